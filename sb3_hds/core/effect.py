@@ -1,0 +1,295 @@
+"""
+Named extensions of a twin: what real hardware does and the twin does not.
+
+An effect sits in one of three places on the way of a signal: between command and plant
+(``ActionEffect``), in the equation of motion (``ForceEffect``), or between plant and measurement
+(``SensorEffect``). Action and force effects are evaluated at every internal sub-step, and may carry
+memory from one to the next.
+"""
+
+import abc
+import copy
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+
+import jax.numpy as jnp
+
+from sb3_hds.core.linear import solve_spd
+from sb3_hds.core.parameter import Parameter
+from sb3_hds.core.types import (
+    Action,
+    Force,
+    MassMatrix,
+    Memory,
+    Obs,
+    Params,
+    Position,
+    Scalar,
+    Velocity,
+)
+from sb3_hds.errors import EffectError
+
+if TYPE_CHECKING:
+    from sb3_hds.core.twin import Twin
+
+
+class Moment(NamedTuple):
+    """
+    The mechanical system at one evaluation of its equation of motion ``M a + bias = actuator + effects``.
+
+    :param q: generalised position, shape ``(dof,)``
+    :param v: generalised velocity, shape ``(dof,)``
+    :param actuator: generalised force of the actuators, shape ``(dof,)``
+    :param load: generalised force that the joints carry against gravity and inertia (``bias``), shape ``(dof,)``
+    :param mass_matrix: shape ``(dof, dof)``
+    :param h: length of the sub-step [s]
+    """
+
+    q: Position
+    v: Velocity
+    actuator: Force
+    load: Force
+    mass_matrix: MassMatrix
+    h: float
+
+
+class JointMoment(NamedTuple):
+    """
+    The view of one joint. All entries are scalars.
+
+    :param q: position [rad] or [m]
+    :param v: velocity [rad/s] or [m/s]
+    :param actuator: force of the actuators on this joint [N m] or [N]
+    :param load: force that the joint carries against gravity and inertia [N m] or [N]
+    :param inertia: what a force at this joint alone has to accelerate, ``1 / (M^-1)_jj`` [kg m2] or [kg]
+    :param h: length of the sub-step [s]
+    """
+
+    q: Scalar
+    v: Scalar
+    actuator: Scalar
+    load: Scalar
+    inertia: Scalar
+    h: float
+
+
+class Effect(abc.ABC):
+    """
+    Something real hardware does and the twin does not. It vanishes when its parameters are null.
+
+    :param where: index or name of the joint, actuator or channel that it acts on
+    :param values: values of its parameters by name; default: null, where it changes nothing
+    :raises EffectError: for an unknown parameter
+    :raises ParameterError: for a value out of bounds
+    """
+
+    name: ClassVar[str]
+    #: ``"joint"``, ``"actuator"`` or ``"channel"``
+    slot: ClassVar[str]
+    #: units are those of a rotary joint
+    parameters: ClassVar[Mapping[str, Parameter]]
+    #: one sentence for people
+    explanation: ClassVar[str]
+    #: where the equation comes from
+    source: ClassVar[str]
+    #: names of effects from which data cannot tell this one, with the condition under which they cannot
+    equivalents: ClassVar[Mapping[str, str]] = {}
+
+    def __init__(self, where: int | str = 0, **values: float) -> None:
+        self.where = where
+        self.values: dict[str, float] = {
+            name: parameter.null for name, parameter in self.parameters.items()
+        }
+        self._set(values)
+
+    def with_values(self, **values: float) -> Self:
+        """:return: the same effect with new values; equal to this one for the compiler"""
+        changed = copy.copy(self)
+        changed.values = dict(self.values)
+        changed._set(values)
+        return changed
+
+    def _set(self, values: Mapping[str, float]) -> None:
+        unknown = set(values) - set(self.parameters)
+        if unknown:
+            raise EffectError(
+                f"Effect '{self.name}' has no parameter {sorted(unknown)}. "
+                f"Its parameters are: {', '.join(self.parameters)}."
+            )
+        for name, value in values.items():
+            self.values[name] = self.parameters[name].check(f"{self.name}.{name}", value)
+
+    def to_spec(self) -> dict[str, Any]:
+        """:return: plain data from which the same effect can be made"""
+        return {"effect": self.name, "where": self.where, "parameters": dict(self.values)}
+
+    def structure(self) -> tuple[Any, ...]:
+        """What makes two effects different programs: everything but the values of parameters."""
+        return (type(self), self.where)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Effect) and self.structure() == other.structure()
+
+    def __hash__(self) -> int:
+        return hash(self.structure())
+
+    def __repr__(self) -> str:
+        values = "".join(f", {name}={value:g}" for name, value in self.values.items())
+        return f"{type(self).__name__}({self.where!r}{values})"
+
+
+class ForceEffect(Effect):
+    """Adds a generalised force to the equation of motion."""
+
+    slot: ClassVar[str] = "joint"
+
+    def memory(self, twin: "Twin") -> Memory:
+        """:return: what the effect remembers at the start of an episode; a pytree of float arrays"""
+        return ()
+
+    @abc.abstractmethod
+    def force(self, moment: Moment, index: int, memory: Memory, params: Params) -> Force:
+        """
+        :param moment: the system at this evaluation of its equation of motion
+        :param index: index of the joint that the effect acts on
+        :param memory: as it was at the start of the sub-step
+        :param params: the effect's own parameters, without prefix
+        :return: generalised force on all joints, shape ``(dof,)``
+        """
+
+    def advance(self, moment: Moment, index: int, memory: Memory, params: Params) -> Memory:
+        """:return: the memory after one sub-step that starts at ``moment``"""
+        return memory
+
+
+class JointEffect(ForceEffect):
+    """A force effect that looks at one joint and acts on it alone."""
+
+    @abc.abstractmethod
+    def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
+        """:return: force on this joint [N m] or [N]"""
+
+    def force(self, moment: Moment, index: int, memory: Memory, params: Params) -> Force:
+        torque = self.torque(at_joint(moment, index), memory, params)
+        return jnp.zeros_like(moment.v).at[index].set(torque)
+
+
+class ActionEffect(Effect):
+    """Changes one command on its way to the plant."""
+
+    slot: ClassVar[str] = "actuator"
+
+    def memory(self, twin: "Twin") -> Memory:
+        """:return: what the effect remembers at the start of an episode; a pytree of float arrays"""
+        return ()
+
+    @abc.abstractmethod
+    def act(
+        self, command: Scalar, memory: Memory, h: float, params: Params
+    ) -> tuple[Scalar, Memory]:
+        """
+        :param command: what this actuator is told, in its unit
+        :param memory: as it was at the start of the sub-step
+        :param h: length of the sub-step [s]
+        :param params: the effect's own parameters, without prefix
+        :return: the command that reaches the plant during the sub-step, and the memory after it
+        """
+
+
+class SensorEffect(Effect):
+    """Changes one measurement on its way out of the plant."""
+
+    slot: ClassVar[str] = "channel"
+
+    def memory(self, obs: Obs, index: int) -> Memory:
+        """:return: what the sensor remembers at the start of an episode that begins with ``obs``"""
+        return ()
+
+    @abc.abstractmethod
+    def sense(self, measured: Scalar, memory: Memory, params: Params) -> Scalar:
+        """:return: what is reported for the true value ``measured``"""
+
+    @abc.abstractmethod
+    def invert(self, reported: Scalar, params: Params) -> Scalar:
+        """:return: the true value, as well as one report tells"""
+
+    def advance(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Memory:
+        """:return: the memory after a control interval that ends with the true value ``measured``"""
+        return memory
+
+
+@dataclasses.dataclass(frozen=True)
+class Attached:
+    """
+    An effect at its place in a twin.
+
+    :param key: full name, ``"viscous_friction.hinge"``; prefix of its parameters and key of its memory
+    :param effect: the effect
+    :param index: index of the joint, actuator or channel
+    """
+
+    key: str
+    effect: Effect
+    index: int
+
+    def own(self, params: Params) -> Params:
+        """:return: the effect's own parameters, without prefix"""
+        return {name: params[f"{self.key}.{name}"] for name in self.effect.parameters}
+
+
+class EffectChain:
+    """
+    The attached effects with their values, as a twin's ``step`` meets them at each sub-step.
+
+    :param attached: action and force effects, in the order in which the signal meets them
+    :param params: full parameters of the extended twin
+    """
+
+    def __init__(self, attached: tuple[Attached, ...], params: Params) -> None:
+        self._actions = [
+            (a, a.effect, a.own(params)) for a in attached if isinstance(a.effect, ActionEffect)
+        ]
+        self._forces = [
+            (a, a.effect, a.own(params)) for a in attached if isinstance(a.effect, ForceEffect)
+        ]
+
+    def act(
+        self, action: Action, memory: dict[str, Memory], h: float
+    ) -> tuple[Action, dict[str, Memory]]:
+        """:return: the command that reaches the plant during a sub-step of ``h`` seconds, and the memory after it"""
+        for attached, effect, params in self._actions:
+            command, after = effect.act(action[attached.index], memory[attached.key], h, params)
+            action, memory = action.at[attached.index].set(command), memory | {attached.key: after}
+        return action, memory
+
+    def force(self, moment: Moment, memory: dict[str, Memory]) -> Force:
+        """:return: the sum of all force effects, shape ``(dof,)``"""
+        total = jnp.zeros_like(moment.v)
+        for attached, effect, params in self._forces:
+            total = total + effect.force(moment, attached.index, memory[attached.key], params)
+        return total
+
+    def advance(self, moment: Moment, memory: dict[str, Memory]) -> dict[str, Memory]:
+        """:return: the memory of the force effects after a sub-step that starts at ``moment``"""
+        for attached, effect, params in self._forces:
+            after = effect.advance(moment, attached.index, memory[attached.key], params)
+            memory = memory | {attached.key: after}
+        return memory
+
+
+NO_EFFECTS = EffectChain((), {})
+
+
+def at_joint(moment: Moment, index: int) -> JointMoment:
+    """:return: the view of joint ``index``"""
+    unit = jnp.zeros_like(moment.v).at[index].set(1.0)
+    inertia = 1.0 / solve_spd(moment.mass_matrix, unit)[index]
+    return JointMoment(
+        moment.q[index],
+        moment.v[index],
+        moment.actuator[index],
+        moment.load[index],
+        inertia,
+        moment.h,
+    )

@@ -1,0 +1,170 @@
+"""A twin with effects attached is again a twin."""
+
+from collections import Counter
+from typing import Any
+
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from sb3_hds.core.effect import (
+    NO_EFFECTS,
+    ActionEffect,
+    Attached,
+    Effect,
+    EffectChain,
+    ForceEffect,
+    SensorEffect,
+)
+from sb3_hds.core.parameter import Parameter
+from sb3_hds.core.twin import State, Twin
+from sb3_hds.core.types import Action, Flag, Obs, Params, Scalar, Tangent
+from sb3_hds.errors import EffectError
+
+
+class ExtendedTwin(Twin):
+    """
+    A twin plus effects. Parameters of an effect are named ``effect.place.parameter``, for example
+    ``"viscous_friction.hinge.b"``.
+
+    Where the base twin has a parameter for the same thing (``native_effects``), the effect adds to that
+    parameter instead of computing a force of its own. Extending an extended twin flattens.
+
+    :param base: the twin to extend
+    :param effects: effects to attach, in the order in which a signal meets them
+    :raises EffectError: for an effect attached twice at one place, or at a place that does not exist
+    """
+
+    def __init__(self, base: Twin, *effects: Effect) -> None:
+        if isinstance(base, ExtendedTwin):
+            base, effects = base._base_with_values(), (*base.effects_with_values(), *effects)
+        self.base = base
+        self.effects = effects
+        self.attached = tuple(_attach(effect, base) for effect in effects)
+        twice = [key for key, count in Counter(a.key for a in self.attached).items() if count > 1]
+        if twice:
+            raise EffectError(
+                f"An effect can be attached once at each place; {', '.join(twice)} came more than once."
+            )
+        self.name, self.env_id = base.name, base.env_id
+        self.dt, self.substeps = base.dt, base.substeps
+        self.joints, self.actuators, self.channels = base.joints, base.actuators, base.channels
+        self.max_episode_steps = base.max_episode_steps
+        self.differentiability = base.differentiability
+        self.reward_has_gradient = base.reward_has_gradient
+        self.parameters = dict(base.parameters)
+        self.values = dict(base.values)
+        for a in self.attached:
+            for name, parameter in a.effect.parameters.items():
+                self.parameters[f"{a.key}.{name}"] = _in_units_of(parameter, base, a)
+                self.values[f"{a.key}.{name}"] = a.effect.values[name]
+        self._native = tuple(
+            a for a in self.attached if (a.effect.name, a.index) in base.native_effects
+        )
+        self._simulated = tuple(a for a in self.attached if a not in self._native)
+
+    def initial(self, key: PRNGKeyArray, params: Params) -> State:
+        return self._remember(self.base.initial(key, self._base_params(params)), params)
+
+    def infer(self, obs: Obs, params: Params) -> State:
+        for a in reversed(self._sensors()):
+            obs = obs.at[a.index].set(a.effect.invert(obs[a.index], a.own(params)))
+        return self._remember(self.base.infer(obs, self._base_params(params)), params)
+
+    def observe(self, state: State, params: Params) -> Obs:
+        obs = self.base.observe(state, self._base_params(params))
+        for a in self._sensors():
+            reported = a.effect.sense(obs[a.index], state.memory[a.key], a.own(params))
+            obs = obs.at[a.index].set(reported)
+        return obs
+
+    def step(
+        self, state: State, action: Action, params: Params, effects: EffectChain = NO_EFFECTS
+    ) -> State:
+        own = EffectChain(self._simulated, params)
+        base_params = self._base_params(params)
+        state = self.base.step(state, action, base_params, own)
+        memory = state.memory
+        for a in self._sensors():
+            measured = self.base.observe(state, base_params)[a.index]
+            memory = memory | {
+                a.key: a.effect.advance(measured, memory[a.key], self.dt, a.own(params))
+            }
+        return state._replace(memory=memory)
+
+    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
+        return self.base.reward(state, action, next_state, self._base_params(params))
+
+    def planning_reward(
+        self, state: State, action: Action, next_state: State, params: Params
+    ) -> Scalar:
+        return self.base.planning_reward(state, action, next_state, self._base_params(params))
+
+    def terminated(self, state: State, params: Params) -> Flag:
+        return self.base.terminated(state, self._base_params(params))
+
+    def difference(self, state: State, reference: State) -> Tangent:
+        return self.base.difference(state, reference)
+
+    def retract(self, state: State, tangent: Tangent) -> State:
+        return self.base.retract(state, tangent)
+
+    def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
+        return self.base.sketch(state, self._base_params(params))
+
+    def effects_with_values(self) -> tuple[Effect, ...]:
+        """:return: the effects, holding the values that the extended twin has for them now"""
+        return tuple(a.effect.with_values(**a.own(self.values)) for a in self.attached)
+
+    def to_spec(self) -> dict[str, Any]:
+        effects = [effect.to_spec() for effect in self.effects_with_values()]
+        return self._base_with_values().to_spec() | {"effects": effects}
+
+    def structure(self) -> tuple[Any, ...]:
+        return (type(self), self.base, tuple(a.key for a in self.attached), self.effects)
+
+    def _base_with_values(self) -> Twin:
+        return self.base.with_parameters(
+            **{name: self.values[name] for name in self.base.parameters}
+        )
+
+    def _base_params(self, params: Params) -> Params:
+        own = {name: params[name] for name in self.base.parameters}
+        for a in self._native:
+            for name, target in self.base.native_effects[a.effect.name, a.index].items():
+                own[target] = own[target] + params[f"{a.key}.{name}"]
+        return own
+
+    def _sensors(self) -> list[Attached]:
+        return [a for a in self.attached if isinstance(a.effect, SensorEffect)]
+
+    def _remember(self, state: State, params: Params) -> State:
+        """Give every effect its first memory, so that the state keeps one structure under ``scan``."""
+        memory = dict(state.memory)
+        for a in self._simulated:
+            if isinstance(a.effect, SensorEffect):
+                memory[a.key] = a.effect.memory(
+                    self.base.observe(state, self._base_params(params)), a.index
+                )
+            elif isinstance(a.effect, ForceEffect | ActionEffect):
+                memory[a.key] = a.effect.memory(self.base)
+        return state._replace(memory=memory)
+
+
+def _attach(effect: Effect, twin: Twin) -> Attached:
+    """Find the place that an effect names."""
+    places = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}[
+        effect.slot
+    ]
+    names = [place.name for place in places]
+    index = names.index(effect.where) if effect.where in names else effect.where
+    if not isinstance(index, int) or not 0 <= index < len(names):
+        raise EffectError(
+            f"Effect '{effect.name}' names {effect.slot} {effect.where!r}, but {twin.name} has: "
+            f"{', '.join(f'{i} ({name})' for i, name in enumerate(names))}."
+        )
+    return Attached(f"{effect.name}.{names[index]}", effect, index)
+
+
+def _in_units_of(parameter: Parameter, twin: Twin, attached: Attached) -> Parameter:
+    """Effects state the units of a rotary joint."""
+    sliding = attached.effect.slot == "joint" and twin.joints[attached.index].unit == "m"
+    return parameter.prismatic() if sliding else parameter

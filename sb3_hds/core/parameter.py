@@ -1,0 +1,68 @@
+"""A physical constant that data can inform."""
+
+import dataclasses
+import math
+
+from sb3_hds.errors import ParameterError
+
+_PRISMATIC_UNIT = {
+    "N m": "N",
+    "N m s/rad": "N s/m",
+    "N m s2/rad2": "N s2/m2",
+    "N m/rad": "N/m",
+    "N m/rad3": "N/m3",
+    "rad": "m",
+    "rad/s": "m/s",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """
+    One unknown number of a twin or an effect, with what is believed about it.
+
+    :param null: value before seeing any data; for an effect, the value at which it vanishes
+    :param scale: typical deviation from ``null``, in the same unit; must be positive
+    :param unit: SI unit, for example ``"N m s/rad"``; ``"1"`` where there is none
+    :param lower: smallest admissible value
+    :param upper: largest admissible value
+    :raises ParameterError: if ``scale`` is not positive or ``null`` lies outside the bounds
+    """
+
+    null: float
+    scale: float
+    unit: str
+    lower: float = -math.inf
+    upper: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not self.scale > 0.0:
+            raise ParameterError(
+                f"A parameter's scale must be positive, got {self.scale} {self.unit}."
+            )
+        if not self.lower <= self.null <= self.upper:
+            raise ParameterError(
+                f"A parameter's null value, {self.null} {self.unit}, must lie within its bounds "
+                f"[{self.lower}, {self.upper}]."
+            )
+
+    def check(self, name: str, value: float) -> float:
+        """
+        :return: ``value`` as a float
+        :raises ParameterError: if it is not a finite number within the bounds
+        """
+        try:
+            value = float(value)
+        except (TypeError, ValueError):
+            raise ParameterError(
+                f"Parameter '{name}' must be a number [{self.unit}], got {value!r}."
+            ) from None
+        if not (math.isfinite(value) and self.lower <= value <= self.upper):
+            raise ParameterError(
+                f"Parameter '{name}' must be finite and within [{self.lower}, {self.upper}] {self.unit}, got {value}."
+            )
+        return value
+
+    def prismatic(self) -> "Parameter":
+        """:return: the same parameter with the unit that it has at a sliding joint"""
+        return dataclasses.replace(self, unit=_PRISMATIC_UNIT.get(self.unit, self.unit))

@@ -1,0 +1,47 @@
+"""What moves, what drives it, and what is measured. Names and units are data: they stand in every table."""
+
+from typing import NamedTuple
+
+
+class Joint(NamedTuple):
+    """
+    One degree of freedom.
+
+    :param name: unique within the twin
+    :param unit: unit of its position: ``"rad"`` for a hinge, ``"m"`` for a slider
+    """
+
+    name: str
+    unit: str = "rad"
+
+
+class Actuator(NamedTuple):
+    """
+    One command.
+
+    :param name: unique within the twin
+    :param unit: unit of the command
+    :param low: smallest command that the environment accepts
+    :param high: largest command that the environment accepts
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+
+class Channel(NamedTuple):
+    """
+    One entry of the observation.
+
+    :param name: unique within the twin
+    :param unit: unit of the measurement
+    :param low: smallest value that the observation space declares
+    :param high: largest value that the observation space declares
+    """
+
+    name: str
+    unit: str
+    low: float = float("-inf")
+    high: float = float("inf")

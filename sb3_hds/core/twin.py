@@ -1,0 +1,227 @@
+"""The interface of every differentiable simulator."""
+
+import abc
+import copy
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from sb3_hds.core.effect import NO_EFFECTS, EffectChain
+from sb3_hds.core.parameter import Parameter
+from sb3_hds.core.signals import Actuator, Channel, Joint
+from sb3_hds.core.types import (
+    Action,
+    Flag,
+    Memory,
+    Obs,
+    Params,
+    Position,
+    Scalar,
+    Tangent,
+    Velocity,
+)
+from sb3_hds.errors import ParameterError
+
+if TYPE_CHECKING:
+    from sb3_hds.core.effect import Effect
+    from sb3_hds.core.extended import ExtendedTwin
+
+
+class State(NamedTuple):
+    """
+    Everything that the next step depends on besides the action and the parameters.
+
+    :param q: generalised position [rad] or [m], shape ``(dof,)``
+    :param v: generalised velocity [rad/s] or [m/s], shape ``(dof,)``
+    :param memory: what attached effects remember, keyed by the effect's full name
+    """
+
+    q: Position
+    v: Velocity
+    memory: dict[str, Memory]
+
+
+class Twin(abc.ABC):
+    """
+    A differentiable simulator of one system.
+
+    Its methods are pure and unbatched, and safe under ``jit``, ``vmap``, ``scan`` and forward-mode
+    differentiation: batching is the caller's business. Values of parameters always arrive in
+    ``params``; a method never reads them from ``self``, so two twins that differ in nothing else are
+    equal, and one compiled program serves both.
+
+    A subclass declares its signals and parameters as class attributes and implements the abstract
+    methods. Mechanical systems with a mass matrix are shorter as an ``AnalyticTwin``.
+
+    :param dt: control interval [s]; default: the class attribute
+    :param substeps: internal steps per control interval; default: the class attribute
+    :param settings: values of parameters by name, and of the options that the class declares
+    :raises ParameterError: for a name that is neither a parameter nor an option, or a value out of bounds
+    """
+
+    name: str
+    env_id: str | None = None
+    dt: float
+    substeps: int = 1
+    joints: tuple[Joint, ...]
+    actuators: tuple[Actuator, ...]
+    channels: tuple[Channel, ...]
+    parameters: Mapping[str, Parameter]
+    max_episode_steps: int | None = None
+    #: ``"reverse"`` where reverse mode works too, ``"forward"`` where only forward mode does (engines).
+    differentiability: str = "reverse"
+    #: False where the reward is flat almost everywhere; then ``planning_reward`` must be overridden.
+    reward_has_gradient: bool = True
+    #: (effect name, joint index) -> {the effect's parameter: the twin's parameter that it adds to}
+    native_effects: Mapping[tuple[str, int], Mapping[str, str]] = {}
+    #: Structural choices with their defaults, set by keyword in the constructor: ``{"goal": "stop"}``.
+    options: ClassVar[Mapping[str, Any]] = {}
+
+    def __init__(
+        self, *, dt: float | None = None, substeps: int | None = None, **settings: Any
+    ) -> None:
+        if dt is not None:
+            self.dt = float(dt)
+        if substeps is not None:
+            self.substeps = int(substeps)
+        if not self.dt > 0.0 or self.substeps < 1:
+            raise ParameterError(
+                f"{self.name} needs dt > 0 s and at least one sub-step, got dt={self.dt}, substeps={self.substeps}."
+            )
+        for option, default in self.options.items():
+            setattr(self, option, settings.pop(option, default))
+        self.values: dict[str, float] = {
+            name: parameter.null for name, parameter in self.parameters.items()
+        }
+        self._set(settings)
+
+    @property
+    def params(self) -> Params:
+        """The current values of all parameters: what every method takes as ``params``."""
+        return dict(self.values)
+
+    def with_parameters(self, **values: float) -> Self:
+        """
+        :param values: new values by full name, in the units of ``parameters``
+        :return: the same twin with these values; equal to this one for the compiler
+        :raises ParameterError: for an unknown name or a value out of bounds
+        """
+        changed = copy.copy(self)
+        changed.values = dict(self.values)
+        changed._set(values)
+        return changed
+
+    def extend(self, *effects: "Effect") -> "ExtendedTwin":
+        """:return: this twin with ``effects`` attached, in the order in which a signal meets them"""
+        from sb3_hds.core.extended import ExtendedTwin
+
+        return ExtendedTwin(self, *effects)
+
+    @classmethod
+    def from_env(cls, env: Any) -> Self:
+        """
+        Read the parameters that an environment was made with.
+
+        :param env: an environment, wrapped or not; its ``unwrapped`` is read
+        :return: a twin whose ``values`` are those of the environment
+        """
+        return cls()
+
+    @abc.abstractmethod
+    def initial(self, key: PRNGKeyArray, params: Params) -> State:
+        """Draw the state at the start of an episode."""
+
+    @abc.abstractmethod
+    def infer(self, obs: Obs, params: Params) -> State:
+        """
+        The state that a measurement stands for: the inverse of :meth:`observe`.
+
+        Unobserved parts are zero, and the subclass says so.
+        """
+
+    @abc.abstractmethod
+    def observe(self, state: State, params: Params) -> Obs:
+        """What the sensors report, in the order of ``channels``."""
+
+    @abc.abstractmethod
+    def step(
+        self, state: State, action: Action, params: Params, effects: EffectChain = NO_EFFECTS
+    ) -> State:
+        """
+        Advance by one control interval ``dt``.
+
+        :param action: the command, in the units of the action space; clipped to it as the environment does
+        :param effects: attached effects, to be evaluated at every internal sub-step
+        """
+
+    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
+        """The environment's own reward for this step; zero where there is no task."""
+        return jnp.zeros(())
+
+    def planning_reward(
+        self, state: State, action: Action, next_state: State, params: Params
+    ) -> Scalar:
+        """
+        What planning maximises: the reward, or a smooth surrogate where the reward has no useful gradient.
+
+        It is counted up to and including the step that terminates, and is zero afterwards. So where
+        surviving is good it must stay positive, otherwise planning learns to die early.
+        """
+        return self.reward(state, action, next_state, params)
+
+    def terminated(self, state: State, params: Params) -> Flag:
+        """Whether the episode ends in this state for a reason of the task, not of time."""
+        return jnp.zeros((), bool)
+
+    def difference(self, state: State, reference: State) -> Tangent:
+        """:return: the tangent vector from ``reference`` to ``state``, memory included; override for quaternions"""
+        return ravel_pytree(state)[0] - ravel_pytree(reference)[0]
+
+    def retract(self, state: State, tangent: Tangent) -> State:
+        """:return: ``state`` moved along ``tangent``; the inverse of :meth:`difference`"""
+        flat, unravel = ravel_pytree(state)
+        return unravel(flat + tangent)
+
+    def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
+        """A line drawing of the system for rendering [m]: by default one bar as high as each joint's position."""
+        base = jnp.arange(state.q.shape[0], dtype=state.q.dtype)
+        zero = jnp.zeros_like(base)
+        return jnp.stack(
+            [jnp.stack([base, base, base], 1), jnp.stack([zero, state.q, zero], 1)], -1
+        ).reshape(-1, 2)
+
+    def to_spec(self) -> dict[str, Any]:
+        """:return: plain data from which ``twins.from_spec`` makes an equal twin with equal values"""
+        options = {name: getattr(self, name) for name in self.options}
+        return {
+            "twin": self.name,
+            "options": options | {"dt": self.dt, "substeps": self.substeps},
+            "parameters": dict(self.values),
+        }
+
+    def structure(self) -> tuple[Any, ...]:
+        """What makes two twins different programs: everything but the values of parameters."""
+        return (type(self), self.dt, self.substeps, *(getattr(self, name) for name in self.options))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Twin) and self.structure() == other.structure()
+
+    def __hash__(self) -> int:
+        return hash(self.structure())
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{name}={value:g}" for name, value in self.values.items())
+        return f"{type(self).__name__}({values})"
+
+    def _set(self, values: Mapping[str, float]) -> None:
+        for name, value in values.items():
+            if name not in self.parameters:
+                known = ", ".join(self.parameters) or "none"
+                choices = f"; its options are: {', '.join(self.options)}" if self.options else ""
+                raise ParameterError(
+                    f"{self.name} has no parameter '{name}'. Its parameters are: {known}{choices}."
+                )
+            self.values[name] = self.parameters[name].check(name, value)

@@ -1,0 +1,19 @@
+"""What the arrays mean. Shapes are checked whenever the tests run."""
+
+from typing import Any, TypeAlias
+
+from jaxtyping import Array, Bool, Float
+
+Position: TypeAlias = Float[Array, " dof"]  # [rad] or [m]
+Velocity: TypeAlias = Float[Array, " dof"]  # [rad/s] or [m/s]
+Force: TypeAlias = Float[Array, " dof"]  # generalised force, [N m] or [N]
+MassMatrix: TypeAlias = Float[Array, "dof dof"]
+Action: TypeAlias = Float[Array, " act"]  # in the units of the action space
+Obs: TypeAlias = Float[Array, " obs"]
+Tangent: TypeAlias = Float[Array, " tangent"]  # a small change of a state
+Scalar: TypeAlias = Float[Array, ""]
+Flag: TypeAlias = Bool[Array, ""]
+Memory: TypeAlias = (
+    Any  # what an effect carries from sub-step to sub-step: a pytree of float arrays
+)
+Params: TypeAlias = dict[str, Any]  # full parameter name -> value (a float or a scalar array)

@@ -1,0 +1,8 @@
+"""The catalogue of effects. A class listed in ``ALL`` is tested, offered to the user and documented."""
+
+from sb3_hds.core import Effect
+from sb3_hds.effects.joint import CoulombFriction, ViscousFriction
+
+ALL: tuple[type[Effect], ...] = (ViscousFriction, CoulombFriction)
+
+__all__ = ["ALL", "CoulombFriction", "ViscousFriction"]

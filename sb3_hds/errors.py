@@ -1,0 +1,33 @@
+"""The errors this package raises on purpose. Each message says what was expected, what came, and the way out."""
+
+
+class SB3HDSError(Exception):
+    """Base of every error below."""
+
+
+class NoTwinError(SB3HDSError, LookupError):
+    """No twin is registered for an environment or a name."""
+
+
+class ParameterError(SB3HDSError, ValueError):
+    """A physical parameter is unknown, out of its bounds, or not finite."""
+
+
+class EffectError(SB3HDSError, ValueError):
+    """An effect cannot be attached to a twin."""
+
+
+class TrajectoryError(SB3HDSError, ValueError):
+    """Measured or simulated data have the wrong shape, sampling or content."""
+
+
+class CalibrationError(SB3HDSError, ValueError):
+    """A calibration cannot be carried out."""
+
+
+class RewardError(SB3HDSError, ValueError):
+    """A reward gives planning nothing to climb."""
+
+
+class EnvironmentMismatchError(SB3HDSError, ValueError):
+    """An environment, as wrapped, is not what its twin simulates."""

@@ -1,0 +1,114 @@
+"""Which twins exist, by name and by environment id."""
+
+import difflib
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from sb3_hds.core import Effect, Twin
+from sb3_hds.errors import NoTwinError
+
+_TWINS: dict[str, type[Twin]] = {}
+
+
+def register(twin: type[Twin]) -> type[Twin]:
+    """
+    Make a twin known under its ``name`` and its ``env_id``. Usable as a class decorator.
+
+    :param twin: a concrete subclass of ``Twin``
+    :return: the class itself
+    :raises TypeError: for anything but a subclass of ``Twin``
+    :raises ValueError: if another class has the name or the id already
+    """
+    if not (isinstance(twin, type) and issubclass(twin, Twin)):
+        raise TypeError(
+            f"twins.register takes a subclass of Twin, got {twin!r}. Register the class, not an instance."
+        )
+    for key in filter(None, (twin.name, twin.env_id)):
+        other = _TWINS.setdefault(key, twin)
+        if other.__qualname__ != twin.__qualname__:
+            raise ValueError(
+                f"'{key}' is already the twin {other.__qualname__}. Choose another name for {twin!r}."
+            )
+        _TWINS[key] = twin
+    return twin
+
+
+def names() -> list[str]:
+    """:return: the names of all twins, sorted"""
+    return sorted({twin.name for twin in _TWINS.values()})
+
+
+def all_ids() -> list[str]:
+    """:return: the ids of all environments that have a twin, sorted"""
+    return sorted({twin.env_id for twin in _TWINS.values() if twin.env_id is not None})
+
+
+def get(name_or_env_id: str) -> type[Twin]:
+    """
+    :return: the class registered under a name or an environment id
+    :raises NoTwinError: if there is none; the message lists what exists and how to add one's own
+    """
+    try:
+        return _TWINS[name_or_env_id]
+    except KeyError:
+        raise NoTwinError(_how_to_add_one(str(name_or_env_id))) from None
+
+
+def make(name_or_env_id: str, **settings: Any) -> Twin:
+    """
+    :param name_or_env_id: ``"Pendulum"`` or ``"Pendulum-v1"``
+    :param settings: values of parameters, options of the twin, ``dt`` [s], ``substeps``
+    :raises NoTwinError: if there is no such twin
+    :raises ParameterError: for a setting that the twin does not have, or a value out of bounds
+    """
+    return get(name_or_env_id)(**settings)
+
+
+def from_env(env: Any) -> Twin:
+    """
+    :param env: an environment made by ``gymnasium.make``, wrapped or not
+    :return: its twin, with the parameters that the environment was made with
+    :raises NoTwinError: if its id has no twin
+    """
+    spec = getattr(env, "spec", None)
+    env_id = spec.id if spec is not None else type(env.unwrapped).__name__
+    return get(env_id).from_env(env)
+
+
+def from_spec(spec: Mapping[str, Any], effects: Iterable[type[Effect]] = ()) -> Twin:
+    """
+    The inverse of ``Twin.to_spec``.
+
+    :param spec: plain data
+    :param effects: the classes among which the effects of the spec are found by name
+    :raises NoTwinError: if the twin or one of its effects is not known here
+    """
+    twin = make(spec["twin"], **spec["options"], **spec["parameters"])
+    known = {effect.name: effect for effect in effects}
+    missing = {part["effect"] for part in spec.get("effects", ())} - set(known)
+    if missing:
+        raise NoTwinError(
+            f"The twin '{spec['twin']}' was saved with effects that are not known here: {missing}."
+        )
+    attached = [
+        known[part["effect"]](part["where"], **part["parameters"])
+        for part in spec.get("effects", ())
+    ]
+    return twin.extend(*attached) if attached else twin
+
+
+def _how_to_add_one(wanted: str) -> str:
+    close = difflib.get_close_matches(wanted, _TWINS, n=1)
+    hint = f" Did you mean '{close[0]}'?" if close else ""
+    return (
+        f"There is no twin for '{wanted}'.{hint}\n"
+        f"Environments with a twin: {', '.join(all_ids())}.\n"
+        f"Twins by name: {', '.join(names())}.\n"
+        "To add your own (see 'Your own twin' in the documentation):\n\n"
+        "    from sb3_hds import twins\n"
+        "    from sb3_hds.core import AnalyticTwin\n\n"
+        "    @twins.register\n"
+        "    class MyTwin(AnalyticTwin):\n"
+        f'        name, env_id, dt = "MyTwin", "{wanted}", 0.05\n'
+        "        ...  # joints, actuators, channels, parameters; actuate, mass_matrix, bias, observe, infer, reward"
+    )
