@@ -4,7 +4,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-def solve_spd(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+def solve_spd(
+    matrix: Float[Array, "n n"], right: Float[Array, "n *k"], least_pivot: float | None = None
+) -> Float[Array, "n *k"]:
     """
     Solve ``matrix @ x = right`` for a symmetric positive definite matrix by unrolled ``L D L^T``.
 
@@ -13,13 +15,16 @@ def solve_spd(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float
 
     :param matrix: symmetric positive definite, shape ``(n, n)``; not checked
     :param right: shape ``(n,)`` or ``(n, k)``
+    :param least_pivot: raise smaller pivots to this value, so that an indefinite matrix is replaced by
+        a positive definite one near it; None leaves them
     :return: the solution, in the shape of ``right``
     """
     n = matrix.shape[0]
     lower = [[None] * n for _ in range(n)]
     pivot = []
     for j in range(n):
-        pivot.append(matrix[j, j] - sum(lower[j][k] ** 2 * pivot[k] for k in range(j)))
+        rest = matrix[j, j] - sum(lower[j][k] ** 2 * pivot[k] for k in range(j))
+        pivot.append(rest if least_pivot is None else jnp.maximum(rest, least_pivot))
         for i in range(j + 1, n):
             shared = sum(lower[i][k] * lower[j][k] * pivot[k] for k in range(j))
             lower[i][j] = (matrix[i, j] - shared) / pivot[j]

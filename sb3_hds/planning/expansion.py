@@ -1,0 +1,87 @@
+"""Local models of a plan: what one step and one reward do to first and second order."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sb3_hds.core import State
+from sb3_hds.planning.problem import Control, Plan, Problem
+
+
+class Expansion(NamedTuple):
+    r"""
+    A plan's neighbourhood, in tangent coordinates :math:`\delta x` of the states (dimension n) and
+    changes :math:`\delta u` of the controls (dimension m). Costs are negative, discounted rewards, zero
+    after termination.
+
+    :param A: :math:`\partial x_{t+1} / \partial x_t`, shape ``(horizon, n, n)``
+    :param B: :math:`\partial x_{t+1} / \partial u_t`, shape ``(horizon, n, m)``
+    :param slope: gradient of the stage cost by (x, u), shape ``(horizon, n + m)``
+    :param curvature: Hessian of the stage cost by (x, u), shape ``(horizon, n + m, n + m)``
+    :param end_slope: gradient of the terminal cost, shape ``(n,)``
+    :param end_curvature: Hessian of the terminal cost, shape ``(n, n)``
+    """
+
+    A: Float[Array, "horizon n n"]
+    B: Float[Array, "horizon n m"]
+    slope: Float[Array, "horizon nm"]
+    curvature: Float[Array, "horizon nm nm"]
+    end_slope: Float[Array, " n"]
+    end_curvature: Float[Array, "n n"]
+
+
+def expand(problem: Problem, plan: Plan, second_order: bool = True) -> Expansion:
+    """
+    Differentiate one step at every point of a plan. Forward mode only: engines have no other.
+
+    :param plan: where to expand
+    :param second_order: whether to compute curvatures; zero otherwise
+    :return: the local model; its cost derivatives are zero where the episode has terminated
+    """
+    starts = jax.tree.map(lambda leaf: leaf[:-1], plan.states)
+    ends = jax.tree.map(lambda leaf: leaf[1:], plan.states)
+    end = jax.tree.map(lambda leaf: leaf[-1], plan.states)
+    twin = problem.twin
+    first = jax.tree.map(lambda leaf: leaf[0], starts)
+    origin = jnp.zeros_like(twin.difference(first, first))
+    n, horizon = origin.shape[0], plan.controls.shape[0]
+    weight = -jnp.where(plan.alive[:-1], problem.discount ** jnp.arange(horizon), 0.0)
+
+    def near(state: State, control: Control, after: State, z: Float[Array, " nm"]):
+        moved, reward = problem.step(twin.retract(state, z[:n]), control + z[n:])
+        return twin.difference(moved, after), reward
+
+    def at(state: State, control: Control, after: State):
+        z = jnp.concatenate([origin, jnp.zeros_like(control)])
+        jacobian, slope = jax.jacfwd(lambda z: near(state, control, after, z))(z)
+        if not second_order:
+            return jacobian, slope, jnp.zeros((z.shape[0], z.shape[0]), z.dtype)
+        reward = lambda z: near(state, control, after, z)[1]  # noqa: E731
+        return jacobian, slope, jax.jacfwd(jax.jacfwd(reward))(z)
+
+    jacobians, slopes, curvatures = jax.vmap(at)(starts, plan.controls, ends)
+    end_weight = -jnp.where(plan.alive[-1], problem.discount**horizon, 0.0)
+    end_slope, end_curvature = _expand_end(problem, end, origin, second_order)
+    return Expansion(
+        jacobians[:, :, :n],
+        jacobians[:, :, n:],
+        weight[:, None] * slopes,
+        weight[:, None, None] * curvatures,
+        end_weight * end_slope,
+        end_weight * end_curvature,
+    )
+
+
+def _expand_end(problem: Problem, end: State, origin: Float[Array, " n"], second_order: bool):
+    def value(dx: Float[Array, " n"]):
+        return problem.value_at_end(problem.twin.retract(end, dx))
+
+    flat = jnp.zeros((origin.shape[0], origin.shape[0]), origin.dtype)
+    if problem.terminal_value is None:
+        return origin, flat
+    slope = jax.jacfwd(value)(origin)
+    if second_order and problem.terminal_curvature:
+        return slope, jax.jacfwd(jax.jacfwd(value))(origin)
+    return slope, flat

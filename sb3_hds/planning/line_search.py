@@ -1,0 +1,74 @@
+"""Choosing among step sizes, "no change" always among them."""
+
+import math
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from sb3_hds.core import Scalar, State
+from sb3_hds.planning.problem import Controls, Plan, Problem, simulate
+
+
+def step_sizes(n: int, smallest: float = 0.015) -> tuple[float, ...]:
+    """
+    :param n: how many, "no change" included; at least 2
+    :param smallest: smallest step other than zero
+    :return: zero and ``n - 1`` steps from 1 down to ``smallest``, geometrically spaced
+    """
+    if n < 2:
+        raise ValueError(
+            f"A line search needs at least 2 candidates, 'no change' among them, got {n}."
+        )
+    if n == 2:
+        return (0.0, 1.0)
+    return (0.0, *(math.exp(math.log(smallest) * i / (n - 2)) for i in range(n - 1)))
+
+
+def choose(
+    values: Float[Array, " candidates"], temperature: Scalar | float, key: PRNGKeyArray | None
+) -> Int[Array, ""]:
+    r"""
+    The candidate to take. Without temperature, the best; the first among equals, so that a useless step
+    is not taken. With temperature, candidate i with probability :math:`\propto \exp(J_i / T)`
+    (Boltzmann acceptance of simulated annealing, drawn by the Gumbel trick).
+
+    :param values: objectives; minus infinity marks what must not be taken
+    :param temperature: :math:`T`, in the units of the objective; 0 is a plain maximum
+    :param key: needed where the temperature may be positive
+    """
+    if key is None:
+        return jnp.argmax(values)
+    noise = jax.random.gumbel(key, values.shape, values.dtype)
+    return jnp.argmax(values + temperature * jnp.where(jnp.isfinite(values), noise, 0.0))
+
+
+def climb(
+    problem: Problem,
+    start: State,
+    controls: Controls,
+    direction: Callable[[Problem, Plan], Controls],
+    n_iterations: int,
+    n_step_sizes: int,
+    temperature: Scalar | float,
+    key: PRNGKeyArray | None,
+) -> Plan:
+    """
+    Move a whole control sequence along a direction, again and again; clipped to the limits.
+
+    :param direction: change of the controls for a unit step, zero where it is not finite
+    :param n_step_sizes: candidates of each line search, "no change" and steps from 1 down to 5e-4
+    :return: the last plan; without temperature never worse than the start
+    """
+    steps = jnp.array(step_sizes(n_step_sizes, 5e-4), controls.dtype)
+    draws = jnp.arange(n_iterations) if key is None else jax.random.split(key, n_iterations)
+
+    def iterate(plan: Plan, draw):
+        change = steps[:, None, None] * direction(problem, plan)
+        moved = jnp.clip(plan.controls + change, -1.0, 1.0)
+        candidates = jax.vmap(lambda u: simulate(problem, start, u))(moved)
+        best = choose(candidates.value, temperature, None if key is None else draw)
+        return jax.tree.map(lambda leaf: leaf[best], candidates), None
+
+    return jax.lax.scan(iterate, simulate(problem, start, controls), draws)[0]

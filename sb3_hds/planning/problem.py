@@ -1,0 +1,131 @@
+"""What a planner maximises, and what it returns."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from sb3_hds.core import Action, Flag, Obs, Params, Scalar, State, Twin
+
+Control: TypeAlias = Float[Array, " act"]  # an action scaled to [-1, 1]
+Controls: TypeAlias = Float[Array, "horizon act"]
+TerminalValue: TypeAlias = Callable[[Obs], Scalar]
+
+
+class Plan(NamedTuple):
+    """
+    A sequence of controls and what comes of it.
+
+    :param controls: scaled actions in [-1, 1], shape ``(horizon, n_act)``
+    :param states: leaves of shape ``(horizon + 1, ...)``, the start state first
+    :param rewards: scaled planning rewards, zero after termination, shape ``(horizon,)``
+    :param alive: whether the episode still runs at each state, shape ``(horizon + 1,)``
+    :param value: the objective, minus infinity where it is not finite
+    """
+
+    controls: Controls
+    states: State
+    rewards: Float[Array, " horizon"]
+    alive: Bool[Array, " horizon_1"]
+    value: Scalar
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    r"""
+    Maximise, over controls :math:`u_t \in [-1, 1]`,
+
+    .. math:: \sum_{t<H} \gamma^t\, s\,(r_t - r_0) + \gamma^H V(o_H)
+
+    where :math:`r` is the twin's planning reward. An episode that has terminated is worth
+    :math:`-s\,r_0/(1-\gamma)` from there on: shifting every reward by the same :math:`r_0` then changes
+    the objective by a constant only, and no start of dying is rewarded. There is no auto-reset.
+
+    :param twin: what is simulated
+    :param params: its parameters
+    :param discount: :math:`\gamma` per step, in (0, 1]
+    :param reward_scale: :math:`s`
+    :param reward_offset: :math:`r_0`; must be zero where the discount is one
+    :param terminal_value: :math:`V`, scaled like the rewards; None means zero
+    :param terminal_curvature: whether second-order methods use the Hessian of :math:`V` too
+    """
+
+    twin: Twin
+    params: Params
+    discount: float = 1.0
+    reward_scale: float | Scalar = 1.0
+    reward_offset: float | Scalar = 0.0
+    terminal_value: TerminalValue | None = None
+    terminal_curvature: bool = False
+
+    @property
+    def n_controls(self) -> int:
+        return len(self.twin.actuators)
+
+    def action(self, control: Control) -> Action:
+        """:return: the command in the units of the action space for a control in [-1, 1]"""
+        low = jnp.array([actuator.low for actuator in self.twin.actuators], control.dtype)
+        high = jnp.array([actuator.high for actuator in self.twin.actuators], control.dtype)
+        return low + 0.5 * (control + 1.0) * (high - low)
+
+    def step(self, state: State, control: Control) -> tuple[State, Scalar]:
+        """:return: the next state and the scaled, shifted planning reward of getting there"""
+        action = self.action(control)
+        after = self.twin.step(state, action, self.params)
+        reward = self.twin.planning_reward(state, action, after, self.params)
+        return after, (reward - self.reward_offset) * self.reward_scale
+
+    def observe(self, state: State) -> Obs:
+        return self.twin.observe(state, self.params)
+
+    def terminated(self, state: State) -> Flag:
+        return self.twin.terminated(state, self.params)
+
+    @property
+    def value_when_terminated(self) -> Scalar:
+        """What an episode that has ended is worth, scaled and shifted."""
+        if self.discount == 1.0:
+            return jnp.zeros(())
+        return -jnp.asarray(self.reward_offset * self.reward_scale) / (1.0 - self.discount)
+
+    def value_at_end(self, state: State) -> Scalar:
+        """:return: the terminal value of a state in which the episode still runs"""
+        if self.terminal_value is None:
+            return jnp.zeros(())
+        return self.terminal_value(self.observe(state))
+
+
+def simulate(problem: Problem, start: State, controls: Controls) -> Plan:
+    """Roll out a control sequence and score it."""
+
+    def advance(carry: tuple[State, Flag], control: Control) -> tuple[tuple[State, Flag], tuple]:
+        state, alive = carry
+        after, reward = problem.step(state, control)
+        still = alive & ~problem.terminated(after)
+        return (after, still), (state, alive, jnp.where(alive, reward, 0.0))
+
+    alive = ~problem.terminated(start)
+    (end, alive), (states, lived, rewards) = jax.lax.scan(advance, (start, alive), controls)
+    states = jax.tree.map(lambda path, last: jnp.concatenate([path, last[None]]), states, end)
+    lived = jnp.append(lived, alive)
+    value = score(problem, rewards, lived, problem.value_at_end(end))
+    return Plan(controls, states, rewards, lived, value)
+
+
+def score(
+    problem: Problem,
+    rewards: Float[Array, " horizon"],
+    alive: Bool[Array, " horizon_1"],
+    value_at_end: Scalar,
+) -> Scalar:
+    """:return: the objective of a trajectory; minus infinity where it is not finite"""
+    horizon = rewards.shape[0]
+    discounts = problem.discount ** jnp.arange(horizon + 1, dtype=rewards.dtype)
+    ended = alive[:-1] & ~alive[1:]
+    after_death = jnp.sum(jnp.where(ended, discounts[1:], 0.0)) * problem.value_when_terminated
+    tail = jnp.where(alive[-1], discounts[-1] * value_at_end, 0.0)
+    total = jnp.sum(discounts[:-1] * rewards) + tail + after_death
+    return jnp.where(jnp.isfinite(total), total, -jnp.inf)
