@@ -1,0 +1,63 @@
+# Everything happens in .venv, which each target makes and brings up to date by itself: it needs
+# Python 3.11 or later, make and git. A second call costs nothing until pyproject.toml or
+# constraints.txt change.
+
+SHELL := /bin/bash
+PYTHON ?= $(firstword $(foreach python,python3.11 python3.12 python3.13 python3 python,\
+	$(shell $(python) -c 'import sys; sys.version_info >= (3, 11) and print("$(python)")' 2>/dev/null)))
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+# PyTorch only keeps books here, for Stable-Baselines3. Its CPU build saves gigabytes; where this
+# index cannot be reached, pip falls back to the ones that it is configured with.
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+TESTS ?= tests
+
+.PHONY: install format lint type test test-all docs commit-checks demo clean
+
+install: $(VENV)/.installed-dev
+
+# torch first, so that nothing installed later can pull another build of it.
+$(VENV)/.torch: constraints.txt
+	@test -n "$(PYTHON)" || { echo "No Python 3.11 or later was found. Name one: make PYTHON=/path/to/python"; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(PIP) install --quiet --retries 1 --constraint constraints.txt --extra-index-url $(TORCH_INDEX) torch
+	@touch $@
+
+$(VENV)/.installed-%: pyproject.toml constraints.txt $(VENV)/.torch
+	$(PIP) install --quiet --constraint constraints.txt --editable ".[$(EXTRAS)]"
+	@touch $@
+
+$(VENV)/.installed-demo: EXTRAS := zoo,report
+$(VENV)/.installed-dev: EXTRAS := zoo,report,dev
+
+format: install
+	$(BIN)/ruff check --select I --fix .
+	$(BIN)/ruff format .
+
+lint: install
+	$(BIN)/ruff check .
+
+type: install
+	$(BIN)/pyright
+
+commit-checks: install
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+
+# Two processes, each with whole files, so that a file shares its fixtures and compiled functions.
+test: install
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not expensive" $(TESTS)
+
+test-all: install
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(TESTS)
+
+docs: install
+	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+
+demo: $(VENV)/.installed-demo
+	$(BIN)/python examples/demo.py --folder demo
+
+clean:
+	rm -rf $(VENV) build dist demo docs/_build .pytest_cache .ruff_cache
