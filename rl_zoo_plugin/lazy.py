@@ -1,0 +1,71 @@
+"""Stand-ins for algorithms, so that registering them does not import JAX."""
+
+import difflib
+import inspect
+from collections.abc import Iterable
+from typing import Any
+
+
+class LazyAlgorithm:
+    """
+    Stands in ``rl_zoo3.ALGOS`` for a class of ``sb3_hds`` that is imported on first use.
+
+    It is called, loaded from and read like the class. It is not a class: ``issubclass`` and
+    ``isinstance`` need :meth:`resolve`.
+
+    :param class_name: the public name in ``sb3_hds``
+    """
+
+    def __init__(self, class_name: str) -> None:
+        self.__name__ = class_name
+
+    def resolve(self) -> Any:
+        """:return: the class itself"""
+        import sb3_hds
+
+        return getattr(sb3_hds, self.__name__)
+
+    def __call__(self, *args: Any, **hyperparams: Any) -> Any:
+        """
+        :raises TypeError: for a hyperparameter that the algorithm does not have
+        """
+        algorithm = self.resolve()
+        _refuse_unknown(algorithm, hyperparams)
+        return algorithm(*args, **hyperparams)
+
+    def load(self, path: Any, *args: Any, **hyperparams: Any) -> Any:
+        """
+        SB3's ``load``, which would write any keyword into the model unseen.
+
+        :raises TypeError: for a hyperparameter that the algorithm does not have
+        """
+        algorithm = self.resolve()
+        _refuse_unknown(algorithm, hyperparams, also=_parameters(algorithm.load))
+        return algorithm.load(path, *args, **hyperparams)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self.resolve(), name)
+
+    def __repr__(self) -> str:
+        return f"<sb3_hds.{self.__name__}, imported on first use>"
+
+
+def _parameters(function: Any) -> dict[str, inspect.Parameter]:
+    return dict(inspect.signature(function).parameters)
+
+
+def _refuse_unknown(algorithm: Any, hyperparams: dict[str, Any], also: Iterable[str] = ()) -> None:
+    parameters = _parameters(algorithm.__init__)
+    unknown = sorted(set(hyperparams) - set(parameters) - set(also))
+    takes_any = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values())
+    if takes_any or not unknown:
+        return
+    known = [name for name in parameters if name != "self"]
+    close = difflib.get_close_matches(unknown[0], known, n=1)
+    hint = f" Did you mean '{close[0]}'?" if close else ""
+    raise TypeError(
+        f"{algorithm.__name__} has no hyperparameter '{unknown[0]}'.{hint} "
+        f"Look at the yml file, -params and --conf-file. It has: {', '.join(known)}."
+    )

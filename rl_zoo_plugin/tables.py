@@ -1,0 +1,65 @@
+"""What ``rl_zoo3`` gets from ``sb3_hds``, and into which of its tables it goes."""
+
+import functools
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from rl_zoo_plugin.lazy import LazyAlgorithm
+
+ALGORITHMS = {"pods": "PODS", "hds": "HDS"}
+"""Id in the zoo (lower case, as it names a folder) to public name in ``sb3_hds``."""
+
+
+def hyperparams_file(algo: str) -> Path:
+    """
+    :param algo: an id of ``ALGORITHMS``
+    :return: its zoo-format yml file: next to this module in a wheel, in the root of a checkout
+    """
+    here = Path(__file__).parent
+    folder = (
+        here / "hyperparams" if (here / "hyperparams").is_dir() else here.parent / "hyperparams"
+    )
+    return folder / f"{algo}.yml"
+
+
+def _extend_algorithms(utils: ModuleType) -> None:
+    for algo, class_name in ALGORITHMS.items():
+        utils.ALGOS.setdefault(algo, LazyAlgorithm(class_name))
+    import sb3_hds  # noqa: F401  registers our environments
+
+
+def _extend_samplers(hyperparams_opt: ModuleType) -> None:
+    from rl_zoo_plugin.samplers import CONVERTERS, SAMPLERS
+
+    for algo in ALGORITHMS:
+        if hyperparams_opt.HYPERPARAMS_SAMPLER.setdefault(algo, SAMPLERS[algo]) is SAMPLERS[algo]:
+            hyperparams_opt.HYPERPARAMS_CONVERTER.setdefault(algo, CONVERTERS[algo])
+
+
+def _extend_manager(exp_manager: ModuleType) -> None:
+    """Our algorithms read our yml files unless the user names another one."""
+    manager = exp_manager.ExperimentManager
+    original = manager.__init__
+    signature = inspect.signature(original)
+
+    @functools.wraps(original)
+    def init(*args: Any, **kwargs: Any) -> None:
+        call = signature.bind(*args, **kwargs)
+        algo = call.arguments["algo"]
+        is_ours = isinstance(exp_manager.ALGOS.get(algo), LazyAlgorithm)
+        if is_ours and not call.arguments.get("config"):
+            call.arguments["config"] = str(hyperparams_file(algo))
+        original(*call.args, **call.kwargs)
+
+    manager.__init__ = init
+
+
+EXTENSIONS: dict[str, Callable[[ModuleType], None]] = {
+    "rl_zoo3.utils": _extend_algorithms,
+    "rl_zoo3.hyperparams_opt": _extend_samplers,
+    "rl_zoo3.exp_manager": _extend_manager,
+}
+"""Module of the zoo to the function that extends it, once, after it has run."""
