@@ -1,4 +1,4 @@
-"""The errors this package raises on purpose. Each message says what was expected, what came, and the way out."""
+"""Errors raised on purpose: each message says what was expected, what came, and the way out."""
 
 
 class SB3HDSError(Exception):

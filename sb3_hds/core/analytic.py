@@ -18,15 +18,15 @@ class AnalyticTwin(Twin):
     .. math:: M(q)\,\dot v + c(q, v) = \tau(q, v, u) + \tau_\text{effects}
 
     A subclass gives :math:`\tau` (:meth:`actuate`), :math:`M` (:meth:`mass_matrix`) and :math:`c`
-    (:meth:`bias`: gravity, Coriolis, centrifugal and the twin's own damping), and names the integrator
-    that its environment uses. Effects are evaluated wherever the equation of motion is.
+    (:meth:`bias`: gravity, Coriolis, centrifugal and the twin's own damping), and names the
+    integrator that its environment uses. Effects are evaluated wherever the equation of motion is.
     """
 
     integrator: Integrator = staticmethod(semi_implicit_euler)
 
     @abc.abstractmethod
     def actuate(self, state: State, action: Action, params: Params) -> Force:
-        """:return: generalised force of the actuators, clipped as the environment does, shape ``(dof,)``"""
+        """:return: force of the actuators, clipped as the environment does, shape ``(dof,)``"""
 
     @abc.abstractmethod
     def mass_matrix(self, q: Position, params: Params) -> MassMatrix:

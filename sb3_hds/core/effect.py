@@ -22,7 +22,6 @@ from sb3_hds.core.types import (
     Force,
     MassMatrix,
     Memory,
-    Obs,
     Params,
     Position,
     Scalar,
@@ -36,12 +35,12 @@ if TYPE_CHECKING:
 
 class Moment(NamedTuple):
     """
-    The mechanical system at one evaluation of its equation of motion ``M a + bias = actuator + effects``.
+    The mechanical system at one evaluation of ``M a + load = actuator + effects``.
 
     :param q: generalised position, shape ``(dof,)``
     :param v: generalised velocity, shape ``(dof,)``
     :param actuator: generalised force of the actuators, shape ``(dof,)``
-    :param load: generalised force that the joints carry against gravity and inertia (``bias``), shape ``(dof,)``
+    :param load: generalised force that gravity and inertia take (``bias``), shape ``(dof,)``
     :param mass_matrix: shape ``(dof, dof)``
     :param h: length of the sub-step [s]
     """
@@ -61,8 +60,8 @@ class JointMoment(NamedTuple):
     :param q: position [rad] or [m]
     :param v: velocity [rad/s] or [m/s]
     :param actuator: force of the actuators on this joint [N m] or [N]
-    :param load: force that the joint carries against gravity and inertia [N m] or [N]
-    :param inertia: what a force at this joint alone has to accelerate, ``1 / (M^-1)_jj`` [kg m2] or [kg]
+    :param load: force that gravity and inertia take at this joint [N m] or [N]
+    :param inertia: what a force at this joint accelerates, ``1 / (M^-1)_jj`` [kg m2] or [kg]
     :param h: length of the sub-step [s]
     """
 
@@ -93,7 +92,7 @@ class Effect(abc.ABC):
     explanation: ClassVar[str]
     #: where the equation comes from
     source: ClassVar[str]
-    #: names of effects from which data cannot tell this one, with the condition under which they cannot
+    #: names of effects that data cannot tell from this one -> the condition under which they cannot
     equivalents: ClassVar[Mapping[str, str]] = {}
 
     def __init__(self, where: int | str = 0, **values: float) -> None:
@@ -110,14 +109,19 @@ class Effect(abc.ABC):
         changed._set(values)
         return changed
 
+    def at(self, where: int | str) -> Self:
+        """:return: the same effect at another joint, actuator or channel"""
+        moved = copy.copy(self)
+        moved.where = where
+        return moved
+
     def _set(self, values: Mapping[str, float]) -> None:
-        unknown = set(values) - set(self.parameters)
-        if unknown:
-            raise EffectError(
-                f"Effect '{self.name}' has no parameter {sorted(unknown)}. "
-                f"Its parameters are: {', '.join(self.parameters)}."
-            )
         for name, value in values.items():
+            if name not in self.parameters:
+                raise EffectError(
+                    f"Effect '{self.name}' has no parameter '{name}'. "
+                    f"Its parameters are: {', '.join(self.parameters) or 'none'}."
+                )
             self.values[name] = self.parameters[name].check(f"{self.name}.{name}", value)
 
     def to_spec(self) -> dict[str, Any]:
@@ -145,7 +149,7 @@ class ForceEffect(Effect):
     slot: ClassVar[str] = "joint"
 
     def memory(self, twin: "Twin") -> Memory:
-        """:return: what the effect remembers at the start of an episode; a pytree of float arrays"""
+        """:return: what the effect remembers when an episode starts; a pytree of float arrays"""
         return ()
 
     @abc.abstractmethod
@@ -181,7 +185,7 @@ class ActionEffect(Effect):
     slot: ClassVar[str] = "actuator"
 
     def memory(self, twin: "Twin") -> Memory:
-        """:return: what the effect remembers at the start of an episode; a pytree of float arrays"""
+        """:return: what the effect remembers when an episode starts; a pytree of float arrays"""
         return ()
 
     @abc.abstractmethod
@@ -198,24 +202,34 @@ class ActionEffect(Effect):
 
 
 class SensorEffect(Effect):
-    """Changes one measurement on its way out of the plant."""
+    """
+    Changes one measurement on its way out of the plant, once per control interval.
+
+    Of several at one channel, each measures what the one before it reports.
+    """
 
     slot: ClassVar[str] = "channel"
 
-    def memory(self, obs: Obs, index: int) -> Memory:
-        """:return: what the sensor remembers at the start of an episode that begins with ``obs``"""
+    def memory(self, measured: Scalar, twin: "Twin") -> Memory:
+        """:return: what the sensor remembers when an episode starts; a pytree of float arrays"""
         return ()
 
     @abc.abstractmethod
-    def sense(self, measured: Scalar, memory: Memory, params: Params) -> Scalar:
-        """:return: what is reported for the true value ``measured``"""
+    def sense(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Scalar:
+        """
+        :param measured: the true value, in the unit of the channel
+        :param memory: as ``memory`` made it or ``advance`` left it, both having seen ``measured``
+        :param dt: length of the control interval [s]
+        :param params: the effect's own parameters, without prefix
+        :return: what is reported
+        """
 
     @abc.abstractmethod
     def invert(self, reported: Scalar, params: Params) -> Scalar:
-        """:return: the true value, as well as one report tells"""
+        """:return: the true value, as well as one report at the start of an episode tells"""
 
     def advance(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Memory:
-        """:return: the memory after a control interval that ends with the true value ``measured``"""
+        """:return: the memory after a control interval that ends with the value ``measured``"""
         return memory
 
 
@@ -224,7 +238,7 @@ class Attached:
     """
     An effect at its place in a twin.
 
-    :param key: full name, ``"viscous_friction.hinge"``; prefix of its parameters and key of its memory
+    :param key: full name, ``"viscous_friction.hinge"``: prefix of its parameters, key of its memory
     :param effect: the effect
     :param index: index of the joint, actuator or channel
     """
@@ -242,7 +256,7 @@ class EffectChain:
     """
     The attached effects with their values, as a twin's ``step`` meets them at each sub-step.
 
-    :param attached: action and force effects, in the order in which the signal meets them
+    :param attached: the effects, in the order in which the signal meets them; sensors are left out
     :param params: full parameters of the extended twin
     """
 
@@ -254,10 +268,17 @@ class EffectChain:
             (a, a.effect, a.own(params)) for a in attached if isinstance(a.effect, ForceEffect)
         ]
 
+    def __add__(self, other: "EffectChain") -> "EffectChain":
+        """:return: the effects of both; commands meet ``other`` last"""
+        both = EffectChain((), {})
+        both._actions = self._actions + other._actions
+        both._forces = self._forces + other._forces
+        return both
+
     def act(
         self, action: Action, memory: dict[str, Memory], h: float
     ) -> tuple[Action, dict[str, Memory]]:
-        """:return: the command that reaches the plant during a sub-step of ``h`` seconds, and the memory after it"""
+        """:return: the command that reaches the plant for ``h`` seconds, and the memory after it"""
         for attached, effect, params in self._actions:
             command, after = effect.act(action[attached.index], memory[attached.key], h, params)
             action, memory = action.at[attached.index].set(command), memory | {attached.key: after}

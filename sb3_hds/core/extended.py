@@ -3,6 +3,8 @@
 from collections import Counter
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.core.effect import (
@@ -25,24 +27,25 @@ class ExtendedTwin(Twin):
     A twin plus effects. Parameters of an effect are named ``effect.place.parameter``, for example
     ``"viscous_friction.hinge.b"``.
 
-    Where the base twin has a parameter for the same thing (``native_effects``), the effect adds to that
-    parameter instead of computing a force of its own. Extending an extended twin flattens.
+    Where the base twin has a parameter for the same thing (``native_effects``), the effect adds to
+    that parameter instead of computing a force of its own. Extending an extended twin flattens.
 
     :param base: the twin to extend
     :param effects: effects to attach, in the order in which a signal meets them
-    :raises EffectError: for an effect attached twice at one place, or at a place that does not exist
+    :raises EffectError: for an effect that comes twice at one place, or names a place that is none
     """
 
     def __init__(self, base: Twin, *effects: Effect) -> None:
         if isinstance(base, ExtendedTwin):
             base, effects = base._base_with_values(), (*base.effects_with_values(), *effects)
         self.base = base
-        self.effects = effects
         self.attached = tuple(_attach(effect, base) for effect in effects)
+        self.effects = tuple(a.effect for a in self.attached)
         twice = [key for key, count in Counter(a.key for a in self.attached).items() if count > 1]
         if twice:
             raise EffectError(
-                f"An effect can be attached once at each place; {', '.join(twice)} came more than once."
+                f"An effect can be attached once at each place; {', '.join(twice)} "
+                "came more than once."
             )
         self.name, self.env_id = base.name, base.env_id
         self.dt, self.substeps = base.dt, base.substeps
@@ -60,34 +63,38 @@ class ExtendedTwin(Twin):
             a for a in self.attached if (a.effect.name, a.index) in base.native_effects
         )
         self._simulated = tuple(a for a in self.attached if a not in self._native)
+        self._sensors = tuple(
+            (a, a.effect) for a in self._simulated if isinstance(a.effect, SensorEffect)
+        )
 
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
         return self._remember(self.base.initial(key, self._base_params(params)), params)
 
     def infer(self, obs: Obs, params: Params) -> State:
-        for a in reversed(self._sensors()):
-            obs = obs.at[a.index].set(a.effect.invert(obs[a.index], a.own(params)))
+        for a, sensor in reversed(self._sensors):
+            obs = obs.at[a.index].set(sensor.invert(obs[a.index], a.own(params)))
         return self._remember(self.base.infer(obs, self._base_params(params)), params)
 
     def observe(self, state: State, params: Params) -> Obs:
         obs = self.base.observe(state, self._base_params(params))
-        for a in self._sensors():
-            reported = a.effect.sense(obs[a.index], state.memory[a.key], a.own(params))
+        for a, sensor in self._sensors:
+            reported = sensor.sense(obs[a.index], state.memory[a.key], self.dt, a.own(params))
             obs = obs.at[a.index].set(reported)
         return obs
 
     def step(
         self, state: State, action: Action, params: Params, effects: EffectChain = NO_EFFECTS
     ) -> State:
-        own = EffectChain(self._simulated, params)
-        base_params = self._base_params(params)
-        state = self.base.step(state, action, base_params, own)
-        memory = state.memory
-        for a in self._sensors():
-            measured = self.base.observe(state, base_params)[a.index]
-            memory = memory | {
-                a.key: a.effect.advance(measured, memory[a.key], self.dt, a.own(params))
-            }
+        effects = effects + EffectChain(self._simulated, params)
+        state = self.base.step(state, action, self._base_params(params), effects)
+        if not self._sensors:
+            return state
+        obs, memory = self.base.observe(state, self._base_params(params)), dict(state.memory)
+        for a, sensor in self._sensors:
+            own = a.own(params)
+            memory[a.key] = sensor.advance(obs[a.index], memory[a.key], self.dt, own)
+            reported = sensor.sense(obs[a.index], memory[a.key], self.dt, own)
+            obs = obs.at[a.index].set(reported)
         return state._replace(memory=memory)
 
     def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
@@ -121,6 +128,10 @@ class ExtendedTwin(Twin):
     def structure(self) -> tuple[Any, ...]:
         return (type(self), self.base, tuple(a.key for a in self.attached), self.effects)
 
+    def __repr__(self) -> str:
+        parts = (self._base_with_values(), *self.effects_with_values())
+        return f"{type(self).__name__}({', '.join(map(repr, parts))})"
+
     def _base_with_values(self) -> Twin:
         return self.base.with_parameters(
             **{name: self.values[name] for name in self.base.parameters}
@@ -133,24 +144,28 @@ class ExtendedTwin(Twin):
                 own[target] = own[target] + params[f"{a.key}.{name}"]
         return own
 
-    def _sensors(self) -> list[Attached]:
-        return [a for a in self.attached if isinstance(a.effect, SensorEffect)]
-
     def _remember(self, state: State, params: Params) -> State:
-        """Give every effect its first memory, so that the state keeps one structure under ``scan``."""
-        memory = dict(state.memory)
+        """Give every effect its first memory; ``scan`` needs one structure and dtype throughout."""
+        memory, dtype = {}, state.q.dtype
         for a in self._simulated:
-            if isinstance(a.effect, SensorEffect):
-                memory[a.key] = a.effect.memory(
-                    self.base.observe(state, self._base_params(params)), a.index
-                )
-            elif isinstance(a.effect, ForceEffect | ActionEffect):
+            if isinstance(a.effect, ForceEffect | ActionEffect):
                 memory[a.key] = a.effect.memory(self.base)
-        return state._replace(memory=memory)
+        obs = self.base.observe(state, self._base_params(params))
+        for a, sensor in self._sensors:
+            memory[a.key] = sensor.memory(obs[a.index], self.base)
+            reported = sensor.sense(obs[a.index], memory[a.key], self.dt, a.own(params))
+            obs = obs.at[a.index].set(reported)
+        memory = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), memory)
+        return state._replace(memory=state.memory | memory)
 
 
 def _attach(effect: Effect, twin: Twin) -> Attached:
-    """Find the place that an effect names."""
+    """Find the place that an effect names by index or by name."""
+    if not isinstance(effect, Effect):
+        raise EffectError(
+            f"A twin is extended by effects, got {effect!r}. "
+            "Pass an instance: twin.extend(ViscousFriction())."
+        )
     places = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}[
         effect.slot
     ]
@@ -161,7 +176,7 @@ def _attach(effect: Effect, twin: Twin) -> Attached:
             f"Effect '{effect.name}' names {effect.slot} {effect.where!r}, but {twin.name} has: "
             f"{', '.join(f'{i} ({name})' for i, name in enumerate(names))}."
         )
-    return Attached(f"{effect.name}.{names[index]}", effect, index)
+    return Attached(f"{effect.name}.{names[index]}", effect.at(names[index]), index)
 
 
 def _in_units_of(parameter: Parameter, twin: Twin, attached: Attached) -> Parameter:

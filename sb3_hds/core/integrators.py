@@ -30,7 +30,7 @@ def explicit_euler(
 def rk4(
     acceleration: Acceleration, q: Position, v: Velocity, h: float, limit: LimitVelocity
 ) -> tuple[Position, Velocity]:
-    """The classical Runge-Kutta method of fourth order, which MuJoCo's ``RK4`` is too for joint coordinates."""
+    """The classical Runge-Kutta method; in joint coordinates MuJoCo's ``RK4`` is the same."""
     a1 = acceleration(q, v)
     v2 = v + 0.5 * h * a1
     a2 = acceleration(q + 0.5 * h * v, v2)

@@ -59,7 +59,8 @@ class Parameter:
             ) from None
         if not (math.isfinite(value) and self.lower <= value <= self.upper):
             raise ParameterError(
-                f"Parameter '{name}' must be finite and within [{self.lower}, {self.upper}] {self.unit}, got {value}."
+                f"Parameter '{name}' must be finite and within [{self.lower}, {self.upper}] "
+                f"{self.unit}, got {value}."
             )
         return value
 

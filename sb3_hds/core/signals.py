@@ -1,4 +1,4 @@
-"""What moves, what drives it, and what is measured. Names and units are data: they stand in every table."""
+"""What moves, what drives it, what is measured. Names and units are data: every table has them."""
 
 from typing import NamedTuple
 

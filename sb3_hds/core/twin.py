@@ -2,6 +2,7 @@
 
 import abc
 import copy
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
@@ -50,8 +51,8 @@ class Twin(abc.ABC):
 
     Its methods are pure and unbatched, and safe under ``jit``, ``vmap``, ``scan`` and forward-mode
     differentiation: batching is the caller's business. Values of parameters always arrive in
-    ``params``; a method never reads them from ``self``, so two twins that differ in nothing else are
-    equal, and one compiled program serves both.
+    ``params``; a method never reads them from ``self``. So two twins that differ in nothing else
+    are equal, and one compiled program serves both.
 
     A subclass declares its signals and parameters as class attributes and implements the abstract
     methods. Mechanical systems with a mass matrix are shorter as an ``AnalyticTwin``.
@@ -59,7 +60,7 @@ class Twin(abc.ABC):
     :param dt: control interval [s]; default: the class attribute
     :param substeps: internal steps per control interval; default: the class attribute
     :param settings: values of parameters by name, and of the options that the class declares
-    :raises ParameterError: for a name that is neither a parameter nor an option, or a value out of bounds
+    :raises ParameterError: for a name that is neither, a value out of bounds, or an impossible step
     """
 
     name: str
@@ -71,13 +72,13 @@ class Twin(abc.ABC):
     channels: tuple[Channel, ...]
     parameters: Mapping[str, Parameter]
     max_episode_steps: int | None = None
-    #: ``"reverse"`` where reverse mode works too, ``"forward"`` where only forward mode does (engines).
+    #: ``"reverse"`` where reverse mode works too, ``"forward"`` where only forward mode does.
     differentiability: str = "reverse"
-    #: False where the reward is flat almost everywhere; then ``planning_reward`` must be overridden.
+    #: False where the reward is flat almost everywhere: then override ``planning_reward``.
     reward_has_gradient: bool = True
-    #: (effect name, joint index) -> {the effect's parameter: the twin's parameter that it adds to}
+    #: (effect name, index of its place) -> {its parameter: the twin's parameter that it adds to}
     native_effects: Mapping[tuple[str, int], Mapping[str, str]] = {}
-    #: Structural choices with their defaults, set by keyword in the constructor: ``{"goal": "stop"}``.
+    #: Structural choices with their defaults, set by keyword: ``{"goal": "stop"}``.
     options: ClassVar[Mapping[str, Any]] = {}
 
     def __init__(
@@ -87,9 +88,10 @@ class Twin(abc.ABC):
             self.dt = float(dt)
         if substeps is not None:
             self.substeps = int(substeps)
-        if not self.dt > 0.0 or self.substeps < 1:
+        if not (0.0 < self.dt < math.inf and self.substeps >= 1):
             raise ParameterError(
-                f"{self.name} needs dt > 0 s and at least one sub-step, got dt={self.dt}, substeps={self.substeps}."
+                f"{self.name} needs a finite dt > 0 s and at least one sub-step, "
+                f"got dt={self.dt}, substeps={self.substeps}."
             )
         for option, default in self.options.items():
             setattr(self, option, settings.pop(option, default))
@@ -115,7 +117,7 @@ class Twin(abc.ABC):
         return changed
 
     def extend(self, *effects: "Effect") -> "ExtendedTwin":
-        """:return: this twin with ``effects`` attached, in the order in which a signal meets them"""
+        """:return: this twin plus ``effects``, in the order in which a signal meets them"""
         from sb3_hds.core.extended import ExtendedTwin
 
         return ExtendedTwin(self, *effects)
@@ -153,7 +155,7 @@ class Twin(abc.ABC):
         """
         Advance by one control interval ``dt``.
 
-        :param action: the command, in the units of the action space; clipped to it as the environment does
+        :param action: in the units of the action space; clipped to it as the environment does
         :param effects: attached effects, to be evaluated at every internal sub-step
         """
 
@@ -165,7 +167,7 @@ class Twin(abc.ABC):
         self, state: State, action: Action, next_state: State, params: Params
     ) -> Scalar:
         """
-        What planning maximises: the reward, or a smooth surrogate where the reward has no useful gradient.
+        What planning maximises: the reward, or a smooth surrogate where that has no gradient.
 
         It is counted up to and including the step that terminates, and is zero afterwards. So where
         surviving is good it must stay positive, otherwise planning learns to die early.
@@ -177,7 +179,10 @@ class Twin(abc.ABC):
         return jnp.zeros((), bool)
 
     def difference(self, state: State, reference: State) -> Tangent:
-        """:return: the tangent vector from ``reference`` to ``state``, memory included; override for quaternions"""
+        """
+        :return: tangent vector from ``reference`` to ``state``, memory included; override it for
+            quaternions
+        """
         return ravel_pytree(state)[0] - ravel_pytree(reference)[0]
 
     def retract(self, state: State, tangent: Tangent) -> State:
@@ -186,7 +191,7 @@ class Twin(abc.ABC):
         return unravel(flat + tangent)
 
     def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
-        """A line drawing of the system for rendering [m]: by default one bar as high as each joint's position."""
+        """A line drawing for rendering [m]: by default a bar as high as each joint's position."""
         base = jnp.arange(state.q.shape[0], dtype=state.q.dtype)
         zero = jnp.zeros_like(base)
         return jnp.stack(
@@ -194,7 +199,7 @@ class Twin(abc.ABC):
         ).reshape(-1, 2)
 
     def to_spec(self) -> dict[str, Any]:
-        """:return: plain data from which ``twins.from_spec`` makes an equal twin with equal values"""
+        """:return: plain data; ``twins.from_spec`` makes the same twin with the same values of it"""
         options = {name: getattr(self, name) for name in self.options}
         return {
             "twin": self.name,

@@ -1,4 +1,4 @@
-"""The catalogue of effects. A class listed in ``ALL`` is tested, offered to the user and documented."""
+"""The catalogue of effects: a class listed in ``ALL`` is tested, offered and documented."""
 
 from sb3_hds.core import Effect
 from sb3_hds.effects.joint import CoulombFriction, ViscousFriction

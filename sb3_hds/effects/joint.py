@@ -12,10 +12,14 @@ class ViscousFriction(JointEffect):
     r"""
     Friction that grows with speed.
 
-    .. math:: \tau = -b\,v
+    .. math:: \tau = -\min(b,\; I / h)\,v
 
-    Source: Olsson et al., *Friction models and friction compensation*, European Journal of Control 4(3),
-    1998, section 2.
+    The bound is the coefficient that stops the joint within one sub-step :math:`h` (:math:`I` is
+    its effective inertia); beyond it an explicit integrator would turn friction into a drive. There
+    the derivative with respect to :math:`b` is zero.
+
+    Source: Olsson et al., *Friction models and friction compensation*, European Journal of Control
+    4(3), 1998, section 2.
     """
 
     name = "viscous_friction"
@@ -26,7 +30,7 @@ class ViscousFriction(JointEffect):
     source = "Olsson et al. 1998, section 2"
 
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
-        return -params["b"] * joint.v
+        return -jnp.minimum(params["b"], joint.inertia / joint.h) * joint.v
 
 
 class CoulombFriction(JointEffect):
@@ -36,12 +40,13 @@ class CoulombFriction(JointEffect):
     .. math:: \tau = -\tau_c \tanh(v / w), \qquad w = \max(0.01\ \mathrm{rad/s},\; \tau_c h / I)
 
     The sign function is smoothed over :math:`w`, which never falls below what a sub-step :math:`h`
-    can stop (:math:`I` is the joint's effective inertia): so friction does not overshoot standstill
-    at any step length. What this costs: a joint never sticks; under a load :math:`f < \tau_c` it creeps
-    at :math:`w\,\mathrm{artanh}(f / \tau_c)` instead.
+    can stop (:math:`I` is the joint's effective inertia): so friction at one joint does not
+    overshoot standstill at any step length. What this costs: a joint never sticks; under a load
+    :math:`f < \tau_c` it creeps at :math:`w\,\mathrm{artanh}(f / \tau_c)` instead. Dry friction at
+    several strongly coupled joints at once may chatter around standstill if :math:`h` is long.
 
-    Source: Olsson et al., *Friction models and friction compensation*, European Journal of Control 4(3),
-    1998, section 2.
+    Source: Olsson et al., *Friction models and friction compensation*, European Journal of Control
+    4(3), 1998, section 2.
     """
 
     name = "coulomb_friction"
