@@ -1,1 +1,40 @@
-"""x"""
+"""
+Learn through a differentiable simulation of your environment, and find out what it gets wrong.
+
+Names are imported on first use: importing the package imports neither jax nor torch. It registers
+our environments with Gymnasium.
+"""
+
+import importlib
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+from sb3_hds.envs.registration import register_environments
+
+if TYPE_CHECKING:
+    from sb3_hds import effects, envs, planning, twins
+    from sb3_hds.algos import HDS, PODS
+    from sb3_hds.core import Trajectories
+
+__all__ = ["HDS", "PODS", "Trajectories", "effects", "envs", "planning", "twins"]
+
+_CLASSES = {"HDS": "algos", "PODS": "algos", "Trajectories": "core"}
+
+try:
+    __version__ = version("sb3-hds")
+except PackageNotFoundError:  # a checkout that is on the path without being installed
+    __version__ = "0+unknown"
+
+register_environments()
+
+
+def __getattr__(name: str) -> Any:
+    if name in _CLASSES:
+        return getattr(importlib.import_module(f"sb3_hds.{_CLASSES[name]}"), name)
+    if name in __all__:
+        return importlib.import_module(f"sb3_hds.{name}")
+    raise AttributeError(f"module 'sb3_hds' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])
