@@ -16,7 +16,18 @@ from sb3_hds.core.extended import ExtendedTwin
 from sb3_hds.core.integrators import explicit_euler, rk4, semi_implicit_euler
 from sb3_hds.core.linear import solve_spd
 from sb3_hds.core.parameter import Parameter
+from sb3_hds.core.rollout import Rollout, rollout, rollout_policy
 from sb3_hds.core.signals import Actuator, Channel, Joint
+from sb3_hds.core.transform import (
+    TRANSFORMS,
+    ActionTransform,
+    ObservationTransform,
+    RescaleAction,
+    RescaleObservation,
+    transform_from_spec,
+    transform_to_spec,
+)
+from sb3_hds.core.transformed import TransformedTwin, seen_through
 from sb3_hds.core.twin import State, Twin
 from sb3_hds.core.types import (
     Action,
@@ -34,8 +45,10 @@ from sb3_hds.core.types import (
 
 __all__ = [
     "NO_EFFECTS",
+    "TRANSFORMS",
     "Action",
     "ActionEffect",
+    "ActionTransform",
     "Actuator",
     "AnalyticTwin",
     "Channel",
@@ -52,17 +65,27 @@ __all__ = [
     "Memory",
     "Moment",
     "Obs",
+    "ObservationTransform",
     "Parameter",
     "Params",
     "Position",
+    "RescaleAction",
+    "RescaleObservation",
+    "Rollout",
     "Scalar",
     "SensorEffect",
     "State",
     "Tangent",
+    "TransformedTwin",
     "Twin",
     "Velocity",
     "explicit_euler",
     "rk4",
+    "rollout",
+    "rollout_policy",
+    "seen_through",
     "semi_implicit_euler",
     "solve_spd",
+    "transform_from_spec",
+    "transform_to_spec",
 ]

@@ -17,6 +17,7 @@ from sb3_hds.core.effect import (
     SensorEffect,
 )
 from sb3_hds.core.parameter import Parameter
+from sb3_hds.core.transformed import TransformedTwin
 from sb3_hds.core.twin import State, Twin
 from sb3_hds.core.types import Action, Flag, Obs, Params, Scalar, Tangent
 from sb3_hds.errors import EffectError
@@ -36,6 +37,11 @@ class ExtendedTwin(Twin):
     """
 
     def __init__(self, base: Twin, *effects: Effect) -> None:
+        if isinstance(base, TransformedTwin):
+            raise EffectError(
+                "Effects belong to the plant, below the wrapper that a TransformedTwin stands for. "
+                "Use twin.extend(*effects), which attaches them there."
+            )
         if isinstance(base, ExtendedTwin):
             base, effects = base._base_with_values(), (*base.effects_with_values(), *effects)
         self.base = base
@@ -47,18 +53,12 @@ class ExtendedTwin(Twin):
                 f"An effect can be attached once at each place; {', '.join(twice)} "
                 "came more than once."
             )
-        self.name, self.env_id = base.name, base.env_id
-        self.dt, self.substeps = base.dt, base.substeps
-        self.joints, self.actuators, self.channels = base.joints, base.actuators, base.channels
-        self.max_episode_steps = base.max_episode_steps
-        self.differentiability = base.differentiability
-        self.reward_has_gradient = base.reward_has_gradient
-        self.parameters = dict(base.parameters)
-        self.values = dict(base.values)
+        self._mirror(base)
         for a in self.attached:
             for name, parameter in a.effect.parameters.items():
-                self.parameters[f"{a.key}.{name}"] = _in_units_of(parameter, base, a)
-                self.values[f"{a.key}.{name}"] = a.effect.values[name]
+                full_name = f"{a.key}.{name}"
+                self.parameters = {**self.parameters, full_name: _in_units_of(parameter, base, a)}
+                self.values[full_name] = a.effect.values[name]
         self._native = tuple(
             a for a in self.attached if (a.effect.name, a.index) in base.native_effects
         )

@@ -28,7 +28,6 @@ from sb3_hds.errors import ParameterError
 
 if TYPE_CHECKING:
     from sb3_hds.core.effect import Effect
-    from sb3_hds.core.extended import ExtendedTwin
 
 
 class State(NamedTuple):
@@ -116,7 +115,7 @@ class Twin(abc.ABC):
         changed._set(values)
         return changed
 
-    def extend(self, *effects: "Effect") -> "ExtendedTwin":
+    def extend(self, *effects: "Effect") -> "Twin":
         """:return: this twin plus ``effects``, in the order in which a signal meets them"""
         from sb3_hds.core.extended import ExtendedTwin
 
@@ -199,7 +198,7 @@ class Twin(abc.ABC):
         ).reshape(-1, 2)
 
     def to_spec(self) -> dict[str, Any]:
-        """:return: plain data; ``twins.from_spec`` makes the same twin with the same values of it"""
+        """:return: plain data from which ``twins.from_spec`` makes this twin with these values"""
         options = {name: getattr(self, name) for name in self.options}
         return {
             "twin": self.name,
@@ -220,6 +219,16 @@ class Twin(abc.ABC):
     def __repr__(self) -> str:
         values = ", ".join(f"{name}={value:g}" for name, value in self.values.items())
         return f"{type(self).__name__}({values})"
+
+    def _mirror(self, base: "Twin") -> None:
+        """Take over what a twin that wraps ``base`` has in common with it."""
+        self.name, self.env_id = base.name, base.env_id
+        self.dt, self.substeps = base.dt, base.substeps
+        self.joints, self.actuators, self.channels = base.joints, base.actuators, base.channels
+        self.max_episode_steps = base.max_episode_steps
+        self.differentiability = base.differentiability
+        self.reward_has_gradient = base.reward_has_gradient
+        self.parameters, self.values = base.parameters, dict(base.values)
 
     def _set(self, values: Mapping[str, float]) -> None:
         for name, value in values.items():

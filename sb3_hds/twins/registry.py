@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from sb3_hds.core import Effect, Twin
+from sb3_hds.core import Effect, Twin, seen_through
 from sb3_hds.errors import NoTwinError
 
 _TWINS: dict[str, type[Twin]] = {}
@@ -94,7 +94,8 @@ def from_spec(spec: Mapping[str, Any], effects: Iterable[type[Effect]] = ()) -> 
         known[part["effect"]](part["where"], **part["parameters"])
         for part in spec.get("effects", ())
     ]
-    return twin.extend(*attached) if attached else twin
+    twin = twin.extend(*attached) if attached else twin
+    return seen_through(twin, spec.get("transforms", ()))
 
 
 def _how_to_add_one(wanted: str) -> str:
