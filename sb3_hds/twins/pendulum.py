@@ -33,9 +33,10 @@ class Pendulum(AnalyticTwin):
 
     .. math:: \tfrac{1}{3} m l^2 \dot\omega = \tfrac{1}{2} m g l \sin\theta + u
 
-    Reproduces ``gymnasium/envs/classic_control/pendulum.py`` step for step: semi-implicit Euler, torque
-    clipped to 2 N m, speed clipped to 8 rad/s; :math:`\theta = 0` is upright. Where a clip is active, the
-    derivative is zero. The reward wraps the angle, so its gradient jumps at the bottom.
+    Reproduces ``gymnasium/envs/classic_control/pendulum.py`` step for step: semi-implicit Euler,
+    torque clipped to 2 N m, speed clipped to 8 rad/s; :math:`\theta = 0` is upright. Where a clip
+    is active, the derivative is zero. The reward wraps the angle, so its gradient jumps at the
+    bottom.
     """
 
     name = "Pendulum"

@@ -21,13 +21,15 @@ def register(twin: type[Twin]) -> type[Twin]:
     """
     if not (isinstance(twin, type) and issubclass(twin, Twin)):
         raise TypeError(
-            f"twins.register takes a subclass of Twin, got {twin!r}. Register the class, not an instance."
+            f"twins.register takes a subclass of Twin, got {twin!r}. "
+            "Register the class, not an instance."
         )
     for key in filter(None, (twin.name, twin.env_id)):
         other = _TWINS.setdefault(key, twin)
         if other.__qualname__ != twin.__qualname__:
             raise ValueError(
-                f"'{key}' is already the twin {other.__qualname__}. Choose another name for {twin!r}."
+                f"'{key}' is already the twin {other.__qualname__}. "
+                f"Choose another name for {twin!r}."
             )
         _TWINS[key] = twin
     return twin
@@ -111,5 +113,6 @@ def _how_to_add_one(wanted: str) -> str:
         "    @twins.register\n"
         "    class MyTwin(AnalyticTwin):\n"
         f'        name, env_id, dt = "MyTwin", "{wanted}", 0.05\n'
-        "        ...  # joints, actuators, channels, parameters; actuate, mass_matrix, bias, observe, infer, reward"
+        "        ...  # joints, actuators, channels, parameters; initial, infer, observe,\n"
+        "        ...  # actuate, mass_matrix, bias, reward"
     )

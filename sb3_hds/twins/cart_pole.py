@@ -1,0 +1,104 @@
+"""Twin of ``sb3_hds/CartPoleSwingUp-v0``: ``CartPole-v1`` with another task."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from sb3_hds.core import (
+    Action,
+    Actuator,
+    AnalyticTwin,
+    Channel,
+    Force,
+    Joint,
+    MassMatrix,
+    Obs,
+    Parameter,
+    Params,
+    Position,
+    Scalar,
+    State,
+    Velocity,
+)
+
+_MAX_FORCE = 10.0  # [N]
+
+
+class CartPole(AnalyticTwin):
+    r"""
+    A pole swung up by pushing the cart that it stands on.
+
+    .. math::
+        (m_c + m_p)\,\ddot x + m_p l\,(\dot\omega \cos\theta - \omega^2 \sin\theta) &= u \\
+        m_p l\,\ddot x \cos\theta + \tfrac{4}{3} m_p l^2\,\dot\omega - m_p g l \sin\theta &= 0
+
+    with :math:`l` half the length of the pole; :math:`\theta = 0` is upright. Reproduces
+    ``gymnasium/envs/classic_control/cartpole.py`` with ``kinematics_integrator = "semi-implicit"``
+    and any force in [-10, 10] N. There is no end of the track and no termination. The reward is
+    smooth:
+
+    .. math::
+        r = -2\,(1 - \cos\theta) - 0.2\,x^2
+            - 0.01\,\big(\dot x^2 + \omega^2 + (u / 10\,\mathrm{N})^2\big)
+    """
+
+    name = "CartPole"
+    env_id = "sb3_hds/CartPoleSwingUp-v0"
+    dt = 0.02
+    max_episode_steps = 250
+    joints = (Joint("track", "m"), Joint("hinge", "rad"))
+    actuators = (Actuator("force", "N", -_MAX_FORCE, _MAX_FORCE),)
+    channels = (
+        Channel("position", "m"),
+        Channel("cos", "1", -1.0, 1.0),
+        Channel("sin", "1", -1.0, 1.0),
+        Channel("speed", "m/s"),
+        Channel("rate", "rad/s"),
+    )
+    parameters = {
+        "gravity": Parameter(null=9.8, scale=0.5, unit="m/s2", lower=0.0),
+        "cart_mass": Parameter(null=1.0, scale=0.2, unit="kg", lower=1e-3),
+        "pole_mass": Parameter(null=0.1, scale=0.02, unit="kg", lower=1e-4),
+        "half_length": Parameter(null=0.5, scale=0.1, unit="m", lower=1e-3),
+    }
+
+    def initial(self, key: PRNGKeyArray, params: Params) -> State:
+        """Uniform: position within 0.5 m, any angle, speed within 0.5 m/s, rate within 1 rad/s."""
+        high = jnp.array([[0.5, jnp.pi], [0.5, 1.0]])
+        start = jax.random.uniform(key, (2, 2), minval=-high, maxval=high)
+        return State(start[0], start[1], {})
+
+    def infer(self, obs: Obs, params: Params) -> State:
+        angle = jnp.arctan2(obs[2:3], obs[1:2])
+        return State(jnp.concatenate([obs[:1], angle]), obs[3:], {})
+
+    def observe(self, state: State, params: Params) -> Obs:
+        angle = state.q[1:]
+        return jnp.concatenate([state.q[:1], jnp.cos(angle), jnp.sin(angle), state.v])
+
+    def actuate(self, state: State, action: Action, params: Params) -> Force:
+        force = jnp.clip(action[0], -_MAX_FORCE, _MAX_FORCE)
+        return jnp.stack([force, jnp.zeros_like(force)])
+
+    def mass_matrix(self, q: Position, params: Params) -> MassMatrix:
+        mass, length = params["pole_mass"], params["half_length"]
+        both = mass * length * jnp.cos(q[1])
+        cart = params["cart_mass"] + mass + 0.0 * both
+        pole = 4.0 / 3.0 * mass * length**2 + 0.0 * both
+        return jnp.stack([cart, both, both, pole]).reshape(2, 2)
+
+    def bias(self, q: Position, v: Velocity, params: Params) -> Force:
+        lever = params["pole_mass"] * params["half_length"] * jnp.sin(q[1])
+        return jnp.stack([-lever * v[1] ** 2, -lever * params["gravity"]])
+
+    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
+        (x, angle), force = state.q, jnp.clip(action[0] / _MAX_FORCE, -1.0, 1.0)
+        effort = jnp.sum(state.v**2) + force**2
+        return -2.0 * (1.0 - jnp.cos(angle)) - 0.2 * x**2 - 0.01 * effort
+
+    def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
+        """The cart and the pole."""
+        x, angle = state.q
+        tip = 2.0 * params["half_length"] * jnp.stack([jnp.sin(angle), jnp.cos(angle)])
+        cart = jnp.array([[-0.2, 0.0], [0.2, 0.0], [0.0, 0.0]])
+        return jnp.concatenate([cart, tip[None]]) + jnp.stack([x, jnp.zeros_like(x)])
