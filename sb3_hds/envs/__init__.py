@@ -1,0 +1,43 @@
+"""
+Environments made of twins, and the way back: the twin that mirrors an environment.
+
+Names are imported on first use, so that registering our ids costs neither jax nor torch.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sb3_hds.envs.mirror import check_mirrors, twin_of
+    from sb3_hds.envs.registration import register_environments
+    from sb3_hds.envs.side_by_side import verify_mirror
+    from sb3_hds.envs.twin_env import TwinEnv
+    from sb3_hds.envs.twin_vec_env import TwinVecEnv
+
+__all__ = [
+    "TwinEnv",
+    "TwinVecEnv",
+    "check_mirrors",
+    "register_environments",
+    "twin_of",
+    "verify_mirror",
+]
+
+_MODULES = {
+    "TwinEnv": "twin_env",
+    "TwinVecEnv": "twin_vec_env",
+    "check_mirrors": "mirror",
+    "register_environments": "registration",
+    "twin_of": "mirror",
+    "verify_mirror": "side_by_side",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,240 @@
+"""
+Which twin mirrors an environment, however that is vectorised and wrapped.
+
+Wrappers known to leave observations, actions and rewards alone are looked through. All others are
+refused by name: planning in a twin of what lies below them would be silently wrong.
+"""
+
+import dataclasses
+import re
+from collections.abc import Iterable, Sequence
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from stable_baselines3.common.vec_env import (
+    VecCheckNan,
+    VecEnv,
+    VecEnvWrapper,
+    VecMonitor,
+    VecNormalize,
+    VecVideoRecorder,
+)
+
+from sb3_hds.core import Twin
+from sb3_hds.envs.twin_env import TwinEnv
+from sb3_hds.envs.twin_vec_env import TwinVecEnv
+from sb3_hds.errors import EnvironmentMismatchError, NoTwinError
+from sb3_hds.twins import registry
+
+# Class name -> the package that it comes from. rl_zoo3 replaces Gymnasium's TimeLimit by its own.
+_NEUTRAL = {
+    "Autoreset": "gymnasium",
+    "HumanRendering": "gymnasium",
+    "Monitor": "stable_baselines3",
+    "OrderEnforcing": "gymnasium",
+    "PassiveEnvChecker": "gymnasium",
+    "PatchedTimeLimit": "rl_zoo3",
+    "RecordEpisodeStatistics": "gymnasium",
+    "RecordVideo": "gymnasium",
+    "RenderCollection": "gymnasium",
+    "TimeLimit": "gymnasium",
+}
+# VecNormalize is honoured by the learners themselves.
+_NEUTRAL_VEC = (VecCheckNan, VecMonitor, VecNormalize, VecVideoRecorder)
+
+# ``str(env)`` nests: <Monitor<TimeLimit<PendulumEnv<Pendulum-v1>>>>
+_ENCLOSING = re.compile(r"<(\w+)(?=<)")
+_WITHOUT_ID = re.compile(r"<\w+ instance>")
+
+
+def twin_of(env: gymnasium.Env | VecEnv) -> Twin:
+    """
+    Find the twin that mirrors an environment.
+
+    :param env: an environment or a vectorised one (in this process or in others), wrapped or not
+    :return: its twin, with the parameters that the environment was made with
+    :raises EnvironmentMismatchError: for a wrapper not known to leave observations, actions and
+        rewards alone, for copies with different parameters, or for spaces that no twin has
+    :raises NoTwinError: if no twin is registered for it
+    """
+    if isinstance(env, VecEnv):
+        bare = _without_vec_wrappers(env)
+        twin = bare.twin if isinstance(bare, TwinVecEnv) else _agreed(_twins_of_copies(bare))
+    elif isinstance(env, gymnasium.Env):
+        twin = _twin_of_one(env)
+    else:
+        raise TypeError(f"A gymnasium.Env or an SB3 VecEnv has a twin, got {env!r}.")
+    check_mirrors(env, twin)
+    return twin
+
+
+def check_mirrors(env: gymnasium.Env | VecEnv, twin: Twin) -> None:
+    """
+    Check that a twin has the actions and the observations of an environment as wrapped.
+
+    Says nothing about what a step does: see :func:`~sb3_hds.envs.side_by_side.verify_mirror`.
+
+    :param env: as the learner gets it
+    :param twin: what is planned with
+    :raises EnvironmentMismatchError: if actions are no bounded Box, or if sizes or limits differ
+    """
+    low, high = _action_limits(env.action_space)
+    names = ", ".join(a.name for a in twin.actuators)
+    ours = np.array([(a.low, a.high) for a in twin.actuators], np.float64).T
+    if low.size != len(twin.actuators):
+        raise EnvironmentMismatchError(
+            f"The environment takes {low.size} actions and {twin.name} has {len(twin.actuators)} "
+            f"actuators ({names}). Pass a twin= of this environment as wrapped."
+        )
+    # Spaces are single precision.
+    if not np.allclose((low, high), ours, rtol=1e-6, atol=0.0):
+        raise EnvironmentMismatchError(
+            f"The environment takes actions from {low.tolist()} to {high.tolist()}, and the "
+            f"actuators of {twin.name} ({names}) from {ours[0].tolist()} to {ours[1].tolist()}. "
+            "Pass a twin= of this environment as wrapped, for example a TransformedTwin."
+        )
+    shape, wanted = env.observation_space.shape, (len(twin.channels),)
+    if not isinstance(env.observation_space, spaces.Box) or shape != wanted:
+        raise EnvironmentMismatchError(
+            f"The environment observes {env.observation_space}, and {twin.name} observes a Box of "
+            f"shape {wanted} ({', '.join(c.name for c in twin.channels)}). "
+            "Pass a twin= of this environment as wrapped, for example a TransformedTwin."
+        )
+
+
+def _action_limits(space: spaces.Space) -> tuple[np.ndarray, np.ndarray]:
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise EnvironmentMismatchError(
+            "Planning follows derivatives with respect to the action, so actions must be a Box "
+            f"with one axis, got {space}. Use an environment with continuous actions."
+        )
+    if not space.is_bounded():
+        raise EnvironmentMismatchError(
+            f"Planning keeps actions within their limits, so these must be finite, got {space}. "
+            "Give the environment's action_space finite bounds."
+        )
+    return space.low.astype(np.float64), space.high.astype(np.float64)
+
+
+def _without_vec_wrappers(env: VecEnv) -> VecEnv:
+    while isinstance(env, VecEnvWrapper):
+        if type(env) not in _NEUTRAL_VEC:
+            raise _refused(type(env).__name__, "VecEnv wrapper")
+        env = env.venv
+    return env
+
+
+def _twin_of_one(env: gymnasium.Env) -> Twin:
+    layer = env
+    while isinstance(layer, gymnasium.Wrapper):
+        _refuse_unless_neutral(type(layer).__name__, type(layer).__module__)
+        layer = layer.env
+    _action_limits(env.action_space)
+    return layer.twin if isinstance(layer, TwinEnv) else registry.from_env(layer)
+
+
+def _twins_of_copies(env: VecEnv) -> list[Twin]:
+    """The twin of each copy in this process (``DummyVecEnv``) or another (``SubprocVecEnv``)."""
+    if hasattr(env, "envs"):
+        return [_twin_of_one(copy) for copy in env.envs]
+    specs = _specs_of(env)
+    _action_limits(env.action_space)
+    own = env.get_attr("twin") if env.has_attr("twin") else []
+    if own and all(isinstance(twin, Twin) for twin in own):
+        return own
+    return [_twin_of_spec(spec) for spec in specs]
+
+
+def _specs_of(env: VecEnv) -> list[EnvSpec | None]:
+    """
+    How the copies in other processes were made.
+
+    :raises EnvironmentMismatchError: for a wrapper not known to be neutral
+    :raises NoTwinError: if they do not tell
+    """
+    try:
+        for text in env.env_method("__str__"):
+            for name in _wrappers_in(text):
+                _refuse_unless_neutral(name)
+        # Only now: a spec holds the arguments of wrappers, and sending a lambda kills the process.
+        specs = env.get_attr("spec")
+    except (AttributeError, NotImplementedError, EOFError, ConnectionError) as error:
+        raise NoTwinError(
+            f"{type(env).__name__} does not tell how its environments were made ({error!r}). "
+            "Pass twin=."
+        ) from error
+    for spec in specs:
+        for wrapper in spec.additional_wrappers if spec is not None else ():
+            _refuse_unless_neutral(wrapper.name, wrapper.entry_point)
+    return specs
+
+
+def _wrappers_in(text: str) -> list[str]:
+    """:return: class names of the wrappers in ``str(env)``, outermost first"""
+    enclosing = _ENCLOSING.findall(text)
+    return enclosing if _WITHOUT_ID.search(text) else enclosing[:-1]
+
+
+def _twin_of_spec(spec: EnvSpec | None) -> Twin:
+    """Make the bare environment here, to read the parameters of its copy elsewhere."""
+    if spec is None:
+        raise NoTwinError(
+            "The environments in other processes were not made by gymnasium.make, so their "
+            "parameters cannot be read. Register the environment with gymnasium, or pass twin=."
+        )
+    registry.get(spec.id)
+    arguments = {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
+    bare = dataclasses.replace(
+        spec, kwargs=arguments, additional_wrappers=(), max_episode_steps=None, order_enforce=False
+    )
+    env = gymnasium.make(bare, disable_env_checker=True)
+    try:
+        return _twin_of_one(env)
+    finally:
+        env.close()
+
+
+def _agreed(copies: Sequence[Twin]) -> Twin:
+    """
+    :return: the twin of all copies
+    :raises EnvironmentMismatchError: if they differ
+    """
+    first = copies[0]
+    for i, other in enumerate(copies[1:], 1):
+        if other != first:
+            raise _differing(i, [f"{first!r} and {other!r}"])
+        differing = [
+            f"{name} is {value:g} and {other.values[name]:g} {first.parameters[name].unit}"
+            for name, value in first.values.items()
+            if other.values[name] != value
+        ]
+        if differing:
+            raise _differing(i, differing)
+    return first
+
+
+def _differing(index: int, differences: Iterable[str]) -> EnvironmentMismatchError:
+    return EnvironmentMismatchError(
+        f"The copies 0 and {index} of the vectorised environment differ: {', '.join(differences)}. "
+        "One twin cannot mirror both: make all copies with the same arguments, or pass twin=."
+    )
+
+
+def _refuse_unless_neutral(name: str, origin: str | None = None) -> None:
+    """
+    :param origin: module or entry point of the wrapper; None where only its name is known
+    :raises EnvironmentMismatchError: for a wrapper not known to be neutral
+    """
+    package = origin.split(".")[0].split(":")[0] if origin is not None else _NEUTRAL.get(name)
+    if package is None or _NEUTRAL.get(name) != package:
+        raise _refused(name, "wrapper")
+
+
+def _refused(name: str, kind: str) -> EnvironmentMismatchError:
+    return EnvironmentMismatchError(
+        f"The {kind} {name} may change observations, actions or rewards, so no registered twin "
+        "mirrors the environment as wrapped. Remove it, or pass a twin= that simulates the wrapped "
+        "environment: a TransformedTwin, or the plain twin if the wrapper changes nothing."
+    )

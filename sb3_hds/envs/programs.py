@@ -1,0 +1,128 @@
+"""
+The compiled programs behind the environments.
+
+Values of parameters are arguments, so all environments of equal twins share one compilation. States
+travel as numpy arrays: they pickle, they copy, and they belong to no device.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from sb3_hds.core import Params, State, Twin
+
+
+class Transition(NamedTuple):
+    """
+    What one step of a twin gives; with a leading axis where several copies step at once.
+
+    :param state: where the twin is now
+    :param obs: what its sensors report
+    :param reward: for this step
+    :param terminated: whether the episode ends for a reason of the task
+    """
+
+    state: State
+    obs: Any
+    reward: Any
+    terminated: Any
+
+
+class BatchTransition(NamedTuple):
+    """
+    What one step of many copies gives, those that ended already standing at a new start.
+
+    :param state: where the next step begins, leading axis ``n_envs``
+    :param obs: what the sensors report there, ``(n_envs, n_obs)``
+    :param elapsed: steps since the start of each episode, ``(n_envs,)``
+    :param ended: the step itself, before any restart
+    :param truncated: whether the step limit was reached, ``(n_envs,)``
+    """
+
+    state: State
+    obs: Any
+    elapsed: Any
+    ended: Transition
+    truncated: Any
+
+
+class Programs(NamedTuple):
+    """
+    :param draw: ``(seed, params) -> state`` at the start of an episode
+    :param observe: ``(state, params) -> obs``
+    :param step: ``(state, action, params) -> Transition``
+    """
+
+    draw: Callable[..., State]
+    observe: Callable[..., Any]
+    step: Callable[..., Transition]
+
+
+class BatchPrograms(NamedTuple):
+    """
+    :param draw: ``(seeds, params) -> states``
+    :param observe: ``(states, params) -> obs``
+    :param step: ``(states, elapsed, actions, seeds, limit, params) -> BatchTransition``, where
+        ``seeds`` are those of the episodes that begin if a copy ends
+    """
+
+    draw: Callable[..., State]
+    observe: Callable[..., Any]
+    step: Callable[..., BatchTransition]
+
+
+@functools.lru_cache(maxsize=64)
+def for_one(twin: Twin) -> Programs:
+    """:return: the programs of a single copy"""
+    pure = _pure(twin)
+    return Programs(*(jax.jit(function) for function in pure))
+
+
+@functools.lru_cache(maxsize=64)
+def for_many(twin: Twin) -> BatchPrograms:
+    """:return: the programs of any number of copies that share their parameters"""
+    pure = _pure(twin)
+    draw = jax.vmap(pure.draw, (0, None))
+    observe = jax.vmap(pure.observe, (0, None))
+    transition = jax.vmap(pure.step, (0, 0, None))
+
+    def step(
+        states: State, elapsed: Any, actions: Any, seeds: Any, limit: Any, params: Params
+    ) -> BatchTransition:
+        ended = transition(states, actions, params)
+        elapsed = elapsed + 1
+        truncated = elapsed >= limit
+        done = ended.terminated | truncated
+
+        def restart() -> tuple[State, Any]:
+            fresh = draw(seeds, params)
+            pick = functools.partial(_where, done)
+            start = fresh, observe(fresh, params)
+            return jax.tree.map(pick, start, (ended.state, ended.obs))
+
+        # Outside vmap, so drawing costs nothing in the many steps in which no copy ends.
+        state, obs = jax.lax.cond(jnp.any(done), restart, lambda: (ended.state, ended.obs))
+        return BatchTransition(state, obs, jnp.where(done, 0, elapsed), ended, truncated)
+
+    return BatchPrograms(jax.jit(draw), jax.jit(observe), jax.jit(step))
+
+
+def _pure(twin: Twin) -> Programs:
+    def draw(seed: Any, params: Params) -> State:
+        return twin.initial(jax.random.key(seed), params)
+
+    def step(state: State, action: Any, params: Params) -> Transition:
+        after = twin.step(state, action, params)
+        reward = twin.reward(state, action, after, params)
+        return Transition(
+            after, twin.observe(after, params), reward, twin.terminated(after, params)
+        )
+
+    return Programs(draw, twin.observe, step)
+
+
+def _where(done: Any, new: Any, old: Any) -> Any:
+    return jnp.where(done.reshape(done.shape + (1,) * (new.ndim - 1)), new, old)

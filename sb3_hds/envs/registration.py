@@ -1,0 +1,29 @@
+"""Our environments' ids. This module imports neither jax nor torch: ``import sb3_hds`` runs it."""
+
+import gymnasium
+
+#: Environment id -> steps after which gymnasium's ``TimeLimit`` cuts an episode.
+STEP_LIMITS = {
+    "sb3_hds/AcrobotContinuous-v0": 500,
+    "sb3_hds/CartPoleSwingUp-v0": 250,
+    "sb3_hds/PayloadPendulum-v0": 100,
+}
+
+_ENTRY_POINT = "sb3_hds.envs.twin_env:TwinEnv"
+
+
+def register_environments() -> None:
+    """
+    Make our ids known to ``gymnasium.make``. Calling it again changes nothing.
+
+    Keyword arguments of ``gymnasium.make`` are settings of the twin: values of parameters by name,
+    its options, ``dt`` [s], ``substeps``.
+    """
+    for env_id, max_episode_steps in STEP_LIMITS.items():
+        if env_id not in gymnasium.registry:
+            gymnasium.register(
+                env_id,
+                entry_point=_ENTRY_POINT,
+                max_episode_steps=max_episode_steps,
+                kwargs={"twin": env_id},
+            )

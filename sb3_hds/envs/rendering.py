@@ -1,0 +1,133 @@
+"""Line drawings of twins as images."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from sb3_hds.core import State, Twin
+from sb3_hds.envs import programs
+
+_PIXELS = 400
+_DPI = 100
+_N_POSES = 64
+# Beyond so many points a polyline is a curve, not rods between joints.
+_MAX_JOINTS = 12
+_MARGIN = 1.15
+# A system on a slider needs room to travel: so much more than its own extent is shown.
+_ROOM_TO_TRAVEL = 1.8
+_LINE_COLOUR, _JOINT_COLOUR, _PAPER_COLOUR, _GRID_COLOUR = (
+    "#27496d",
+    "#d1495b",
+    "#fbfaf7",
+    "#dfdcd3",
+)
+
+
+class View(NamedTuple):
+    """
+    A square window on the plane, in metres.
+
+    :param x: horizontal position of its centre
+    :param y: vertical position of its centre
+    :param half: half its side
+    """
+
+    x: float
+    y: float
+    half: float
+
+    def following(self, points: np.ndarray) -> "View":
+        """:return: this window, moved just far enough to show ``points``, at the same scale"""
+        room = self.half / _MARGIN
+        x, y = (
+            centre + max(0.0, along.max() - centre - room) + min(0.0, along.min() - centre + room)
+            for centre, along in zip((self.x, self.y), points.T, strict=True)
+        )
+        return View(x, y, self.half)
+
+
+def view_of(twin: Twin) -> View:
+    """
+    A window that holds the twin at its start states, with every hinge turned all the way.
+
+    :param twin: drawn with its current values
+    :return: the window
+    """
+    seeds = np.arange(_N_POSES, dtype=np.uint32)
+    start: State = jax.device_get(programs.for_many(twin).draw(seeds, twin.params))
+    poses = _turned(twin, np.array(start.q))
+    low, high = _outline(twin, start._replace(q=poses))
+    extent = float((high - low).max())
+    shifted = _outline(twin, start._replace(q=_slid(twin, poses, 0.01 * extent)))
+    roams = not np.allclose((low, high), shifted, rtol=0.0, atol=1e-3 * extent)
+    x, y = (low + high) / 2.0
+    half = 0.5 * extent * _MARGIN * (_ROOM_TO_TRAVEL if roams else 1.0)
+    return View(float(x), float(y), max(half, 1e-3))
+
+
+class Canvas:
+    """
+    Draws frames of one twin with matplotlib's Agg backend; opens no window.
+
+    :param twin: what is drawn
+    """
+
+    def __init__(self, twin: Twin) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        self._view = view_of(twin)
+        figure = Figure(figsize=(_PIXELS / _DPI,) * 2, dpi=_DPI, facecolor=_PAPER_COLOUR)
+        self._agg = FigureCanvasAgg(figure)
+        self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), facecolor=_PAPER_COLOUR)
+        self._axes.set_aspect("equal")
+        self._axes.grid(color=_GRID_COLOUR, linewidth=1.0)
+        self._axes.tick_params(length=0, labelbottom=False, labelleft=False)
+        for spine in self._axes.spines.values():
+            spine.set_visible(False)
+        (self._line,) = self._axes.plot(
+            [], [], color=_LINE_COLOUR, linewidth=6.0, solid_capstyle="round"
+        )
+        (self._dots,) = self._axes.plot(
+            [], [], "o", color=_JOINT_COLOUR, markersize=5.0, markeredgewidth=0.0
+        )
+
+    def draw(self, points: Any) -> np.ndarray:
+        """
+        :param points: the polyline of ``Twin.sketch`` [m], shape ``(points, 2)``
+        :return: RGB image, uint8, shape ``(400, 400, 3)``
+        """
+        points = np.asarray(points, np.float64)
+        view = self._view.following(points)
+        self._axes.set_xlim(view.x - view.half, view.x + view.half)
+        self._axes.set_ylim(view.y - view.half, view.y + view.half)
+        self._line.set_data(*points.T)
+        self._dots.set_data(*points.T if len(points) <= _MAX_JOINTS else ([], []))
+        self._agg.draw()
+        return np.array(self._agg.buffer_rgba())[..., :3].copy()
+
+
+def _outline(twin: Twin, poses: State) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest coordinates [m] of all drawings."""
+    sketches = jax.vmap(twin.sketch, (0, None))(poses, twin.params)
+    points = np.asarray(sketches, np.float64).reshape(-1, 2)
+    return points.min(0), points.max(0)
+
+
+def _turned(twin: Twin, q: np.ndarray) -> np.ndarray:
+    """Turn every hinge through the full circle, each at a different rate over the poses."""
+    turn = 2.0 * np.pi * np.arange(len(q))[:, None] / len(q)
+    return np.where(_are(twin, "rad", q), turn * np.arange(1, q.shape[1] + 1), q)
+
+
+def _slid(twin: Twin, q: np.ndarray, shift: float) -> np.ndarray:
+    """Move every slider by ``shift`` [m]."""
+    return q + shift * _are(twin, "m", q)
+
+
+def _are(twin: Twin, unit: str, q: np.ndarray) -> np.ndarray:
+    """Which coordinates have this unit; none where a joint has several coordinates."""
+    if q.shape[1] != len(twin.joints):
+        return np.zeros(q.shape[1], bool)
+    return np.array([joint.unit == unit for joint in twin.joints])

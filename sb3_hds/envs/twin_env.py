@@ -1,0 +1,187 @@
+"""Any twin as a Gymnasium environment."""
+
+import contextlib
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+from gymnasium import spaces
+
+from sb3_hds.core import Actuator, Channel, State, Twin
+from sb3_hds.envs import programs
+from sb3_hds.envs.doors import check_action, check_start, start_of
+from sb3_hds.twins import registry
+
+_RENDER_MODES = ["rgb_array"]
+
+
+class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """
+    A twin to act in: its ``initial``, ``step``, ``observe``, ``reward`` and ``terminated``.
+
+    Has no time limit of its own; ``gymnasium.make`` of a registered id adds it. Steps are computed
+    on the host, where a single copy steps fastest. They are deterministic: all randomness is in
+    ``reset``.
+
+    :param twin: a twin, or the name or environment id under which one is registered
+    :param render_mode: ``"rgb_array"`` or None
+    :param settings: values of the twin's parameters by name, in their units; where ``twin`` is a
+        name, also its options, ``dt`` [s] and ``substeps``
+    :raises NoTwinError: for a name that is not registered
+    :raises ParameterError: for a setting that the twin does not have, or a value out of bounds
+    :raises ValueError: for another render mode
+    """
+
+    metadata: dict[str, Any] = {"render_modes": _RENDER_MODES}
+
+    def __init__(
+        self, twin: Twin | str = "Pendulum", render_mode: str | None = None, **settings: Any
+    ) -> None:
+        self.twin = twin_from(twin, settings)
+        self.render_mode = check_render_mode(render_mode)
+        self.metadata = metadata_of(self.twin)
+        self.observation_space = observation_space(self.twin)
+        self.action_space = action_space(self.twin)
+        self._state: State | None = None
+        self._canvas: Any = None
+
+    @property
+    def state(self) -> State:
+        """
+        Where the twin is now, memory included.
+
+        :raises gymnasium.error.ResetNeeded: before the first reset
+        """
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded(
+                f"The state of {self.twin.name} is not set yet. Call reset() first."
+            )
+        return self._state
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """
+        Begin an episode.
+
+        :param seed: restarts the sequence of start states; None continues it
+        :param options: ``{"state": (q, v)}`` begins there instead, in the units of the joints
+        :return: observation of shape ``(n_obs,)``, empty info
+        :raises ValueError: for an unknown option, or a state of wrong size, not finite, or out of
+            the observation space
+        """
+        super().reset(seed=seed)
+        run, params = programs.for_one(self.twin), self.twin.params
+        with _host():
+            drawn = run.draw(draw_seed(self.np_random), params)
+            state = jax.device_get(start_of(self.twin, drawn, options))
+            obs = _as_observation(run.observe(state, params))
+        check_start(self.twin, self.observation_space, obs, options)
+        self._state = state
+        return obs, {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """
+        Act for one control interval.
+
+        :param action: in the units of the action space, shape ``(n_act,)``; the twin clips it
+        :return: observation, reward, terminated, truncated (always False), empty info
+        :raises ValueError: for an action of the wrong shape or not finite
+        """
+        action = check_action(self.twin, action, self.action_space.shape)
+        with _host():
+            after = programs.for_one(self.twin).step(self.state, action, self.twin.params)
+            self._state, obs, reward, terminated = jax.device_get(after)
+        return _as_observation(obs), float(reward), bool(terminated), False, {}
+
+    def render(self) -> np.ndarray | None:
+        """:return: an RGB image, uint8, shape ``(400, 400, 3)``; None without a render mode"""
+        if self.render_mode is None:
+            gymnasium.logger.warn(
+                "render() shows nothing without a render mode: make the environment with "
+                'render_mode="rgb_array".'
+            )
+            return None
+        from sb3_hds.envs.rendering import Canvas
+
+        with _host():
+            if self._canvas is None:
+                self._canvas = Canvas(self.twin)
+            return self._canvas.draw(self.twin.sketch(self.state, self.twin.params))
+
+    def close(self) -> None:
+        self._canvas = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_canvas": None}
+
+
+def twin_from(twin: Twin | str, settings: Mapping[str, Any]) -> Twin:
+    """
+    :return: the twin that is meant, with ``settings``
+    :raises TypeError: for neither a twin nor a name
+    """
+    if isinstance(twin, Twin):
+        return twin.with_parameters(**settings) if settings else twin
+    if isinstance(twin, str):
+        return registry.make(twin, **settings)
+    raise TypeError(
+        f"An environment is made of a twin or the name of one, got {twin!r}. "
+        f"Names: {', '.join(registry.names())}."
+    )
+
+
+def check_render_mode(mode: str | None) -> str | None:
+    """:raises ValueError: for a render mode that twins do not have"""
+    if mode is not None and mode not in _RENDER_MODES:
+        raise ValueError(
+            f"Twins render with render_mode='rgb_array' or None, got {mode!r}. "
+            "gymnasium.make shows them in a window for render_mode='human'."
+        )
+    return mode
+
+
+def metadata_of(twin: Twin) -> dict[str, Any]:
+    """:return: what Gymnasium and SB3's video recorders read"""
+    return {"render_modes": list(_RENDER_MODES), "render_fps": max(1, round(1.0 / twin.dt))}
+
+
+def observation_space(twin: Twin) -> spaces.Box:
+    """:return: the bounds of the twin's channels"""
+    return _box(twin.channels)
+
+
+def action_space(twin: Twin) -> spaces.Box:
+    """:return: the bounds of the twin's actuators"""
+    return _box(twin.actuators)
+
+
+def draw_seed(generator: np.random.Generator) -> np.uint32:
+    """:return: the seed of the next episode's start state"""
+    return generator.integers(2**32, dtype=np.uint32)
+
+
+def _box(signals: Sequence[Actuator | Channel]) -> spaces.Box:
+    low, high = np.array([(signal.low, signal.high) for signal in signals], np.float32).T
+    return spaces.Box(low, high)
+
+
+def _as_observation(obs: Any) -> np.ndarray:
+    return np.array(obs, np.float32)
+
+
+def _host() -> contextlib.AbstractContextManager[None]:
+    """Compute on the CPU even where JAX has an accelerator."""
+    return jax.default_device(_cpu())
+
+
+@functools.cache
+def _cpu() -> jax.Device | None:
+    """:return: None where JAX was told to know no CPU; then its default device serves"""
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:
+        return None
