@@ -1,0 +1,224 @@
+"""The commands of an unmodified ``rl_zoo3``, each as a user types it, in a process of its own."""
+
+import csv
+import os
+import shutil
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+pytestmark = pytest.mark.skipif(find_spec("rl_zoo3") is None, reason="needs the extra 'zoo'")
+
+CONSOLE = (str(Path(sys.executable).with_name("rl_zoo3")),)
+MODULE = (sys.executable, "-m")
+# Small plans: these tests ask whether a command works, not how well the algorithm learns.
+QUICK = ("n_rollouts:8", "pretrain_epochs:1")
+N_STEPS, EVAL_FREQ, SAVE_FREQ = 300, 100, 150
+
+
+class Zoo:
+    """A folder to work in, and the commands in it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.logs = folder / "logs" / "hds"
+        # One compilation cache for all processes: they compile the same functions.
+        self.environ = {
+            **os.environ,
+            "JAX_COMPILATION_CACHE_DIR": str(folder / "cache"),
+            "MPLBACKEND": "Agg",
+            "COLUMNS": "200",
+        }
+
+    def run(self, *words: str, **environ: str) -> subprocess.CompletedProcess:
+        return subprocess.run(
+            words,
+            cwd=self.folder,
+            env={**self.environ, **environ},
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            timeout=400,
+        )
+
+    def succeeds(self, *words: str, **environ: str) -> str:
+        done = self.run(*words, **environ)
+        assert done.returncode == 0, done.stdout[-6000:]
+        return done.stdout
+
+    def fails(self, *words: str, **environ: str) -> str:
+        done = self.run(*words, **environ)
+        assert done.returncode != 0, done.stdout[-6000:]
+        return done.stdout
+
+
+def train(*options: str) -> tuple[str, ...]:
+    return ("--algo", "hds", "--env", "Pendulum-v1", "--seed", "0", "-f", "logs", *options)
+
+
+def saved_hyperparameters(run: Path) -> dict:
+    tag, _, entries = (run / "Pendulum-v1" / "config.yml").read_text().partition("\n")
+    assert tag == "!!python/object/apply:collections.OrderedDict"
+    return dict(yaml.safe_load(entries)[0])
+
+
+@pytest.fixture(scope="module")
+def zoo(tmp_path_factory) -> Zoo:
+    return Zoo(tmp_path_factory.mktemp("zoo"))
+
+
+@pytest.fixture(scope="module")
+def trained(zoo) -> Path:
+    """The folder of a run by the console command, shared by the tests that come after it."""
+    schedule = ("-n", str(N_STEPS), "--eval-freq", str(EVAL_FREQ), "--save-freq", str(SAVE_FREQ))
+    evaluation = ("--n-eval-envs", "2", "--eval-episodes", "2")
+    changes = ("--env-kwargs", "g:9.8", "-params", "train_freq:2", *QUICK)
+    zoo.succeeds(*CONSOLE, "train", *train(*schedule, *evaluation, "-P", *changes))
+    return zoo.logs / "Pendulum-v1_1"
+
+
+@pytest.fixture(scope="module")
+def continued(zoo, trained) -> Path:
+    """A second run, by the module instead of the start-up line, that goes on where it ended."""
+    zoo.succeeds(
+        *MODULE,
+        "rl_zoo_plugin",
+        "train",
+        *train("-n", str(N_STEPS), "--eval-freq", str(EVAL_FREQ), "--eval-episodes", "2"),
+        *("-i", str(trained / "Pendulum-v1.zip"), "-params", *QUICK),
+        SB3_HDS_NO_ZOO="1",
+    )
+    return zoo.logs / "Pendulum-v1_2"
+
+
+@pytest.fixture(scope="module")
+def collected(zoo, trained, continued) -> Path:
+    """The results of both runs, as ``all_plots`` collects them."""
+    source = ("-a", "hds", "-e", "Pendulum", "-f", "logs")
+    table = zoo.succeeds(*CONSOLE, "all_plots", *source, "--no-million", "-o", "results")
+    assert "HDS" in table and "Pendulum" in table
+    return zoo.folder / "results.pkl"
+
+
+def test_a_run_folder_holds_what_the_zoo_always_writes(trained):
+    checkpoints = {f"rl_model_{step}_steps.zip" for step in (SAVE_FREQ, 2 * SAVE_FREQ)}
+    expected = {"0.monitor.csv", "best_model.zip", "evaluations.npz", "Pendulum-v1.zip"}
+
+    assert expected | checkpoints <= {path.name for path in trained.iterdir()}
+    assert {"args.yml", "config.yml"} <= {path.name for path in (trained / "Pendulum-v1").iterdir()}
+
+
+def test_hyperparameters_given_on_the_command_line_replace_those_of_the_file(trained):
+    used = saved_hyperparameters(trained)
+
+    assert used["policy"] == "MlpPolicy"
+    assert used["train_freq"] == 2
+    assert used["n_rollouts"] == 8
+
+
+def test_a_timestep_is_a_step_of_the_environment_and_nothing_else(trained):
+    with open(trained / "0.monitor.csv") as file:
+        episodes = list(csv.DictReader(line for line in file if not line.startswith("#")))
+
+    # Pendulum-v1 ends an episode after 200 steps, so 300 steps hold one that is complete.
+    assert [int(episode["l"]) for episode in episodes] == [200]
+    # 100, 200, 300: on_step has been called once per step, or the evaluations would lie elsewhere.
+    evaluations = np.load(trained / "evaluations.npz")
+    assert evaluations["timesteps"].tolist() == [EVAL_FREQ, 2 * EVAL_FREQ, N_STEPS]
+    assert evaluations["results"].shape == (3, 2)
+
+
+def test_training_continues_from_a_saved_agent(continued):
+    assert (continued / "Pendulum-v1.zip").is_file()
+    assert np.load(continued / "evaluations.npz")["timesteps"][-1] == N_STEPS
+
+
+def test_enjoy_replays_the_best_agent(zoo, trained):
+    agent = ("--algo", "hds", "--env", "Pendulum-v1", "-f", "logs", "--exp-id", "1", "--load-best")
+
+    output = zoo.succeeds(*CONSOLE, "enjoy", *agent, "--no-render", "-n", "400")
+
+    assert "2 Episodes" in output and "Mean reward" in output
+
+
+def test_our_environments_train_in_subprocesses_and_are_filmed(zoo):
+    agent = ("--algo", "hds", "--env", "sb3_hds/PayloadPendulum-v0", "--seed", "0", "-f", "payload")
+    schedule = ("-n", "200", "--eval-freq", "-1", "--vec-env", "subproc")
+
+    zoo.succeeds(*MODULE, "rl_zoo3.train", *agent, *schedule, "-params", "n_envs:2", *QUICK)
+    run = zoo.folder / "payload" / "hds" / "sb3_hds-PayloadPendulum-v0_1"
+    assert {"0.monitor.csv", "1.monitor.csv"} <= {path.name for path in run.iterdir()}
+
+    zoo.succeeds(*MODULE, "rl_zoo3.record_video", *agent, "-n", "30", "-o", "videos")
+    assert list(zoo.folder.glob("videos/*.mp4"))
+
+
+def test_optuna_trials_are_stored_and_one_of_them_can_be_trained(zoo):
+    study = ("--storage", "study/journal.log", "--study-name", "hds")
+    budget = ("-n", "200", "--n-trials", "3", "--n-evaluations", "1", "--eval-episodes", "1")
+
+    output = zoo.succeeds(
+        *CONSOLE, "train", *train("-optimize", *study, *budget, "--no-optim-plots"), "-f", "tuned"
+    )
+    assert "Number of finished trials:  3" in output
+
+    # The zoo takes trial 0 for no trial at all.
+    output = zoo.succeeds(
+        *CONSOLE, "train", *train("--trial-id", "1", *study, "-n", "100"), "-f", "chosen"
+    )
+    assert "Loading from Optuna study" in output
+    [run] = (zoo.folder / "chosen" / "hds").glob("Pendulum-v1_*")
+    assert saved_hyperparameters(run)["policy_kwargs"].keys() == {"net_arch", "activation_fn"}
+
+
+def test_results_of_several_runs_are_drawn(zoo, collected):
+    # LaTeX is a program of its own, which matplotlib calls.
+    latex = ("-latex",) if shutil.which("latex") else ()
+    picture = ("-o", "results.png", "--format", "png")
+
+    zoo.succeeds(*CONSOLE, "plot_from_file", "-i", str(collected), *latex, "--rliable", *picture)
+
+    assert (zoo.folder / "results.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_training_curve_is_drawn_from_the_monitor_files(zoo, trained):
+    output = zoo.succeeds(
+        *CONSOLE, "plot_train", "-a", "hds", "-e", "Pendulum-v1", "-f", "logs", "-w", "1"
+    )
+
+    assert "No data available" not in output
+
+
+def test_an_unknown_key_in_a_yml_file_is_named_with_the_one_that_was_meant(zoo):
+    entry = {"n_timesteps": 100, "policy": "MlpPolicy", "n_rolouts": 8}
+    (zoo.folder / "typo.yml").write_text(yaml.dump({"Pendulum-v1": entry}))
+
+    output = zoo.fails(*CONSOLE, "train", *train("--conf-file", "typo.yml"), "-f", "typo")
+
+    assert "HDS has no hyperparameter 'n_rolouts'. Did you mean 'n_rollouts'?" in output
+    assert not list(zoo.folder.glob("typo/**/*.zip"))
+
+
+def test_a_log_folder_that_cannot_be_written_is_named(zoo):
+    (zoo.folder / "occupied").write_text("a file where the log folder should go")
+
+    output = zoo.fails(*CONSOLE, "train", *train(), "-f", "occupied")
+
+    assert "Not a directory: 'occupied/hds" in output.splitlines()[-1]
+
+
+def test_switched_off_the_hook_leaves_the_zoo_as_it_is(zoo):
+    output = zoo.fails(*CONSOLE, "train", *train(), SB3_HDS_NO_ZOO="1")
+
+    assert "invalid choice: 'hds'" in output
+
+
+def test_the_module_lists_the_commands_that_it_knows(zoo):
+    output = zoo.fails(*MODULE, "rl_zoo_plugin", "trian")
+
+    assert "Unknown command 'trian'" in output and "train" in output

@@ -1,0 +1,244 @@
+"""The parts of ``rl_zoo_plugin``: the hook, the stand-ins, the samplers and the yml files."""
+
+import inspect
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+import yaml
+
+import sb3_hds
+from rl_zoo_plugin import hook, lazy, tables
+from rl_zoo_plugin.lazy import LazyAlgorithm
+from rl_zoo_plugin.samplers import CONVERTERS, SAMPLERS
+
+STOCK = [
+    "a2c",
+    "ars",
+    "crossq",
+    "ddpg",
+    "dqn",
+    "ppo",
+    "ppo_lstm",
+    "qrdqn",
+    "sac",
+    "td3",
+    "tqc",
+    "trpo",
+]
+# Keys of a zoo entry that the zoo itself consumes, see ExperimentManager._preprocess_hyperparams.
+CONSUMED_BY_THE_ZOO = {"n_timesteps", "n_envs", "normalize", "env_wrapper", "frame_stack"}
+
+
+class Walker:
+    """Stands for an algorithm."""
+
+    answer = 42
+
+    def __init__(self, policy, env=None, stride=0.5, _init_setup_model=True):
+        self.stride = stride
+
+    @classmethod
+    def load(cls, path, env=None, custom_objects=None, **kwargs):
+        return cls("MlpPolicy", env, **kwargs)
+
+
+@pytest.fixture
+def walker(monkeypatch) -> LazyAlgorithm:
+    monkeypatch.setattr(sb3_hds, "Walker", Walker, raising=False)
+    return LazyAlgorithm("Walker")
+
+
+def python(code: str, **environ: str) -> str:
+    """:return: what the code prints in an interpreter of its own"""
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env={**os.environ, **environ}, text=True, capture_output=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def load_yml(algo: str) -> dict:
+    return yaml.safe_load(tables.hyperparams_file(algo).read_text())
+
+
+def test_a_stand_in_is_called_loaded_and_read_like_the_class(walker):
+    assert walker.__name__ == "Walker"
+    assert walker("MlpPolicy", stride=0.7).stride == 0.7
+    assert walker.load("agent.zip", custom_objects={}, stride=0.7).stride == 0.7
+    assert walker.answer == 42
+
+
+def test_a_stand_in_refuses_a_hyperparameter_that_the_class_does_not_have(walker):
+    message = "Walker has no hyperparameter 'strid'. Did you mean 'stride'?"
+
+    with pytest.raises(TypeError, match=message.replace("?", r"\?")):
+        walker("MlpPolicy", strid=0.7)
+    with pytest.raises(TypeError, match=message.replace("?", r"\?")):
+        walker.load("agent.zip", strid=0.7)
+
+
+def test_a_stand_in_does_not_pretend_to_have_special_attributes(walker):
+    assert not hasattr(walker, "__wrapped__")
+
+
+def test_stock_algorithms_keep_their_ids():
+    stock = {"hds": "somebody else's"}
+    zoo = SimpleNamespace(ALGOS=dict(stock))
+
+    tables.EXTENSIONS["rl_zoo3.utils"](zoo)
+
+    assert zoo.ALGOS["hds"] == "somebody else's"
+    assert isinstance(zoo.ALGOS["pods"], LazyAlgorithm)
+    assert not set(tables.ALGORITHMS) & set(STOCK)
+
+
+def test_every_algorithm_is_a_public_name_with_a_file_a_sampler_and_a_converter():
+    for algo, class_name in tables.ALGORITHMS.items():
+        assert algo == algo.lower(), "the zoo's plots look for a folder in lower case"
+        assert class_name in sb3_hds.__all__
+        assert tables.hyperparams_file(algo).is_file()
+        assert algo in SAMPLERS and algo in CONVERTERS
+
+
+@pytest.mark.parametrize("algo", tables.ALGORITHMS)
+def test_a_yml_file_has_an_entry_for_every_environment_with_a_twin(algo):
+    entries = load_yml(algo)
+
+    assert set(sb3_hds.twins.all_ids()) | {"default"} == set(entries)
+    assert all(entry["n_timesteps"] > 0 for entry in entries.values())
+
+
+@pytest.mark.parametrize("algo", tables.ALGORITHMS)
+def test_every_key_of_a_yml_file_is_an_argument_of_the_algorithm(algo):
+    algorithm = LazyAlgorithm(tables.ALGORITHMS[algo]).resolve()
+    known = set(inspect.signature(algorithm.__init__).parameters) | CONSUMED_BY_THE_ZOO
+
+    for env_id, entry in load_yml(algo).items():
+        assert set(entry) <= known, env_id
+
+
+@pytest.mark.parametrize("algo", tables.ALGORITHMS)
+def test_a_trial_is_recreated_exactly_from_its_parameters(algo):
+    optuna = pytest.importorskip("optuna")
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+
+    for _ in range(20):
+        trial = study.ask()
+        sampled = SAMPLERS[algo](trial, n_actions=1, n_envs=1, additional_args={})
+        study.tell(trial, 0.0)
+        assert CONVERTERS[algo](study.trials[-1].params) == sampled
+        # The zoo writes them to config.yml, which has to be readable without this package.
+        assert yaml.safe_load(yaml.safe_dump(sampled)) == sampled
+
+
+@pytest.mark.parametrize("algo", tables.ALGORITHMS)
+def test_what_is_sampled_are_arguments_of_the_algorithm(algo):
+    optuna = pytest.importorskip("optuna")
+    algorithm = LazyAlgorithm(tables.ALGORITHMS[algo]).resolve()
+    trial = optuna.create_study().ask()
+
+    sampled = SAMPLERS[algo](trial, n_actions=1, n_envs=1, additional_args={})
+
+    assert set(sampled) <= set(inspect.signature(algorithm.__init__).parameters)
+
+
+def test_installing_twice_installs_one_finder(monkeypatch):
+    monkeypatch.setattr(sys, "meta_path", [f for f in sys.meta_path if not is_ours(f)])
+
+    hook.install()
+    hook.install()
+
+    assert sum(map(is_ours, sys.meta_path)) == 1
+
+
+def is_ours(finder: object) -> bool:
+    return type(finder).__module__ == "rl_zoo_plugin.hook"
+
+
+def test_the_hook_imports_nothing_but_itself():
+    code = "import sys; before = set(sys.modules); from rl_zoo_plugin import hook; hook.start();"
+    loaded = python(code + "print(*sorted(set(sys.modules) - before))", SB3_HDS_NO_ZOO="1")
+
+    assert set(loaded.split()) <= {"rl_zoo_plugin", "rl_zoo_plugin.hook"}
+
+
+def test_a_broken_extension_leaves_the_zoo_usable_and_says_so(monkeypatch):
+    def breaks(module):
+        raise KeyError("ALGOS")
+
+    monkeypatch.setitem(tables.EXTENSIONS, "rl_zoo3.utils", breaks)
+
+    with pytest.warns(RuntimeWarning, match=r"could not extend rl_zoo3\.utils: KeyError"):
+        hook._extend(SimpleNamespace(__name__="rl_zoo3.utils"))
+
+
+@pytest.fixture
+def fake_zoo(tmp_path) -> str:
+    """A package named rl_zoo3 with the three modules that the hook looks for, and their tables."""
+    package = tmp_path / "rl_zoo3"
+    package.mkdir()
+    (package / "__init__.py").write_text("from rl_zoo3.utils import ALGOS\n")
+    (package / "utils.py").write_text("ALGOS = {'sac': 'stock'}\n")
+    tables_of_optuna = "HYPERPARAMS_SAMPLER, HYPERPARAMS_CONVERTER = {}, {}\n"
+    (package / "hyperparams_opt.py").write_text(tables_of_optuna)
+    (package / "exp_manager.py").write_text(
+        "from rl_zoo3.utils import ALGOS\n"
+        "class ExperimentManager:\n"
+        "    def __init__(self, args, algo, env_id, config=None):\n"
+        "        self.config = config\n"
+    )
+    return str(tmp_path)
+
+
+PRINT_CONFIGS = """
+import sys
+sys.path.insert(0, {folder!r})
+{before}
+from rl_zoo_plugin import hook
+hook.install()
+from rl_zoo3.exp_manager import ALGOS, ExperimentManager
+for algo, config in (("hds", None), ("hds", "mine.yml"), ("sac", None)):
+    print(ExperimentManager(None, algo, "Pendulum-v1", config=config).config)
+print(list(ALGOS), "jax" in sys.modules, "torch" in sys.modules)
+"""
+
+
+@pytest.mark.parametrize(
+    "before", ["", "import rl_zoo3.exp_manager"], ids=["not_yet_imported", "already_imported"]
+)
+def test_a_zoo_is_extended_before_and_after_it_is_imported(fake_zoo, before):
+    code = PRINT_CONFIGS.format(folder=fake_zoo, before=before)
+    ours, users, stock, names = python(code, SB3_HDS_NO_ZOO="1").splitlines()
+
+    assert ours == str(tables.hyperparams_file("hds"))
+    assert users == "mine.yml"
+    assert stock == "None"
+    # Known by name only: neither jax nor torch is imported before an algorithm is used.
+    assert names == "['sac', 'pods', 'hds'] False False"
+
+
+def test_two_hooks_that_ask_all_finders_do_not_recurse(fake_zoo):
+    code = """
+import sys
+sys.path.insert(0, {folder!r})
+class Other:
+    def find_spec(self, name, path=None, target=None):
+        if not name.startswith("rl_zoo3"):
+            return None
+        specs = (f.find_spec(name, path, target) for f in sys.meta_path if f is not self)
+        return next(filter(None, specs), None)
+from rl_zoo_plugin import hook
+hook.install()
+sys.meta_path.insert(0, Other())
+import rl_zoo3
+print("hds" in rl_zoo3.ALGOS)
+"""
+    assert python(code.format(folder=fake_zoo), SB3_HDS_NO_ZOO="1") == "True"
+
+
+def test_the_names_in_an_error_are_those_of_the_constructor():
+    with pytest.raises(TypeError, match="It has: policy, env, stride, _init_setup_model"):
+        lazy._refuse_unknown(Walker, {"zzz": 1})
