@@ -18,6 +18,7 @@ from sb3_hds.core.linear import solve_spd
 from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.rollout import Rollout, rollout, rollout_policy
 from sb3_hds.core.signals import Actuator, Channel, Joint
+from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.core.transform import (
     TRANSFORMS,
     ActionTransform,
@@ -76,6 +77,7 @@ __all__ = [
     "SensorEffect",
     "State",
     "Tangent",
+    "Trajectories",
     "TransformedTwin",
     "Twin",
     "Velocity",

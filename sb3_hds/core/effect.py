@@ -11,7 +11,7 @@ import abc
 import copy
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 
@@ -31,6 +31,10 @@ from sb3_hds.errors import EffectError
 
 if TYPE_CHECKING:
     from sb3_hds.core.twin import Twin
+
+
+# Not `typing.Self`: the checks that the tests install on annotations cannot read it.
+_Effect = TypeVar("_Effect", bound="Effect")
 
 
 class Moment(NamedTuple):
@@ -102,14 +106,14 @@ class Effect(abc.ABC):
         }
         self._set(values)
 
-    def with_values(self, **values: float) -> Self:
+    def with_values(self: _Effect, **values: float) -> _Effect:
         """:return: the same effect with new values; equal to this one for the compiler"""
         changed = copy.copy(self)
         changed.values = dict(self.values)
         changed._set(values)
         return changed
 
-    def at(self, where: int | str) -> Self:
+    def at(self: _Effect, where: int | str) -> _Effect:
         """:return: the same effect at another joint, actuator or channel"""
         moved = copy.copy(self)
         moved.where = where

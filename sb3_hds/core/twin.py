@@ -4,7 +4,7 @@ import abc
 import copy
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
@@ -28,6 +28,10 @@ from sb3_hds.errors import ParameterError
 
 if TYPE_CHECKING:
     from sb3_hds.core.effect import Effect
+
+
+# Not `typing.Self`: the checks that the tests install on annotations cannot read it.
+_Twin = TypeVar("_Twin", bound="Twin")
 
 
 class State(NamedTuple):
@@ -104,7 +108,7 @@ class Twin(abc.ABC):
         """The current values of all parameters: what every method takes as ``params``."""
         return dict(self.values)
 
-    def with_parameters(self, **values: float) -> Self:
+    def with_parameters(self: _Twin, **values: float) -> _Twin:
         """
         :param values: new values by full name, in the units of ``parameters``
         :return: the same twin with these values; equal to this one for the compiler
@@ -122,7 +126,7 @@ class Twin(abc.ABC):
         return ExtendedTwin(self, *effects)
 
     @classmethod
-    def from_env(cls, env: Any) -> Self:
+    def from_env(cls: type[_Twin], env: Any) -> _Twin:
         """
         Read the parameters that an environment was made with.
 

@@ -1,0 +1,73 @@
+"""Episodes out of the replay buffer of Stable-Baselines3, which is read but not imported."""
+
+from typing import Any
+
+import numpy as np
+
+from sb3_hds.errors import TrajectoryError
+
+
+def episodes_in(
+    buffer: Any, action_space: Any = None, scaled: bool = True
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """
+    Follow each environment through the ring, oldest step first.
+
+    An episode ends where ``dones`` says so (timeouts included), and where the next stored
+    observation is not the one that the step led to: there the environment was reset from outside.
+    With ``optimize_memory_usage`` SB3 overwrites what an episode's last action led to, and the
+    oldest observation of a full ring: those steps are left out.
+
+    :param buffer: anything with the attributes of SB3's ``ReplayBuffer``
+    :param action_space: the box that actions are scaled back to; default: the buffer's own
+    :param scaled: whether stored actions are scaled to [-1, 1], as SB3's algorithms store them
+    :return: observations, each ``(T + 1, n_obs)``, and actions, each ``(T, n_act)``
+    :raises TrajectoryError: for spaces other than boxes of one axis, and for an empty buffer
+    """
+    if not isinstance(buffer.observations, np.ndarray) or buffer.observations.ndim != 3:
+        raise TrajectoryError(
+            "Trajectories are read from buffers of flat Box observations, "
+            f"got observations of {buffer.observation_space}."
+        )
+    shared = bool(getattr(buffer, "optimize_memory_usage", False))
+    order = _oldest_first(buffer, shared)
+    space = buffer.action_space if action_space is None else action_space
+    commands = _unscaled(buffer, space, scaled)
+    following = (order + 1) % buffer.buffer_size
+    obs, actions = [], []
+    for env in range(buffer.n_envs):
+        before = buffer.observations[order, env]
+        stored = buffer.observations[following] if shared else buffer.next_observations[order]
+        after = stored[:, env]
+        ends = (buffer.dones[order, env] > 0) | (buffer.timeouts[order, env] > 0)
+        ends[:-1] |= np.any(after[:-1] != before[1:], axis=1)
+        for steps in np.split(np.arange(len(order)), np.flatnonzero(ends) + 1):
+            if shared and len(steps) and ends[steps[-1]] and steps[-1] != len(order) - 1:
+                steps = steps[:-1]
+            if len(steps):
+                obs.append(np.concatenate([before[steps], after[steps[-1:]]]))
+                actions.append(commands[order[steps], env])
+    if not obs:
+        raise TrajectoryError("The replay buffer holds no step yet. Collect some first.")
+    return obs, actions
+
+
+def _oldest_first(buffer: Any, shared: bool) -> np.ndarray:
+    if not buffer.full:
+        return np.arange(buffer.pos)
+    return (buffer.pos + np.arange(int(shared), buffer.buffer_size)) % buffer.buffer_size
+
+
+def _unscaled(buffer: Any, space: Any, scaled: bool) -> np.ndarray:
+    """Actions in the units of the action space; the inverse of SB3's ``policy.scale_action``."""
+    low, high = getattr(space, "low", None), getattr(space, "high", None)
+    if low is None or high is None or not (np.all(np.isfinite(low)) and np.all(np.isfinite(high))):
+        raise TrajectoryError(
+            f"Actions must come from a Box with finite limits, got {space}. "
+            "Pass the box that they were scaled from: action_space=..."
+        )
+    stored = buffer.actions.astype(np.float64)
+    if not scaled:
+        return stored
+    low, high = np.ravel(low).astype(np.float64), np.ravel(high).astype(np.float64)
+    return low + 0.5 * (stored + 1.0) * (high - low)

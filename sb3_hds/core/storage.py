@@ -1,0 +1,77 @@
+"""Arrays in a file: all of them or none, and never a pickle."""
+
+import contextlib
+import os
+import secrets
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_hds.errors import TrajectoryError
+
+_SUFFIX = ".npz"
+
+
+def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> Path:
+    """
+    Write under a temporary name in the same folder, then rename: a reader never sees half a file.
+
+    :param path: ``.npz`` is appended where it is missing, as numpy does
+    :param arrays: by name; none may hold objects
+    :return: the path of the file
+    :raises TrajectoryError: if the file cannot be written; an older file there is left as it was
+    """
+    target = Path(path)
+    if target.suffix != _SUFFIX:
+        target = target.with_name(target.name + _SUFFIX)
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
+    try:
+        try:
+            with temporary.open("xb") as file:
+                np.savez_compressed(file, **arrays)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, target)
+        finally:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+    except OSError as error:
+        raise TrajectoryError(
+            f"'{target}' could not be written: {error.strerror}. "
+            "The folder must exist and be writable, with space left on the disk."
+        ) from error
+    return target
+
+
+def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """
+    :param path: as given to :func:`write_npz`
+    :return: all arrays, by name
+    :raises TrajectoryError: if there is no such file, or if it is damaged or of another kind
+    """
+    source = Path(path)
+    if not source.exists() and source.with_name(source.name + _SUFFIX).exists():
+        source = source.with_name(source.name + _SUFFIX)
+    if source.suffix != _SUFFIX:
+        raise TrajectoryError(
+            f"'{source}' cannot be read: files that end in {_SUFFIX} can, "
+            f"not those that end in '{source.suffix}'. "
+            "Read other files yourself and use Trajectories.from_arrays."
+        )
+    if not source.is_file():
+        raise TrajectoryError(f"There is no file '{source}' (in {Path.cwd()}).")
+    try:
+        archive = np.load(source, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ValueError("it holds a single array")
+        with archive:
+            return {name: np.asarray(archive[name]) for name in archive.files}
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        raise TrajectoryError(
+            f"'{source}' is damaged or was not written by Trajectories.save ({error}). "
+            "Restore it from a copy, or record it again."
+        ) from error
