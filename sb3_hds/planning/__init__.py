@@ -10,7 +10,7 @@ from sb3_hds.planning.expansion import Expansion, expand
 from sb3_hds.planning.first_order import control_gradient, gradient_ascent
 from sb3_hds.planning.ilqr import gauss_newton, ilqr, newton_direction
 from sb3_hds.planning.line_search import choose, step_sizes
-from sb3_hds.planning.problem import Plan, Problem, score, simulate
+from sb3_hds.planning.problem import Plan, Problem, follow, score, simulate
 from sb3_hds.planning.receding_horizon import receding_horizon
 from sb3_hds.planning.riccati import Gains, solve_backward
 from sb3_hds.planning.warm_start import (
@@ -30,6 +30,7 @@ __all__ = [
     "choose",
     "control_gradient",
     "expand",
+    "follow",
     "gauss_newton",
     "gradient_ascent",
     "horizon_continuation",

@@ -7,7 +7,7 @@ from jaxtyping import PRNGKeyArray
 from sb3_hds.core import Flag, Scalar, State
 from sb3_hds.planning.expansion import expand
 from sb3_hds.planning.line_search import choose, climb, step_sizes
-from sb3_hds.planning.problem import Controls, Plan, Problem, score, simulate
+from sb3_hds.planning.problem import Controls, Plan, Problem, assemble, simulate
 from sb3_hds.planning.riccati import Gains, solve_backward
 
 _LEAST_REGULARISATION = 1e-6
@@ -118,13 +118,8 @@ def _follow(problem: Problem, start: State, plan: Plan, gains: Gains, step: Scal
         return (after, still), (state, alive, jnp.where(alive, reward, 0.0), control)
 
     stages = (reference, plan.controls, gains.feedforward, feedback)
-    (end, alive), (states, lived, rewards, controls) = jax.lax.scan(
-        advance, (start, plan.alive[0]), stages
-    )
-    states = jax.tree.map(lambda path, last: jnp.concatenate([path, last[None]]), states, end)
-    lived = jnp.append(lived, alive)
-    value = score(problem, rewards, lived, problem.value_at_end(end))
-    return Plan(controls, states, rewards, lived, value)
+    (end, alive), taken = jax.lax.scan(advance, (start, plan.alive[0]), stages)
+    return assemble(problem, end, alive, *taken)
 
 
 def _all_finite(gains: Gains) -> Flag:

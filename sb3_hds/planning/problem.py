@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -100,17 +100,48 @@ class Problem:
 
 def simulate(problem: Problem, start: State, controls: Controls) -> Plan:
     """Roll out a control sequence and score it."""
+    return _roll(problem, start, lambda state, control: control, controls, controls.shape[0])
 
-    def advance(carry: tuple[State, Flag], control: Control) -> tuple[tuple[State, Flag], tuple]:
+
+def follow(problem: Problem, start: State, policy: Callable[[Obs], Control], n_steps: int) -> Plan:
+    """
+    Roll out a policy and score what it does.
+
+    :param policy: observation of the twin to control; clipped to [-1, 1]
+    :param n_steps: length of the plan
+    """
+
+    def decide(state: State, _: None) -> Control:
+        return jnp.clip(policy(problem.observe(state)), -1.0, 1.0)
+
+    return _roll(problem, start, decide, None, n_steps)
+
+
+def _roll(problem: Problem, start: State, decide: Callable, inputs: Any, length: int) -> Plan:
+    def advance(carry: tuple[State, Flag], given: Any):
         state, alive = carry
+        control = decide(state, given)
         after, reward = problem.step(state, control)
         still = alive & ~problem.terminated(after)
-        return (after, still), (state, alive, jnp.where(alive, reward, 0.0))
+        return (after, still), (state, alive, jnp.where(alive, reward, 0.0), control)
 
-    alive = ~problem.terminated(start)
-    (end, alive), (states, lived, rewards) = jax.lax.scan(advance, (start, alive), controls)
+    first = (start, ~problem.terminated(start))
+    (end, alive), taken = jax.lax.scan(advance, first, inputs, length=length)
+    return assemble(problem, end, alive, *taken)
+
+
+def assemble(
+    problem: Problem,
+    end: State,
+    alive_at_end: Flag,
+    states: State,
+    alive: Bool[Array, " horizon"],
+    rewards: Float[Array, " horizon"],
+    controls: Controls,
+) -> Plan:
+    """:return: the plan made of the steps taken and the state reached, scored"""
     states = jax.tree.map(lambda path, last: jnp.concatenate([path, last[None]]), states, end)
-    lived = jnp.append(lived, alive)
+    lived = jnp.append(alive, alive_at_end)
     value = score(problem, rewards, lived, problem.value_at_end(end))
     return Plan(controls, states, rewards, lived, value)
 

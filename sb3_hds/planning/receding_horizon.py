@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from sb3_hds.core import Flag, State
-from sb3_hds.planning.problem import Controls, Plan, Problem, score
+from sb3_hds.planning.problem import Controls, Plan, Problem, assemble
 
 
 def receding_horizon(
@@ -44,7 +44,7 @@ def receding_horizon(
         rewards = jnp.where(lived[:-1], plan.rewards[:replan_every], 0.0)
         repeated = jnp.broadcast_to(plan.controls[-1:], (replan_every, plan.controls.shape[1]))
         shifted = jnp.concatenate([plan.controls[replan_every:], repeated])
-        taken = (plan.controls[:replan_every], done, rewards, lived[:-1])
+        taken = (done, lived[:-1], rewards, plan.controls[:replan_every])
         return (after, lived[-1], shifted), taken
 
     alive = ~problem.terminated(start)
@@ -52,8 +52,4 @@ def receding_horizon(
         act, (start, alive, initial), None, length=n_steps // replan_every
     )
     merge = lambda leaf: leaf.reshape(n_steps, *leaf.shape[2:])  # noqa: E731
-    controls, states, rewards, lived = jax.tree.map(merge, taken)
-    states = jax.tree.map(lambda path, last: jnp.concatenate([path, last[None]]), states, end)
-    lived = jnp.append(lived, alive)
-    value = score(problem, rewards, lived, problem.value_at_end(end))
-    return Plan(controls, states, rewards, lived, value)
+    return assemble(problem, end, alive, *jax.tree.map(merge, taken))

@@ -1,0 +1,261 @@
+"""
+One planning epoch as a pure function: roll the policy out in the twin, improve the plans, keep what is
+better, regress the policy on it, move on.
+
+The stateful shell around it is ``twin_algorithm.py``. Nothing here knows an environment's name.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from sb3_hds.algos.learner import Knobs, Learner, Settings, problem_of, resets
+from sb3_hds.algos.regression import regress, remember, samples_of
+from sb3_hds.core import Obs, State
+from sb3_hds.planning import (
+    Plan,
+    Problem,
+    best_of_random,
+    follow,
+    gauss_newton,
+    gradient_ascent,
+    ilqr,
+    score,
+)
+from sb3_hds.planning.problem import Control, Controls
+
+PLANNERS = ("first_order", "gauss_newton", "ilqr")
+# By this much, in units of the objective, the plan that began as the policy's own is preferred.
+_TIE = 1e-3
+# Episode length where a twin declares none.
+_LONG_EPISODE = 1000
+
+
+class Report(NamedTuple):
+    """
+    What an epoch tells. Returns are discounted planning rewards, in the reward's own unit.
+
+    :param before: mean return of the policy's own plans
+    :param after: mean return of the plans that were kept
+    :param worsened: number of kept plans that are worse than the policy's own
+    :param policy_loss: mean regression loss of the epoch
+    :param value_loss: mean regression loss of the value
+    :param dropped: number of samples that were not finite
+    """
+
+    before: jax.Array
+    after: jax.Array
+    worsened: jax.Array
+    policy_loss: jax.Array
+    value_loss: jax.Array
+    dropped: jax.Array
+
+
+class Choice(NamedTuple):
+    """
+    The plans of one epoch; leaves of shape ``(n_rollouts, ...)``.
+
+    :param own: what the policy does
+    :param kept: what is learned from
+    :param tails: value of the last state of ``kept``
+    :param sensitivity: cost of an error of each control of ``kept``
+    """
+
+    own: Plan
+    kept: Plan
+    tails: Float[Array, " rollouts"]
+    sensitivity: Float[Array, "rollouts horizon"]
+
+
+@partial(jax.jit, static_argnums=0)
+def epoch(settings: Settings, learner: Learner, knobs: Knobs) -> tuple[Learner, Report]:
+    """
+    Plan from every start state, keep what is better than the policy, regress on it, move on.
+
+    :return: the learner after the epoch, and what happened
+    """
+    key = jax.random.wrap_key_data(learner.progress.key, impl="unsafe_rbg")
+    key, k_plan, k_regress, k_move = jax.random.split(key, 4)
+    problem = problem_of(settings, learner, knobs)
+    seen = jax.vmap(lambda obs: settings.twin.infer(obs, knobs.params))(knobs.visited)
+    starts = _where(knobs.relabel, seen, learner.workspace.starts)
+
+    choice = _plan(settings, learner, knobs, problem, starts, k_plan)
+    gain = jnp.maximum(choice.kept.value - choice.own.value, 0.0)
+    samples, finite = samples_of(
+        knobs, problem, choice.kept, choice.tails, gain, choice.sensitivity
+    )
+    moved, ages = _move_on(settings, learner, knobs, problem, starts, k_move)
+    learner = remember(settings, learner, samples)
+    learner, losses = regress(settings, learner, knobs, k_regress)
+
+    report = _report(settings, learner, choice, finite, losses)
+    progress = learner.progress._replace(
+        gain=_mean(gain, finite),
+        n_epochs=learner.progress.n_epochs + 1,
+        key=jax.random.key_data(key),
+    )
+    workspace = learner.workspace._replace(starts=moved, ages=ages)
+    return learner._replace(progress=progress, workspace=workspace), report
+
+
+def control_of(settings: Settings, learner: Learner, knobs: Knobs, obs: Obs) -> Control:
+    """:return: what the policy in training does for an observation of the twin"""
+    seen = learner.networks.inside(knobs.view(obs))
+    return settings.actor.apply(learner.networks.actor, seen)
+
+
+def twin_steps_per_epoch(settings: Settings) -> int:
+    """
+    :return: simulated steps of one epoch, line searches included; a Jacobian counts one step for each of
+        its columns besides the step itself, as many as finite differences would take
+    """
+    s = settings
+    columns = 2 * len(s.twin.joints) + len(s.twin.actuators)
+    improving = s.n_iterations * s.horizon * (1 + columns + s.n_step_sizes)
+    n_sources = 2 if s.n_candidates else 1
+    planning = s.horizon * (1 + s.n_candidates) + n_sources * (s.horizon + improving)
+    return s.n_rollouts * (planning + (n_sources + 1) * s.lookahead + s.advance)
+
+
+def _plan(
+    settings: Settings,
+    learner: Learner,
+    knobs: Knobs,
+    problem: Problem,
+    starts: State,
+    key: PRNGKeyArray,
+) -> Choice:
+    """The policy's own plans, and for each start state the plan that is kept."""
+    k_random, k_improve = jax.random.split(key)
+    policy = partial(control_of, settings, learner, knobs)
+    own = jax.vmap(lambda start: follow(problem, start, policy, settings.horizon))(starts)
+    sources = [own.controls]
+    if settings.n_candidates:
+        keys = jax.random.split(k_random, settings.n_rollouts)
+        search = lambda s, k: best_of_random(problem, s, k, settings.horizon, settings.n_candidates)  # noqa: E731
+        sources.append(jax.vmap(search)(starts, keys).controls)
+    improved, sensitivity = _improve(settings, learner, knobs, problem, starts, sources, k_improve)
+
+    plans = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), improved, own)
+    ends = jax.tree.map(lambda leaf: leaf[:, :, -1], plans.states)
+    tails = jax.vmap(jax.vmap(lambda end: _tail(settings, problem, policy, end)))(ends)
+    values = jax.vmap(jax.vmap(lambda p, tail: score(problem, p.rewards, p.alive, tail)))(
+        plans, tails
+    )
+    plans = plans._replace(value=values)
+
+    last = len(sources)
+    best = jnp.argmax(values[:last].at[0].add(_TIE), axis=0)
+    kept = best if settings.annealed else jnp.where(_pick(values, best) > values[last], best, last)
+    return Choice(
+        own._replace(value=values[last]),
+        _pick(plans, kept),
+        _pick(tails, kept),
+        _pick(sensitivity, best),
+    )
+
+
+def _improve(
+    settings: Settings,
+    learner: Learner,
+    knobs: Knobs,
+    problem: Problem,
+    starts: State,
+    sources: list[Float[Array, "rollouts horizon act"]],
+    key: PRNGKeyArray,
+) -> tuple[Plan, Float[Array, "sources rollouts horizon"]]:
+    """Improve every source of plans; leaves of shape ``(n_sources, n_rollouts, ...)``."""
+    n, n_sources = settings.n_rollouts, len(sources)
+    discounts = settings.discount ** jnp.arange(settings.horizon)
+    temperature = knobs.temperature * learner.progress.gain
+
+    def one(start: State, controls: Controls, key: PRNGKeyArray | None):
+        options = {
+            "n_iterations": settings.n_iterations,
+            "n_step_sizes": settings.n_step_sizes,
+            "temperature": temperature,
+            "key": key,
+        }
+        if settings.planner == "ilqr":
+            plan, gains = ilqr(problem, start, controls, **options)
+            return plan, jnp.sqrt(gains.sensitivity / discounts)
+        improver = gradient_ascent if settings.planner == "first_order" else gauss_newton
+        return improver(problem, start, controls, **options), jnp.ones(settings.horizon)
+
+    keys = jax.random.split(key, n_sources * n) if settings.annealed else None
+    many = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * n_sources), starts)
+    together = jax.vmap(one, (0, 0, None if keys is None else 0))
+    plans, sensitivity = together(many, jnp.concatenate(sources), keys)
+    split = lambda leaf: leaf.reshape(n_sources, n, *leaf.shape[1:])  # noqa: E731
+    return jax.tree.map(split, plans), split(sensitivity)
+
+
+def _tail(settings: Settings, problem: Problem, policy, end: State) -> jax.Array:
+    """Value of a plan's end by what the policy makes of it, so that errors of V are not exploited."""
+    if not settings.lookahead:
+        return problem.value_at_end(end)
+    return follow(problem, end, policy, settings.lookahead).value
+
+
+def _move_on(
+    settings: Settings,
+    learner: Learner,
+    knobs: Knobs,
+    problem: Problem,
+    starts: State,
+    key: PRNGKeyArray,
+) -> tuple[State, Float[Array, " rollouts"]]:
+    """The next start states: where the policy goes with exploration noise, or a reset."""
+    n = settings.n_rollouts
+    k_noise, k_reset, k_draw = jax.random.split(key, 3)
+    fresh = resets(settings.twin, knobs.params, k_draw, n)
+    if not settings.advance:
+        return fresh, jnp.zeros(n)
+    offsets = knobs.noise * jax.random.normal(k_noise, (n, problem.n_controls))
+
+    def wander(start: State, offset: Control) -> Plan:
+        policy = lambda obs: control_of(settings, learner, knobs, obs) + offset  # noqa: E731
+        return follow(problem, start, policy, settings.advance)
+
+    paths = jax.vmap(wander)(starts, offsets)
+    moved = jax.tree.map(lambda leaf: leaf[:, -1], paths.states)
+    ages = learner.workspace.ages + settings.advance
+    finite = jnp.isfinite(moved.q).all(1) & jnp.isfinite(moved.v).all(1)
+    too_old = ages >= (settings.twin.max_episode_steps or _LONG_EPISODE)
+    drawn = jax.random.uniform(k_reset, (n,)) < knobs.reset_share
+    again = too_old | drawn | ~paths.alive[:, -1] | ~finite
+    return _where(again, fresh, moved), jnp.where(again, 0.0, ages)
+
+
+def _report(settings: Settings, learner: Learner, choice: Choice, finite, losses) -> Report:
+    forever = 1.0 / (1.0 - settings.discount) if settings.discount < 1.0 else settings.horizon
+    progress = learner.progress
+    unit = lambda value: value / progress.reward_scale + progress.reward_offset * forever  # noqa: E731
+    both = finite & jnp.isfinite(choice.own.value)
+    return Report(
+        unit(_mean(choice.own.value, both)),
+        unit(_mean(choice.kept.value, both)),
+        jnp.sum(choice.kept.value < choice.own.value),
+        losses[0],
+        losses[1],
+        jnp.sum(~finite) * settings.horizon,
+    )
+
+
+def _mean(values: jax.Array, counted: jax.Array) -> jax.Array:
+    return jnp.sum(jnp.where(counted, values, 0.0)) / jnp.maximum(jnp.sum(counted), 1)
+
+
+def _pick(tree, index):
+    """From leaves of shape ``(sources, n, ...)`` take source ``index[i]`` for each i."""
+    return jax.tree.map(lambda leaf: leaf[index, jnp.arange(index.shape[0])], tree)
+
+
+def _where(condition, new, old):
+    """Choose row by row."""
+    rows = lambda leaf: condition.reshape(-1, *[1] * (leaf.ndim - 1))  # noqa: E731
+    return jax.tree.map(lambda a, b: jnp.where(rows(a), a, b), new, old)

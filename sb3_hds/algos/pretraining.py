@@ -1,0 +1,47 @@
+"""Planning epochs before the first real step."""
+
+from typing import TYPE_CHECKING
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+if TYPE_CHECKING:
+    from sb3_hds.algos.twin_algorithm import TwinAlgorithm
+
+# Log lines written during pretraining.
+_N_LOGS = 10
+
+
+class Pretraining(BaseCallback):
+    """
+    Runs the planning epochs that are due when training starts, so that everything SB3 sets up for
+    ``learn`` (logger, other callbacks, environment) is there. Interrupted, it leaves a model that goes on
+    where it stopped.
+
+    :param progress_bar: whether to show one
+    """
+
+    def __init__(self, progress_bar: bool) -> None:
+        super().__init__()
+        self.progress_bar = progress_bar
+
+    def _on_training_start(self) -> None:
+        model: TwinAlgorithm = self.model  # type: ignore[assignment]
+        due = model.pretrain_epochs - model.n_pretrained
+        if due <= 0:
+            return
+        every = max(1, due // _N_LOGS)
+        for i in self._shown(range(1, due + 1)):
+            model.run_epoch(model.gradient_steps)
+            model.n_pretrained += 1
+            if i % every == 0 or i == due:
+                model.logger.dump(step=model.num_timesteps)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _shown(self, epochs: range):
+        if not self.progress_bar:
+            return epochs
+        from rich.progress import track
+
+        return track(epochs, description="planning in the twin")

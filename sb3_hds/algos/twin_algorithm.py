@@ -1,0 +1,467 @@
+"""
+The shell of every algorithm that learns through a twin.
+
+SB3 collects real steps and calls ``train``; a call of ``train`` is one planning epoch in the twin (the
+pure function in ``epoch.py``). A timestep is a step of the environment that the user passed in, nothing
+else; simulated steps are counted apart.
+"""
+
+import math
+import warnings
+from typing import Any, ClassVar, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from sbx.common.off_policy_algorithm import OffPolicyAlgorithmJax
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+
+from sb3_hds import effects, twins
+from sb3_hds.algos.call_forms import jax_device, policy_and_env
+from sb3_hds.algos.epoch import PLANNERS, Report, epoch, twin_steps_per_epoch
+from sb3_hds.algos.learner import Knobs, Learner, Settings, Workspace, find_scales, fresh_workspace
+from sb3_hds.algos.normalisation import prepare_statistics, view_of
+from sb3_hds.algos.pretraining import Pretraining
+from sb3_hds.algos.twin_policy import TwinPolicy
+from sb3_hds.core import Twin
+from sb3_hds.envs.mirror import check_mirrors, twin_of
+from sb3_hds.errors import NoTwinError, RewardError
+
+# A plan looks this far ahead where the horizon is derived [s], within these numbers of steps.
+_HORIZON = 0.6
+_SHORTEST, _LONGEST = 12, 32
+# How many horizons the policy is followed beyond the end of a plan, where that is derived.
+_LOOKAHEAD = 5
+# Steps of an episode where the twin declares no limit; only for planning a schedule.
+_LONG_EPISODE = 1000
+
+
+class TwinAlgorithm(OffPolicyAlgorithmJax):
+    """
+    Abstract: what PODS and HDS share. Arguments are documented there.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": TwinPolicy}
+    default_timesteps: ClassVar[int] = 1_000
+    policy: TwinPolicy
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] | GymEnv,
+        env: GymEnv | str | None,
+        *,
+        learning_rate: float | Schedule,
+        value_learning_rate: float | str | Schedule | None,
+        buffer_size: int,
+        learning_starts: int,
+        batch_size: int,
+        gamma: float,
+        train_freq: int | tuple[int, str],
+        gradient_steps: int,
+        action_noise: ActionNoise | None,
+        replay_buffer_class: type[ReplayBuffer] | None,
+        replay_buffer_kwargs: dict[str, Any] | None,
+        optimize_memory_usage: bool,
+        twin: Twin | str | None,
+        pretrain_epochs: int,
+        n_rollouts: int,
+        horizon: int | None,
+        order: int,
+        planner: str | None,
+        n_iterations: int,
+        n_step_sizes: int,
+        n_random_plans: int,
+        lookahead: int | None,
+        terminal_value: bool,
+        reset_share: float,
+        exploration_noise: float,
+        exploration_decay: float,
+        temperature: float,
+        temperature_decay: float,
+        relabel_share: float,
+        plan_memory: int,
+        loss: str,
+        gain_weight: float,
+        sensitivity_weight: float,
+        averaging: float,
+        policy_kwargs: dict[str, Any] | None,
+        stats_window_size: int,
+        tensorboard_log: str | None,
+        verbose: int,
+        device: str,
+        seed: int | None,
+        monitor_wrapper: bool,
+        _init_setup_model: bool,
+    ) -> None:
+        policy, env = policy_and_env(policy, env, self.policy_aliases)
+        super().__init__(
+            policy=policy,
+            env=env,
+            learning_rate=learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            seed=seed,
+            monitor_wrapper=monitor_wrapper,
+            sde_support=False,
+            supported_action_spaces=(spaces.Box,),
+            support_multi_env=True,
+        )
+        self.value_learning_rate = value_learning_rate
+        self.twin = twin
+        self.twin_spec: dict[str, Any] | None = None
+        self.pretrain_epochs = pretrain_epochs
+        self.n_rollouts = n_rollouts
+        self.horizon = horizon
+        self.order = order
+        self.planner = planner
+        self.n_iterations = n_iterations
+        self.n_step_sizes = n_step_sizes
+        self.n_random_plans = n_random_plans
+        self.lookahead = lookahead
+        self.terminal_value = terminal_value
+        self.reset_share = reset_share
+        self.exploration_noise = exploration_noise
+        self.exploration_decay = exploration_decay
+        self.temperature = temperature
+        self.temperature_decay = temperature_decay
+        self.relabel_share = relabel_share
+        self.plan_memory = plan_memory
+        self.loss = loss
+        self.gain_weight = gain_weight
+        self.sensitivity_weight = sensitivity_weight
+        self.averaging = averaging
+        self.n_pretrained = 0
+        self.twin_timesteps = 0
+        self._n_updates = 0
+        self._epochs_planned, self._epochs_done = 0, 0
+        self._device_name = str(device)
+        self._workspace: Workspace | None = None
+        if _init_setup_model:
+            self._setup_model()
+
+    def learn(  # type: ignore[override]
+        self,
+        total_timesteps: int | None = None,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """
+        Plan in the twin until the pretraining is done, then act in the environment and plan on.
+
+        :param total_timesteps: steps of the *environment*; default ``default_timesteps``. With 0, only
+            the pretraining runs, and the environment is not stepped.
+        :param callback: called at every step of the environment
+        :param log_interval: episodes between two log lines
+        :param tb_log_name: name of the run for TensorBoard; default: the class's name
+        :param reset_num_timesteps: False goes on counting
+        :param progress_bar: show one for planning and one for acting
+        """
+        if total_timesteps is None:
+            total_timesteps = self.default_timesteps
+        return super().learn(
+            total_timesteps,
+            callback,
+            log_interval,  # type: ignore[arg-type]
+            tb_log_name or type(self).__name__,
+            reset_num_timesteps,
+            progress_bar,
+        )
+
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        """One planning epoch with ``gradient_steps`` regression steps. SB3 calls it while it collects."""
+        self.run_epoch(gradient_steps)
+
+    def run_epoch(self, gradient_steps: int) -> Report:
+        """
+        Improve plans in the twin and regress the policy on them, once.
+
+        :param gradient_steps: regression steps
+        :return: what happened, on the device
+        :raises NoTwinError: if the model was loaded without environment and without twin
+        :raises FloatingPointError: if the regression diverged; the model keeps its last good state
+        """
+        learner, settings, knobs = self._learner(), self._settings, self._knobs(gradient_steps)
+        learner, report = epoch(settings, learner, knobs)
+        losses = float(report.policy_loss), float(report.value_loss)
+        if not all(map(math.isfinite, losses)):
+            raise FloatingPointError(
+                f"The regression diverged (losses {losses}); the model keeps the state before this "
+                "epoch. Lower learning_rate."
+            )
+        self.policy.networks, self.policy.progress = learner.networks, learner.progress
+        self._workspace = learner.workspace
+        self._n_updates += gradient_steps
+        self._epochs_done += 1
+        self.twin_timesteps += twin_steps_per_epoch(settings)
+        self._log(report, knobs)
+        return report
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        super().set_env(env, force_reset)
+        self._meet_env()
+
+    def _setup_model(self) -> None:
+        _check_arguments(self)
+        super()._setup_model()
+        device = jax_device(self._device_name)
+        self.policy = self.policy_class(  # type: ignore[assignment]
+            self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
+        )
+        seed = int(np.asarray(self.key)[-1])
+        self.policy.build(jax.random.key(seed, impl="unsafe_rbg"), device)
+        self._workspace = None
+        self._setup_twin()
+
+    def _setup_twin(self) -> None:
+        """The twin that was passed, or saved because it had been passed, or the environment's own."""
+        if isinstance(self.twin, str):
+            self.twin = twins.make(self.twin)
+        elif self.twin is None and self.twin_spec is not None:
+            self.twin = _twin_from_file(self.twin_spec)
+        if self.twin is not None:
+            self.twin_spec = self.twin.to_spec()
+        self._meet_env()
+
+    def _meet_env(self) -> None:
+        if self.env is not None:
+            if self.twin_spec is None:
+                self.twin = twin_of(self.env)
+            elif self.twin is not None:
+                check_mirrors(self.env, self.twin)
+        if self.twin is not None:
+            check_reward(self.twin)
+
+    @property
+    def _settings(self) -> Settings:
+        if self.twin is None:
+            raise NoTwinError(
+                "This model has no twin to plan in. Set an environment that has one (set_env), or load "
+                "it with one: load(path, twin=...)."
+            )
+        horizon = self.horizon or _derived_horizon(self.twin)
+        return Settings(
+            twin=self.twin,
+            actor=self.policy.actor_network,
+            value=self.policy.value_network,
+            n_rollouts=self.n_rollouts,
+            horizon=horizon,
+            lookahead=_LOOKAHEAD * horizon if self.lookahead is None else self.lookahead,
+            advance=(horizon + 1) // 2 if self.reset_share < 1.0 else 0,
+            planner=self.planner or ("first_order" if self.order == 1 else "ilqr"),
+            n_iterations=self.n_iterations,
+            n_step_sizes=self.n_step_sizes,
+            n_candidates=self.n_random_plans,
+            discount=self.gamma,
+            terminal_value=self.terminal_value,
+            plan_memory=self.plan_memory,
+            batch_size=self.batch_size,
+            squared_error=self.loss == "squared",
+            max_grad_norm=self.policy.max_grad_norm,
+            annealed=self.temperature > 0.0,
+        )
+
+    def _learner(self) -> Learner:
+        """Networks and training state of the policy, with a workspace; scales are found before the first epoch."""
+        settings, policy = self._settings, self.policy
+        if self._workspace is None:
+            n_obs = len(settings.twin.channels)
+            key = jax.random.wrap_key_data(policy.progress.key, impl="unsafe_rbg")
+            key, k_starts, k_scales = jax.random.split(key, 3)
+            params = settings.twin.params
+            self._workspace = fresh_workspace(settings, n_obs, params, k_starts)
+            progress = policy.progress._replace(key=jax.random.key_data(key))
+            if int(progress.n_epochs) == 0:
+                prepare_statistics(self._vec_normalize_env, settings.twin, k_scales)
+                view = view_of(self._vec_normalize_env, n_obs)
+                starts = self._workspace.starts
+                inside, scale, offset = find_scales(settings, params, view, starts, k_scales)
+                policy.networks = policy.networks._replace(inside=inside)
+                progress = progress._replace(reward_scale=scale, reward_offset=offset)
+            policy.progress = progress
+        return Learner(policy.networks, policy.progress, self._workspace)
+
+    def _knobs(self, gradient_steps: int) -> Knobs:
+        twin, n_epochs = self._settings.twin, int(self.policy.progress.n_epochs)
+        n_obs = len(twin.channels)
+        progress = self._progress_remaining()
+        rate = self.lr_schedule(progress)
+        value_rate = rate
+        if self.value_learning_rate is not None:
+            value_rate = schedule_of(self.value_learning_rate)(progress)
+        visited, relabel = self._visited(n_obs)
+        return Knobs(
+            twin.params,
+            rate,
+            value_rate,
+            self.exploration_noise * self.exploration_decay**n_epochs,
+            self.temperature * self.temperature_decay**n_epochs,
+            self.reset_share,
+            self.gain_weight,
+            self.sensitivity_weight,
+            self.averaging,
+            gradient_steps,
+            visited,
+            relabel,
+            view_of(self._vec_normalize_env, n_obs),
+        )
+
+    def _visited(self, n_obs: int) -> tuple[jax.Array, jax.Array]:
+        """Observations of the real environment to plan from, and for which start states."""
+        buffer, n = self.replay_buffer, self.n_rollouts
+        stored = 0 if buffer is None else buffer.size()
+        count = int(round(self.relabel_share * n)) if stored else 0
+        visited = np.zeros((n, n_obs), np.float32)
+        if count:
+            steps = np.random.randint(stored, size=count)
+            copies = np.random.randint(buffer.n_envs, size=count)
+            visited[:count] = buffer.observations[steps, copies].reshape(count, n_obs)
+        return jnp.asarray(visited), jnp.arange(n) < count
+
+    def _progress_remaining(self) -> float:
+        """From 1 to 0 over the planning epochs of this call of ``learn``, pretraining included."""
+        if not self._epochs_planned:
+            return 1.0
+        return max(0.0, 1.0 - self._epochs_done / self._epochs_planned)
+
+    def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any):
+        total_timesteps, callback = super()._setup_learn(total_timesteps, *args, **kwargs)
+        assert isinstance(self.train_freq, TrainFreq)
+        steps = total_timesteps - self.num_timesteps
+        if self.train_freq.unit.value == "step":
+            per_epoch = self.train_freq.frequency * self.n_envs
+        else:
+            limit = self.twin.max_episode_steps if self.twin is not None else None
+            per_epoch = self.train_freq.frequency * (limit or _LONG_EPISODE)
+        pending = max(0, self.pretrain_epochs - self.n_pretrained)
+        self._epochs_planned, self._epochs_done = pending + math.ceil(steps / per_epoch), 0
+        return total_timesteps, callback
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        callback = super()._init_callback(callback, progress_bar)
+        together = CallbackList([Pretraining(progress_bar), callback])
+        together.init_callback(self)
+        return together
+
+    def _log(self, report: Report, knobs: Knobs) -> None:
+        record = self.logger.record
+        record("train/learning_rate", knobs.learning_rate)
+        record("train/plan_return_before", float(report.before))
+        record("train/plan_return_after", float(report.after))
+        record("train/policy_loss", float(report.policy_loss))
+        record("train/value_loss", float(report.value_loss))
+        record("train/worsened_plans", int(report.worsened))
+        record("train/dropped_samples", int(report.dropped))
+        record("train/exploration_noise", knobs.noise)
+        record("train/temperature", knobs.temperature)
+        record("train/n_updates", self._n_updates, exclude="tensorboard")
+        record("time/epochs", int(self.policy.progress.n_epochs))
+        record("time/twin_timesteps", self.twin_timesteps)
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer"], []
+
+    def _excluded_save_params(self) -> list[str]:
+        ours = ["policy", "twin", "key", "_workspace", "_device_name"]
+        return [*super()._excluded_save_params(), *ours]
+
+
+def check_reward(twin: Twin) -> None:
+    """
+    :raises RewardError: if planning has nothing to climb in this twin
+    """
+    base = getattr(twin, "base", twin)
+    surrogate = type(base).planning_reward is not Twin.planning_reward
+    if not surrogate and type(base).reward is Twin.reward:
+        raise RewardError(
+            f"{twin.name} has no reward: it simulates a system without a task. Implement `reward`."
+        )
+    if not surrogate and not base.reward_has_gradient:
+        raise RewardError(
+            f"The reward of {twin.name} is flat almost everywhere, so its gradient tells nothing. "
+            "Implement `planning_reward`: a smooth surrogate that is best where the reward is best."
+        )
+
+
+def schedule_of(rate: float | str | Schedule) -> Schedule:
+    """
+    :param rate: a number, a function of the remaining progress (from 1 to 0), or the zoo's ``"lin_3e-3"``
+    :raises ValueError: for any other string
+    """
+    if not isinstance(rate, str):
+        return FloatSchedule(rate)
+    kind, _, start = rate.partition("_")
+    try:
+        return (
+            FloatSchedule(LinearSchedule(float(start), 0.0, 1.0))
+            if kind == "lin"
+            else FloatSchedule(float(rate))
+        )
+    except ValueError:
+        raise ValueError(
+            f"A learning rate is a number, a schedule or 'lin_NUMBER', got {rate!r}."
+        ) from None
+
+
+def _derived_horizon(twin: Twin) -> int:
+    return int(np.clip(round(_HORIZON / twin.dt), _SHORTEST, _LONGEST))
+
+
+def _twin_from_file(spec: dict[str, Any]) -> Twin | None:
+    try:
+        return twins.from_spec(spec, effects.ALL)
+    except NoTwinError as error:
+        warnings.warn(
+            f"The model can predict but not train, because its twin '{spec['twin']}' is not registered "
+            f"here. Register it, or load with twin=... ({str(error).splitlines()[0]})"
+        )
+        return None
+
+
+def _check_arguments(model: TwinAlgorithm) -> None:
+    """Everything that would otherwise fail inside a compiled program."""
+    rules = {
+        "n_rollouts": model.n_rollouts >= 1,
+        "horizon": model.horizon is None or model.horizon >= 1,
+        "lookahead": model.lookahead is None or model.lookahead >= 0,
+        "order": model.order in (1, 2),
+        "planner": model.planner is None or model.planner in PLANNERS,
+        "n_iterations": model.n_iterations >= 1,
+        "n_step_sizes": model.n_step_sizes >= 2,
+        "n_random_plans": model.n_random_plans >= 0,
+        "gamma": 0.0 < model.gamma <= 1.0,
+        "plan_memory": model.plan_memory >= 1,
+        "loss": model.loss in ("smooth_absolute", "squared"),
+        "pretrain_epochs": model.pretrain_epochs >= 0,
+        "temperature": model.temperature >= 0.0,
+        "exploration_noise": model.exploration_noise >= 0.0,
+        "batch_size": model.batch_size >= 1,
+    }
+    for share in ("reset_share", "relabel_share", "gain_weight", "sensitivity_weight", "averaging"):
+        rules[share] = 0.0 <= getattr(model, share) <= 1.0
+    for name, holds in rules.items():
+        if not holds:
+            raise ValueError(
+                f"{type(model).__name__}({name}={getattr(model, name)!r}) is out of range; "
+                f"see the documentation of `{name}`."
+            )

@@ -1,0 +1,96 @@
+"""The deterministic policy of PODS and HDS, as SB3 sees it."""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_hds.algos.learner import Networks, Progress, fresh_networks
+from sb3_hds.algos.networks import Activation, Actor, Value, activation
+from sb3_hds.algos.persistence import TensorPolicy, TrainingTensors
+
+_POLICY_WIDTHS, _VALUE_WIDTHS = (96, 96), (64, 64)
+
+
+class TwinPolicy(TensorPolicy):
+    """
+    A policy network with a value network beside it, both with their own input normalisation.
+
+    :param observation_space: a Box of one dimension
+    :param action_space: a bounded Box of one dimension
+    :param lr_schedule: learning rate of the policy by remaining progress
+    :param net_arch: hidden widths of both networks, or ``{"pi": [...], "vf": [...]}``; default 96, 96
+        for the policy and 64, 64 for the value
+    :param activation_fn: name, JAX function or torch module class
+    :param max_grad_norm: gradients of both networks are clipped to this norm
+    :param use_sde: accepted for SB3's sake; the policy is deterministic
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: Sequence[int] | dict[str, Sequence[int]] | None = None,
+        activation_fn: str | Activation | type = "tanh",
+        max_grad_norm: float = 1.0,
+        use_sde: bool = False,
+    ) -> None:
+        super().__init__(observation_space, action_space, squash_output=True)
+        widths = net_arch if isinstance(net_arch, dict) else {"pi": net_arch, "vf": net_arch}
+        function = activation(activation_fn)
+        pi = _POLICY_WIDTHS if widths["pi"] is None else tuple(widths["pi"])
+        vf = _VALUE_WIDTHS if widths["vf"] is None else tuple(widths["vf"])
+        self.actor_network = Actor(int(np.prod(action_space.shape)), pi, function)
+        self.value_network = Value(vf, function)
+        self.max_grad_norm = max_grad_norm
+        self.networks: Networks
+        self.progress: Progress
+        self.optimizer = TrainingTensors(self)
+
+    def build(self, key: jax.Array, device: jax.Device) -> None:
+        """Draw fresh networks."""
+        n_obs = int(np.prod(self.observation_space.shape))
+        networks, progress = fresh_networks(
+            self.actor_network, self.value_network, n_obs, self.max_grad_norm, key
+        )
+        self.networks, self.progress = jax.device_put((networks, progress), device)
+
+    @property
+    def weights(self) -> Networks:
+        return self.networks
+
+    @weights.setter
+    def weights(self, tree: Networks) -> None:
+        self.networks = tree
+
+    @property
+    def training_state(self) -> Progress:
+        """Random keys are stored as 64-bit integers, which torch can hold."""
+        return self.progress._replace(key=np.asarray(self.progress.key, np.int64))
+
+    @training_state.setter
+    def training_state(self, tree: Progress) -> None:
+        key = np.asarray(tree.key).astype(np.uint32)
+        self.progress = tree._replace(key=jnp.asarray(key))
+
+    def forward(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
+        return self._predict(obs, deterministic)
+
+    def _predict(self, observation: np.ndarray, deterministic: bool = True) -> np.ndarray:  # type: ignore[override]
+        flat = observation.reshape(observation.shape[0], -1)
+        return np.asarray(_act(self.actor_network, self.networks, flat))
+
+    def reset_noise(self, batch_size: int = 1) -> None:
+        """Nothing to reset: the policy is deterministic."""
+
+
+@partial(jax.jit, static_argnums=0)
+def _act(actor: Actor, networks: Networks, obs: Any) -> jax.Array:
+    """Controls of the averaged policy for a batch of observations."""
+    return actor.apply(networks.average, networks.inside(jnp.asarray(obs, jnp.float32)))
