@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
     VecCheckNan,
     VecEnv,
     VecEnvWrapper,
@@ -137,7 +138,7 @@ def _twin_of_one(env: gymnasium.Env) -> Twin:
 
 def _twins_of_copies(env: VecEnv) -> list[Twin]:
     """The twin of each copy in this process (``DummyVecEnv``) or another (``SubprocVecEnv``)."""
-    if hasattr(env, "envs"):
+    if isinstance(env, DummyVecEnv):
         return [_twin_of_one(copy) for copy in env.envs]
     specs = _specs_of(env)
     _action_limits(env.action_space)

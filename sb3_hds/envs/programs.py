@@ -53,11 +53,13 @@ class Programs(NamedTuple):
     """
     :param draw: ``(seed, params) -> state`` at the start of an episode
     :param observe: ``(state, params) -> obs``
+    :param sketch: ``(state, params) -> points``
     :param step: ``(state, action, params) -> Transition``
     """
 
     draw: Callable[..., State]
     observe: Callable[..., Any]
+    sketch: Callable[..., Any]
     step: Callable[..., Transition]
 
 
@@ -65,12 +67,14 @@ class BatchPrograms(NamedTuple):
     """
     :param draw: ``(seeds, params) -> states``
     :param observe: ``(states, params) -> obs``
+    :param sketch: ``(states, params) -> points``
     :param step: ``(states, elapsed, actions, seeds, limit, params) -> BatchTransition``, where
         ``seeds`` are those of the episodes that begin if a copy ends
     """
 
     draw: Callable[..., State]
     observe: Callable[..., Any]
+    sketch: Callable[..., Any]
     step: Callable[..., BatchTransition]
 
 
@@ -87,6 +91,7 @@ def for_many(twin: Twin) -> BatchPrograms:
     pure = _pure(twin)
     draw = jax.vmap(pure.draw, (0, None))
     observe = jax.vmap(pure.observe, (0, None))
+    sketch = jax.vmap(pure.sketch, (0, None))
     transition = jax.vmap(pure.step, (0, 0, None))
 
     def step(
@@ -107,7 +112,7 @@ def for_many(twin: Twin) -> BatchPrograms:
         state, obs = jax.lax.cond(jnp.any(done), restart, lambda: (ended.state, ended.obs))
         return BatchTransition(state, obs, jnp.where(done, 0, elapsed), ended, truncated)
 
-    return BatchPrograms(jax.jit(draw), jax.jit(observe), jax.jit(step))
+    return BatchPrograms(*(jax.jit(function) for function in (draw, observe, sketch, step)))
 
 
 def _pure(twin: Twin) -> Programs:
@@ -121,7 +126,7 @@ def _pure(twin: Twin) -> Programs:
             after, twin.observe(after, params), reward, twin.terminated(after, params)
         )
 
-    return Programs(draw, twin.observe, step)
+    return Programs(draw, twin.observe, twin.sketch, step)
 
 
 def _where(done: Any, new: Any, old: Any) -> Any:

@@ -17,7 +17,8 @@ def register_environments() -> None:
     Make our ids known to ``gymnasium.make``. Calling it again changes nothing.
 
     Keyword arguments of ``gymnasium.make`` are settings of the twin: values of parameters by name,
-    its options, ``dt`` [s], ``substeps``.
+    its options, ``dt`` [s], ``substeps``. Where another process makes the environment by its id,
+    as with SB3's ``SubprocVecEnv``, name the package too: ``"sb3_hds:sb3_hds/CartPoleSwingUp-v0"``.
     """
     for env_id, max_episode_steps in STEP_LIMITS.items():
         if env_id not in gymnasium.registry:

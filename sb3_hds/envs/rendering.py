@@ -78,7 +78,7 @@ class Canvas:
         from matplotlib.figure import Figure
 
         self._view = view_of(twin)
-        figure = Figure(figsize=(_PIXELS / _DPI,) * 2, dpi=_DPI, facecolor=_PAPER_COLOUR)
+        figure = Figure(figsize=(_PIXELS / _DPI, _PIXELS / _DPI), dpi=_DPI, facecolor=_PAPER_COLOUR)
         self._agg = FigureCanvasAgg(figure)
         self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), facecolor=_PAPER_COLOUR)
         self._axes.set_aspect("equal")
@@ -110,7 +110,7 @@ class Canvas:
 
 def _outline(twin: Twin, poses: State) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest coordinates [m] of all drawings."""
-    sketches = jax.vmap(twin.sketch, (0, None))(poses, twin.params)
+    sketches = programs.for_many(twin).sketch(poses, twin.params)
     points = np.asarray(sketches, np.float64).reshape(-1, 2)
     return points.min(0), points.max(0)
 

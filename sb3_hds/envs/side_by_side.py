@@ -61,7 +61,7 @@ def _errors(env: gymnasium.Env, twin: Twin, steps: int, seed: int) -> dict[str, 
     """Largest errors by name of channel, and of the reward and the end of the episode."""
     largest = dict.fromkeys([*(c.name for c in twin.channels), "reward", "terminated"], 0.0)
     generator = np.random.default_rng(seed)
-    low, high = env.action_space.low, env.action_space.high
+    low, high = np.array([(a.low, a.high) for a in twin.actuators]).T
     predict = jax.jit(functools.partial(_predict, twin))
     obs, _ = env.reset(seed=seed)
     for _ in range(steps):

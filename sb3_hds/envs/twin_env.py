@@ -36,6 +36,8 @@ class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """
 
     metadata: dict[str, Any] = {"render_modes": _RENDER_MODES}
+    observation_space: spaces.Box
+    action_space: spaces.Box
 
     def __init__(
         self, twin: Twin | str = "Pendulum", render_mode: str | None = None, **settings: Any
@@ -110,7 +112,8 @@ class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         with _host():
             if self._canvas is None:
                 self._canvas = Canvas(self.twin)
-            return self._canvas.draw(self.twin.sketch(self.state, self.twin.params))
+            points = programs.for_one(self.twin).sketch(self.state, self.twin.params)
+            return self._canvas.draw(points)
 
     def close(self) -> None:
         self._canvas = None
@@ -179,7 +182,7 @@ def _host() -> contextlib.AbstractContextManager[None]:
 
 
 @functools.cache
-def _cpu() -> jax.Device | None:
+def _cpu() -> Any:
     """:return: None where JAX was told to know no CPU; then its default device serves"""
     try:
         return jax.local_devices(backend="cpu")[0]

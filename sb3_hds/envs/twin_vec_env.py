@@ -7,6 +7,8 @@ from typing import Any
 import gymnasium
 import jax
 import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 
@@ -48,6 +50,9 @@ class TwinVecEnv(VecEnv):
     :raises ValueError: for no copies, an impossible limit, or another render mode
     """
 
+    observation_space: spaces.Box
+    action_space: spaces.Box
+
     def __init__(
         self,
         twin: Twin | str = "Pendulum",
@@ -67,8 +72,9 @@ class TwinVecEnv(VecEnv):
         self.render_mode = check_render_mode(render_mode)
         super().__init__(n_envs, observation_space(self.twin), action_space(self.twin))
         self.metadata = metadata_of(self.twin)
-        self._generators: list[np.random.Generator | None] = [None] * n_envs
+        self._generators = [seeding.np_random(None)[0] for _ in range(n_envs)]
         self._next_seeds = np.zeros(n_envs, np.uint32)
+        self._draw_seeds(range(n_envs))
         self._elapsed = np.zeros(n_envs, np.int32)
         self._states: State | None = None
         self._actions: np.ndarray | None = None
@@ -94,20 +100,22 @@ class TwinVecEnv(VecEnv):
         :return: observations, shape ``(n_envs, n_obs)``
         :raises ValueError: for options that ``TwinEnv.reset`` refuses
         """
-        for i, seed in enumerate(self._seeds):
-            if seed is not None or self._generators[i] is None:
+        seeds, options = self._seeds, self._options
+        self._reset_seeds()
+        self._reset_options()
+        for i, seed in enumerate(seeds):
+            if seed is not None:
                 self._generators[i], _ = seeding.np_random(seed)
                 self._draw_seeds([i])
         run, params = programs.for_many(self.twin), self.twin.params
-        states = self._start(jax.device_get(run.draw(self._next_seeds, params)))
+        drawn = jax.device_get(run.draw(self._next_seeds, params))
+        states = _start_of_each(self.twin, drawn, options)
         obs = np.array(run.observe(states, params), np.float32)
-        for row, options in zip(obs, self._options, strict=True):
-            check_start(self.twin, self.observation_space, row, options)
+        for row, wanted in zip(obs, options, strict=True):
+            check_start(self.twin, self.observation_space, row, wanted)
         self._states = states
         self._elapsed = np.zeros(self.num_envs, np.int32)
         self._draw_seeds(range(self.num_envs))
-        self._reset_seeds()
-        self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]
         return obs
 
@@ -159,7 +167,7 @@ class TwinVecEnv(VecEnv):
 
         if self._canvas is None:
             self._canvas = Canvas(self.twin)
-        sketches = jax.vmap(self.twin.sketch, (0, None))(self.states, self.twin.params)
+        sketches = programs.for_many(self.twin).sketch(self.states, self.twin.params)
         return [self._canvas.draw(points) for points in np.asarray(sketches)]
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
@@ -202,13 +210,14 @@ class TwinVecEnv(VecEnv):
         for i in indices:
             self._next_seeds[i] = draw_seed(self._generators[i])
 
-    def _start(self, drawn: State) -> State:
-        """Put the copies with options where these want them."""
-        q, v = np.array(drawn.q), np.array(drawn.v)
-        for i, options in enumerate(self._options):
-            one = start_of(self.twin, State(q[i], v[i], {}), options)
-            q[i], v[i] = one.q, one.v
-        return drawn._replace(q=q, v=v)
+
+def _start_of_each(twin: Twin, drawn: State, options: Sequence[dict[str, Any]]) -> State:
+    """Put the copies with options where these want them."""
+    q, v = np.array(drawn.q), np.array(drawn.v)
+    for i, wanted in enumerate(options):
+        one = start_of(twin, State(q[i], v[i], {}), wanted)
+        q[i], v[i] = one.q, one.v
+    return drawn._replace(q=q, v=v)
 
 
 def _limit(twin: Twin, max_episode_steps: int | None) -> int:
@@ -223,5 +232,5 @@ def _limit(twin: Twin, max_episode_steps: int | None) -> int:
     return limit
 
 
-def _spec_of(twin: Twin) -> gymnasium.envs.registration.EnvSpec | None:
+def _spec_of(twin: Twin) -> EnvSpec | None:
     return gymnasium.registry.get(twin.env_id) if twin.env_id else None
