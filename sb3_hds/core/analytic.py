@@ -65,8 +65,9 @@ class AnalyticTwin(Twin):
                 )
 
             q, v = self.integrator(acceleration, state.q, state.v, h, self.limit_velocity)
-            memory = effects.advance(moment(state.q, state.v), memory)
-            return State(*self.limit(q, v), memory), None
+            q, v = self.limit(q, v)
+            # With the new velocity: an elastic memory then keeps energy, as the twin itself does.
+            return State(q, v, effects.advance(moment(q, v), memory)), None
 
         if self.substeps == 1:
             return substep(state, None)[0]

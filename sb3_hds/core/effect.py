@@ -119,7 +119,7 @@ class Effect(abc.ABC):
         moved.where = where
         return moved
 
-    def _set(self, values: Mapping[str, float]) -> None:
+    def _set(self, values: Mapping[str, Any]) -> None:
         for name, value in values.items():
             if name not in self.parameters:
                 raise EffectError(
@@ -167,7 +167,7 @@ class ForceEffect(Effect):
         """
 
     def advance(self, moment: Moment, index: int, memory: Memory, params: Params) -> Memory:
-        """:return: the memory after one sub-step that starts at ``moment``"""
+        """:return: the memory after one sub-step that ends at ``moment``"""
         return memory
 
 
@@ -296,7 +296,7 @@ class EffectChain:
         return total
 
     def advance(self, moment: Moment, memory: dict[str, Memory]) -> dict[str, Memory]:
-        """:return: the memory of the force effects after a sub-step that starts at ``moment``"""
+        """:return: the memory of the force effects after a sub-step that ends at ``moment``"""
         for attached, effect, params in self._forces:
             after = effect.advance(moment, attached.index, memory[attached.key], params)
             memory = memory | {attached.key: after}

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 from sb3_hds.errors import ParameterError
 
@@ -46,7 +47,7 @@ class Parameter:
                 f"[{self.lower}, {self.upper}]."
             )
 
-    def check(self, name: str, value: float) -> float:
+    def check(self, name: str, value: Any) -> float:
         """
         :return: ``value`` as a float
         :raises ParameterError: if it is not a finite number within the bounds

@@ -86,8 +86,8 @@ class RescaleAction(ActionTransform):
 
     name: ClassVar[str] = "rescale_action"
 
-    low: float | tuple[float, ...] = -1.0
-    high: float | tuple[float, ...] = 1.0
+    low: float | Sequence[float] = -1.0
+    high: float | Sequence[float] = 1.0
 
     def __post_init__(self) -> None:
         _store_bounds(self, self.low, self.high)
@@ -117,8 +117,8 @@ class RescaleObservation(ObservationTransform):
 
     name: ClassVar[str] = "rescale_observation"
 
-    low: float | tuple[float, ...] = -1.0
-    high: float | tuple[float, ...] = 1.0
+    low: float | Sequence[float] = -1.0
+    high: float | Sequence[float] = 1.0
 
     def __post_init__(self) -> None:
         _store_bounds(self, self.low, self.high)

@@ -234,7 +234,7 @@ class Twin(abc.ABC):
         self.reward_has_gradient = base.reward_has_gradient
         self.parameters, self.values = base.parameters, dict(base.values)
 
-    def _set(self, values: Mapping[str, float]) -> None:
+    def _set(self, values: Mapping[str, Any]) -> None:
         for name, value in values.items():
             if name not in self.parameters:
                 known = ", ".join(self.parameters) or "none"

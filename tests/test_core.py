@@ -1,0 +1,559 @@
+"""The core: parameters, integrators, linear algebra, twins and their wrappers, rollouts."""
+
+import json
+import re
+
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+from sb3_hds import effects, twins
+from sb3_hds.core import (
+    ActionEffect,
+    Actuator,
+    AnalyticTwin,
+    Channel,
+    EffectChain,
+    ExtendedTwin,
+    Joint,
+    Moment,
+    Parameter,
+    RescaleAction,
+    RescaleObservation,
+    State,
+    TransformedTwin,
+    explicit_euler,
+    rk4,
+    rollout,
+    rollout_policy,
+    semi_implicit_euler,
+    solve_spd,
+)
+from sb3_hds.core.effect import Attached, at_joint
+from sb3_hds.errors import EffectError, ParameterError
+
+
+class Slider(AnalyticTwin):
+    """A mass on a rail with a spring; an episode ends at ``end``, each of its steps earns 1."""
+
+    name = "Slider"
+    dt = 0.1
+    joints = (Joint("rail", "m"),)
+    actuators = (Actuator("push", "N", -1.0, 1.0),)
+    channels = (Channel("position", "m"), Channel("speed", "m/s"))
+    parameters = {
+        "mass": Parameter(null=1.0, scale=0.1, unit="kg", lower=0.1),
+        "stiffness": Parameter(null=0.0, scale=1.0, unit="N/m"),
+    }
+    options = {"end": 0.95}
+
+    def initial(self, key, params):
+        return State(jnp.zeros(1), jax.random.uniform(key, (1,)), {})
+
+    def infer(self, obs, params):
+        return State(obs[:1], obs[1:], {})
+
+    def observe(self, state, params):
+        return jnp.concatenate([state.q, state.v])
+
+    def actuate(self, state, action, params):
+        return jnp.clip(action, -1.0, 1.0)
+
+    def mass_matrix(self, q, params):
+        return params["mass"] * jnp.ones((1, 1), q.dtype)
+
+    def bias(self, q, v, params):
+        return params["stiffness"] * q
+
+    def reward(self, state, action, next_state, params):
+        return jnp.ones(())
+
+    def planning_reward(self, state, action, next_state, params):
+        return next_state.q[0]
+
+    def terminated(self, state, params):
+        return state.q[0] > self.end
+
+
+class Gain(ActionEffect):
+    """Multiplies a command."""
+
+    name = "gain"
+    parameters = {"k": Parameter(null=1.0, scale=0.1, unit="1")}
+    explanation = "The drive is stronger or weaker than rated."
+    source = "test"
+
+    def act(self, command, memory, h, params):
+        return params["k"] * command, memory
+
+
+class Offset(ActionEffect):
+    """Adds to a command."""
+
+    name = "offset"
+    parameters = {"c": Parameter(null=0.0, scale=0.1, unit="N")}
+    explanation = "The drive pushes when told not to."
+    source = "test"
+
+    def act(self, command, memory, h, params):
+        return command + params["c"], memory
+
+
+def at_rest(speed=0.0):
+    return State(jnp.zeros(1), jnp.full(1, speed), {})
+
+
+# --- parameters
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: Parameter(null=0.0, scale=0.0, unit="kg"),
+            "A parameter's scale must be positive, got 0.0 kg.",
+        ),
+        (
+            lambda: Parameter(null=-1.0, scale=1.0, unit="kg", lower=0.0),
+            "A parameter's null value, -1.0 kg, must lie within its bounds [0.0, inf].",
+        ),
+        (
+            lambda: Slider(mass="heavy"),
+            "Parameter 'mass' must be a number [kg], got 'heavy'.",
+        ),
+        (
+            lambda: Slider(mass=0.0),
+            "Parameter 'mass' must be finite and within [0.1, inf] kg, got 0.0.",
+        ),
+        (
+            lambda: Slider().with_parameters(stiffness=float("nan")),
+            "Parameter 'stiffness' must be finite and within [-inf, inf] N/m, got nan.",
+        ),
+        (
+            lambda: Slider(lenght=1.0),
+            "Slider has no parameter 'lenght'. Its parameters are: mass, stiffness; "
+            "its options are: end.",
+        ),
+        (
+            lambda: Slider(dt=0.0),
+            "Slider needs a finite dt > 0 s and at least one sub-step, got dt=0.0, substeps=1.",
+        ),
+        (
+            lambda: Slider(substeps=0),
+            "Slider needs a finite dt > 0 s and at least one sub-step, got dt=0.1, substeps=0.",
+        ),
+    ],
+)
+def test_an_impossible_value_is_refused_with_name_unit_and_bounds(make, message):
+    with pytest.raises(ParameterError, match=f"^{re.escape(message)}$"):
+        make()
+
+
+def test_a_parameter_of_a_rotary_joint_has_its_own_unit_at_a_sliding_one():
+    hinge = Parameter(null=0.0, scale=0.05, unit="N m s/rad", lower=0.0)
+
+    assert hinge.prismatic() == Parameter(null=0.0, scale=0.05, unit="N s/m", lower=0.0)
+    assert Parameter(null=0.0, scale=1.0, unit="1").prismatic().unit == "1"
+
+
+# --- integrators
+
+_SYSTEM = np.array([[0.0, 1.0], [-4.0, -0.3]])  # dq/dt = v, dv/dt = -4 q - 0.3 v
+
+
+def integrate(integrator, h, duration=2.0):
+    def acceleration(q, v):
+        return -4.0 * q - 0.3 * v
+
+    q, v = jnp.ones(1), jnp.zeros(1)
+    for _ in range(round(duration / h)):
+        q, v = integrator(acceleration, q, v, h, lambda v: v)
+    return np.concatenate([q, v])
+
+
+@pytest.mark.parametrize(
+    ("integrator", "order"), [(explicit_euler, 1), (semi_implicit_euler, 1), (rk4, 4)]
+)
+def test_the_error_falls_with_the_order_of_the_integrator(x64, integrator, order):
+    steps = 2.0 / np.array([40, 80, 160])
+    exact = scipy.linalg.expm(2.0 * _SYSTEM) @ [1.0, 0.0]
+
+    errors = [np.linalg.norm(integrate(integrator, h) - exact) for h in steps]
+
+    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert slope == pytest.approx(order, abs=0.15)  # terms of the next order bend the line
+
+
+def test_explicit_euler_gains_energy_by_its_textbook_factor(x64):
+    # For dv/dt = -q, one step multiplies q^2 + v^2 by 1 + h^2.
+    q, v = jnp.ones(1), jnp.zeros(1)
+    for _ in range(10):
+        q, v = explicit_euler(lambda q, v: -q, q, v, 0.1, lambda v: v)
+
+    assert float((q**2 + v**2)[0]) == pytest.approx(1.01**10, rel=1e-12)
+
+
+@pytest.mark.parametrize("integrator", [explicit_euler, semi_implicit_euler, rk4])
+def test_a_speed_limit_holds_after_a_step(integrator):
+    _, v = integrator(
+        lambda q, v: jnp.full(1, 50.0), jnp.zeros(1), jnp.zeros(1), 0.1, lambda v: v.clip(-2, 2)
+    )
+
+    assert v == pytest.approx(2.0)
+
+
+# --- linear algebra
+
+
+def spd(rng, n, batch):
+    root = rng.normal(size=(batch, n, n))
+    return root @ root.transpose(0, 2, 1) + n * np.eye(n)
+
+
+@pytest.mark.parametrize("n", range(1, 7))
+@pytest.mark.parametrize("columns", [(), (3,)], ids=["vector", "matrix"])
+def test_a_batch_of_small_systems_is_solved_as_lapack_does(x64, n, columns):
+    rng = np.random.default_rng(n)
+    matrices, right = spd(rng, n, 20), rng.normal(size=(20, n, *columns))
+
+    ours = jax.jit(jax.vmap(solve_spd))(jnp.asarray(matrices), jnp.asarray(right))
+
+    theirs = np.linalg.solve(matrices, right if columns else right[..., None])
+    # The matrices are conditioned better than 1e2, so 1e-12 leaves rounding a factor of 100.
+    np.testing.assert_allclose(ours, theirs.reshape(ours.shape), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_the_derivative_of_a_solution_is_the_implicit_one(x64, n):
+    rng = np.random.default_rng(n)
+    matrix, change = spd(rng, n, 2)
+    right, shift = rng.normal(size=(2, n))
+
+    _, ours = jax.jvp(solve_spd, (matrix, right), (change, shift))
+    pulled = jax.grad(lambda b: solve_spd(jnp.asarray(matrix), b).sum())(jnp.asarray(right))
+
+    x = np.linalg.solve(matrix, right)
+    expected = np.linalg.solve(matrix, shift - change @ x)  # d(A^-1 b) = A^-1 (db - dA A^-1 b)
+    np.testing.assert_allclose(ours, expected, rtol=1e-11)  # rounding, as above
+    np.testing.assert_allclose(pulled, np.linalg.inv(matrix).sum(0), rtol=1e-11)
+
+
+def test_a_least_pivot_replaces_a_negative_one_and_leaves_good_ones(x64):
+    indefinite, right = jnp.diag(jnp.array([2.0, -1.0])), jnp.ones(2)
+
+    np.testing.assert_allclose(solve_spd(indefinite, right, least_pivot=0.1), [0.5, 10.0])
+
+
+def test_the_inertia_of_a_joint_is_what_a_force_there_accelerates(x64):
+    matrix = spd(np.random.default_rng(0), 3, 1)[0]
+    zero = jnp.zeros(3)
+
+    inertia = [
+        at_joint(Moment(zero, zero, zero, zero, jnp.asarray(matrix), 0.1), j).inertia
+        for j in range(3)
+    ]
+
+    np.testing.assert_allclose(inertia, 1.0 / np.diag(np.linalg.inv(matrix)), rtol=1e-12)
+
+
+# --- twins
+
+
+def test_twins_that_differ_in_values_alone_are_one_program():
+    step = jax.jit(
+        lambda twin, state, params: twin.step(state, jnp.ones(1), params), static_argnums=0
+    )
+    light, heavy = Slider(mass=0.5), Slider(mass=2.0)
+
+    speeds = [step(twin, at_rest(), twin.params).v[0] for twin in (light, heavy)]
+
+    assert light == heavy and hash(light) == hash(heavy)
+    np.testing.assert_allclose(speeds, [0.2, 0.05], rtol=1e-6)  # v = h / m, float32
+    assert step._cache_size() == 1
+
+
+def test_twins_that_differ_in_structure_are_unequal():
+    class Other(Slider):
+        pass
+
+    different = [Slider(dt=0.2), Slider(substeps=2), Slider(end=2.0), Other(), twins.Pendulum()]
+    different.append(Slider().extend(effects.ViscousFriction()))
+    different.append(TransformedTwin(Slider(), action=RescaleAction(-2.0, 2.0)))
+
+    for one in different:
+        assert one != Slider()
+        assert one == one.with_parameters()
+    assert Slider() != "Slider"
+
+
+def test_new_values_leave_the_old_twin_alone():
+    old = Slider(mass=2.0)
+
+    new = old.with_parameters(mass=3.0)
+
+    assert (old.params["mass"], new.params["mass"]) == (2.0, 3.0)
+    new.params["mass"] = 9.0
+    assert new.params["mass"] == 3.0
+
+
+def test_sub_steps_are_shorter_steps(x64):
+    coarse, fine = Slider(dt=0.4, substeps=4, stiffness=3.0), Slider(dt=0.1, stiffness=3.0)
+    state = after = at_rest(0.5)
+
+    for _ in range(4):
+        after = fine.step(after, jnp.ones(1), fine.params)
+
+    once = coarse.step(state, jnp.ones(1), coarse.params)
+    np.testing.assert_allclose(once.q, after.q, rtol=1e-14)  # rounding alone
+    np.testing.assert_allclose(once.v, after.v, rtol=1e-14)
+
+
+def test_retracting_by_a_difference_arrives_memory_included(x64):
+    twin = Slider()
+    state = State(jnp.array([1.0]), jnp.array([2.0]), {"lag.push": jnp.array([3.0, 4.0])})
+    reference = State(jnp.array([0.5]), jnp.array([0.0]), {"lag.push": jnp.array([1.0, 1.0])})
+
+    tangent = twin.difference(state, reference)
+    arrived = twin.retract(reference, tangent)
+
+    assert tangent.shape == (4,)
+    jax.tree.map(np.testing.assert_array_equal, arrived, state)
+
+
+def test_a_command_meets_effects_in_order_and_a_joined_chain_last(x64):
+    params = {"gain.push.k": 3.0, "offset.push.c": 1.0}
+    gain, offset = Attached("gain.push", Gain(), 0), Attached("offset.push", Offset(), 0)
+    memory = {"gain.push": (), "offset.push": ()}
+
+    def command(chain):
+        return float(chain.act(jnp.full(1, 2.0), memory, 0.1)[0][0])
+
+    assert command(EffectChain((gain, offset), params)) == 7.0
+    assert command(EffectChain((offset, gain), params)) == 9.0
+    assert command(EffectChain((offset,), params) + EffectChain((gain,), params)) == 9.0
+
+
+def test_an_extended_twin_obeys_a_chain_from_outside_before_its_own_effects(x64):
+    twin = Slider().extend(Offset(c=0.25))
+    outer = EffectChain((Attached("gain.push", Gain(), 0),), {"gain.push.k": 0.5})
+    state = twin.infer(jnp.zeros(2), twin.params)
+    state = state._replace(memory=state.memory | {"gain.push": ()})
+
+    after = twin.step(state, jnp.full(1, 0.6), twin.params, outer)
+
+    assert float(after.v[0]) == pytest.approx(0.1 * (0.5 * 0.6 + 0.25), rel=1e-12)
+
+
+# --- twins behind wrappers
+
+
+def wrapped_pendulum():
+    """Pendulum-v1 behind Gymnasium's two wrappers, and the twin that stands for it."""
+    env = gym.make("Pendulum-v1")
+    env = gym.wrappers.RescaleAction(env, np.float32(-1.0), np.float32(3.0))
+    low, high = np.array([-2.0, -1.0, 0.0], np.float32), np.array([2.0, 0.0, 1.0], np.float32)
+    env = gym.wrappers.RescaleObservation(env, low, high)
+    observation = RescaleObservation(low=low.tolist(), high=high.tolist())
+    twin = twins.make("Pendulum")
+    return env, TransformedTwin(twin, observation=observation, action=RescaleAction(-1.0, 3.0))
+
+
+def test_a_transformed_twin_reproduces_the_wrapped_environment(x64):
+    env, twin = wrapped_pendulum()
+    obs, _ = env.reset(seed=0)
+    env.action_space.seed(0)
+    step = jax.jit(twin.step)
+
+    for _ in range(200):
+        state = twin.infer(jnp.asarray(obs, jnp.float64), twin.params)
+        action = env.action_space.sample()
+        obs, reward, *_ = env.step(action)
+        after = step(state, jnp.asarray(action, jnp.float64), twin.params)
+        # One step from a float32 observation: rounding 6e-8 of a speed of 8, torque likewise; the
+        # reward squares an angle of up to pi and a speed of up to 8.
+        np.testing.assert_allclose(twin.observe(after, twin.params), obs, atol=2e-6)
+        ours = twin.reward(state, jnp.asarray(action, jnp.float64), after, twin.params)
+        assert float(ours) == pytest.approx(reward, abs=2e-5)
+
+
+def test_a_transformed_twin_declares_the_spaces_of_the_wrapped_environment():
+    env, twin = wrapped_pendulum()
+
+    np.testing.assert_allclose([a.low for a in twin.actuators], env.action_space.low)
+    np.testing.assert_allclose([a.high for a in twin.actuators], env.action_space.high)
+    np.testing.assert_allclose([c.low for c in twin.channels], env.observation_space.low)
+    np.testing.assert_allclose([c.high for c in twin.channels], env.observation_space.high)
+    assert {a.unit for a in twin.actuators} == {c.unit for c in twin.channels} == {"1"}
+
+
+def test_what_is_observed_through_a_wrapper_is_inferred_through_it(x64):
+    _, twin = wrapped_pendulum()
+    state = twin.initial(jax.random.key(0), twin.params)
+
+    back = twin.infer(twin.observe(state, twin.params), twin.params)
+
+    np.testing.assert_allclose(back.q, state.q, rtol=1e-12)
+    np.testing.assert_allclose(back.v, state.v, rtol=1e-12)
+
+
+def test_effects_attach_to_the_plant_below_the_wrapper(x64):
+    wrapper = RescaleAction(-0.5, 0.5)  # Slider takes -1 to 1 N
+    inside = TransformedTwin(Slider().extend(Offset(c=0.25)), action=wrapper)
+
+    outside = TransformedTwin(Slider(), action=wrapper).extend(Offset(c=0.25))
+
+    assert outside == inside and outside.params == inside.params
+    after = outside.step(outside.infer(jnp.zeros(2), outside.params), jnp.full(1, 0.1), outside.params)
+    assert float(after.v[0]) == pytest.approx(0.1 * (0.2 + 0.25), rel=1e-12)
+    with pytest.raises(EffectError, match=re.escape("Use twin.extend(*effects), which attaches")):
+        ExtendedTwin(TransformedTwin(Slider(), action=wrapper), Offset())
+
+
+def test_values_and_effects_survive_a_spec_through_wrappers():
+    twin = TransformedTwin(twins.make("Pendulum", mass=2.0), action=RescaleAction(-1.0, 1.0))
+    twin = TransformedTwin(twin, observation=RescaleObservation((0.0, 0.0, -1.0), 1.0))
+    twin = twin.extend(effects.CoulombFriction(tau_c=0.3)).with_parameters(gravity=9.0)
+
+    back = twins.from_spec(json.loads(json.dumps(twin.to_spec())), effects.ALL)
+
+    assert back == twin and back.params == twin.params
+    assert repr(back) == repr(twin)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: RescaleAction(1.0, 1.0),
+            "RescaleAction needs finite bounds with low < high, got low=1.0, high=1.0.",
+        ),
+        (
+            lambda: TransformedTwin(Slider(), action=RescaleAction((-1.0, -1.0), 1.0)),
+            "RescaleAction has bounds for 2 actuators, but the twin has 1.",
+        ),
+        (
+            lambda: TransformedTwin(Slider(), observation=RescaleObservation()),
+            "RescaleObservation needs limits to scale by, but these have none: position, speed.",
+        ),
+        (
+            lambda: twins.from_spec(
+                twins.Pendulum().to_spec() | {"transforms": [[{"transform": "flip"}]]}
+            ),
+            "A twin was saved with the transform 'flip', which is not known here. "
+            "Known are: rescale_action, rescale_observation.",
+        ),
+    ],
+)
+def test_a_transform_that_does_not_fit_is_refused(make, message):
+    with pytest.raises(ParameterError, match=f"^{re.escape(message)}$"):
+        make()
+
+
+# --- rollouts
+
+
+def test_a_rollout_is_a_loop_of_steps(x64):
+    twin = twins.make("Pendulum")
+    actions = jnp.asarray(np.random.default_rng(0).uniform(-2, 2, (30, 1)))
+    start = state = twin.initial(jax.random.key(0), twin.params)
+
+    result = rollout(twin, twin.params, start, actions)
+
+    assert result.obs.shape == (31, 3) and result.rewards.shape == (30,) and result.alive.all()
+    np.testing.assert_array_equal(result.actions, actions)
+    for k, action in enumerate(actions):
+        after = twin.step(state, action, twin.params)
+        np.testing.assert_allclose(result.states.q[k], state.q, atol=1e-12)  # other fusion
+        np.testing.assert_allclose(result.obs[k], twin.observe(state, twin.params), atol=1e-12)
+        reward = twin.reward(state, action, after, twin.params)
+        assert float(result.rewards[k]) == pytest.approx(float(reward), rel=1e-10)
+        state = after
+    np.testing.assert_allclose(result.obs[-1], twin.observe(state, twin.params), atol=1e-12)
+
+
+def test_rewards_stop_with_the_step_that_terminates(x64):
+    # At 1 m/s and 0.1 s the mass passes 0.95 m in the tenth step.
+    result = rollout(Slider(), Slider().params, at_rest(1.0), jnp.zeros((15, 1)))
+
+    assert result.rewards.tolist() == [1.0] * 10 + [0.0] * 5
+    assert result.alive.tolist() == [True] * 10 + [False] * 5
+    np.testing.assert_allclose(result.states.q[:, 0], [0.1 * min(k, 10) for k in range(16)])
+
+
+def test_a_terminated_start_earns_nothing():
+    over = State(jnp.ones(1), jnp.zeros(1), {})
+
+    result = rollout(Slider(), Slider().params, over, jnp.ones((3, 1)))
+
+    assert not result.alive.any() and not result.rewards.any()
+    np.testing.assert_array_equal(result.states.q, jnp.ones((4, 1)))
+
+
+def test_what_comes_after_the_end_cannot_spoil_a_gradient(x64):
+    # Pushed away from the middle, the position multiplies by about 1e5 per step: inf soon after.
+    twin = Slider(stiffness=-1e7)
+
+    def earned(speed):
+        state = State(jnp.zeros(1), speed * jnp.ones(1), {})
+        return rollout(
+            twin, twin.params, state, jnp.zeros((100, 1)), twin.planning_reward
+        ).rewards.sum()
+
+    value, slope = jax.value_and_grad(earned)(1e-6)
+
+    assert float(slope) == pytest.approx(float(value) / 1e-6, rel=1e-9)  # linear in the speed
+
+
+def test_another_reward_can_be_planned_for(x64):
+    twin = Slider()
+
+    result = rollout(twin, twin.params, at_rest(1.0), jnp.zeros((5, 1)), twin.planning_reward)
+
+    np.testing.assert_allclose(result.rewards, 0.1 * np.arange(1, 6))
+
+
+def test_a_policy_sees_what_the_sensors_report(x64):
+    twin = twins.make("Pendulum")
+    state = twin.initial(jax.random.key(1), twin.params)
+
+    closed = rollout_policy(twin, twin.params, state, lambda obs: -0.5 * obs[2:3], 40)
+    opened = rollout(twin, twin.params, state, closed.actions)
+
+    np.testing.assert_allclose(closed.actions, -0.5 * closed.obs[:-1, 2:3], atol=1e-12)
+    # The same 40 steps in another program: rounding, amplified by a swinging pendulum.
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-10), closed, opened)
+
+
+def test_rollouts_batch_over_states_and_actions(x64):
+    twin = Slider()
+    speeds = jnp.array([0.1, 1.0])
+    states = State(jnp.zeros((2, 1)), speeds[:, None], {})
+    actions = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (2, 15, 1)))
+
+    batch = jax.jit(jax.vmap(lambda s, a: rollout(twin, twin.params, s, a)))(states, actions)
+
+    for i, speed in enumerate(speeds):
+        alone = rollout(twin, twin.params, at_rest(float(speed)), actions[i])
+        jax.tree.map(
+            lambda b, a, i=i: np.testing.assert_allclose(b[i], a, atol=1e-12),  # other fusion
+            batch,
+            alone,
+        )
+
+
+def test_a_rollout_keeps_the_precision_of_its_state(x64):
+    state = State(jnp.zeros(1, jnp.float32), jnp.ones(1, jnp.float32), {})
+    twin = Slider().extend(effects.CoulombFriction(tau_c=0.1), Gain())
+
+    result = rollout(
+        twin,
+        twin.params,
+        twin.infer(jnp.ones(2, jnp.float32), twin.params),
+        jnp.ones((3, 1), jnp.float32),
+    )
+
+    assert {leaf.dtype for leaf in jax.tree.leaves(result.states)} == {jnp.dtype(jnp.float32)}
+    assert result.rewards.shape == (3,) and state.q.dtype == jnp.float32
