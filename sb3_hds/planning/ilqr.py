@@ -112,7 +112,8 @@ def _follow(problem: Problem, start: State, plan: Plan, gains: Gains, step: Scal
         state, alive = carry
         nominal, u, k, K = stage
         dx = problem.twin.difference(state, nominal)
-        control = jnp.clip(u + step * k + K @ dx, -1.0, 1.0)
+        reaction = K @ jnp.where(jnp.isfinite(dx), dx, 0.0)
+        control = jnp.clip(u + step * k + reaction, -1.0, 1.0)
         after, reward = problem.step(state, control)
         still = alive & ~problem.terminated(after)
         return (after, still), (state, alive, jnp.where(alive, reward, 0.0), control)
