@@ -17,7 +17,7 @@ pytestmark = pytest.mark.skipif(find_spec("rl_zoo3") is None, reason="needs the 
 CONSOLE = (str(Path(sys.executable).with_name("rl_zoo3")),)
 MODULE = (sys.executable, "-m")
 # Small plans: these tests ask whether a command works, not how well the algorithm learns.
-QUICK = ("n_rollouts:8", "pretrain_epochs:1")
+QUICK = ("n_rollouts:8", "pretrain_epochs:1", "horizon:8", "gradient_steps:4", "n_random_plans:1")
 N_STEPS, EVAL_FREQ, SAVE_FREQ = 300, 100, 150
 
 
@@ -121,6 +121,15 @@ def test_hyperparameters_given_on_the_command_line_replace_those_of_the_file(tra
     assert used["n_rollouts"] == 8
 
 
+def test_arguments_of_the_environment_reach_the_twin(trained):
+    from stable_baselines3.common.save_util import load_from_zip_file
+
+    data, _, _ = load_from_zip_file(trained / "Pendulum-v1.zip")
+
+    # Pendulum-v1's own default is 10.0 m/s2; the run was started with --env-kwargs g:9.8.
+    assert data["twin_spec"]["parameters"]["g"] == 9.8
+
+
 def test_a_timestep_is_a_step_of_the_environment_and_nothing_else(trained):
     with open(trained / "0.monitor.csv") as file:
         episodes = list(csv.DictReader(line for line in file if not line.startswith("#")))
@@ -159,17 +168,17 @@ def test_our_environments_train_in_subprocesses_and_are_filmed(zoo):
 
 
 def test_optuna_trials_are_stored_and_one_of_them_can_be_trained(zoo):
-    study = ("--storage", "study/journal.log", "--study-name", "hds")
+    study = ("--storage", "study/journal.log", "--study-name", "hds", "-params", *QUICK)
     budget = ("-n", "200", "--n-trials", "3", "--n-evaluations", "1", "--eval-episodes", "1")
 
     output = zoo.succeeds(
-        *CONSOLE, "train", *train("-optimize", *study, *budget, "--no-optim-plots"), "-f", "tuned"
+        *CONSOLE, "train", *train("-optimize", *budget, "--no-optim-plots", "-f", "tuned"), *study
     )
     assert "Number of finished trials:  3" in output
 
     # The zoo takes trial 0 for no trial at all.
     output = zoo.succeeds(
-        *CONSOLE, "train", *train("--trial-id", "1", *study, "-n", "100"), "-f", "chosen"
+        *CONSOLE, "train", *train("--trial-id", "1", "-n", "100", "-f", "chosen"), *study
     )
     assert "Loading from Optuna study" in output
     [run] = (zoo.folder / "chosen" / "hds").glob("Pendulum-v1_*")

@@ -81,6 +81,12 @@ def test_stock_algorithms_keep_their_ids():
     assert not set(tables.ALGORITHMS) & STOCK
 
 
+def test_the_zoo_has_every_algorithm_that_the_package_has():
+    from sb3_hds.algos import ALL
+
+    assert {algo: algorithm.__name__ for algo, algorithm in ALL.items()} == tables.ALGORITHMS
+
+
 def test_every_algorithm_is_a_public_name_with_a_file_a_sampler_and_a_converter():
     for algo, class_name in tables.ALGORITHMS.items():
         assert algo == algo.lower(), "the zoo's plots look for a folder in lower case"
