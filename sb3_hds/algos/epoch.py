@@ -1,6 +1,6 @@
 """
-One planning epoch as a pure function: roll the policy out in the twin, improve the plans, keep what is
-better, regress the policy on it, move on.
+One planning epoch as a pure function: roll the policy out in the twin, improve the plans, keep what
+is better, regress the policy on it, move on.
 
 The stateful shell around it is ``twin_algorithm.py``. Nothing here knows an environment's name.
 """
@@ -110,8 +110,8 @@ def control_of(settings: Settings, learner: Learner, knobs: Knobs, obs: Obs) -> 
 
 def twin_steps_per_epoch(settings: Settings) -> int:
     """
-    :return: simulated steps of one epoch, line searches included; a Jacobian counts one step for each of
-        its columns besides the step itself, as many as finite differences would take
+    :return: simulated steps of one epoch, line searches included; a Jacobian counts one step for
+        each of its columns besides the step itself, as many as finite differences would take
     """
     s = settings
     columns = 2 * len(s.twin.joints) + len(s.twin.actuators)

@@ -14,7 +14,75 @@ from sb3_hds.core import Twin
 
 class HDS(TwinAlgorithm):
     """
-    x
+    Hybrid differentiable simulation: PODS on a model that measured data keep correcting.
+
+    What it adds to PODS here: exploration noise that decays, annealed acceptance of step sizes, and
+    plans that start where the real environment was seen. Correcting the model by what the
+    environment answers (parameters, effects, a learned residual) is not part of it yet: the twin
+    stays as given.
+
+    Idea: the HDS course project (ETH Zurich, 2024), from its description; planning by short
+    horizons with a learned tail, weights and averaging are our own, see the documentation for what
+    each gains.
+
+    :param policy: ``"MlpPolicy"``, a policy class, or the environment itself
+    :param env: an environment with a twin, its id, or a vectorised environment
+    :param learning_rate: of the policy, per Adam step; a schedule runs over all planning epochs,
+        pretraining included. Own choice, measured.
+    :param value_learning_rate: of the value network; number, schedule or ``"lin_3e-3"``. None: as
+        ``learning_rate``.
+    :param buffer_size: real transitions that are kept
+    :param learning_starts: real steps with random actions before the policy acts
+    :param batch_size: states per regression step
+    :param gamma: discount per step of the environment
+    :param train_freq: real steps between two planning epochs, or ``(n, "episode")``
+    :param gradient_steps: regression steps per planning epoch; -1: as many as real steps were made
+        (the paper: 50)
+    :param action_noise: added to the actions in the real environment
+    :param replay_buffer_class: as in SB3
+    :param replay_buffer_kwargs: as in SB3
+    :param optimize_memory_usage: as in SB3
+    :param twin: the simulation to plan in, or its name; None: the one that mirrors the environment.
+        Pass a different one to learn in a model that is wrong on purpose.
+    :param pretrain_epochs: planning epochs before the first real step
+    :param n_rollouts: start states planned from in each epoch (the paper: 4000)
+    :param horizon: steps of a plan; None: 0.6 s, between 12 and 32 steps (the paper: the whole
+        episode of 100)
+    :param order: 1: gradient of the action sequence; 2: its Gauss-Newton step with feedback (iLQR)
+    :param planner: overrides ``order``: ``"first_order"``, ``"gauss_newton"`` (the paper's
+        open-loop second-order step) or ``"ilqr"``
+    :param n_iterations: improvements of each plan in an epoch (the paper: 1)
+    :param n_step_sizes: candidates of each line search, "no change" included
+    :param n_random_plans: random sequences of which the best is improved too, the remedy against
+        local optima; 0 switches it off (the paper)
+    :param lookahead: steps for which the policy is followed beyond the end of a plan when plans are
+        compared; None: five horizons; 0 switches it off (the paper)
+    :param terminal_value: whether a value network judges the end of a plan (the paper: no)
+    :param reset_share: share of start states drawn from the reset distribution in each epoch, the
+        others go on from where the policy went; 1 is the paper's choice
+    :param exploration_noise: standard deviation of a constant offset of the controls, in units of
+        half the action range, while start states go on
+    :param exploration_decay: factor on the noise after each epoch (the HDS project: 0.5 to 0.99)
+    :param temperature: of the annealed acceptance of step sizes, in units of the mean gain of the
+        last epoch's plans; 0 takes the best step always. The HDS project describes it and does not
+        run it.
+    :param temperature_decay: factor on the temperature after each epoch
+    :param relabel_share: share of plans that start in states in which the real environment was seen
+    :param plan_memory: epochs whose plans are learned from (the paper: 1)
+    :param loss: ``"smooth_absolute"`` or ``"squared"`` (the paper)
+    :param gain_weight: 0..1, how much a sample counts in proportion to what its plan gained over
+        the policy (the paper: 0)
+    :param sensitivity_weight: 0..1, how much it counts in proportion to what an error of its
+        control costs; only with ``"ilqr"`` (the paper: 0)
+    :param averaging: decay per epoch of the average of policies that acts (the paper: 0)
+    :param policy_kwargs: ``net_arch``, ``activation_fn``, ``max_grad_norm``
+    :param stats_window_size: episodes in the averages that are logged
+    :param tensorboard_log: folder for TensorBoard
+    :param verbose: 0 nothing, 1 information, 2 debugging
+    :param device: ``"auto"``, ``"cpu"`` or ``"cuda"``, as JAX has it
+    :param seed: of all random numbers
+    :param monitor_wrapper: as in SB3
+    :param _init_setup_model: as in SB3
     """
 
     def __init__(

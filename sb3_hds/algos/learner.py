@@ -223,8 +223,8 @@ def find_scales(
     settings: Settings, params: Params, view: View, starts: State, key: PRNGKeyArray
 ) -> tuple[View, jax.Array, jax.Array]:
     """
-    Read the scales of observations and rewards off random rollouts, so that nothing needs to be set by
-    hand for a new task.
+    Read the scales of observations and rewards off random rollouts, so that nothing needs to be set
+    by hand for a new task.
 
     :return: input normalisation, reward scale, reward offset
     """

@@ -19,13 +19,15 @@ ACTIVATIONS: dict[str, Activation] = {
     "softplus": nn.softplus,
 }
 
-# Width around zero where the value is linear rather than a square root, in units of the scaled reward.
+# Width around zero where the value is linear rather than a square root, in units of the scaled
+# reward.
 _NEAR_ZERO = 0.3
 
 
 def activation(choice: str | Activation | type) -> Activation:
     """
-    :param choice: a name ("relu", any case), a JAX function, or a torch module class of the same name
+    :param choice: a name ("relu", any case), a JAX function, or a torch module class of the same
+        name
     :raises ValueError: for a name without an equal here
     """
     name = choice if isinstance(choice, str) else getattr(choice, "__name__", "")
@@ -84,8 +86,8 @@ def squash(value: jax.Array) -> jax.Array:
     r"""
     The root that the value network learns: :math:`y\,(|y| + 0.3) = V`.
 
-    A network that learns V itself errs by a share of its range, which near the goal is more than all
-    that is left to gain; the root has relative precision there.
+    A network that learns V itself errs by a share of its range, which near the goal is more than
+    all that is left to gain; the root has relative precision there.
     """
     return jnp.sign(value) * (jnp.sqrt(_NEAR_ZERO**2 + 4.0 * jnp.abs(value)) - _NEAR_ZERO) / 2.0
 

@@ -27,14 +27,15 @@ def samples_of(
 
     .. math:: Y_t = r_t + \gamma Y_{t+1}
 
-    and a weight that grows with what the plan gained over the policy and with what an error costs there.
+    and a weight that grows with what the plan gained over the policy and with what an error costs
+    there.
 
     :param kept: plans, leaves of shape ``(n_rollouts, ...)``
     :param tails: value of each plan's last state
     :param gain: of each plan over the policy's own
     :param sensitivity: cost of an error of each control
-    :return: samples, leaves of shape ``(n_rollouts * horizon, ...)``, and which plans were finite; the
-        others weigh nothing
+    :return: samples, leaves of shape ``(n_rollouts * horizon, ...)``, and which plans were finite;
+        the others weigh nothing
     """
     before = jax.tree.map(lambda leaf: leaf[:, :-1], kept.states)
     obs = jax.vmap(jax.vmap(lambda state: knobs.view(problem.observe(state))))(before)
@@ -74,8 +75,9 @@ def regress(
     r"""
     Adam on minibatches of the remembered samples.
 
-    The policy's loss is :math:`w\,\sqrt{e^2 + 0.1^2}`: a squared error averages between turning left
-    and turning right, and blurs the moments of switching. The paper's :math:`w\,e^2/2` is a setting.
+    The policy's loss is :math:`w\,\sqrt{e^2 + 0.1^2}`: a squared error averages between turning
+    left and turning right, and blurs the moments of switching. The paper's :math:`w\,e^2/2` is a
+    setting.
 
     :return: the learner, and the mean losses of policy and value
     """

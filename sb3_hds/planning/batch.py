@@ -43,8 +43,8 @@ def solve(
     :param terminal_value: of the last observation; the same function object compiles only once
     :param terminal_curvature: whether second-order methods use its Hessian
     :param temperature: annealed acceptance; needs ``key``
-    :return: plans, leaves of shape ``(batch, ...)``; a sequence that meets a value that is not finite
-        keeps its best finite form, the others are not touched by it
+    :return: plans, leaves of shape ``(batch, ...)``; a sequence that meets a value that is not
+        finite keeps its best finite form, the others are not touched by it
     :raises ValueError: for an unknown method or controls of the wrong shape
     """
     if method not in METHODS:

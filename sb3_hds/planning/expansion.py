@@ -13,8 +13,8 @@ from sb3_hds.planning.problem import Control, Plan, Problem
 class Expansion(NamedTuple):
     r"""
     A plan's neighbourhood, in tangent coordinates :math:`\delta x` of the states (dimension n) and
-    changes :math:`\delta u` of the controls (dimension m). Costs are negative, discounted rewards, zero
-    after termination.
+    changes :math:`\delta u` of the controls (dimension m). Costs are negative, discounted rewards,
+    zero after termination.
 
     :param A: :math:`\partial x_{t+1} / \partial x_t`, shape ``(horizon, n, n)``
     :param B: :math:`\partial x_{t+1} / \partial u_t`, shape ``(horizon, n, m)``

@@ -68,12 +68,13 @@ def gauss_newton(
     key: PRNGKeyArray | None = None,
 ) -> Plan:
     r"""
-    The paper's second-order step on the whole action sequence: :math:`a \leftarrow a + \alpha H^{-1} g` with
+    The paper's second-order step on the whole action sequence: :math:`a \leftarrow a + \alpha
+    H^{-1} g` with
     :math:`H = S^\top \ell_{ss} S + \ell_{aa}`, :math:`S = \partial s / \partial a`.
 
-    The step is found by the Riccati recursion, which gives the same :math:`H^{-1} g` at a cost linear
-    in the horizon; curvature that is not positive is raised. It ends as controls without feedback, as
-    in the paper, clipped to the limits. "No change" is among the step sizes.
+    The step is found by the Riccati recursion, which gives the same :math:`H^{-1} g` at a cost
+    linear in the horizon; curvature that is not positive is raised. It ends as controls without
+    feedback, as in the paper, clipped to the limits. "No change" is among the step sizes.
 
     :param start: where the plan starts
     :param controls: what to improve, shape ``(horizon, n_act)``

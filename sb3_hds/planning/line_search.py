@@ -30,8 +30,8 @@ def choose(
     values: Float[Array, " candidates"], temperature: Scalar | float, key: PRNGKeyArray | None
 ) -> Int[Array, ""]:
     r"""
-    The candidate to take. Without temperature, the best; the first among equals, so that a useless step
-    is not taken. With temperature, candidate i with probability :math:`\propto \exp(J_i / T)`
+    The candidate to take. Without temperature, the best; the first among equals, so that a useless
+    step is not taken. With temperature, candidate i with probability :math:`\propto \exp(J_i / T)`
     (Boltzmann acceptance of simulated annealing, drawn by the Gumbel trick).
 
     :param values: objectives; minus infinity marks what must not be taken

@@ -41,7 +41,8 @@ class Problem:
     .. math:: \sum_{t<H} \gamma^t\, s\,(r_t - r_0) + \gamma^H V(o_H)
 
     where :math:`r` is the twin's planning reward. An episode that has terminated is worth
-    :math:`-s\,r_0/(1-\gamma)` from there on: shifting every reward by the same :math:`r_0` then changes
+    :math:`-s\,r_0/(1-\gamma)` from there on: shifting every reward by the same :math:`r_0` then
+        changes
     the objective by a constant only, and no start of dying is rewarded. There is no auto-reset.
 
     :param twin: what is simulated

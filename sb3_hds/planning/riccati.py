@@ -20,7 +20,8 @@ class Gains(NamedTuple):
 
     :param feedforward: change of the controls, shape ``(horizon, m)``
     :param feedback: reaction to a change of the state, shape ``(horizon, m, n)``
-    :param sensitivity: what an error of this control costs, ``|Q_u| + tr(Q_uu) / 2``, shape ``(horizon,)``
+    :param sensitivity: what an error of this control costs, ``|Q_u| + tr(Q_uu) / 2``, shape
+        ``(horizon,)``
     """
 
     feedforward: Controls
@@ -34,10 +35,12 @@ def solve_backward(
     r"""
     Minimise the local model from the last step to the first:
 
-    .. math:: Q_z = \ell_z + [A\,B]^\top V_x', \quad Q_{zz} = \ell_{zz} + [A\,B]^\top V_{xx}' [A\,B], \quad
+    .. math:: Q_z = \ell_z + [A\,B]^\top V_x', \quad Q_{zz} = \ell_{zz} + [A\,B]^\top V_{xx}'
+    [A\,B], \quad
               k = -Q_{uu}^{-1} Q_u, \quad K = -Q_{uu}^{-1} Q_{ux}
 
-    :math:`Q_{uu}` is made positive definite by raising pivots of its factorisation. With ``bounded``,
+    :math:`Q_{uu}` is made positive definite by raising pivots of its factorisation. With
+        ``bounded``,
     controls that stand at a limit and want beyond it are held there and do not react to the state.
 
     :param controls: where the model was expanded

@@ -63,12 +63,14 @@ def horizon_continuation(
     improve: Callable[[Problem, State, Controls], Plan],
 ) -> Plan:
     """
-    Improve the first steps, then more and more of them: a long swing-up is found from its beginning.
+    Improve the first steps, then more and more of them: a long swing-up is found from its
+    beginning.
 
     :param controls: the whole sequence, shape ``(horizon, n_act)``
     :param horizons: growing lengths; the last one is the whole horizon
     :param improve: an improver, for example ``gauss_newton``
-    :return: the plan over the whole horizon; never worse than the start, which is kept if it is better
+    :return: the plan over the whole horizon; never worse than the start, which is kept if it is
+        better
     """
     if (
         list(horizons) != sorted(set(horizons))
