@@ -1,11 +1,54 @@
 """The ways in which an algorithm may be called."""
 
-from collections.abc import Mapping
-from typing import Any
+import math
+import numbers
+import warnings
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import jax
+from gymnasium import spaces
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_hds.algos.epoch import PLANNERS
+from sb3_hds.algos.persistence import TensorPolicy
+from sb3_hds.errors import EnvironmentMismatchError
+
+if TYPE_CHECKING:
+    from sb3_hds.algos.twin_algorithm import TwinAlgorithm
+
+# Counts, with the least that makes sense. Where None is the default, it means: derived.
+_AT_LEAST = {
+    "n_rollouts": 1,
+    "horizon": 1,
+    "lookahead": 0,
+    "n_iterations": 1,
+    "n_step_sizes": 2,
+    "n_random_plans": 0,
+    "plan_memory": 1,
+    "pretrain_epochs": 0,
+    "batch_size": 1,
+    "gradient_steps": -1,
+}
+_DERIVED = ("horizon", "lookahead")
+_SHARES = (
+    "reset_share",
+    "relabel_share",
+    "gain_weight",
+    "sensitivity_weight",
+    "averaging",
+    "exploration_decay",
+    "temperature_decay",
+)
+_CHOICES = {
+    "order": (1, 2),
+    "planner": (None, *PLANNERS),
+    "loss": ("smooth_absolute", "squared"),
+}
 
 
 def policy_and_env(policy: Any, env: Any, aliases: Mapping[str, Any]) -> tuple[Any, Any]:
@@ -13,13 +56,123 @@ def policy_and_env(policy: Any, env: Any, aliases: Mapping[str, Any]) -> tuple[A
     A lone environment, or a lone string that names no policy, is the environment:
     ``HDS("Pendulum-v1")`` means ``HDS("MlpPolicy", "Pendulum-v1")``.
 
-    :return: policy and environment in SB3's order
+    :return: policy and environment in SB3's order; the environment made, if it was a string
+    :raises EnvironmentMismatchError: for observations that no twin has
     """
     if env is None and (
         isinstance(policy, gym.Env | VecEnv) or (isinstance(policy, str) and policy not in aliases)
     ):
-        return "MlpPolicy", policy
+        policy, env = "MlpPolicy", policy
+    if env is None:
+        return policy, None
+    env = maybe_make_env(env, 0)
+    check_observations(env)
     return policy, env
+
+
+def check_observations(env: gym.Env | VecEnv) -> None:
+    """
+    :raises EnvironmentMismatchError: for dictionaries, images and whatever else no twin has
+    """
+    space = env.observation_space
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise EnvironmentMismatchError(
+            f"A twin observes a Box with one axis, and this environment observes {space}. Use one "
+            "that has a twin (sb3_hds.twins.all_ids() lists them), or make your own of its state."
+        )
+
+
+def check_policy(algorithm: type, policy: Any) -> None:
+    """
+    :raises ValueError: for a policy class of another algorithm, as its saved files name it
+    """
+    if isinstance(policy, type) and not issubclass(policy, TensorPolicy):
+        raise ValueError(
+            f"{algorithm.__name__} cannot use the policy {policy.__name__}: pass 'MlpPolicy'. "
+            "A file that another algorithm saved is loaded by the class of that algorithm."
+        )
+
+
+def check_arguments(model: "TwinAlgorithm") -> None:
+    """
+    Everything that would otherwise fail inside a compiled program, or in the middle of training.
+
+    :raises ValueError: naming the argument, what it may be and what it is
+    """
+    for name, allowed in _broken_rules(model):
+        raise ValueError(
+            f"{type(model).__name__}({name}={getattr(model, name)!r}): {name} must be {allowed}."
+        )
+    if model.value_learning_rate is not None:
+        schedule_of(model.value_learning_rate)
+
+
+def _broken_rules(model: "TwinAlgorithm") -> Iterator[tuple[str, str]]:
+    for name, least in _AT_LEAST.items():
+        value, derived = getattr(model, name), name in _DERIVED
+        if not (value is None and derived) and not (_is_count(value) and value >= least):
+            yield name, f"a whole number of at least {least}" + " or None" * derived
+    for name in _SHARES:
+        if not _between(getattr(model, name), 0.0, 1.0):
+            yield name, "a number from 0 to 1"
+    for name in ("temperature", "exploration_noise"):
+        if not _between(getattr(model, name), 0.0, math.inf):
+            yield name, "a finite number of at least 0"
+    if not (_between(model.gamma, 0.0, 1.0) and model.gamma > 0.0):
+        yield "gamma", "a number above 0 and at most 1"
+    for name in ("learning_rate", "value_learning_rate"):
+        rate = getattr(model, name)
+        if isinstance(rate, numbers.Real) and not _between(rate, 0.0, math.inf):
+            yield name, "a finite number of at least 0, or a schedule"
+    for name, choices in _CHOICES.items():
+        if getattr(model, name) not in choices:
+            yield name, f"one of {', '.join(map(repr, choices))}"
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+
+
+def _between(value: Any, low: float, high: float) -> bool:
+    return isinstance(value, numbers.Real) and low <= value <= high and math.isfinite(value)
+
+
+def schedule_of(rate: float | str | Schedule) -> Schedule:
+    """
+    :param rate: a number, a function of the remaining progress (from 1 to 0), or ``"lin_3e-3"`` as
+        in the zoo
+    :raises ValueError: for any other string
+    """
+    if not isinstance(rate, str):
+        return FloatSchedule(rate)
+    kind, _, start = rate.partition("_")
+    try:
+        return (
+            FloatSchedule(LinearSchedule(float(start), 0.0, 1.0))
+            if kind == "lin"
+            else FloatSchedule(float(rate))
+        )
+    except ValueError:
+        raise ValueError(
+            f"A learning rate is a number, a schedule or 'lin_NUMBER', got {rate!r}."
+        ) from None
+
+
+def device_or_cpu(device: Any) -> Any:
+    """
+    A model that was trained on an accelerator must load where there is none: as in SB3, ``"cuda"``
+    then means the CPU.
+
+    :return: ``device``, or ``"cpu"``, with a warning
+    """
+    if str(device).partition(":")[0] != "cuda":
+        return device
+    try:
+        jax_device(device)
+    except ValueError:
+        warnings.warn(f"There is no '{device}' that JAX could use; the model is loaded on the CPU.")
+        return "cpu"
+    return device
 
 
 def jax_device(device: Any) -> jax.Device:

@@ -1,11 +1,20 @@
 """
-Weights as tensors inside SB3's own zip format, so that a saved model outlives the JAX that wrote it.
+Weights as tensors inside SB3's own zip format, so that a saved model outlives the JAX that wrote
+it.
 
-SB3 saves every attribute that an algorithm lists in ``_get_torch_save_params`` by its ``state_dict``, and
-reads it back with ``torch.load(weights_only=True)``. A policy built on :class:`TensorPolicy` answers that
-protocol for its pytrees; nothing of JAX or Flax is pickled.
+SB3 saves every attribute that an algorithm lists in ``_get_torch_save_params`` by its
+``state_dict``, and reads it back with ``torch.load(weights_only=True)``. A policy built on
+:class:`TensorPolicy` answers that protocol for its pytrees; nothing of JAX or Flax is pickled.
+
+A file appears under its name only when it is complete (:func:`write_whole`).
 """
 
+import contextlib
+import io
+import os
+import secrets
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -15,8 +24,45 @@ import torch as th
 from sbx.common.policies import BaseJaxPolicy
 
 
+def write_whole(
+    path: str | os.PathLike[str] | io.BufferedIOBase,
+    suffix: str,
+    write: Callable[[io.BufferedIOBase], None],
+) -> None:
+    """
+    Write under a temporary name in the same folder, then rename: whoever reads the folder, also
+    after the process was killed, finds the new file, or the older one of that name, never a half.
+
+    :param path: of the file, whose folders are made; something open for writing is just written to
+    :param suffix: without a dot, appended to a name that has none, as SB3 does
+    :param write: is called with the open file
+    :raises OSError: if the file cannot be written; an older one is then left as it was
+    """
+    if not isinstance(path, str | os.PathLike):
+        write(path)
+        return
+    target = Path(path)
+    target = target if target.suffix else target.with_name(f"{target.name}.{suffix}")
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.ExitStack() as stack:
+            stack.callback(_remove, temporary)
+            with temporary.open("xb") as file:
+                write(file)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, target)
+    except OSError as error:
+        reason = (
+            f"'{target}' could not be written: {error.strerror or error}. An older file there is "
+            "unchanged. The folder must be writable, with space left on the disk"
+        )
+        raise OSError(error.errno, reason) from error
+
+
 def to_state_dict(tree: Any) -> dict[str, th.Tensor]:
-    """:return: one tensor for each leaf, under its path in the pytree, in the order of the leaves"""
+    """:return: one tensor for each leaf, under its path in the pytree, in the leaves' order"""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {_name(path): th.as_tensor(np.array(leaf)) for path, leaf in leaves}
 
@@ -57,6 +103,31 @@ class TensorPolicy(BaseJaxPolicy):
     Subclasses implement ``weights`` and ``training_state``, each with a setter.
     """
 
+    def predict(  # type: ignore[override]
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        :param observation: one, or a batch with one row for each copy of the environment
+        :return: action of the same number of rows, in the units of the action space; ``state``
+        :raises ValueError: if the observation has another shape than the observation space
+        """
+        if isinstance(observation, tuple) and len(observation) == 2:
+            raise ValueError(
+                "predict() got a tuple instead of an observation. Gymnasium's reset() returns "
+                "(obs, info) where a VecEnv's returns obs, mixing Gym API with SB3 VecEnv API: use "
+                "`obs, info = env.reset()`, or `obs = vec_env.reset()`."
+            )
+        return super().predict(observation, state, episode_start, deterministic)
+
+    def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
+        """Rounding may lead out of the bounds, by one unit in the last place."""
+        low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
+        return np.clip(super().unscale_action(scaled_action), low, high)
+
     @property
     def weights(self) -> Any:
         """The pytree that prediction needs."""
@@ -68,7 +139,7 @@ class TensorPolicy(BaseJaxPolicy):
 
     @property
     def training_state(self) -> Any:
-        """The pytree that only training needs: optimiser states, counters, random keys as integers."""
+        """What only training needs: optimiser states, counters, random keys as integers."""
         raise AttributeError("training_state")
 
     @training_state.setter
@@ -84,7 +155,7 @@ class TensorPolicy(BaseJaxPolicy):
 
 class TrainingTensors:
     """
-    What SB3 takes for the optimiser of a policy: an object with ``state_dict`` and ``load_state_dict``.
+    What SB3 takes for the optimiser of a policy: it has ``state_dict`` and ``load_state_dict``.
 
     :param policy: whose training state is saved
     """
@@ -99,6 +170,11 @@ class TrainingTensors:
         self._policy.training_state = from_state_dict(
             self._policy.training_state, state_dict, strict
         )
+
+
+def _remove(file: Path) -> None:
+    with contextlib.suppress(OSError):
+        file.unlink()
 
 
 def _name(path: tuple) -> str:

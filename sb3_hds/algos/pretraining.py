@@ -14,8 +14,8 @@ _N_LOGS = 10
 class Pretraining(BaseCallback):
     """
     Runs the planning epochs that are due when training starts, so that everything SB3 sets up for
-    ``learn`` (logger, other callbacks, environment) is there. Interrupted, it leaves a model that goes on
-    where it stopped.
+    ``learn`` (logger, other callbacks, environment) is there. Interrupted, it leaves a model that
+    goes on where it stopped.
 
     :param progress_bar: whether to show one
     """
@@ -31,8 +31,7 @@ class Pretraining(BaseCallback):
             return
         every = max(1, due // _N_LOGS)
         for i in self._shown(range(1, due + 1)):
-            model.run_epoch(model.gradient_steps)
-            model.n_pretrained += 1
+            model.pretrain_epoch()
             if i % every == 0 or i == due:
                 model.logger.dump(step=model.num_timesteps)
 

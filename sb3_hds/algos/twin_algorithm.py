@@ -1,13 +1,16 @@
 """
 The shell of every algorithm that learns through a twin.
 
-SB3 collects real steps and calls ``train``; a call of ``train`` is one planning epoch in the twin (the
-pure function in ``epoch.py``). A timestep is a step of the environment that the user passed in, nothing
-else; simulated steps are counted apart.
+SB3 collects real steps and calls ``train``; a call of ``train`` is one planning epoch in the twin
+(the pure function in ``epoch.py``). A timestep is a step of the environment that the user passed
+in, nothing else; simulated steps are counted apart.
 """
 
+import io
 import math
+import pathlib
 import warnings
+from collections.abc import Iterable
 from typing import Any, ClassVar, Self
 
 import jax
@@ -16,19 +19,26 @@ import numpy as np
 from gymnasium import spaces
 from sbx.common.off_policy_algorithm import OffPolicyAlgorithmJax
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
-from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 
 from sb3_hds import effects, twins
-from sb3_hds.algos.call_forms import jax_device, policy_and_env
-from sb3_hds.algos.epoch import PLANNERS, Report, epoch, twin_steps_per_epoch
+from sb3_hds.algos.call_forms import (
+    check_arguments,
+    check_policy,
+    device_or_cpu,
+    jax_device,
+    policy_and_env,
+    schedule_of,
+)
+from sb3_hds.algos.epoch import Report, epoch, twin_steps_per_epoch
 from sb3_hds.algos.learner import Knobs, Learner, Settings, Workspace, find_scales, fresh_workspace
 from sb3_hds.algos.normalisation import prepare_statistics, view_of
+from sb3_hds.algos.persistence import write_whole
 from sb3_hds.algos.pretraining import Pretraining
-from sb3_hds.algos.twin_policy import TwinPolicy
+from sb3_hds.algos.twin_policy import TwinPolicy, all_finite
 from sb3_hds.core import Twin
 from sb3_hds.envs.mirror import check_mirrors, twin_of
 from sb3_hds.errors import NoTwinError, RewardError
@@ -100,6 +110,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         _init_setup_model: bool,
     ) -> None:
         policy, env = policy_and_env(policy, env, self.policy_aliases)
+        check_policy(type(self), policy)
         super().__init__(
             policy=policy,
             env=env,
@@ -155,6 +166,11 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         self._device_name = str(device)
         self._workspace: Workspace | None = None
         if _init_setup_model:
+            if self.env is None:
+                raise ValueError(
+                    f"{type(self).__name__} needs an environment, for example "
+                    f"{type(self).__name__}('Pendulum-v1')."
+                )
             self._setup_model()
 
     def learn(  # type: ignore[override]
@@ -169,8 +185,8 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         """
         Plan in the twin until the pretraining is done, then act in the environment and plan on.
 
-        :param total_timesteps: steps of the *environment*; default ``default_timesteps``. With 0, only
-            the pretraining runs, and the environment is not stepped.
+        :param total_timesteps: steps of the *environment*; default ``default_timesteps``. With 0,
+            only the pretraining runs, and the environment is not stepped.
         :param callback: called at every step of the environment
         :param log_interval: episodes between two log lines
         :param tb_log_name: name of the run for TensorBoard; default: the class's name
@@ -189,7 +205,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         )
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
-        """One planning epoch with ``gradient_steps`` regression steps. SB3 calls it while it collects."""
+        """One planning epoch with ``gradient_steps`` regression steps, between real steps."""
         self.run_epoch(gradient_steps)
 
     def run_epoch(self, gradient_steps: int) -> Report:
@@ -204,7 +220,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         learner, settings, knobs = self._learner(), self._settings, self._knobs(gradient_steps)
         learner, report = epoch(settings, learner, knobs)
         losses = float(report.policy_loss), float(report.value_loss)
-        if not all(map(math.isfinite, losses)):
+        if not (all(map(math.isfinite, losses)) and all_finite(learner.networks)):
             raise FloatingPointError(
                 f"The regression diverged (losses {losses}); the model keeps the state before this "
                 "epoch. Lower learning_rate."
@@ -218,11 +234,60 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         return report
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        :param env: has the spaces of the one before, as many copies, and a twin
+        :param force_reset: False goes on from where the environment is
+        :raises NoTwinError: if it has no twin; the model then keeps the environment that it had
+        """
+        before = self.env, self.n_envs, self._vec_normalize_env, self._last_obs
         super().set_env(env, force_reset)
-        self._meet_env()
+        try:
+            self._meet_env()
+        except Exception:
+            self.env, self.n_envs, self._vec_normalize_env, self._last_obs = before
+            raise
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Write a zip file as SB3 does, whole or not at all.
+
+        :param path: of the file; ``.zip`` is appended where it has no suffix
+        :param exclude: attributes to leave out besides the usual ones
+        :param include: attributes to write although they are usually left out
+        :raises OSError: if the file cannot be written; an older one is then left as it was
+        """
+        write = super().save
+        write_whole(path, "zip", lambda file: write(file, exclude, include))
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        write_whole(path, "pkl", super().save_replay_buffer)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: Any = "auto",
+        *args: Any,
+        **kwargs: Any,
+    ) -> Self:
+        """
+        SB3's ``load``.
+
+        :param path: of a file that this class saved
+        :param env: to go on training in; none is needed to predict
+        :param device: where to; ``"cuda"`` means the CPU where there is none, with a warning
+        :raises ValueError: for a damaged file, or one that another algorithm saved
+        """
+        return super().load(path, env, device_or_cpu(device), *args, **kwargs)
 
     def _setup_model(self) -> None:
-        _check_arguments(self)
+        check_arguments(self)
         super()._setup_model()
         device = jax_device(self._device_name)
         self.policy = self.policy_class(  # type: ignore[assignment]
@@ -234,7 +299,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         self._setup_twin()
 
     def _setup_twin(self) -> None:
-        """The twin that was passed, or saved because it had been passed, or the environment's own."""
+        """The twin that was passed, or saved because it had been, or the environment's own."""
         if isinstance(self.twin, str):
             self.twin = twins.make(self.twin)
         elif self.twin is None and self.twin_spec is not None:
@@ -244,20 +309,26 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         self._meet_env()
 
     def _meet_env(self) -> None:
+        """Plan with the twin of the environment, unless one was passed."""
+        twin = self.twin
         if self.env is not None:
             if self.twin_spec is None:
-                self.twin = twin_of(self.env)
-            elif self.twin is not None:
-                check_mirrors(self.env, self.twin)
-        if self.twin is not None:
-            check_reward(self.twin)
+                twin = twin_of(self.env)
+            elif twin is not None:
+                check_mirrors(self.env, twin)
+        if twin is not None:
+            check_reward(twin)
+            if self.twin is not None and (twin != self.twin or twin.values != self.twin.values):
+                self._workspace = None
+        self.twin = twin
 
     @property
     def _settings(self) -> Settings:
         if self.twin is None:
+            way_out = "" if self.twin_spec else "Set an environment that has one (set_env). "
             raise NoTwinError(
-                "This model has no twin to plan in. Set an environment that has one (set_env), or load "
-                "it with one: load(path, twin=...)."
+                f"This model has no twin to plan in. {way_out}"
+                "Load it with one: load(path, env=env, twin=...)."
             )
         horizon = self.horizon or _derived_horizon(self.twin)
         return Settings(
@@ -282,7 +353,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         )
 
     def _learner(self) -> Learner:
-        """Networks and training state of the policy, with a workspace; scales are found before the first epoch."""
+        """What an epoch changes. Before the first one, the scales of the task are found."""
         settings, policy = self._settings, self.policy
         if self._workspace is None:
             n_obs = len(settings.twin.channels)
@@ -330,7 +401,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         """Observations of the real environment to plan from, and for which start states."""
         buffer, n = self.replay_buffer, self.n_rollouts
         stored = 0 if buffer is None else buffer.size()
-        count = int(round(self.relabel_share * n)) if stored else 0
+        count = round(self.relabel_share * n) if stored else 0
         visited = np.zeros((n, n_obs), np.float32)
         if count:
             steps = np.random.randint(stored, size=count)
@@ -346,22 +417,35 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
 
     def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any):
         total_timesteps, callback = super()._setup_learn(total_timesteps, *args, **kwargs)
-        assert isinstance(self.train_freq, TrainFreq)
         steps = total_timesteps - self.num_timesteps
-        if self.train_freq.unit.value == "step":
-            per_epoch = self.train_freq.frequency * self.n_envs
-        else:
-            limit = self.twin.max_episode_steps if self.twin is not None else None
-            per_epoch = self.train_freq.frequency * (limit or _LONG_EPISODE)
         pending = max(0, self.pretrain_epochs - self.n_pretrained)
-        self._epochs_planned, self._epochs_done = pending + math.ceil(steps / per_epoch), 0
+        self._epochs_planned = pending + math.ceil(steps / self._steps_per_epoch)
+        self._epochs_done = 0
         return total_timesteps, callback
 
+    @property
+    def _steps_per_epoch(self) -> int:
+        """Real steps between two epochs; where ``train_freq`` counts episodes, the most."""
+        assert isinstance(self.train_freq, TrainFreq)
+        if self.train_freq.unit.value == "step":
+            return self.train_freq.frequency * self.n_envs
+        limit = self.twin.max_episode_steps if self.twin is not None else None
+        return self.train_freq.frequency * (limit or _LONG_EPISODE)
+
+    def pretrain_epoch(self) -> None:
+        """One planning epoch before the first real step, like any other."""
+        due = self.gradient_steps if self.gradient_steps >= 0 else self._steps_per_epoch
+        self.run_epoch(due)
+        self.n_pretrained += 1
+
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        callback = super()._init_callback(callback, progress_bar)
-        together = CallbackList([Pretraining(progress_bar), callback])
-        together.init_callback(self)
-        return together
+        if callback is None:
+            given = []
+        elif isinstance(callback, list):
+            given = callback
+        else:
+            given = [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
+        return super()._init_callback([Pretraining(progress_bar), *given], progress_bar)
 
     def _log(self, report: Report, knobs: Knobs) -> None:
         record = self.logger.record
@@ -403,26 +487,6 @@ def check_reward(twin: Twin) -> None:
         )
 
 
-def schedule_of(rate: float | str | Schedule) -> Schedule:
-    """
-    :param rate: a number, a function of the remaining progress (from 1 to 0), or the zoo's ``"lin_3e-3"``
-    :raises ValueError: for any other string
-    """
-    if not isinstance(rate, str):
-        return FloatSchedule(rate)
-    kind, _, start = rate.partition("_")
-    try:
-        return (
-            FloatSchedule(LinearSchedule(float(start), 0.0, 1.0))
-            if kind == "lin"
-            else FloatSchedule(float(rate))
-        )
-    except ValueError:
-        raise ValueError(
-            f"A learning rate is a number, a schedule or 'lin_NUMBER', got {rate!r}."
-        ) from None
-
-
 def _derived_horizon(twin: Twin) -> int:
     return int(np.clip(round(_HORIZON / twin.dt), _SHORTEST, _LONGEST))
 
@@ -432,36 +496,7 @@ def _twin_from_file(spec: dict[str, Any]) -> Twin | None:
         return twins.from_spec(spec, effects.ALL)
     except NoTwinError as error:
         warnings.warn(
-            f"The model can predict but not train, because its twin '{spec['twin']}' is not registered "
-            f"here. Register it, or load with twin=... ({str(error).splitlines()[0]})"
+            f"The model can predict but not train, because its twin '{spec['twin']}' is not "
+            f"registered here. Register it, or load with twin=... ({str(error).splitlines()[0]})"
         )
         return None
-
-
-def _check_arguments(model: TwinAlgorithm) -> None:
-    """Everything that would otherwise fail inside a compiled program."""
-    rules = {
-        "n_rollouts": model.n_rollouts >= 1,
-        "horizon": model.horizon is None or model.horizon >= 1,
-        "lookahead": model.lookahead is None or model.lookahead >= 0,
-        "order": model.order in (1, 2),
-        "planner": model.planner is None or model.planner in PLANNERS,
-        "n_iterations": model.n_iterations >= 1,
-        "n_step_sizes": model.n_step_sizes >= 2,
-        "n_random_plans": model.n_random_plans >= 0,
-        "gamma": 0.0 < model.gamma <= 1.0,
-        "plan_memory": model.plan_memory >= 1,
-        "loss": model.loss in ("smooth_absolute", "squared"),
-        "pretrain_epochs": model.pretrain_epochs >= 0,
-        "temperature": model.temperature >= 0.0,
-        "exploration_noise": model.exploration_noise >= 0.0,
-        "batch_size": model.batch_size >= 1,
-    }
-    for share in ("reset_share", "relabel_share", "gain_weight", "sensitivity_weight", "averaging"):
-        rules[share] = 0.0 <= getattr(model, share) <= 1.0
-    for name, holds in rules.items():
-        if not holds:
-            raise ValueError(
-                f"{type(model).__name__}({name}={getattr(model, name)!r}) is out of range; "
-                f"see the documentation of `{name}`."
-            )

@@ -24,8 +24,8 @@ class TwinPolicy(TensorPolicy):
     :param observation_space: a Box of one dimension
     :param action_space: a bounded Box of one dimension
     :param lr_schedule: learning rate of the policy by remaining progress
-    :param net_arch: hidden widths of both networks, or ``{"pi": [...], "vf": [...]}``; default 96, 96
-        for the policy and 64, 64 for the value
+    :param net_arch: hidden widths of both networks, or ``{"pi": [...], "vf": [...]}``; default
+        96, 96 for the policy and 64, 64 for the value
     :param activation_fn: name, JAX function or torch module class
     :param max_grad_norm: gradients of both networks are clipped to this norm
     :param use_sde: accepted for SB3's sake; the policy is deterministic
@@ -42,19 +42,30 @@ class TwinPolicy(TensorPolicy):
         use_sde: bool = False,
     ) -> None:
         super().__init__(observation_space, action_space, squash_output=True)
-        widths = net_arch if isinstance(net_arch, dict) else {"pi": net_arch, "vf": net_arch}
+        pi, vf = _widths(net_arch)
         function = activation(activation_fn)
-        pi = _POLICY_WIDTHS if widths["pi"] is None else tuple(widths["pi"])
-        vf = _VALUE_WIDTHS if widths["vf"] is None else tuple(widths["vf"])
+        if not max_grad_norm > 0.0:
+            raise ValueError(f"max_grad_norm must be above 0, got {max_grad_norm!r}.")
+        self._arguments = {
+            "lr_schedule": lr_schedule,
+            "net_arch": net_arch,
+            "activation_fn": activation_fn,
+            "max_grad_norm": max_grad_norm,
+        }
         self.actor_network = Actor(int(np.prod(action_space.shape)), pi, function)
         self.value_network = Value(vf, function)
         self.max_grad_norm = max_grad_norm
         self.networks: Networks
         self.progress: Progress
         self.optimizer = TrainingTensors(self)
+        self.build(jax.random.key(0, impl="unsafe_rbg"), jax.devices()[0])
 
     def build(self, key: jax.Array, device: jax.Device) -> None:
-        """Draw fresh networks."""
+        """
+        Draw fresh networks.
+
+        :param key: of the generator ``unsafe_rbg``
+        """
         n_obs = int(np.prod(self.observation_space.shape))
         networks, progress = fresh_networks(
             self.actor_network, self.value_network, n_obs, self.max_grad_norm, key
@@ -86,6 +97,12 @@ class TwinPolicy(TensorPolicy):
         flat = observation.reshape(observation.shape[0], -1)
         return np.asarray(_act(self.actor_network, self.networks, flat))
 
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        """What ``save`` keeps of the policy besides its weights, and ``load`` makes it from."""
+        spaces_and_more = super()._get_constructor_parameters()
+        spaces_and_more.pop("normalize_images")
+        return spaces_and_more | self._arguments
+
     def reset_noise(self, batch_size: int = 1) -> None:
         """Nothing to reset: the policy is deterministic."""
 
@@ -94,3 +111,34 @@ class TwinPolicy(TensorPolicy):
 def _act(actor: Actor, networks: Networks, obs: Any) -> jax.Array:
     """Controls of the averaged policy for a batch of observations."""
     return actor.apply(networks.average, networks.inside(jnp.asarray(obs, jnp.float32)))
+
+
+@jax.jit
+def _finite(leaves: list[jax.Array]) -> jax.Array:
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in leaves]).all()
+
+
+def all_finite(networks: Networks) -> bool:
+    """:return: whether no weight is infinite or not a number"""
+    return bool(_finite(jax.tree.leaves((networks.actor, networks.average, networks.value))))
+
+
+def _widths(
+    net_arch: Sequence[int] | dict[str, Sequence[int]] | None,
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """
+    :return: hidden widths of the policy and of the value
+    :raises ValueError: for other keys than ``pi`` and ``vf``, or widths that are no counts
+    """
+    given = net_arch if isinstance(net_arch, dict) else {"pi": net_arch, "vf": net_arch}
+    usual = {"pi": _POLICY_WIDTHS, "vf": _VALUE_WIDTHS}
+    widths = usual | {name: tuple(some) for name, some in given.items() if some is not None}
+    numbers = [width for some in widths.values() for width in some]
+    if widths.keys() != usual.keys() or not all(
+        isinstance(width, int) and width > 0 for width in numbers
+    ):
+        raise ValueError(
+            "net_arch must be a list of widths such as [64, 64], or {'pi': [64, 64], 'vf': [64]}, "
+            f"got {net_arch!r}."
+        )
+    return widths["pi"], widths["vf"]
