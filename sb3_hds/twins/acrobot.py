@@ -121,7 +121,7 @@ class Acrobot(AnalyticTwin):
         return jnp.stack([shoulder, spin * v[0] ** 2 + elbow])
 
     def limit_velocity(self, v: Velocity) -> Velocity:
-        highest = jnp.array([_MAX_SPEED_1, _MAX_SPEED_2])
+        highest = jnp.array([_MAX_SPEED_1, _MAX_SPEED_2], v.dtype)
         return jnp.clip(v, -highest, highest)
 
     def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:

@@ -44,9 +44,10 @@ class PayloadPendulum(AnalyticTwin):
         m l^2 \dot\omega + m l\,(\ddot x \cos\theta + (\ddot z + g) \sin\theta) + d\,\omega = 0,
         \qquad (\ddot x, \ddot z) = (u - (\dot x, \dot z)) / 0.05\,\mathrm{s}
 
-    The handle is driven by a servo that knows its load, so the payload never pushes it back; it
-    takes up a new velocity with a time constant of 0.05 s, where the paper prescribes it at once.
-    Integrated by RK4 in two sub-steps of 25 ms.
+    The handle is driven by a servo that knows its load, damping included, so the payload never
+    pushes it back; it takes up a new velocity with a time constant of 0.05 s, where the paper
+    prescribes it at once. What the drive does not know, an effect, moves the handle too, as a body
+    of 10 kg. Integrated by RK4 in two sub-steps of 25 ms.
 
     The reward of the paper, with :math:`p` the payload's position relative to where it hangs when
     the handle is in the origin, :math:`v` its velocity, and :math:`a` the command:

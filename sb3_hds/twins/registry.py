@@ -69,9 +69,13 @@ def make(name_or_env_id: str, **settings: Any) -> Twin:
 def from_env(env: Any) -> Twin:
     """
     :param env: an environment made by ``gymnasium.make``, wrapped or not
-    :return: its twin, with the parameters that the environment was made with
+    :return: its twin, with the parameters that the environment was made with; the very twin that
+        it simulates if it is made of one
     :raises NoTwinError: if its id has no twin
     """
+    own = getattr(env.unwrapped, "twin", None)
+    if isinstance(own, Twin):
+        return own
     spec = getattr(env, "spec", None)
     env_id = spec.id if spec is not None else type(env.unwrapped).__name__
     return get(env_id).from_env(env)

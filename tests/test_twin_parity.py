@@ -1,0 +1,476 @@
+"""Each twin against what it mirrors: step for step, and in what it reads from the environment."""
+
+import math
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.stats import ks_2samp
+
+import sb3_hds
+from sb3_hds import twins
+from sb3_hds.core import State, rollout
+from sb3_hds.errors import EnvironmentMismatchError
+
+MUJOCO = ["InvertedPendulum-v5", "InvertedDoublePendulum-v5"]
+CLASSIC = ["MountainCarContinuous-v0", "Pendulum-v1"]
+N_STEPS = 200
+
+
+def state_of(q, v):
+    return State(jnp.asarray(q, jnp.float64), jnp.asarray(v, jnp.float64), {})
+
+
+def simulator(twin):
+    """Compiled step, observation, reward and termination of a twin with its own values."""
+
+    @jax.jit
+    def simulate(state, action):
+        after = twin.step(state, action, twin.params)
+        reward = twin.reward(state, action, after, twin.params)
+        terminated = twin.terminated(after, twin.params)
+        return after, twin.observe(after, twin.params), reward, terminated
+
+    return simulate
+
+
+def mujoco_state(env):
+    return state_of(env.data.qpos.copy(), env.data.qvel.copy())
+
+
+def away_from_limits(env):
+    """The rail ends at 1 m with a margin of 1 cm, the hinge of the single pole at 90 degrees."""
+    return abs(env.data.qpos[0]) < 0.95 and abs(env.data.qpos[1]) < 1.5
+
+
+def random_episodes(env, twin, seed=0):
+    """
+    Drive environment and twin by the same random commands, each from its own state; reset both
+    when the environment terminates or a joint comes near its limit. Yields after each step.
+    """
+    rng, simulate = np.random.default_rng(seed), simulator(twin)
+    low, high = twin.actuators[0].low, twin.actuators[0].high
+    env.reset(seed=seed)
+    state, n_steps, n_resets = mujoco_state(env), 0, 1
+    while n_steps < N_STEPS:
+        action = 0.3 * rng.uniform(low, high, 1)
+        obs, reward, terminated, *_ = env.step(action)
+        if away_from_limits(env):
+            after = simulate(state, jnp.asarray(action))
+            yield obs, reward, terminated, *after
+            state, n_steps = after[0], n_steps + 1
+        if terminated or not away_from_limits(env):
+            env.reset()
+            state, n_resets = mujoco_state(env), n_resets + 1
+    assert n_resets > 3
+
+
+def change_constants(model):
+    """Give a MuJoCo model other masses, shapes, damping, armature, gravity, gear and time step."""
+    rng = np.random.default_rng(1)
+    model.body_mass[1:] *= rng.uniform(0.7, 1.3, model.body_mass[1:].shape)
+    model.body_inertia[1:] *= rng.uniform(0.7, 1.3, model.body_inertia[1:].shape)
+    model.body_ipos[2:, 2] += rng.uniform(-0.05, 0.05, model.body_ipos[2:, 2].shape)
+    model.dof_damping[:] *= rng.uniform(0.5, 2.0, model.dof_damping.shape)
+    model.dof_armature[:] = rng.uniform(0.1, 0.3, model.dof_armature.shape)
+    model.opt.gravity[:] = 0.7, 0.0, -8.0
+    model.actuator_gear[0, 0] *= 0.8
+    model.opt.timestep *= 0.7
+    if model.nbody > 3:
+        model.body_pos[3, 2] += 0.1
+        model.site_pos[0, 2] -= 0.05
+
+
+@pytest.mark.parametrize("changed", [False, True], ids=["as shipped", "changed XML"])
+@pytest.mark.parametrize("env_id", MUJOCO)
+def test_mujoco_twins_follow_mujoco(env_id, changed, x64):
+    env = gymnasium.make(env_id, **({"frame_skip": 3} if changed else {})).unwrapped
+    if changed:
+        change_constants(env.model)
+    twin = twins.from_env(env)
+
+    for obs, _, terminated, state, twin_obs, _, twin_terminated in random_episodes(env, twin):
+        # Rounding of 1e-16 per operation, grown along unstable episodes of some ten steps.
+        scale = np.maximum(1.0, np.abs([*env.data.qpos, *env.data.qvel]))
+        error = np.concatenate([state.q - env.data.qpos, state.v - env.data.qvel]) / scale
+        assert np.abs(error).max() < 1e-12
+        np.testing.assert_allclose(twin_obs, obs, rtol=1e-12, atol=1e-12)
+        if env_id == "InvertedPendulum-v5":
+            assert terminated == twin_terminated
+
+
+@pytest.mark.parametrize("env_id", MUJOCO)
+def test_declared_constants_are_those_of_the_shipped_model(env_id):
+    twin = twins.from_env(gymnasium.make(env_id))
+
+    assert twin == twins.make(env_id)
+    # The compiler derives masses and inertias from shapes; declared to 16 digits.
+    assert twin.values == pytest.approx(twins.make(env_id).values, rel=1e-14)
+
+
+def test_the_reward_of_the_inverted_pendulum_is_the_environments(x64):
+    env = gymnasium.make("InvertedPendulum-v5").unwrapped
+
+    for _, reward, _, _, _, twin_reward, _ in random_episodes(env, twins.from_env(env)):
+        assert twin_reward == reward
+
+
+def test_the_reward_of_the_double_pendulum_is_the_environments_at_the_end_of_the_step(x64):
+    env = gymnasium.make("InvertedDoublePendulum-v5", healthy_reward=7.0).unwrapped
+
+    for _, reward, ended, _, _, twin_reward, twin_ended in random_episodes(
+        env, twins.from_env(env)
+    ):
+        # As the environment has it, the tip is where the last Runge-Kutta stage put it: O(h^3) off.
+        assert ended != twin_ended or twin_reward == pytest.approx(reward, abs=5e-3)
+        mujoco.mj_kinematics(env.model, env.data)
+        x, _, z = env.data.site_xpos[0]
+        expected, _ = env._get_rew(x, z, bool(z <= 1.0))
+        assert twin_reward == pytest.approx(expected, rel=1e-12)
+        assert twin_ended == (z <= 1.0)
+
+
+def test_the_double_pendulums_reward_is_positive_while_alive(x64):
+    """So that planning, which counts nothing after the fall, does not prefer an early one."""
+    twin = twins.make("InvertedDoublePendulum")
+    starts = jax.vmap(twin.initial, (0, None))(
+        jax.random.split(jax.random.key(0), 200), twin.params
+    )
+    pushes = jax.random.choice(jax.random.key(1), jnp.array([-1.0, 1.0]), (200, 20, 1))
+
+    episodes = jax.jit(jax.vmap(lambda s, a: rollout(twin, twin.params, s, a)))(starts, pushes)
+
+    survived = episodes.alive[:, 1:]
+    assert not survived[:, -1].any()
+    assert episodes.rewards[:, :-1][survived].min() > 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda m: m.dof_frictionloss.__setitem__(0, 0.1), "joints without dry friction"),
+        (lambda m: m.jnt_stiffness.__setitem__(1, 0.1), "joints without springs"),
+        (lambda m: setattr(m.opt, "integrator", 0), "the integrator RK4"),
+        (lambda m: setattr(m.opt, "density", 1.2), "no medium around the bodies"),
+        (lambda m: m.actuator_ctrlrange.__setitem__(0, (-2.0, 2.0)), "commands within"),
+        (lambda m: m.jnt_axis.__setitem__(1, (1.0, 0.0, 0.0)), "hinges about y"),
+    ],
+)
+@pytest.mark.parametrize("env_id", MUJOCO)
+def test_a_model_of_another_structure_is_refused(env_id, change, expected):
+    env = gymnasium.make(env_id).unwrapped
+    change(env.model)
+
+    with pytest.raises(EnvironmentMismatchError, match=f"The twin expects .*{expected}"):
+        twins.from_env(env)
+
+
+def test_pendulum_follows_gymnasium(x64):
+    env = gymnasium.make("Pendulum-v1", g=9.81).unwrapped
+    twin, rng = twins.from_env(env), np.random.default_rng(0)
+    simulate = simulator(twin)
+    assert twin.values["gravity"] == 9.81
+
+    for seed in range(3):
+        env.reset(seed=seed)
+        state = state_of(env.state[:1], env.state[1:])
+        for _ in range(N_STEPS):
+            torque = rng.uniform(-2.5, 2.5, 1)  # beyond the clip, too
+            reward = env.step(torque)[1]
+            state, _, twin_reward, terminated = simulate(state, jnp.asarray(torque))
+            # Rounding of 1e-16, grown by the upper equilibrium over 10 s.
+            np.testing.assert_allclose(np.r_[state.q, state.v], env.state, rtol=0.0, atol=1e-11)
+            assert twin_reward == pytest.approx(reward, abs=1e-9)
+            assert not terminated
+
+
+def test_mountain_car_follows_gymnasium(x64):
+    """From the environment's own state at each step, for it stores that in single precision."""
+    env = gymnasium.make("MountainCarContinuous-v0", goal_velocity=0.01).unwrapped
+    twin, rng = twins.from_env(env), np.random.default_rng(0)
+    simulate, n_terminated, n_walls = simulator(twin), 0, 0
+    assert twin.goal_velocity == 0.01
+
+    for seed in range(5):
+        env.reset(seed=seed)
+        for _ in range(N_STEPS):
+            before = state_of(env.state[:1], env.state[1:])
+            push = np.array([1.2 * np.sign(before.v[0])]) + rng.uniform(-1.0, 1.0, 1)
+            _, reward, terminated, *_ = env.step(push)
+            after, _, twin_reward, twin_terminated = simulate(before, jnp.asarray(push))
+            # Half a unit in the last place of a float32 up to 1.2 and 0.07; the environment also
+            # computes the sums in single precision where it clips.
+            np.testing.assert_allclose(after.q, env.state[:1], rtol=0.0, atol=2e-7)
+            np.testing.assert_allclose(after.v, env.state[1:], rtol=0.0, atol=1e-8)
+            assert terminated == twin_terminated
+            assert twin_reward == pytest.approx(reward, rel=1e-12)
+            n_terminated += terminated
+            n_walls += after.q[0] == -1.2
+            if terminated:
+                env.reset()
+    assert n_terminated >= 3
+    assert n_walls >= 1
+
+
+def acrobot_state(env):
+    return state_of(env.state[:2], env.state[2:])
+
+
+def test_acrobot_follows_gymnasium(x64):
+    env, twin = gymnasium.make("Acrobot-v1").unwrapped, twins.make("Acrobot")
+    rng, simulate = np.random.default_rng(0), simulator(twin)
+
+    for seed in range(3):
+        env.reset(seed=seed)
+        state = acrobot_state(env)
+        for _ in range(N_STEPS):
+            choice = rng.integers(3)
+            obs, reward, terminated, *_ = env.step(choice)
+            state, twin_obs, twin_reward, twin_terminated = simulate(
+                state, jnp.array([choice - 1.0])
+            )
+            angles = (state.q - env.state[:2] + math.pi) % (2.0 * math.pi) - math.pi
+            # Rounding of 1e-16, grown by chaotic motion over 40 s.
+            np.testing.assert_allclose(angles, 0.0, rtol=0.0, atol=1e-10)
+            np.testing.assert_allclose(state.v, env.state[2:], rtol=0.0, atol=1e-10)
+            np.testing.assert_allclose(twin_obs, obs, rtol=1e-6, atol=1e-6)  # reported in float32
+            assert (twin_reward, twin_terminated) == (reward, terminated)
+
+
+def test_acrobot_clips_speeds_and_ends_high_as_gymnasium_does(x64):
+    env, twin = gymnasium.make("Acrobot-v1").unwrapped, twins.make("Acrobot")
+    rng, simulate = np.random.default_rng(0), simulator(twin)
+    n_clipped = n_terminated = 0
+
+    for _ in range(N_STEPS):
+        env.reset()
+        highest = np.array([math.pi, math.pi, env.MAX_VEL_1, env.MAX_VEL_2])
+        env.state = rng.uniform(-highest, highest)
+        before = acrobot_state(env)
+        _, reward, terminated, *_ = env.step(2)
+        after, _, twin_reward, twin_terminated = simulate(before, jnp.ones(1))
+        # One step at up to 28 rad/s, with derivatives of up to 1e3.
+        np.testing.assert_allclose(after.v, env.state[2:], rtol=0.0, atol=1e-10)
+        assert (twin_reward, twin_terminated) == (reward, terminated)
+        n_clipped += np.abs(after.v[1]) == env.MAX_VEL_2
+        n_terminated += terminated
+    assert n_clipped > 5
+    assert n_terminated > 5
+
+
+def test_cart_pole_follows_gymnasium(x64):
+    env, twin = gymnasium.make("CartPole-v1").unwrapped, twins.make("CartPole")
+    env.kinematics_integrator = "semi-implicit"
+    rng, simulate = np.random.default_rng(0), simulator(twin)
+
+    for seed, forces in enumerate([(-10.0, 10.0), (10.0, -10.0), None]):
+        env.reset(seed=seed)
+        env.state, env.steps_beyond_terminated = rng.normal(size=4), 1
+        state = state_of(env.state[[0, 2]], env.state[[1, 3]])
+        for _ in range(N_STEPS):
+            env.force_mag = rng.choice(forces) if forces else rng.uniform(-10.0, 10.0)
+            env.step(1)
+            state, *_ = simulate(state, jnp.array([env.force_mag]))
+            # Rounding of 1e-16, grown by the upper equilibrium over 4 s.
+            np.testing.assert_allclose(state.q, env.state[[0, 2]], rtol=0.0, atol=1e-11)
+            np.testing.assert_allclose(state.v, env.state[[1, 3]], rtol=0.0, atol=1e-11)
+
+
+def test_cart_pole_is_best_at_rest_upright_in_the_middle(x64):
+    twin = twins.make("CartPole")
+    best, hanging = state_of([0.0, 0.0], [0.0, 0.0]), state_of([0.5, math.pi], [1.0, 2.0])
+
+    assert twin.reward(best, jnp.zeros(1), best, twin.params) == 0.0
+    # -2 (1 - cos pi) - 0.2 0.25 - 0.01 (1 + 4 + 0.25)
+    expected = -4.0 - 0.05 - 0.0525
+    value = twin.reward(hanging, jnp.array([5.0]), hanging, twin.params)
+    assert value == pytest.approx(expected, rel=1e-14)
+
+
+def payload_in_cartesian_coordinates(twin):
+    """Handle and payload as two points kept apart by a rod, whose tension is a multiplier."""
+    g, m, d = (twin.values[name] for name in ("gravity", "mass", "damping"))
+
+    def derivative(_, y, command):
+        handle_v, rod, rod_v = y[2:4], y[4:6] - y[0:2], y[6:8] - y[2:4]
+        handle_a = (command - handle_v) / 0.05
+        normal = np.array([-rod[1], rod[0]])
+        rate = normal @ rod_v / (rod @ rod)
+        free = np.array([0.0, -g]) - d * rate * normal / (rod @ rod) / m
+        # The second derivative of |rod|^2 vanishes.
+        tension = -((free - handle_a) @ rod + rod_v @ rod_v) / (rod @ rod)
+        return np.concatenate([handle_v, handle_a, y[6:8], free + tension * rod])
+
+    return derivative
+
+
+@pytest.mark.parametrize(
+    ("substeps", "tolerance"),
+    # RK4: the servo's error per sub-step is (h / 0.05 s)^5 / 120, 2.6e-4 at the default and 1e-12
+    # at 100 sub-steps, of a change of up to 4 m/s in speed, whence 0.05 s of that in position.
+    [(2, 2e-3), (100, 1e-9)],
+)
+def test_payload_pendulum_follows_an_independent_integration(substeps, tolerance, x64):
+    twin = twins.make("PayloadPendulum", mass=0.7, length=0.8, damping=0.1, substeps=substeps)
+    rng, simulate = np.random.default_rng(0), simulator(twin)
+    state = twin.initial(jax.random.key(1), twin.params)
+
+    def points(state):
+        (x, z, swing), (vx, vz, rate) = np.asarray(state.q), np.asarray(state.v)
+        rod = 0.8 * np.array([math.sin(swing), -math.cos(swing)])
+        rod_v = 0.8 * rate * np.array([math.cos(swing), math.sin(swing)])
+        return np.array([x, z, vx, vz, x + rod[0], z + rod[1], vx + rod_v[0], vz + rod_v[1]])
+
+    reference, derivative = points(state), payload_in_cartesian_coordinates(twin)
+    for _ in range(40):
+        command = rng.uniform(-2.0, 2.0, 2)
+        state, *_ = simulate(state, jnp.asarray(command))
+        reference = solve_ivp(
+            derivative, (0.0, 0.05), reference, "DOP853", args=(command,), rtol=1e-12, atol=1e-13
+        ).y[:, -1]
+        where = [0, 1, 4, 5]
+        np.testing.assert_allclose(points(state)[where], reference[where], 0.0, tolerance)
+
+
+def test_a_payload_under_a_still_handle_keeps_its_energy(x64):
+    twin = twins.make("PayloadPendulum", damping=0.0)
+    simulate = simulator(twin)
+    state = state_of([0.3, -0.2, 1.2], [0.0, 0.0, 0.5])
+
+    def energy(state):
+        return 0.5 * state.v[2] ** 2 - 9.81 * jnp.cos(state.q[2])
+
+    before = energy(state)
+    for _ in range(100):
+        state, *_ = simulate(state, jnp.zeros(2))
+
+    # RK4 loses (3.1 rad/s 25 ms)^6 / 72 = 3e-9 of the energy in each of 200 sub-steps.
+    assert float(energy(state)) == pytest.approx(float(before), rel=1e-5)
+    # The drive holds against the payload up to rounding.
+    np.testing.assert_allclose(state.q[:2], [0.3, -0.2], rtol=0.0, atol=1e-13)
+
+
+def test_the_payloads_reward_is_the_papers(x64):
+    stop, origin = (twins.make("PayloadPendulum", goal=g) for g in ("stop", "stop_at_origin"))
+    state, action = state_of([0.3, 0.4, math.pi / 2], [0.5, 0.0, 2.0]), jnp.array([1.0, -1.0])
+    # Payload 1 m to the right of the handle, moving with the handle and at 2 m/s upwards.
+    payload, velocity = (1.3, 1.4), (0.5, 2.0)
+    cost_stop = 0.5 * (np.dot(velocity, velocity) + 0.1 * 2.0)
+    cost_origin = cost_stop + 0.5 * (np.dot(payload, payload) + 0.25)
+
+    for twin, cost in ((stop, cost_stop), (origin, cost_origin)):
+        value = twin.reward(state, action, state, twin.params)
+        assert value == pytest.approx(1.0 / (0.1 + cost), rel=1e-12)
+        assert twin.planning_reward(state, action, state, twin.params) == pytest.approx(-cost)
+    rest = state_of([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    assert origin.reward(rest, jnp.zeros(2), rest, origin.params) == pytest.approx(10.0)
+
+
+def test_the_inverted_pendulums_surrogate_is_positive_and_best_at_rest_in_the_middle(x64):
+    twin, still = twins.make("InvertedPendulum"), jnp.zeros(1)
+    rng = np.random.default_rng(0)
+
+    def planned(q, v):
+        state = state_of(q, v)
+        return float(twin.planning_reward(state, still, state, twin.params))
+
+    assert planned([0.0, 0.0], [0.0, 0.0]) == 1.0
+    assert planned([0.0, 0.2], [0.0, 0.0]) == pytest.approx(1.0 / 1.5)
+    assert planned([1.0, 0.2], [5.0, 5.0]) == pytest.approx(1.0 / 3.0)
+    for _ in range(100):
+        assert 0.0 < planned(rng.normal(size=2), rng.normal(0.0, 20.0, 2)) < 1.0
+
+
+def greedy_episode(twin, start, n_steps):
+    """Choose at each step what the planning reward of that step alone likes best."""
+    actions = jnp.linspace(-1.0, 1.0, 41)[:, None] ** 3  # finer around zero
+
+    def advance(carry, _):
+        state, alive, earned, n_alive = carry
+        after = jax.vmap(twin.step, (None, 0, None))(state, actions, twin.params)
+        planned = jax.vmap(twin.planning_reward, (None, 0, 0, None))
+        best = jnp.argmax(planned(state, actions, after, twin.params))
+        after = jax.tree.map(lambda leaf: leaf[best], after)
+        reward = twin.reward(state, actions[best], after, twin.params)
+        earned, n_alive = earned + alive * reward, n_alive + alive
+        return (after, alive & ~twin.terminated(after, twin.params), earned, n_alive), None
+
+    carry = (start, jnp.array(True), jnp.zeros(()), jnp.zeros((), int))
+    (_, alive, earned, n_alive), _ = jax.lax.scan(advance, carry, None, n_steps)
+    return alive, earned, n_alive
+
+
+def test_climbing_the_mountain_cars_surrogate_reaches_the_goal_cheaply(x64):
+    """One step of foresight earns 93 from wherever the car stands off the valley's bottom."""
+    twin = twins.make("MountainCar")
+    x = np.linspace(-0.6, -0.4, 40)
+    x = jnp.asarray(x[np.abs(x + math.pi / 6.0) > 0.005])[:, None]
+    starts = State(x, jnp.zeros_like(x), {})
+
+    alive, earned, _ = jax.jit(jax.vmap(lambda s: greedy_episode(twin, s, 999)))(starts)
+
+    assert not alive.any()
+    assert earned.min() >= 93.0
+
+
+def test_climbing_the_acrobots_surrogate_swings_it_up(x64):
+    """One step of foresight mostly does it in 150 steps, where random torque needs far longer."""
+    twin = twins.make("Acrobot")
+    starts = jax.vmap(twin.initial, (0, None))(jax.random.split(jax.random.key(0), 32), twin.params)
+    torques = jax.random.uniform(jax.random.key(1), (32, 150, 1), minval=-1.0, maxval=1.0)
+
+    alive, _, _ = jax.jit(jax.vmap(lambda s: greedy_episode(twin, s, 150)))(starts)
+    random = jax.jit(jax.vmap(lambda s, a: rollout(twin, twin.params, s, a)))(starts, torques)
+
+    assert alive.mean() <= 0.25
+    assert random.alive[:, -1].mean() >= 0.75
+
+
+def reset_states(env, n):
+    for seed in range(n):
+        env.reset(seed=seed)
+        if hasattr(env, "data"):
+            yield np.concatenate([env.data.qpos, env.data.qvel])
+        else:
+            yield np.asarray(env.state, float)
+
+
+@pytest.mark.parametrize("env_id", [*MUJOCO, *CLASSIC, "Acrobot-v1"])
+def test_episodes_start_as_the_environments_do(env_id, x64):
+    settings = {"reset_noise_scale": 0.05} if env_id in MUJOCO else {}
+    env = gymnasium.make(env_id, **settings).unwrapped
+    twin = twins.make("Acrobot") if env_id == "Acrobot-v1" else twins.from_env(env)
+
+    theirs = np.stack(list(reset_states(env, 500)))
+    keys = jax.random.split(jax.random.key(0), 4000)
+    ours = np.concatenate(jax.vmap(twin.initial, (0, None))(keys, twin.params)[:2], axis=1)
+
+    for column in range(theirs.shape[1]):
+        # Kolmogorov and Smirnov; chance gives 1 in 1000, and the seeds are fixed.
+        assert ks_2samp(theirs[:, column], ours[:, column]).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("env_id", twins.all_ids())
+def test_spaces_and_time_limits_are_the_environments(env_id):
+    sb3_hds.envs.register_environments()
+    env, twin = gymnasium.make(env_id), twins.get(env_id)()
+
+    actions, observations = env.action_space, env.observation_space
+    np.testing.assert_array_equal(actions.low, np.float32([a.low for a in twin.actuators]))
+    np.testing.assert_array_equal(actions.high, np.float32([a.high for a in twin.actuators]))
+    np.testing.assert_array_equal(observations.low, np.float32([c.low for c in twin.channels]))
+    np.testing.assert_array_equal(observations.high, np.float32([c.high for c in twin.channels]))
+    assert env.spec.max_episode_steps == twin.max_episode_steps
+
+
+def test_an_environment_made_of_a_twin_hands_it_back():
+    env = gymnasium.make("sb3_hds/PayloadPendulum-v0", goal="stop_at_origin", mass=0.5)
+
+    twin = twins.from_env(env)
+
+    assert twin.goal == "stop_at_origin"
+    assert twin.values["mass"] == 0.5

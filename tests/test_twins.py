@@ -1,0 +1,482 @@
+"""The contract that every twin keeps. A new twin is tested by being registered."""
+
+import functools
+import inspect
+import json
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from sb3_hds import effects, twins
+from sb3_hds.core import AnalyticTwin, ExtendedTwin, Parameter, State
+from sb3_hds.errors import NoTwinError, ParameterError
+
+PLAIN = [twins.make(name) for name in twins.names()]
+EXTENDED = [twin.extend(*(effect(0) for effect in effects.ALL)) for twin in PLAIN]
+EXTENDED = [
+    twin.with_parameters(
+        **{name: p.null + p.scale for name, p in twin.parameters.items() if name not in base.values}
+    )
+    for base, twin in zip(PLAIN, EXTENDED, strict=True)
+]
+
+
+def label(twin):
+    return twin.name + ("-extended" if isinstance(twin, ExtendedTwin) else "")
+
+
+def every_twin(test):
+    """Run a test for every registered twin, and for each of them extended by every effect."""
+    return pytest.mark.parametrize("twin", PLAIN + EXTENDED, ids=label)(test)
+
+
+def every_plain_twin(test):
+    return pytest.mark.parametrize("twin", PLAIN, ids=label)(test)
+
+
+def an_action(twin, share=0.65):
+    """A command inside its limits, and not in the middle."""
+    return jnp.array([a.low + share * (a.high - a.low) for a in twin.actuators])
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def step(twin, state, action, params):
+    """Compiled once for all tests of a twin."""
+    return twin.step(state, action, params)
+
+
+def a_state(twin, seed=0, n_steps=3):
+    """A state in motion, away from clips: shortly after the start of an episode."""
+    state = twin.initial(jax.random.key(seed), twin.params)
+    for _ in range(n_steps):
+        state = step(twin, state, an_action(twin), twin.params)
+    return state
+
+
+def flat(tree):
+    return np.asarray(ravel_pytree(tree)[0])
+
+
+@every_twin
+def test_signals_have_one_entry_each(twin, x64):
+    state = a_state(twin)
+
+    assert state.q.shape == state.v.shape == (len(twin.joints),)
+    assert twin.observe(state, twin.params).shape == (len(twin.channels),)
+    assert len({joint.name for joint in twin.joints}) == len(twin.joints)
+    assert len({actuator.name for actuator in twin.actuators}) == len(twin.actuators)
+    assert len({channel.name for channel in twin.channels}) == len(twin.channels)
+
+
+@every_twin
+def test_observations_stay_within_the_declared_bounds(twin, x64):
+    obs = np.stack([twin.observe(a_state(twin, seed), twin.params) for seed in range(3)])
+
+    assert np.all(obs >= [channel.low for channel in twin.channels])
+    assert np.all(obs <= [channel.high for channel in twin.channels])
+
+
+@every_twin
+def test_inferring_inverts_observing_up_to_whole_turns(twin, x64):
+    state = a_state(twin)
+
+    again = twin.infer(twin.observe(state, twin.params), twin.params)
+
+    turns = np.array([2.0 * math.pi if joint.unit == "rad" else 1.0 for joint in twin.joints])
+    whole = np.where(turns == 1.0, 0.0, np.round((again.q - state.q) / turns))
+    # sin, cos and arctan2 each round once.
+    np.testing.assert_allclose(again.q - whole * turns, state.q, rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(again.v, state.v, rtol=0.0, atol=1e-14)
+
+
+@every_twin
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_a_step_keeps_structure_shapes_and_dtypes(twin, dtype, x64):
+    state = jax.tree.map(lambda leaf: leaf.astype(dtype), a_state(twin))
+
+    after = jax.eval_shape(twin.step, state, an_action(twin).astype(dtype), twin.params)
+
+    assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), after) == jax.tree.map(
+        lambda leaf: (leaf.shape, leaf.dtype), state
+    )
+
+
+@every_twin
+def test_a_compiled_step_equals_a_plain_one(twin, x64):
+    state, action = a_state(twin), an_action(twin)
+
+    with jax.disable_jit():
+        plain = twin.step(state, action, twin.params)
+
+    # Fusing reorders sums: a few roundings of 1e-16 at speeds up to 10, through a 3 x 3 solve.
+    compiled = step(twin, state, action, twin.params)
+    np.testing.assert_allclose(flat(compiled), flat(plain), rtol=1e-12, atol=1e-12)
+
+
+@every_twin
+def test_a_batch_of_steps_equals_single_ones(twin, x64):
+    states, action = [a_state(twin, seed) for seed in range(3)], an_action(twin)
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+
+    batched = jax.jit(jax.vmap(twin.step, (0, None, None)))(batch, action, twin.params)
+
+    for i, state in enumerate(states):
+        row = jax.tree.map(lambda leaf, i=i: leaf[i], batched)
+        one = step(twin, state, action, twin.params)
+        np.testing.assert_allclose(flat(row), flat(one), rtol=1e-12, atol=1e-12)  # as above
+
+
+def motion(twin, state, action):
+    """
+    Next state and observation as a function of small changes of state, action and parameters.
+
+    :return: the function, and where to evaluate it; parameters change in units of their scales
+    """
+    scales = {name: parameter.scale for name, parameter in twin.parameters.items()}
+
+    def moved(change):
+        tangent, push, shift = change
+        params = {name: twin.values[name] + shift[name] * scales[name] for name in scales}
+        after = twin.step(twin.retract(state, tangent), action + push, params)
+        return twin.difference(after, state), twin.observe(after, params)
+
+    nothing = jnp.zeros_like(twin.difference(state, state))
+    return moved, (nothing, jnp.zeros_like(action), {name: jnp.asarray(0.0) for name in scales})
+
+
+def random_like(tree, seed=0):
+    leaves, structure = jax.tree.flatten(tree)
+    rng = np.random.default_rng(seed)
+    return structure.unflatten(jnp.asarray(rng.normal(size=leaf.shape)) for leaf in leaves)
+
+
+@every_twin
+def test_the_derivative_of_a_step_equals_a_finite_difference(twin, x64):
+    """With respect to state, action and every parameter at once, in three directions."""
+    moved, here = motion(twin, a_state(twin), an_action(twin))
+    width = 1e-5
+
+    @jax.jit
+    def forward(direction):
+        ahead = moved(jax.tree.map(lambda d: width * d, direction))
+        behind = moved(jax.tree.map(lambda d: -width * d, direction))
+        difference = jax.tree.map(lambda a, b: (a - b) / (2.0 * width), ahead, behind)
+        return difference, jax.jvp(moved, (here,), (direction,))[1]
+
+    for seed in range(3):
+        difference, derivative = forward(random_like(here, seed))
+        # Central differences over 1e-5: truncation 1e-10 and rounding 1e-11, times derivatives of
+        # up to 1e3, for dry friction changes direction within 0.01.
+        np.testing.assert_allclose(flat(derivative), flat(difference), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "twin",
+    # Reverse mode takes long to compile: effects are the same on every twin.
+    [t for t in (*PLAIN, EXTENDED[-1]) if t.differentiability == "reverse"],
+    ids=label,
+)
+def test_reverse_mode_is_the_transpose_of_forward_mode(twin, x64):
+    moved, here = motion(twin, a_state(twin), an_action(twin))
+    direction = random_like(here)
+
+    ahead = jax.jit(lambda d: jax.jvp(moved, (here,), (d,))[1])(direction)
+    weights = random_like(ahead, seed=1)
+    (back,) = jax.jit(lambda w: jax.vjp(moved, here)[1](w))(weights)
+
+    # <w, J d> = <J^T w, d>; rounding only.
+    assert flat(weights) @ flat(ahead) == pytest.approx(flat(back) @ flat(direction), rel=1e-9)
+
+
+@every_twin
+def test_retracting_inverts_taking_the_difference(twin, x64):
+    state, reference = a_state(twin, 0), a_state(twin, 1)
+
+    again = twin.retract(reference, twin.difference(state, reference))
+
+    np.testing.assert_allclose(flat(again), flat(state), rtol=0.0, atol=1e-14)  # one rounding
+
+
+@every_twin
+def test_values_do_not_make_another_program(twin):
+    name, parameter = next(iter(twin.parameters.items()))
+
+    changed = twin.with_parameters(**{name: twin.values[name] + parameter.scale})
+
+    assert changed == twin
+    assert hash(changed) == hash(twin)
+    assert changed.values != twin.values
+
+
+@every_plain_twin
+def test_another_time_step_makes_another_program(twin):
+    assert type(twin)(dt=2.0 * twin.dt) != twin
+    assert type(twin)(substeps=twin.substeps + 1) != twin
+
+
+@every_twin
+def test_values_act_only_through_params(twin, x64):
+    name, parameter = next(iter(twin.parameters.items()))
+    changed = twin.with_parameters(**{name: twin.values[name] + parameter.scale})
+    state, action = a_state(twin), an_action(twin)
+
+    same = step(changed, state, action, twin.params)
+    other = step(changed, state, action, changed.params)
+
+    before = flat(step(twin, state, action, twin.params))
+    np.testing.assert_array_equal(flat(same), before)
+    assert np.abs(flat(other) - before).max() > 1e-9
+
+
+@every_twin
+def test_every_parameter_matters(twin, x64):
+    """None is decoration: each changes a step, an observation or the reward."""
+    generic = twin.with_parameters(
+        **{name: twin.values[name] + 0.5 * p.scale for name, p in twin.parameters.items()}
+    )
+    state, action = a_state(generic), an_action(generic)
+
+    @jax.jit
+    def outcome(params):
+        after = generic.step(state, action, params)
+        reward = generic.reward(state, action, after, params)
+        return after, generic.observe(after, params), reward
+
+    before = flat(outcome(generic.params))
+    for name, parameter in generic.parameters.items():
+        after = flat(outcome(generic.params | {name: generic.values[name] + 0.5 * parameter.scale}))
+        # Rounding of slow motion (the car does millimetres per second) is below 1e-16.
+        assert np.abs(after - before).max() > 1e-12, name
+
+
+@every_twin
+def test_a_twin_survives_being_written_down(twin):
+    spec = json.loads(json.dumps(twin.to_spec()))
+
+    again = twins.from_spec(spec, effects.ALL)
+
+    assert again == twin
+    assert again.values == twin.values
+
+
+@every_twin
+def test_parameters_declare_what_is_believed(twin):
+    for name, parameter in twin.parameters.items():
+        assert isinstance(parameter, Parameter)
+        assert parameter.unit, name
+        assert parameter.lower <= twin.values[name] <= parameter.upper
+
+
+@every_twin
+def test_an_unknown_parameter_is_refused_with_the_known_ones(twin):
+    with pytest.raises(ParameterError) as refusal:
+        twin.with_parameters(weight=1.0)
+
+    assert f"{twin.name} has no parameter 'weight'." in str(refusal.value)
+    assert ", ".join(twin.parameters) in str(refusal.value)
+
+
+@every_plain_twin
+def test_a_value_out_of_bounds_is_refused_with_the_bounds(twin):
+    name, parameter = next((n, p) for n, p in twin.parameters.items() if p.lower > -math.inf)
+
+    with pytest.raises(ParameterError, match=rf"{name}.*within \[{parameter.lower}, "):
+        type(twin)(**{name: parameter.lower - 1.0})
+    with pytest.raises(ParameterError, match="must be finite"):
+        type(twin)(**{name: math.nan})
+
+
+@every_twin
+def test_rewards_are_finite_scalars(twin, x64):
+    state, action = a_state(twin), an_action(twin)
+    after = step(twin, state, action, twin.params)
+
+    for reward in (twin.reward, twin.planning_reward):
+        value = reward(state, action, after, twin.params)
+        assert value.shape == ()
+        assert np.isfinite(value)
+    assert twin.terminated(after, twin.params).dtype == bool
+
+
+@every_plain_twin
+def test_planning_has_something_to_climb(twin, x64):
+    state, action = a_state(twin), an_action(twin)
+
+    @jax.jit
+    @jax.jacfwd
+    def climb(change):
+        tangent, push = change
+        start = twin.retract(state, tangent)
+        after = twin.step(start, action + push, twin.params)
+        steps = (start, action + push, after, twin.params)
+        return twin.planning_reward(*steps), twin.reward(*steps)
+
+    nothing = jnp.zeros_like(twin.difference(state, state))
+    to_plan, to_report = climb((nothing, jnp.zeros_like(action)))
+
+    assert np.abs(flat(to_plan)).max() > 1e-3
+    assert np.all(np.isfinite(flat(to_plan)))
+    assert (np.abs(to_report[0]).max() > 1e-3) == twin.reward_has_gradient
+
+
+@every_twin
+def test_episodes_start_alive_and_differently(twin, x64):
+    keys = jax.random.split(jax.random.key(0), 100)
+
+    starts = jax.vmap(twin.initial, (0, None))(keys, twin.params)
+
+    assert not jax.vmap(twin.terminated, (0, None))(starts, twin.params).any()
+    assert np.ptp(starts.q[:, 0]) > 0.0
+
+
+@every_twin
+def test_the_sketch_is_a_line_that_moves(twin, x64):
+    first, second = (twin.sketch(a_state(twin, seed), twin.params) for seed in range(2))
+
+    assert first.ndim == 2
+    assert first.shape[1] == 2
+    assert np.all(np.isfinite(first))
+    assert not np.allclose(first, second)
+
+
+@every_plain_twin
+@pytest.mark.parametrize("effect", effects.ALL, ids=lambda effect: effect.name)
+def test_a_null_effect_changes_nothing(twin, effect, x64):
+    extended = (
+        twin.extend(effect(len(twin.joints) - 1))
+        if effect.slot == "joint"
+        else (twin.extend(effect(0)))
+    )
+    state, action = a_state(twin), an_action(twin)
+    other = extended.infer(extended.observe(state, extended.params), extended.params)
+    other = State(state.q, state.v, other.memory)
+
+    for _ in range(5):
+        state = step(twin, state, action, twin.params)
+        other = step(extended, other, action, extended.params)
+
+    # Not bitwise: XLA may fuse the two programs differently.
+    np.testing.assert_allclose(other.q, state.q, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(other.v, state.v, rtol=1e-11, atol=1e-12)
+
+
+def damped_joints():
+    """All but the payload's, whose drive makes up for the damping that it knows of."""
+    for twin in PLAIN:
+        if twin.name == "PayloadPendulum":
+            continue
+        for (effect, index), targets in twin.native_effects.items():
+            if effect == "viscous_friction":
+                yield pytest.param(twin, index, targets["b"], id=f"{twin.name}-{targets['b']}")
+
+
+@pytest.mark.parametrize(("twin", "index", "damping"), list(damped_joints()))
+def test_friction_on_a_damped_joint_equals_a_force_of_its_own(twin, index, damping, x64):
+    """The native parameter and the force are the same physics at every Runge-Kutta stage."""
+
+    class Undamped(type(twin)):
+        native_effects = {}
+
+    friction = effects.ViscousFriction(index, b=0.07)
+    native, forced = twin.extend(friction), Undamped().extend(friction)
+    state, action = a_state(twin), an_action(twin)
+    obs = twin.observe(state, twin.params)
+
+    by_parameter, by_force = (
+        step(extended, extended.infer(obs, extended.params), action, extended.params)
+        for extended in (native, forced)
+    )
+    without = step(twin, state, action, twin.params)
+
+    assert native.params[damping] == twin.params[damping]
+    # The same sum in another order.
+    np.testing.assert_allclose(flat(by_parameter[:2]), flat(by_force[:2]), rtol=1e-12, atol=1e-12)
+    assert np.abs(flat(by_parameter[:2]) - flat(without[:2])).max() > 1e-7
+
+
+def test_the_registry_finds_twins_by_name_and_by_id():
+    assert type(twins.make("Pendulum")) is type(twins.make("Pendulum-v1")) is twins.Pendulum
+    assert twins.make("Pendulum", gravity=9.81).values["gravity"] == 9.81
+    assert set(twins.all_ids()) >= {
+        "InvertedDoublePendulum-v5",
+        "InvertedPendulum-v5",
+        "MountainCarContinuous-v0",
+        "Pendulum-v1",
+        "sb3_hds/AcrobotContinuous-v0",
+        "sb3_hds/CartPoleSwingUp-v0",
+        "sb3_hds/PayloadPendulum-v0",
+    }
+
+
+def test_a_missing_twin_is_refused_with_what_exists_and_how_to_add_one():
+    with pytest.raises(NoTwinError) as refusal:
+        twins.make("Pendulum-v2")
+
+    assert str(refusal.value) == (
+        "There is no twin for 'Pendulum-v2'. Did you mean 'Pendulum-v1'?\n"
+        f"Environments with a twin: {', '.join(twins.all_ids())}.\n"
+        f"Twins by name: {', '.join(twins.names())}.\n"
+        "To add your own (see 'Your own twin' in the documentation):\n\n"
+        "    from sb3_hds import twins\n"
+        "    from sb3_hds.core import AnalyticTwin\n\n"
+        "    @twins.register\n"
+        "    class MyTwin(AnalyticTwin):\n"
+        '        name, env_id, dt = "MyTwin", "Pendulum-v2", 0.05\n'
+        "        ...  # joints, actuators, channels, parameters; initial, infer, observe,\n"
+        "        ...  # actuate, mass_matrix, bias, reward"
+    )
+
+
+@pytest.fixture
+def clean_registry(monkeypatch):
+    monkeypatch.setattr(twins.registry, "_TWINS", dict(twins.registry._TWINS))
+
+
+def test_a_registered_twin_is_found_and_listed(clean_registry):
+    @twins.register
+    class Spring(twins.Pendulum):
+        name, env_id = "Spring", "lab/Spring-v0"
+
+    assert twins.get("lab/Spring-v0") is twins.get("Spring") is Spring
+    assert "Spring" in twins.names()
+    assert "lab/Spring-v0" in twins.all_ids()
+
+
+def test_a_name_is_given_once(clean_registry):
+    class Other(AnalyticTwin):
+        name, env_id = "Pendulum", None
+
+    with pytest.raises(ValueError, match="'Pendulum' is already the twin Pendulum"):
+        twins.register(Other)
+
+
+def test_only_classes_are_registered():
+    register = inspect.unwrap(twins.register)  # without the type checks of the tests
+
+    with pytest.raises(TypeError, match="takes a subclass of Twin, got Pendulum"):
+        register(twins.make("Pendulum"))
+
+
+@pytest.mark.parametrize(
+    ("name", "option"),
+    [
+        ("InvertedDoublePendulum", {"healthy_reward": 1.0}),
+        ("InvertedPendulum", {"reset_noise_scale": 0.1}),
+        ("MountainCar", {"goal_velocity": 0.01}),
+        ("PayloadPendulum", {"goal": "stop_at_origin"}),
+    ],
+)
+def test_an_option_makes_another_program_and_is_written_down(name, option):
+    twin = twins.make(name, **option)
+
+    assert twin != twins.make(name)
+    assert twins.from_spec(json.loads(json.dumps(twin.to_spec()))) == twin
+
+
+def test_an_unknown_goal_is_refused_with_the_known_ones():
+    with pytest.raises(ParameterError, match="one of 'stop', 'stop_at_origin', got 'fly'"):
+        twins.make("PayloadPendulum", goal="fly")
