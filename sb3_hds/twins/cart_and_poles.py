@@ -8,7 +8,7 @@ _RK4 = 1  # mjtIntegrator.mjINT_RK4
 _SLIDE, _HINGE = 2, 3  # mjtJoint
 
 
-def read(env: Any, poles: int) -> dict[str, float]:
+def read(env: Any, poles: int) -> dict[str, Any]:
     """
     Read a cart on a rail in x that carries a chain of poles swinging about y.
 

@@ -71,6 +71,8 @@ class InvertedDoublePendulum(AnalyticTwin):
     integrator = staticmethod(rk4)
     max_episode_steps = 1000
     options = {"healthy_reward": 10.0, "reset_noise_scale": 0.1}
+    healthy_reward: float
+    reset_noise_scale: float
     joints = (Joint("slider", "m"), Joint("hinge", "rad"), Joint("hinge2", "rad"))
     actuators = (Actuator("motor", "1", -1.0, 1.0),)
     channels = (
@@ -124,8 +126,8 @@ class InvertedDoublePendulum(AnalyticTwin):
         for pole in ("pole", "pole2"):
             offset = found.pop(f"{pole}_com_offset")
             require(offset == 0.0, "centres of mass on the axes of the poles")
-        lengths = {"pole_length": float(top[2]), "pole2_length": float(tip[2])}
-        return cls(**found, **lengths, healthy_reward=float(env.unwrapped._healthy_reward))
+        found |= {"pole_length": float(top[2]), "pole2_length": float(tip[2])}
+        return cls(**found, healthy_reward=float(env.unwrapped._healthy_reward))
 
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
         """Positions uniform, speeds normal, both scaled by ``reset_noise_scale``."""

@@ -69,6 +69,7 @@ class InvertedPendulum(AnalyticTwin):
     max_episode_steps = 1000
     reward_has_gradient = False
     options = {"reset_noise_scale": 0.01}
+    reset_noise_scale: float
     joints = (Joint("slider", "m"), Joint("hinge", "rad"))
     actuators = (Actuator("motor", "1", -_MAX_COMMAND, _MAX_COMMAND),)
     channels = (

@@ -71,6 +71,7 @@ class MountainCar(AnalyticTwin):
     max_episode_steps = 999
     reward_has_gradient = False
     options = {"goal_velocity": 0.0}
+    goal_velocity: float
     joints = (Joint("track", "m"),)
     actuators = (Actuator("throttle", "1", -1.0, 1.0),)
     channels = (

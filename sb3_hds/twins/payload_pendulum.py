@@ -74,6 +74,7 @@ class PayloadPendulum(AnalyticTwin):
     integrator = staticmethod(rk4)
     max_episode_steps = 100
     options = {"goal": "stop"}
+    goal: str
     joints = (Joint("handle_x", "m"), Joint("handle_z", "m"), Joint("swing", "rad"))
     actuators = (
         Actuator("velocity_x", "m/s", -_MAX_SPEED, _MAX_SPEED),
@@ -167,7 +168,5 @@ class PayloadPendulum(AnalyticTwin):
         position = handle + length * jnp.stack([sin, 1.0 - cos])
         velocity = state.v[:2] + length * state.v[2] * jnp.stack([cos, sin])
         command = jnp.clip(action, -_MAX_SPEED, _MAX_SPEED)
-        squares = [jnp.sum(a**2) for a in (position, handle, velocity, command)]
-        return 0.5 * sum(
-            w * square for w, square in zip((w_p, w_x, w_v, w_a), squares, strict=True)
-        )
+        still = w_p * jnp.sum(position**2) + w_x * jnp.sum(handle**2)
+        return 0.5 * (still + w_v * jnp.sum(velocity**2) + w_a * jnp.sum(command**2))
