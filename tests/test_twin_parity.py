@@ -309,6 +309,26 @@ def test_payload_pendulum_follows_an_independent_integration(substeps, tolerance
         np.testing.assert_allclose(points(state)[where], reference[where], 0.0, tolerance)
 
 
+def test_the_drive_of_the_payload_changes_its_momentum(x64):
+    """What the drive gives minus the weight is the rate of momentum of handle (10 kg) and payload."""
+    twin = twins.make("PayloadPendulum", mass=0.7, length=0.8, damping=0.1)
+    state, command = state_of([0.1, 0.2, 0.6], [0.5, -0.3, 2.0]), jnp.array([1.0, -0.5])
+
+    def momentum(q, v):
+        payload_v = v[:2] + 0.8 * v[2] * jnp.stack([jnp.cos(q[2]), jnp.sin(q[2])])
+        return 10.0 * v[:2] + 0.7 * payload_v
+
+    drive = twin.actuate(state, command, twin.params)
+    acceleration = jnp.linalg.solve(
+        twin.mass_matrix(state.q, twin.params), drive - twin.bias(state.q, state.v, twin.params)
+    )
+    _, rate = jax.jvp(momentum, (state.q, state.v), (state.v, acceleration))
+
+    weight = np.array([0.0, 10.7 * 9.81])
+    np.testing.assert_allclose(drive[:2] - weight, rate, rtol=1e-12)  # rounding
+    np.testing.assert_allclose(acceleration[:2], (command - state.v[:2]) / 0.05, rtol=1e-12)
+
+
 def test_a_payload_under_a_still_handle_keeps_its_energy(x64):
     twin = twins.make("PayloadPendulum", damping=0.0)
     simulate = simulator(twin)

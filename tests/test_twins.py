@@ -48,6 +48,12 @@ def step(twin, state, action, params):
     return twin.step(state, action, params)
 
 
+def with_other_values(twin):
+    return twin.with_parameters(
+        **{name: twin.values[name] + 0.5 * p.scale for name, p in twin.parameters.items()}
+    )
+
+
 def a_state(twin, seed=0, n_steps=3):
     """A state in motion, away from clips: shortly after the start of an episode."""
     state = twin.initial(jax.random.key(seed), twin.params)
@@ -234,9 +240,7 @@ def test_values_act_only_through_params(twin, x64):
 @every_twin
 def test_every_parameter_matters(twin, x64):
     """None is decoration: each changes a step, an observation or the reward."""
-    generic = twin.with_parameters(
-        **{name: twin.values[name] + 0.5 * p.scale for name, p in twin.parameters.items()}
-    )
+    generic = with_other_values(twin)
     state, action = a_state(generic), an_action(generic)
 
     @jax.jit
@@ -254,6 +258,8 @@ def test_every_parameter_matters(twin, x64):
 
 @every_twin
 def test_a_twin_survives_being_written_down(twin):
+    twin = with_other_values(twin)
+
     spec = json.loads(json.dumps(twin.to_spec()))
 
     again = twins.from_spec(spec, effects.ALL)
