@@ -310,7 +310,7 @@ def test_payload_pendulum_follows_an_independent_integration(substeps, tolerance
 
 
 def test_the_drive_of_the_payload_changes_its_momentum(x64):
-    """What the drive gives minus the weight is the rate of momentum of handle (10 kg) and payload."""
+    """Less the weight, it is the rate of momentum of handle (10 kg) and payload."""
     twin = twins.make("PayloadPendulum", mass=0.7, length=0.8, damping=0.1)
     state, command = state_of([0.1, 0.2, 0.6], [0.5, -0.3, 2.0]), jnp.array([1.0, -0.5])
 
