@@ -82,6 +82,7 @@ def gauss_newton(
     :param n_step_sizes: candidates of each line search, from 1 down to 5e-4
     :param temperature: annealed acceptance, see :func:`~sb3_hds.planning.line_search.choose`
     :param key: needed with a temperature
+
     Source: PODS, eqs. 13 and 14.
     """
     return climb(
@@ -105,7 +106,7 @@ def newton_direction(problem: Problem, plan: Plan) -> Controls:
 
 
 def _follow(problem: Problem, start: State, plan: Plan, gains: Gains, step: Scalar) -> Plan:
-    """Roll out the plan with a share ``step`` of its change, and feedback; unchanged for a step of zero."""
+    """Roll out the plan with a share of its change, and feedback; a step of 0 changes nothing."""
     reference = jax.tree.map(lambda leaf: leaf[:-1], plan.states)
     feedback = jnp.where(step > 0.0, gains.feedback, 0.0)
 

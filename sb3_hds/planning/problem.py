@@ -42,8 +42,7 @@ class Problem:
 
     where :math:`r` is the twin's planning reward. An episode that has terminated is worth
     :math:`-s\,r_0/(1-\gamma)` from there on: shifting every reward by the same :math:`r_0` then
-        changes
-    the objective by a constant only, and no start of dying is rewarded. There is no auto-reset.
+    changes the objective by a constant only, and does not make dying pay. There is no auto-reset.
 
     :param twin: what is simulated
     :param params: its parameters

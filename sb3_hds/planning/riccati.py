@@ -35,17 +35,18 @@ def solve_backward(
     r"""
     Minimise the local model from the last step to the first:
 
-    .. math:: Q_z = \ell_z + [A\,B]^\top V_x', \quad Q_{zz} = \ell_{zz} + [A\,B]^\top V_{xx}'
-    [A\,B], \quad
+    .. math:: Q_z = \ell_z + [A\,B]^\top V_x', \quad
+              Q_{zz} = \ell_{zz} + [A\,B]^\top V_{xx}' [A\,B], \quad
               k = -Q_{uu}^{-1} Q_u, \quad K = -Q_{uu}^{-1} Q_{ux}
 
     :math:`Q_{uu}` is made positive definite by raising pivots of its factorisation. With
-        ``bounded``,
-    controls that stand at a limit and want beyond it are held there and do not react to the state.
+    ``bounded``, controls that stand at a limit and want beyond it are held there and do not react
+    to the state.
 
     :param controls: where the model was expanded
     :param regularisation: added to the diagonal of :math:`Q_{uu}`
     :param bounded: whether the box [-1, 1] is respected
+
     Source: Tassa, Mansard, Todorov, *Control-limited differential dynamic programming*, ICRA 2014,
     with one clamping step instead of the full projected Newton iteration.
     """
