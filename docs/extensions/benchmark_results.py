@@ -1,0 +1,45 @@
+"""The measurements that lie in ``benchmarks/results``, with the commands that made them."""
+
+import ast
+import csv
+from pathlib import Path
+
+from tables import table
+
+BENCHMARKS = Path(__file__).parent.parent.parent / "benchmarks"
+
+_NONE = (
+    "There are no results in this checkout yet. Run one of the commands above, then `make docs`.\n"
+)
+
+
+def as_markdown(folder: Path = BENCHMARKS) -> str:
+    """
+    :param folder: with the scripts, and with their tables in ``results``
+    :return: the commands, then every table
+    """
+    tables = sorted(folder.glob("results/*.csv"))
+    results = "".join(map(_as_section, tables)) if tables else _NONE
+    return f"{_commands(folder)}## Results\n\n{results}"
+
+
+def _commands(folder: Path) -> str:
+    scripts = [path for path in sorted(folder.glob("*.py")) if _is_command(path)]
+    rows = [[f"`python {folder.name}/{path.name}`", _first_line(path)] for path in scripts]
+    return table(["command", "what it measures"], rows) if rows else ""
+
+
+def _is_command(path: Path) -> bool:
+    return "__main__" in path.read_text()
+
+
+def _first_line(path: Path) -> str:
+    words = ast.get_docstring(ast.parse(path.read_text())) or ""
+    return words.partition("\n\n")[0]
+
+
+def _as_section(path: Path) -> str:
+    with path.open(newline="") as file:
+        columns, *rows = csv.reader(file)
+    title = path.stem.replace("_", " ")
+    return f"### {title}\n\n{table(columns, rows)}From `{path.parent.name}/{path.name}`.\n\n"

@@ -1,0 +1,46 @@
+"""
+Fills in what the code knows better than a page.
+
+A line ``<!-- generated: NAME -->`` of a page is replaced by Markdown that is made from the package
+as it is now, each time that the page is read.
+"""
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import benchmark_results
+import catalogue
+import import_picture
+
+PARTS: dict[str, Callable[[], str]] = {
+    "imports": import_picture.as_markdown,
+    "twins": catalogue.twins_as_markdown,
+    "surrogates": catalogue.surrogates_as_markdown,
+    "effects": catalogue.effects_as_markdown,
+    "environments": catalogue.environments_as_markdown,
+    "benchmarks": benchmark_results.as_markdown,
+}
+
+_LINE = re.compile(r"^<!-- generated: (\w+) -->$", re.MULTILINE)
+
+
+def fill_in(text: str) -> str:
+    """
+    :param text: of a page
+    :return: the same text with its generated parts in place
+    :raises KeyError: for a part that does not exist
+    """
+    return _LINE.sub(lambda line: PARTS[line[1]](), text)
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """What Sphinx calls."""
+
+    def read(_: Any, page: str, content: list[str]) -> None:
+        if _LINE.search(content[0]):
+            app.env.note_reread()
+        content[0] = fill_in(content[0])
+
+    app.connect("source-read", read)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
