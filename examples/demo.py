@@ -38,7 +38,7 @@ def main() -> None:
     seconds = time.perf_counter() - started
 
     untrained = sb3_hds.HDS("MlpPolicy", ENV_ID, seed=TRAINING_SEED)
-    trained = sb3_hds.HDS.load(run / ENV_ID)
+    trained = sb3_hds.HDS.load(run / f"{ENV_ID}.zip")
     before, after = returns(untrained), returns(trained)
 
     picture = options.folder / "learning_curve.png"
@@ -77,21 +77,25 @@ def returns(model: sb3_hds.HDS) -> np.ndarray:
 
 
 def draw(run: Path, picture: Path, before: np.ndarray, after: np.ndarray) -> None:
-    """The return of the evaluations during training, between the values before and after it."""
+    """The return of the evaluations during training, with the values before and after it."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
     evaluations = np.load(run / "evaluations.npz")
+    timesteps = [0, *evaluations["timesteps"]]
+    curve = [before.mean(), *evaluations["results"].mean(axis=1)]
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
-    axes.axhline(before.mean(), color="0.6", linestyle="--", label="untrained policy")
-    axes.axhline(after.mean(), color="0.3", linestyle=":", label="trained policy")
-    axes.plot(
-        evaluations["timesteps"],
-        evaluations["results"].mean(axis=1),
-        marker="o",
-        label="evaluations by rl_zoo3 (5 episodes each)",
+    axes.axhline(
+        after.mean(), color="0.3", linestyle=":", label=f"trained policy, {N_EPISODES} episodes"
+    )
+    axes.plot(timesteps, curve, marker="o", label="during training, 5 episodes each")
+    axes.annotate(
+        f"untrained policy, {N_EPISODES} episodes",
+        (0, curve[0]),
+        (12, 0),
+        textcoords="offset points",
     )
     axes.set(
         title=f"HDS on {ENV_ID}", xlabel="steps of the environment", ylabel="return of an episode"

@@ -40,7 +40,11 @@ class LazyAlgorithm:
         :raises TypeError: for a hyperparameter that the algorithm does not have
         """
         algorithm = self.resolve()
-        _refuse_unknown(algorithm, hyperparams, also=_parameters(algorithm.load))
+        loaders = (
+            vars(base)["load"].__func__ for base in algorithm.__mro__ if "load" in vars(base)
+        )
+        known = {name for loader in loaders for name in _parameters(loader)}
+        _refuse_unknown(algorithm, hyperparams, also=known)
         return algorithm.load(path, *args, **hyperparams)
 
     def __getattr__(self, name: str) -> Any:

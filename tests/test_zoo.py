@@ -8,9 +8,13 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_hds import HDS
 
 pytestmark = pytest.mark.skipif(find_spec("rl_zoo3") is None, reason="needs the extra 'zoo'")
 
@@ -122,12 +126,15 @@ def test_hyperparameters_given_on_the_command_line_replace_those_of_the_file(tra
 
 
 def test_arguments_of_the_environment_reach_the_twin(trained):
-    from stable_baselines3.common.save_util import load_from_zip_file
+    spec = gym.spec("Pendulum-v1")
+    # As the zoo builds it, see ExperimentManager.create_envs.
+    env = make_vec_env(lambda **kwargs: spec.make(**kwargs), env_kwargs={"g": 9.8})
 
-    data, _, _ = load_from_zip_file(trained / "Pendulum-v1.zip")
+    model = HDS.load(trained / "Pendulum-v1.zip", env=env)
 
-    # Pendulum-v1's own default is 10.0 m/s2; the run was started with --env-kwargs g:9.8.
-    assert data["twin_spec"]["parameters"]["g"] == 9.8
+    # Pendulum-v1's own default is 10.0 m/s2.
+    assert model.twin.values["gravity"] == 9.8
+    assert "env_kwargs\n    - g: 9.8" in (trained / "Pendulum-v1" / "args.yml").read_text()
 
 
 def test_a_timestep_is_a_step_of_the_environment_and_nothing_else(trained):
