@@ -195,7 +195,7 @@ def _improve(
 
 
 def _tail(settings: Settings, problem: Problem, policy, end: State) -> jax.Array:
-    """Value of a plan's end by what the policy makes of it, so that errors of V are not exploited."""
+    """Value of a plan's end by what the policy makes of it: errors of V are not exploited."""
     if not settings.lookahead:
         return problem.value_at_end(end)
     return follow(problem, end, policy, settings.lookahead).value

@@ -14,8 +14,8 @@ from sb3_hds.algos.networks import Actor, Value, unsquash
 from sb3_hds.core import Obs, Params, State, Twin
 from sb3_hds.planning import Plan, Problem, best_of_random
 
-# The worst return of the first rollouts becomes this many units of the objective.
-_WORST_VALUE = 20.0
+# The median shortfall of the first rollouts becomes this many units of the objective.
+_TYPICAL_SHORTFALL = 12.0
 # Without discounting, or nearly so, a value counts rewards of at most this many steps.
 _LONGEST = 1000.0
 
@@ -234,7 +234,8 @@ def find_scales(
     plans = jax.vmap(lambda start, k: best_of_random(problem, start, k, length, 1))(starts, keys)
     seen = jax.vmap(jax.vmap(lambda state: view(problem.observe(state))))(plans.states)
     offset = _best_reward(plans) if settings.discount < 1.0 else jnp.zeros(())
-    scale = _WORST_VALUE / jnp.maximum(_worst_return(plans, offset, settings.discount), 1e-6)
+    shortfall = _typical_shortfall(plans, offset, settings.discount)
+    scale = _TYPICAL_SHORTFALL / jnp.maximum(shortfall, 1e-6)
     return _input_scales(seen, plans), scale, offset
 
 
@@ -280,11 +281,11 @@ def _best_reward(plans: Plan) -> jax.Array:
     return jnp.where(jnp.isfinite(best), best, 0.0)
 
 
-def _worst_return(plans: Plan, offset: jax.Array, discount: float) -> jax.Array:
-    """Largest discounted shortfall from the best reward, as if each rollout went on as it did."""
+def _typical_shortfall(plans: Plan, offset: jax.Array, discount: float) -> jax.Array:
+    """Median discounted shortfall from the best reward, as if each rollout went on as it did."""
     counted = plans.alive[:, :-1] & jnp.isfinite(plans.rewards)
     weights = jnp.where(counted, discount ** jnp.arange(plans.rewards.shape[1]), 0.0)
     shortfalls = jnp.where(counted, plans.rewards - offset, 0.0)
     mean = jnp.sum(weights * shortfalls, 1) / jnp.maximum(jnp.sum(weights, 1), 1e-6)
     length = min(1.0 / (1.0 - discount), _LONGEST) if discount < 1.0 else plans.rewards.shape[1]
-    return jnp.max(jnp.abs(mean)) * length
+    return jnp.median(jnp.abs(mean)) * length

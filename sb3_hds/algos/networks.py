@@ -22,6 +22,8 @@ ACTIVATIONS: dict[str, Activation] = {
 # Width around zero where the value is linear rather than a square root, in units of the scaled
 # reward.
 _NEAR_ZERO = 0.3
+# Of a last layer, so that a network starts near zero.
+_SMALL = nn.initializers.variance_scaling(1e-4, "fan_in", "normal")
 
 
 def activation(choice: str | Activation | type) -> Activation:
@@ -37,7 +39,8 @@ def activation(choice: str | Activation | type) -> Activation:
         return found
     if isinstance(choice, str | type) or not callable(choice):
         raise ValueError(
-            f"activation_fn must be one of {', '.join(ACTIVATIONS)}, or a JAX function, got {choice!r}."
+            f"activation_fn must be one of {', '.join(ACTIVATIONS)}, or a JAX function, "
+            f"got {choice!r}."
         )
     return choice
 
@@ -58,10 +61,7 @@ class Actor(nn.Module):
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch act"]:
         hidden = _mlp(obs, self.net_arch, self.activation_fn)
-        last = nn.Dense(
-            self.n_act, kernel_init=nn.initializers.variance_scaling(1e-4, "fan_in", "normal")
-        )
-        return jnp.tanh(last(hidden))
+        return jnp.tanh(nn.Dense(self.n_act, kernel_init=_SMALL)(hidden))
 
 
 class Value(nn.Module):
@@ -78,8 +78,7 @@ class Value(nn.Module):
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch"]:
         hidden = _mlp(obs, self.net_arch, self.activation_fn)
-        last = nn.Dense(1, kernel_init=nn.initializers.variance_scaling(1e-4, "fan_in", "normal"))
-        return last(hidden)[..., 0]
+        return nn.Dense(1, kernel_init=_SMALL)(hidden)[..., 0]
 
 
 def squash(value: jax.Array) -> jax.Array:

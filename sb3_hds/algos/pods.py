@@ -24,9 +24,11 @@ class PODS(TwinAlgorithm):
     Where this differs from the paper by default, because whole episodes planned from scratch get
     stuck on swing-ups: short horizons with a learned terminal value, random warm starts, start
     states that go on from epoch to epoch, weighted regression. Every one of these is an argument,
-    so that the paper's setting can be reached: ``PODS(env, planner="gauss_newton", horizon=100,
-    n_iterations=1, n_random_plans=0, lookahead=0, terminal_value=False, reset_share=1.0, plan_memory=1, loss="squared", gain_weight=0.0,
-    sensitivity_weight=0.0, averaging=0.0, gamma=1.0, gradient_steps=50)``.
+    so that the paper's setting can be reached::
+
+        PODS(env, planner="gauss_newton", horizon=100, n_iterations=1, n_random_plans=0, lookahead=0,
+             terminal_value=False, reset_share=1.0, plan_memory=1, loss="squared", gain_weight=0.0,
+             sensitivity_weight=0.0, averaging=0.0, gamma=1.0, gradient_steps=50)
 
     Paper: Mora, Peychev, Ha, Vechev, Coros, *PODS: Policy Optimization via Differentiable
     Simulation*, ICML 2021, PMLR 139:7805-7817.

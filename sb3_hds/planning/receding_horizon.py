@@ -31,8 +31,8 @@ def receding_horizon(
     horizon = initial.shape[0]
     if not 1 <= replan_every <= horizon or n_steps % replan_every:
         raise ValueError(
-            f"replan_every must lie between 1 and the horizon, {horizon}, and divide n_steps={n_steps}, "
-            f"got {replan_every}."
+            f"replan_every must lie between 1 and the horizon, {horizon}, and "
+            f"divide n_steps={n_steps}, got {replan_every}."
         )
 
     def act(carry: tuple[State, Flag, Controls], _: None):

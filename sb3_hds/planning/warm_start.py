@@ -78,8 +78,8 @@ def horizon_continuation(
         or horizons[0] < 1
     ):
         raise ValueError(
-            f"Horizons must grow from at least 1 to the length of the controls, {controls.shape[0]}, "
-            f"got {list(horizons)}."
+            f"Horizons must grow from at least 1 to the length of the controls, "
+            f"{controls.shape[0]}, got {list(horizons)}."
         )
     first = simulate(problem, start, controls)
     current = controls
