@@ -31,7 +31,7 @@ def view_of(normalise: VecNormalize | None, n_obs: int) -> View:
 
 def prepare_statistics(normalise: VecNormalize | None, twin: Twin, key: jax.Array) -> None:
     """
-    Give a fresh ``VecNormalize`` the statistics of rollouts in the twin. Otherwise a policy that is
+    Give a fresh ``VecNormalize`` the statistics of episodes in the twin. Otherwise a policy that is
     trained before the first real step would see other numbers afterwards.
 
     Statistics that are frozen, or already rest on more observations, are left alone.
@@ -43,13 +43,14 @@ def prepare_statistics(normalise: VecNormalize | None, twin: Twin, key: jax.Arra
     if normalise.obs_rms.count >= _N_ROLLOUTS * _N_STEPS:
         return
     problem = Problem(twin, twin.params)
+    length = min(_N_STEPS, twin.max_episode_steps or _N_STEPS)
 
-    def wander(k: jax.Array) -> jax.Array:
+    def wander(k: jax.Array) -> tuple[jax.Array, jax.Array]:
         k_start, k_plan = jax.random.split(k)
         start = twin.initial(k_start, twin.params)
-        plan = best_of_random(problem, start, k_plan, _N_STEPS, 1)
-        return jax.vmap(problem.observe)(plan.states)
+        plan = best_of_random(problem, start, k_plan, length, 1)
+        return jax.vmap(problem.observe)(plan.states), plan.alive
 
-    seen = jax.jit(jax.vmap(wander))(jax.random.split(key, _N_ROLLOUTS))
-    flat = np.asarray(seen, np.float64).reshape(-1, seen.shape[-1])
-    normalise.obs_rms.update(flat[np.isfinite(flat).all(1)])
+    seen, alive = jax.jit(jax.vmap(wander))(jax.random.split(key, _N_ROLLOUTS))
+    lived = np.asarray(seen, np.float64)[np.asarray(alive)]
+    normalise.obs_rms.update(lived[np.isfinite(lived).all(1)])
