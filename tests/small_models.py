@@ -1,0 +1,75 @@
+"""Every algorithm, so small that a test of it takes moments: tests ask whether, not how well."""
+
+import io
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import KVWriter, Logger
+
+from sb3_hds import algos
+from sb3_hds.algos.twin_algorithm import TwinAlgorithm
+
+# One set for all that plan in a twin: equal settings are one compiled program.
+_PLANNING = {
+    "pretrain_epochs": 1,
+    "n_rollouts": 8,
+    "horizon": 4,
+    "lookahead": 2,
+    "n_iterations": 1,
+    "n_step_sizes": 3,
+    "n_random_plans": 2,
+    "plan_memory": 2,
+    "gradient_steps": 4,
+    "batch_size": 16,
+    "train_freq": 25,
+    "buffer_size": 500,
+    "policy_kwargs": {"net_arch": [8]},
+}
+#: an algorithm is tested as soon as it has an entry here, under its id in ``algos.ALL``
+SMALL: dict[str, dict[str, Any]] = {"pods": _PLANNING, "hds": _PLANNING}
+
+NAMES = list(algos.ALL)
+#: the algorithms that plan in a twin
+PLANNERS = [name for name in NAMES if issubclass(algos.ALL[name], TwinAlgorithm)]
+
+
+def small(name: str, env: Any = "Pendulum-v1", **changes: Any) -> BaseAlgorithm:
+    """:return: a model of the algorithm with this id, with seed 0 unless another is given"""
+    return algos.ALL[name](env=env, **({"seed": 0} | SMALL[name] | changes))
+
+
+class Lines(KVWriter):
+    """Keeps what is logged: one dictionary for each line."""
+
+    def __init__(self) -> None:
+        self.lines: list[dict[str, Any]] = []
+
+    def write(self, key_values, key_excluded, step: int = 0) -> None:
+        self.lines.append(dict(key_values))
+
+    def close(self) -> None:
+        self.lines = []
+
+    def column(self, key: str) -> list[Any]:
+        return [line[key] for line in self.lines if key in line]
+
+
+def logged(model: BaseAlgorithm) -> Lines:
+    """:return: what the model will log from now on"""
+    lines = Lines()
+    model.set_logger(Logger(folder=None, output_formats=[lines]))
+    return lines
+
+
+def saved(model: BaseAlgorithm) -> io.BytesIO:
+    """:return: the model's zip file in memory"""
+    file = io.BytesIO()
+    model.save(file)
+    file.seek(0)
+    return file
+
+
+def steps_of(checkpoint: Path) -> int:
+    """:return: 50 for ``rl_model_50_steps.zip``, as SB3 names them"""
+    return int(checkpoint.stem.split("_")[-2])

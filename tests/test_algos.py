@@ -1,0 +1,312 @@
+"""The contract of every algorithm: what a user of Stable-Baselines3 expects of one."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch as th
+from point_mass import linear_controller, point_mass_env, returns_of
+from small_models import NAMES, SMALL, logged, small, steps_of
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    CheckpointCallback,
+    EvalCallback,
+    EveryNTimesteps,
+    StopTrainingOnMaxEpisodes,
+    StopTrainingOnRewardThreshold,
+)
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+
+from sb3_hds import algos
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+every_algorithm = pytest.mark.parametrize("name", NAMES)
+
+#: what it takes to learn PointMass in seconds
+LEARNING = {
+    name: {
+        "pretrain_epochs": 40,
+        "n_rollouts": 16,
+        "horizon": 8,
+        "gradient_steps": 40,
+        "batch_size": 64,
+        "learning_rate": 5e-3,
+        "policy_kwargs": {"net_arch": [16]},
+    }
+    for name in ("pods", "hds")
+}
+
+
+class Watching(BaseCallback):
+    """Counts its calls and stops training at one of them."""
+
+    def __init__(self, stop_at: int | None = None) -> None:
+        super().__init__()
+        self.stop_at, self.n_inits, self.n_starts, self.n_ends = stop_at, 0, 0, 0
+
+    def _init_callback(self) -> None:
+        self.n_inits += 1
+
+    def _on_training_start(self) -> None:
+        self.n_starts += 1
+
+    def _on_training_end(self) -> None:
+        self.n_ends += 1
+
+    def _on_step(self) -> bool:
+        return self.n_calls != self.stop_at
+
+
+def weights(model) -> dict[str, np.ndarray]:
+    return {
+        f"{part}.{key}": tensor.numpy()
+        for part, tensors in model.get_parameters().items()
+        for key, tensor in tensors.items()
+    }
+
+
+def pendulums(n: int, **kwargs) -> DummyVecEnv:
+    return make_vec_env("Pendulum-v1", n_envs=n, seed=0, env_kwargs=kwargs)
+
+
+@pytest.mark.parametrize("name", list(algos.ALL))
+def test_every_algorithm_has_an_entry_in_the_table_of_small_settings(name):
+    assert name in SMALL and name in LEARNING
+
+
+@every_algorithm
+@pytest.mark.parametrize("form", ["id alone", "env alone", "vec env alone", "SB3's", "keyword"])
+def test_the_environment_may_be_given_alone_or_in_stable_baselines_order(name, form):
+    algorithm = algos.ALL[name]
+    make = {
+        "id alone": lambda: algorithm("Pendulum-v1", **SMALL[name]),
+        "env alone": lambda: algorithm(gymnasium.make("Pendulum-v1"), **SMALL[name]),
+        "vec env alone": lambda: algorithm(pendulums(1), **SMALL[name]),
+        "SB3's": lambda: algorithm("MlpPolicy", "Pendulum-v1", **SMALL[name]),
+        "keyword": lambda: algorithm(env="Pendulum-v1", **SMALL[name]),
+    }
+
+    model = make[form]().learn(30)
+
+    assert model.num_timesteps >= 30
+    assert model.observation_space.shape == (3,)
+
+
+@every_algorithm
+def test_it_learns_a_task_that_a_linear_controller_solves(name):
+    idle = returns_of(lambda obs: np.zeros(1, np.float32)).mean()
+    best = returns_of(linear_controller()).mean()
+    model = small(name, point_mass_env(), **LEARNING[name])
+
+    model.learn(0)
+
+    learned = returns_of(lambda obs: model.predict(obs, deterministic=True)[0]).mean()
+    # Seen over three seeds: 98 to 99.7 % of the way from doing nothing to the optimum.
+    assert learned > best - 0.1 * (best - idle)
+
+
+@every_algorithm
+def test_learning_without_arguments_takes_the_default_number_of_steps(name, monkeypatch):
+    monkeypatch.setattr(algos.ALL[name], "default_timesteps", 50)
+
+    model = small(name).learn()
+
+    assert model.num_timesteps == 50
+
+
+@every_algorithm
+def test_two_runs_with_one_seed_end_with_the_same_weights(name):
+    first, second, other = (small(name, seed=seed).learn(75) for seed in (3, 3, 4))
+
+    for key, weight in weights(first).items():
+        np.testing.assert_array_equal(weight, weights(second)[key], err_msg=key)
+    assert any((weight != weights(other)[key]).any() for key, weight in weights(first).items())
+
+
+@every_algorithm
+def test_exploration_noise_of_stable_baselines_is_applied_and_is_deterministic(name):
+    def rewards(sigma):
+        noise = NormalActionNoise(np.zeros(1), sigma * np.ones(1))
+        model = small(name, action_noise=noise).learn(50)
+        return model.replay_buffer.rewards[:50].copy()
+
+    np.testing.assert_array_equal(rewards(0.3), rewards(0.3))
+    assert (rewards(0.3) != rewards(0.0)).any()
+
+
+@every_algorithm
+def test_one_observation_gives_one_action_and_a_batch_gives_a_batch(name):
+    model = small(name)
+    space = model.action_space
+    batch = np.stack([model.observation_space.sample() for _ in range(5)])
+
+    actions, state = model.predict(batch, deterministic=True)
+    singles = np.stack([model.predict(obs, deterministic=True)[0] for obs in batch])
+
+    assert actions.shape == (5, 1) and actions.dtype == space.dtype and state is None
+    assert all(space.contains(action) for action in actions)
+    # One program for each batch size: they may round differently.
+    np.testing.assert_allclose(singles, actions, rtol=1e-5, atol=1e-7)
+
+
+@every_algorithm
+def test_actions_stay_within_asymmetric_bounds_of_double_precision(name):
+    model = small(name, point_mass_env(np.float64))
+    parameters = model.get_parameters()
+    # Large weights drive the policy to its bounds, both of them over many observations.
+    parameters["policy"] = {key: 50.0 * th.randn_like(t) for key, t in parameters["policy"].items()}
+    model.set_parameters(parameters)
+
+    actions, _ = model.predict(np.random.default_rng(0).normal(size=(200, 2)), deterministic=True)
+
+    assert actions.dtype == np.float64
+    assert all(model.action_space.contains(action) for action in actions)
+    # tanh comes this close to 1 in single precision.
+    assert actions.min() < -1.0 + 1e-5 and actions.max() > 3.0 - 1e-5
+    model.learn(30)
+
+
+@every_algorithm
+def test_a_callback_that_returns_false_stops_training(name):
+    watching = Watching(stop_at=7)
+
+    model = small(name).learn(100, callback=watching)
+
+    assert model.num_timesteps == 7
+    assert (watching.n_inits, watching.n_starts, watching.n_ends) == (1, 1, 1)
+
+
+@every_algorithm
+@pytest.mark.parametrize("kind", ["one", "list", "function", "none"])
+def test_callbacks_may_be_given_in_every_form(name, kind):
+    calls = []
+    watching = [Watching(), Watching()]
+    form = {
+        "one": watching[0],
+        "list": watching,
+        "function": lambda local, _: calls.append(local["new_obs"]) or True,
+        "none": None,
+    }
+
+    small(name).learn(50, callback=form[kind], progress_bar=True)
+
+    expected = {"one": [50, 0], "list": [50, 50]}.get(kind, [0, 0])
+    assert [callback.n_calls for callback in watching] == expected
+    assert len(calls) == (50 if kind == "function" else 0)
+
+
+@every_algorithm
+def test_stable_baselines_own_callbacks_work(name, tmp_path):
+    best = EvalCallback(
+        Monitor(gymnasium.make("Pendulum-v1")),
+        callback_on_new_best=StopTrainingOnRewardThreshold(reward_threshold=0.0),
+        best_model_save_path=str(tmp_path / "best"),
+        log_path=str(tmp_path),
+        eval_freq=100,
+        n_eval_episodes=1,
+    )
+    checkpoints = CheckpointCallback(50, str(tmp_path), save_replay_buffer=True)
+    on_event = EveryNTimesteps(100, CheckpointCallback(1, str(tmp_path), name_prefix="event"))
+    episodes = StopTrainingOnMaxEpisodes(max_episodes=1)
+
+    model = small(name).learn(1_000, callback=CallbackList([best, checkpoints, on_event, episodes]))
+
+    # Pendulum-v1 ends an episode after 200 steps, and 0 is more than any return.
+    assert model.num_timesteps == 200
+    assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == [100, 200]
+    assert (tmp_path / "best" / "best_model.zip").is_file()
+    written = sorted(map(steps_of, tmp_path.glob("rl_model_*_steps.zip")))
+    assert written == [50, 100, 150, 200]
+    assert len(list(tmp_path.glob("rl_model_replay_buffer_*.pkl"))) == 4
+    assert list(tmp_path.glob("event_*.zip"))
+
+
+@every_algorithm
+def test_the_usual_keys_are_logged_at_the_number_of_environment_steps(name):
+    model = small(name)
+    lines = logged(model)
+
+    model.learn(400, log_interval=1)
+
+    assert lines.column("time/total_timesteps") == [200, 400]
+    assert lines.column("rollout/ep_len_mean") == [200.0, 200.0]
+    for key in ("rollout/ep_rew_mean", "time/fps", "train/learning_rate", "train/n_updates"):
+        assert all(np.isfinite(value) for value in lines.column(key)) and lines.column(key)
+
+
+@every_algorithm
+def test_another_environment_may_be_set(name):
+    model = small(name, pendulums(1)).learn(25)
+
+    model.set_env(gymnasium.make("Pendulum-v1"))
+    assert model._last_obs is None
+    model.learn(25)
+    model.set_env(model.get_env(), force_reset=False)
+    assert model._last_obs is not None
+    model.learn(25, reset_num_timesteps=False)
+
+    assert model.num_timesteps == 50
+    with pytest.raises(AssertionError, match="number of environments"):
+        model.set_env(pendulums(2))
+
+
+@every_algorithm
+def test_several_copies_of_the_environment_are_stepped_together(name):
+    model = small(name, pendulums(4), train_freq=5).learn(60)
+
+    assert model.num_timesteps == 60
+    assert model.replay_buffer.size() == 15 and model.replay_buffer.n_envs == 4
+    actions, _ = model.predict(model.get_env().reset(), deterministic=True)
+    assert actions.shape == (4, 1)
+
+
+def test_environments_in_other_processes_are_stepped_together():
+    env = make_vec_env("Pendulum-v1", n_envs=2, vec_env_cls=SubprocVecEnv)
+    try:
+        model = small(NAMES[-1], env).learn(50)
+    finally:
+        env.close()
+
+    assert model.num_timesteps == 50
+
+
+@every_algorithm
+@pytest.mark.parametrize("options", [{}, {"norm_obs": False}, {"norm_reward": False}])
+def test_a_policy_learns_and_acts_in_a_normalised_environment(name, options):
+    idle = returns_of(lambda obs: np.zeros(1, np.float32)).mean()
+    env = VecNormalize(DummyVecEnv([point_mass_env]), **options)
+    model = small(name, env, **LEARNING[name]).learn(60)
+    elsewhere = VecNormalize(
+        DummyVecEnv([lambda: Monitor(point_mass_env())]),
+        training=False,
+        **(options | {"norm_reward": False}),
+    )
+    elsewhere.obs_rms = getattr(env, "obs_rms", None)
+
+    score, _ = evaluate_policy(model, elsewhere, n_eval_episodes=20)
+
+    # Doing nothing earns -7 and the optimum is -1.3; without the right view a policy does worse.
+    assert score > 0.5 * idle
+    if env.norm_obs:
+        # Positions start in [-1, 1] m; full force for a whole episode leads less than 30 m away.
+        assert (env.obs_rms.var > 0.1**2).all() and (env.obs_rms.var < 15.0**2).all()
+
+
+@every_algorithm
+@pytest.mark.parametrize(
+    "rate", [1e-3, lambda left: 1e-3 * left, LinearSchedule(1e-3, 0.0, 1.0)], ids=type
+)
+def test_a_learning_rate_may_be_a_schedule(name, rate):
+    model = small(name, learning_rate=rate)
+    lines = logged(model)
+
+    model.learn(200, log_interval=1)
+
+    rates = lines.column("train/learning_rate")
+    assert all(0.0 <= value <= 1e-3 for value in rates)
+    assert (rates[-1] < 0.5e-3) == callable(rate)

@@ -1,0 +1,422 @@
+"""The contract of the algorithms that plan in a twin, on top of that of every algorithm."""
+
+from inspect import signature
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from point_mass import PointMass, point_mass_env
+from small_models import PLANNERS, logged, small
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecFrameStack,
+    VecNormalize,
+)
+
+from sb3_hds import algos, effects, twins
+from sb3_hds.algos.twin_policy import all_finite
+from sb3_hds.core import Twin
+from sb3_hds.errors import EnvironmentMismatchError, NoTwinError, RewardError
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+every_planner = pytest.mark.parametrize("name", PLANNERS)
+
+
+def planners_with(argument: str) -> pytest.MarkDecorator:
+    takes = [name for name in PLANNERS if argument in signature(algos.ALL[name]).parameters]
+    return pytest.mark.parametrize("name", takes)
+
+
+class CountedEnv(gymnasium.Env):
+    """Pendulum-v1 without a wrapper, so that the twin is found, and counted steps."""
+
+    def __init__(self) -> None:
+        self.inner = gymnasium.make("Pendulum-v1").unwrapped
+        self.observation_space, self.action_space = (
+            self.inner.observation_space,
+            self.inner.action_space,
+        )
+        self.spec = gymnasium.spec("Pendulum-v1")
+        self.g, self.m, self.l, self.dt = 10.0, 1.0, 1.0, 0.05
+        self.n_steps = 0
+
+    def reset(self, *, seed=None, options=None):
+        return self.inner.reset(seed=seed, options=options)
+
+    def step(self, action):
+        self.n_steps += 1
+        return self.inner.step(action)
+
+
+class Lossy(PointMass):
+    """Breaks down where it starts to the right of 0.5 m."""
+
+    name = "Lossy"
+
+    def actuate(self, state, action, params):
+        return jnp.where(state.q > 0.5, jnp.nan, super().actuate(state, action, params))
+
+
+class Aimless(PointMass):
+    """Has no task."""
+
+    name = "Aimless"
+    reward = Twin.reward
+
+
+class Flat(PointMass):
+    """Has a reward without a gradient, and no surrogate."""
+
+    name = "Flat"
+    reward_has_gradient = False
+
+
+class Dead(gymnasium.ObservationWrapper):
+    """A sensor that reports numbers which are none from the tenth step on."""
+
+    def __init__(self, env: gymnasium.Env, value: float) -> None:
+        super().__init__(env)
+        self.value, self.n_steps = value, 0
+
+    def observation(self, observation):
+        self.n_steps += 1
+        return observation if self.n_steps < 10 else np.full_like(observation, self.value)
+
+
+def finite(model) -> bool:
+    return all_finite(model.policy.networks)
+
+
+def n_epochs(model) -> int:
+    return int(model.policy.progress.n_epochs)
+
+
+@every_planner
+def test_pretraining_alone_never_steps_the_environment(name):
+    env = CountedEnv()
+    model = small(name, env, pretrain_epochs=3)
+    lines = logged(model)
+
+    model.learn(0)
+
+    assert env.n_steps == 0 and model.num_timesteps == 0
+    assert (model.n_pretrained, n_epochs(model), model._n_updates) == (3, 3, 12)
+    assert lines.column("time/epochs") == [1, 2, 3]
+    assert model.twin_timesteps == lines.column("time/twin_timesteps")[-1] > 0
+
+
+@every_planner
+def test_pretraining_is_done_once_and_counts_no_timesteps(name):
+    env = CountedEnv()
+    model = small(name, env, pretrain_epochs=2, train_freq=10)
+
+    model.learn(30)
+    model.learn(30)
+
+    # Two epochs of pretraining, then one after every tenth real step of both calls.
+    assert n_epochs(model) == 2 + 3 + 3
+    assert env.n_steps == 60 and model.num_timesteps == 30
+
+
+@every_planner
+def test_simulated_steps_grow_alike_with_every_epoch(name):
+    model = small(name, pretrain_epochs=4)
+    lines = logged(model)
+
+    model.learn(0)
+
+    # From the definition: 8 rollouts of 4 steps, each with own, random and improved plans.
+    growth = np.diff(lines.column("time/twin_timesteps"))
+    assert (growth == growth[0]).all() and growth[0] >= 8 * 4 * (1 + 2 + 2)
+
+
+@every_planner
+def test_an_interrupted_pretraining_goes_on_where_it_stopped(name, monkeypatch):
+    model = small(name, pretrain_epochs=4)
+    run, calls = model.run_epoch, []
+
+    def interrupted(gradient_steps):
+        calls.append(gradient_steps)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return run(gradient_steps)
+
+    monkeypatch.setattr(model, "run_epoch", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(0)
+    model.learn(0)
+
+    assert (model.n_pretrained, n_epochs(model)) == (4, 4)
+
+
+@every_planner
+def test_a_model_regresses_as_often_as_it_steps_with_minus_one_gradient_steps(name):
+    model = small(name, gradient_steps=-1, train_freq=7, pretrain_epochs=2).learn(21)
+
+    # Seven for each epoch of pretraining, seven for each of three rollouts of seven steps.
+    assert model._n_updates == 2 * 7 + 3 * 7
+
+
+@every_planner
+def test_an_epoch_may_wait_for_the_end_of_an_episode(name):
+    model = small(name, train_freq=(1, "episode"), pretrain_epochs=0).learn(300)
+
+    # Pendulum-v1 ends an episode after 200 steps.
+    assert model.num_timesteps == 400 and n_epochs(model) == 2
+
+
+@every_planner
+def test_rates_of_policy_and_value_follow_their_own_schedules(name, monkeypatch):
+    model = small(name, pretrain_epochs=4, learning_rate=1e-3, value_learning_rate="lin_1e-2")
+    seen, knobs = [], model._knobs
+
+    def recorded(gradient_steps):
+        seen.append(knobs(gradient_steps))
+        return seen[-1]
+
+    monkeypatch.setattr(model, "_knobs", recorded)
+    model.learn(0)
+
+    assert [float(k.learning_rate) for k in seen] == [1e-3] * 4
+    # A straight line from 0.01 to 0 over four epochs.
+    expected = [1e-2, 0.75e-2, 0.5e-2, 0.25e-2]
+    np.testing.assert_allclose([float(k.value_learning_rate) for k in seen], expected)
+
+
+@planners_with("relabel_share")
+def test_relabelling_plans_from_states_that_the_environment_visited(name):
+    model = small(name, relabel_share=1.0).learn(50)
+
+    visited, relabel = model._visited(3)
+
+    stored = model.replay_buffer.observations[:50].reshape(50, 3)
+    assert relabel.all()
+    assert all((np.asarray(obs) == stored).all(1).any() for obs in visited)
+    assert finite(model)
+
+
+@every_planner
+def test_a_plan_is_never_worse_than_what_it_started_from(name):
+    model = small(name, pretrain_epochs=10)
+    lines = logged(model)
+
+    model.learn(0)
+
+    assert lines.column("train/worsened_plans") == [0] * 10
+    before, after = (lines.column(f"train/plan_return_{when}") for when in ("before", "after"))
+    assert (np.array(after) >= np.array(before)).all() and after != before
+
+
+@planners_with("temperature")
+def test_a_high_temperature_takes_worse_steps_at_times(name):
+    model = small(name, pretrain_epochs=10, temperature=1e3, temperature_decay=1.0)
+    lines = logged(model)
+
+    model.learn(0)
+
+    assert lines.column("train/temperature") == [1e3] * 10
+    assert sum(lines.column("train/worsened_plans")) > 0
+    assert finite(model)
+
+
+@every_planner
+def test_samples_that_are_not_finite_are_dropped_and_counted(name):
+    model = small(name, point_mass_env(), twin=Lossy(), pretrain_epochs=10)
+    lines = logged(model)
+
+    model.learn(30)
+
+    dropped = lines.column("train/dropped_samples")
+    # A quarter of the starts lies right of 0.5 m; there are 8 rollouts of 4 steps.
+    assert 0 < sum(dropped) < 10 * 8 * 4 and max(dropped) < 8 * 4
+    assert finite(model)
+
+
+@planners_with("relabel_share")
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_dead_sensor_does_not_reach_the_weights(name, value):
+    env = Dead(gymnasium.make("Pendulum-v1"), value)
+    model = small(name, env, twin="Pendulum", relabel_share=1.0).learn(100)
+
+    assert not np.isfinite(model.replay_buffer.observations[:100]).all()
+    assert finite(model)
+    action, _ = model.predict(np.array([1.0, 0.0, 0.0], np.float32), deterministic=True)
+    assert np.isfinite(action).all()
+
+
+@every_planner
+def test_a_regression_that_diverges_is_an_error_and_keeps_the_last_good_state(name):
+    model = small(name, pretrain_epochs=2).learn(0)
+    before = model.get_parameters()
+    model.learning_rate = 1e38
+    model._setup_lr_schedule()
+
+    with pytest.raises(FloatingPointError, match="Lower learning_rate"):
+        model.learn(50)
+
+    assert finite(model)
+    for part, tensors in model.get_parameters().items():
+        for key, tensor in tensors.items():
+            np.testing.assert_array_equal(tensor, before[part][key], err_msg=key)
+
+
+@every_planner
+@pytest.mark.parametrize("kind", [DummyVecEnv, SubprocVecEnv])
+def test_arguments_of_the_environment_reach_the_twin(name, kind):
+    env = make_vec_env("Pendulum-v1", n_envs=2, env_kwargs={"g": 9.8}, vec_env_cls=kind)
+    try:
+        model = small(name, env)
+    finally:
+        env.close()
+
+    assert model.twin.values["gravity"] == 9.8
+    model.set_env(make_vec_env("Pendulum-v1", n_envs=2, env_kwargs={"g": 3.7}))
+    assert model.twin.values["gravity"] == 3.7
+
+
+def test_plans_of_a_former_environment_are_forgotten_when_the_twin_changes():
+    model = small(PLANNERS[0]).learn(25)
+    workspace = model._workspace
+
+    model.set_env(gymnasium.make("Pendulum-v1"))
+    assert model._workspace is workspace
+    model.set_env(gymnasium.make("Pendulum-v1", g=9.8))
+
+    assert model._workspace is None
+    model.learn(25)
+    assert model.policy.progress.n_epochs == 1 + 1 + 1
+
+
+def test_an_environment_that_is_refused_leaves_the_model_as_it_was():
+    model = small(PLANNERS[0]).learn(25)
+    env, twin = model.get_env(), model.twin
+
+    with pytest.raises(EnvironmentMismatchError, match="TransformReward"):
+        model.set_env(gymnasium.wrappers.TransformReward(gymnasium.make("Pendulum-v1"), abs))
+
+    assert model.get_env() is env and model.twin is twin
+    model.learn(25)
+
+
+@every_planner
+def test_a_twin_that_was_passed_is_planned_in_whatever_the_environment_says(name):
+    model = small(name, twin=twins.make("Pendulum", mass=1.2)).learn(25)
+
+    model.set_env(gymnasium.make("Pendulum-v1", g=9.8))
+
+    assert model.twin.values == {"gravity": 10.0, "mass": 1.2, "length": 1.0}
+
+
+@every_planner
+def test_it_learns_through_a_twin_with_friction(name):
+    twin = twins.make("Pendulum").extend(effects.ViscousFriction(b=0.2))
+    lines = logged(model := small(name, twin=twin))
+
+    model.learn(25)
+
+    assert model.twin.values["viscous_friction.hinge.b"] == 0.2
+    assert np.isfinite(lines.column("train/plan_return_after")).all() and finite(model)
+
+
+PAPER = {
+    "reset_share": 1.0,
+    "n_random_plans": 0,
+    "lookahead": 0,
+    "terminal_value": False,
+    "loss": "squared",
+    "gain_weight": 0.0,
+    "sensitivity_weight": 0.0,
+    "averaging": 0.0,
+    "plan_memory": 1,
+    "gamma": 1.0,
+}
+
+
+@every_planner
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.expensive)])
+def test_the_settings_of_the_pods_paper_improve_plans(name, order):
+    model = small(name, order=order, pretrain_epochs=3, **PAPER)
+    lines = logged(model)
+
+    model.learn(25)
+
+    before, after = (lines.column(f"train/plan_return_{when}") for when in ("before", "after"))
+    assert (np.array(after) > np.array(before)).all()
+    assert set(lines.column("train/value_loss")) == {0.0}
+    assert finite(model)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"planner": "first_order"},
+        {"planner": "gauss_newton"},
+        pytest.param({"terminal_value": False}, marks=pytest.mark.expensive),
+        pytest.param({"lookahead": 0}, marks=pytest.mark.expensive),
+        pytest.param({"n_random_plans": 0}, marks=pytest.mark.expensive),
+        pytest.param({"reset_share": 1.0}, marks=pytest.mark.expensive),
+        pytest.param({"gamma": 1.0}, marks=pytest.mark.expensive),
+        pytest.param({"loss": "squared"}, marks=pytest.mark.expensive),
+    ],
+    ids=str,
+)
+def test_each_choice_improves_plans(changes):
+    model = small(PLANNERS[0], pretrain_epochs=3, **changes)
+    lines = logged(model)
+
+    model.learn(25)
+
+    before, after = (lines.column(f"train/plan_return_{when}") for when in ("before", "after"))
+    assert (np.array(after) > np.array(before)).all() and finite(model)
+
+
+def test_frozen_statistics_of_a_normalised_environment_are_left_alone():
+    env = VecNormalize(DummyVecEnv([point_mass_env]), training=False)
+    before = env.obs_rms.copy()
+
+    small(PLANNERS[0], env).learn(0)
+
+    np.testing.assert_array_equal(env.obs_rms.mean, before.mean)
+    np.testing.assert_array_equal(env.obs_rms.var, before.var)
+
+
+def test_a_fresh_normalised_environment_gets_statistics_of_whole_episodes_and_no_longer_ones():
+    env = VecNormalize(DummyVecEnv([point_mass_env]))
+
+    small(PLANNERS[0], env).learn(0)
+
+    # Random episodes of PointMass, 20 steps with forces uniform in [-1, 3] N, spread by 1.8 m and
+    # 0.7 m/s around 1.3 m and 0.8 m/s; plans drawn at random are smoother, so they spread more.
+    spread, mean = np.sqrt(env.obs_rms.var), env.obs_rms.mean
+    assert (spread > [1.0, 0.4]).all() and (spread < [5.0, 2.5]).all()
+    assert (np.abs(mean) < [4.0, 2.5]).all()
+
+
+def test_stacked_observations_are_refused_by_name():
+    env = VecFrameStack(make_vec_env("Pendulum-v1", n_envs=1), 2)
+
+    with pytest.raises(EnvironmentMismatchError, match="VecFrameStack"):
+        small(PLANNERS[0], env)
+
+
+def test_an_environment_without_a_twin_is_refused_with_the_list_of_those_that_have_one():
+    with pytest.raises(NoTwinError, match=r"Pendulum-v1(.|\n)*twins\.register"):
+        small(PLANNERS[0], "Reacher-v5")
+
+
+@pytest.mark.parametrize("twin, reason", [(Aimless, "no reward"), (Flat, "planning_reward")])
+def test_a_twin_whose_reward_leads_nowhere_is_refused(twin, reason):
+    with pytest.raises(RewardError, match=reason):
+        small(PLANNERS[0], point_mass_env(), twin=twin())
+
+
+def test_the_device_of_jax_holds_the_networks():
+    model = small(PLANNERS[0], device="cpu")
+
+    leaves = jax.tree.leaves(model.policy.networks)
+
+    assert {device.platform for leaf in leaves for device in leaf.devices()} == {"cpu"}
