@@ -4,6 +4,7 @@ import inspect
 import os
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -14,6 +15,7 @@ from rl_zoo_plugin import hook, lazy, tables
 from rl_zoo_plugin.lazy import LazyAlgorithm
 from rl_zoo_plugin.samplers import CONVERTERS, SAMPLERS
 
+ROOT = Path(__file__).parent.parent
 STOCK = {"a2c", "ars", "crossq", "ddpg", "dqn", "ppo", "ppo_lstm", "qrdqn", "sac", "td3", "tqc"}
 # Keys of a zoo entry that the zoo itself consumes, see ExperimentManager._preprocess_hyperparams.
 CONSUMED_BY_THE_ZOO = {"n_timesteps", "n_envs", "normalize", "env_wrapper", "frame_stack"}
@@ -135,6 +137,27 @@ def test_a_trial_is_recreated_exactly_from_its_parameters(algo):
         assert yaml.safe_load(yaml.safe_dump(sampled)) == sampled
 
 
+def test_what_a_trial_means():
+    params = {
+        "one_minus_gamma": 0.01,
+        "learning_rate": 1e-3,
+        "batch_size_pow": 7,
+        "n_rollouts_pow": 5,
+        "order": 2,
+        "net_arch": "small",
+        "activation_fn": "tanh",
+    }
+
+    assert CONVERTERS["hds"](params) == {
+        "gamma": 0.99,
+        "learning_rate": 1e-3,
+        "batch_size": 128,
+        "n_rollouts": 32,
+        "order": 2,
+        "policy_kwargs": {"net_arch": [64, 64], "activation_fn": "tanh"},
+    }
+
+
 @pytest.mark.parametrize("algo", tables.ALGORITHMS)
 def test_what_is_sampled_are_arguments_of_the_algorithm(algo):
     optuna = pytest.importorskip("optuna")
@@ -160,10 +183,15 @@ def is_ours(finder: object) -> bool:
 
 
 def test_the_hook_imports_nothing_but_itself():
-    code = "import sys; before = set(sys.modules); from rl_zoo_plugin import hook; hook.start();"
-    loaded = python(code + "print(*sorted(set(sys.modules) - before))", SB3_HDS_NO_ZOO="1")
+    # -S: no start-up line has run the hook already. Every other interpreter imports os anyway.
+    code = (
+        "import os, sys; before = set(sys.modules); from rl_zoo_plugin import hook; hook.start();"
+        "print(*sorted(set(sys.modules) - before))"
+    )
+    command = [sys.executable, "-S", "-c", code]
+    done = subprocess.run(command, cwd=ROOT, text=True, capture_output=True, check=True)
 
-    assert set(loaded.split()) <= {"rl_zoo_plugin", "rl_zoo_plugin.hook"}
+    assert set(done.stdout.split()) == {"rl_zoo_plugin", "rl_zoo_plugin.hook"}
 
 
 def test_a_broken_extension_leaves_the_zoo_usable_and_says_so(monkeypatch):
