@@ -406,7 +406,9 @@ def test_effects_attach_to_the_plant_below_the_wrapper(x64):
     outside = TransformedTwin(Slider(), action=wrapper).extend(Offset(c=0.25))
 
     assert outside == inside and outside.params == inside.params
-    after = outside.step(outside.infer(jnp.zeros(2), outside.params), jnp.full(1, 0.1), outside.params)
+    after = outside.step(
+        outside.infer(jnp.zeros(2), outside.params), jnp.full(1, 0.1), outside.params
+    )
     assert float(after.v[0]) == pytest.approx(0.1 * (0.2 + 0.25), rel=1e-12)
     with pytest.raises(EffectError, match=re.escape("Use twin.extend(*effects), which attaches")):
         ExtendedTwin(TransformedTwin(Slider(), action=wrapper), Offset())

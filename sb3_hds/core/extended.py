@@ -161,11 +161,6 @@ class ExtendedTwin(Twin):
 
 def _attach(effect: Effect, twin: Twin) -> Attached:
     """Find the place that an effect names by index or by name."""
-    if not isinstance(effect, Effect):
-        raise EffectError(
-            f"A twin is extended by effects, got {effect!r}. "
-            "Pass an instance: twin.extend(ViscousFriction())."
-        )
     places = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}[
         effect.slot
     ]

@@ -1,0 +1,638 @@
+"""The contract every effect keeps, at every joint of every twin, and what friction does."""
+
+import functools
+import json
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sb3_hds import effects, twins
+from sb3_hds.core import (
+    ActionEffect,
+    Actuator,
+    AnalyticTwin,
+    Channel,
+    ForceEffect,
+    Joint,
+    JointEffect,
+    JointMoment,
+    Parameter,
+    SensorEffect,
+    State,
+    explicit_euler,
+    rk4,
+    rollout,
+    semi_implicit_euler,
+)
+from sb3_hds.effects import CoulombFriction, ViscousFriction
+from sb3_hds.errors import EffectError, ParameterError
+
+
+class Mass(AnalyticTwin):
+    """A free mass on a rail, driven by a force; its own damping is a parameter."""
+
+    name = "Mass"
+    dt = 0.1
+    joints = (Joint("rail", "m"),)
+    actuators = (Actuator("push", "N", -10.0, 10.0),)
+    channels = (Channel("position", "m"), Channel("speed", "m/s"))
+    parameters = {
+        "mass": Parameter(null=1.0, scale=0.1, unit="kg", lower=0.1),
+        "damping": Parameter(null=0.0, scale=0.1, unit="N s/m", lower=0.0),
+    }
+
+    def initial(self, key, params):
+        return State(jnp.zeros(1), jax.random.normal(key, (1,)), {})
+
+    def infer(self, obs, params):
+        return State(obs[:1], obs[1:], {})
+
+    def observe(self, state, params):
+        return jnp.concatenate([state.q, state.v])
+
+    def actuate(self, state, action, params):
+        return jnp.clip(action, -10.0, 10.0)
+
+    def mass_matrix(self, q, params):
+        return params["mass"] * jnp.ones((1, 1), q.dtype)
+
+    def bias(self, q, v, params):
+        return params["damping"] * v
+
+
+class DampedMass(Mass):
+    """The same, declaring that viscous friction is what it calls damping."""
+
+    native_effects = {("viscous_friction", 0): {"b": "damping"}}
+
+
+# Members of each kind that carry memory: doubles of what the catalogue may hold, for the interface.
+
+
+class Lag(ActionEffect):
+    """A drive follows its command as a first-order lag, solved exactly over each sub-step."""
+
+    name = "lag"
+    parameters = {"T": Parameter(null=0.0, scale=0.1, unit="s", lower=0.0)}
+    explanation = "The drive follows its command with a delay."
+    source = "test"
+
+    def memory(self, twin):
+        return jnp.zeros(())
+
+    def act(self, command, memory, h, params):
+        slow = params["T"] > 0.0
+        share = jnp.where(slow, 1.0 - jnp.exp(-h / jnp.where(slow, params["T"], 1.0)), 1.0)
+        after = memory + share * (command - memory)
+        return after, after
+
+
+class DrivenSpring(JointEffect):
+    """A spring to where the joint was at the start: its memory is the way from there."""
+
+    name = "driven_spring"
+    parameters = {"k": Parameter(null=0.0, scale=1.0, unit="N m/rad", lower=0.0)}
+    explanation = "Something elastic holds the joint back."
+    source = "test"
+
+    def memory(self, twin):
+        return {"way": jnp.zeros(())}
+
+    def torque(self, joint, memory, params):
+        return -params["k"] * memory["way"]
+
+    def advance(self, moment, index, memory, params):
+        return {"way": memory["way"] + moment.h * moment.v[index]}
+
+
+class LateSensor(SensorEffect):
+    """A sensor reports what was ``tau`` ago, plus ``bias``."""
+
+    name = "late_sensor"
+    parameters = {
+        # Off the grid of samples, where the interpolation has a kink.
+        "tau": Parameter(null=0.0, scale=0.07, unit="s", lower=0.0),
+        "bias": Parameter(null=0.0, scale=0.1, unit="1"),
+    }
+    explanation = "The sensor is late and off by a constant."
+    source = "test"
+    longest = 0.5  # [s]
+
+    def memory(self, measured, twin):
+        return jnp.full(2 + int(self.longest / twin.dt), measured)
+
+    def sense(self, measured, memory, dt, params):
+        age = jnp.arange(len(memory)) * dt
+        return jnp.interp(params["tau"], age, memory) + params["bias"]
+
+    def invert(self, reported, params):
+        return reported - params["bias"]
+
+    def advance(self, measured, memory, dt, params):
+        return jnp.concatenate([measured[None], memory[:-1]])
+
+
+class Halved(SensorEffect):
+    """A sensor reports half of what it measures, smoothed over two samples."""
+
+    name = "halved"
+    parameters = {"share": Parameter(null=1.0, scale=0.1, unit="1")}
+    explanation = "The sensor has a wrong gain."
+    source = "test"
+
+    def memory(self, measured, twin):
+        return measured
+
+    def sense(self, measured, memory, dt, params):
+        return params["share"] * memory
+
+    def invert(self, reported, params):
+        return reported / params["share"]
+
+    def advance(self, measured, memory, dt, params):
+        return measured
+
+
+DOUBLES = (Lag, DrivenSpring, LateSensor, Halved)
+PLACES = {"joint": "joints", "actuator": "actuators", "channel": "channels"}
+
+
+def places(effect, twin):
+    return range(len(getattr(twin, PLACES[effect.slot])))
+
+
+CASES = [
+    pytest.param(effect, name, where, id=f"{effect.name}-{name}-{where}")
+    for known, systems in (
+        (effects.ALL, twins.names()),
+        (DOUBLES, ["Pendulum"]),
+    )
+    for name in systems
+    for effect in known
+    for where in places(effect, twins.make(name))
+]
+every_case = pytest.mark.parametrize(("effect", "name", "where"), CASES)
+every_effect = pytest.mark.parametrize(
+    "effect", (*effects.ALL, *DOUBLES), ids=lambda effect: effect.name
+)
+
+
+def sample_actions(twin, n):
+    low, high = (np.array([getattr(a, end) for a in twin.actuators]) for end in ("low", "high"))
+    share = np.random.default_rng(0).uniform(0.3, 0.7, (n, len(low)))
+    return jnp.asarray(low + share * (high - low))
+
+
+def replay(twin):
+    state = twin.initial(jax.random.key(0), twin.params)
+    actions = sample_actions(twin, 50)
+    simulate = jax.jit(rollout, static_argnums=0)
+    return simulate(twin, twin.params, state, actions).obs
+
+
+@functools.cache
+def replay_plain(name):
+    return replay(twins.make(name))
+
+
+# --- the contract
+
+
+@every_case
+def test_a_null_effect_changes_nothing(x64, effect, name, where):
+    extended = twins.make(name).extend(effect(where))
+
+    # Not bitwise: XLA fuses the two programs differently, and 50 steps of a system that falls over
+    # amplify rounding of 1e-16 by up to 1e6.
+    np.testing.assert_allclose(replay(extended), replay_plain(name), rtol=1e-9, atol=1e-9)
+
+
+def outcome_of(effect, name, where):
+    """Where two steps lead, as a function of the effect's parameters; and their values."""
+    values = {name: p.null + p.scale for name, p in effect.parameters.items()}
+    twin = twins.make(name).extend(effect(where, **values))
+    state = twin.initial(jax.random.key(0), twin.params)
+    # Slower than any twin's limit, so that no clip hides the effect, and away from standstill.
+    state = state._replace(v=jnp.full_like(state.v, 0.03))
+    actions = sample_actions(twin, 2)
+    keys = [key for key in twin.params if key.startswith(effect.name)]
+
+    def outcome(own):
+        params = twin.params | dict(zip(keys, own, strict=True))
+        result = rollout(twin, params, state, actions)
+        return jnp.concatenate([result.states.v[-1], result.obs[-1]])
+
+    return outcome, jnp.array([twin.params[key] for key in keys])
+
+
+@every_case
+def test_the_gradient_by_a_parameter_is_that_of_finite_differences(x64, effect, name, where):
+    outcome, at = outcome_of(effect, name, where)
+
+    @jax.jit
+    def along(own, direction):
+        return jax.jvp(outcome, (own,), (direction,))
+
+    for direction in jnp.eye(len(at)):
+        ahead, behind = (
+            along(at + 1e-5 * direction, direction),
+            along(at - 1e-5 * direction, direction),
+        )
+        _, slope = along(at, direction)
+        # Central differences: rounding of 1e-16 / 1e-5, and a third derivative times 1e-10.
+        np.testing.assert_allclose(slope, (ahead[0] - behind[0]) / 2e-5, rtol=1e-5, atol=1e-8)
+        assert jnp.any(slope != 0.0)
+
+
+@every_effect
+def test_reverse_mode_agrees_with_forward_mode(x64, effect):
+    outcome, at = outcome_of(effect, "Pendulum", 0)
+
+    # The same derivative, summed in another order.
+    np.testing.assert_allclose(
+        jax.jit(jax.jacrev(outcome))(at), jax.jit(jax.jacfwd(outcome))(at), rtol=1e-10, atol=1e-14
+    )
+
+
+@every_effect
+def test_a_value_beyond_its_physical_bounds_is_refused(effect):
+    for name, parameter in effect.parameters.items():
+        if parameter.lower == -np.inf:
+            continue
+        low = parameter.lower - parameter.scale
+        message = f"Parameter '{effect.name}.{name}' must be finite and within"
+        with pytest.raises(ParameterError, match=re.escape(message)):
+            effect(0, **{name: low})
+        twin = twins.Pendulum().extend(effect(0))
+        full = next(key for key in twin.params if key.endswith(f".{name}"))
+        with pytest.raises(ParameterError, match=re.escape(f"'{full}' must be finite and within")):
+            twin.with_parameters(**{full: low})
+
+
+@every_effect
+def test_an_effect_says_what_it_is(effect):
+    assert re.fullmatch(r"[a-z][a-z_]*", effect.name)
+    assert effect.explanation.endswith(".") and effect.explanation[0].isupper()
+    assert effect.source and effect.__doc__
+    assert all(parameter.unit for parameter in effect.parameters.values())
+
+
+def test_a_catalogue_entry_states_its_equation_and_where_it_comes_from():
+    for effect in effects.ALL:
+        assert ".. math::" in effect.__doc__ and "Source:" in effect.__doc__
+    names = [effect.name for effect in effects.ALL]
+    assert len(set(names)) == len(names)
+    known = set(names)
+    assert all(set(effect.equivalents) <= known for effect in effects.ALL)
+
+
+@every_effect
+def test_an_effect_survives_its_spec(effect):
+    values = {name: p.null + 0.5 * p.scale for name, p in effect.parameters.items()}
+    twin = twins.make("InvertedPendulum").extend(effect(0, **values))
+
+    spec = json.loads(json.dumps(twin.to_spec()))
+    back = twins.from_spec(spec, (*effects.ALL, *DOUBLES))
+
+    assert back == twin and hash(back) == hash(twin) and back.params == twin.params
+
+
+@every_effect
+def test_attaching_by_name_and_by_index_is_the_same(effect):
+    twin = twins.make("InvertedPendulum")
+    name = getattr(twin, PLACES[effect.slot])[0].name
+
+    assert twin.extend(effect(name)) == twin.extend(effect(0))
+    assert twin.extend(effect(name)).to_spec() == twin.extend(effect(0)).to_spec()
+
+
+@every_effect
+def test_attaching_an_effect_twice_is_an_error(effect):
+    twin = twins.Pendulum()
+    place = getattr(twin, PLACES[effect.slot])[0].name
+    message = (
+        f"An effect can be attached once at each place; {effect.name}.{place} came more than once."
+    )
+
+    for attach in (
+        lambda: twin.extend(effect(0), effect(place)),
+        lambda: twin.extend(effect(0)).extend(effect(0)),
+    ):
+        with pytest.raises(EffectError, match=f"^{re.escape(message)}$"):
+            attach()
+
+
+# --- what friction does
+
+FRICTION = (ViscousFriction, CoulombFriction)
+every_friction = pytest.mark.parametrize("effect", FRICTION, ids=lambda effect: effect.name)
+every_integrator = pytest.mark.parametrize(
+    "integrator", [explicit_euler, semi_implicit_euler, rk4], ids=lambda i: i.__name__
+)
+
+
+@every_friction
+def test_friction_never_adds_energy(x64, effect):
+    rng = np.random.default_rng(0)
+    v = jnp.asarray(rng.choice([-1.0, 0.0, 1.0], 1000) * np.exp(rng.uniform(-6, 6, 1000)))
+    inertia, h, size = jnp.asarray(np.exp(rng.uniform(-6, 6, (3, 1000))))
+    (name,) = effect.parameters
+
+    def power(v, inertia, h, size):
+        joint = JointMoment(*map(jnp.asarray, (0.0, v, 0.0, 0.0, inertia)), h)
+        return effect(0).torque(joint, (), {name: size}) * v
+
+    powers = jax.vmap(power)(v, inertia, h, size)
+
+    assert powers.max() <= 0.0 and powers.min() < 0.0
+
+
+def coast(effect, integrator, h, v, steps=1, mass=0.5):
+    """
+    Speed of a free mass after each step under friction alone.
+
+    :param effect: with its value
+    :param v: initial speeds
+    :return: shape ``(len(v), steps + 1)``
+    """
+
+    class Coasting(Mass):
+        pass
+
+    Coasting.integrator = staticmethod(integrator)
+    twin = Coasting(dt=h, mass=mass).extend(effect)
+    (size,) = effect.parameters
+
+    def speeds(v, size_value):
+        params = twin.params | {f"{effect.name}.rail.{size}": size_value}
+        start = twin.infer(jnp.stack([jnp.zeros(()), v]), params)
+        return rollout(twin, params, start, jnp.zeros((steps, 1))).states.v[:, 0]
+
+    v = jnp.asarray(v)
+    return np.asarray(jax.jit(jax.vmap(speeds))(v, jnp.full(v.shape, effect.values[size])))
+
+
+@every_integrator
+@every_friction
+@pytest.mark.parametrize("h", [1e-3, 0.1, 10.0])
+def test_friction_alone_brings_to_rest_without_overshoot_at_any_step(x64, effect, integrator, h):
+    (name,) = effect.parameters
+    v = jnp.array([-3.0, 0.02, 1e-3])
+
+    for size in (0.01, 1.0, 100.0):
+        speeds = coast(effect(0, **{name: size}), integrator, h, v, steps=30)
+        # Rounding may leave 1e-16 of the other sign where a sub-step stops exactly.
+        assert np.all(speeds * np.sign(v)[:, None] >= -1e-14)
+        assert np.all(np.diff(np.abs(speeds), axis=1) <= 1e-14)
+
+
+def test_viscous_friction_decays_exponentially(x64):
+    speeds = coast(ViscousFriction(b=0.4), rk4, 0.01, [2.0], steps=100)[0]
+
+    exact = 2.0 * np.exp(-0.4 * 0.01 * np.arange(101) / 0.5)
+    np.testing.assert_allclose(speeds, exact, rtol=1e-10)  # RK4: (b h / m)^5 / 120 per step
+
+
+def test_viscous_friction_is_linear_up_to_what_a_sub_step_can_stop(x64):
+    # One sub-step takes b h / m of the speed: the plain equation until that is all of it.
+    for b, left in ((0.5, 0.9), (2.5, 0.5), (5.0, 0.0), (50.0, 0.0)):
+        after = coast(ViscousFriction(b=b), semi_implicit_euler, 0.1, [2.0])[0, -1]
+        assert after == pytest.approx(2.0 * left, abs=1e-14)
+
+
+def test_dry_friction_decelerates_evenly_and_then_stops(x64):
+    # tau_c / m = 0.4 m/s2: from 2 m/s standstill after 5 s.
+    speeds = coast(CoulombFriction(tau_c=0.2), semi_implicit_euler, 0.01, [2.0], steps=700)[0]
+
+    time = 0.01 * np.arange(701)
+    sliding = 2.0 - 0.4 * time > 0.1  # ten times the width over which the sign is smoothed
+    np.testing.assert_allclose(speeds[sliding], (2.0 - 0.4 * time)[sliding], rtol=1e-6)
+    # At standstill the smoothed law leaves exp(-0.4 / 0.01 * t): nothing after two more seconds.
+    assert abs(speeds[-1]) < 1e-9
+
+
+def test_dry_friction_creeps_under_a_load_as_its_docstring_says(x64):
+    twin = Mass(dt=0.01).extend(CoulombFriction(tau_c=2.0))
+    load, width = 1.0, max(0.01, 2.0 * 0.01 / 1.0)
+    start = twin.infer(jnp.zeros(2), twin.params)
+
+    result = rollout(twin, twin.params, start, jnp.full((200, 1), load))
+
+    assert float(result.states.v[-1, 0]) == pytest.approx(width * np.arctanh(load / 2.0), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: ViscousFriction(b=-0.1),
+            "Parameter 'viscous_friction.b' must be finite and within [0.0, inf] N m s/rad, "
+            "got -0.1.",
+        ),
+        (
+            lambda: CoulombFriction(tau_c=-0.1),
+            "Parameter 'coulomb_friction.tau_c' must be finite and within [0.0, inf] N m, "
+            "got -0.1.",
+        ),
+    ],
+)
+def test_negative_friction_is_refused(make, message):
+    with pytest.raises(ParameterError, match=f"^{re.escape(message)}$"):
+        make()
+
+
+# --- composition
+
+
+def test_units_follow_the_joint():
+    twin = twins.make("InvertedPendulum").extend(
+        *(effect(where) for effect in FRICTION for where in ("slider", "hinge"))
+    )
+
+    units = {key: p.unit for key, p in twin.parameters.items() if "friction" in key}
+    assert units == {
+        "viscous_friction.slider.b": "N s/m",
+        "viscous_friction.hinge.b": "N m s/rad",
+        "coulomb_friction.slider.tau_c": "N",
+        "coulomb_friction.hinge.tau_c": "N m",
+    }
+
+
+def test_forces_of_several_effects_add_up(x64):
+    twin = Mass(mass=2.0).extend(ViscousFriction(b=0.5), CoulombFriction(tau_c=0.3))
+    state = twin.infer(jnp.array([0.0, 4.0]), twin.params)
+
+    after = twin.step(state, jnp.ones(1), twin.params)
+
+    # At 4 m/s the sign of dry friction is saturated to 1 - 2e-348.
+    assert float(after.v[0]) == pytest.approx(4.0 + 0.1 / 2.0 * (1.0 - 0.5 * 4.0 - 0.3), rel=1e-14)
+
+
+def test_extending_an_extended_twin_flattens_and_keeps_order_and_values():
+    at_once = Mass(mass=2.0).extend(Lag(T=0.1), CoulombFriction(tau_c=0.3), ViscousFriction(b=0.2))
+
+    in_turn = Mass().extend(Lag(T=0.1)).with_parameters(mass=2.0)
+    in_turn = in_turn.extend(CoulombFriction(tau_c=0.1), ViscousFriction(b=0.2))
+    in_turn = in_turn.with_parameters(**{"coulomb_friction.rail.tau_c": 0.3})
+
+    assert in_turn == at_once and in_turn.params == at_once.params
+    assert [effect.name for effect in in_turn.effects] == [
+        "lag", "coulomb_friction", "viscous_friction",
+    ]  # fmt: skip
+    assert repr(in_turn) == (
+        "ExtendedTwin(Mass(mass=2, damping=0), Lag('push', T=0.1), "
+        "CoulombFriction('rail', tau_c=0.3), ViscousFriction('rail', b=0.2))"
+    )
+
+
+def test_an_effect_that_the_twin_has_itself_adds_to_its_parameter(x64):
+    own, native = Mass(damping=0.5), DampedMass(damping=0.2).extend(ViscousFriction(b=0.3))
+
+    for twin in (own, native):
+        state = twin.infer(jnp.array([0.0, 4.0]), twin.params)
+        after = twin.step(state, jnp.ones(1), twin.params)
+        assert float(after.v[0]) == pytest.approx(4.0 + 0.1 * (1.0 - 0.5 * 4.0), rel=1e-14)
+    assert native.params["viscous_friction.rail.b"] == 0.3
+    assert native.infer(jnp.zeros(2), native.params).memory == {}
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: Mass().extend(ViscousFriction("hinge")),
+            "Effect 'viscous_friction' names joint 'hinge', but Mass has: 0 (rail).",
+        ),
+        (
+            lambda: Mass().extend(LateSensor(2)),
+            "Effect 'late_sensor' names channel 2, but Mass has: 0 (position), 1 (speed).",
+        ),
+        (
+            lambda: Mass().extend(Lag(-1)),
+            "Effect 'lag' names actuator -1, but Mass has: 0 (push).",
+        ),
+        (
+            lambda: ViscousFriction(tau_c=0.1),
+            "Effect 'viscous_friction' has no parameter 'tau_c'. Its parameters are: b.",
+        ),
+    ],
+)
+def test_a_wrong_extension_is_refused_with_what_exists(make, message):
+    with pytest.raises(EffectError, match=f"^{re.escape(message)}$"):
+        make()
+
+
+# --- memory
+
+
+@pytest.mark.parametrize("substeps", [1, 5])
+def test_a_lagging_drive_answers_a_step_exactly_however_often_it_is_called(x64, substeps):
+    twin = Mass(substeps=substeps).extend(Lag(T=0.25))
+    start = twin.infer(jnp.zeros(2), twin.params)
+
+    result = rollout(twin, twin.params, start, jnp.ones((20, 1)))
+
+    time = 0.1 * np.arange(21)
+    np.testing.assert_allclose(
+        result.states.memory["lag.push"], 1.0 - np.exp(-time / 0.25), rtol=1e-12
+    )
+    # v = integral of the command; its value at the end of each sub-step stands for the sub-step.
+    h = 0.1 / substeps
+    exact = time - 0.25 * (1.0 - np.exp(-time / 0.25))
+    np.testing.assert_allclose(result.states.v[:, 0], exact, atol=0.51 * h)
+
+
+def test_a_remembered_spring_swings_without_gaining_energy(x64):
+    # omega = sqrt(k / m) = 2 rad/s. Semi-implicit Euler keeps q^2 + (v / omega)^2 within
+    # 1 +- omega h / 2 for ever; explicit Euler would multiply it by exp(omega^2 h t) = e^8 here.
+    twin = Mass(dt=0.1, substeps=5, mass=0.5).extend(DrivenSpring(k=2.0))
+    start = twin.infer(jnp.array([0.0, 2.0]), twin.params)
+
+    states = rollout(twin, twin.params, start, jnp.zeros((1000, 1))).states
+
+    energy = states.q[:, 0] ** 2 + (states.v[:, 0] / 2.0) ** 2
+    np.testing.assert_allclose(energy, 1.0, atol=2.0 * 0.02 / 2.0 + 1e-3)
+    way = states.memory["driven_spring.rail"]["way"]
+    np.testing.assert_allclose(way, states.q[:, 0], atol=1e-10)  # sums of 5000 terms
+    # Its frequency is off by (omega h)^2 / 24 = 7e-5: after 10 s the phase by 1.4e-3, and the
+    # amplitude by omega h / 2.
+    time = 0.1 * np.arange(101)
+    np.testing.assert_allclose(states.q[:101, 0], np.sin(2.0 * time), atol=0.025)
+
+
+def test_a_late_sensor_reports_the_past_and_its_bias(x64):
+    twin = Mass().extend(LateSensor("position", tau=0.25, bias=3.0))
+    start = twin.infer(jnp.array([4.0, 1.0]), twin.params)
+
+    obs = rollout(twin, twin.params, start, jnp.zeros((10, 1))).obs
+
+    # Inferred from a report of 4: the true start is 1, and it moves at 1 m/s.
+    past = np.maximum(0.1 * np.arange(11) - 0.25, 0.0)
+    np.testing.assert_allclose(obs[:, 0], 1.0 + past + 3.0, rtol=1e-12)
+    np.testing.assert_allclose(obs[:, 1], 1.0)
+
+
+@every_effect
+def test_inferring_what_was_observed_at_the_start_is_the_start(x64, effect):
+    values = {name: p.null + p.scale for name, p in effect.parameters.items()}
+    twin = twins.Pendulum().extend(effect(0, **values))
+    start = twin.initial(jax.random.key(3), twin.params)
+
+    back = twin.infer(twin.observe(start, twin.params), twin.params)
+
+    # arctan2 of cos and sin gives the angle back up to rounding.
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), back, start)
+
+
+def test_a_sensor_behind_another_measures_what_that_one_reports(x64):
+    late, halved = LateSensor("position", tau=0.1, bias=3.0), Halved("position", share=0.5)
+    first_late = Mass().extend(late, halved)
+    first_halved = Mass().extend(halved, late)
+    true = np.maximum(0.1 * np.arange(11) - 0.1, 0.0)  # 1 m/s, one sample ago
+
+    for twin, expected in ((first_late, 0.5 * (true + 3.0)), (first_halved, 0.5 * true + 3.0)):
+        start = twin.infer(jnp.array([expected[0], 1.0]), twin.params)
+        obs = rollout(twin, twin.params, start, jnp.zeros((10, 1))).obs
+        np.testing.assert_allclose(obs[:, 0], expected, rtol=1e-12, atol=1e-12)
+
+
+def test_memory_batches_and_keeps_the_precision_of_the_state(x64):
+    twin = Mass().extend(Lag(T=0.2), DrivenSpring(k=1.0), LateSensor(0, tau=0.1), Halved(1))
+    obs = jnp.asarray(np.random.default_rng(0).normal(size=(4, 2)), jnp.float32)
+    actions = jnp.ones((10, 1), jnp.float32)
+
+    def simulate(obs):
+        return rollout(twin, twin.params, twin.infer(obs, twin.params), actions)
+
+    batch = jax.jit(jax.vmap(simulate))(obs)
+
+    assert {leaf.dtype for leaf in jax.tree.leaves(batch.states)} == {jnp.dtype(jnp.float32)}
+    np.testing.assert_allclose(batch.obs[2], simulate(obs[2]).obs, rtol=1e-5)  # float32
+
+
+def test_a_force_effect_may_act_on_other_joints_than_its_own(x64):
+    class Coupling(ForceEffect):
+        """Pulls two joints together."""
+
+        name = "coupling"
+        parameters = {"k": Parameter(null=0.0, scale=1.0, unit="N m/rad", lower=0.0)}
+        explanation, source = "A belt connects two joints.", "test"
+
+        def force(self, moment, index, memory, params):
+            pull = params["k"] * (moment.q[1] - moment.q[0])
+            return jnp.stack([pull, -pull])
+
+    plain = twins.make("Acrobot", dt=1e-6)
+    coupled = plain.extend(Coupling(k=2.0))
+    q = jnp.array([0.3, -0.2])
+
+    def speed(twin, memory):
+        return twin.step(State(q, jnp.zeros(2), memory), jnp.zeros(1), twin.params).v
+
+    gained = (speed(coupled, {"coupling.shoulder": ()}) - speed(plain, {})) / 1e-6
+    pull = 2.0 * (q[1] - q[0])
+    expected = np.linalg.solve(plain.mass_matrix(q, plain.params), [pull, -pull])
+    np.testing.assert_allclose(gained, expected, rtol=1e-5)  # first order in a step of 1e-6 s
