@@ -12,8 +12,9 @@ A file appears under its name only when it is complete (:func:`write_whole`).
 import contextlib
 import io
 import os
+import re
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,23 @@ def write_whole(
             "unchanged. The folder must be writable, with space left on the disk"
         )
         raise OSError(error.errno, reason) from error
+
+
+@contextlib.contextmanager
+def damage_reported(path: Any) -> Iterator[None]:
+    """
+    A file that was cut off may still look like a zip file, because the weights in it are one each.
+
+    :raises ValueError: where SB3 only asserts that the file has all its parts
+    """
+    try:
+        yield
+    except AssertionError as error:
+        if not re.match("No (data|params) found", str(error)):
+            raise
+        raise ValueError(
+            f"'{path}' is damaged, or is no saved model: {error}. Load an older checkpoint."
+        ) from error
 
 
 def to_state_dict(tree: Any) -> dict[str, th.Tensor]:

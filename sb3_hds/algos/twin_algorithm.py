@@ -36,7 +36,7 @@ from sb3_hds.algos.call_forms import (
 from sb3_hds.algos.epoch import Report, epoch, twin_steps_per_epoch
 from sb3_hds.algos.learner import Knobs, Learner, Settings, Workspace, find_scales, fresh_workspace
 from sb3_hds.algos.normalisation import prepare_statistics, view_of
-from sb3_hds.algos.persistence import write_whole
+from sb3_hds.algos.persistence import damage_reported, write_whole
 from sb3_hds.algos.pretraining import Pretraining
 from sb3_hds.algos.twin_policy import TwinPolicy, all_finite
 from sb3_hds.core import Twin
@@ -284,7 +284,8 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         :param device: where to; ``"cuda"`` means the CPU where there is none, with a warning
         :raises ValueError: for a damaged file, or one that another algorithm saved
         """
-        return super().load(path, env, device_or_cpu(device), *args, **kwargs)
+        with damage_reported(path):
+            return super().load(path, env, device_or_cpu(device), *args, **kwargs)
 
     def _setup_model(self) -> None:
         check_arguments(self)

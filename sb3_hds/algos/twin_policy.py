@@ -132,13 +132,14 @@ def _widths(
     """
     given = net_arch if isinstance(net_arch, dict) else {"pi": net_arch, "vf": net_arch}
     usual = {"pi": _POLICY_WIDTHS, "vf": _VALUE_WIDTHS}
-    widths = usual | {name: tuple(some) for name, some in given.items() if some is not None}
-    numbers = [width for some in widths.values() for width in some]
-    if widths.keys() != usual.keys() or not all(
-        isinstance(width, int) and width > 0 for width in numbers
-    ):
+    widths = usual | {name: some for name, some in given.items() if some is not None}
+    if widths.keys() != usual.keys() or not all(map(_are_widths, widths.values())):
         raise ValueError(
             "net_arch must be a list of widths such as [64, 64], or {'pi': [64, 64], 'vf': [64]}, "
             f"got {net_arch!r}."
         )
-    return widths["pi"], widths["vf"]
+    return tuple(widths["pi"]), tuple(widths["vf"])
+
+
+def _are_widths(some: Any) -> bool:
+    return isinstance(some, Sequence) and all(isinstance(w, int) and w > 0 for w in some)

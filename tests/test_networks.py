@@ -1,0 +1,179 @@
+"""Networks, their settings, and pytrees as tensors."""
+
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from small_models import PLANNERS, small
+from stable_baselines3.common.utils import FloatSchedule
+
+from sb3_hds.algos import TwinPolicy
+from sb3_hds.algos.networks import ACTIVATIONS, Actor, Value, activation, squash, unsquash
+from sb3_hds.algos.persistence import from_state_dict, to_state_dict
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+
+class Pair(NamedTuple):
+    first: dict
+    second: jax.Array
+
+
+def tree(fill: float) -> Pair:
+    return Pair({"kernel": jnp.full((2, 3), fill), "count": jnp.int32(7)}, jnp.full((), fill))
+
+
+def policy(low: float = -1.0, high: float = 1.0, **kwargs) -> TwinPolicy:
+    return TwinPolicy(
+        spaces.Box(-1.0, 1.0, (3,)), spaces.Box(low, high, (2,)), FloatSchedule(1e-3), **kwargs
+    )
+
+
+def widths(weights) -> list[int]:
+    layers = weights["params"].values()
+    return [layer["bias"].shape[0] for layer in layers]
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_an_activation_is_known_by_name_in_any_spelling(name):
+    assert activation(name) is ACTIVATIONS[name]
+    assert activation(name.upper()) is ACTIVATIONS[name]
+    assert activation(name.replace("_", "")) is ACTIVATIONS[name]
+
+
+@pytest.mark.parametrize(
+    "module", [th.nn.Tanh, th.nn.ReLU, th.nn.ELU, th.nn.SiLU, th.nn.LeakyReLU, th.nn.Softplus]
+)
+def test_a_torch_module_stands_for_the_same_function(module):
+    x = np.linspace(-3.0, 3.0, 13, dtype=np.float32)
+
+    ours = activation(module)(jnp.asarray(x))
+
+    # Single precision, and torch's own approximations.
+    np.testing.assert_allclose(ours, module()(th.as_tensor(x)).numpy(), atol=1e-6)
+
+
+def test_a_function_of_jax_is_taken_as_it_is_and_anything_else_is_refused():
+    assert activation(nn.swish) is nn.silu
+    assert activation(jnp.sin) is jnp.sin
+    for wrong in ("sigmoids", th.nn.Conv1d, 3, None):
+        with pytest.raises(ValueError, match=r"activation_fn must be one of tanh, relu"):
+            activation(wrong)
+
+
+def test_the_actor_starts_near_zero_and_stays_within_one():
+    actor = Actor(2, (16,), nn.tanh)
+    obs = jax.random.normal(jax.random.key(0), (100, 3))
+    weights = actor.init(jax.random.key(1), obs[0])
+
+    controls = actor.apply(weights, obs)
+
+    # The last layer's weights have standard deviation 0.01 / 4, times 16 inputs of at most 1.
+    assert controls.shape == (100, 2) and jnp.abs(controls).max() < 0.1
+    large = jax.tree.map(lambda leaf: 1e4 * leaf, weights)
+    assert jnp.abs(actor.apply(large, obs)).max() <= 1.0
+
+
+def test_one_value_comes_out_for_each_observation():
+    value = Value((4, 5), nn.relu)
+    weights = value.init(jax.random.key(0), jnp.zeros(3))
+
+    assert value.apply(weights, jnp.zeros(3)).shape == ()
+    assert value.apply(weights, jnp.zeros((7, 3))).shape == (7,)
+    assert widths(weights) == [4, 5, 1]
+
+
+def test_squash_and_unsquash_undo_each_other():
+    value = jnp.array([-1e4, -20.0, -1.0, -1e-3, 0.0, 1e-3, 1.0, 20.0, 1e4])
+
+    # Single precision.
+    np.testing.assert_allclose(unsquash(squash(value)), value, rtol=1e-4, atol=1e-7)
+    assert (jnp.diff(squash(value)) > 0.0).all()
+
+
+def test_a_pytree_makes_a_round_trip_through_tensors():
+    tensors = to_state_dict(tree(1.5))
+
+    back = from_state_dict(tree(0.0), tensors)
+
+    assert list(tensors) == ["first.count", "first.kernel", "second"]
+    assert all(isinstance(tensor, th.Tensor) for tensor in tensors.values())
+    for leaf, expected in zip(jax.tree.leaves(back), jax.tree.leaves(tree(1.5)), strict=True):
+        np.testing.assert_array_equal(leaf, expected)
+        assert leaf.dtype == expected.dtype
+
+
+def test_tensors_do_not_change_with_what_they_were_made_from():
+    source = {"weight": np.zeros(3)}
+    tensors = to_state_dict(source)
+
+    source["weight"][:] = 1.0
+
+    assert tensors["weight"].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_tensors_that_do_not_fit_are_refused():
+    tensors = to_state_dict(tree(1.0))
+    tensors["third"] = tensors.pop("second")
+
+    with pytest.raises(RuntimeError, match=r"missing \['second'\], unexpected \['third'\]"):
+        from_state_dict(tree(0.0), tensors)
+    with pytest.raises(RuntimeError, match=r"'first\.kernel' has shape \(2,\)"):
+        from_state_dict(tree(0.0), {"first.kernel": th.zeros(2)}, strict=False)
+
+
+def test_leaves_that_are_not_given_keep_their_values_where_that_is_allowed():
+    back = from_state_dict(tree(0.0), {"second": th.tensor(2.0)}, strict=False)
+
+    assert float(back.second) == 2.0 and float(back.first["kernel"].max()) == 0.0
+
+
+@pytest.mark.parametrize(
+    "net_arch, pi, vf",
+    [
+        (None, [96, 96, 2], [64, 64, 1]),
+        ([5], [5, 2], [5, 1]),
+        ([], [2], [1]),
+        ({"pi": [4, 3], "vf": [6]}, [4, 3, 2], [6, 1]),
+        ({"pi": [4]}, [4, 2], [64, 64, 1]),
+        ({"vf": []}, [96, 96, 2], [1]),
+    ],
+)
+def test_net_arch_sets_the_widths_of_both_networks(net_arch, pi, vf):
+    networks = policy(net_arch=net_arch).networks
+
+    assert widths(networks.actor) == pi and widths(networks.value) == vf
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+@pytest.mark.parametrize(
+    "activation_fn", ["relu", th.nn.ReLU, nn.relu], ids=["name", "torch", "jax"]
+)
+def test_a_model_takes_an_activation_in_every_form(name, activation_fn):
+    settings = {"net_arch": [8], "activation_fn": activation_fn}
+
+    model = small(name, policy_kwargs=settings)
+
+    assert model.policy.actor_network.activation_fn is nn.relu
+    assert model.predict(np.zeros(3, np.float32))[0].shape == (1,)
+
+
+def test_rounding_does_not_lead_out_of_the_bounds():
+    low, high = np.float32(-2.0), np.float32(0.2)
+    # What makes this case one: SB3's formula gives more than the upper bound here.
+    assert low + np.float32(0.5) * np.float32(2.0) * (high - low) > high
+
+    actions = policy(low, high).unscale_action(np.array([[1.0, -1.0]], np.float32))
+
+    assert actions.tolist() == [[float(high), float(low)]]
+
+
+def test_a_policy_that_was_not_trained_acts_already():
+    action, state = policy().predict(np.zeros(3, np.float32))
+
+    assert action.shape == (2,) and state is None

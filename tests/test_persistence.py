@@ -1,0 +1,349 @@
+"""Saved models: whole, readable without JAX, and good to go on with."""
+
+import io
+import json
+import pickletools
+import subprocess
+import sys
+import warnings
+import zipfile
+from base64 import b64decode
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch as th
+from small_models import NAMES, PLANNERS, saved, small
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_hds import algos, effects, twins
+from sb3_hds.algos import TwinPolicy, persistence
+from sb3_hds.errors import NoTwinError
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+every_algorithm = pytest.mark.parametrize("name", NAMES)
+every_planner = pytest.mark.parametrize("name", PLANNERS)
+
+PREDICT = """
+import sys
+import numpy as np
+from sb3_hds import algos
+
+folder, obs = sys.argv[1], np.load(sys.argv[1] + "/obs.npy")
+for name in sys.argv[2:]:
+    model = algos.ALL[name].load(f"{folder}/{name}")
+    np.save(f"{folder}/{name}.npy", model.predict(obs, deterministic=True)[0])
+"""
+
+
+def observations() -> np.ndarray:
+    env = gymnasium.make("Pendulum-v1")
+    return np.stack([env.reset(seed=seed)[0] for seed in range(20)])
+
+
+def same(first: dict, second: dict) -> bool:
+    return all(
+        th.equal(tensor, second[part][key])
+        for part, tensors in first.items()
+        for key, tensor in tensors.items()
+    )
+
+
+def pickled_names(data: dict) -> list[str]:
+    """:return: every string in the pickles of SB3's ``data``: modules and classes among them"""
+    pickles = [
+        b64decode(entry[":serialized:"])
+        for entry in data.values()
+        if isinstance(entry, dict) and ":serialized:" in entry
+    ]
+    return [arg for each in pickles for _, arg, _ in pickletools.genops(each) if type(arg) is str]
+
+
+@every_algorithm
+def test_a_loaded_model_predicts_and_holds_the_same(name, tmp_path):
+    model = small(name).learn(50)
+
+    model.save(tmp_path / "model")
+    loaded = algos.ALL[name].load(tmp_path / "model")
+
+    obs = observations()
+    actions = model.predict(obs, deterministic=True)[0]
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], actions)
+    assert same(model.get_parameters(), loaded.get_parameters())
+    for kept in ("num_timesteps", "_n_updates", "seed", "policy_kwargs", "train_freq"):
+        assert getattr(loaded, kept) == getattr(model, kept), kept
+
+
+def test_another_process_predicts_the_same(tmp_path):
+    obs = observations()
+    np.save(tmp_path / "obs.npy", obs)
+    models = {name: small(name).learn(25) for name in NAMES}
+    for name, model in models.items():
+        model.save(tmp_path / name)
+
+    subprocess.run([sys.executable, "-c", PREDICT, str(tmp_path), *NAMES], check=True)
+
+    for name, model in models.items():
+        # Two compilations may round differently.
+        np.testing.assert_allclose(
+            np.load(tmp_path / f"{name}.npy"), model.predict(obs, deterministic=True)[0], atol=1e-6
+        )
+
+
+@every_algorithm
+def test_a_file_holds_tensors_and_no_objects_of_jax(name):
+    archive = zipfile.ZipFile(saved(small(name).learn(25)))
+
+    assert {"policy.pth", "policy.optimizer.pth", "data"} <= set(archive.namelist())
+    for part in ("policy.pth", "policy.optimizer.pth"):
+        tensors = th.load(io.BytesIO(archive.read(part)), weights_only=True)
+        assert tensors and all(isinstance(value, th.Tensor) for value in tensors.values())
+    names = pickled_names(json.loads(archive.read("data")))
+    # The scan sees what it should see: the policy's class is stored by its name.
+    assert any("Policy" in found for found in names)
+    foreign = [found for found in names if "jax" in found or "flax" in found or "learner" in found]
+    assert foreign == []
+
+
+@every_algorithm
+def test_training_goes_on_after_loading(name):
+    model = small(name).learn(50)
+    loaded = algos.ALL[name].load(saved(model), env=gymnasium.make("Pendulum-v1"))
+    n_updates = model._n_updates
+
+    loaded.learn(50, reset_num_timesteps=False)
+
+    assert loaded.num_timesteps == 100
+    assert loaded._n_updates > n_updates
+    assert not same(model.get_parameters(), loaded.get_parameters())
+
+
+@every_algorithm
+def test_a_model_loaded_without_environment_takes_one_later(name):
+    loaded = algos.ALL[name].load(saved(small(name).learn(25)))
+
+    loaded.predict(observations())
+    loaded.set_env(gymnasium.make("Pendulum-v1"))
+
+    assert loaded.learn(25).num_timesteps == 25
+
+
+@every_algorithm
+def test_arguments_may_be_changed_while_loading(name):
+    loaded = algos.ALL[name].load(
+        saved(small(name)), env=gymnasium.make("Pendulum-v1"), batch_size=8, learning_rate=1e-5
+    )
+
+    assert loaded.batch_size == 8 and loaded.lr_schedule(1.0) == 1e-5
+    with pytest.raises(ValueError, match="policy kwargs"):
+        algos.ALL[name].load(saved(small(name)), policy_kwargs={"net_arch": [4]})
+
+
+@every_algorithm
+def test_parameters_make_a_round_trip_and_misfits_are_refused(name):
+    one, other = small(name, seed=1), small(name, seed=2)
+
+    other.set_parameters(one.get_parameters())
+
+    assert same(one.get_parameters(), other.get_parameters())
+    with pytest.raises(ValueError, match="invalid object name"):
+        one.set_parameters({**one.get_parameters(), "nothing": {}})
+    lacking = one.get_parameters()
+    lacking["policy"].popitem()
+    with pytest.raises(RuntimeError, match="missing"):
+        one.set_parameters(lacking)
+    wider = small(name, policy_kwargs={"net_arch": [9]})
+    with pytest.raises(RuntimeError, match="policy_kwargs"):
+        wider.set_parameters(one.get_parameters())
+
+
+@every_algorithm
+def test_parameters_that_are_not_given_keep_their_values(name):
+    model = small(name)
+    before = model.get_parameters()
+    key, *others = before["policy"]
+
+    model.set_parameters({"policy": {key: before["policy"][key] + 1.0}}, exact_match=False)
+
+    after = model.get_parameters()["policy"]
+    assert th.equal(after[key], before["policy"][key] + 1.0)
+    assert all(th.equal(after[other], before["policy"][other]) for other in others)
+
+
+@every_algorithm
+def test_a_replay_buffer_is_saved_and_read_again(name, tmp_path):
+    model = small(name).learn(50)
+    loaded = algos.ALL[name].load(saved(model), env=gymnasium.make("Pendulum-v1"))
+
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+
+    assert [path.name for path in tmp_path.iterdir()] == ["buffer.pkl"]
+    np.testing.assert_array_equal(
+        loaded.replay_buffer.observations, model.replay_buffer.observations
+    )
+    assert loaded.learn(25, reset_num_timesteps=False).replay_buffer.size() == 75
+
+
+@every_algorithm
+def test_attributes_may_be_left_out_of_a_file(name):
+    model = small(name, verbose=2)
+    file = io.BytesIO()
+
+    model.save(file, exclude=["verbose"])
+
+    file.seek(0)
+    assert "verbose" not in json.loads(zipfile.ZipFile(file).read("data"))
+
+
+@every_algorithm
+def test_a_file_appears_under_its_name_only_when_it_is_complete(name, tmp_path, monkeypatch):
+    model = small(name)
+    write, seen = th.save, []
+
+    def watched(*args, **kwargs):
+        seen.extend(path.suffix for path in tmp_path.iterdir())
+        write(*args, **kwargs)
+
+    monkeypatch.setattr(th, "save", watched)
+    model.save(tmp_path / "model")
+
+    assert set(seen) == {".tmp"}
+    assert [path.name for path in tmp_path.iterdir()] == ["model.zip"]
+
+
+@every_algorithm
+def test_a_failed_save_leaves_the_older_file_and_nothing_else(name, tmp_path, monkeypatch):
+    model = small(name)
+    model.save(tmp_path / "model")
+    before = (tmp_path / "model.zip").read_bytes()
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(th, "save", full)
+    with pytest.raises(OSError, match=r"model\.zip' could not be written: No space left"):
+        model.save(tmp_path / "model")
+
+    assert (tmp_path / "model.zip").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["model.zip"]
+
+
+@pytest.mark.parametrize("given", ["model", "model.zip", "model.best", "new/folder/model"])
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_file_gets_the_suffix_that_stable_baselines_would_give_it(given, kind, tmp_path):
+    persistence.write_whole(kind(tmp_path / given), "zip", lambda file: file.write(b"content"))
+
+    expected = tmp_path / (given if "." in given else f"{given}.zip")
+    assert expected.read_bytes() == b"content"
+
+
+@every_planner
+def test_epochs_and_optimisers_go_on_after_loading(name):
+    model = small(name, pretrain_epochs=2).learn(50)
+    epochs = int(model.policy.progress.n_epochs)
+    loaded = algos.ALL[name].load(saved(model), env=gymnasium.make("Pendulum-v1"))
+
+    before = loaded.get_parameters()["policy.optimizer"]
+    loaded.learn(25, reset_num_timesteps=False)
+
+    after = loaded.get_parameters()["policy.optimizer"]
+    # One epoch for 25 steps and no second pretraining, with four steps of Adam.
+    assert int(after["n_epochs"]) == epochs + 1 == 5
+    counts = [key for key in after if key.endswith("count")]
+    assert counts and all(int(after[key]) == int(before[key]) + 4 for key in counts)
+    assert loaded.twin_timesteps > model.twin_timesteps
+
+
+@every_planner
+def test_a_twin_that_was_passed_survives_saving(name):
+    twin = twins.make("Pendulum", mass=1.2).extend(effects.ViscousFriction(b=0.1))
+    model = small(name, twin=twin)
+
+    loaded = algos.ALL[name].load(saved(model), env=gymnasium.make("Pendulum-v1"))
+
+    assert loaded.twin == twin and loaded.twin.values == twin.values
+    other = algos.ALL[name].load(saved(model), twin=twins.make("Pendulum", mass=0.8))
+    assert other.twin.values["mass"] == 0.8
+
+
+@every_planner
+def test_a_model_without_its_twin_predicts_with_a_warning_and_does_not_train(name):
+    model = small(name, twin=twins.make("Pendulum"))
+    model.twin_spec["twin"] = "Vanished"
+
+    with pytest.warns(UserWarning, match=r"'Vanished' is not registered here"):
+        loaded = algos.ALL[name].load(saved(model), env=gymnasium.make("Pendulum-v1"))
+
+    loaded.predict(observations())
+    with pytest.raises(NoTwinError, match=r"load\(path, env=env, twin=\.\.\.\)"):
+        loaded.learn(25)
+
+
+@every_planner
+def test_a_model_of_an_accelerator_loads_where_there_is_none(name):
+    file = saved(small(name))
+
+    with pytest.warns(UserWarning, match="loaded on the CPU"):
+        algos.ALL[name].load(file, device="cuda").predict(observations())
+
+
+@every_planner
+def test_a_policy_can_be_saved_alone(name, tmp_path):
+    model = small(name, policy_kwargs={"net_arch": [8], "activation_fn": "relu"}).learn(25)
+
+    model.policy.save(tmp_path / "policy.pth")
+    policy = TwinPolicy.load(tmp_path / "policy.pth")
+
+    obs = observations()
+    np.testing.assert_array_equal(policy.predict(obs)[0], model.policy.predict(obs)[0])
+
+
+def test_loading_and_saving_raise_no_warning(tmp_path):
+    model = small(NAMES[0])
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.save(tmp_path / "model")
+        algos.ALL[NAMES[0]].load(tmp_path / "model", env=gymnasium.make("Pendulum-v1"))
+
+
+class SavesEach(BaseCallback):
+    """Saves the model after every step."""
+
+    def _on_step(self) -> bool:
+        saved(self.model)
+        return True
+
+
+@every_algorithm
+def test_saving_does_not_change_what_training_does(name):
+    quiet, saving = small(name).learn(50), small(name).learn(50, callback=SavesEach())
+
+    assert same(quiet.get_parameters(), saving.get_parameters())
+
+
+def test_a_file_of_another_algorithm_is_refused(tmp_path):
+    SAC("MlpPolicy", "Pendulum-v1", buffer_size=10).save(tmp_path / "sac")
+
+    for name in NAMES:
+        with pytest.raises(ValueError, match=r"SACPolicy.*loaded by the class of that algorithm"):
+            algos.ALL[name].load(tmp_path / "sac")
+
+
+@every_algorithm
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 0.999])
+def test_a_truncated_file_is_refused(name, share, tmp_path):
+    content = saved(small(name)).getvalue()
+    (tmp_path / "model.zip").write_bytes(content[: int(share * len(content))])
+
+    with pytest.raises(ValueError, match=r"wasn't a zip-file|is damaged"):
+        algos.ALL[name].load(tmp_path / "model.zip")
+
+
+@every_algorithm
+def test_a_file_that_is_not_there_is_named(name, tmp_path):
+    with pytest.raises(FileNotFoundError, match="absent"):
+        algos.ALL[name].load(tmp_path / "absent")
