@@ -17,8 +17,7 @@ from sb3_hds.core.replay_buffer import episodes_in
 from sb3_hds.core.storage import read_npz, write_npz
 from sb3_hds.errors import TrajectoryError
 
-_FORMAT = "sb3_hds.Trajectories"
-_VERSION = 1
+_FORMAT, _VERSION = "sb3_hds.Trajectories", 1
 _LEAVES = ("obs", "actions", "mask", "origin")
 
 
@@ -309,7 +308,7 @@ class Trajectories:
                 f"one step of {dt} s. Leave it out or choose a smaller dt."
             )
         pieces = [resample(*self.episode(i), ratio, int(n), angles) for i, n in enumerate(lengths)]
-        changed = type(self).from_arrays(*_unzip(pieces), dt=dt, conditions=self.conditions)
+        changed = self.from_arrays(*_unzip(pieces), dt=dt, conditions=self.conditions)
         return dataclasses.replace(changed, origin=self.origin)
 
     def __repr__(self) -> str:
