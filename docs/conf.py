@@ -15,9 +15,9 @@ version = release = __version__
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
-    "sphinx.ext.mathjax",
     "sphinx_copybutton",
     "generated_parts",
+    "offline_math",
 ]
 exclude_patterns = ["_build", "modules/_*.md"]
 
@@ -31,6 +31,7 @@ autodoc_typehints_description_target = "documented_params"
 maximum_signature_line_length = 88
 python_use_unqualified_type_names = True
 
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = f"sb3_hds {release}"
 html_static_path = ["_static"]

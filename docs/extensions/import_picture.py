@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent.parent
 Imports = Mapping[str, frozenset[str]]
 
 # Of the drawing, in its own units.
-_WIDTH, _BOX, _HEIGHT, _PITCH, _MARGIN = 720, 200, 56, 104, 8
+_WIDTH, _BOX, _HEIGHT, _PITCH, _MARGIN = 720, 210, 66, 112, 8
 _CORNER = 24  # from the corner of a box to the outermost end of an arrow
 _LETTERS = 36  # that fit into a line of a box
 
@@ -171,16 +171,16 @@ def _arrow(start: tuple[float, float], end: tuple[float, float]) -> str:
     y1 += _HEIGHT
     bend = (y1 + y2) / 2
     return (
-        f'<path d="M {leave:.0f} {y1:.0f} C {leave:.0f} {bend:.0f}, {arrive:.0f} {bend:.0f}, '
-        f'{arrive:.0f} {y2:.0f}" fill="none" stroke="currentColor" stroke-width="1.3" '
-        'marker-end="url(#head)"/>'
+        f'<path d="M {leave:.0f} {y1:.0f} C {arrive:.0f} {y1 + _CORNER:.0f}, '
+        f'{arrive:.0f} {bend:.0f}, {arrive:.0f} {y2:.0f}" fill="none" stroke="currentColor" '
+        'stroke-width="1.3" marker-end="url(#head)"/>'
     )
 
 
 def _box(name: str, summary: str, x: float, y: float) -> str:
-    lines = _wrapped(summary, _LETTERS)[:2]
+    lines = textwrap.wrap(summary.partition(":")[0].rstrip("."), _LETTERS)
     text = "".join(
-        f'<text x="{x + _BOX / 2:.0f}" y="{y + 33 + 13 * i:.0f}" font-size="10.5" '
+        f'<text x="{x + _BOX / 2:.0f}" y="{y + 32 + 12 * i:.0f}" font-size="10.5" '
         f'text-anchor="middle" fill="currentColor">{escape(line)}</text>'
         for i, line in enumerate(lines)
     )
@@ -190,7 +190,3 @@ def _box(name: str, summary: str, x: float, y: float) -> str:
         f'<text x="{x + _BOX / 2:.0f}" y="{y + 18:.0f}" font-size="14" font-weight="bold" '
         f'text-anchor="middle" fill="currentColor">{escape(name)}</text>{text}'
     )
-
-
-def _wrapped(text: str, width: int) -> list[str]:
-    return textwrap.wrap(text, width, max_lines=2, placeholder=" …")
