@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import jax
+import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.type_aliases import Schedule
@@ -109,9 +110,8 @@ def check_arguments(model: "TwinAlgorithm") -> None:
 
 def _broken_rules(model: "TwinAlgorithm") -> Iterator[tuple[str, str]]:
     for name, least in _AT_LEAST.items():
-        value, derived = getattr(model, name), name in _DERIVED
-        if not (value is None and derived) and not (_is_count(value) and value >= least):
-            yield name, f"a whole number of at least {least}" + " or None" * derived
+        if not _is_count(getattr(model, name), least, may_be_none=name in _DERIVED):
+            yield name, f"a whole number of at least {least}" + " or None" * (name in _DERIVED)
     for name in _SHARES:
         if not _between(getattr(model, name), 0.0, 1.0):
             yield name, "a number from 0 to 1"
@@ -129,12 +129,16 @@ def _broken_rules(model: "TwinAlgorithm") -> Iterator[tuple[str, str]]:
             yield name, f"one of {', '.join(map(repr, choices))}"
 
 
-def _is_count(value: Any) -> bool:
-    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+def _is_count(value: Any, least: int, may_be_none: bool) -> bool:
+    if value is None:
+        return may_be_none
+    return isinstance(value, int | np.integer) and int(value) >= least
 
 
 def _between(value: Any, low: float, high: float) -> bool:
-    return isinstance(value, numbers.Real) and low <= value <= high and math.isfinite(value)
+    if not isinstance(value, numbers.Real):
+        return False
+    return low <= float(value) <= high and math.isfinite(value)
 
 
 def schedule_of(rate: float | str | Schedule) -> Schedule:
@@ -175,7 +179,7 @@ def device_or_cpu(device: Any) -> Any:
     return device
 
 
-def jax_device(device: Any) -> jax.Device:
+def jax_device(device: Any) -> Any:
     """
     :param device: ``"auto"``, ``"cpu"``, ``"cuda"``, ``"cuda:1"`` or a ``torch.device``
     :return: the JAX device of that name

@@ -1,5 +1,7 @@
 """``VecNormalize`` around the environment, honoured while planning in the twin."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +22,7 @@ def view_of(normalise: VecNormalize | None, n_obs: int) -> View:
     """
     if normalise is None or not normalise.norm_obs:
         return View(jnp.zeros(n_obs), jnp.ones(n_obs), jnp.full((), jnp.inf))
-    statistics = normalise.obs_rms
+    statistics: Any = normalise.obs_rms
     scale = np.sqrt(statistics.var + normalise.epsilon)
     return View(
         jnp.asarray(statistics.mean, jnp.float32),
@@ -40,7 +42,8 @@ def prepare_statistics(normalise: VecNormalize | None, twin: Twin, key: jax.Arra
     """
     if normalise is None or not normalise.norm_obs or not normalise.training:
         return
-    if normalise.obs_rms.count >= _N_ROLLOUTS * _N_STEPS:
+    statistics: Any = normalise.obs_rms
+    if statistics.count >= _N_ROLLOUTS * _N_STEPS:
         return
     problem = Problem(twin, twin.params)
     length = min(_N_STEPS, twin.max_episode_steps or _N_STEPS)
@@ -53,4 +56,4 @@ def prepare_statistics(normalise: VecNormalize | None, twin: Twin, key: jax.Arra
 
     seen, alive = jax.jit(jax.vmap(wander))(jax.random.split(key, _N_ROLLOUTS))
     lived = np.asarray(seen, np.float64)[np.asarray(alive)]
-    normalise.obs_rms.update(lived[np.isfinite(lived).all(1)])
+    statistics.update(lived[np.isfinite(lived).all(1)])

@@ -109,11 +109,11 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         monitor_wrapper: bool,
         _init_setup_model: bool,
     ) -> None:
-        policy, env = policy_and_env(policy, env, self.policy_aliases)
-        check_policy(type(self), policy)
+        policy_class, made_env = policy_and_env(policy, env, self.policy_aliases)
+        check_policy(type(self), policy_class)
         super().__init__(
-            policy=policy,
-            env=env,
+            policy=policy_class,
+            env=made_env,
             learning_rate=learning_rate,
             buffer_size=buffer_size,
             learning_starts=learning_starts,
@@ -136,7 +136,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
             support_multi_env=True,
         )
         self.value_learning_rate = value_learning_rate
-        self.twin = twin
+        self.twin: Twin | None = twins.make(twin) if isinstance(twin, str) else twin
         self.twin_spec: dict[str, Any] | None = None
         self.pretrain_epochs = pretrain_epochs
         self.n_rollouts = n_rollouts
@@ -301,9 +301,10 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
 
     def _setup_twin(self) -> None:
         """The twin that was passed, or saved because it had been, or the environment's own."""
-        if isinstance(self.twin, str):
-            self.twin = twins.make(self.twin)
-        elif self.twin is None and self.twin_spec is not None:
+        given: Any = self.twin  # a name, where one was passed to `load`
+        if isinstance(given, str):
+            self.twin = twins.make(given)
+        elif given is None and self.twin_spec is not None:
             self.twin = _twin_from_file(self.twin_spec)
         if self.twin is not None:
             self.twin_spec = self.twin.to_spec()
@@ -356,22 +357,23 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
     def _learner(self) -> Learner:
         """What an epoch changes. Before the first one, the scales of the task are found."""
         settings, policy = self._settings, self.policy
-        if self._workspace is None:
+        workspace = self._workspace
+        if workspace is None:
             n_obs = len(settings.twin.channels)
             key = jax.random.wrap_key_data(policy.progress.key, impl="unsafe_rbg")
             key, k_starts, k_scales = jax.random.split(key, 3)
             params = settings.twin.params
-            self._workspace = fresh_workspace(settings, n_obs, params, k_starts)
+            workspace = self._workspace = fresh_workspace(settings, n_obs, params, k_starts)
             progress = policy.progress._replace(key=jax.random.key_data(key))
             if int(progress.n_epochs) == 0:
                 prepare_statistics(self._vec_normalize_env, settings.twin, k_scales)
                 view = view_of(self._vec_normalize_env, n_obs)
-                starts = self._workspace.starts
+                starts = workspace.starts
                 inside, scale, offset = find_scales(settings, params, view, starts, k_scales)
                 policy.networks = policy.networks._replace(inside=inside)
                 progress = progress._replace(reward_scale=scale, reward_offset=offset)
             policy.progress = progress
-        return Learner(policy.networks, policy.progress, self._workspace)
+        return Learner(policy.networks, policy.progress, workspace)
 
     def _knobs(self, gradient_steps: int) -> Knobs:
         twin, n_epochs = self._settings.twin, int(self.policy.progress.n_epochs)
@@ -401,11 +403,12 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
     def _visited(self, n_obs: int) -> tuple[jax.Array, jax.Array]:
         """Observations of the real environment to plan from, and for which start states."""
         buffer, n = self.replay_buffer, self.n_rollouts
-        stored = 0 if buffer is None else buffer.size()
-        count = round(self.relabel_share * n) if stored else 0
+        count = round(self.relabel_share * n)
         visited = np.zeros((n, n_obs), np.float32)
-        if count:
-            steps = np.random.randint(stored, size=count)
+        if buffer is None or buffer.size() == 0:
+            count = 0
+        elif count:
+            steps = np.random.randint(buffer.size(), size=count)
             copies = np.random.randint(buffer.n_envs, size=count)
             visited[:count] = buffer.observations[steps, copies].reshape(count, n_obs)
         return jnp.asarray(visited), jnp.arange(n) < count

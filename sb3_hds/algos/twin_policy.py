@@ -57,16 +57,16 @@ class TwinPolicy(TensorPolicy):
         self.max_grad_norm = max_grad_norm
         self.networks: Networks
         self.progress: Progress
-        self.optimizer = TrainingTensors(self)
+        self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
         self.build(jax.random.key(0, impl="unsafe_rbg"), jax.devices()[0])
 
-    def build(self, key: jax.Array, device: jax.Device) -> None:
+    def build(self, key: jax.Array, device: Any) -> None:
         """
         Draw fresh networks.
 
         :param key: of the generator ``unsafe_rbg``
         """
-        n_obs = int(np.prod(self.observation_space.shape))
+        n_obs = spaces.flatdim(self.observation_space)
         networks, progress = fresh_networks(
             self.actor_network, self.value_network, n_obs, self.max_grad_norm, key
         )
@@ -108,7 +108,7 @@ class TwinPolicy(TensorPolicy):
 
 
 @partial(jax.jit, static_argnums=0)
-def _act(actor: Actor, networks: Networks, obs: Any) -> jax.Array:
+def _act(actor: Actor, networks: Networks, obs: Any) -> Any:
     """Controls of the averaged policy for a batch of observations."""
     return actor.apply(networks.average, networks.inside(jnp.asarray(obs, jnp.float32)))
 
