@@ -248,6 +248,20 @@ def test_a_dead_sensor_does_not_reach_the_weights(name, value):
     assert np.isfinite(action).all()
 
 
+@planners_with("relabel_share")
+def test_an_epoch_in_which_every_sample_was_dropped_moves_no_scale(name):
+    model = small(name, relabel_share=1.0).learn(50)
+    before = model.policy.networks.inside
+    model.replay_buffer.observations[:] = np.nan
+
+    model.run_epoch(gradient_steps=4)
+
+    # Eight rollouts of four steps.
+    assert model.logger.name_to_value["train/dropped_samples"] == 8 * 4
+    np.testing.assert_array_equal(model.policy.networks.inside.mean, before.mean)
+    np.testing.assert_array_equal(model.policy.networks.inside.scale, before.scale)
+
+
 @every_planner
 # A single step of infinite length is noticed by the weights alone: its loss was finite.
 @pytest.mark.parametrize("rate, gradient_steps", [(1e38, 4), (1e39, 1)])
