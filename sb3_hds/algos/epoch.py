@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.algos.learner import Knobs, Learner, Settings, problem_of, resets
-from sb3_hds.algos.regression import regress, remember, samples_of
+from sb3_hds.algos.regression import regress, remember, rescale, samples_of
 from sb3_hds.core import Obs, State
 from sb3_hds.planning import (
     Plan,
@@ -89,7 +89,7 @@ def epoch(settings: Settings, learner: Learner, knobs: Knobs) -> tuple[Learner, 
         knobs, problem, choice.kept, choice.tails, gain, choice.sensitivity
     )
     moved, ages = _move_on(settings, learner, knobs, problem, starts, k_move)
-    learner = remember(settings, learner, samples)
+    learner = rescale(remember(settings, learner, samples), samples)
     learner, losses = regress(settings, learner, knobs, k_regress)
 
     report = _report(settings, learner, choice, finite, losses)
@@ -215,7 +215,8 @@ def _move_on(
     fresh = resets(settings.twin, knobs.params, k_draw, n)
     if not settings.advance:
         return fresh, jnp.zeros(n)
-    offsets = knobs.noise * jax.random.normal(k_noise, (n, problem.n_controls))
+    noise = knobs.noise * learner.progress.control_scale
+    offsets = noise * jax.random.normal(k_noise, (n, problem.n_controls))
 
     def wander(start: State, offset: Control) -> Plan:
         policy = lambda obs: control_of(settings, learner, knobs, obs) + offset  # noqa: E731

@@ -60,7 +60,7 @@ class HDS(TwinAlgorithm):
     :param terminal_value: whether a value network judges the end of a plan (the paper: no)
     :param reset_share: share of start states drawn from the reset distribution in each epoch, the
         others go on from where the policy went; 1 is the paper's choice
-    :param exploration_noise: standard deviation of a constant offset of the controls, in units of
+    :param exploration_noise: standard deviation of a constant offset of the controls, relative to
         half the action range, while start states go on
     :param exploration_decay: factor on the noise after each epoch (the HDS project: 0.5 to 0.99)
     :param temperature: of the annealed acceptance of step sizes, in units of the mean gain of the

@@ -71,7 +71,7 @@ class Knobs(NamedTuple):
     :param params: the twin's parameters
     :param learning_rate: of the policy
     :param value_learning_rate: of the value network
-    :param noise: standard deviation of the exploration noise on controls in [-1, 1]
+    :param noise: standard deviation of the exploration noise, in units of the control scale
     :param temperature: of the annealed acceptance, in units of the mean gain of the last epoch
     :param reset_share: share of start states drawn afresh in each epoch
     :param gain_weight: 0..1, how much a sample counts by what its plan gained
@@ -122,6 +122,7 @@ class Progress(NamedTuple):
     :param value_optimiser: state of Adam
     :param reward_scale: scale of the objective
     :param reward_offset: reward that counts as zero
+    :param control_scale: median size of the plans' controls, shape ``(n_act,)``
     :param gain: mean gain of the last epoch's plans, in units of the objective
     :param n_epochs: epochs done
     :param key: for random numbers, as integers
@@ -131,6 +132,7 @@ class Progress(NamedTuple):
     value_optimiser: Any
     reward_scale: jax.Array
     reward_offset: jax.Array
+    control_scale: jax.Array
     gain: jax.Array
     n_epochs: jax.Array
     key: jax.Array
@@ -195,6 +197,7 @@ def fresh_networks(
         adam.init(value_weights),
         jnp.ones(()),
         zero,
+        jnp.ones(actor.n_act),
         zero,
         jnp.zeros((), jnp.int32),
         jax.random.key_data(k_next),
@@ -229,7 +232,7 @@ def find_scales(
     :return: input normalisation, reward scale, reward offset
     """
     problem = Problem(settings.twin, params, settings.discount)
-    length = max(settings.horizon, settings.lookahead)
+    length = settings.horizon
     keys = jax.random.split(key, settings.n_rollouts)
     plans = jax.vmap(lambda start, k: best_of_random(problem, start, k, length, 1))(starts, keys)
     seen = jax.vmap(jax.vmap(lambda state: view(problem.observe(state))))(plans.states)

@@ -8,8 +8,11 @@ from sb3_hds.algos.learner import Knobs, Learner, Samples, Settings, optimiser
 from sb3_hds.algos.networks import squash
 from sb3_hds.planning import Plan, Problem
 
-# Where the absolute error of the regression turns into a squared one, in units of the control.
+# Where the absolute error of the regression turns into a squared one, in units of the control scale.
 _SMOOTH_ERROR = 0.1
+_FORGETTING = 3.0
+# Below this, an input does not move and its scale is left alone; controls are at least this large.
+_LEAST_SPREAD, _LEAST_EFFORT = 1e-6, 1e-3
 # No sample counts more than this many times the mean.
 _LARGEST_WEIGHT = 20.0
 
@@ -69,6 +72,30 @@ def remember(settings: Settings, learner: Learner, samples: Samples) -> Learner:
     return learner._replace(workspace=work._replace(samples=rows, n_filled=work.n_filled + 1))
 
 
+def rescale(learner: Learner, samples: Samples) -> Learner:
+    """
+    Let the scales of inputs and controls follow the plans: near a balance both are far smaller than in
+    the random rollouts from which they were first taken. Old epochs are forgotten at a rate of 3/n.
+    """
+    nets, progress = learner.networks, learner.progress
+    counted = samples.alive[:, None]
+    rate = _FORGETTING / (progress.n_epochs + _FORGETTING) * jnp.any(counted > 0.0)
+    total = jnp.maximum(jnp.sum(counted), 1.0)
+    mean = jnp.sum(counted * samples.obs, 0) / total
+    spread = jnp.sqrt(jnp.sum(counted * (samples.obs - mean) ** 2, 0) / total)
+    sizes = jnp.where(counted > 0.0, jnp.abs(samples.control), jnp.nan)
+    effort = jnp.nan_to_num(jnp.nanmedian(sizes, 0), nan=1.0)
+    follow = lambda old, new: old + rate * (new - old)  # noqa: E731
+    spread = jnp.where(spread > _LEAST_SPREAD, spread, nets.inside.scale)
+    inside = nets.inside._replace(
+        mean=follow(nets.inside.mean, mean), scale=follow(nets.inside.scale, spread)
+    )
+    effort = jnp.clip(follow(progress.control_scale, effort), _LEAST_EFFORT, 1.0)
+    return learner._replace(
+        networks=nets._replace(inside=inside), progress=progress._replace(control_scale=effort)
+    )
+
+
 def regress(
     settings: Settings, learner: Learner, knobs: Knobs, key: PRNGKeyArray
 ) -> tuple[Learner, Float[Array, " 2"]]:
@@ -83,13 +110,13 @@ def regress(
     """
     adam, work = optimiser(settings.max_grad_norm), learner.workspace
     filled = jnp.minimum(work.n_filled, settings.plan_memory)
-    inside = learner.networks.inside
+    inside, unit = learner.networks.inside, learner.progress.control_scale
 
     def policy_loss(actor, batch: Samples) -> jax.Array:
         error = settings.actor.apply(actor, inside(batch.obs)) - batch.control
         if settings.squared_error:
             return jnp.mean(batch.weight[:, None] * 0.5 * error**2)
-        return jnp.mean(batch.weight[:, None] * jnp.sqrt(error**2 + _SMOOTH_ERROR**2))
+        return jnp.mean(batch.weight[:, None] * jnp.sqrt((error / unit) ** 2 + _SMOOTH_ERROR**2))
 
     def value_loss(value, batch: Samples) -> jax.Array:
         error = settings.value.apply(value, inside(batch.obs)) - squash(batch.value)

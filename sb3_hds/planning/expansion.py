@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sb3_hds.core import State
+from sb3_hds.core import Scalar, State
 from sb3_hds.planning.problem import Control, Plan, Problem
 
 
@@ -19,7 +19,8 @@ class Expansion(NamedTuple):
     :param A: :math:`\partial x_{t+1} / \partial x_t`, shape ``(horizon, n, n)``
     :param B: :math:`\partial x_{t+1} / \partial u_t`, shape ``(horizon, n, m)``
     :param slope: gradient of the stage cost by (x, u), shape ``(horizon, n + m)``
-    :param curvature: Hessian of the stage cost by (x, u), shape ``(horizon, n + m, n + m)``
+    :param curvature: Hessian of the stage cost by (x, u), shape ``(horizon, n + m, n + m)``; where
+        the reward looks at the next state, without the second derivative of the step (Gauss-Newton)
     :param end_slope: gradient of the terminal cost, shape ``(n,)``
     :param end_curvature: Hessian of the terminal cost, shape ``(n, n)``
     """
@@ -47,19 +48,25 @@ def expand(problem: Problem, plan: Plan, second_order: bool = True) -> Expansion
     first = jax.tree.map(lambda leaf: leaf[0], starts)
     origin = jnp.zeros_like(twin.difference(first, first))
     n, horizon = origin.shape[0], plan.controls.shape[0]
+    nm = n + problem.n_controls
     weight = -jnp.where(plan.alive[:-1], problem.discount ** jnp.arange(horizon), 0.0)
 
-    def near(state: State, control: Control, after: State, z: Float[Array, " nm"]):
-        moved, reward = problem.step(twin.retract(state, z[:n]), control + z[n:])
-        return twin.difference(moved, after), reward
-
     def at(state: State, control: Control, after: State):
-        z = jnp.concatenate([origin, jnp.zeros_like(control)])
-        jacobian, slope = jax.jacfwd(lambda z: near(state, control, after, z))(z)
+        def move(z: Float[Array, " nm"]) -> Float[Array, " n"]:
+            moved = problem.advance(twin.retract(state, z[:n]), control + z[n:])
+            return twin.difference(moved, after)
+
+        def reward(w: Float[Array, " nmn"]) -> Scalar:
+            before = twin.retract(state, w[:n])
+            return problem.reward(before, control + w[n:nm], twin.retract(after, w[nm:]))
+
+        jacobian = jax.jacfwd(move)(jnp.zeros(nm, origin.dtype))
+        still = jnp.zeros(nm + n, origin.dtype)
+        chain = jnp.concatenate([jnp.eye(nm, dtype=origin.dtype), jacobian])
+        slope = jax.jacfwd(reward)(still) @ chain
         if not second_order:
-            return jacobian, slope, jnp.zeros((z.shape[0], z.shape[0]), z.dtype)
-        reward = lambda z: near(state, control, after, z)[1]  # noqa: E731
-        return jacobian, slope, jax.jacfwd(jax.jacfwd(reward))(z)
+            return jacobian, slope, jnp.zeros((nm, nm), origin.dtype)
+        return jacobian, slope, chain.T @ jax.jacfwd(jax.jacfwd(reward))(still) @ chain
 
     jacobians, slopes, curvatures = jax.vmap(at)(starts, plan.controls, ends)
     end_weight = -jnp.where(plan.alive[-1], problem.discount**horizon, 0.0)

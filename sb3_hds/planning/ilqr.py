@@ -116,7 +116,8 @@ def _follow(problem: Problem, start: State, plan: Plan, gains: Gains, step: Scal
         dx = problem.twin.difference(state, nominal)
         reaction = K @ jnp.where(jnp.isfinite(dx), dx, 0.0)
         control = jnp.clip(u + step * k + reaction, -1.0, 1.0)
-        after, reward = problem.step(state, control)
+        after = problem.advance(state, control)
+        reward = problem.reward(state, control, after)
         still = alive & ~problem.terminated(after)
         return (after, still), (state, alive, jnp.where(alive, reward, 0.0), control)
 

@@ -71,12 +71,14 @@ class Problem:
         high = jnp.array([actuator.high for actuator in self.twin.actuators], control.dtype)
         return low + 0.5 * (control + 1.0) * (high - low)
 
-    def step(self, state: State, control: Control) -> tuple[State, Scalar]:
-        """:return: the next state and the scaled, shifted planning reward of getting there"""
-        action = self.action(control)
-        after = self.twin.step(state, action, self.params)
-        reward = self.twin.planning_reward(state, action, after, self.params)
-        return after, (reward - self.reward_offset) * self.reward_scale
+    def advance(self, state: State, control: Control) -> State:
+        """:return: the next state"""
+        return self.twin.step(state, self.action(control), self.params)
+
+    def reward(self, state: State, control: Control, after: State) -> Scalar:
+        """:return: the scaled, shifted planning reward of getting from ``state`` to ``after``"""
+        reward = self.twin.planning_reward(state, self.action(control), after, self.params)
+        return (reward - self.reward_offset) * self.reward_scale
 
     def observe(self, state: State) -> Obs:
         return self.twin.observe(state, self.params)
@@ -121,7 +123,8 @@ def _roll(problem: Problem, start: State, decide: Callable, inputs: Any, length:
     def advance(carry: tuple[State, Flag], given: Any):
         state, alive = carry
         control = decide(state, given)
-        after, reward = problem.step(state, control)
+        after = problem.advance(state, control)
+        reward = problem.reward(state, control, after)
         still = alive & ~problem.terminated(after)
         return (after, still), (state, alive, jnp.where(alive, reward, 0.0), control)
 

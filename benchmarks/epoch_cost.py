@@ -1,0 +1,74 @@
+"""
+What one planning epoch costs against the number of rollouts, and where a cold start spends its time.
+
+    python benchmarks/epoch_cost.py
+
+Pendulum-v1, default arguments but for ``n_rollouts``; one fresh process per row. Memory is the peak
+resident size of the process. The regression does not grow with the number of rollouts (96 steps of 512
+samples), the planning does: both are timed.
+"""
+
+import argparse
+import json
+import resource
+import sys
+import time
+
+from runs import fresh_process, save, seconds_since_start
+
+ROLLOUTS = (64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384)
+N_EPOCHS = 5
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument("--worker", nargs=1, metavar="N_ROLLOUTS")
+    arguments = parser.parse_args()
+    if arguments.worker:
+        print(json.dumps(worker(int(arguments.worker[0]))))
+        return
+    rows = []
+    for n_rollouts in ROLLOUTS:
+        print(f"{n_rollouts} rollouts ...", file=sys.stderr, flush=True)
+        rows.append({"n_rollouts": n_rollouts, **fresh_process(__file__, n_rollouts)})
+        table = save(rows, "epoch_cost")
+    print(table.to_string(index=False, float_format="%.3f"))
+
+
+def worker(n_rollouts: int) -> dict:
+    interpreter = seconds_since_start()
+    import jax
+
+    from sb3_hds import HDS
+
+    imported = seconds_since_start()
+    model = HDS("Pendulum-v1", n_rollouts=n_rollouts, pretrain_epochs=1, seed=0)
+    constructed = seconds_since_start()
+    model.learn(0)
+    first = seconds_since_start()
+    epoch, planning = timed(model, jax, model.gradient_steps), timed(model, jax, 1)
+    return {
+        "interpreter_s": interpreter,
+        "import_s": imported - interpreter,
+        "construct_s": constructed - imported,
+        "compile_and_first_epoch_s": first - constructed,
+        "epoch_ms": 1e3 * epoch,
+        "planning_ms": 1e3 * planning,
+        "twin_steps_per_epoch": model.twin_timesteps // model.n_pretrained,
+        "peak_memory_MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }
+
+
+def timed(model, jax, gradient_steps: int) -> float:
+    """:return: seconds of one epoch, the smallest of a few"""
+    seconds = []
+    for _ in range(N_EPOCHS):
+        begin = time.perf_counter()
+        model.run_epoch(gradient_steps)
+        jax.block_until_ready(model.policy.networks)
+        seconds.append(time.perf_counter() - begin)
+    return min(seconds)
+
+
+if __name__ == "__main__":
+    main()
