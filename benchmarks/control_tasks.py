@@ -4,8 +4,8 @@ HDS with its default arguments on every other task: return in the environment it
     python benchmarks/control_tasks.py [--seeds 3]
 
 Each run is a fresh process with an empty compilation cache; the time counts from the start of its
-interpreter to the end of ``HDS(env_id).learn()``. The policy is then evaluated on 100 episodes of the
-environment as ``gymnasium.make`` makes it, the same resets for every seed.
+interpreter to the end of ``HDS(env_id).learn()``. The policy is then evaluated on 100 episodes of
+the environment as ``gymnasium.make`` makes it, the same resets for every seed.
 """
 
 import argparse
@@ -87,7 +87,7 @@ def evaluate(model, env_id: str) -> tuple[np.ndarray, float | None]:
 
 
 def share_upright(ends: list[np.ndarray]) -> float:
-    """Share of episodes whose last second is spent within 0.1 rad of upright and 0.2 m of the middle."""
+    """Share of episodes that stay within 0.1 rad and 0.2 m of the goal for their last second."""
     good = [np.all(np.abs(e[:, 0]) < 0.2) and np.all(e[:, 1] > np.cos(0.1)) for e in ends]
     return float(np.mean(good))
 

@@ -1,11 +1,12 @@
 """
-What one planning epoch costs against the number of rollouts, and where a cold start spends its time.
+What one planning epoch costs against the number of rollouts, and where a cold start spends its
+time.
 
     python benchmarks/epoch_cost.py
 
 Pendulum-v1, default arguments but for ``n_rollouts``; one fresh process per row. Memory is the peak
-resident size of the process. The regression does not grow with the number of rollouts (96 steps of 512
-samples), the planning does: both are timed.
+resident size of the process. The regression does not grow with the number of rollouts (96 steps of
+512 samples), the planning does: both are timed.
 """
 
 import argparse

@@ -1,12 +1,14 @@
 """
-The paper's comparison on its 2D pendulum payload: second order, backpropagation through time, first order.
+The paper's comparison on its 2D pendulum payload: second order, backpropagation through time, first
+order.
 
     python benchmarks/payload.py [--seeds 5] [--epochs 40]
 
-All three have the same networks, start states, number of rollouts, discount and number of Adam steps
-per epoch, and the paper's settings otherwise: whole episodes of 100 steps, no terminal value, one
-improvement of each plan, regression with a squared error. Backpropagation takes each Adam step along
-the gradient of the mean objective through the twin and the policy, from the same start states.
+All three have the same networks, start states, number of rollouts, discount and number of Adam
+steps per epoch, and the paper's settings otherwise: whole episodes of 100 steps, no terminal value,
+one improvement of each plan, regression with a squared error. Backpropagation takes each Adam step
+along the gradient of the mean objective through the twin and the policy, from the same start
+states.
 
 The objective is minus the cost whose inverse is the paper's reward (see the twin). Return and
 objective are measured on 500 start states that no epoch has seen. ``worsened`` counts plans kept
@@ -18,7 +20,6 @@ import json
 import sys
 import time
 
-import numpy as np
 from runs import RESULTS, fresh_process, save
 
 METHODS = ("first_order", "gauss_newton", "bptt")
@@ -120,7 +121,6 @@ def model_epoch(model):
 
 def backpropagation(model):
     """Adam steps along the gradient of the mean objective through policy and twin."""
-    from functools import partial
 
     import jax
 

@@ -6,8 +6,8 @@ Pendulum-v1 from a cold start: HDS beside SB3's SAC and SBX's SAC, each in fresh
 
 Every policy is a sequence of snapshots, taken while it trains and evaluated afterwards on 500 start
 states whose best reachable return is known (SB3_HDS_DATA). Those rows are drawn afresh and exclude
-rows 0, 16, 32, ..., on which the defaults were tuned. Regret is the mean over the same states of best
-return minus return.
+rows 0, 16, 32, ..., on which the defaults were tuned. Regret is the mean over the same states of
+best return minus return.
 """
 
 import argparse
@@ -144,7 +144,7 @@ def watched(model, total_timesteps: int, copy):
 
 
 def held_out_states():
-    """:return: angles [rad], speeds [rad/s] and best returns of 500 states that no tuning has seen"""
+    """:return: angles [rad], speeds [rad/s], best returns of 500 states that no tuning has seen"""
     folder = os.environ.get("SB3_HDS_DATA")
     if folder is None:
         raise SystemExit(

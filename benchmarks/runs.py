@@ -19,8 +19,8 @@ def fresh_process(script: str, *arguments: Any) -> dict[str, Any]:
     """
     Run a benchmark's worker in a process of its own.
 
-    The worker finds the moment of its start [s since the epoch] in ``BENCHMARK_START`` and prints one
-    line of JSON last.
+    The worker finds the moment of its start [s since the epoch] in ``BENCHMARK_START`` and prints
+    one line of JSON last.
 
     :raises RuntimeError: with the worker's last lines, if it failed
     """

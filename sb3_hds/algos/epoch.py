@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.algos.learner import Knobs, Learner, Settings, problem_of, resets
+from sb3_hds.algos.learner import GENERATOR, Knobs, Learner, Settings, problem_of, resets
+from sb3_hds.algos.networks import output
 from sb3_hds.algos.regression import regress, remember, rescale, samples_of
 from sb3_hds.core import Obs, State
 from sb3_hds.planning import (
@@ -77,7 +78,7 @@ def epoch(settings: Settings, learner: Learner, knobs: Knobs) -> tuple[Learner, 
 
     :return: the learner after the epoch, and what happened
     """
-    key = jax.random.wrap_key_data(learner.progress.key, impl="unsafe_rbg")
+    key = jax.random.wrap_key_data(learner.progress.key, impl=GENERATOR)
     key, k_plan, k_regress, k_move = jax.random.split(key, 4)
     problem = problem_of(settings, learner, knobs)
     seen = jax.vmap(lambda obs: settings.twin.infer(obs, knobs.params))(knobs.visited)
@@ -105,7 +106,7 @@ def epoch(settings: Settings, learner: Learner, knobs: Knobs) -> tuple[Learner, 
 def control_of(settings: Settings, learner: Learner, knobs: Knobs, obs: Obs) -> Control:
     """:return: what the policy in training does for an observation of the twin"""
     seen = learner.networks.inside(knobs.view(obs))
-    return settings.actor.apply(learner.networks.actor, seen)
+    return output(settings.actor, learner.networks.actor, seen)
 
 
 def twin_steps_per_epoch(settings: Settings) -> int:

@@ -10,12 +10,14 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from sb3_hds.algos.networks import Actor, Value, unsquash
+from sb3_hds.algos.networks import Actor, Value, output, unsquash
 from sb3_hds.core import Obs, Params, State, Twin
 from sb3_hds.planning import Plan, Problem, best_of_random
 
-# The median shortfall of the first rollouts becomes this many units of the objective.
+# The typical shortfall of the first rollouts becomes this many units of the objective.
 _TYPICAL_SHORTFALL = 12.0
+# The random generator that XLA compiles fastest.
+GENERATOR = "unsafe_rbg"
 # Without discounting, or nearly so, a value counts rewards of at most this many steps.
 _LONGEST = 1000.0
 
@@ -122,7 +124,7 @@ class Progress(NamedTuple):
     :param value_optimiser: state of Adam
     :param reward_scale: scale of the objective
     :param reward_offset: reward that counts as zero
-    :param control_scale: median size of the plans' controls, shape ``(n_act,)``
+    :param control_scale: geometric mean of the size of the plans' controls, shape ``(n_act,)``
     :param gain: mean gain of the last epoch's plans, in units of the objective
     :param n_epochs: epochs done
     :param key: for random numbers, as integers
@@ -173,6 +175,18 @@ class Workspace(NamedTuple):
     n_filled: jax.Array
 
 
+class Scales(NamedTuple):
+    """
+    :param inside: of the networks' input
+    :param reward_scale: of the objective
+    :param reward_offset: reward that counts as zero
+    """
+
+    inside: View
+    reward_scale: jax.Array
+    reward_offset: jax.Array
+
+
 class Learner(NamedTuple):
     """Everything that an epoch reads and changes."""
 
@@ -205,41 +219,34 @@ def fresh_networks(
     return Networks(weights, weights, value_weights, inside), progress
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def fresh_workspace(settings: Settings, n_obs: int, params: Params, key: PRNGKeyArray) -> Workspace:
-    """:return: start states from the twin's reset, and no samples"""
-    n, rows = settings.n_rollouts, (settings.plan_memory, settings.n_rollouts * settings.horizon)
-    empty = jnp.zeros(rows)
-    samples = Samples(
-        jnp.zeros((*rows, n_obs)),
-        jnp.zeros((*rows, len(settings.twin.actuators))),
-        empty,
-        empty,
-        empty,
-    )
-    starts = resets(settings.twin, params, key, n)
-    return Workspace(starts, jnp.zeros(n), samples, jnp.zeros((), jnp.int32))
-
-
 @partial(jax.jit, static_argnums=0)
-def find_scales(
-    settings: Settings, params: Params, view: View, starts: State, key: PRNGKeyArray
-) -> tuple[View, jax.Array, jax.Array]:
+def begin(
+    settings: Settings, params: Params, view: View, progress: Progress
+) -> tuple[Workspace, Scales, Progress]:
     """
-    Read the scales of observations and rewards off random rollouts, so that nothing needs to be set
-    by hand for a new task.
+    Start states from the twin's reset, no samples, and the scales of observations and rewards, read
+    off random rollouts: nothing needs to be set by hand for a new task.
 
-    :return: input normalisation, reward scale, reward offset
+    :return: both, and the training state with its random key moved on
     """
+    key = jax.random.wrap_key_data(progress.key, impl=GENERATOR)
+    key, k_starts, k_plans = jax.random.split(key, 3)
+    n, n_obs, n_act = settings.n_rollouts, view.mean.shape[0], len(settings.twin.actuators)
+    rows = (settings.plan_memory, n * settings.horizon)
+    empty = jnp.zeros(rows)
+    samples = Samples(jnp.zeros((*rows, n_obs)), jnp.zeros((*rows, n_act)), empty, empty, empty)
+    starts = resets(settings.twin, params, k_starts, n)
+    workspace = Workspace(starts, jnp.zeros(n), samples, jnp.zeros((), jnp.int32))
+
     problem = Problem(settings.twin, params, settings.discount)
-    length = settings.horizon
-    keys = jax.random.split(key, settings.n_rollouts)
-    plans = jax.vmap(lambda start, k: best_of_random(problem, start, k, length, 1))(starts, keys)
+    search = lambda start, k: best_of_random(problem, start, k, settings.horizon, 1)  # noqa: E731
+    plans = jax.vmap(search)(starts, jax.random.split(k_plans, n))
     seen = jax.vmap(jax.vmap(lambda state: view(problem.observe(state))))(plans.states)
     offset = _best_reward(plans) if settings.discount < 1.0 else jnp.zeros(())
     shortfall = _typical_shortfall(plans, offset, settings.discount)
     scale = _TYPICAL_SHORTFALL / jnp.maximum(shortfall, 1e-6)
-    return _input_scales(seen, plans), scale, offset
+    scales = Scales(_input_scales(seen, plans), scale, offset)
+    return workspace, scales, progress._replace(key=jax.random.key_data(key))
 
 
 def optimiser(max_grad_norm: float) -> optax.GradientTransformation:
@@ -257,7 +264,7 @@ def problem_of(settings: Settings, learner: Learner, knobs: Knobs) -> Problem:
 
     def value(obs: Obs) -> jax.Array:
         seen = learner.networks.inside(knobs.view(obs))
-        return unsquash(settings.value.apply(learner.networks.value, seen))
+        return unsquash(output(settings.value, learner.networks.value, seen))
 
     return Problem(
         settings.twin,
@@ -285,10 +292,10 @@ def _best_reward(plans: Plan) -> jax.Array:
 
 
 def _typical_shortfall(plans: Plan, offset: jax.Array, discount: float) -> jax.Array:
-    """Median discounted shortfall from the best reward, as if each rollout went on as it did."""
+    """Geometric mean of what rollouts lose on the best reward, as if they went on as they did."""
     counted = plans.alive[:, :-1] & jnp.isfinite(plans.rewards)
     weights = jnp.where(counted, discount ** jnp.arange(plans.rewards.shape[1]), 0.0)
     shortfalls = jnp.where(counted, plans.rewards - offset, 0.0)
     mean = jnp.sum(weights * shortfalls, 1) / jnp.maximum(jnp.sum(weights, 1), 1e-6)
     length = min(1.0 / (1.0 - discount), _LONGEST) if discount < 1.0 else plans.rewards.shape[1]
-    return jnp.median(jnp.abs(mean)) * length
+    return jnp.exp(jnp.mean(jnp.log(jnp.abs(mean) + 1e-9))) * length

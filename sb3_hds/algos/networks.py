@@ -1,6 +1,7 @@
 """Policy and value networks of the algorithms that learn through a twin."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, cast
 
 import flax.linen as nn
 import jax
@@ -22,8 +23,10 @@ ACTIVATIONS: dict[str, Activation] = {
 # Width around zero where the value is linear rather than a square root, in units of the scaled
 # reward.
 _NEAR_ZERO = 0.3
-# Of a last layer, so that a network starts near zero.
-_SMALL = nn.initializers.variance_scaling(1e-4, "fan_in", "normal")
+# Uniform rather than normal: half a second less to compile. Small in a last layer, so that a
+# network starts near zero.
+_HIDDEN = nn.initializers.variance_scaling(1.0, "fan_in", "uniform")
+_SMALL = nn.initializers.variance_scaling(1e-4, "fan_in", "uniform")
 
 
 def activation(choice: str | Activation | type) -> Activation:
@@ -81,6 +84,11 @@ class Value(nn.Module):
         return nn.Dense(1, kernel_init=_SMALL)(hidden)[..., 0]
 
 
+def output(network: Actor | Value, weights: Mapping[str, Any], obs: jax.Array) -> jax.Array:
+    """:return: what a network puts out for one observation or a batch"""
+    return cast(jax.Array, network.apply(weights, obs))
+
+
 def squash(value: jax.Array) -> jax.Array:
     r"""
     The root that the value network learns: :math:`y\,(|y| + 0.3) = V`.
@@ -98,6 +106,5 @@ def unsquash(root: jax.Array) -> jax.Array:
 
 def _mlp(x: jax.Array, net_arch: Sequence[int], activation_fn: Activation) -> jax.Array:
     for width in net_arch:
-        init = nn.initializers.variance_scaling(1.0, "fan_in", "normal")
-        x = activation_fn(nn.Dense(width, kernel_init=init)(x))
+        x = activation_fn(nn.Dense(width, kernel_init=_HIDDEN)(x))
     return x

@@ -26,9 +26,10 @@ class PODS(TwinAlgorithm):
     states that go on from epoch to epoch, weighted regression. Every one of these is an argument,
     so that the paper's setting can be reached::
 
-        PODS(env, planner="gauss_newton", horizon=100, n_iterations=1, n_random_plans=0, lookahead=0,
-             terminal_value=False, reset_share=1.0, plan_memory=1, loss="squared", gain_weight=0.0,
-             sensitivity_weight=0.0, averaging=0.0, gamma=1.0, gradient_steps=50)
+        PODS(env, planner="gauss_newton", horizon=100, n_iterations=1, n_random_plans=0,
+             lookahead=0, terminal_value=False, reset_share=1.0, plan_memory=1, loss="squared",
+             gain_weight=0.0, sensitivity_weight=0.0, averaging=0.0, gamma=1.0,
+             gradient_steps=50)
 
     Paper: Mora, Peychev, Ha, Vechev, Coros, *PODS: Policy Optimization via Differentiable
     Simulation*, ICML 2021, PMLR 139:7805-7817.
@@ -96,7 +97,7 @@ class PODS(TwinAlgorithm):
         value_learning_rate: float | str | Schedule | None = None,
         buffer_size: int = 100_000,
         learning_starts: int = 0,
-        batch_size: int = 512,
+        batch_size: int = 256,
         gamma: float = 0.99,
         train_freq: int | tuple[int, str] = 100,
         gradient_steps: int = 96,
@@ -115,7 +116,7 @@ class PODS(TwinAlgorithm):
         n_random_plans: int = 15,
         lookahead: int | None = None,
         terminal_value: bool = True,
-        reset_share: float = 0.3,
+        reset_share: float = 0.5,
         exploration_noise: float = 0.0,
         plan_memory: int = 8,
         loss: str = "smooth_absolute",

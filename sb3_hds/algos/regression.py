@@ -5,10 +5,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sb3_hds.algos.learner import Knobs, Learner, Samples, Settings, optimiser
-from sb3_hds.algos.networks import squash
+from sb3_hds.algos.networks import output, squash
 from sb3_hds.planning import Plan, Problem
 
-# Where the absolute error of the regression turns into a squared one, in units of the control scale.
+# Where the absolute error of the regression turns into a squared one, in units of the control
+# scale.
 _SMOOTH_ERROR = 0.1
 _FORGETTING = 3.0
 # Below this, an input does not move and its scale is left alone; controls are at least this large.
@@ -74,8 +75,9 @@ def remember(settings: Settings, learner: Learner, samples: Samples) -> Learner:
 
 def rescale(learner: Learner, samples: Samples) -> Learner:
     """
-    Let the scales of inputs and controls follow the plans: near a balance both are far smaller than in
-    the random rollouts from which they were first taken. Old epochs are forgotten at a rate of 3/n.
+    Let the scales of inputs and controls follow the plans: near a balance both are far smaller than
+    in the random rollouts from which they were first taken. Old epochs are forgotten at a rate of
+    3/n.
     """
     nets, progress = learner.networks, learner.progress
     counted = samples.alive[:, None]
@@ -83,8 +85,8 @@ def rescale(learner: Learner, samples: Samples) -> Learner:
     total = jnp.maximum(jnp.sum(counted), 1.0)
     mean = jnp.sum(counted * samples.obs, 0) / total
     spread = jnp.sqrt(jnp.sum(counted * (samples.obs - mean) ** 2, 0) / total)
-    sizes = jnp.where(counted > 0.0, jnp.abs(samples.control), jnp.nan)
-    effort = jnp.nan_to_num(jnp.nanmedian(sizes, 0), nan=1.0)
+    sizes = jnp.log(jnp.abs(samples.control) + _LEAST_EFFORT)
+    effort = jnp.exp(jnp.sum(counted * sizes, 0) / total)
     follow = lambda old, new: old + rate * (new - old)  # noqa: E731
     spread = jnp.where(spread > _LEAST_SPREAD, spread, nets.inside.scale)
     inside = nets.inside._replace(
@@ -113,13 +115,13 @@ def regress(
     inside, unit = learner.networks.inside, learner.progress.control_scale
 
     def policy_loss(actor, batch: Samples) -> jax.Array:
-        error = settings.actor.apply(actor, inside(batch.obs)) - batch.control
+        error = output(settings.actor, actor, inside(batch.obs)) - batch.control
         if settings.squared_error:
             return jnp.mean(batch.weight[:, None] * 0.5 * error**2)
         return jnp.mean(batch.weight[:, None] * jnp.sqrt((error / unit) ** 2 + _SMOOTH_ERROR**2))
 
     def value_loss(value, batch: Samples) -> jax.Array:
-        error = settings.value.apply(value, inside(batch.obs)) - squash(batch.value)
+        error = output(settings.value, value, inside(batch.obs)) - squash(batch.value)
         return jnp.mean(batch.alive * error**2)
 
     def update(i, carry):

@@ -34,7 +34,7 @@ from sb3_hds.algos.call_forms import (
     schedule_of,
 )
 from sb3_hds.algos.epoch import Report, epoch, twin_steps_per_epoch
-from sb3_hds.algos.learner import Knobs, Learner, Settings, Workspace, find_scales, fresh_workspace
+from sb3_hds.algos.learner import GENERATOR, Knobs, Learner, Settings, Workspace, begin
 from sb3_hds.algos.normalisation import prepare_statistics, view_of
 from sb3_hds.algos.persistence import damage_reported, write_whole
 from sb3_hds.algos.pretraining import Pretraining
@@ -295,7 +295,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
             self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
         )
         seed = int(np.asarray(self.key)[-1])
-        self.policy.build(jax.random.key(seed, impl="unsafe_rbg"), device)
+        self.policy.build(jax.random.key(seed, impl=GENERATOR), device)
         self._workspace = None
         self._setup_twin()
 
@@ -359,20 +359,20 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         settings, policy = self._settings, self.policy
         workspace = self._workspace
         if workspace is None:
-            n_obs = len(settings.twin.channels)
-            key = jax.random.wrap_key_data(policy.progress.key, impl="unsafe_rbg")
-            key, k_starts, k_scales = jax.random.split(key, 3)
-            params = settings.twin.params
-            workspace = self._workspace = fresh_workspace(settings, n_obs, params, k_starts)
-            progress = policy.progress._replace(key=jax.random.key_data(key))
-            if int(progress.n_epochs) == 0:
-                prepare_statistics(self._vec_normalize_env, settings.twin, k_scales)
-                view = view_of(self._vec_normalize_env, n_obs)
-                starts = workspace.starts
-                inside, scale, offset = find_scales(settings, params, view, starts, k_scales)
-                policy.networks = policy.networks._replace(inside=inside)
-                progress = progress._replace(reward_scale=scale, reward_offset=offset)
-            policy.progress = progress
+            fresh = int(policy.progress.n_epochs) == 0
+            if fresh:
+                seed = int(np.asarray(policy.progress.key)[0])
+                prepare_statistics(self._vec_normalize_env, settings.twin, jax.random.key(seed))
+            view = view_of(self._vec_normalize_env, len(settings.twin.channels))
+            workspace, scales, progress = begin(
+                settings, settings.twin.params, view, policy.progress
+            )
+            if fresh:
+                policy.networks = policy.networks._replace(inside=scales.inside)
+                progress = progress._replace(
+                    reward_scale=scales.reward_scale, reward_offset=scales.reward_offset
+                )
+            self._workspace, policy.progress = workspace, progress
         return Learner(policy.networks, policy.progress, workspace)
 
     def _knobs(self, gradient_steps: int) -> Knobs:

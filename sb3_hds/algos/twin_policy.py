@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_hds.algos.learner import Networks, Progress, fresh_networks
+from sb3_hds.algos.learner import GENERATOR, Networks, Progress, fresh_networks
 from sb3_hds.algos.networks import Activation, Actor, Value, activation
 from sb3_hds.algos.persistence import TensorPolicy, TrainingTensors
 
@@ -58,7 +58,7 @@ class TwinPolicy(TensorPolicy):
         self.networks: Networks
         self.progress: Progress
         self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
-        self.build(jax.random.key(0, impl="unsafe_rbg"), jax.devices()[0])
+        self.build(jax.random.key(0, impl=GENERATOR), jax.devices()[0])
 
     def build(self, key: jax.Array, device: Any) -> None:
         """
