@@ -43,6 +43,7 @@ LIBRARIES = {
     "experiments": LEARNING | TABLES,
     "cli": LEARNING | TABLES,
     "rl_zoo_plugin": {"rl_zoo3", "optuna"},
+    "rl_zoo_plugin/compilation_cache.py": {"jax"},
 }
 """What a layer, or one file of it, imports from outside; the standard library is free."""
 

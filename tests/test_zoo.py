@@ -34,7 +34,7 @@ class Zoo:
         # One compilation cache for all processes: they compile the same functions.
         self.environ = {
             **os.environ,
-            "JAX_COMPILATION_CACHE_DIR": str(folder / "cache"),
+            "SB3_HDS_CACHE": str(folder / "cache"),
             "MPLBACKEND": "Agg",
             "COLUMNS": "200",
         }
