@@ -1,4 +1,4 @@
-"""Compiled programs kept between two commands: the second one starts training several seconds sooner."""
+"""Compiled programs kept between two commands, so that the second one starts training sooner."""
 
 import os
 from pathlib import Path
@@ -10,8 +10,8 @@ def enable() -> None:
     """
     Let JAX keep what it compiles in a folder of the user's.
 
-    ``SB3_HDS_CACHE`` moves the folder; empty, it switches the cache off. A folder that JAX was already
-    given (``JAX_COMPILATION_CACHE_DIR``) stays.
+    ``SB3_HDS_CACHE`` moves the folder; empty, it switches the cache off. A folder that JAX was
+    already given (``JAX_COMPILATION_CACHE_DIR``) stays.
     """
     folder = os.environ.get(_SWITCH, str(_default_folder()))
     if not folder or os.environ.get("JAX_COMPILATION_CACHE_DIR"):

@@ -60,8 +60,8 @@ class HDS(TwinAlgorithm):
     :param terminal_value: whether a value network judges the end of a plan (the paper: no)
     :param reset_share: share of start states drawn from the reset distribution in each epoch, the
         others go on from where the policy went; 1 is the paper's choice
-    :param exploration_noise: standard deviation of a constant offset of the controls, relative to
-        half the action range, while start states go on
+    :param exploration_noise: standard deviation of a constant offset of the controls while start
+        states go on, in units of the typical size of the plans' controls
     :param exploration_decay: factor on the noise after each epoch (the HDS project: 0.5 to 0.99)
     :param temperature: of the annealed acceptance of step sizes, in units of the mean gain of the
         last epoch's plans; 0 takes the best step always. The HDS project describes it and does not
@@ -69,7 +69,8 @@ class HDS(TwinAlgorithm):
     :param temperature_decay: factor on the temperature after each epoch
     :param relabel_share: share of plans that start in states in which the real environment was seen
     :param plan_memory: epochs whose plans are learned from (the paper: 1)
-    :param loss: ``"smooth_absolute"`` or ``"squared"`` (the paper)
+    :param loss: ``"smooth_absolute"`` (in units of the typical control, see the documentation) or
+        ``"squared"`` (the paper)
     :param gain_weight: 0..1, how much a sample counts in proportion to what its plan gained over
         the policy (the paper: 0)
     :param sensitivity_weight: 0..1, how much it counts in proportion to what an error of its
@@ -90,7 +91,7 @@ class HDS(TwinAlgorithm):
         policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
         env: GymEnv | str | None = None,
         *,
-        learning_rate: float | Schedule = LinearSchedule(3e-3, 1e-4, 1.0),  # noqa: B008
+        learning_rate: float | Schedule = LinearSchedule(5e-3, 1e-4, 1.0),  # noqa: B008
         value_learning_rate: float | str | Schedule | None = None,
         buffer_size: int = 100_000,
         learning_starts: int = 0,
@@ -103,21 +104,21 @@ class HDS(TwinAlgorithm):
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
         twin: Twin | str | None = None,
-        pretrain_epochs: int = 200,
+        pretrain_epochs: int = 170,
         n_rollouts: int = 128,
         horizon: int | None = None,
         order: int = 2,
         planner: str | None = None,
         n_iterations: int = 3,
         n_step_sizes: int = 6,
-        n_random_plans: int = 15,
+        n_random_plans: int = 7,
         lookahead: int | None = None,
         terminal_value: bool = True,
         reset_share: float = 0.5,
-        exploration_noise: float = 0.2,
-        exploration_decay: float = 1.0,
-        temperature: float = 0.0,
-        temperature_decay: float = 0.97,
+        exploration_noise: float = 0.25,
+        exploration_decay: float = 0.995,
+        temperature: float = 0.05,
+        temperature_decay: float = 0.95,
         relabel_share: float = 0.25,
         plan_memory: int = 8,
         loss: str = "smooth_absolute",
