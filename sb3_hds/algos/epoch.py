@@ -12,7 +12,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.algos.learner import GENERATOR, Knobs, Learner, Settings, problem_of, resets
+from sb3_hds.algos.learner import (
+    GENERATOR,
+    QUICK_COMPILATION,
+    Knobs,
+    Learner,
+    Settings,
+    problem_of,
+    resets,
+)
 from sb3_hds.algos.networks import output
 from sb3_hds.algos.regression import regress, remember, rescale, samples_of
 from sb3_hds.core import Obs, State
@@ -35,24 +43,36 @@ _TIE = 1e-3
 _LONG_EPISODE = 1000
 
 
-class Report(NamedTuple):
+class Outcome(NamedTuple):
     """
-    What an epoch tells. Returns are discounted planning rewards, in the reward's own unit.
+    What came of planning. Returns are discounted planning rewards, in the reward's own unit.
 
     :param before: mean return of the policy's own plans
     :param after: mean return of the plans that were kept
     :param worsened: number of kept plans that are worse than the policy's own
-    :param policy_loss: mean regression loss of the epoch
-    :param value_loss: mean regression loss of the value
     :param dropped: number of samples that were not finite
     """
 
     before: jax.Array
     after: jax.Array
     worsened: jax.Array
+    dropped: jax.Array
+
+
+class Report(NamedTuple):
+    """
+    What an epoch tells: its :class:`Outcome`, and
+
+    :param policy_loss: mean regression loss of the epoch
+    :param value_loss: mean regression loss of the value
+    """
+
+    before: jax.Array
+    after: jax.Array
+    worsened: jax.Array
+    dropped: jax.Array
     policy_loss: jax.Array
     value_loss: jax.Array
-    dropped: jax.Array
 
 
 class Choice(NamedTuple):
@@ -71,15 +91,22 @@ class Choice(NamedTuple):
     sensitivity: Float[Array, "rollouts horizon"]
 
 
-@partial(jax.jit, static_argnums=0)
 def epoch(settings: Settings, learner: Learner, knobs: Knobs) -> tuple[Learner, Report]:
     """
     Plan from every start state, keep what is better than the policy, regress on it, move on.
 
     :return: the learner after the epoch, and what happened
     """
+    learner, outcome = plan_ahead(settings, learner, knobs)
+    learner, losses = learn_from_plans(settings, learner, knobs)
+    return learner, Report(*outcome, *losses)
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK_COMPILATION)
+def plan_ahead(settings: Settings, learner: Learner, knobs: Knobs) -> tuple[Learner, Outcome]:
+    """The first half of an epoch: everything that happens in the twin."""
     key = jax.random.wrap_key_data(learner.progress.key, impl=GENERATOR)
-    key, k_plan, k_regress, k_move = jax.random.split(key, 4)
+    key, k_plan, k_move = jax.random.split(key, 3)
     problem = problem_of(settings, learner, knobs)
     seen = jax.vmap(lambda obs: settings.twin.infer(obs, knobs.params))(knobs.visited)
     starts = _where(knobs.relabel, seen, learner.workspace.starts)
@@ -90,17 +117,25 @@ def epoch(settings: Settings, learner: Learner, knobs: Knobs) -> tuple[Learner, 
         knobs, problem, choice.kept, choice.tails, gain, choice.sensitivity
     )
     moved, ages = _move_on(settings, learner, knobs, problem, starts, k_move)
+    outcome = _outcome(settings, learner, choice, finite)
     learner = rescale(remember(settings, learner, samples), samples)
-    learner, losses = regress(settings, learner, knobs, k_regress)
-
-    report = _report(settings, learner, choice, finite, losses)
-    progress = learner.progress._replace(
-        gain=_mean(gain, finite),
-        n_epochs=learner.progress.n_epochs + 1,
-        key=jax.random.key_data(key),
-    )
+    progress = learner.progress._replace(gain=_mean(gain, finite), key=jax.random.key_data(key))
     workspace = learner.workspace._replace(starts=moved, ages=ages)
-    return learner._replace(progress=progress, workspace=workspace), report
+    return learner._replace(progress=progress, workspace=workspace), outcome
+
+
+@partial(jax.jit, static_argnums=0)
+def learn_from_plans(
+    settings: Settings, learner: Learner, knobs: Knobs
+) -> tuple[Learner, Float[Array, " 2"]]:
+    """The second half of an epoch: the regression."""
+    key = jax.random.wrap_key_data(learner.progress.key, impl=GENERATOR)
+    key, k_regress = jax.random.split(key)
+    learner, losses = regress(settings, learner, knobs, k_regress)
+    progress = learner.progress._replace(
+        n_epochs=learner.progress.n_epochs + 1, key=jax.random.key_data(key)
+    )
+    return learner._replace(progress=progress), losses
 
 
 def control_of(settings: Settings, learner: Learner, knobs: Knobs, obs: Obs) -> Control:
@@ -233,17 +268,15 @@ def _move_on(
     return _where(again, fresh, moved), jnp.where(again, 0.0, ages)
 
 
-def _report(settings: Settings, learner: Learner, choice: Choice, finite, losses) -> Report:
+def _outcome(settings: Settings, learner: Learner, choice: Choice, finite: jax.Array) -> Outcome:
     forever = 1.0 / (1.0 - settings.discount) if settings.discount < 1.0 else settings.horizon
     progress = learner.progress
     unit = lambda value: value / progress.reward_scale + progress.reward_offset * forever  # noqa: E731
     both = finite & jnp.isfinite(choice.own.value)
-    return Report(
+    return Outcome(
         unit(_mean(choice.own.value, both)),
         unit(_mean(choice.kept.value, both)),
         jnp.sum(choice.kept.value < choice.own.value),
-        losses[0],
-        losses[1],
         jnp.sum(~finite) * settings.horizon,
     )
 

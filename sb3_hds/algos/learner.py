@@ -18,6 +18,9 @@ from sb3_hds.planning import Plan, Problem, best_of_random
 _TYPICAL_SHORTFALL = 12.0
 # The random generator that XLA compiles fastest.
 GENERATOR = "unsafe_rbg"
+# For programs of many small operations: XLA's newer code generator takes a third longer to compile
+# them and they run no faster. (Matrix products do: the regression is compiled as usual.)
+QUICK_COMPILATION = {"xla_cpu_use_fusion_emitters": False}
 # Without discounting, or nearly so, a value counts rewards of at most this many steps.
 _LONGEST = 1000.0
 
@@ -195,7 +198,7 @@ class Learner(NamedTuple):
     workspace: Workspace
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+@partial(jax.jit, static_argnums=(0, 1, 2, 3), compiler_options=QUICK_COMPILATION)
 def fresh_networks(
     actor: Actor, value: Value, n_obs: int, max_grad_norm: float, key: PRNGKeyArray
 ) -> tuple[Networks, Progress]:
@@ -219,7 +222,7 @@ def fresh_networks(
     return Networks(weights, weights, value_weights, inside), progress
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK_COMPILATION)
 def begin(
     settings: Settings, params: Params, view: View, progress: Progress
 ) -> tuple[Workspace, Scales, Progress]:
