@@ -107,7 +107,7 @@ class PODS(TwinAlgorithm):
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
         twin: Twin | str | None = None,
-        pretrain_epochs: int = 175,
+        pretrain_epochs: int = 160,
         n_rollouts: int = 128,
         horizon: int | None = None,
         order: int = 2,
