@@ -51,6 +51,16 @@ class Spring(Twin):
         return -(x @ STATE_COST @ x + ACTION_COST * jnp.sum(action**2))
 
 
+class Ahead(Spring):
+    """Rewarded for where a step ends."""
+
+    name = "Ahead"
+
+    def reward(self, state, action, next_state, params):
+        x = jnp.concatenate([next_state.q, next_state.v])
+        return -(x @ STATE_COST @ x)
+
+
 class Cliff(Spring):
     """Ends beyond one metre; every living step pays one."""
 
@@ -185,6 +195,23 @@ def test_the_expansion_holds_jacobians_and_hessians():
         expected[:2, :2] = 2.0 * STATE_COST
         expected[2, 2] = 2.0 * ACTION_COST * LIMIT**2
         np.testing.assert_allclose(expansion.curvature[t], 0.9**t * expected, rtol=1e-10)
+
+
+@pytest.mark.usefixtures("x64")
+def test_a_reward_of_the_next_state_is_expanded_through_the_step():
+    twin = Ahead()
+    problem = Problem(twin, twin.params)
+    start = _first(starts_of(twin, 1))
+    plan = planning.simulate(problem, start, jnp.full((3, 1), 0.01))
+
+    expansion = planning.expand(problem, plan)
+
+    AB = np.concatenate([A, B * LIMIT], axis=1)
+    for t in range(3):
+        after = np.array([plan.states.q[t + 1, 0], plan.states.v[t + 1, 0]])
+        # The system is linear, so leaving out the step's second derivative loses nothing.
+        np.testing.assert_allclose(expansion.slope[t], 2.0 * after @ STATE_COST @ AB, rtol=1e-10)
+        np.testing.assert_allclose(expansion.curvature[t], 2.0 * AB.T @ STATE_COST @ AB, rtol=1e-10)
 
 
 @pytest.mark.parametrize("method", planning.METHODS)

@@ -11,6 +11,7 @@ from sb3_hds.planning import Plan, Problem
 # Where the absolute error of the regression turns into a squared one, in units of the control
 # scale.
 _SMOOTH_ERROR = 0.1
+# Epochs after which a new one counts one half in the scales that follow the plans.
 _FORGETTING = 3.0
 # Below this, an input does not move and its scale is left alone; controls are at least this large.
 _LEAST_SPREAD, _LEAST_EFFORT = 1e-6, 1e-3
@@ -104,9 +105,9 @@ def regress(
     r"""
     Adam on minibatches of the remembered samples.
 
-    The policy's loss is :math:`w\,\sqrt{e^2 + 0.1^2}`: a squared error averages between turning
-    left and turning right, and blurs the moments of switching. The paper's :math:`w\,e^2/2` is a
-    setting.
+    The policy's loss is :math:`w\,\sqrt{e^2 + 0.1^2}` with the error :math:`e` in units of the
+    control scale: a squared error averages between turning left and turning right, and blurs the
+    moments of switching. The paper's :math:`w\,e^2/2`, in units of the control, is a setting.
 
     :return: the learner, and the mean losses of policy and value
     """

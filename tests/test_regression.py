@@ -1,0 +1,51 @@
+"""Scales that follow the plans."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import linen as nn
+
+from sb3_hds.algos.learner import Learner, Samples, fresh_networks
+from sb3_hds.algos.networks import Actor, Value
+from sb3_hds.algos.regression import rescale
+
+
+def learner_after(n_epochs):
+    key = jax.random.key(0, impl="unsafe_rbg")
+    actor, value = Actor(1, (4,), nn.tanh), Value((4,), nn.tanh)
+    networks, progress = fresh_networks(actor, value, 2, 1.0, key)
+    return Learner(networks, progress._replace(n_epochs=jnp.asarray(n_epochs)), None)
+
+
+def samples(alive):
+    obs = jnp.array([[1.0, 5.0], [3.0, 5.0], [100.0, 0.0]])
+    control = jnp.array([[0.04], [0.01], [1.0]])
+    return Samples(obs, control, jnp.zeros(3), jnp.ones(3), jnp.asarray(alive))
+
+
+def test_the_first_plans_set_the_scales_and_dead_samples_do_not_count():
+    learner = rescale(learner_after(0), samples([1.0, 1.0, 0.0]))
+
+    inside = learner.networks.inside
+    np.testing.assert_allclose(inside.mean, [2.0, 5.0], rtol=1e-6)
+    # An input that does not move keeps the scale that it had, one.
+    np.testing.assert_allclose(inside.scale, [1.0, 1.0], rtol=1e-6)
+    # Geometric mean; the floor of 1e-3 is added to each size before.
+    expected = np.sqrt(0.041 * 0.011)
+    assert float(learner.progress.control_scale[0]) == pytest.approx(expected, rel=1e-5)
+
+
+def test_after_three_epochs_new_plans_count_one_half():
+    learner = rescale(learner_after(3), samples([1.0, 1.0, 0.0]))
+
+    np.testing.assert_allclose(learner.networks.inside.mean, [1.0, 2.5], rtol=1e-6)
+
+
+def test_an_epoch_without_samples_moves_nothing():
+    before = learner_after(0)
+
+    after = rescale(before, samples([0.0, 0.0, 0.0]))
+
+    np.testing.assert_array_equal(after.networks.inside.mean, before.networks.inside.mean)
+    np.testing.assert_array_equal(after.progress.control_scale, before.progress.control_scale)
