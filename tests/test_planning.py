@@ -198,6 +198,28 @@ def test_the_expansion_holds_jacobians_and_hessians():
 
 
 @pytest.mark.usefixtures("x64")
+def test_the_root_of_a_value_gives_its_curvature_where_it_is_below_zero():
+    twin, direction = Spring(), jnp.array([0.7, -0.2])
+    plan = planning.simulate(
+        Problem(twin, twin.params), _first(starts_of(twin, 1)), jnp.zeros((4, 1))
+    )
+
+    def root(obs):
+        return direction @ obs - 3.0
+
+    def end_curvature(**how):
+        value = lambda obs: -(root(obs) ** 2)  # noqa: E731
+        problem = Problem(twin, twin.params, terminal_value=value, **how)
+        return planning.expand(problem, plan).end_curvature
+
+    hessian = end_curvature(terminal_curvature=True)
+    np.testing.assert_allclose(hessian, 2.0 * jnp.outer(direction, direction), rtol=1e-10)
+    np.testing.assert_allclose(end_curvature(terminal_root=root), hessian, rtol=1e-10)
+    assert not end_curvature(terminal_root=lambda obs: -root(obs)).any()
+    assert not end_curvature().any()
+
+
+@pytest.mark.usefixtures("x64")
 def test_a_reward_of_the_next_state_is_expanded_through_the_step():
     twin = Ahead()
     problem = Problem(twin, twin.params)

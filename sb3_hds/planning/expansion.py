@@ -91,4 +91,9 @@ def _expand_end(problem: Problem, end: State, origin: Float[Array, " n"], second
     slope = jax.jacfwd(value)(origin)
     if second_order and problem.terminal_curvature:
         return slope, jax.jacfwd(jax.jacfwd(value))(origin)
+    root = problem.terminal_root
+    if second_order and root is not None:
+        rho = lambda dx: root(problem.observe(problem.twin.retract(end, dx)))  # noqa: E731
+        gradient = jax.jacfwd(rho)(origin)
+        return slope, jnp.where(rho(origin) < 0.0, -2.0, 0.0) * jnp.outer(gradient, gradient)
     return slope, flat

@@ -51,6 +51,9 @@ class Problem:
     :param reward_offset: :math:`r_0`; must be zero where the discount is one
     :param terminal_value: :math:`V`, scaled like the rewards; None means zero
     :param terminal_curvature: whether second-order methods use the Hessian of :math:`V` too
+    :param terminal_root: :math:`\rho` with :math:`V \approx -\rho^2` where :math:`\rho < 0`. Then
+        :math:`-2\,\nabla\rho\,\nabla\rho^\top` stands in for the Hessian of :math:`V`: never of
+        the wrong sign, and as smooth as a gradient (Gauss-Newton).
     """
 
     twin: Twin
@@ -60,6 +63,7 @@ class Problem:
     reward_offset: float | Scalar = 0.0
     terminal_value: TerminalValue | None = None
     terminal_curvature: bool = False
+    terminal_root: TerminalValue | None = None
 
     @property
     def n_controls(self) -> int:
