@@ -4,6 +4,7 @@ import io
 from pathlib import Path
 from typing import Any
 
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import KVWriter, Logger
 
@@ -60,6 +61,15 @@ def logged(model: BaseAlgorithm) -> Lines:
     lines = Lines()
     model.set_logger(Logger(folder=None, output_formats=[lines]))
     return lines
+
+
+def same(first: dict, second: dict) -> bool:
+    """:return: whether two results of ``get_parameters`` are equal"""
+    return all(
+        th.equal(tensor, second[part][key])
+        for part, tensors in first.items()
+        for key, tensor in tensors.items()
+    )
 
 
 def saved(model: BaseAlgorithm) -> io.BytesIO:

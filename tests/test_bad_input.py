@@ -144,6 +144,7 @@ def test_the_pair_that_reset_returns_is_no_observation(name):
         ("gamma", np.nan),
         ("loss", "cubic"),
         ("reset_share", 1.5),
+        ("random_share", -0.5),
         ("gain_weight", -0.1),
         ("sensitivity_weight", np.nan),
         ("averaging", "much"),

@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch as th
-from small_models import NAMES, PLANNERS, saved, small
+from small_models import NAMES, PLANNERS, same, saved, small
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -41,14 +41,6 @@ for name in sys.argv[2:]:
 def observations() -> np.ndarray:
     env = gymnasium.make("Pendulum-v1")
     return np.stack([env.reset(seed=seed)[0] for seed in range(20)])
-
-
-def same(first: dict, second: dict) -> bool:
-    return all(
-        th.equal(tensor, second[part][key])
-        for part, tensors in first.items()
-        for key, tensor in tensors.items()
-    )
 
 
 def pickled_names(data: dict) -> list[str]:
@@ -128,6 +120,17 @@ def test_a_model_loaded_without_environment_takes_one_later(name):
     loaded.set_env(gymnasium.make("Pendulum-v1"))
 
     assert loaded.learn(25).num_timesteps == 25
+
+
+def test_a_file_of_one_twin_algorithm_is_not_loaded_as_another():
+    class Mine(algos.HDS):
+        pass
+
+    file = saved(small("hds"))
+
+    with pytest.raises(ValueError, match=r"HDS saved this model: use HDS\.load, not PODS\.load"):
+        algos.PODS.load(file)
+    assert isinstance(Mine.load(file), Mine)
 
 
 @every_algorithm

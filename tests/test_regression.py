@@ -49,3 +49,18 @@ def test_an_epoch_without_samples_moves_nothing():
 
     np.testing.assert_array_equal(after.networks.inside.mean, before.networks.inside.mean)
     np.testing.assert_array_equal(after.progress.control_scale, before.progress.control_scale)
+
+
+def test_new_scales_leave_what_the_networks_compute():
+    before, obs = learner_after(3), jnp.array([[0.3, -2.0], [4.0, 1.0]])
+
+    after = rescale(before, samples([1.0, 1.0, 0.0]))
+
+    networks = {"actor": Actor(1, (4,), nn.tanh), "value": Value((4,), nn.tanh)}
+    for name, network in networks.items():
+        old, new = (getattr(learner.networks, name) for learner in (before, after))
+        expected = network.apply(old, before.networks.inside(obs))
+        np.testing.assert_allclose(
+            network.apply(new, after.networks.inside(obs)), expected, rtol=1e-4
+        )
+        assert not np.allclose(network.apply(old, after.networks.inside(obs)), expected, rtol=1e-2)

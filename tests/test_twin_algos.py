@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from point_mass import PointMass, point_mass_env
-from small_models import PLANNERS, logged, small
+from small_models import PLANNERS, logged, same, small
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
@@ -18,6 +18,8 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_hds import algos, effects, twins
+from sb3_hds.algos import twin_algorithm
+from sb3_hds.algos.arguments import visited_states
 from sb3_hds.algos.twin_policy import all_finite
 from sb3_hds.core import Twin
 from sb3_hds.errors import EnvironmentMismatchError, NoTwinError, RewardError
@@ -89,6 +91,11 @@ class Dead(gymnasium.ObservationWrapper):
 
 def finite(model) -> bool:
     return all_finite(model.policy.networks)
+
+
+def close(first, second) -> bool:
+    near = jax.tree.map(lambda a, b: bool(jnp.allclose(a, b, rtol=1e-5)), first, second)
+    return all(jax.tree.leaves(near))
 
 
 def n_epochs(model) -> int:
@@ -172,13 +179,13 @@ def test_an_epoch_may_wait_for_the_end_of_an_episode(name):
 @every_planner
 def test_rates_of_policy_and_value_follow_their_own_schedules(name, monkeypatch):
     model = small(name, pretrain_epochs=4, learning_rate=1e-3, value_learning_rate="lin_1e-2")
-    seen, knobs = [], model._knobs
+    seen, knobs_of = [], twin_algorithm.knobs_of
 
-    def recorded(gradient_steps):
-        seen.append(knobs(gradient_steps))
+    def recorded(*arguments):
+        seen.append(knobs_of(*arguments))
         return seen[-1]
 
-    monkeypatch.setattr(model, "_knobs", recorded)
+    monkeypatch.setattr(twin_algorithm, "knobs_of", recorded)
     model.learn(0)
 
     assert [float(k.learning_rate) for k in seen] == [1e-3] * 4
@@ -191,7 +198,7 @@ def test_rates_of_policy_and_value_follow_their_own_schedules(name, monkeypatch)
 def test_relabelling_plans_from_states_that_the_environment_visited(name):
     model = small(name, relabel_share=1.0).learn(50)
 
-    visited, relabel = model._visited(3)
+    visited, relabel = visited_states(model, 3)
 
     stored = model.replay_buffer.observations[:50].reshape(50, 3)
     assert relabel.all()
@@ -201,7 +208,8 @@ def test_relabelling_plans_from_states_that_the_environment_visited(name):
 
 @every_planner
 def test_a_plan_is_never_worse_than_what_it_started_from(name):
-    model = small(name, pretrain_epochs=10)
+    cold = {"temperature": 0.0} if name == "hds" else {}
+    model = small(name, pretrain_epochs=10, **cold)
     lines = logged(model)
 
     model.learn(0)
@@ -342,6 +350,76 @@ def test_it_learns_through_a_twin_with_friction(name):
     assert np.isfinite(lines.column("train/plan_return_after")).all() and finite(model)
 
 
+@every_planner
+def test_some_rollouts_go_on_for_long_while_others_start_afresh(name):
+    model = small(name, n_rollouts=64, reset_share=0.5, pretrain_epochs=30).learn(0)
+
+    ages = np.asarray(model._workspace.ages)
+
+    # They go on by two steps per epoch; the first quarter starts afresh once in eight epochs, the
+    # last one seven times.
+    assert ages[:16].mean() > 10.0 > 2.0 > ages[48:].mean()
+    assert (
+        small(name, reset_share=0.0, pretrain_epochs=3).learn(0)._workspace.ages.tolist()
+        == [6.0] * 8
+    )
+
+
+@every_planner
+def test_random_plans_are_tried_for_a_share_of_the_rollouts(name):
+    def trained(**changes):
+        model = small(name, pretrain_epochs=2, **changes).learn(0)
+        return model.twin_timesteps, model.get_parameters()
+
+    none, without = trained(n_random_plans=0)
+    also_none, zero_share = trained(random_share=0.0)
+    half, with_half = trained(random_share=0.5)
+    every, _ = trained(random_share=1.0)
+
+    assert none == also_none and same(without, zero_share)
+    assert every - half == half - none > 0 and not same(without, with_half)
+
+
+@every_planner
+def test_scales_may_stay_those_of_the_first_rollouts(name):
+    model = small(name, adapt_scales=False, pretrain_epochs=1).learn(0)
+    inside, progress = model.policy.networks.inside, model.policy.progress
+
+    model.learn(100)
+
+    after = model.policy.networks.inside
+    np.testing.assert_array_equal(after.mean, inside.mean)
+    np.testing.assert_array_equal(after.scale, inside.scale)
+    np.testing.assert_array_equal(model.policy.progress.control_scale, progress.control_scale)
+
+
+@every_planner
+def test_the_better_of_two_policies_acts(name):
+    model = small(name, point_mass_env(), compare_every=1, pretrain_epochs=9, adapt_scales=False)
+    nets = model.learn(0).policy.networks
+    good, bad = nets.average, jax.tree.map(lambda leaf: leaf + 5.0, nets.average)
+
+    def compared(average, acting):
+        # Without regression steps, the average of equal policies stays what it is.
+        model.policy.networks = nets._replace(actor=average, average=average, acting=acting)
+        model.run_epoch(0)
+        values = model.logger.name_to_value
+        return values["train/return_of_average"], values["train/return_of_best"]
+
+    of_average, of_best = compared(average=good, acting=bad)
+    assert of_average == of_best and close(model.policy.networks.acting, good)
+    of_average, of_best = compared(average=bad, acting=good)
+    assert of_average < of_best and close(model.policy.networks.acting, good)
+
+
+@every_planner
+def test_the_average_acts_until_it_was_first_compared_and_always_where_nothing_is(name):
+    for every, n_epochs in ((5, 3), (0, 6)):
+        nets = small(name, compare_every=every, pretrain_epochs=n_epochs).learn(0).policy.networks
+        assert close(nets.acting, nets.average)
+        assert close(nets.acting_inside, nets.inside)
+
+
 PAPER = {
     "reset_share": 1.0,
     "n_random_plans": 0,
@@ -351,6 +429,9 @@ PAPER = {
     "gain_weight": 0.0,
     "sensitivity_weight": 0.0,
     "averaging": 0.0,
+    "adapt_scales": False,
+    "compare_every": 0,
+    "learned_share": 1.0,
     "plan_memory": 1,
     "gamma": 1.0,
 }
@@ -378,6 +459,7 @@ def test_the_settings_of_the_pods_paper_improve_plans(name, order):
         pytest.param({"terminal_value": False}, marks=pytest.mark.expensive),
         pytest.param({"lookahead": 0}, marks=pytest.mark.expensive),
         pytest.param({"n_random_plans": 0}, marks=pytest.mark.expensive),
+        pytest.param({"random_share": 1.0}, marks=pytest.mark.expensive),
         pytest.param({"reset_share": 1.0}, marks=pytest.mark.expensive),
         pytest.param({"gamma": 1.0}, marks=pytest.mark.expensive),
         pytest.param({"loss": "squared"}, marks=pytest.mark.expensive),

@@ -31,6 +31,7 @@ _AT_LEAST = {
     "n_step_sizes": 2,
     "n_random_plans": 0,
     "plan_memory": 1,
+    "compare_every": 0,
     "pretrain_epochs": 0,
     "batch_size": 1,
     "gradient_steps": -1,
@@ -39,6 +40,8 @@ _DERIVED = ("horizon", "lookahead")
 _SHARES = (
     "reset_share",
     "relabel_share",
+    "random_share",
+    "learned_share",
     "gain_weight",
     "sensitivity_weight",
     "averaging",
@@ -91,6 +94,17 @@ def check_policy(algorithm: type, policy: Any) -> None:
         raise ValueError(
             f"{algorithm.__name__} cannot use the policy {policy.__name__}: pass 'MlpPolicy'. "
             "A file that another algorithm saved is loaded by the class of that algorithm."
+        )
+
+
+def check_origin(algorithm: type, saved_by: str) -> None:
+    """
+    :param saved_by: name of the class whose arguments a model has
+    :raises ValueError: if that is neither this class nor one that it extends
+    """
+    if saved_by not in (parent.__name__ for parent in algorithm.__mro__):
+        raise ValueError(
+            f"{saved_by} saved this model: use {saved_by}.load, not {algorithm.__name__}.load."
         )
 
 

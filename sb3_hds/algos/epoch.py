@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.algos.learner import (
@@ -18,6 +19,8 @@ from sb3_hds.algos.learner import (
     Knobs,
     Learner,
     Settings,
+    for_each,
+    longest_episode,
     problem_of,
     resets,
 )
@@ -39,8 +42,6 @@ from sb3_hds.planning.problem import Control, Controls
 PLANNERS = ("first_order", "gauss_newton", "ilqr")
 # By this much, in units of the objective, the plan that began as the policy's own is preferred.
 _TIE = 1e-3
-# Episode length where a twin declares none.
-_LONG_EPISODE = 1000
 
 
 class Outcome(NamedTuple):
@@ -118,7 +119,9 @@ def plan_ahead(settings: Settings, learner: Learner, knobs: Knobs) -> tuple[Lear
     )
     moved, ages = _move_on(settings, learner, knobs, problem, starts, k_move)
     outcome = _outcome(settings, learner, choice, finite)
-    learner = rescale(remember(settings, learner, samples), samples)
+    learner = remember(settings, learner, samples)
+    if settings.adapt_scales:
+        learner = rescale(learner, samples)
     progress = learner.progress._replace(gain=_mean(gain, finite), key=jax.random.key_data(key))
     workspace = learner.workspace._replace(starts=moved, ages=ages)
     return learner._replace(progress=progress, workspace=workspace), outcome
@@ -152,9 +155,10 @@ def twin_steps_per_epoch(settings: Settings) -> int:
     s = settings
     columns = 2 * len(s.twin.joints) + len(s.twin.actuators)
     improving = s.n_iterations * s.horizon * (1 + columns + s.n_step_sizes)
-    n_sources = 2 if s.n_candidates else 1
-    planning = s.horizon * (1 + s.n_candidates) + n_sources * (s.horizon + improving)
-    return s.n_rollouts * (planning + (n_sources + 1) * s.lookahead + s.advance)
+    n, n_random = s.n_rollouts, _random_slots(s).size
+    first = s.horizon * (n + n_random * s.n_candidates)
+    planning = (n + n_random) * (s.horizon + improving)
+    return first + planning + (2 * n + n_random) * s.lookahead + n * s.advance
 
 
 def _plan(
@@ -166,33 +170,45 @@ def _plan(
     key: PRNGKeyArray,
 ) -> Choice:
     """The policy's own plans, and for each start state the plan that is kept."""
-    k_random, k_improve = jax.random.split(key)
+    k_random, k_improve, k_keep = jax.random.split(key, 3)
+    n, fresh = settings.n_rollouts, _random_slots(settings)
     policy = partial(control_of, settings, learner, knobs)
-    own = jax.vmap(lambda start: follow(problem, start, policy, settings.horizon))(starts)
-    sources = [own.controls]
-    if settings.n_candidates:
-        keys = jax.random.split(k_random, settings.n_rollouts)
+    own = for_each(lambda start: follow(problem, start, policy, settings.horizon), starts)
+    slots = np.concatenate([np.arange(n), fresh])
+    # Without the barrier, XLA gathers again in every step of the loops.
+    many = jax.lax.optimization_barrier(_pick(starts, slots))
+    controls = own.controls
+    if fresh.size:
         search = lambda s, k: best_of_random(problem, s, k, settings.horizon, settings.n_candidates)  # noqa: E731
-        sources.append(jax.vmap(search)(starts, keys).controls)
-    improved, sensitivity = _improve(settings, learner, knobs, problem, starts, sources, k_improve)
+        keys = jax.random.split(k_random, fresh.size)
+        found = jax.vmap(search)(_pick(many, slice(n, None)), keys)
+        controls = jnp.concatenate([controls, found.controls])
+    improved, sensitivity = _improve(settings, learner, knobs, problem, many, controls, k_improve)
 
-    plans = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), improved, own)
-    ends = jax.tree.map(lambda leaf: leaf[:, :, -1], plans.states)
-    tails = jax.vmap(jax.vmap(lambda end: _tail(settings, problem, policy, end)))(ends)
-    values = jax.vmap(jax.vmap(lambda p, tail: score(problem, p.rewards, p.alive, tail)))(
-        plans, tails
-    )
+    plans = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), improved, own)
+    ends = jax.tree.map(lambda leaf: leaf[:, -1], plans.states)
+    tails = for_each(lambda end: _tail(settings, problem, policy, end), ends)
+    values = jax.vmap(lambda p, tail: score(problem, p.rewards, p.alive, tail))(plans, tails)
     plans = plans._replace(value=values)
 
-    last = len(sources)
-    best = jnp.argmax(values[:last].at[0].add(_TIE), axis=0)
-    kept = best if settings.annealed else jnp.where(_pick(values, best) > values[last], best, last)
+    others = n + np.arange(fresh.size)
+    better = values[others] > values[fresh] + _TIE
+    best = jnp.arange(n).at[fresh].set(jnp.where(better, others, fresh))
+    unchanged = slots.size + jnp.arange(n)
+    advantage = values[best] - values[unchanged]
+    if settings.annealed:
+        temperature = knobs.temperature * learner.progress.gain
+        advantage += temperature * jax.random.logistic(k_keep, (n,))
+    kept = jnp.where(advantage > 0.0, best, unchanged)
     return Choice(
-        own._replace(value=values[last]),
-        _pick(plans, kept),
-        _pick(tails, kept),
-        _pick(sensitivity, best),
+        _pick(plans, unchanged), _pick(plans, kept), _pick(tails, kept), _pick(sensitivity, best)
     )
+
+
+def _random_slots(settings: Settings) -> np.ndarray:
+    """:return: the rollouts for which random plans are tried too"""
+    count = round(settings.n_rollouts * settings.random_share) if settings.n_candidates else 0
+    return np.linspace(0, settings.n_rollouts, count, endpoint=False).astype(int)
 
 
 def _improve(
@@ -201,11 +217,10 @@ def _improve(
     knobs: Knobs,
     problem: Problem,
     starts: State,
-    sources: list[Float[Array, "rollouts horizon act"]],
+    controls: Float[Array, "plans horizon act"],
     key: PRNGKeyArray,
-) -> tuple[Plan, Float[Array, "sources rollouts horizon"]]:
-    """Improve every source of plans; leaves of shape ``(n_sources, n_rollouts, ...)``."""
-    n, n_sources = settings.n_rollouts, len(sources)
+) -> tuple[Plan, Float[Array, "plans horizon"]]:
+    """:return: the improved plans, and what an error of each of their controls costs"""
     discounts = settings.discount ** jnp.arange(settings.horizon)
     temperature = knobs.temperature * learner.progress.gain
 
@@ -222,12 +237,8 @@ def _improve(
         improver = gradient_ascent if settings.planner == "first_order" else gauss_newton
         return improver(problem, start, controls, **options), jnp.ones(settings.horizon)
 
-    keys = jax.random.split(key, n_sources * n) if settings.annealed else None
-    many = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * n_sources), starts)
-    together = jax.vmap(one, (0, 0, None if keys is None else 0))
-    plans, sensitivity = together(many, jnp.concatenate(sources), keys)
-    split = lambda leaf: leaf.reshape(n_sources, n, *leaf.shape[1:])  # noqa: E731
-    return jax.tree.map(split, plans), split(sensitivity)
+    keys = jax.random.split(key, controls.shape[0]) if settings.annealed else None
+    return jax.vmap(one, (0, 0, None if keys is None else 0))(starts, controls, keys)
 
 
 def _tail(settings: Settings, problem: Problem, policy, end: State) -> jax.Array:
@@ -258,14 +269,23 @@ def _move_on(
         policy = lambda obs: control_of(settings, learner, knobs, obs) + offset  # noqa: E731
         return follow(problem, start, policy, settings.advance)
 
-    paths = jax.vmap(wander)(starts, offsets)
+    paths = for_each(wander, starts, offsets)
     moved = jax.tree.map(lambda leaf: leaf[:, -1], paths.states)
     ages = learner.workspace.ages + settings.advance
     finite = jnp.isfinite(moved.q).all(1) & jnp.isfinite(moved.v).all(1)
-    too_old = ages >= (settings.twin.max_episode_steps or _LONG_EPISODE)
-    drawn = jax.random.uniform(k_reset, (n,)) < knobs.reset_share
+    too_old = ages >= longest_episode(settings.twin)
+    drawn = jax.random.uniform(k_reset, (n,)) < _reset_rates(knobs.reset_share, n)
     again = too_old | drawn | ~paths.alive[:, -1] | ~finite
     return _where(again, fresh, moved), jnp.where(again, 0.0, ages)
+
+
+def _reset_rates(share: float, n: int) -> Float[Array, " rollouts"]:
+    """
+    How often each rollout starts afresh: ``share`` on the average, spread from hardly ever to
+    nearly always, so that there are start states soon after a reset and long after one.
+    """
+    position = (jnp.arange(n) + 0.5) / n
+    return position ** (1.0 / share - 1.0)
 
 
 def _outcome(settings: Settings, learner: Learner, choice: Choice, finite: jax.Array) -> Outcome:
@@ -286,8 +306,8 @@ def _mean(values: jax.Array, counted: jax.Array) -> jax.Array:
 
 
 def _pick(tree, index):
-    """From leaves of shape ``(sources, n, ...)`` take source ``index[i]`` for each i."""
-    return jax.tree.map(lambda leaf: leaf[index, jnp.arange(index.shape[0])], tree)
+    """:return: the rows ``index`` of every leaf"""
+    return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
 def _where(condition, new, old):

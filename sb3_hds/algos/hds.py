@@ -55,6 +55,7 @@ class HDS(TwinAlgorithm):
     :param n_step_sizes: candidates of each line search, "no change" included
     :param n_random_plans: random sequences of which the best is improved too, the remedy against
         local optima; 0 switches it off (the paper)
+    :param random_share: share of start states for which they are tried
     :param lookahead: steps for which the policy is followed beyond the end of a plan when plans are
         compared; None: five horizons; 0 switches it off (the paper)
     :param terminal_value: whether a value network judges the end of a plan (the paper: no)
@@ -69,13 +70,21 @@ class HDS(TwinAlgorithm):
     :param temperature_decay: factor on the temperature after each epoch
     :param relabel_share: share of plans that start in states in which the real environment was seen
     :param plan_memory: epochs whose plans are learned from (the paper: 1)
+    :param learned_share: share of each plan, from its start, that is learned from: what it does at
+        its end depends most on the learned value (the paper: 1)
     :param loss: ``"smooth_absolute"`` (in units of the typical control, see the documentation) or
         ``"squared"`` (the paper)
     :param gain_weight: 0..1, how much a sample counts in proportion to what its plan gained over
         the policy (the paper: 0)
     :param sensitivity_weight: 0..1, how much it counts in proportion to what an error of its
         control costs; only with ``"ilqr"`` (the paper: 0)
-    :param averaging: decay per epoch of the average of policies that acts (the paper: 0)
+    :param averaging: decay per epoch of the average of policies (the paper: 0)
+    :param adapt_scales: whether the scales of the networks' inputs and of the regression's errors
+        follow the plans (near a balance both are far smaller than in random rollouts); False keeps
+        those of the first rollouts
+    :param compare_every: epochs after which the average policy and the one that acts go through
+        whole episodes of the twin, and the better one acts from then on; 0: the average acts (the
+        paper)
     :param policy_kwargs: ``net_arch``, ``activation_fn``, ``max_grad_norm``
     :param stats_window_size: episodes in the averages that are logged
     :param tensorboard_log: folder for TensorBoard
@@ -112,6 +121,7 @@ class HDS(TwinAlgorithm):
         n_iterations: int = 3,
         n_step_sizes: int = 6,
         n_random_plans: int = 7,
+        random_share: float = 0.5,
         lookahead: int | None = None,
         terminal_value: bool = True,
         reset_share: float = 0.5,
@@ -121,10 +131,13 @@ class HDS(TwinAlgorithm):
         temperature_decay: float = 0.9,
         relabel_share: float = 0.25,
         plan_memory: int = 8,
+        learned_share: float = 0.5,
         loss: str = "smooth_absolute",
         gain_weight: float = 0.9,
         sensitivity_weight: float = 0.9,
         averaging: float = 0.9,
+        adapt_scales: bool = True,
+        compare_every: int = 10,
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -158,6 +171,7 @@ class HDS(TwinAlgorithm):
             n_iterations=n_iterations,
             n_step_sizes=n_step_sizes,
             n_random_plans=n_random_plans,
+            random_share=random_share,
             lookahead=lookahead,
             terminal_value=terminal_value,
             reset_share=reset_share,
@@ -167,10 +181,13 @@ class HDS(TwinAlgorithm):
             temperature_decay=temperature_decay,
             relabel_share=relabel_share,
             plan_memory=plan_memory,
+            learned_share=learned_share,
             loss=loss,
             gain_weight=gain_weight,
             sensitivity_weight=sensitivity_weight,
             averaging=averaging,
+            adapt_scales=adapt_scales,
+            compare_every=compare_every,
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,

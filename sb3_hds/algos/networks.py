@@ -89,6 +89,21 @@ def output(network: Actor | Value, weights: Mapping[str, Any], obs: jax.Array) -
     return cast(jax.Array, network.apply(weights, obs))
 
 
+def with_input_scales(weights: Mapping[str, Any], old: Any, new: Any) -> Mapping[str, Any]:
+    """
+    :param weights: of an ``Actor`` or ``Value`` whose input is ``(obs - old.mean) / old.scale``
+    :param new: mean and scale from now on, each of shape ``(n_obs,)``
+    :return: weights that compute the same of ``(obs - new.mean) / new.scale``
+    """
+    layers = dict(weights["params"])
+    kernel, bias = layers["Dense_0"]["kernel"], layers["Dense_0"]["bias"]
+    layers["Dense_0"] = {
+        "kernel": kernel * (new.scale / old.scale)[:, None],
+        "bias": bias + ((new.mean - old.mean) / old.scale) @ kernel,
+    }
+    return {**weights, "params": layers}
+
+
 def squash(value: jax.Array) -> jax.Array:
     r"""
     The root that the value network learns: :math:`y\,(|y| + 0.3) = V`.

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sb3_hds.algos.learner import Knobs, Learner, Samples, Settings, optimiser
-from sb3_hds.algos.networks import output, squash
+from sb3_hds.algos.networks import output, squash, with_input_scales
 from sb3_hds.planning import Plan, Problem
 
 # Where the absolute error of the regression turns into a squared one, in units of the control
@@ -39,7 +39,7 @@ def samples_of(
     :param tails: value of each plan's last state
     :param gain: of each plan over the policy's own
     :param sensitivity: cost of an error of each control
-    :return: samples, leaves of shape ``(n_rollouts * horizon, ...)``, and which plans were finite;
+    :return: samples, leaves of shape ``(horizon * n_rollouts, ...)``, and which plans were finite;
         the others weigh nothing
     """
     before = jax.tree.map(lambda leaf: leaf[:, :-1], kept.states)
@@ -53,7 +53,7 @@ def samples_of(
 
     def flat(x: jax.Array) -> jax.Array:
         clean = jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, 0.0)
-        return clean.reshape(-1, *x.shape[2:])
+        return jnp.swapaxes(clean, 0, 1).reshape(-1, *x.shape[2:])
 
     samples = Samples(
         flat(obs),
@@ -78,7 +78,7 @@ def rescale(learner: Learner, samples: Samples) -> Learner:
     """
     Let the scales of inputs and controls follow the plans: near a balance both are far smaller than
     in the random rollouts from which they were first taken. Old epochs are forgotten at a rate of
-    3/n.
+    3/n. The networks' first layers change with their inputs, so that what they compute does not.
     """
     nets, progress = learner.networks, learner.progress
     counted = samples.alive[:, None]
@@ -94,8 +94,14 @@ def rescale(learner: Learner, samples: Samples) -> Learner:
         mean=follow(nets.inside.mean, mean), scale=follow(nets.inside.scale, spread)
     )
     effort = jnp.clip(follow(progress.control_scale, effort), _LEAST_EFFORT, 1.0)
+    actor, average, value = (
+        with_input_scales(weights, nets.inside, inside)
+        for weights in (nets.actor, nets.average, nets.value)
+    )
+    nets = nets._replace(actor=actor, average=average, value=value, inside=inside)
     return learner._replace(
-        networks=nets._replace(inside=inside), progress=progress._replace(control_scale=effort)
+        networks=nets,
+        progress=progress._replace(control_scale=effort),
     )
 
 
@@ -104,6 +110,9 @@ def regress(
 ) -> tuple[Learner, Float[Array, " 2"]]:
     r"""
     Adam on minibatches of the remembered samples.
+
+    The policy learns from the first steps of each plan only: what a plan does towards its end
+    depends on the value found there. The value, which is asked for at the ends, learns from all.
 
     The policy's loss is :math:`w\,\sqrt{e^2 + 0.1^2}` with the error :math:`e` in units of the
     control scale: a squared error averages between turning left and turning right, and blurs the
@@ -114,6 +123,13 @@ def regress(
     adam, work = optimiser(settings.max_grad_norm), learner.workspace
     filled = jnp.minimum(work.n_filled, settings.plan_memory)
     inside, unit = learner.networks.inside, learner.progress.control_scale
+
+    n_columns = settings.horizon * settings.n_rollouts
+    n_early = settings.n_learned * settings.n_rollouts
+
+    def draw(key: PRNGKeyArray, n: int) -> Samples:
+        drawn = jax.random.randint(key, (settings.batch_size,), 0, filled * n)
+        return jax.tree.map(lambda leaf: leaf[drawn // n, drawn % n], work.samples)
 
     def policy_loss(actor, batch: Samples) -> jax.Array:
         error = output(settings.actor, actor, inside(batch.obs)) - batch.control
@@ -127,17 +143,12 @@ def regress(
 
     def update(i, carry):
         actor, value, actor_state, value_state, losses = carry
-        k_row, k_column = jax.random.split(jax.random.fold_in(key, i))
-        rows = jax.random.randint(k_row, (settings.batch_size,), 0, filled)
-        columns = jax.random.randint(
-            k_column, (settings.batch_size,), 0, work.samples.weight.shape[1]
-        )
-        batch = jax.tree.map(lambda leaf: leaf[rows, columns], work.samples)
-        loss_p, slope = jax.value_and_grad(policy_loss)(actor, batch)
+        k_policy, k_value = jax.random.split(jax.random.fold_in(key, i))
+        loss_p, slope = jax.value_and_grad(policy_loss)(actor, draw(k_policy, n_early))
         actor, actor_state = _descend(adam, slope, actor, actor_state, knobs.learning_rate)
         loss_v = jnp.zeros(())
         if settings.terminal_value:
-            loss_v, slope = jax.value_and_grad(value_loss)(value, batch)
+            loss_v, slope = jax.value_and_grad(value_loss)(value, draw(k_value, n_columns))
             value, value_state = _descend(
                 adam, slope, value, value_state, knobs.value_learning_rate
             )

@@ -9,12 +9,10 @@ in, nothing else; simulated steps are counted apart.
 import io
 import math
 import pathlib
-import warnings
 from collections.abc import Iterable
 from typing import Any, ClassVar, Self
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
 from sbx.common.off_policy_algorithm import OffPolicyAlgorithmJax
@@ -24,32 +22,34 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 
-from sb3_hds import effects, twins
+from sb3_hds import twins
+from sb3_hds.algos.arguments import knobs_of, settings_of
 from sb3_hds.algos.call_forms import (
     check_arguments,
+    check_origin,
     check_policy,
     device_or_cpu,
     jax_device,
     policy_and_env,
-    schedule_of,
 )
 from sb3_hds.algos.epoch import Report, epoch, twin_steps_per_epoch
-from sb3_hds.algos.learner import GENERATOR, Knobs, Learner, Settings, Workspace, begin
+from sb3_hds.algos.learner import (
+    GENERATOR,
+    Learner,
+    Settings,
+    Workspace,
+    begin,
+    longest_episode,
+)
+from sb3_hds.algos.log import record_epoch
+from sb3_hds.algos.model import check_reward, required, twin_from_spec
 from sb3_hds.algos.normalisation import prepare_statistics, view_of
 from sb3_hds.algos.persistence import damage_reported, write_whole
 from sb3_hds.algos.pretraining import Pretraining
+from sb3_hds.algos.selection import choose_policy, twin_steps_per_comparison
 from sb3_hds.algos.twin_policy import TwinPolicy, all_finite
 from sb3_hds.core import Twin
 from sb3_hds.envs.mirror import check_mirrors, twin_of
-from sb3_hds.errors import NoTwinError, RewardError
-
-# A plan looks this far ahead where the horizon is derived [s], within these numbers of steps.
-_HORIZON = 0.6
-_SHORTEST, _LONGEST = 12, 32
-# How many horizons the policy is followed beyond the end of a plan, where that is derived.
-_LOOKAHEAD = 5
-# Steps of an episode where the twin declares no limit; only for planning a schedule.
-_LONG_EPISODE = 1000
 
 
 class TwinAlgorithm(OffPolicyAlgorithmJax):
@@ -87,6 +87,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         n_iterations: int,
         n_step_sizes: int,
         n_random_plans: int,
+        random_share: float,
         lookahead: int | None,
         terminal_value: bool,
         reset_share: float,
@@ -96,10 +97,13 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         temperature_decay: float,
         relabel_share: float,
         plan_memory: int,
+        learned_share: float,
         loss: str,
         gain_weight: float,
         sensitivity_weight: float,
         averaging: float,
+        adapt_scales: bool,
+        compare_every: int,
         policy_kwargs: dict[str, Any] | None,
         stats_window_size: int,
         tensorboard_log: str | None,
@@ -146,6 +150,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         self.n_iterations = n_iterations
         self.n_step_sizes = n_step_sizes
         self.n_random_plans = n_random_plans
+        self.random_share = random_share
         self.lookahead = lookahead
         self.terminal_value = terminal_value
         self.reset_share = reset_share
@@ -155,10 +160,14 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         self.temperature_decay = temperature_decay
         self.relabel_share = relabel_share
         self.plan_memory = plan_memory
+        self.learned_share = learned_share
         self.loss = loss
         self.gain_weight = gain_weight
         self.sensitivity_weight = sensitivity_weight
         self.averaging = averaging
+        self.adapt_scales = adapt_scales
+        self.compare_every = compare_every
+        self.saved_by = type(self).__name__
         self.n_pretrained = 0
         self.twin_timesteps = 0
         self._n_updates = 0
@@ -217,8 +226,10 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         :raises NoTwinError: if the model was loaded without environment and without twin
         :raises FloatingPointError: if the regression diverged; the model keeps its last good state
         """
-        learner, settings, knobs = self._learner(), self._settings, self._knobs(gradient_steps)
+        learner, settings = self._learner(), self._settings
+        knobs = knobs_of(self, settings.twin, self._progress_remaining(), gradient_steps)
         learner, report = epoch(settings, learner, knobs)
+        learner, returns = choose_policy(settings, learner, knobs, self.compare_every)
         losses = float(report.policy_loss), float(report.value_loss)
         if not (all(map(math.isfinite, losses)) and all_finite(learner.networks)):
             raise FloatingPointError(
@@ -230,7 +241,9 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         self._n_updates += gradient_steps
         self._epochs_done += 1
         self.twin_timesteps += twin_steps_per_epoch(settings)
-        self._log(report, knobs)
+        if returns is not None:
+            self.twin_timesteps += twin_steps_per_comparison(settings)
+        record_epoch(self, report, knobs, returns)
         return report
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -288,6 +301,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
             return super().load(path, env, device_or_cpu(device), *args, **kwargs)
 
     def _setup_model(self) -> None:
+        check_origin(type(self), self.saved_by)
         check_arguments(self)
         super()._setup_model()
         device = jax_device(self._device_name)
@@ -305,7 +319,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         if isinstance(given, str):
             self.twin = twins.make(given)
         elif given is None and self.twin_spec is not None:
-            self.twin = _twin_from_file(self.twin_spec)
+            self.twin = twin_from_spec(self.twin_spec)
         if self.twin is not None:
             self.twin_spec = self.twin.to_spec()
         self._meet_env()
@@ -326,33 +340,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
 
     @property
     def _settings(self) -> Settings:
-        if self.twin is None:
-            way_out = "" if self.twin_spec else "Set an environment that has one (set_env). "
-            raise NoTwinError(
-                f"This model has no twin to plan in. {way_out}"
-                "Load it with one: load(path, env=env, twin=...)."
-            )
-        horizon = self.horizon or _derived_horizon(self.twin)
-        return Settings(
-            twin=self.twin,
-            actor=self.policy.actor_network,
-            value=self.policy.value_network,
-            n_rollouts=self.n_rollouts,
-            horizon=horizon,
-            lookahead=_LOOKAHEAD * horizon if self.lookahead is None else self.lookahead,
-            advance=(horizon + 1) // 2 if self.reset_share < 1.0 else 0,
-            planner=self.planner or ("first_order" if self.order == 1 else "ilqr"),
-            n_iterations=self.n_iterations,
-            n_step_sizes=self.n_step_sizes,
-            n_candidates=self.n_random_plans,
-            discount=self.gamma,
-            terminal_value=self.terminal_value,
-            plan_memory=self.plan_memory,
-            batch_size=self.batch_size,
-            squared_error=self.loss == "squared",
-            max_grad_norm=self.policy.max_grad_norm,
-            annealed=self.temperature > 0.0,
-        )
+        return settings_of(self, required(self.twin, self.twin_spec))
 
     def _learner(self) -> Learner:
         """What an epoch changes. Before the first one, the scales of the task are found."""
@@ -375,44 +363,6 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
             self._workspace, policy.progress = workspace, progress
         return Learner(policy.networks, policy.progress, workspace)
 
-    def _knobs(self, gradient_steps: int) -> Knobs:
-        twin, n_epochs = self._settings.twin, int(self.policy.progress.n_epochs)
-        n_obs = len(twin.channels)
-        progress = self._progress_remaining()
-        rate = self.lr_schedule(progress)
-        value_rate = rate
-        if self.value_learning_rate is not None:
-            value_rate = schedule_of(self.value_learning_rate)(progress)
-        visited, relabel = self._visited(n_obs)
-        return Knobs(
-            twin.params,
-            rate,
-            value_rate,
-            self.exploration_noise * self.exploration_decay**n_epochs,
-            self.temperature * self.temperature_decay**n_epochs,
-            self.reset_share,
-            self.gain_weight,
-            self.sensitivity_weight,
-            self.averaging,
-            gradient_steps,
-            visited,
-            relabel,
-            view_of(self._vec_normalize_env, n_obs),
-        )
-
-    def _visited(self, n_obs: int) -> tuple[jax.Array, jax.Array]:
-        """Observations of the real environment to plan from, and for which start states."""
-        buffer, n = self.replay_buffer, self.n_rollouts
-        count = round(self.relabel_share * n)
-        visited = np.zeros((n, n_obs), np.float32)
-        if buffer is None or buffer.size() == 0:
-            count = 0
-        elif count:
-            steps = np.random.randint(buffer.size(), size=count)
-            copies = np.random.randint(buffer.n_envs, size=count)
-            visited[:count] = buffer.observations[steps, copies].reshape(count, n_obs)
-        return jnp.asarray(visited), jnp.arange(n) < count
-
     def _progress_remaining(self) -> float:
         """From 1 to 0 over the planning epochs of this call of ``learn``, pretraining included."""
         if not self._epochs_planned:
@@ -433,8 +383,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         assert isinstance(self.train_freq, TrainFreq)
         if self.train_freq.unit.value == "step":
             return self.train_freq.frequency * self.n_envs
-        limit = self.twin.max_episode_steps if self.twin is not None else None
-        return self.train_freq.frequency * (limit or _LONG_EPISODE)
+        return self.train_freq.frequency * longest_episode(self._settings.twin)
 
     def pretrain_epoch(self) -> None:
         """One planning epoch before the first real step, like any other."""
@@ -451,56 +400,9 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
             given = [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
         return super()._init_callback([Pretraining(progress_bar), *given], progress_bar)
 
-    def _log(self, report: Report, knobs: Knobs) -> None:
-        record = self.logger.record
-        record("train/learning_rate", knobs.learning_rate)
-        record("train/plan_return_before", float(report.before))
-        record("train/plan_return_after", float(report.after))
-        record("train/policy_loss", float(report.policy_loss))
-        record("train/value_loss", float(report.value_loss))
-        record("train/worsened_plans", int(report.worsened))
-        record("train/dropped_samples", int(report.dropped))
-        record("train/exploration_noise", knobs.noise)
-        record("train/temperature", knobs.temperature)
-        record("train/n_updates", self._n_updates, exclude="tensorboard")
-        record("time/epochs", int(self.policy.progress.n_epochs))
-        record("time/twin_timesteps", self.twin_timesteps)
-
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
 
     def _excluded_save_params(self) -> list[str]:
         ours = ["policy", "twin", "key", "_workspace", "_device_name"]
         return [*super()._excluded_save_params(), *ours]
-
-
-def check_reward(twin: Twin) -> None:
-    """
-    :raises RewardError: if planning has nothing to climb in this twin
-    """
-    base = getattr(twin, "base", twin)
-    surrogate = type(base).planning_reward is not Twin.planning_reward
-    if not surrogate and type(base).reward is Twin.reward:
-        raise RewardError(
-            f"{twin.name} has no reward: it simulates a system without a task. Implement `reward`."
-        )
-    if not surrogate and not base.reward_has_gradient:
-        raise RewardError(
-            f"The reward of {twin.name} is flat almost everywhere, so its gradient tells nothing. "
-            "Implement `planning_reward`: a smooth surrogate that is best where the reward is best."
-        )
-
-
-def _derived_horizon(twin: Twin) -> int:
-    return int(np.clip(round(_HORIZON / twin.dt), _SHORTEST, _LONGEST))
-
-
-def _twin_from_file(spec: dict[str, Any]) -> Twin | None:
-    try:
-        return twins.from_spec(spec, effects.ALL)
-    except NoTwinError as error:
-        warnings.warn(
-            f"The model can predict but not train, because its twin '{spec['twin']}' is not "
-            f"registered here. Register it, or load with twin=... ({str(error).splitlines()[0]})"
-        )
-        return None

@@ -109,8 +109,8 @@ class TwinPolicy(TensorPolicy):
 
 @partial(jax.jit, static_argnums=0)
 def _act(actor: Actor, networks: Networks, obs: Any) -> Any:
-    """Controls of the averaged policy for a batch of observations."""
-    return actor.apply(networks.average, networks.inside(jnp.asarray(obs, jnp.float32)))
+    """Controls of the acting policy for a batch of observations."""
+    return actor.apply(networks.acting, networks.acting_inside(jnp.asarray(obs, jnp.float32)))
 
 
 @jax.jit
@@ -120,7 +120,8 @@ def _finite(leaves: list[jax.Array]) -> jax.Array:
 
 def all_finite(networks: Networks) -> bool:
     """:return: whether no weight is infinite or not a number"""
-    return bool(_finite(jax.tree.leaves((networks.actor, networks.average, networks.value))))
+    learned = networks.actor, networks.average, networks.value, networks.acting
+    return bool(_finite(jax.tree.leaves(learned)))
 
 
 def _widths(
