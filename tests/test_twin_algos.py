@@ -19,13 +19,15 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_hds import algos, effects, twins
 from sb3_hds.algos import twin_algorithm
-from sb3_hds.algos.arguments import visited_states
+from sb3_hds.algos.arguments import knobs_of, visited_states
+from sb3_hds.algos.regression import regress
 from sb3_hds.algos.twin_policy import all_finite
 from sb3_hds.core import Twin
 from sb3_hds.errors import EnvironmentMismatchError, NoTwinError, RewardError
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 every_planner = pytest.mark.parametrize("name", PLANNERS)
+_TAKE_TEMPERATURE = [n for n in PLANNERS if "temperature" in signature(algos.ALL[n]).parameters]
 
 
 def planners_with(argument: str) -> pytest.MarkDecorator:
@@ -208,7 +210,7 @@ def test_relabelling_plans_from_states_that_the_environment_visited(name):
 
 @every_planner
 def test_a_plan_is_never_worse_than_what_it_started_from(name):
-    cold = {"temperature": 0.0} if name == "hds" else {}
+    cold = {"temperature": 0.0} if name in _TAKE_TEMPERATURE else {}
     model = small(name, pretrain_epochs=10, **cold)
     lines = logged(model)
 
@@ -391,6 +393,29 @@ def test_scales_may_stay_those_of_the_first_rollouts(name):
     np.testing.assert_array_equal(after.mean, inside.mean)
     np.testing.assert_array_equal(after.scale, inside.scale)
     np.testing.assert_array_equal(model.policy.progress.control_scale, progress.control_scale)
+
+
+@every_planner
+def test_the_policy_learns_from_the_first_half_of_plans_and_the_value_from_all(name):
+    model = small(name, pretrain_epochs=1, learned_share=0.5).learn(0)
+    learner, settings = model._learner(), model._settings
+    knobs = knobs_of(model, settings.twin, 1.0, 4)
+    # Four steps of eight rollouts, first steps first.
+    late = jnp.arange(4 * 8) >= 2 * 8
+
+    def learned_with(field, where):
+        samples = learner.workspace.samples
+        rows = getattr(samples, field)
+        mask = where.reshape(1, -1, *[1] * (rows.ndim - 2))
+        changed = samples._replace(**{field: jnp.where(mask, rows + 1.0, rows)})
+        workspace = learner.workspace._replace(samples=changed)
+        key = jax.random.key(0, impl="unsafe_rbg")
+        return regress(settings, learner._replace(workspace=workspace), knobs, key)[0].networks
+
+    before = learned_with("control", jnp.zeros_like(late))
+    assert close(learned_with("control", late).actor, before.actor)
+    assert not close(learned_with("control", ~late).actor, before.actor)
+    assert not close(learned_with("value", late).value, before.value)
 
 
 @every_planner

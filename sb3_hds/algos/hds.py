@@ -64,9 +64,9 @@ class HDS(TwinAlgorithm):
     :param exploration_noise: standard deviation of a constant offset of the controls while start
         states go on, in units of the typical size of the plans' controls
     :param exploration_decay: factor on the noise after each epoch (the HDS project: 0.5 to 0.99)
-    :param temperature: of the annealed acceptance of step sizes, in units of the mean gain of the
-        last epoch's plans; 0 takes the best step always. The HDS project describes it and does not
-        run it.
+    :param temperature: of the annealed acceptance of step sizes and plans, in units of the mean
+        gain of the last epoch's plans; 0 takes the best always. The HDS project describes it and
+        does not run it.
     :param temperature_decay: factor on the temperature after each epoch
     :param relabel_share: share of plans that start in states in which the real environment was seen
     :param plan_memory: epochs whose plans are learned from (the paper: 1)
