@@ -78,9 +78,11 @@ def worker(method: str, goal: str, seed: int, epochs: int) -> dict:
         adapt_scales=False,
         learned_share=1.0,
         compare_every=0,
+        least_gain=0.0,
         gamma=1.0,
         batch_size=N_ROLLOUTS * 8,
         learning_rate=1e-3,
+        policy_kwargs={"linear_path": False},
         seed=seed,
     )
     model.learn(0) if model.pretrain_epochs == 0 else None

@@ -13,15 +13,31 @@ from small_models import PLANNERS, small
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_hds.algos import TwinPolicy
-from sb3_hds.algos.networks import ACTIVATIONS, Actor, Value, activation, squash, unsquash
+from sb3_hds.algos.networks import (
+    ACTIVATIONS,
+    Actor,
+    Value,
+    activation,
+    squash,
+    unsquash,
+    value_of,
+    with_input_scales,
+)
 from sb3_hds.algos.persistence import from_state_dict, to_state_dict
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+ROOTS = 9
 
 
 class Pair(NamedTuple):
     first: dict
     second: jax.Array
+
+
+class Scales(NamedTuple):
+    mean: jax.Array
+    scale: jax.Array
 
 
 def tree(fill: float) -> Pair:
@@ -36,7 +52,7 @@ def policy(low: float = -1.0, high: float = 1.0, **kwargs) -> TwinPolicy:
 
 def widths(weights) -> list[int]:
     layers = weights["params"].values()
-    return [layer["bias"].shape[0] for layer in layers]
+    return [layer["bias"].shape[0] for layer in layers if "bias" in layer]
 
 
 @pytest.mark.parametrize("name", ACTIVATIONS)
@@ -83,9 +99,44 @@ def test_one_value_comes_out_for_each_observation():
     value = Value((4, 5), nn.relu)
     weights = value.init(jax.random.key(0), jnp.zeros(3))
 
-    assert value.apply(weights, jnp.zeros(3)).shape == ()
-    assert value.apply(weights, jnp.zeros((7, 3))).shape == (7,)
-    assert widths(weights) == [4, 5, 1]
+    assert value_of(value.apply(weights, jnp.zeros(3))).shape == ()
+    assert value_of(value.apply(weights, jnp.zeros((7, 3)))).shape == (7,)
+    assert widths(weights) == [4, 5, ROOTS]
+
+
+def test_a_value_is_a_signed_root_less_squares():
+    # u(2) = 2 * (2 + 0.3), u(-2) the same below zero.
+    assert value_of(jnp.array([2.0, 0.0, 0.0])) == pytest.approx(4.6)
+    assert value_of(jnp.array([-2.0, 1.0, -3.0])) == pytest.approx(-4.6 - 1.0 - 9.0)
+
+
+@pytest.mark.parametrize("hidden", [(), (8,)])
+def test_what_an_actor_computes_does_not_change_with_the_scales_of_its_input(hidden):
+    actor, obs = Actor(2, hidden, nn.tanh), jax.random.normal(jax.random.key(0), (9, 3))
+    drawn = actor.init(jax.random.key(1), obs[0])
+    weights = jax.tree.map(lambda leaf: leaf + 0.3, drawn)
+    old = Scales(jnp.array([0.1, 0.0, -2.0]), jnp.array([1.0, 2.0, 0.5]))
+    new = Scales(jnp.array([0.4, -1.0, 1.0]), jnp.array([3.0, 0.2, 0.7]))
+
+    moved = with_input_scales(weights, old, new)
+
+    before = actor.apply(weights, (obs - old.mean) / old.scale)
+    # Single precision.
+    np.testing.assert_allclose(
+        actor.apply(moved, (obs - new.mean) / new.scale), before, rtol=1e-4, atol=1e-5
+    )
+
+
+def test_a_linear_path_leads_past_the_hidden_layers_unless_it_is_switched_off():
+    obs = jnp.ones(3)
+    with_path, without = Actor(1, (4,), nn.tanh), Actor(1, (4,), nn.tanh, linear_path=False)
+    drawn = with_path.init(jax.random.key(0), obs)["params"]
+    still = jax.tree.map(jnp.zeros_like, drawn) | {"linear": {"kernel": jnp.full((3, 1), 0.1)}}
+
+    assert with_path.apply({"params": still}, obs) == pytest.approx(np.tanh(0.3))
+    assert "linear" not in without.init(jax.random.key(0), obs)["params"]
+    assert policy().actor_network.linear_path
+    assert not policy(linear_path=False).actor_network.linear_path
 
 
 def test_squash_and_unsquash_undo_each_other():
@@ -136,12 +187,12 @@ def test_leaves_that_are_not_given_keep_their_values_where_that_is_allowed():
 @pytest.mark.parametrize(
     "net_arch, pi, vf",
     [
-        (None, [96, 96, 2], [64, 64, 1]),
-        ([5], [5, 2], [5, 1]),
-        ([], [2], [1]),
-        ({"pi": [4, 3], "vf": [6]}, [4, 3, 2], [6, 1]),
-        ({"pi": [4]}, [4, 2], [64, 64, 1]),
-        ({"vf": []}, [96, 96, 2], [1]),
+        (None, [96, 96, 2], [64, 64, ROOTS]),
+        ([5], [5, 2], [5, ROOTS]),
+        ([], [2], [ROOTS]),
+        ({"pi": [4, 3], "vf": [6]}, [4, 3, 2], [6, ROOTS]),
+        ({"pi": [4]}, [4, 2], [64, 64, ROOTS]),
+        ({"vf": []}, [96, 96, 2], [ROOTS]),
     ],
 )
 def test_net_arch_sets_the_widths_of_both_networks(net_arch, pi, vf):

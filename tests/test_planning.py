@@ -197,26 +197,45 @@ def test_the_expansion_holds_jacobians_and_hessians():
         np.testing.assert_allclose(expansion.curvature[t], 0.9**t * expected, rtol=1e-10)
 
 
-@pytest.mark.usefixtures("x64")
-def test_the_root_of_a_value_gives_its_curvature_where_it_is_below_zero():
-    twin, direction = Spring(), jnp.array([0.7, -0.2])
-    plan = planning.simulate(
-        Problem(twin, twin.params), _first(starts_of(twin, 1)), jnp.zeros((4, 1))
-    )
-
-    def root(obs):
-        return direction @ obs - 3.0
+def _curvatures(roots):
+    """Exact curvature of -|roots|^2 at the end of a plan, and the one taken from its slopes."""
+    twin = Spring()
+    plain = Problem(twin, twin.params)
+    plan = planning.simulate(plain, _first(starts_of(twin, 1)), jnp.zeros((4, 1)))
 
     def end_curvature(**how):
-        value = lambda obs: -(root(obs) ** 2)  # noqa: E731
+        value = lambda obs: -jnp.sum(roots(obs) ** 2)  # noqa: E731
         problem = Problem(twin, twin.params, terminal_value=value, **how)
         return planning.expand(problem, plan).end_curvature
 
-    hessian = end_curvature(terminal_curvature=True)
-    np.testing.assert_allclose(hessian, 2.0 * jnp.outer(direction, direction), rtol=1e-10)
-    np.testing.assert_allclose(end_curvature(terminal_root=root), hessian, rtol=1e-10)
-    assert not end_curvature(terminal_root=lambda obs: -root(obs)).any()
     assert not end_curvature().any()
+    exact, found = end_curvature(terminal_curvature=True), end_curvature(terminal_roots=roots)
+    at_end = plain.observe(jax.tree.map(lambda leaf: leaf[-1], plan.states))
+    return exact, found, at_end
+
+
+@pytest.mark.usefixtures("x64")
+def test_one_root_of_a_value_gives_its_curvature():
+    direction = jnp.array([0.7, -0.2])
+
+    exact, found, _ = _curvatures(lambda obs: (direction @ obs - 3.0)[None])
+
+    np.testing.assert_allclose(exact, 2.0 * jnp.outer(direction, direction), rtol=1e-10)
+    np.testing.assert_allclose(found, exact, rtol=1e-10)
+
+
+@pytest.mark.usefixtures("x64")
+def test_many_roots_of_a_value_give_its_curvature_at_the_goal_and_only_their_length_far_off():
+    slopes = jnp.array([[0.7, -0.2], [0.3, 0.5], [-0.1, 0.4]])
+    _, _, goal = _curvatures(lambda obs: slopes @ obs)
+
+    exact, at_goal, _ = _curvatures(lambda obs: slopes @ (obs - goal))
+    turn = lambda obs: 1e3 * jnp.stack([jnp.sin(obs[0]), jnp.cos(obs[0])])  # noqa: E731
+    _, turning, _ = _curvatures(turn)
+
+    np.testing.assert_allclose(at_goal, exact, rtol=1e-10)
+    # Its length is constant. Without fading this would be 2e6.
+    assert jnp.abs(turning).max() < 0.2
 
 
 @pytest.mark.usefixtures("x64")

@@ -445,6 +445,20 @@ def test_the_average_acts_until_it_was_first_compared_and_always_where_nothing_i
         assert close(nets.acting_inside, nets.inside)
 
 
+@every_planner
+def test_pretraining_ends_where_plans_gain_nothing_and_schedules_go_on_from_its_end(name):
+    idle = {"pretrain_epochs": 30, "n_random_plans": 0}
+    # More than a plan can gain, and less.
+    eager, thorough = small(name, least_gain=1e9, **idle), small(name, least_gain=0.0, **idle)
+
+    eager.learn(0)
+    thorough.learn(0)
+
+    assert (eager.n_pretrained, thorough.n_pretrained) == (20, 30)
+    assert eager._progress_remaining() == thorough._progress_remaining() == 0.0
+    assert eager.learn(0).n_pretrained == 20
+
+
 PAPER = {
     "reset_share": 1.0,
     "n_random_plans": 0,
@@ -456,9 +470,11 @@ PAPER = {
     "averaging": 0.0,
     "adapt_scales": False,
     "compare_every": 0,
+    "least_gain": 0.0,
     "learned_share": 1.0,
     "plan_memory": 1,
     "gamma": 1.0,
+    "policy_kwargs": {"linear_path": False},
 }
 
 

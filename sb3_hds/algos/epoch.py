@@ -37,7 +37,7 @@ from sb3_hds.planning import (
     ilqr,
     score,
 )
-from sb3_hds.planning.problem import Control, Controls
+from sb3_hds.planning.problem import Control
 
 PLANNERS = ("first_order", "gauss_newton", "ilqr")
 # By this much, in units of the objective, the plan that began as the policy's own is preferred.
@@ -107,17 +107,18 @@ def epoch(settings: Settings, learner: Learner, knobs: Knobs) -> tuple[Learner, 
 def plan_ahead(settings: Settings, learner: Learner, knobs: Knobs) -> tuple[Learner, Outcome]:
     """The first half of an epoch: everything that happens in the twin."""
     key = jax.random.wrap_key_data(learner.progress.key, impl=GENERATOR)
-    key, k_plan, k_move = jax.random.split(key, 3)
+    key, k_noise, k_plan, k_move = jax.random.split(key, 4)
     problem = problem_of(settings, learner, knobs)
     seen = jax.vmap(lambda obs: settings.twin.infer(obs, knobs.params))(knobs.visited)
     starts = _where(knobs.relabel, seen, learner.workspace.starts)
 
-    choice = _plan(settings, learner, knobs, problem, starts, k_plan)
+    own, wandering = _act(settings, learner, knobs, problem, starts, k_noise)
+    choice = _plan(settings, learner, knobs, problem, own, k_plan)
     gain = jnp.maximum(choice.kept.value - choice.own.value, 0.0)
     samples, finite = samples_of(
         knobs, problem, choice.kept, choice.tails, gain, choice.sensitivity
     )
-    moved, ages = _move_on(settings, learner, knobs, problem, starts, k_move)
+    moved, ages = _move_on(settings, learner, knobs, wandering, k_move)
     outcome = _outcome(settings, learner, choice, finite)
     learner = remember(settings, learner, samples)
     if settings.adapt_scales:
@@ -156,9 +157,34 @@ def twin_steps_per_epoch(settings: Settings) -> int:
     columns = 2 * len(s.twin.joints) + len(s.twin.actuators)
     improving = s.n_iterations * s.horizon * (1 + columns + s.n_step_sizes)
     n, n_random = s.n_rollouts, _random_slots(s).size
-    first = s.horizon * (n + n_random * s.n_candidates)
-    planning = (n + n_random) * (s.horizon + improving)
-    return first + planning + (2 * n + n_random) * s.lookahead + n * s.advance
+    acting = n * s.horizon * (2 if s.advance else 1)
+    planning = (n + n_random) * improving + n_random * s.n_candidates * s.horizon
+    return acting + planning + (2 * n + n_random) * s.lookahead
+
+
+def _act(
+    settings: Settings,
+    learner: Learner,
+    knobs: Knobs,
+    problem: Problem,
+    starts: State,
+    key: PRNGKeyArray,
+) -> tuple[Plan, Plan]:
+    """What the policy does from each start state, and what it does with exploration noise."""
+    policy = partial(control_of, settings, learner, knobs)
+
+    def act(start: State, offset: Control) -> Plan:
+        return follow(problem, start, lambda obs: policy(obs) + offset, settings.horizon)
+
+    n = settings.n_rollouts
+    noise = knobs.noise * learner.progress.control_scale
+    offsets = noise * jax.random.normal(key, (n, problem.n_controls))
+    if not settings.advance:
+        own = for_each(act, starts, jnp.zeros_like(offsets))
+        return own, own
+    rows = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), starts)
+    paths = for_each(act, rows, jnp.concatenate([jnp.zeros_like(offsets), offsets]))
+    return _pick(paths, slice(n)), _pick(paths, slice(n, None))
 
 
 def _plan(
@@ -166,24 +192,22 @@ def _plan(
     learner: Learner,
     knobs: Knobs,
     problem: Problem,
-    starts: State,
+    own: Plan,
     key: PRNGKeyArray,
 ) -> Choice:
-    """The policy's own plans, and for each start state the plan that is kept."""
+    """For each of the policy's own plans, the plan that is kept."""
     k_random, k_improve, k_keep = jax.random.split(key, 3)
     n, fresh = settings.n_rollouts, _random_slots(settings)
     policy = partial(control_of, settings, learner, knobs)
-    own = for_each(lambda start: follow(problem, start, policy, settings.horizon), starts)
-    slots = np.concatenate([np.arange(n), fresh])
-    # Without the barrier, XLA gathers again in every step of the loops.
-    many = jax.lax.optimization_barrier(_pick(starts, slots))
-    controls = own.controls
+    first = own
     if fresh.size:
+        # Without the barrier, XLA gathers again in every step of the loops.
+        starts = jax.tree.map(lambda leaf: leaf[fresh, 0], own.states)
+        starts = jax.lax.optimization_barrier(starts)
         search = lambda s, k: best_of_random(problem, s, k, settings.horizon, settings.n_candidates)  # noqa: E731
-        keys = jax.random.split(k_random, fresh.size)
-        found = jax.vmap(search)(_pick(many, slice(n, None)), keys)
-        controls = jnp.concatenate([controls, found.controls])
-    improved, sensitivity = _improve(settings, learner, knobs, problem, many, controls, k_improve)
+        found = jax.vmap(search)(starts, jax.random.split(k_random, fresh.size))
+        first = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), own, found)
+    improved, sensitivity = _improve(settings, learner, knobs, problem, first, k_improve)
 
     plans = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), improved, own)
     ends = jax.tree.map(lambda leaf: leaf[:, -1], plans.states)
@@ -194,7 +218,7 @@ def _plan(
     others = n + np.arange(fresh.size)
     better = values[others] > values[fresh] + _TIE
     best = jnp.arange(n).at[fresh].set(jnp.where(better, others, fresh))
-    unchanged = slots.size + jnp.arange(n)
+    unchanged = n + fresh.size + jnp.arange(n)
     advantage = values[best] - values[unchanged]
     if settings.annealed:
         temperature = knobs.temperature * learner.progress.gain
@@ -216,15 +240,15 @@ def _improve(
     learner: Learner,
     knobs: Knobs,
     problem: Problem,
-    starts: State,
-    controls: Float[Array, "plans horizon act"],
+    first: Plan,
     key: PRNGKeyArray,
 ) -> tuple[Plan, Float[Array, "plans horizon"]]:
     """:return: the improved plans, and what an error of each of their controls costs"""
     discounts = settings.discount ** jnp.arange(settings.horizon)
     temperature = knobs.temperature * learner.progress.gain
 
-    def one(start: State, controls: Controls, key: PRNGKeyArray | None):
+    def one(first: Plan, key: PRNGKeyArray | None):
+        start = jax.tree.map(lambda leaf: leaf[0], first.states)
         options = {
             "n_iterations": settings.n_iterations,
             "n_step_sizes": settings.n_step_sizes,
@@ -232,13 +256,13 @@ def _improve(
             "key": key,
         }
         if settings.planner == "ilqr":
-            plan, gains = ilqr(problem, start, controls, **options)
+            plan, gains = ilqr(problem, start, first, **options)
             return plan, jnp.sqrt(gains.sensitivity / discounts)
         improver = gradient_ascent if settings.planner == "first_order" else gauss_newton
-        return improver(problem, start, controls, **options), jnp.ones(settings.horizon)
+        return improver(problem, start, first, **options), jnp.ones(settings.horizon)
 
-    keys = jax.random.split(key, controls.shape[0]) if settings.annealed else None
-    return jax.vmap(one, (0, 0, None if keys is None else 0))(starts, controls, keys)
+    keys = jax.random.split(key, first.value.shape[0]) if settings.annealed else None
+    return jax.vmap(one, (0, None if keys is None else 0))(first, keys)
 
 
 def _tail(settings: Settings, problem: Problem, policy, end: State) -> jax.Array:
@@ -249,33 +273,20 @@ def _tail(settings: Settings, problem: Problem, policy, end: State) -> jax.Array
 
 
 def _move_on(
-    settings: Settings,
-    learner: Learner,
-    knobs: Knobs,
-    problem: Problem,
-    starts: State,
-    key: PRNGKeyArray,
+    settings: Settings, learner: Learner, knobs: Knobs, wandering: Plan, key: PRNGKeyArray
 ) -> tuple[State, Float[Array, " rollouts"]]:
-    """The next start states: where the policy goes with exploration noise, or a reset."""
+    """The next start states: where the policy went with exploration noise, or a reset."""
     n = settings.n_rollouts
-    k_noise, k_reset, k_draw = jax.random.split(key, 3)
+    k_reset, k_draw = jax.random.split(key)
     fresh = resets(settings.twin, knobs.params, k_draw, n)
     if not settings.advance:
         return fresh, jnp.zeros(n)
-    noise = knobs.noise * learner.progress.control_scale
-    offsets = noise * jax.random.normal(k_noise, (n, problem.n_controls))
-
-    def wander(start: State, offset: Control) -> Plan:
-        policy = lambda obs: control_of(settings, learner, knobs, obs) + offset  # noqa: E731
-        return follow(problem, start, policy, settings.advance)
-
-    paths = for_each(wander, starts, offsets)
-    moved = jax.tree.map(lambda leaf: leaf[:, -1], paths.states)
+    moved = jax.tree.map(lambda leaf: leaf[:, settings.advance], wandering.states)
     ages = learner.workspace.ages + settings.advance
     finite = jnp.isfinite(moved.q).all(1) & jnp.isfinite(moved.v).all(1)
     too_old = ages >= longest_episode(settings.twin)
     drawn = jax.random.uniform(k_reset, (n,)) < _reset_rates(knobs.reset_share, n)
-    again = too_old | drawn | ~paths.alive[:, -1] | ~finite
+    again = too_old | drawn | ~wandering.alive[:, settings.advance] | ~finite
     return _where(again, fresh, moved), jnp.where(again, 0.0, ages)
 
 

@@ -85,7 +85,9 @@ class HDS(TwinAlgorithm):
     :param compare_every: epochs after which the average policy and the one that acts go through
         whole episodes of the twin, and the better one acts from then on; 0: the average acts (the
         paper)
-    :param policy_kwargs: ``net_arch``, ``activation_fn``, ``max_grad_norm``
+    :param least_gain: the pretraining ends when plans have gained less than this share of the
+        policy's return, on the average of about ten epochs; 0: never
+    :param policy_kwargs: ``net_arch``, ``activation_fn``, ``linear_path``, ``max_grad_norm``
     :param stats_window_size: episodes in the averages that are logged
     :param tensorboard_log: folder for TensorBoard
     :param verbose: 0 nothing, 1 information, 2 debugging
@@ -133,11 +135,12 @@ class HDS(TwinAlgorithm):
         plan_memory: int = 8,
         learned_share: float = 0.5,
         loss: str = "smooth_absolute",
-        gain_weight: float = 0.9,
-        sensitivity_weight: float = 0.9,
+        gain_weight: float = 0.7,
+        sensitivity_weight: float = 0.7,
         averaging: float = 0.9,
         adapt_scales: bool = True,
         compare_every: int = 10,
+        least_gain: float = 1e-3,
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -188,6 +191,7 @@ class HDS(TwinAlgorithm):
             averaging=averaging,
             adapt_scales=adapt_scales,
             compare_every=compare_every,
+            least_gain=least_gain,
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,

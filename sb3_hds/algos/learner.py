@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from sb3_hds.algos.networks import Actor, Value, output, unsquash
+from sb3_hds.algos.networks import Actor, Value, output, value_of
 from sb3_hds.core import Obs, Params, State, Twin
 from sb3_hds.planning import Plan, Problem, best_of_random
 
@@ -299,9 +299,13 @@ def longest_episode(twin: Twin) -> int:
 def problem_of(settings: Settings, learner: Learner, knobs: Knobs) -> Problem:
     """:return: what the planner maximises with the networks as they are now"""
 
-    def root(obs: Obs) -> jax.Array:
+    def roots(obs: Obs) -> jax.Array:
         seen = learner.networks.inside(knobs.view(obs))
         return output(settings.value, learner.networks.value, seen)
+
+    def of_shortfall(obs: Obs) -> jax.Array:
+        found = roots(obs)
+        return jnp.concatenate([jnp.minimum(found[:1], 0.0), found[1:]])
 
     return Problem(
         settings.twin,
@@ -309,8 +313,8 @@ def problem_of(settings: Settings, learner: Learner, knobs: Knobs) -> Problem:
         settings.discount,
         learner.progress.reward_scale,
         learner.progress.reward_offset,
-        (lambda obs: unsquash(root(obs))) if settings.terminal_value else None,
-        terminal_root=root if settings.terminal_value else None,
+        (lambda obs: value_of(roots(obs))) if settings.terminal_value else None,
+        terminal_roots=of_shortfall if settings.terminal_value else None,
     )
 
 

@@ -29,7 +29,8 @@ class PODS(TwinAlgorithm):
         PODS(env, planner="gauss_newton", horizon=100, n_iterations=1, n_random_plans=0,
              lookahead=0, terminal_value=False, reset_share=1.0, plan_memory=1, loss="squared",
              gain_weight=0.0, sensitivity_weight=0.0, averaging=0.0, adapt_scales=False,
-             learned_share=1.0, compare_every=0, gamma=1.0, gradient_steps=50)
+             learned_share=1.0, compare_every=0, least_gain=0.0, gamma=1.0, gradient_steps=50,
+             policy_kwargs={"linear_path": False})
 
     Paper: Mora, Peychev, Ha, Vechev, Coros, *PODS: Policy Optimization via Differentiable
     Simulation*, ICML 2021, PMLR 139:7805-7817.
@@ -88,7 +89,9 @@ class PODS(TwinAlgorithm):
     :param compare_every: epochs after which the average policy and the one that acts go through
         whole episodes of the twin, and the better one acts from then on; 0: the average acts (the
         paper)
-    :param policy_kwargs: ``net_arch``, ``activation_fn``, ``max_grad_norm``
+    :param least_gain: the pretraining ends when plans have gained less than this share of the
+        policy's return, on the average of about ten epochs; 0: never
+    :param policy_kwargs: ``net_arch``, ``activation_fn``, ``linear_path``, ``max_grad_norm``
     :param stats_window_size: episodes in the averages that are logged
     :param tensorboard_log: folder for TensorBoard
     :param verbose: 0 nothing, 1 information, 2 debugging
@@ -132,11 +135,12 @@ class PODS(TwinAlgorithm):
         plan_memory: int = 8,
         learned_share: float = 0.5,
         loss: str = "smooth_absolute",
-        gain_weight: float = 0.9,
-        sensitivity_weight: float = 0.9,
+        gain_weight: float = 0.7,
+        sensitivity_weight: float = 0.7,
         averaging: float = 0.9,
         adapt_scales: bool = True,
         compare_every: int = 10,
+        least_gain: float = 1e-3,
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -187,6 +191,7 @@ class PODS(TwinAlgorithm):
             averaging=averaging,
             adapt_scales=adapt_scales,
             compare_every=compare_every,
+            least_gain=least_gain,
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,

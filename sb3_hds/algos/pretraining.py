@@ -26,20 +26,21 @@ class Pretraining(BaseCallback):
 
     def _on_training_start(self) -> None:
         model: TwinAlgorithm = self.model  # type: ignore[assignment]
-        due = model.pretrain_epochs - model.n_pretrained
-        if due <= 0:
-            return
+        due = model.pretraining_due
         every = max(1, due // _N_LOGS)
         for i in self._shown(range(1, due + 1)):
             model.pretrain_epoch()
-            if i % every == 0 or i == due:
+            done = not model.pretraining_due
+            if done or i % every == 0:
                 model.logger.dump(step=model.num_timesteps)
+            if done:
+                break
 
     def _on_step(self) -> bool:
         return True
 
     def _shown(self, epochs: range):
-        if not self.progress_bar:
+        if not (self.progress_bar and epochs):
             return epochs
         from rich.progress import track
 

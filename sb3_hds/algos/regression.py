@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sb3_hds.algos.learner import Knobs, Learner, Samples, Settings, optimiser
-from sb3_hds.algos.networks import output, squash, with_input_scales
+from sb3_hds.algos.networks import output, squash, value_of, with_input_scales
 from sb3_hds.planning import Plan, Problem
 
 # Where the absolute error of the regression turns into a squared one, in units of the control
@@ -138,7 +138,8 @@ def regress(
         return jnp.mean(batch.weight[:, None] * jnp.sqrt((error / unit) ** 2 + _SMOOTH_ERROR**2))
 
     def value_loss(value, batch: Samples) -> jax.Array:
-        error = output(settings.value, value, inside(batch.obs)) - squash(batch.value)
+        found = value_of(output(settings.value, value, inside(batch.obs)))
+        error = squash(found) - squash(batch.value)
         return jnp.mean(batch.alive * error**2)
 
     def update(i, carry):

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from sb3_hds.algos.learner import (
@@ -20,7 +21,12 @@ from sb3_hds.algos.learner import (
     resets,
 )
 from sb3_hds.algos.networks import output
+from sb3_hds.core import Twin
 from sb3_hds.planning import Problem, follow
+
+# Simulated steps of a policy in a comparison, and the numbers of episodes between which they make.
+_STEPS_COMPARED = 64_000
+_FEWEST, _MOST = 32, 256
 
 
 def choose_policy(
@@ -44,7 +50,7 @@ def choose_policy(
 
 def twin_steps_per_comparison(settings: Settings) -> int:
     """:return: simulated steps of a comparison, if no episode ends early"""
-    return 2 * settings.n_rollouts * longest_episode(settings.twin)
+    return 2 * _n_starts(settings.twin) * longest_episode(settings.twin)
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK_COMPILATION)
@@ -61,7 +67,7 @@ def keep_better(
     key, k_starts = jax.random.split(jax.random.wrap_key_data(learner.progress.key, impl=GENERATOR))
     twin, nets = settings.twin, learner.networks
     problem = Problem(twin, knobs.params)
-    starts = resets(twin, knobs.params, k_starts, settings.n_rollouts)
+    starts = resets(twin, knobs.params, k_starts, _n_starts(twin))
     length = longest_episode(twin)
 
     def mean_return(actor: Mapping[str, Any], inside: View) -> jax.Array:
@@ -78,3 +84,7 @@ def keep_better(
         progress=learner.progress._replace(key=jax.random.key_data(key)),
     )
     return learner, returns
+
+
+def _n_starts(twin: Twin) -> int:
+    return int(np.clip(_STEPS_COMPARED // longest_episode(twin), _FEWEST, _MOST))

@@ -51,6 +51,10 @@ from sb3_hds.algos.twin_policy import TwinPolicy, all_finite
 from sb3_hds.core import Twin
 from sb3_hds.envs.mirror import check_mirrors, twin_of
 
+# Decay of what counts as recent in the pretraining, per epoch, and the fewest epochs to judge by.
+_RECENT = 0.9
+_FEWEST_EPOCHS = 20
+
 
 class TwinAlgorithm(OffPolicyAlgorithmJax):
     """
@@ -104,6 +108,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         averaging: float,
         adapt_scales: bool,
         compare_every: int,
+        least_gain: float,
         policy_kwargs: dict[str, Any] | None,
         stats_window_size: int,
         tensorboard_log: str | None,
@@ -167,6 +172,8 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         self.averaging = averaging
         self.adapt_scales = adapt_scales
         self.compare_every = compare_every
+        self.least_gain = least_gain
+        self.recent_gain, self.recent_return = 0.0, 0.0
         self.saved_by = type(self).__name__
         self.n_pretrained = 0
         self.twin_timesteps = 0
@@ -372,8 +379,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
     def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any):
         total_timesteps, callback = super()._setup_learn(total_timesteps, *args, **kwargs)
         steps = total_timesteps - self.num_timesteps
-        pending = max(0, self.pretrain_epochs - self.n_pretrained)
-        self._epochs_planned = pending + math.ceil(steps / self._steps_per_epoch)
+        self._epochs_planned = self.pretraining_due + math.ceil(steps / self._steps_per_epoch)
         self._epochs_done = 0
         return total_timesteps, callback
 
@@ -385,11 +391,27 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
             return self.train_freq.frequency * self.n_envs
         return self.train_freq.frequency * longest_episode(self._settings.twin)
 
+    @property
+    def pretraining_due(self) -> int:
+        """Planning epochs that are left to do before the next real step."""
+        enough = self.least_gain * self.recent_return
+        if self.n_pretrained >= _FEWEST_EPOCHS and self.recent_gain < enough:
+            return 0
+        return max(0, self.pretrain_epochs - self.n_pretrained)
+
     def pretrain_epoch(self) -> None:
-        """One planning epoch before the first real step, like any other."""
-        due = self.gradient_steps if self.gradient_steps >= 0 else self._steps_per_epoch
-        self.run_epoch(due)
+        """
+        One planning epoch before the first real step, like any other. Where plans gain nothing
+        more, it is the last one, and schedules jump over those that are spared.
+        """
+        planned = self.pretraining_due
+        steps = self.gradient_steps if self.gradient_steps >= 0 else self._steps_per_epoch
+        report = self.run_epoch(steps)
+        before, after = float(report.before), float(report.after)
+        self.recent_gain = _RECENT * self.recent_gain + max(0.0, after - before)
+        self.recent_return = _RECENT * self.recent_return + abs(before)
         self.n_pretrained += 1
+        self._epochs_done += planned - 1 - self.pretraining_due
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         if callback is None:

@@ -27,6 +27,8 @@ class TwinPolicy(TensorPolicy):
     :param net_arch: hidden widths of both networks, or ``{"pi": [...], "vf": [...]}``; default
         96, 96 for the policy and 64, 64 for the value
     :param activation_fn: name, JAX function or torch module class
+    :param linear_path: whether a linear map leads from the policy's input to its output beside the
+        hidden layers (the paper: no)
     :param max_grad_norm: gradients of both networks are clipped to this norm
     :param use_sde: accepted for SB3's sake; the policy is deterministic
     """
@@ -38,6 +40,7 @@ class TwinPolicy(TensorPolicy):
         lr_schedule: Schedule,
         net_arch: Sequence[int] | dict[str, Sequence[int]] | None = None,
         activation_fn: str | Activation | type = "tanh",
+        linear_path: bool = True,
         max_grad_norm: float = 1.0,
         use_sde: bool = False,
     ) -> None:
@@ -50,9 +53,10 @@ class TwinPolicy(TensorPolicy):
             "lr_schedule": lr_schedule,
             "net_arch": net_arch,
             "activation_fn": activation_fn,
+            "linear_path": linear_path,
             "max_grad_norm": max_grad_norm,
         }
-        self.actor_network = Actor(int(np.prod(action_space.shape)), pi, function)
+        self.actor_network = Actor(int(np.prod(action_space.shape)), pi, function, linear_path)
         self.value_network = Value(vf, function)
         self.max_grad_norm = max_grad_norm
         self.networks: Networks

@@ -3,6 +3,9 @@
 from collections.abc import Callable
 from typing import TypeAlias
 
+import jax
+import jax.numpy as jnp
+
 from sb3_hds.core.types import Position, Velocity
 
 Acceleration: TypeAlias = Callable[[Position, Velocity], Velocity]
@@ -30,14 +33,21 @@ def explicit_euler(
 def rk4(
     acceleration: Acceleration, q: Position, v: Velocity, h: float, limit: LimitVelocity
 ) -> tuple[Position, Velocity]:
-    """The classical Runge-Kutta method; in joint coordinates MuJoCo's ``RK4`` is the same."""
-    a1 = acceleration(q, v)
-    v2 = v + 0.5 * h * a1
-    a2 = acceleration(q + 0.5 * h * v, v2)
-    v3 = v + 0.5 * h * a2
-    a3 = acceleration(q + 0.5 * h * v2, v3)
-    v4 = v + h * a3
-    a4 = acceleration(q + h * v3, v4)
-    q_new = q + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
-    v_new = v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
+    """
+    The classical Runge-Kutta method; in joint coordinates MuJoCo's ``RK4`` is the same.
+
+    The four stages are one loop: written out, they take four times as long to compile.
+    """
+    ahead = jnp.array([0.0, 0.5, 0.5, 1.0], v.dtype) * h
+    share = jnp.array([1.0, 2.0, 2.0, 1.0], v.dtype) * (h / 6.0)
+
+    def stage(carry, now):
+        q_dot, v_dot, q_new, v_new = carry
+        delay, weight = now
+        q_there, v_there = q + delay * q_dot, v + delay * v_dot
+        a = acceleration(q_there, v_there)
+        return (v_there, a, q_new + weight * v_there, v_new + weight * a), None
+
+    still = jnp.zeros_like(v)
+    (_, _, q_new, v_new), _ = jax.lax.scan(stage, (still, still, q, v), (ahead, share))
     return q_new, limit(v_new)

@@ -9,6 +9,10 @@ from jaxtyping import Array, Float
 from sb3_hds.core import Scalar, State
 from sb3_hds.planning.problem import Control, Plan, Problem
 
+# Value, in units of the scaled objective, at which a turn of the roots counts one half.
+_NEAR_GOAL = 0.05
+_LEAST_LENGTH = 1e-6
+
 
 class Expansion(NamedTuple):
     r"""
@@ -91,9 +95,22 @@ def _expand_end(problem: Problem, end: State, origin: Float[Array, " n"], second
     slope = jax.jacfwd(value)(origin)
     if second_order and problem.terminal_curvature:
         return slope, jax.jacfwd(jax.jacfwd(value))(origin)
-    root = problem.terminal_root
-    if second_order and root is not None:
-        rho = lambda dx: root(problem.observe(problem.twin.retract(end, dx)))  # noqa: E731
-        gradient = jax.jacfwd(rho)(origin)
-        return slope, jnp.where(rho(origin) < 0.0, -2.0, 0.0) * jnp.outer(gradient, gradient)
+    if second_order and problem.terminal_roots is not None:
+        return slope, _curvature_of_squares(problem, problem.terminal_roots, end, origin)
     return slope, flat
+
+
+def _curvature_of_squares(problem: Problem, roots, end: State, origin: Float[Array, " n"]):
+    r"""
+    Gauss-Newton Hessian of :math:`-|\rho|^2`. Of :math:`(\partial\rho/\partial x)^\top
+    (\partial\rho/\partial x)`, what turns :math:`\rho` without making it longer is curvature only
+    near the goal, where :math:`\rho` is zero. Further off it is the freedom of the network, so that
+    its share fades.
+    """
+    at = lambda dx: roots(problem.observe(problem.twin.retract(end, dx)))  # noqa: E731
+    rho, jacobian = at(origin), jax.jacfwd(at)(origin)
+    length = jnp.sqrt(jnp.sum(rho**2) + _LEAST_LENGTH**2)
+    radial = rho @ jacobian / length
+    longer = jnp.outer(radial, radial)
+    share = _NEAR_GOAL / (_NEAR_GOAL + length**2)
+    return -2.0 * (longer + share * (jacobian.T @ jacobian - longer))

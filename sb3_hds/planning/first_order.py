@@ -32,7 +32,7 @@ def control_gradient(expansion: Expansion) -> Controls:
 def gradient_ascent(
     problem: Problem,
     start: State,
-    controls: Controls,
+    first: Controls | Plan,
     n_iterations: int = 1,
     n_step_sizes: int = 14,
     temperature: Scalar | float = 0.0,
@@ -47,13 +47,13 @@ def gradient_ascent(
     temperature the objective never falls. A gradient that is not finite counts as zero.
 
     :param start: where the plan starts
-    :param controls: what to improve, shape ``(horizon, n_act)``
+    :param first: what to improve: controls of shape ``(horizon, n_act)``, or a plan from ``start``
     :param n_iterations: gradients taken
     :param n_step_sizes: candidates of each line search, from 1 down to 5e-4
     :param temperature: annealed acceptance, see :func:`~sb3_hds.planning.line_search.choose`
     :param key: needed with a temperature
     """
-    return climb(problem, start, controls, steepest, n_iterations, n_step_sizes, temperature, key)
+    return climb(problem, start, first, steepest, n_iterations, n_step_sizes, temperature, key)
 
 
 def steepest(problem: Problem, plan: Plan) -> Controls:

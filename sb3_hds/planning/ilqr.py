@@ -7,7 +7,7 @@ from jaxtyping import PRNGKeyArray
 from sb3_hds.core import Flag, Scalar, State
 from sb3_hds.planning.expansion import expand
 from sb3_hds.planning.line_search import choose, climb, step_sizes
-from sb3_hds.planning.problem import Controls, Plan, Problem, assemble, simulate
+from sb3_hds.planning.problem import Controls, Plan, Problem, assemble, simulated
 from sb3_hds.planning.riccati import Gains, solve_backward
 
 _LEAST_REGULARISATION = 1e-6
@@ -16,7 +16,7 @@ _LEAST_REGULARISATION = 1e-6
 def ilqr(
     problem: Problem,
     start: State,
-    controls: Controls,
+    first: Controls | Plan,
     n_iterations: int = 3,
     n_step_sizes: int = 6,
     temperature: Scalar | float = 0.0,
@@ -32,14 +32,16 @@ def ilqr(
     tenfold after a useful one. Only forward-mode derivatives of one step are needed.
 
     :param start: where the plan starts
-    :param controls: what to improve, shape ``(horizon, n_act)``
+    :param first: what to improve: controls of shape ``(horizon, n_act)``, or a plan from ``start``
     :param n_iterations: expansions computed
     :param n_step_sizes: candidates of each line search
     :param temperature: annealed acceptance, see :func:`~sb3_hds.planning.line_search.choose`
     :param key: needed with a temperature
     :return: the plan, and the gains of the last iteration, around the plan before it
     """
-    steps = jnp.array(step_sizes(n_step_sizes), controls.dtype)
+    first = simulated(problem, start, first)
+    dtype = first.controls.dtype
+    steps = jnp.array(step_sizes(n_step_sizes), dtype)
     keys = jnp.arange(n_iterations) if key is None else jax.random.split(key, n_iterations)
 
     def iterate(carry, draw):
@@ -48,12 +50,11 @@ def ilqr(
         gains = jax.tree.map(lambda leaf: jnp.where(_all_finite(gains), leaf, 0.0), gains)
         candidates = jax.vmap(lambda step: _follow(problem, start, plan, gains, step))(steps)
         best = choose(candidates.value, temperature, None if key is None else draw)
-        factor = jnp.where(best == 0, 10.0, 0.1).astype(controls.dtype)
+        factor = jnp.where(best == 0, 10.0, 0.1).astype(dtype)
         regularisation = jnp.clip(regularisation * factor, _LEAST_REGULARISATION, 1e6)
         return (jax.tree.map(lambda leaf: leaf[best], candidates), regularisation), gains
 
-    first = simulate(problem, start, controls)
-    initial = (first, jnp.asarray(_LEAST_REGULARISATION, controls.dtype))
+    initial = (first, jnp.asarray(_LEAST_REGULARISATION, dtype))
     (plan, _), gains = jax.lax.scan(iterate, initial, keys)
     return plan, jax.tree.map(lambda leaf: leaf[-1], gains)
 
@@ -61,7 +62,7 @@ def ilqr(
 def gauss_newton(
     problem: Problem,
     start: State,
-    controls: Controls,
+    first: Controls | Plan,
     n_iterations: int = 1,
     n_step_sizes: int = 14,
     temperature: Scalar | float = 0.0,
@@ -77,7 +78,7 @@ def gauss_newton(
     feedback, as in the paper, clipped to the limits. "No change" is among the step sizes.
 
     :param start: where the plan starts
-    :param controls: what to improve, shape ``(horizon, n_act)``
+    :param first: what to improve: controls of shape ``(horizon, n_act)``, or a plan from ``start``
     :param n_iterations: steps taken
     :param n_step_sizes: candidates of each line search, from 1 down to 5e-4
     :param temperature: annealed acceptance, see :func:`~sb3_hds.planning.line_search.choose`
@@ -86,7 +87,7 @@ def gauss_newton(
     Source: PODS, eqs. 13 and 14.
     """
     return climb(
-        problem, start, controls, newton_direction, n_iterations, n_step_sizes, temperature, key
+        problem, start, first, newton_direction, n_iterations, n_step_sizes, temperature, key
     )
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sb3_hds.core import Scalar, State
-from sb3_hds.planning.problem import Controls, Plan, Problem, simulate
+from sb3_hds.planning.problem import Controls, Plan, Problem, simulate, simulated
 
 
 def step_sizes(n: int, smallest: float = 0.015) -> tuple[float, ...]:
@@ -47,7 +47,7 @@ def choose(
 def climb(
     problem: Problem,
     start: State,
-    controls: Controls,
+    first: Controls | Plan,
     direction: Callable[[Problem, Plan], Controls],
     n_iterations: int,
     n_step_sizes: int,
@@ -61,7 +61,8 @@ def climb(
     :param n_step_sizes: candidates of each line search, "no change" and steps from 1 down to 5e-4
     :return: the last plan; without temperature never worse than the start
     """
-    steps = jnp.array(step_sizes(n_step_sizes, 5e-4), controls.dtype)
+    first = simulated(problem, start, first)
+    steps = jnp.array(step_sizes(n_step_sizes, 5e-4), first.controls.dtype)
     draws = jnp.arange(n_iterations) if key is None else jax.random.split(key, n_iterations)
 
     def iterate(plan: Plan, draw):
@@ -71,4 +72,4 @@ def climb(
         best = choose(candidates.value, temperature, None if key is None else draw)
         return jax.tree.map(lambda leaf: leaf[best], candidates), None
 
-    return jax.lax.scan(iterate, simulate(problem, start, controls), draws)[0]
+    return jax.lax.scan(iterate, first, draws)[0]

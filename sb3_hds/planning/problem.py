@@ -51,9 +51,9 @@ class Problem:
     :param reward_offset: :math:`r_0`; must be zero where the discount is one
     :param terminal_value: :math:`V`, scaled like the rewards; None means zero
     :param terminal_curvature: whether second-order methods use the Hessian of :math:`V` too
-    :param terminal_root: :math:`\rho` with :math:`V \approx -\rho^2` where :math:`\rho < 0`. Then
-        :math:`-2\,\nabla\rho\,\nabla\rho^\top` stands in for the Hessian of :math:`V`: never of
-        the wrong sign, and as smooth as a gradient (Gauss-Newton).
+    :param terminal_roots: observation to :math:`\rho`, shape ``(k,)``, with :math:`V \approx c -
+        |\rho|^2`. What their slopes say of the curvature stands in for the Hessian of :math:`V`:
+        never of the wrong sign, and as smooth as a gradient (Gauss-Newton).
     """
 
     twin: Twin
@@ -63,7 +63,7 @@ class Problem:
     reward_offset: float | Scalar = 0.0
     terminal_value: TerminalValue | None = None
     terminal_curvature: bool = False
-    terminal_root: TerminalValue | None = None
+    terminal_roots: Callable[[Obs], Float[Array, " k"]] | None = None
 
     @property
     def n_controls(self) -> int:
@@ -107,6 +107,11 @@ class Problem:
 def simulate(problem: Problem, start: State, controls: Controls) -> Plan:
     """Roll out a control sequence and score it."""
     return _roll(problem, start, lambda state, control: control, controls, controls.shape[0])
+
+
+def simulated(problem: Problem, start: State, first: Controls | Plan) -> Plan:
+    """:return: the plan that controls make from ``start``, or one that has been made already"""
+    return first if isinstance(first, Plan) else simulate(problem, start, first)
 
 
 def follow(problem: Problem, start: State, policy: Callable[[Obs], Control], n_steps: int) -> Plan:

@@ -28,8 +28,7 @@ from sb3_hds.twins import cart_and_poles
 
 _MAX_REPORTED = 10.0  # [m/s], [rad/s]
 _MIN_HEIGHT = 1.0  # [m]
-_RAIL = 1.0  # [m] to either side, not simulated
-_TILT = 5.0  # weight of the poles' tilt in the planning reward
+_OFF_CENTRE, _TILT = 0.4, 0.5  # weights in the planning reward [1/m2], [1]
 
 
 class InvertedDoublePendulum(AnalyticTwin):
@@ -60,10 +59,11 @@ class InvertedDoublePendulum(AnalyticTwin):
     the last Runge-Kutta step. The twin evaluates the tip where the step ends, which is
     :math:`O(h^3)` away.
 
-    Planning maximises the reward minus :math:`x^2 + 5(\sin^2\varphi_1 + \sin^2\varphi_2)` (x in
-    metres): the environment's own reward hardly minds where the cart is, so a plan would run off
-    the rail. What is subtracted is zero where the reward is best, and the sum stays positive while
-    the poles stand and the cart is on the rail.
+    Planning maximises the reward with the healthy reward divided by
+    :math:`1 + 0.4 (x/\mathrm{m})^2 + 0.5 (\sin^2\varphi_1 + \sin^2\varphi_2)`: the environment's
+    own reward hardly minds where the cart is, so a plan would run off the rail. The two are equal
+    where the reward is best, and staying up pays everywhere: a cart far off is better brought back
+    than dropped.
 
     :param healthy_reward: option; what each step in which the tip stays above 1 m earns
     :param reset_noise_scale: option; positions start uniformly within this, speeds normally with
@@ -201,8 +201,9 @@ class InvertedDoublePendulum(AnalyticTwin):
         self, state: State, action: Action, next_state: State, params: Params
     ) -> Scalar:
         tilt = jnp.stack([next_state.q[1], next_state.q[1] + next_state.q[2]])
-        deviation = (next_state.q[0] / _RAIL) ** 2 + _TILT * jnp.sum(jnp.sin(tilt) ** 2)
-        return self.reward(state, action, next_state, params) - deviation
+        deviation = _OFF_CENTRE * next_state.q[0] ** 2 + _TILT * jnp.sum(jnp.sin(tilt) ** 2)
+        withheld = self.healthy_reward * deviation / (1.0 + deviation)
+        return self.reward(state, action, next_state, params) - withheld
 
     def terminated(self, state: State, params: Params) -> Flag:
         return _tip(state, params)[1] <= _MIN_HEIGHT
