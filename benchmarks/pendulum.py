@@ -42,6 +42,7 @@ def main() -> None:
 
 def run(n_seeds: int) -> None:
     jobs = [("hds", seed) for seed in range(n_seeds)] + [(peer, 0) for peer in PEERS]
+    held_out_states()  # says so now where the data are missing
     curves, finals = [], []
     for name, seed in jobs:
         print(f"{name}, seed {seed} ...", file=sys.stderr, flush=True)
