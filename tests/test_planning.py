@@ -197,6 +197,17 @@ def test_the_expansion_holds_jacobians_and_hessians():
         np.testing.assert_allclose(expansion.curvature[t], 0.9**t * expected, rtol=1e-10)
 
 
+@pytest.mark.parametrize("improve", [planning.gradient_ascent, planning.gauss_newton])
+def test_a_plan_is_improved_like_its_controls(improve):
+    problem = Problem(Spring(), Spring().params)
+    start, controls = _first(starts_of(Spring(), 1)), jnp.full((4, 1), 0.3)
+    plan = planning.simulate(problem, start, controls)
+
+    assert jnp.array_equal(
+        improve(problem, start, plan).controls, improve(problem, start, controls).controls
+    )
+
+
 def _curvatures(roots):
     """Exact curvature of -|roots|^2 at the end of a plan, and the one taken from its slopes."""
     twin = Spring()

@@ -1,8 +1,8 @@
 """
 Trajectory optimisation on any twin.
 
-Every improver is a function ``(problem, start, controls, ...)`` on one trajectory, safe under
-``jit`` and ``vmap``; :func:`solve` batches one over many start states.
+Every improver is a function ``(problem, start, first, ...)`` on one trajectory, controls or a plan,
+safe under ``jit`` and ``vmap``; :func:`solve` batches one over many start states.
 """
 
 from sb3_hds.planning.batch import METHODS, solve

@@ -62,8 +62,8 @@ class InvertedDoublePendulum(AnalyticTwin):
     Planning maximises the reward with the healthy reward divided by
     :math:`1 + 0.4 (x/\mathrm{m})^2 + 0.5 (\sin^2\varphi_1 + \sin^2\varphi_2)`: the environment's
     own reward hardly minds where the cart is, so a plan would run off the rail. The two are equal
-    where the reward is best, and staying up pays everywhere: a cart far off is better brought back
-    than dropped.
+    where the reward is best, and staying up pays far beyond the rail: a cart that ran off is better
+    brought back than dropped.
 
     :param healthy_reward: option; what each step in which the tip stays above 1 m earns
     :param reset_noise_scale: option; positions start uniformly within this, speeds normally with
