@@ -18,7 +18,7 @@ import yaml
 from rl_zoo_plugin.tables import ALGORITHMS
 from sb3_hds import HDS, PODS, algos, effects, twins
 from sb3_hds.algos.log import record_epoch
-from sb3_hds.envs.registration import STEP_LIMITS
+from sb3_hds.envs.registration import HARDWARE, STEP_LIMITS
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -166,7 +166,8 @@ def test_every_twin_effect_and_environment_is_listed_with_its_parameters():
         for name, parameter in effect.parameters.items():
             assert f"`{name}` [{parameter.unit}]" in shown and effect.explanation in shown
 
-    assert [i for i in STEP_LIMITS if f"`{i}`" not in catalogue.environments_as_markdown()] == []
+    listed = catalogue.environments_as_markdown()
+    assert [i for i in STEP_LIMITS | HARDWARE if f"`{i}`" not in listed] == []
 
 
 def test_a_surrogate_is_announced_where_planning_maximises_something_else():

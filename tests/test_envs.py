@@ -17,7 +17,7 @@ from stable_baselines3.common.env_checker import check_env as check_sb3
 from sb3_hds import twins
 from sb3_hds.effects import ViscousFriction
 from sb3_hds.envs import TwinEnv, TwinVecEnv, programs, register_environments
-from sb3_hds.envs.registration import STEP_LIMITS
+from sb3_hds.envs.registration import HARDWARE, STEP_LIMITS
 from sb3_hds.errors import NoTwinError, ParameterError
 from sb3_hds.twins import Pendulum
 
@@ -302,12 +302,14 @@ def test_without_a_render_mode_there_is_no_image():
 def test_our_ids_and_their_step_limits_are_those_of_the_twins():
     declared = {twins.get(i).env_id: twins.get(i).max_episode_steps for i in twins.all_ids()}
 
-    assert {i: n for i, n in declared.items() if i.startswith("sb3_hds/")} == STEP_LIMITS
+    limits = STEP_LIMITS | {env_id: steps for env_id, (_, steps) in HARDWARE.items()}
+    assert {i: n for i, n in declared.items() if i.startswith("sb3_hds/")} == limits
 
 
-@pytest.mark.parametrize("env_id", STEP_LIMITS)
+@pytest.mark.parametrize("env_id", STEP_LIMITS | HARDWARE)
 def test_our_ids_are_cut_by_gymnasiums_time_limit(env_id):
-    assert gymnasium.spec(env_id).max_episode_steps == STEP_LIMITS[env_id]
+    limits = STEP_LIMITS | {env_id: steps for env_id, (_, steps) in HARDWARE.items()}
+    assert gymnasium.spec(env_id).max_episode_steps == limits[env_id]
     env = gymnasium.make(env_id, max_episode_steps=3)
     env.reset(seed=0)
 

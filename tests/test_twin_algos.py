@@ -289,8 +289,8 @@ def test_a_regression_that_diverges_is_an_error_and_keeps_the_last_good_state(
         model.learn(50)
 
     assert finite(model)
-    for part, tensors in model.get_parameters().items():
-        for key, tensor in tensors.items():
+    for part in ("policy", "policy.optimizer"):
+        for key, tensor in model.get_parameters()[part].items():
             np.testing.assert_array_equal(tensor, before[part][key], err_msg=key)
 
 

@@ -64,6 +64,7 @@ def knobs_of(model: "TwinAlgorithm", twin: Twin, remaining: float, gradient_step
     visited, relabel = visited_states(model, len(twin.channels))
     return Knobs(
         params=twin.params,
+        varied=model.varied(twin),
         learning_rate=rate,
         value_learning_rate=value_rate,
         noise=model.exploration_noise * model.exploration_decay**n_epochs,

@@ -129,7 +129,7 @@ def _broken_rules(model: "TwinAlgorithm") -> Iterator[tuple[str, str]]:
     for name in _SHARES:
         if not _between(getattr(model, name), 0.0, 1.0):
             yield name, "a number from 0 to 1"
-    for name in ("temperature", "exploration_noise", "least_gain"):
+    for name in ("temperature", "exploration_noise", "least_gain", "randomisation"):
         if not _between(getattr(model, name), 0.0, math.inf):
             yield name, "a finite number of at least 0"
     if not (_between(model.gamma, 0.0, 1.0) and model.gamma > 0.0):

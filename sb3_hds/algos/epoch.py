@@ -26,7 +26,7 @@ from sb3_hds.algos.learner import (
 )
 from sb3_hds.algos.networks import output
 from sb3_hds.algos.regression import regress, remember, rescale, samples_of
-from sb3_hds.core import Obs, State
+from sb3_hds.core import Obs, Params, State
 from sb3_hds.planning import (
     Plan,
     Problem,
@@ -173,17 +173,18 @@ def _act(
     """What the policy does from each start state, and what it does with exploration noise."""
     policy = partial(control_of, settings, learner, knobs)
 
-    def act(start: State, offset: Control) -> Plan:
-        return follow(problem, start, lambda obs: policy(obs) + offset, settings.horizon)
+    def act(start: State, offset: Control, varied: Params) -> Plan:
+        here = problem.with_params(varied)
+        return follow(here, start, lambda obs: policy(obs) + offset, settings.horizon)
 
     n = settings.n_rollouts
     noise = knobs.noise * learner.progress.control_scale
     offsets = noise * jax.random.normal(key, (n, problem.n_controls))
     if not settings.advance:
-        own = for_each(act, starts, jnp.zeros_like(offsets))
+        own = for_each(act, starts, jnp.zeros_like(offsets), knobs.varied)
         return own, own
-    rows = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), starts)
-    paths = for_each(act, rows, jnp.concatenate([jnp.zeros_like(offsets), offsets]))
+    rows, varied = _joined(starts, starts), _joined(knobs.varied, knobs.varied)
+    paths = for_each(act, rows, jnp.concatenate([jnp.zeros_like(offsets), offsets]), varied)
     return _pick(paths, slice(n)), _pick(paths, slice(n, None))
 
 
@@ -199,19 +200,25 @@ def _plan(
     k_random, k_improve, k_keep = jax.random.split(key, 3)
     n, fresh = settings.n_rollouts, _random_slots(settings)
     policy = partial(control_of, settings, learner, knobs)
-    first = own
+    first, tried = own, _pick(knobs.varied, fresh)
+    varied = knobs.varied
     if fresh.size:
         # Without the barrier, XLA gathers again in every step of the loops.
         starts = jax.tree.map(lambda leaf: leaf[fresh, 0], own.states)
         starts = jax.lax.optimization_barrier(starts)
-        search = lambda s, k: best_of_random(problem, s, k, settings.horizon, settings.n_candidates)  # noqa: E731
-        found = jax.vmap(search)(starts, jax.random.split(k_random, fresh.size))
-        first = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), own, found)
-    improved, sensitivity = _improve(settings, learner, knobs, problem, first, k_improve)
 
-    plans = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), improved, own)
+        def search(start: State, key: PRNGKeyArray, varied: Params) -> Plan:
+            here = problem.with_params(varied)
+            return best_of_random(here, start, key, settings.horizon, settings.n_candidates)
+
+        found = jax.vmap(search)(starts, jax.random.split(k_random, fresh.size), tried)
+        first, varied = _joined(own, found), _joined(varied, tried)
+    improved, sensitivity = _improve(settings, learner, knobs, problem, first, varied, k_improve)
+
+    plans, varied = _joined(improved, own), _joined(varied, knobs.varied)
     ends = jax.tree.map(lambda leaf: leaf[:, -1], plans.states)
-    tails = for_each(lambda end: _tail(settings, problem, policy, end), ends)
+    value_of_end = lambda end, own: _tail(settings, problem.with_params(own), policy, end)  # noqa: E731
+    tails = for_each(value_of_end, ends, varied)
     values = jax.vmap(lambda p, tail: score(problem, p.rewards, p.alive, tail))(plans, tails)
     plans = plans._replace(value=values)
 
@@ -241,13 +248,15 @@ def _improve(
     knobs: Knobs,
     problem: Problem,
     first: Plan,
+    varied: Params,
     key: PRNGKeyArray,
 ) -> tuple[Plan, Float[Array, "plans horizon"]]:
     """:return: the improved plans, and what an error of each of their controls costs"""
     discounts = settings.discount ** jnp.arange(settings.horizon)
     temperature = knobs.temperature * learner.progress.gain
 
-    def one(first: Plan, key: PRNGKeyArray | None):
+    def one(first: Plan, own: Params, key: PRNGKeyArray | None):
+        here = problem.with_params(own)
         start = jax.tree.map(lambda leaf: leaf[0], first.states)
         options = {
             "n_iterations": settings.n_iterations,
@@ -256,13 +265,13 @@ def _improve(
             "key": key,
         }
         if settings.planner == "ilqr":
-            plan, gains = ilqr(problem, start, first, **options)
+            plan, gains = ilqr(here, start, first, **options)
             return plan, jnp.sqrt(gains.sensitivity / discounts)
         improver = gradient_ascent if settings.planner == "first_order" else gauss_newton
-        return improver(problem, start, first, **options), jnp.ones(settings.horizon)
+        return improver(here, start, first, **options), jnp.ones(settings.horizon)
 
     keys = jax.random.split(key, first.value.shape[0]) if settings.annealed else None
-    return jax.vmap(one, (0, None if keys is None else 0))(first, keys)
+    return jax.vmap(one, (0, 0, None if keys is None else 0))(first, varied, keys)
 
 
 def _tail(settings: Settings, problem: Problem, policy, end: State) -> jax.Array:
@@ -314,6 +323,11 @@ def _outcome(settings: Settings, learner: Learner, choice: Choice, finite: jax.A
 
 def _mean(values: jax.Array, counted: jax.Array) -> jax.Array:
     return jnp.sum(jnp.where(counted, values, 0.0)) / jnp.maximum(jnp.sum(counted), 1)
+
+
+def _joined(one, other):
+    """:return: the rows of both"""
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), one, other)
 
 
 def _pick(tree, index):

@@ -1,25 +1,41 @@
 """Hybrid differentiable simulation."""
 
+from collections.abc import Sequence
 from typing import Any
 
+import jax.numpy as jnp
+import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_hds.algos.correction import Correction, Wishes, correct, names_to_estimate
+from sb3_hds.algos.log import record_correction
+from sb3_hds.algos.measured import Measured, data_from
+from sb3_hds.algos.model import missing_effects
+from sb3_hds.algos.persistence import Tensors
 from sb3_hds.algos.twin_algorithm import TwinAlgorithm
-from sb3_hds.core import Twin
+from sb3_hds.core import Effect, Params, Trajectories, Twin
+from sb3_hds.sysid.residual import force_of
+
+# The learned force is learned again when the data have grown by this factor.
+_GROWTH = 2.0
+# Where the model has changed, learning rates go back to this point of their schedule.
+_AGAIN_FROM = 0.5
 
 
 class HDS(TwinAlgorithm):
     """
     Hybrid differentiable simulation: PODS on a model that measured data keep correcting.
 
-    What it adds to PODS here: exploration noise that decays, annealed acceptance of step sizes, and
-    plans that start where the real environment was seen. Correcting the model by what the
-    environment answers (parameters, effects, a learned residual) is not part of it yet: the twin
-    stays as given.
+    What it adds to PODS: exploration noise that decays, annealed acceptance of step sizes, plans
+    that start where the real environment was seen; and after each block of real steps, the model is
+    corrected by what the environment answered: parameters and attached effects are estimated, then
+    a force is learned for what remains, and a share ``beta`` of the plans is made in that hybrid.
+    Nothing is kept that does not predict held-out windows of the data better; a twin that is exact
+    is left alone.
 
     Idea: the HDS course project (ETH Zurich, 2024), from its description; planning by short
     horizons with a learned tail, weights and averaging are our own, see the documentation for what
@@ -87,6 +103,23 @@ class HDS(TwinAlgorithm):
         paper)
     :param least_gain: the pretraining ends when plans have gained less than this share of the
         policy's return, on the average of about ten epochs; 0: never
+    :param randomisation: domain randomisation: standard deviation of the twin's parameters between
+        rollouts, in units of each parameter's ``scale``; 0: none
+    :param calibrated: parameters of the twin, and of attached effects, that data correct:
+        ``"all"``, names, or None
+    :param effects: attached to the twin, so that data can inform them: names from ``effects.ALL``
+        (then at every joint or actuator), or effects
+    :param residual: whether a force is learned for what remains
+    :param residual_kwargs: ``n_members``, ``net_arch``, ``caution``, see ``sysid.fit_residual``
+    :param beta: share of rollouts in the model with the learned force, where that predicts held-out
+        windows better than the model without; ``"auto"``: in proportion to how much better, all of
+        them from a quarter on. The HDS project: 0.05.
+    :param refit_freq: blocks of ``train_freq`` from one correction to the next; 0: never
+    :param replan_epochs: planning epochs after a correction that changes the model noticeably
+    :param pretrain_data: ``Trajectories``, or a file of them, from which the model is corrected
+        before the first plan. The HDS project: random motion.
+    :param save_data: whether the measured steps are saved with the model
+    :param max_saved_steps: how many of them, the latest
     :param policy_kwargs: ``net_arch``, ``activation_fn``, ``linear_path``, ``max_grad_norm``
     :param stats_window_size: episodes in the averages that are logged
     :param tensorboard_log: folder for TensorBoard
@@ -141,6 +174,17 @@ class HDS(TwinAlgorithm):
         adapt_scales: bool = True,
         compare_every: int = 10,
         least_gain: float = 1e-3,
+        randomisation: float = 0.0,
+        calibrated: str | Sequence[str] | None = "all",
+        effects: Sequence[str | Effect] = (),
+        residual: bool = True,
+        residual_kwargs: dict[str, Any] | None = None,
+        beta: float | str = "auto",
+        refit_freq: int = 1,
+        replan_epochs: int = 30,
+        pretrain_data: Trajectories | str | None = None,
+        save_data: bool = True,
+        max_saved_steps: int = 100_000,
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -150,6 +194,21 @@ class HDS(TwinAlgorithm):
         monitor_wrapper: bool = True,
         _init_setup_model: bool = True,
     ) -> None:
+        self.calibrated = calibrated
+        self.effects = [e if isinstance(e, str) else e.to_spec() for e in effects]
+        self.residual = residual
+        self.residual_kwargs = residual_kwargs
+        self.beta = beta
+        self.refit_freq = refit_freq
+        self.replan_epochs = replan_epochs
+        self.save_data = save_data
+        self.max_saved_steps = max_saved_steps
+        self.model_beta = 0.0
+        self.nominal: dict[str, float] = {}
+        self.measured = Measured(self, data_from(pretrain_data))
+        self.learned_force = Tensors(self)
+        self._n_blocks, self._steps_at_refit, self._steps_at_force = 0, 0, 0
+        self._replanning = 0
         super().__init__(
             policy,
             env,
@@ -192,6 +251,7 @@ class HDS(TwinAlgorithm):
             adapt_scales=adapt_scales,
             compare_every=compare_every,
             least_gain=least_gain,
+            randomisation=randomisation,
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
@@ -201,3 +261,90 @@ class HDS(TwinAlgorithm):
             monitor_wrapper=monitor_wrapper,
             _init_setup_model=_init_setup_model,
         )
+
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        """Correct the model where a correction is due, then plan."""
+        self._n_blocks += 1
+        if self.refit_freq and self._n_blocks % self.refit_freq == 0:
+            self.correct_model(gradient_steps)
+        super().train(gradient_steps, batch_size)
+
+    def before_planning(self) -> None:
+        if self.measured.earlier is not None and not self._steps_at_refit:
+            self.correct_model()
+
+    def correct_model(self, gradient_steps: int = 0) -> Correction | None:
+        """
+        Correct the twin by all that was measured; where that changes it noticeably, plan anew.
+
+        :param gradient_steps: regression steps of each of those planning epochs; 0: no epochs
+        :return: what the data say; None before anything was measured
+        :raises NoTwinError: if the model was loaded without environment and without twin
+        """
+        data = self.measured.trajectories()
+        if data is None or self.twin is None:
+            return None
+        n_steps = data.n_steps
+        learn_force = n_steps >= _GROWTH * self._steps_at_force
+        found = correct(
+            self.twin,
+            data,
+            self._wishes(self.twin),
+            self.model_beta,
+            learn_force,
+            n_steps - self._steps_at_refit,
+        )
+        self._steps_at_refit = n_steps
+        if found.residual is not None:
+            self._steps_at_force = n_steps
+        if found.twin != self.twin:
+            self._workspace = None
+        if found.fit is not None:
+            self.twin_spec = found.twin.to_spec()
+        self.twin, self.model_beta = found.twin, found.beta
+        record_correction(self, found)
+        if found.changed and gradient_steps:
+            for left in range(self.replan_epochs, 0, -1):
+                self._replanning = left
+                self.run_epoch(gradient_steps)
+            self._replanning = 0
+        return found
+
+    def varied(self, twin: Twin) -> Params:
+        drawn, force = super().varied(twin), force_of(twin)
+        if force is not None:
+            n_hybrid = round(self.model_beta * self.n_rollouts)
+            chosen = np.random.permutation(self.n_rollouts) < n_hybrid
+            drawn[f"{force[0]}.share"] = jnp.asarray(chosen, jnp.float32)
+        return drawn
+
+    def _wishes(self, twin: Twin) -> Wishes:
+        return Wishes(
+            names=names_to_estimate(twin, self.calibrated),
+            nominal=self.nominal,
+            residual=self.residual,
+            residual_kwargs=self.residual_kwargs or {},
+            beta=self.beta,
+            seed=self.seed or 0,
+        )
+
+    def _prepared(self, twin: Twin) -> Twin:
+        missing = missing_effects(twin, self.effects)
+        twin = twin.extend(*missing) if missing else twin
+        if not self.nominal or set(self.nominal) - set(twin.values):
+            self.nominal = dict(twin.values)
+            names_to_estimate(twin, self.calibrated)
+        return twin
+
+    def _progress_remaining(self) -> float:
+        remaining = super()._progress_remaining()
+        if not self._replanning:
+            return remaining
+        return max(remaining, _AGAIN_FROM * self._replanning / self.replan_epochs)
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        names, variables = super()._get_torch_save_params()
+        return [*names, "learned_force", "measured"], variables
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "measured", "learned_force"]

@@ -82,6 +82,7 @@ class Knobs(NamedTuple):
     What may change from epoch to epoch without compiling again.
 
     :param params: the twin's parameters
+    :param varied: those of them that differ between rollouts, each of shape ``(n_rollouts,)``
     :param learning_rate: of the policy
     :param value_learning_rate: of the value network
     :param noise: standard deviation of the exploration noise, in units of the control scale
@@ -97,6 +98,7 @@ class Knobs(NamedTuple):
     """
 
     params: Params
+    varied: Params
     learning_rate: float
     value_learning_rate: float
     noise: float

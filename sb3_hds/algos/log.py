@@ -6,6 +6,8 @@ from sb3_hds.algos.epoch import Report
 from sb3_hds.algos.learner import Knobs
 
 if TYPE_CHECKING:
+    from sb3_hds.algos.correction import Correction
+    from sb3_hds.algos.hds import HDS
     from sb3_hds.algos.twin_algorithm import TwinAlgorithm
 
 
@@ -31,3 +33,21 @@ def record_epoch(model: "TwinAlgorithm", report: Report, knobs: Knobs, returns: 
     record("train/n_updates", model._n_updates, exclude="tensorboard")
     record("time/epochs", int(model.policy.progress.n_epochs))
     record("time/twin_timesteps", model.twin_timesteps)
+
+
+def record_correction(model: "HDS", found: "Correction") -> None:
+    """Record what the data say about the model."""
+    record = model.logger.record
+    record("model/error_twin", found.error_twin)
+    if found.fit is None:
+        return
+    record("model/error_calibrated", found.error_calibrated)
+    record("model/error_hybrid", found.error_hybrid)
+    record("model/beta", found.beta)
+    record("model/forgotten", int(found.forgotten))
+    if found.residual is not None:
+        record("model/disagreement", found.residual.disagreement)
+    for estimate in found.fit.estimates:
+        record(f"model/{estimate.name}", estimate.estimate)
+        record(f"model/{estimate.name}_low", estimate.low, exclude="stdout")
+        record(f"model/{estimate.name}_high", estimate.high, exclude="stdout")

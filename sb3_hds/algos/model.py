@@ -1,11 +1,12 @@
 """Which twin an algorithm plans in, and whether it can."""
 
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 from sb3_hds import effects, twins
-from sb3_hds.core import Twin
-from sb3_hds.errors import NoTwinError, RewardError
+from sb3_hds.core import Effect, Twin
+from sb3_hds.errors import EffectError, NoTwinError, RewardError
 
 
 def check_reward(twin: Twin) -> None:
@@ -43,10 +44,45 @@ def required(twin: Twin | None, spec: dict[str, Any] | None) -> Twin:
 def twin_from_spec(spec: dict[str, Any]) -> Twin | None:
     """:return: the twin that a file describes, or None, with a warning, if it is not registered"""
     try:
-        return twins.from_spec(spec, effects.ALL)
+        return twins.from_spec(spec, effects.KNOWN)
     except NoTwinError as error:
         warnings.warn(
             f"The model can predict but not train, because its twin '{spec['twin']}' is not "
             f"registered here. Register it, or load with twin=... ({str(error).splitlines()[0]})"
         )
         return None
+
+
+def missing_effects(twin: Twin, wanted: Sequence[str | dict[str, Any]]) -> list[Effect]:
+    """
+    :param wanted: names of effects, each meant at every place that it may have, or specs of effects
+    :return: those that the twin does not have yet
+    :raises EffectError: for a name that is not in the catalogue
+    """
+    known = {effect.name: effect for effect in effects.KNOWN}
+    names = [entry if isinstance(entry, str) else entry["effect"] for entry in wanted]
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise EffectError(
+            f"There is no effect called {', '.join(unknown)}. The catalogue has: "
+            f"{', '.join(effect.name for effect in effects.ALL)}."
+        )
+    found: list[Effect] = []
+    for entry in wanted:
+        if isinstance(entry, str):
+            effect = known[entry]
+            found += [effect(place.name) for place in _places(twin)[effect.slot]]
+        else:
+            effect, options = known[entry["effect"]], entry.get("options", {})
+            found.append(effect(entry["where"], **options, **entry["parameters"]))
+    return [effect for effect in found if not _has(twin, effect)]
+
+
+def _has(twin: Twin, effect: Effect) -> bool:
+    places = _places(twin)[effect.slot]
+    where = places[effect.where].name if isinstance(effect.where, int) else effect.where
+    return any(name.startswith(f"{effect.name}.{where}.") for name in twin.values)
+
+
+def _places(twin: Twin) -> dict[str, Any]:
+    return {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}

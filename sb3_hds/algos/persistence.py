@@ -190,6 +190,27 @@ class TrainingTensors:
         )
 
 
+class Tensors:
+    """
+    The learned arrays of a model's twin, as SB3 saves a network.
+
+    :param model: whose ``twin`` has them
+    """
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+
+    def state_dict(self) -> dict[str, th.Tensor]:
+        twin = self._model.twin
+        return {} if twin is None else to_state_dict(dict(twin.tensors))
+
+    def load_state_dict(self, state_dict: dict[str, th.Tensor], strict: bool = True) -> None:
+        twin = self._model.twin
+        if twin is not None and (twin.tensors or state_dict):
+            tensors = from_state_dict(dict(twin.tensors), state_dict, strict)
+            self._model.twin = twin.with_tensors(tensors)
+
+
 def _remove(file: Path) -> None:
     with contextlib.suppress(OSError):
         file.unlink()

@@ -91,6 +91,8 @@ class PODS(TwinAlgorithm):
         paper)
     :param least_gain: the pretraining ends when plans have gained less than this share of the
         policy's return, on the average of about ten epochs; 0: never
+    :param randomisation: domain randomisation: standard deviation of the twin's parameters between
+        rollouts, in units of each parameter's ``scale``; 0: none
     :param policy_kwargs: ``net_arch``, ``activation_fn``, ``linear_path``, ``max_grad_norm``
     :param stats_window_size: episodes in the averages that are logged
     :param tensorboard_log: folder for TensorBoard
@@ -141,6 +143,7 @@ class PODS(TwinAlgorithm):
         adapt_scales: bool = True,
         compare_every: int = 10,
         least_gain: float = 1e-3,
+        randomisation: float = 0.0,
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -192,6 +195,7 @@ class PODS(TwinAlgorithm):
             adapt_scales=adapt_scales,
             compare_every=compare_every,
             least_gain=least_gain,
+            randomisation=randomisation,
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,

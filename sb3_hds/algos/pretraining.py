@@ -26,6 +26,7 @@ class Pretraining(BaseCallback):
 
     def _on_training_start(self) -> None:
         model: TwinAlgorithm = self.model  # type: ignore[assignment]
+        model.before_planning()
         due = model.pretraining_due
         every = max(1, due // _N_LOGS)
         for i in self._shown(range(1, due + 1)):

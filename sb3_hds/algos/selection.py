@@ -69,10 +69,13 @@ def keep_better(
     problem = Problem(twin, knobs.params)
     starts = resets(twin, knobs.params, k_starts, _n_starts(twin))
     length = longest_episode(twin)
+    spread = np.linspace(0, settings.n_rollouts - 1, _n_starts(twin)).round().astype(int)
+    varied = jax.tree.map(lambda leaf: leaf[spread], knobs.varied)
 
     def mean_return(actor: Mapping[str, Any], inside: View) -> jax.Array:
         policy = lambda obs: output(settings.actor, actor, inside(knobs.view(obs)))  # noqa: E731
-        return jnp.mean(for_each(lambda s: follow(problem, s, policy, length).value, starts))
+        value = lambda s, own: follow(problem.with_params(own), s, policy, length).value  # noqa: E731
+        return jnp.mean(for_each(value, starts, varied))
 
     pairs = ((nets.average, nets.inside), (nets.acting, nets.acting_inside))
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pairs)

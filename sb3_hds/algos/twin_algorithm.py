@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from typing import Any, ClassVar, Self
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
 from sbx.common.off_policy_algorithm import OffPolicyAlgorithmJax
@@ -48,7 +49,7 @@ from sb3_hds.algos.persistence import damage_reported, write_whole
 from sb3_hds.algos.pretraining import Pretraining
 from sb3_hds.algos.selection import choose_policy, twin_steps_per_comparison
 from sb3_hds.algos.twin_policy import TwinPolicy, all_finite
-from sb3_hds.core import Twin
+from sb3_hds.core import Params, Twin
 from sb3_hds.envs.mirror import check_mirrors, twin_of
 
 # Decay of what counts as recent in the pretraining, per epoch, and the fewest epochs to judge by.
@@ -109,6 +110,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         adapt_scales: bool,
         compare_every: int,
         least_gain: float,
+        randomisation: float,
         policy_kwargs: dict[str, Any] | None,
         stats_window_size: int,
         tensorboard_log: str | None,
@@ -173,6 +175,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         self.adapt_scales = adapt_scales
         self.compare_every = compare_every
         self.least_gain = least_gain
+        self.randomisation = randomisation
         self.recent_gain, self.recent_return = 0.0, 0.0
         self.saved_by = type(self).__name__
         self.n_pretrained = 0
@@ -341,9 +344,31 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
                 check_mirrors(self.env, twin)
         if twin is not None:
             check_reward(twin)
+            twin = self._prepared(twin)
             if self.twin is not None and (twin != self.twin or twin.values != self.twin.values):
                 self._workspace = None
         self.twin = twin
+
+    def _prepared(self, twin: Twin) -> Twin:
+        """:return: what to plan in, given the twin of the environment or the one that was passed"""
+        return twin
+
+    def varied(self, twin: Twin) -> Params:
+        """
+        :return: parameters that differ between the rollouts of an epoch, each of shape
+            ``(n_rollouts,)``
+        """
+        if not self.randomisation:
+            return {}
+        drawn = {}
+        for name, parameter in twin.parameters.items():
+            deviation = self.randomisation * parameter.scale * np.random.randn(self.n_rollouts)
+            values = np.clip(twin.values[name] + deviation, parameter.lower, parameter.upper)
+            drawn[name] = jnp.asarray(values, jnp.float32)
+        return drawn
+
+    def before_planning(self) -> None:
+        """Called when a training starts, before the first planning epoch."""
 
     @property
     def _settings(self) -> Settings:

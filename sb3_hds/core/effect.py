@@ -11,6 +11,7 @@ import abc
 import copy
 import dataclasses
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import jax.numpy as jnp
@@ -98,6 +99,8 @@ class Effect(abc.ABC):
     source: ClassVar[str]
     #: names of effects that data cannot tell from this one -> the condition under which they cannot
     equivalents: ClassVar[Mapping[str, str]] = {}
+    #: learned arrays by name, pytrees that travel with the parameters; most effects have none
+    tensors: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(self, where: int | str = 0, **values: float) -> None:
         self.where = where
@@ -112,6 +115,25 @@ class Effect(abc.ABC):
         changed.values = dict(self.values)
         changed._set(values)
         return changed
+
+    def with_tensors(self: _Effect, **tensors: Any) -> _Effect:
+        """:return: the same effect with new arrays of the same shapes; equal for the compiler"""
+        changed = copy.copy(self)
+        changed.tensors = {**self.tensors, **tensors}
+        return changed
+
+    def fitted_to(self: _Effect, twin: "Twin") -> _Effect:
+        """:return: the same effect, with whatever depends on the twin that it is attached to"""
+        return self
+
+    def doubt(self, twin: "Twin", state: Any, action: Action, base: Params, own: Params) -> Scalar:
+        """
+        :param twin: the twin that the effect is attached to
+        :param base: parameters of that twin
+        :param own: the effect's own parameters, without prefix
+        :return: what planning pays for relying on the effect here, in the reward's unit
+        """
+        return jnp.zeros(())
 
     def at(self: _Effect, where: int | str) -> _Effect:
         """:return: the same effect at another joint, actuator or channel"""
@@ -252,8 +274,9 @@ class Attached:
     index: int
 
     def own(self, params: Params) -> Params:
-        """:return: the effect's own parameters, without prefix"""
-        return {name: params[f"{self.key}.{name}"] for name in self.effect.parameters}
+        """:return: the effect's own parameters and tensors, without prefix"""
+        names = (*self.effect.parameters, *self.effect.tensors)
+        return {name: params[f"{self.key}.{name}"] for name in names}
 
 
 class EffectChain:

@@ -59,6 +59,8 @@ class ExtendedTwin(Twin):
                 full_name = f"{a.key}.{name}"
                 self.parameters = {**self.parameters, full_name: _in_units_of(parameter, base, a)}
                 self.values[full_name] = a.effect.values[name]
+            own = {f"{a.key}.{name}": tree for name, tree in a.effect.tensors.items()}
+            self.tensors = {**self.tensors, **own}
         self._native = tuple(
             a for a in self.attached if (a.effect.name, a.index) in base.native_effects
         )
@@ -103,7 +105,11 @@ class ExtendedTwin(Twin):
     def planning_reward(
         self, state: State, action: Action, next_state: State, params: Params
     ) -> Scalar:
-        return self.base.planning_reward(state, action, next_state, self._base_params(params))
+        base = self._base_params(params)
+        reward = self.base.planning_reward(state, action, next_state, base)
+        for a in self._simulated:
+            reward = reward - a.effect.doubt(self.base, state, action, base, a.own(params))
+        return reward
 
     def terminated(self, state: State, params: Params) -> Flag:
         return self.base.terminated(state, self._base_params(params))
@@ -119,7 +125,7 @@ class ExtendedTwin(Twin):
 
     def effects_with_values(self) -> tuple[Effect, ...]:
         """:return: the effects, holding the values that the extended twin has for them now"""
-        return tuple(a.effect.with_values(**a.own(self.values)) for a in self.attached)
+        return tuple(_holding(a, self.params) for a in self.attached)
 
     def to_spec(self) -> dict[str, Any]:
         effects = [effect.to_spec() for effect in self.effects_with_values()]
@@ -159,6 +165,13 @@ class ExtendedTwin(Twin):
         return state._replace(memory=state.memory | memory)
 
 
+def _holding(attached: Attached, params: Params) -> Effect:
+    """The effect with its share of ``params``."""
+    own, effect = attached.own(params), attached.effect
+    tensors = {name: own.pop(name) for name in effect.tensors}
+    return effect.with_values(**own).with_tensors(**tensors)
+
+
 def _attach(effect: Effect, twin: Twin) -> Attached:
     """Find the place that an effect names by index or by name."""
     places = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}[
@@ -171,7 +184,8 @@ def _attach(effect: Effect, twin: Twin) -> Attached:
             f"Effect '{effect.name}' names {effect.slot} {effect.where!r}, but {twin.name} has: "
             f"{', '.join(f'{i} ({name})' for i, name in enumerate(names))}."
         )
-    return Attached(f"{effect.name}.{names[index]}", effect.at(names[index]), index)
+    placed = effect.at(names[index]).fitted_to(twin)
+    return Attached(f"{effect.name}.{names[index]}", placed, index)
 
 
 def _in_units_of(parameter: Parameter, twin: Twin, attached: Attached) -> Parameter:

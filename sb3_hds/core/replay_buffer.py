@@ -8,7 +8,7 @@ from sb3_hds.errors import TrajectoryError
 
 
 def episodes_in(
-    buffer: Any, action_space: Any = None, scaled: bool = True
+    buffer: Any, action_space: Any = None, scaled: bool = True, only_finite: bool = False
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """
     Follow each environment through the ring, oldest step first.
@@ -21,6 +21,7 @@ def episodes_in(
     :param buffer: anything with the attributes of SB3's ``ReplayBuffer``
     :param action_space: the box that actions are scaled back to; default: the buffer's own
     :param scaled: whether stored actions are scaled to [-1, 1], as SB3's algorithms store them
+    :param only_finite: whether to leave out steps with a value that is not finite, and to cut there
     :return: observations, each ``(T + 1, n_obs)``, and actions, each ``(T, n_act)``
     :raises TrajectoryError: for spaces other than boxes of one axis, and for an empty buffer
     """
@@ -44,12 +45,19 @@ def episodes_in(
         for steps in np.split(np.arange(len(order)), np.flatnonzero(ends) + 1):
             if shared and len(steps) and ends[steps[-1]] and steps[-1] != len(order) - 1:
                 steps = steps[:-1]
-            if len(steps):
-                obs.append(np.concatenate([before[steps], after[steps[-1:]]]))
-                actions.append(commands[order[steps], env])
+            for piece in _finite_runs(steps, before, after) if only_finite else [steps]:
+                if len(piece):
+                    obs.append(np.concatenate([before[piece], after[piece[-1:]]]))
+                    actions.append(commands[order[piece], env])
     if not obs:
         raise TrajectoryError("The replay buffer holds no step yet. Collect some first.")
     return obs, actions
+
+
+def _finite_runs(steps: np.ndarray, before: np.ndarray, after: np.ndarray) -> list[np.ndarray]:
+    finite = np.all(np.isfinite(before[steps]) & np.isfinite(after[steps]), axis=1)
+    runs = np.split(steps, np.flatnonzero(np.diff(finite.astype(int))) + 1) if len(steps) else []
+    return [run for run in runs if finite[run[0] - steps[0]]]
 
 
 def _oldest_first(buffer: Any, shared: bool) -> np.ndarray:

@@ -92,6 +92,7 @@ class Trajectories:
         action_space: Any = None,
         *,
         scaled: bool = True,
+        only_finite: bool = False,
         condition: str = "replay buffer",
     ) -> "Trajectories":
         """
@@ -103,10 +104,11 @@ class Trajectories:
         :param dt: control interval of the environment [s]
         :param action_space: the box that actions are scaled back to; default: the buffer's own
         :param scaled: whether stored actions are scaled to [-1, 1], as SB3's algorithms store them
+        :param only_finite: leave out steps with a value that is not finite, and cut there
         :param condition: label for all of them
         :raises TrajectoryError: for spaces other than boxes of one axis, and for an empty buffer
         """
-        obs, actions = episodes_in(replay_buffer, action_space, scaled)
+        obs, actions = episodes_in(replay_buffer, action_space, scaled, only_finite)
         return cls.from_arrays(obs, actions, dt=dt, conditions=condition)
 
     @classmethod

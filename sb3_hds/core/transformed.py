@@ -107,7 +107,7 @@ class TransformedTwin(Twin):
         return action if self.action is None else self.action.apply(action, self.base.actuators)
 
     def _base_with_values(self) -> Twin:
-        return self.base.with_parameters(**self.values)
+        return self.base.with_parameters(**self.values).with_tensors(self.tensors)
 
 
 def seen_through(

@@ -4,6 +4,7 @@ import abc
 import copy
 import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import jax.numpy as jnp
@@ -83,6 +84,8 @@ class Twin(abc.ABC):
     native_effects: Mapping[tuple[str, int], Mapping[str, str]] = {}
     #: Structural choices with their defaults, set by keyword: ``{"goal": "stop"}``.
     options: ClassVar[Mapping[str, Any]] = {}
+    #: Learned arrays of attached effects, by full name: pytrees that travel with the parameters.
+    tensors: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(
         self, *, dt: float | None = None, substeps: int | None = None, **settings: Any
@@ -106,7 +109,7 @@ class Twin(abc.ABC):
     @property
     def params(self) -> Params:
         """The current values of all parameters: what every method takes as ``params``."""
-        return dict(self.values)
+        return {**self.values, **self.tensors}
 
     def with_parameters(self: _Twin, **values: float) -> _Twin:
         """
@@ -117,6 +120,22 @@ class Twin(abc.ABC):
         changed = copy.copy(self)
         changed.values = dict(self.values)
         changed._set(values)
+        return changed
+
+    def with_tensors(self: _Twin, tensors: Mapping[str, Any]) -> _Twin:
+        """
+        :param tensors: new arrays by full name, of the same shapes
+        :return: the same twin with these arrays; equal to this one for the compiler
+        :raises ParameterError: for an unknown name
+        """
+        unknown = set(tensors) - set(self.tensors)
+        if unknown:
+            raise ParameterError(
+                f"{self.name} has no tensors named {', '.join(sorted(unknown))}. "
+                f"It has: {', '.join(self.tensors) or 'none'}."
+            )
+        changed = copy.copy(self)
+        changed.tensors = {**self.tensors, **tensors}
         return changed
 
     def extend(self, *effects: "Effect") -> "Twin":
@@ -233,6 +252,7 @@ class Twin(abc.ABC):
         self.differentiability = base.differentiability
         self.reward_has_gradient = base.reward_has_gradient
         self.parameters, self.values = base.parameters, dict(base.values)
+        self.tensors = dict(base.tensors)
 
     def _set(self, values: Mapping[str, Any]) -> None:
         for name, value in values.items():

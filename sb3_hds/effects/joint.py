@@ -59,3 +59,24 @@ class CoulombFriction(JointEffect):
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
         width = jnp.maximum(_STANDSTILL, params["tau_c"] * joint.h / joint.inertia)
         return -params["tau_c"] * jnp.tanh(joint.v / width)
+
+
+class QuadraticDrag(JointEffect):
+    r"""
+    Resistance of a medium: grows with the square of the speed.
+
+    .. math:: \tau = -\min(c\,|v|,\; I / h)\,v
+
+    The bound is the same as that of :class:`ViscousFriction`.
+
+    Source: Fossen, *Handbook of Marine Craft Hydrodynamics and Motion Control*, Wiley 2011,
+    section 6.4.
+    """
+
+    name = "quadratic_drag"
+    parameters = {"c": Parameter(null=0.0, scale=0.02, unit="N m s2/rad2", lower=0.0)}
+    explanation = "The joint moves through a medium, such as air, that resists fast motion most."
+    source = "Fossen 2011, section 6.4"
+
+    def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
+        return -jnp.minimum(params["c"] * jnp.abs(joint.v), joint.inertia / joint.h) * joint.v

@@ -8,26 +8,35 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sb3_hds.envs.inverted_pendulum_friction import InvertedPendulumFriction
     from sb3_hds.envs.mirror import check_mirrors, twin_of
+    from sb3_hds.envs.pendulum_real import PendulumReal
     from sb3_hds.envs.registration import register_environments
     from sb3_hds.envs.side_by_side import verify_mirror
+    from sb3_hds.envs.truth import true_twin
     from sb3_hds.envs.twin_env import TwinEnv
     from sb3_hds.envs.twin_vec_env import TwinVecEnv
 
 __all__ = [
+    "InvertedPendulumFriction",
+    "PendulumReal",
     "TwinEnv",
     "TwinVecEnv",
     "check_mirrors",
     "register_environments",
+    "true_twin",
     "twin_of",
     "verify_mirror",
 ]
 
 _MODULES = {
+    "InvertedPendulumFriction": "inverted_pendulum_friction",
+    "PendulumReal": "pendulum_real",
     "TwinEnv": "twin_env",
     "TwinVecEnv": "twin_vec_env",
     "check_mirrors": "mirror",
     "register_environments": "registration",
+    "true_twin": "truth",
     "twin_of": "mirror",
     "verify_mirror": "side_by_side",
 }

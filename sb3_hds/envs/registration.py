@@ -2,11 +2,20 @@
 
 import gymnasium
 
-#: Environment id -> steps after which gymnasium's ``TimeLimit`` cuts an episode.
+#: Environments made of a twin: id -> steps after which gymnasium's ``TimeLimit`` cuts an episode.
 STEP_LIMITS = {
     "sb3_hds/AcrobotContinuous-v0": 500,
     "sb3_hds/CartPoleSwingUp-v0": 250,
     "sb3_hds/PayloadPendulum-v0": 100,
+}
+
+#: Stand-ins for hardware, stepped by MuJoCo's engine: id -> class and step limit.
+HARDWARE = {
+    "sb3_hds/InvertedPendulumFriction-v5": (
+        "sb3_hds.envs.inverted_pendulum_friction:InvertedPendulumFriction",
+        1000,
+    ),
+    "sb3_hds/PendulumReal-v1": ("sb3_hds.envs.pendulum_real:PendulumReal", 200),
 }
 
 _ENTRY_POINT = "sb3_hds.envs.twin_env:TwinEnv"
@@ -17,8 +26,9 @@ def register_environments() -> None:
     Make our ids known to ``gymnasium.make``. Calling it again changes nothing.
 
     Keyword arguments of ``gymnasium.make`` are settings of the twin: values of parameters by name,
-    its options, ``dt`` [s], ``substeps``. Where another process makes the environment by its id,
-    as with SB3's ``SubprocVecEnv``, name the package too: ``"sb3_hds:sb3_hds/CartPoleSwingUp-v0"``.
+    its options, ``dt`` [s], ``substeps``; those of the stand-ins for hardware are documented in
+    their classes. Where another process makes the environment by its id, as with SB3's
+    ``SubprocVecEnv``, name the package too: ``"sb3_hds:sb3_hds/CartPoleSwingUp-v0"``.
     """
     for env_id, max_episode_steps in STEP_LIMITS.items():
         if env_id not in gymnasium.registry:
@@ -28,3 +38,6 @@ def register_environments() -> None:
                 max_episode_steps=max_episode_steps,
                 kwargs={"twin": env_id},
             )
+    for env_id, (entry_point, max_episode_steps) in HARDWARE.items():
+        if env_id not in gymnasium.registry:
+            gymnasium.register(env_id, entry_point=entry_point, max_episode_steps=max_episode_steps)

@@ -68,16 +68,16 @@ def view_of(twin: Twin) -> View:
 
 class Canvas:
     """
-    Draws frames of one twin with matplotlib's Agg backend; opens no window.
+    Draws frames with matplotlib's Agg backend; opens no window.
 
-    :param twin: what is drawn
+    :param view: what is shown; moves along where the drawing leaves it
     """
 
-    def __init__(self, twin: Twin) -> None:
+    def __init__(self, view: View) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        self._view = view_of(twin)
+        self._view = view
         figure = Figure(figsize=(_PIXELS / _DPI, _PIXELS / _DPI), dpi=_DPI, facecolor=_PAPER_COLOUR)
         self._agg = FigureCanvasAgg(figure)
         self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), facecolor=_PAPER_COLOUR)

@@ -107,11 +107,11 @@ class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
                 'render_mode="rgb_array".'
             )
             return None
-        from sb3_hds.envs.rendering import Canvas
+        from sb3_hds.envs.rendering import Canvas, view_of
 
         with _host():
             if self._canvas is None:
-                self._canvas = Canvas(self.twin)
+                self._canvas = Canvas(view_of(self.twin))
             points = programs.for_one(self.twin).sketch(self.state, self.twin.params)
             return self._canvas.draw(points)
 

@@ -163,10 +163,10 @@ class TwinVecEnv(VecEnv):
         if self.render_mode is None:
             warnings.warn('There are no images without render_mode="rgb_array".')
             return [None] * self.num_envs
-        from sb3_hds.envs.rendering import Canvas
+        from sb3_hds.envs.rendering import Canvas, view_of
 
         if self._canvas is None:
-            self._canvas = Canvas(self.twin)
+            self._canvas = Canvas(view_of(self.twin))
         sketches = programs.for_many(self.twin).sketch(self.states, self.twin.params)
         return [self._canvas.draw(points) for points in np.asarray(sketches)]
 

@@ -69,6 +69,10 @@ class Problem:
     def n_controls(self) -> int:
         return len(self.twin.actuators)
 
+    def with_params(self, params: Params) -> "Problem":
+        """:return: the same problem with other values for these parameters"""
+        return dataclasses.replace(self, params=self.params | params) if params else self
+
     def action(self, control: Control) -> Action:
         """:return: the command in the units of the action space for a control in [-1, 1]"""
         low = jnp.array([actuator.low for actuator in self.twin.actuators], control.dtype)

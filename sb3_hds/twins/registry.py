@@ -97,7 +97,7 @@ def from_spec(spec: Mapping[str, Any], effects: Iterable[type[Effect]] = ()) -> 
             f"The twin '{spec['twin']}' was saved with effects that are not known here: {missing}."
         )
     attached = [
-        known[part["effect"]](part["where"], **part["parameters"])
+        known[part["effect"]](part["where"], **part.get("options", {}), **part["parameters"])
         for part in spec.get("effects", ())
     ]
     twin = twin.extend(*attached) if attached else twin

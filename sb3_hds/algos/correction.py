@@ -1,0 +1,294 @@
+"""Correct the twin by what was measured: parameters, then effects, then a learned force."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from sb3_hds.core import Trajectories, Twin
+from sb3_hds.errors import CalibrationError, TrajectoryError
+from sb3_hds.sysid import Fit
+from sb3_hds.sysid.calibrate import check_fits, default_window, fit_windows, spread_of
+from sb3_hds.sysid.prediction import (
+    gain,
+    has_grown,
+    hold_out,
+    is_better,
+    single_step_errors,
+    window_errors,
+)
+from sb3_hds.sysid.residual import Residual, fit_force, force_of
+from sb3_hds.sysid.shooting import Shots, shots_of
+
+# Rows of the compiled programs: the latest windows are used.
+_N_WINDOWS = 128
+# A twin whose windows miss by less than this share of the channels' spread needs no correction.
+_EXACT = 1e-3
+# The same for a single step, and how many are looked at.
+_EXACT_STEP, _N_SINGLE = 1e-4, 256
+# Fewer windows than this are too few to check on some what was learned from others.
+_FEWEST = 6
+# Share of windows to check on, and that share where there are not many.
+_HELD, _HELD_OF_FEW, _MANY = 0.25, 0.5, 24
+# Plans are made anew where the corrected model's error is lower by this share.
+_NOTICEABLE = 0.1
+# A calibrated twin needs less proof than a learned force: it has few parameters, and a prior.
+_LEAST_OF_CALIBRATION = 0.02
+# A learned force that lowers the error by this share is planned in exclusively.
+_TRUSTED = 0.25
+
+
+@dataclasses.dataclass(frozen=True)
+class Wishes:
+    """
+    What is to be corrected.
+
+    :param names: parameters that are estimated; empty: none
+    :param nominal: values that are believed before any data, by name
+    :param residual: whether a force is learned
+    :param residual_kwargs: further arguments of ``sysid.fit_residual``
+    :param beta: share of rollouts in the learned model, or ``"auto"``
+    :param seed: of whatever is drawn
+    """
+
+    names: tuple[str, ...]
+    nominal: Mapping[str, float]
+    residual: bool
+    residual_kwargs: Mapping[str, Any]
+    beta: float | str
+    seed: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Correction:
+    """
+    What the data say. Errors are root mean squares over held-out windows, in shares of the
+    channels' spread; not a number where there was nothing to compare.
+
+    :param twin: to plan in from now on
+    :param beta: share of rollouts in the learned model
+    :param changed: whether the model is so different that plans should be made anew
+    :param forgotten: whether data from before a change of the system were left out
+    :param fit: of the parameters, if they were estimated
+    :param residual: the learned force, if it was learned
+    :param error_twin: of the twin as it was before any data
+    :param error_calibrated: of the calibrated one
+    :param error_hybrid: of that with the learned force
+    """
+
+    twin: Twin
+    beta: float
+    changed: bool
+    forgotten: bool = False
+    fit: Fit | None = None
+    residual: Residual | None = None
+    error_twin: float = np.nan
+    error_calibrated: float = np.nan
+    error_hybrid: float = np.nan
+
+
+def correct(
+    twin: Twin,
+    data: Trajectories,
+    wishes: Wishes,
+    beta: float,
+    learn_force: bool,
+    n_new: int,
+) -> Correction:
+    """
+    Estimate parameters, then learn what remains; keep each only if held-out windows say so.
+
+    :param twin: as it is now
+    :param data: everything measured, oldest first
+    :param wishes: what is to be corrected
+    :param beta: as it is now
+    :param learn_force: whether it is time to learn the force again
+    :param n_new: steps that came since the last correction
+    :raises CalibrationError: for data that cannot have been measured on what the twin simulates
+    """
+    check_fits(twin, data)
+    if twin.values == wishes.nominal:
+        single = single_step_errors(twin, data, spread_of(data), _N_SINGLE)
+        if np.median(single) < _EXACT_STEP:
+            return Correction(twin, beta, changed=False, error_twin=float(np.median(single)))
+    try:
+        shots, origin = shots_of(data, default_window(data), twin, _N_WINDOWS, seed=None)
+    except TrajectoryError:
+        return Correction(twin, beta, changed=False)
+    spread = spread_of(data)
+    nominal = twin.with_parameters(**wishes.nominal)
+    bare, now = (window_errors(t, _without_force(t), shots, spread) for t in (nominal, twin))
+    real = origin >= 0
+    if real.sum() < _FEWEST or np.median(bare[real]) < _EXACT:
+        return Correction(twin, beta, changed=False, error_twin=_mean(bare[real]))
+    shots, origin, forgotten = _since_change(shots, origin, now, n_new)
+    held = hold_out(origin, _HELD if real.sum() >= _MANY else _HELD_OF_FEW)
+    learned = shots._replace(weight=shots.weight * ~held)
+
+    fit = _calibrated(nominal, twin, learned, origin, spread, wishes)
+    calibrated, errors = _best(nominal, twin, fit, bare, now, shots, spread, held)
+    found = Correction(
+        calibrated,
+        0.0,
+        changed=False,
+        forgotten=forgotten,
+        fit=fit,
+        error_twin=_mean(bare[held]),
+        error_calibrated=_mean(errors[held]),
+    )
+    found = _with_residual(found, shots, held, errors, spread, wishes, beta, learn_force)
+    new, old = _of(found, errors, shots, spread, held), _of_old(twin, beta, shots, spread, held)
+    return dataclasses.replace(found, changed=gain(new, old) > _NOTICEABLE)
+
+
+def _calibrated(
+    nominal: Twin,
+    twin: Twin,
+    learned: Shots,
+    origin: np.ndarray,
+    spread: Float[np.ndarray, " obs"],
+    wishes: Wishes,
+) -> Fit | None:
+    """From the values as they are, with what was believed before any data as prior."""
+    if not wishes.names:
+        return None
+    believed = np.array([nominal.values[name] for name in wishes.names])
+    start = twin.with_parameters(**{k: 0.0 for k in _shares(twin)})
+    try:
+        return fit_windows(
+            start, wishes.names, learned, origin, spread, prior=1.0, believed=believed
+        )
+    except CalibrationError:
+        return None
+
+
+def _best(
+    nominal: Twin,
+    twin: Twin,
+    fit: Fit | None,
+    bare: np.ndarray,
+    now: np.ndarray,
+    shots: Shots,
+    spread: np.ndarray,
+    held: np.ndarray,
+) -> tuple[Twin, np.ndarray]:
+    """:return: the calibrated twin if it predicts better, otherwise the twin as it is or was"""
+    current = (twin, now) if now[held].mean() < bare[held].mean() else (nominal, bare)
+    if fit is None or not all(np.isfinite(e.estimate) for e in fit.estimates):
+        return current
+    new = twin.with_parameters(**{e.name: e.estimate for e in fit.estimates})
+    errors = window_errors(new, _without_force(new), shots, spread)
+    if (
+        gain(errors[held], bare[held]) > _LEAST_OF_CALIBRATION
+        and gain(errors[held], now[held]) >= 0.0
+    ):
+        return new, errors
+    return current
+
+
+def _with_residual(
+    found: Correction,
+    shots: Shots,
+    held: np.ndarray,
+    errors: np.ndarray,
+    spread: np.ndarray,
+    wishes: Wishes,
+    beta: float,
+    learn_force: bool,
+) -> Correction:
+    twin, residual = found.twin, None
+    wanted = wishes.residual and wishes.beta != 0.0 and np.median(errors[held]) > _EXACT
+    if wanted and learn_force:
+        scale = 0.05 * spread if found.fit is None else found.fit.noise
+        scale = np.maximum(scale, 1e-3 * spread)
+        try:
+            residual = fit_force(
+                twin, shots, held, scale, seed=wishes.seed, **wishes.residual_kwargs
+            )
+        except CalibrationError:
+            residual = None
+    # Simulating a force that does not help costs time.
+    if residual is not None and (residual.accepted or _shares(twin)):
+        twin = residual.twin
+    key = next(iter(_shares(twin)), None)
+    if key is None:
+        hybrid = np.nan if residual is None else _mean(residual.error_after)
+        return dataclasses.replace(found, residual=residual, error_hybrid=hybrid)
+    whole = window_errors(twin, {**twin.params, key: 1.0}, shots, spread)
+    helps = is_better(whole[held], errors[held])
+    share = 0.0
+    if helps:
+        trust = min(1.0, gain(whole[held], errors[held]) / _TRUSTED)
+        share = trust if wishes.beta == "auto" else wishes.beta
+    twin = twin.with_parameters(**{key: 1.0 if helps else 0.0})
+    return dataclasses.replace(
+        found,
+        twin=twin,
+        beta=float(share),
+        residual=residual,
+        error_hybrid=_mean(whole[held]),
+    )
+
+
+def _of(
+    found: Correction, errors: np.ndarray, shots: Shots, spread: np.ndarray, held: np.ndarray
+) -> np.ndarray:
+    if found.beta == 0.0:
+        return errors[held]
+    return window_errors(found.twin, found.twin.params, shots, spread)[held]
+
+
+def _of_old(
+    twin: Twin, beta: float, shots: Shots, spread: np.ndarray, held: np.ndarray
+) -> np.ndarray:
+    params = twin.params if beta > 0.0 else _without_force(twin)
+    return window_errors(twin, params, shots, spread)[held]
+
+
+def _since_change(
+    shots: Shots, origin: np.ndarray, errors: np.ndarray, n_new: int
+) -> tuple[Shots, np.ndarray, bool]:
+    """Leave out what was measured before the system became another one, if it did."""
+    real = np.flatnonzero(origin >= 0)
+    n_latest = max(_FEWEST, n_new // (shots.actions.shape[1] + 1))
+    older, latest = real[:-n_latest], real[-n_latest:]
+    if len(older) < _FEWEST:
+        return shots, origin, False
+    if not has_grown(errors[latest], errors[older]):
+        return shots, origin, False
+    weight = shots.weight.copy()
+    weight[older] = 0.0
+    return shots._replace(weight=weight), np.where(weight > 0.0, origin, -1), True
+
+
+def _shares(twin: Twin) -> tuple[str, ...]:
+    force = force_of(twin)
+    return () if force is None else (f"{force[0]}.share",)
+
+
+def _without_force(twin: Twin) -> dict[str, Any]:
+    return twin.params | dict.fromkeys(_shares(twin), 0.0)
+
+
+def _mean(errors: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan")
+
+
+def names_to_estimate(twin: Twin, wanted: str | Sequence[str] | None) -> tuple[str, ...]:
+    """
+    :param wanted: ``"all"``, names of parameters, or None
+    :raises CalibrationError: for a name that the twin does not have
+    """
+    every = tuple(name for name in twin.parameters if name not in _shares(twin))
+    if wanted is None:
+        return ()
+    names = every if wanted == "all" else (wanted,) if isinstance(wanted, str) else tuple(wanted)
+    unknown = [name for name in names if name not in every]
+    if unknown:
+        raise CalibrationError(
+            f"calibrated names {', '.join(unknown)}, which {twin.name} does not have. "
+            f"Its parameters are: {', '.join(every) or 'none'}. 'all' estimates all of them."
+        )
+    return names

@@ -1,0 +1,128 @@
+"""The real steps that a model has seen, and how they travel with it."""
+
+import os
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch as th
+
+from sb3_hds.core import Trajectories
+from sb3_hds.errors import TrajectoryError
+
+if TYPE_CHECKING:
+    from sb3_hds.algos.hds import HDS
+
+_COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+
+class Measured:
+    """
+    What SB3 saves beside the policy: it has ``state_dict`` and ``load_state_dict``.
+
+    :param model: whose replay buffer holds the data
+    :param earlier: data from before this model, for example a file of random motion
+    """
+
+    def __init__(self, model: "HDS", earlier: Trajectories | None = None) -> None:
+        self._model = model
+        self.earlier = earlier
+
+    def trajectories(self) -> Trajectories | None:
+        """:return: everything measured, oldest first; None before anything was"""
+        buffer, twin = self._model.replay_buffer, self._model.twin
+        parts = [] if self.earlier is None else [self.earlier]
+        if buffer is not None and buffer.size() > 0 and twin is not None:
+            space = self._model.action_space
+            try:
+                found = Trajectories.from_replay_buffer(buffer, twin.dt, space, only_finite=True)
+                parts.append(found)
+            except TrajectoryError:  # none of the steps is finite
+                pass
+        return Trajectories.concatenate(parts) if parts else None
+
+    def state_dict(self) -> dict[str, th.Tensor]:
+        """:return: the latest steps, oldest first, shape ``(steps, n_envs, ...)``; earlier data"""
+        limit = self._model.max_saved_steps if self._model.save_data else 0
+        saved: dict[str, th.Tensor] = {}
+        buffer = self._model.replay_buffer
+        if buffer is not None and limit and buffer.size() > 0:
+            order = np.arange(buffer.pos)
+            if buffer.full:
+                order = (buffer.pos + np.arange(buffer.buffer_size)) % buffer.buffer_size
+            order = order[-max(1, limit // buffer.n_envs) :]
+            for name in _COLUMNS:
+                if hasattr(buffer, name):
+                    saved[name] = th.as_tensor(getattr(buffer, name)[order].copy())
+        if self.earlier is not None and limit:
+            early = self.earlier
+            for name in ("obs", "actions", "lengths", "origin"):
+                saved[f"earlier.{name}"] = th.as_tensor(np.array(getattr(early, name)))
+            saved["earlier.dt"] = th.as_tensor(early.dt, dtype=th.float64)
+        return saved
+
+    def load_state_dict(self, tensors: dict[str, th.Tensor], strict: bool = True) -> None:
+        """
+        Fill the replay buffer with what was saved.
+
+        :raises RuntimeError: if the data do not fit the spaces
+        """
+        if "earlier.obs" in tensors:
+            self.earlier = _unpadded({k.partition(".")[2]: v for k, v in tensors.items()})
+        buffer = self._model.replay_buffer
+        if buffer is None or "observations" not in tensors:
+            return
+        columns = {name: tensors[name].cpu().numpy() for name in _COLUMNS if name in tensors}
+        columns = _for_copies(columns, buffer.n_envs)
+        n = min(len(columns["observations"]), buffer.buffer_size)
+        for name, values in columns.items():
+            kept = getattr(buffer, name, None)
+            if kept is None:
+                continue
+            if kept.shape[1:] != values.shape[1:]:
+                raise RuntimeError(
+                    f"The saved data have {name} of shape {values.shape[1:]}, this environment "
+                    f"has {kept.shape[1:]}."
+                )
+            kept[:n] = values[-n:]
+        buffer.pos, buffer.full = n % buffer.buffer_size, n == buffer.buffer_size
+
+
+def data_from(source: Any) -> Trajectories | None:
+    """
+    :param source: trajectories, the path of a file that ``Trajectories.save`` wrote, or None
+    :raises TrajectoryError: for anything else, or a file that cannot be read
+    """
+    if source is None or isinstance(source, Trajectories):
+        return source
+    if isinstance(source, str | os.PathLike):
+        return Trajectories.load(source)
+    raise TrajectoryError(
+        f"pretrain_data takes Trajectories or the path of a file, got {source!r}. "
+        "Use Trajectories.from_arrays."
+    )
+
+
+def _for_copies(columns: dict[str, np.ndarray], n_envs: int) -> dict[str, np.ndarray]:
+    """One copy after the other, shared out among another number of copies."""
+    n_saved = columns["observations"].shape[1]
+    if n_saved == n_envs:
+        return columns
+    n = len(columns["observations"]) * n_saved // n_envs
+    if not n:
+        warnings.warn(f"The saved data are fewer than {n_envs} steps and were left out.")
+    line = {k: v.swapaxes(0, 1).reshape(-1, *v.shape[2:]) for k, v in columns.items()}
+    return {
+        k: v[: n * n_envs].reshape(n_envs, n, *v.shape[1:]).swapaxes(0, 1) for k, v in line.items()
+    }
+
+
+def _unpadded(saved: dict[str, th.Tensor]) -> Trajectories:
+    obs, actions = (saved[name].cpu().numpy() for name in ("obs", "actions"))
+    lengths = saved["lengths"].cpu().numpy()
+    return Trajectories.from_arrays(
+        [x[: n + 1] for x, n in zip(obs, lengths, strict=True)],
+        [u[:n] for u, n in zip(actions, lengths, strict=True)],
+        dt=float(saved["dt"]),
+        conditions="earlier",
+    )

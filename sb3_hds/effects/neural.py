@@ -1,0 +1,228 @@
+"""A learned residual: the force that no named effect accounts for."""
+
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Self
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from sb3_hds.core import (
+    Action,
+    Force,
+    ForceEffect,
+    Memory,
+    Moment,
+    Parameter,
+    Params,
+    Position,
+    Scalar,
+    Velocity,
+)
+from sb3_hds.core.storage import read_npz, write_npz
+from sb3_hds.errors import EffectError, TrajectoryError
+
+if TYPE_CHECKING:
+    from sb3_hds.core import Twin
+
+_FORMAT = "sb3_hds.NeuralForce"
+# Largest force that a member can give, in units of the normalised output.
+_LARGEST = 3.0
+
+
+class NeuralForce(ForceEffect):
+    r"""
+    A generalised force on all joints, learned from data: the mean of an ensemble of small networks.
+
+    .. math::
+        \tau = s\,\frac{1}{n} \sum_i \sigma_\tau\, 3 \tanh\!\Big(\tfrac{1}{3}
+            f_i\big((z - \mu) / \sigma\big)\Big),
+        \qquad z = (q, \cos q, \sin q, v, \tau_\text{act})
+
+    Angles enter by cosine and sine, sliders as they are. Inputs and output are normalised by
+    :math:`\mu, \sigma, \sigma_\tau`, which belong to the weights. It is bounded, so it cannot run
+    away where there were no data. It is evaluated at every internal sub-step, like any force.
+
+    It is never the name of a cause: it measures what is left when the named causes are accounted
+    for, and it lets a policy be learned all the same.
+
+    Source: Chua et al., *Deep reinforcement learning in a handful of trials*, NeurIPS 2018
+    (ensembles); Heiden et al., *NeuralSim*, ICRA 2021 (residual forces inside a simulation).
+
+    :param where: the joint by which it is named; it acts on all of them
+    :param n_members: networks in the ensemble
+    :param net_arch: units of the hidden layers
+    :param caution: what planning pays for each unit of disagreement, in the reward's unit
+    :param values: ``share``, how much of it acts: 0 nothing, 1 all
+    :raises EffectError: for an unknown parameter, or sizes that are not positive
+    """
+
+    name = "neural_force"
+    parameters = {"share": Parameter(null=0.0, scale=1.0, unit="1", lower=0.0, upper=1.0)}
+    explanation = "Something acts on the joints that has no name here, and was learned from data."
+    source = "Chua et al. 2018; Heiden et al. 2021"
+
+    def __init__(
+        self,
+        where: int | str = 0,
+        *,
+        n_members: int = 5,
+        net_arch: Sequence[int] = (16,),
+        caution: float = 0.0,
+        **values: float,
+    ) -> None:
+        super().__init__(where, **values)
+        if n_members < 1 or not all(width >= 1 for width in net_arch):
+            raise EffectError(
+                f"An ensemble needs members and units, got {n_members} of {tuple(net_arch)}."
+            )
+        self.n_members, self.net_arch = int(n_members), tuple(int(width) for width in net_arch)
+        self.caution = float(caution)
+        self.hinges: tuple[bool, ...] = ()
+
+    def fitted_to(self, twin: "Twin") -> "NeuralForce":
+        """:return: with random weights, for the joints of ``twin``, unless it has its own"""
+        hinges = tuple(joint.unit == "rad" for joint in twin.joints)
+        if self.tensors and hinges != self.hinges:
+            raise EffectError(
+                f"This NeuralForce was learned on {len(self.hinges)} joint(s) of other kinds than "
+                f"those of {twin.name}. Learn it again: sysid.fit_residual."
+            )
+        if self.tensors:
+            return self
+        fitted = self.with_values()
+        fitted.hinges = hinges
+        return fitted.with_tensors(**fitted.fresh(jax.random.key(0)))
+
+    def fresh(self, key: Array) -> dict[str, Any]:
+        """:return: random weights, normalised as if every input and output were of size one"""
+        n_in, n_out = self._n_inputs, len(self.hinges)
+        draw = lambda k: self._network.init(k, jnp.zeros(n_in))["params"]  # noqa: E731
+        return {
+            "weights": jax.vmap(draw)(jax.random.split(key, self.n_members)),
+            "input_mean": jnp.zeros(n_in),
+            "input_scale": jnp.ones(n_in),
+            "output_scale": jnp.ones(n_out),
+        }
+
+    def inputs(self, q: Position, v: Velocity, actuator: Force) -> Float[Array, " inputs"]:
+        """:return: what the networks see, before it is normalised"""
+        sliders = [i for i, hinge in enumerate(self.hinges) if not hinge]
+        hinges = [i for i, hinge in enumerate(self.hinges) if hinge]
+        turned, slid = q[jnp.array(hinges, int)], q[jnp.array(sliders, int)]
+        return jnp.concatenate([slid, jnp.cos(turned), jnp.sin(turned), v, actuator])
+
+    def forces(
+        self, q: Position, v: Velocity, actuator: Force, own: Params
+    ) -> Float[Array, "members dof"]:
+        """:return: what each member says [N m] or [N], whole, whatever the share"""
+        seen = (self.inputs(q, v, actuator) - own["input_mean"]) / own["input_scale"]
+        say = lambda weights: jnp.asarray(self._network.apply({"params": weights}, seen))  # noqa: E731
+        said = jax.vmap(say)(own["weights"])
+        return own["output_scale"] * _LARGEST * jnp.tanh(said / _LARGEST)
+
+    def force_at(self, q: Position, v: Velocity, actuator: Force, own: Params) -> Force:
+        """:return: the ensemble's mean, as much of it as acts [N m] or [N]"""
+        return own["share"] * jnp.mean(self.forces(q, v, actuator, own), 0)
+
+    def force(self, moment: Moment, index: int, memory: Memory, params: Params) -> Force:
+        return self.force_at(moment.q, moment.v, moment.actuator, params)
+
+    def disagreement(self, q: Position, v: Velocity, actuator: Force, own: Params) -> Scalar:
+        """
+        :return: standard deviation of the members, in units of the normalised output; the largest
+            over the joints
+        """
+        spread = jnp.std(self.forces(q, v, actuator, own), 0)
+        return jnp.max(spread / own["output_scale"])
+
+    def doubt(self, twin: "Twin", state: Any, action: Action, base: Params, own: Params) -> Scalar:
+        if not self.caution:
+            return jnp.zeros(())
+        actuator = twin.actuate(state, action, base)  # type: ignore[attr-defined]
+        return self.caution * own["share"] * self.disagreement(state.q, state.v, actuator, own)
+
+    def structure(self) -> tuple[Any, ...]:
+        return (*super().structure(), self.n_members, self.net_arch, self.hinges, self.caution)
+
+    def to_spec(self) -> dict[str, Any]:
+        options = {
+            "n_members": self.n_members,
+            "net_arch": list(self.net_arch),
+            "caution": self.caution,
+        }
+        return super().to_spec() | {"options": options}
+
+    def save(self, path: str | os.PathLike[str]) -> Any:
+        """
+        Write one ``.npz`` file, without pickle; a file of that name is replaced as a whole.
+
+        :return: the path of the file
+        :raises EffectError: before it was attached to a twin
+        """
+        if not self.tensors:
+            raise EffectError("There is nothing to save: attach it to a twin first.")
+        flat, _ = ravel_pytree(self.tensors)
+        return write_npz(
+            path,
+            {
+                "format": np.array(_FORMAT),
+                "where": np.array(self.where),
+                "n_members": np.array(self.n_members),
+                "net_arch": np.array(self.net_arch, int),
+                "caution": np.array(self.caution),
+                "hinges": np.array(self.hinges, bool),
+                "share": np.array(self.values["share"]),
+                "tensors": np.asarray(flat),
+            },
+        )
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """
+        :param path: as given to :meth:`save`
+        :raises EffectError: if the file is missing, damaged, or of another kind
+        """
+        try:
+            stored = read_npz(path)
+            if stored.get("format", np.array("")).tolist() != _FORMAT:
+                raise ValueError(f"it holds: {', '.join(stored)}")
+            loaded = cls(
+                stored["where"].tolist(),
+                n_members=int(stored["n_members"]),
+                net_arch=stored["net_arch"].tolist(),
+                caution=float(stored["caution"]),
+                share=float(stored["share"]),
+            )
+            loaded.hinges = tuple(stored["hinges"].tolist())
+            flat, unravel = ravel_pytree(loaded.fresh(jax.random.key(0)))
+            if stored["tensors"].shape != flat.shape or not np.isfinite(stored["tensors"]).all():
+                raise ValueError("its weights do not fit its sizes, or are not finite")
+            return loaded.with_tensors(**unravel(jnp.asarray(stored["tensors"], flat.dtype)))
+        except (TrajectoryError, KeyError, ValueError, TypeError) as error:
+            raise EffectError(f"'{path}' was not written by NeuralForce.save ({error}).") from error
+
+    @property
+    def _n_inputs(self) -> int:
+        return len(self.hinges) + sum(self.hinges) + 2 * len(self.hinges)
+
+    @property
+    def _network(self) -> "_Member":
+        return _Member(self.net_arch, len(self.hinges))
+
+
+class _Member(nn.Module):
+    """One network of the ensemble."""
+
+    net_arch: tuple[int, ...]
+    n_out: int
+
+    @nn.compact
+    def __call__(self, seen: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
+        for width in self.net_arch:
+            seen = jnp.tanh(nn.Dense(width)(seen))
+        return nn.Dense(self.n_out)(seen)

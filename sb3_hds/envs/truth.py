@@ -1,0 +1,53 @@
+"""What only whoever made a stand-in for hardware can know."""
+
+from typing import Any
+
+from sb3_hds.core import Effect, Twin
+from sb3_hds.effects import (
+    ActionDelay,
+    CoulombFriction,
+    MotorLag,
+    QuadraticDrag,
+    TorqueGain,
+    ViscousFriction,
+)
+from sb3_hds.envs.inverted_pendulum_friction import InvertedPendulumFriction
+from sb3_hds.envs.pendulum_real import PendulumReal
+from sb3_hds.twins import registry
+
+
+def true_twin(env: Any) -> Twin:
+    """
+    The twin that knows everything about one of our stand-ins for hardware: the ceiling of what a
+    model can be. Noise of the sensors is no part of a twin.
+
+    :param env: ``sb3_hds/PendulumReal-v1`` or ``sb3_hds/InvertedPendulumFriction-v5``, wrapped or
+        not
+    :return: its twin, extended by the effects that the environment has
+    :raises TypeError: for another environment
+    """
+    bare = env.unwrapped
+    twin = registry.from_env(env)
+    if isinstance(bare, PendulumReal):
+        twin = twin.with_parameters(payload=bare.payload)
+        hidden: list[tuple[float, float, Effect]] = [
+            (bare.delay, 0.0, ActionDelay("torque", delay=bare.delay)),
+            (bare.gain, 1.0, TorqueGain("torque", gain=bare.gain)),
+            (bare.lag, 0.0, MotorLag("torque", time_constant=bare.lag)),
+            (bare.friction, 0.0, CoulombFriction("hinge", tau_c=bare.friction)),
+            (bare.drag, 0.0, QuadraticDrag("hinge", c=bare.drag)),
+        ]
+    elif isinstance(bare, InvertedPendulumFriction):
+        hidden = [
+            (bare.slider_damping, 0.0, ViscousFriction("slider", b=bare.slider_damping)),
+            (bare.hinge_damping, 0.0, ViscousFriction("hinge", b=bare.hinge_damping)),
+            (bare.slider_friction, 0.0, CoulombFriction("slider", tau_c=bare.slider_friction)),
+            (bare.hinge_friction, 0.0, CoulombFriction("hinge", tau_c=bare.hinge_friction)),
+        ]
+    else:
+        raise TypeError(
+            "The truth is known of sb3_hds/PendulumReal-v1 and sb3_hds/InvertedPendulumFriction-v5,"
+            f" not of {bare!r}. Build its twin yourself: twins.make(...).extend(...)."
+        )
+    present = [effect for value, null, effect in hidden if value != null]
+    return twin.extend(*present) if present else twin

@@ -1,0 +1,7 @@
+"""System identification: what measured data say about a twin."""
+
+from sb3_hds.sysid.calibrate import calibrate
+from sb3_hds.sysid.residual import Residual, fit_residual
+from sb3_hds.sysid.results import Estimate, Fit
+
+__all__ = ["Estimate", "Fit", "Residual", "calibrate", "fit_residual"]

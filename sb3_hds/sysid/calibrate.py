@@ -1,0 +1,383 @@
+"""Estimate the parameters of a twin from measured data."""
+
+from collections.abc import Iterable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from sb3_hds.core import Params, Trajectories, Twin
+from sb3_hds.errors import CalibrationError
+from sb3_hds.sysid.bounds import bounds_of
+from sb3_hds.sysid.covariance import covariance_of
+from sb3_hds.sysid.results import Estimate, Fit
+from sb3_hds.sysid.shooting import (
+    Offset,
+    Shots,
+    fit_start,
+    n_free,
+    residuals,
+    shots_of,
+    solve_normal,
+)
+
+# Length of a window where none is given [s], within these numbers of steps.
+_WINDOW = 0.5
+_SHORTEST, _LONGEST = 5, 50
+# Noise that the first pass assumes, and the least believed, in shares of a channel's spread.
+_FIRST_NOISE, _LEAST_NOISE = 0.05, 1e-7
+# Huber's threshold, in units of the noise: 95 % as efficient as least squares on Gaussian noise.
+_HUBER = 1.345
+_TOLERANCE = 1e-8
+# Gauss-Newton steps of a start state: at first, and after each change of the parameters.
+_N_FIRST, _N_AGAIN = 8, 3
+_PASSES = 3
+
+
+class Solution(NamedTuple):
+    """
+    :param values: of the free parameters, shape ``(p,)``
+    :param converged: whether the solver says so
+    :param n_steps: of the solver
+    """
+
+    values: Float[Array, " p"]
+    converged: Array
+    n_steps: Array
+
+
+class Errors(NamedTuple):
+    """
+    At given values, start states eliminated.
+
+    :param offsets: of the start states, shape ``(n, 2 dof)``
+    :param raw: simulated minus measured, in the channels' units, shape ``(n, rows, n_obs)``
+    :param bent: what the loss makes of it, in units of the noise, shape ``(n, rows * n_obs)``
+    :param slopes: of ``bent`` by the parameters, shape ``(n, rows * n_obs, p)``
+    """
+
+    offsets: Any
+    raw: Any
+    bent: Any
+    slopes: Any
+
+
+def calibrate(
+    twin: Twin,
+    data: Trajectories,
+    *,
+    free: Iterable[str] | None = None,
+    window: int | None = None,
+    loss: str = "huber",
+    prior: float = 0.0,
+    level: float = 0.95,
+    n_windows: int | None = None,
+    max_steps: int = 100,
+    seed: int = 0,
+) -> Fit:
+    """
+    Find the parameter values under which a twin reproduces measured data best.
+
+    Levenberg-Marquardt (optimistix) in double precision over short windows with free start states,
+    which are eliminated by variable projection. Each channel is weighted by its noise, which is
+    estimated too. Standard errors are those of the sandwich estimator, clustered by recording (by
+    window where there are few recordings): they hold for noise that is neither white nor Gaussian.
+
+    Source: Bock, *Recent advances in parameter identification techniques for ODE*, 1983 (multiple
+    shooting); Kaufman, BIT 15, 1975 (variable projection); Huber and Ronchetti, *Robust
+    Statistics*, 2009.
+
+    :param twin: whose values are where the search begins, and stay where they are not ``free``
+    :param data: measured trajectories, sampled at the twin's ``dt``
+    :param free: names of the parameters to estimate; default: all of them
+    :param window: steps per window; default: half a second, between 5 and 50 steps, and not longer
+        than the longest recording
+    :param loss: ``"huber"``, for which outliers count less, or ``"linear"`` for plain squares
+    :param prior: how firmly to believe the twin's own values: its reciprocal is the standard
+        deviation of that belief, in units of each parameter's ``scale``. 0: not at all.
+    :param level: of the confidence intervals
+    :param n_windows: number of windows that are used: a random choice of more, or a compiled
+        program for more than there are; default: all
+    :param max_steps: of the solver
+    :param seed: of the choice of windows
+    :return: estimates with standard errors and units, and the calibrated twin
+    :raises CalibrationError: for an unknown or missing parameter, other channels or another
+        interval than the twin's, or fewer measurements than unknowns
+    :raises TrajectoryError: if no recording is as long as a window
+    """
+    names = free_names(twin, free)
+    check_fits(twin, data)
+    if loss not in ("huber", "linear"):
+        raise CalibrationError(f"loss must be 'huber' or 'linear', got {loss!r}.")
+    if not 0.0 < level < 1.0:
+        raise CalibrationError(f"level must lie between 0 and 1, got {level}.")
+    shots, origin = shots_of(data, window or default_window(data), twin, n_windows, seed)
+    return fit_windows(
+        twin,
+        names,
+        shots,
+        origin,
+        spread_of(data),
+        threshold=_HUBER if loss == "huber" else None,
+        prior=prior,
+        level=level,
+        max_steps=max_steps,
+    )
+
+
+def fit_windows(
+    twin: Twin,
+    names: tuple[str, ...],
+    shots: Shots,
+    origin: np.ndarray,
+    spread: Float[np.ndarray, " obs"],
+    *,
+    threshold: float | None = _HUBER,
+    prior: float = 0.0,
+    believed: Float[np.ndarray, " p"] | None = None,
+    level: float = 0.95,
+    max_steps: int = 100,
+) -> Fit:
+    """
+    :func:`calibrate` on windows that were cut already.
+
+    :param names: of the free parameters
+    :param shots: windows; those of weight zero do not count
+    :param origin: recording of each window, shape ``(n,)``
+    :param spread: of each channel over the data
+    :param threshold: of the Huber loss, in units of the noise; None for plain squares
+    :param believed: centre of the prior; default: the twin's own values
+    :raises CalibrationError: for fewer measurements than unknowns
+    """
+    _check_enough(twin, names, shots)
+    origin = np.where(shots.weight > 0.0, origin, -1)
+    with jax.enable_x64(True):
+        values = np.array([twin.values[name] for name in names])
+        believed, noise = values if believed is None else believed, _FIRST_NOISE * spread
+        fixed, shots = _doubles(twin.params), Shots(*map(jnp.asarray, shots))
+        look = partial(evaluate, twin, names, threshold, fixed, shots)
+        at = look(values, jnp.zeros((shots.n, n_free(twin))), noise)
+        before = np.asarray(at.raw)
+        search = partial(solve, twin, names, threshold, max_steps, fixed)
+        for _ in range(_PASSES):
+            begin = bounds_of([twin.parameters[name] for name in names]).inside(values)
+            found = search(begin, shots, noise, at.offsets, believed, prior)
+            values = np.asarray(found.values)
+            at = look(values, at.offsets, noise)
+            noise = _noise(at.raw, shots, len(names), n_free(twin), spread)
+        errors = jax.tree.map(np.asarray, look(values, at.offsets, noise))
+    return _fit(twin, names, errors, before, origin, values, noise, found, level, prior)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+def solve(
+    twin: Twin,
+    names: tuple[str, ...],
+    threshold: float | None,
+    max_steps: int,
+    fixed: Params,
+    begin: Float[Array, " p"],
+    shots: Shots,
+    noise: Float[Array, " obs"],
+    offsets: Float[Array, "n free"],
+    believed: Float[Array, " p"],
+    prior: float,
+) -> Solution:
+    """The estimate for given noise: one program for all data of a shape."""
+    bounds = bounds_of([twin.parameters[name] for name in names])
+
+    def objective(inside: Array, _: None) -> Array:
+        values = bounds.outside(inside)
+        params = fixed | dict(zip(names, jax.lax.stop_gradient(values), strict=True))
+
+        def one(values: Array, shot: Shots, first: Offset) -> Array:
+            at = fit_start(twin, params, shot, noise, first, _N_AGAIN, threshold)
+            return projected(twin, names, threshold, fixed, noise, values, shot, at)
+
+        errors = jax.vmap(one, (None, 0, 0))(values, shots, offsets)
+        return jnp.concatenate([errors.ravel(), prior * (values - believed) / bounds.scale])
+
+    solver = optx.LevenbergMarquardt(rtol=_TOLERANCE, atol=_TOLERANCE)
+    found = optx.least_squares(
+        objective, solver, begin, options={"jac": "fwd"}, max_steps=max_steps, throw=False
+    )
+    converged = found.result == optx.RESULTS.successful
+    return Solution(bounds.outside(found.value), converged, found.stats["num_steps"])
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def evaluate(
+    twin: Twin,
+    names: tuple[str, ...],
+    threshold: float | None,
+    fixed: Params,
+    shots: Shots,
+    values: Float[Array, " p"],
+    offsets: Float[Array, "n free"],
+    noise: Float[Array, " obs"],
+) -> Errors:
+    """Errors and their slopes at given values; start states are searched from ``offsets``."""
+    params = fixed | dict(zip(names, values, strict=True))
+
+    def one(shot: Shots, first: Offset) -> Errors:
+        at = fit_start(twin, params, shot, noise, first, _N_FIRST, threshold)
+        error = lambda v: projected(twin, names, threshold, fixed, noise, v, shot, at)  # noqa: E731
+        raw = residuals(twin, params, shot, at, jnp.ones_like(noise)).reshape(shot.obs.shape)
+        return Errors(at, raw, error(values), jax.jacfwd(error)(values))
+
+    return jax.vmap(one)(shots, offsets)
+
+
+def projected(
+    twin: Twin,
+    names: tuple[str, ...],
+    threshold: float | None,
+    fixed: Params,
+    noise: Float[Array, " obs"],
+    values: Float[Array, " p"],
+    shot: Shots,
+    at: Offset,
+) -> Float[Array, " residuals"]:
+    """
+    Errors of one window as a function of the parameters alone: its start state, optimal for them,
+    follows. Only first derivatives are needed (Kaufman).
+    """
+    frozen = fixed | dict(zip(names, jax.lax.stop_gradient(values), strict=True))
+    moving = fixed | dict(zip(names, values, strict=True))
+    from_start = lambda x: residuals(twin, frozen, shot, x, noise, threshold)  # noqa: E731
+    slopes = jax.lax.stop_gradient(jax.jacfwd(from_start)(at))
+    error = residuals(twin, moving, shot, at, noise, threshold)
+    change = error - jax.lax.stop_gradient(error)
+    return error - slopes @ solve_normal(slopes, change)
+
+
+def default_window(data: Trajectories) -> int:
+    """:return: steps per window"""
+    steps = int(np.clip(round(_WINDOW / data.dt), _SHORTEST, _LONGEST))
+    return min(steps, int(data.lengths.max()))
+
+
+def spread_of(data: Trajectories) -> Float[np.ndarray, " obs"]:
+    """:return: standard deviation of each channel over the data, one where it never changes"""
+    real = np.concatenate([data.episode(i)[0] for i in range(len(data))])
+    spread = real.std(0)
+    return np.where(spread > 0.0, spread, 1.0)
+
+
+def check_fits(twin: Twin, data: Trajectories) -> None:
+    """:raises CalibrationError: if the data cannot have been measured on what the twin simulates"""
+    if (data.n_obs, data.n_act) != (len(twin.channels), len(twin.actuators)):
+        names = ", ".join(channel.name for channel in twin.channels)
+        raise CalibrationError(
+            f"{twin.name} observes {len(twin.channels)} channels ({names}) and takes "
+            f"{len(twin.actuators)} commands; the data have {data.n_obs} and {data.n_act}. "
+            "Choose the columns, or the twin, that fit."
+        )
+    if not np.isclose(data.dt, twin.dt, rtol=1e-6):
+        raise CalibrationError(
+            f"{twin.name} steps by {twin.dt} s and the data are sampled at {data.dt} s. "
+            f"Use data.resample(dt={twin.dt}), or make the twin with dt={data.dt}."
+        )
+
+
+def free_names(twin: Twin, free: Iterable[str] | None) -> tuple[str, ...]:
+    """
+    :param free: names of parameters; None for all
+    :raises CalibrationError: for a name that the twin does not have, or none at all
+    """
+    names = tuple(twin.parameters if free is None else [free] if isinstance(free, str) else free)
+    unknown = [name for name in names if name not in twin.parameters]
+    if unknown or not names or len(set(names)) < len(names):
+        known = ", ".join(twin.parameters) or "none"
+        raise CalibrationError(
+            f"free must name parameters of {twin.name}, each once, got {', '.join(names) or 'none'}"
+            f". Its parameters are: {known}."
+        )
+    return names
+
+
+def _check_enough(twin: Twin, names: tuple[str, ...], shots: Shots) -> None:
+    real = int(np.sum(shots.weight))
+    measured = real * int(np.prod(shots.obs.shape[1:]))
+    unknown = len(names) + real * n_free(twin)
+    if measured <= unknown:
+        raise CalibrationError(
+            f"{real} windows of {shots.actions.shape[1]} steps hold {measured} measurements, and "
+            f"{len(names)} parameters with the start states are {unknown} unknowns. "
+            "Record more, free fewer parameters, or ask for longer windows."
+        )
+
+
+def _doubles(params: Params) -> Params:
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
+
+
+def _noise(raw: Array, shots: Shots, n_params: int, n_start: int, spread: np.ndarray) -> np.ndarray:
+    """Standard deviation of each channel's error, by the median, so that outliers do not matter."""
+    real = np.asarray(shots.weight) > 0.0
+    error = np.asarray(raw)[real].reshape(-1, raw.shape[-1])
+    freedom = error.size / max(error.size - n_params - n_start * int(real.sum()), 1)
+    noise = 1.4826 * np.median(np.abs(error), 0) * np.sqrt(freedom)
+    return np.maximum(noise, _LEAST_NOISE * spread)
+
+
+def _fit(
+    twin: Twin,
+    names: tuple[str, ...],
+    errors: Errors,
+    before: np.ndarray,
+    origin: np.ndarray,
+    values: np.ndarray,
+    noise: np.ndarray,
+    found: Solution,
+    level: float,
+    prior: float,
+) -> Fit:
+    parameters = [twin.parameters[name] for name in names]
+    bounds, real = bounds_of(parameters), origin >= 0
+    spread = covariance_of(
+        errors.bent[real], errors.slopes[real], origin[real], bounds.scale, prior, n_free(twin)
+    )
+    margin = spread.quantile(level) * spread.stderr
+    estimates = tuple(
+        Estimate(
+            name=name,
+            estimate=float(value),
+            stderr=float(stderr),
+            low=float(max(value - half, parameter.lower)),
+            high=float(min(value + half, parameter.upper)),
+            unit=parameter.unit,
+            before=twin.values[name],
+            at_bound=bool(at_bound),
+        )
+        for name, parameter, value, stderr, half, at_bound in zip(
+            names, parameters, values, spread.stderr, margin, bounds.reached(values), strict=True
+        )
+    )
+    rms = lambda raw: np.sqrt(np.mean(raw[real] ** 2, (0, 1)))  # noqa: E731
+    return Fit(
+        twin=twin.with_parameters(**dict(zip(names, values.tolist(), strict=True))),
+        estimates=estimates,
+        covariance=spread.covariance,
+        channels=tuple((channel.name, channel.unit) for channel in twin.channels),
+        error_before=rms(before),
+        error_after=rms(errors.raw),
+        noise=noise,
+        n_windows=int(real.sum()),
+        window=errors.raw.shape[1] - 1,
+        n_groups=spread.n_groups,
+        level=level,
+        converged=bool(found.converged),
+        n_steps=int(found.n_steps),
+        undetermined=tuple(_in_words(names, row) for row in spread.undetermined),
+    )
+
+
+def _in_words(names: tuple[str, ...], direction: np.ndarray) -> str:
+    """Which parameters a direction that the data do not determine consists of."""
+    share = np.abs(direction)
+    return ", ".join(names[i] for i in np.argsort(-share) if share[i] > 0.1)

@@ -1,0 +1,82 @@
+"""How sure estimates are."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+# With fewer recordings than this more than there are parameters, windows count as independent.
+_FEWEST_RECORDINGS = 12
+# A direction is undetermined if its standard error is this many typical deviations.
+_UNDETERMINED = 100.0
+
+
+class Spread(NamedTuple):
+    """
+    :param covariance: of the estimates, shape ``(p, p)``; infinite where they are undetermined
+    :param stderr: standard errors, shape ``(p,)``
+    :param freedom: degrees of freedom of the t distribution
+    :param n_groups: independent pieces of evidence
+    :param undetermined: unit vectors that the data do not determine, shape ``(k, p)``, in units of
+        each parameter's scale
+    """
+
+    covariance: np.ndarray
+    stderr: np.ndarray
+    freedom: int
+    n_groups: int
+    undetermined: np.ndarray
+
+    def quantile(self, level: float) -> float:
+        """:return: half the width of a confidence interval, in standard errors"""
+        return float(stats.t.ppf(0.5 + 0.5 * level, self.freedom))
+
+
+def covariance_of(
+    errors: np.ndarray,
+    slopes: np.ndarray,
+    origin: np.ndarray,
+    scale: np.ndarray,
+    prior: float,
+    n_start: int,
+) -> Spread:
+    """
+    The sandwich estimator, clustered by recording, or by window where recordings are few.
+
+    Source: Cameron and Miller, *A practitioner's guide to cluster-robust inference*, Journal of
+    Human Resources 50(2), 2015, sections II and VI (CR1 correction, t with G - 1).
+
+    :param errors: in units of the noise, start states eliminated, shape ``(n, m)``
+    :param slopes: of the errors by the parameters, shape ``(n, m, p)``
+    :param origin: recording of each window, shape ``(n,)``
+    :param scale: typical deviation of each parameter, shape ``(p,)``
+    :param prior: reciprocal of what is believed of each parameter's deviation, in units of scale
+    :param n_start: numbers that the start state of a window has
+    """
+    n, m, p = slopes.shape
+    slopes = slopes * scale
+    recordings = np.unique(origin)
+    groups = origin if len(recordings) >= _FEWEST_RECORDINGS + p else np.arange(n)
+    labels = np.unique(groups)
+    information = np.einsum("nmp,nmq->pq", slopes, slopes) + prior**2 * np.eye(p)
+    power, directions = np.linalg.eigh(information)
+    # In units of the scale, under noise of one, the standard error along a direction.
+    weak = power <= _UNDETERMINED**-2
+    bread = (directions[:, ~weak] / power[~weak]) @ directions[:, ~weak].T
+    scores = np.einsum("nmp,nm->np", slopes, errors)
+    summed = np.stack([scores[groups == label].sum(0) for label in labels])
+    n_groups, n_measured = len(labels), n * (m - n_start)
+    correction = n_groups / max(n_groups - 1, 1) * (n_measured - 1) / max(n_measured - p, 1)
+    covariance = bread @ (correction * summed.T @ summed + prior**2 * np.eye(p)) @ bread
+    stderr = np.sqrt(np.diag(covariance))
+    touched = (np.abs(directions[:, weak]) > 0.1).any(1)
+    stderr = np.where(touched, np.inf, stderr)
+    covariance = covariance.copy()
+    covariance[touched] = covariance[:, touched] = np.inf
+    return Spread(
+        covariance * np.outer(scale, scale),
+        stderr * scale,
+        max(n_groups - 1, 1),
+        n_groups,
+        directions[:, weak].T,
+    )

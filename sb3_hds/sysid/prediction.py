@@ -1,0 +1,146 @@
+"""How well a twin predicts measured data, window by window."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy import stats
+
+from sb3_hds.core import Params, Trajectories, Twin
+from sb3_hds.sysid.shooting import Shots, fit_start, n_free, simulate
+
+# Gauss-Newton steps of a start state.
+_N_STEPS = 8
+# Better is what lowers the error by this share, at this level, judged by so many samples.
+_LEAST_GAIN, _LEVEL, _N_BOOTSTRAP = 0.05, 0.05, 1000
+# What `has_grown` asks for.
+_GROWN, _GROWN_LEVEL = 1.5, 1e-4
+
+
+def window_errors(
+    twin: Twin, params: Params, shots: Shots, scale: Float[np.ndarray, " obs"]
+) -> Float[np.ndarray, " n"]:
+    """
+    Root mean square error of each window, from the start state that suits the twin best. So the
+    noise of the first measurement does not count, and neither does a bias of the twin that moving
+    the start can hide.
+
+    :param params: full parameters of the twin
+    :param shots: windows
+    :param scale: what an error of one means in each channel
+    :return: errors in units of ``scale``, shape ``(n,)``; infinite where a simulation is not finite
+    """
+    with jax.enable_x64(True):
+        doubles = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
+        found = _errors(twin, doubles, Shots(*map(jnp.asarray, shots)), jnp.asarray(scale))[0]
+        return np.asarray(found)
+
+
+def start_offsets(
+    twin: Twin, params: Params, shots: Shots, scale: Float[np.ndarray, " obs"]
+) -> Float[np.ndarray, "n free"]:
+    """:return: of each window, the start state under which the twin comes closest to it"""
+    with jax.enable_x64(True):
+        doubles = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
+        found = _errors(twin, doubles, Shots(*map(jnp.asarray, shots)), jnp.asarray(scale))[1]
+        return np.asarray(found)
+
+
+def single_step_errors(
+    twin: Twin, data: Trajectories, scale: Float[np.ndarray, " obs"], n_rows: int
+) -> Float[np.ndarray, " n"]:
+    """
+    Errors of single steps from measured states: quick to compile, and enough to see that a twin is
+    exact. Where measurements are noisy, or states not fully observed, they say little.
+
+    :param n_rows: the latest steps of the longest recording are looked at, at most so many
+    :return: root mean square over the channels of each step, in units of ``scale``
+    """
+    obs, actions = data.episode(int(np.argmax(data.lengths)))
+    rows = np.minimum(np.arange(n_rows), len(actions) - 1) + max(0, len(actions) - n_rows)
+    given = (jnp.asarray(x, jnp.float32) for x in (obs[rows], actions[rows], obs[rows + 1], scale))
+    return np.asarray(_single_steps(twin, twin.params, *given))
+
+
+def gain(new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"]) -> float:
+    """
+    :param new: errors of each window
+    :param old: errors of the same windows
+    :return: by which share the root mean square over all windows is lower
+    """
+    squares = (np.sum(np.clip(errors, 1e-9, 1e9) ** 2) for errors in (new, old))
+    return float(1.0 - np.sqrt(np.divide(*squares)))
+
+
+def is_better(
+    new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], least: float = _LEAST_GAIN
+) -> bool:
+    """
+    Whether errors of the same held-out windows are lower on the whole, and not by chance: in 95 of
+    100 bootstrap samples of the windows, too.
+
+    :param new: errors of each window
+    :param old: errors of the same windows
+    :param least: the gain that counts
+    """
+    if len(new) < 2 or not gain(new, old) >= least:
+        return False
+    lower = np.clip(old, 1e-9, 1e9) ** 2 - np.clip(new, 1e-9, 1e9) ** 2
+    drawn = np.random.default_rng(0).integers(len(lower), size=(_N_BOOTSTRAP, len(lower)))
+    return bool(np.mean(lower[drawn].sum(1) <= 0.0) < _LEVEL)
+
+
+def has_grown(latest: Float[np.ndarray, " n"], older: Float[np.ndarray, " m"]) -> bool:
+    """
+    Whether the system is no longer the one that it was: errors of the latest windows are half as
+    large again as those of older ones, beyond chance (one-sided Welch test on the logarithms, at a
+    level that allows for looking often).
+    """
+    new, old = (np.log(np.clip(errors, 1e-9, 1e9)) for errors in (latest, older))
+    test: Any = stats.ttest_ind(new, old, equal_var=False, alternative="greater")
+    return bool(new.mean() - old.mean() > np.log(_GROWN) and test.pvalue < _GROWN_LEVEL)
+
+
+def hold_out(origin: np.ndarray, share: float = 0.25) -> np.ndarray:
+    """
+    Which windows are kept from learning: whole recordings where there are at least four, otherwise
+    stretches of each.
+
+    :param origin: recording of each window, -1 for padding, shape ``(n,)``
+    :return: shape ``(n,)``
+    """
+    every = max(2, round(1.0 / share))
+    recordings = np.unique(origin[origin >= 0])
+    if len(recordings) >= 4:
+        return np.isin(origin, recordings[every - 1 :: every])
+    position = np.arange(len(origin))
+    return (position % every == every - 1) & (origin >= 0)
+
+
+@partial(jax.jit, static_argnums=0)
+def _single_steps(
+    twin: Twin, params: Params, obs: Array, actions: Array, after: Array, scale: Array
+) -> Float[Array, " n"]:
+    def one(obs: Array, action: Array, after: Array) -> Array:
+        state = twin.step(twin.infer(obs, params), action, params)
+        error = (twin.observe(state, params) - after) / scale
+        return jnp.sqrt(jnp.mean(error**2))
+
+    return jax.vmap(one)(obs, actions, after)
+
+
+@partial(jax.jit, static_argnums=0)
+def _errors(
+    twin: Twin, params: Params, shots: Shots, scale: Float[Array, " obs"]
+) -> tuple[Float[Array, " n"], Float[Array, "n free"]]:
+    def one(shot: Shots) -> tuple[Array, Array]:
+        first = jnp.zeros(n_free(twin), shot.obs.dtype)
+        offset = fit_start(twin, params, shot, scale, first, _N_STEPS)
+        error = (simulate(twin, params, shot, offset) - shot.obs) / scale
+        rms = jnp.sqrt(jnp.mean(error**2))
+        return jnp.where(jnp.isfinite(rms), rms, jnp.inf), offset
+
+    return jax.vmap(one)(shots)

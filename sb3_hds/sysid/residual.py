@@ -1,0 +1,367 @@
+"""Learn the force that a twin lacks: an ensemble, on errors over several steps."""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+
+from sb3_hds.core import AnalyticTwin, Params, State, Trajectories, Twin
+from sb3_hds.effects import NeuralForce
+from sb3_hds.errors import CalibrationError
+from sb3_hds.sysid.calibrate import check_fits, default_window, spread_of
+from sb3_hds.sysid.prediction import hold_out, is_better, start_offsets, window_errors
+from sb3_hds.sysid.shooting import Shots, shots_of, simulate
+
+# Share of a channel's spread that an error of one means, where its noise is not known.
+_UNIT_ERROR = 0.05
+# Share of the typical inertial force that an output of one means.
+_OUTPUT = 0.3
+_LEARNING_RATE, _WEIGHT_DECAY = 5e-3, 1e-3
+_BATCH = 32
+# Steps between two looks at the held-out windows; after this many looks without gain it stops.
+_CHUNK, _PATIENCE = 50, 6
+_MOST_CHUNKS = 40
+# Beyond this, in units of the channels' scale, an error counts in proportion, not by its square.
+_OUTLIER = 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Residual:
+    """
+    Result of :func:`fit_residual`.
+
+    :param twin: with the learned force attached; its share is 1 if accepted, otherwise 0
+    :param key: full name of the effect in that twin
+    :param accepted: whether it predicts held-out windows better than the twin without it
+    :param error_before: of each held-out window without it, in units of the channels' noise
+    :param error_after: of each held-out window with it
+    :param n_steps: of the optimiser
+    :param disagreement: of the members over the data, in units of the normalised output
+    """
+
+    twin: Twin
+    key: str
+    accepted: bool
+    error_before: np.ndarray
+    error_after: np.ndarray
+    n_steps: int
+    disagreement: float
+
+
+def fit_residual(
+    twin: Twin,
+    data: Trajectories,
+    *,
+    n_members: int = 5,
+    net_arch: Sequence[int] = (16,),
+    caution: float = 0.0,
+    window: int | None = None,
+    noise: Float[np.ndarray, " obs"] | None = None,
+    n_windows: int | None = None,
+    seed: int = 0,
+) -> Residual:
+    """
+    Attach a learned force to a twin, and keep it only if held-out windows say that it helps.
+
+    Each member of the ensemble sees a bootstrap sample of the windows and stops where held-out
+    windows get no better. The loss is the error over whole windows, so the force is learned where
+    the simulation goes, and through the integrator that will use it. A force that the twin has
+    already goes on from its weights.
+
+    :param twin: analytic, extended or not; its values stay as they are
+    :param data: measured trajectories, sampled at the twin's ``dt``
+    :param n_members: networks
+    :param net_arch: units of the hidden layers
+    :param caution: see :class:`~sb3_hds.effects.NeuralForce`
+    :param window: steps per window; default as for ``calibrate``
+    :param noise: standard deviation of each channel's noise, for example ``fit.noise``; default: a
+        twentieth of its spread
+    :param n_windows: fixed number of windows, see ``calibrate``
+    :param seed: of weights, bootstrap and batches
+    :raises CalibrationError: for a twin without mass matrix, other channels or another interval
+    :raises TrajectoryError: if no recording is as long as a window
+    """
+    check_fits(twin, data)
+    spread = spread_of(data)
+    scale = _UNIT_ERROR * spread if noise is None else np.maximum(noise, 1e-3 * spread)
+    shots, origin = shots_of(data, window or default_window(data), twin, n_windows, seed)
+    return fit_force(
+        twin,
+        shots,
+        hold_out(origin),
+        scale,
+        n_members=n_members,
+        net_arch=net_arch,
+        caution=caution,
+        seed=seed,
+    )
+
+
+def fit_force(
+    twin: Twin,
+    shots: Shots,
+    held: np.ndarray,
+    scale: Float[np.ndarray, " obs"],
+    *,
+    n_members: int = 5,
+    net_arch: Sequence[int] = (16,),
+    caution: float = 0.0,
+    seed: int = 0,
+) -> Residual:
+    """
+    :func:`fit_residual` on windows that were cut already.
+
+    :param shots: windows; those of weight zero do not count
+    :param held: which are kept from learning, shape ``(n,)``
+    :param scale: what an error of one means in each channel
+    :raises CalibrationError: for a twin without mass matrix, or too few windows
+    """
+    if _plant(twin) is None or twin.differentiability != "reverse":
+        raise CalibrationError(
+            f"A residual force is learned through analytic twins; {twin.name} is none. "
+            "Calibrate it, or attach named effects."
+        )
+    real = np.asarray(shots.weight) > 0.0
+    held, learned = held & real, real & ~held
+    if not (held.any() and learned.any()):
+        raise CalibrationError(
+            f"{real.sum()} windows are too few to learn from some and check on others. "
+            "Record more, or ask for shorter windows."
+        )
+    has_force = force_of(twin) is not None
+    extended, key = _with_force(twin, n_members, net_arch, caution)
+    without = {**extended.params, f"{key}.share": 0.0}
+    offsets = start_offsets(extended, without, shots, scale)
+    tensors = _own(extended, key)
+    if not has_force:
+        tensors = _normalised(extended, key, shots, learned, seed)
+    tensors, n_steps = _train(
+        extended, key, tensors, shots, offsets, scale, learned, held, n_members, seed
+    )
+    extended = extended.with_tensors({f"{key}.{name}": t for name, t in tensors.items()})
+    before = window_errors(extended, without, shots, scale)[held]
+    whole = {**extended.params, f"{key}.share": 1.0}
+    after = window_errors(extended, whole, shots, scale)[held]
+    accepted = is_better(after, before)
+    extended = extended.with_parameters(**{f"{key}.share": 1.0 if accepted else 0.0})
+    doubt = _mean_disagreement(extended, key, shots, learned)
+    return Residual(extended, key, accepted, before, after, n_steps, doubt)
+
+
+def force_of(twin: Twin) -> tuple[str, NeuralForce] | None:
+    """:return: full name and effect of the learned force that a twin has; None without one"""
+    for a in getattr(_extended(twin), "attached", ()):
+        if isinstance(a.effect, NeuralForce):
+            return a.key, a.effect
+    return None
+
+
+def _with_force(
+    twin: Twin, n_members: int, net_arch: Sequence[int], caution: float
+) -> tuple[Twin, str]:
+    if force_of(twin) is None:
+        twin = twin.extend(NeuralForce(0, n_members=n_members, net_arch=net_arch, caution=caution))
+    found = force_of(twin)
+    assert found is not None
+    return twin, found[0]
+
+
+def _extended(twin: Twin) -> Twin:
+    """Below the wrappers."""
+    while not hasattr(twin, "attached") and hasattr(twin, "base"):
+        twin = twin.base  # type: ignore[attr-defined]
+    return twin
+
+
+def _plant(twin: Twin) -> AnalyticTwin | None:
+    while not isinstance(twin, AnalyticTwin) and hasattr(twin, "base"):
+        twin = twin.base  # type: ignore[attr-defined]
+    return twin if isinstance(twin, AnalyticTwin) else None
+
+
+def _own(twin: Twin, key: str) -> dict[str, Any]:
+    found = force_of(twin)
+    assert found is not None
+    return {name: twin.tensors[f"{key}.{name}"] for name in found[1].tensors}
+
+
+def _seen(twin: Twin, shots: Shots) -> tuple[Array, Array, Array]:
+    """Position, velocity and force of the actuators at every measurement that an action follows."""
+    plant, params = _plant(twin), twin.params
+    assert plant is not None
+
+    def one(obs: Array, action: Array) -> tuple[Array, Array, Array]:
+        state: State = twin.infer(obs, params)
+        return state.q, state.v, plant.actuate(state, action, params)
+
+    obs = jnp.asarray(shots.obs[:, :-1], jnp.float32)
+    return jax.vmap(jax.vmap(one))(obs, jnp.asarray(shots.actions, jnp.float32))
+
+
+def _normalised(
+    twin: Twin, key: str, shots: Shots, learned: np.ndarray, seed: int
+) -> dict[str, Any]:
+    """Random weights with the scales of the data."""
+    found, plant = force_of(twin), _plant(twin)
+    assert found is not None and plant is not None
+    rows = Shots(*(leaf[learned] for leaf in shots))
+    q, v, actuator = _seen(twin, rows)
+    inputs = jax.vmap(jax.vmap(found[1].inputs))(q, v, actuator)
+    inputs = inputs.reshape(-1, inputs.shape[-1])
+    scale = jnp.std(inputs, 0)
+    masses = jax.vmap(jax.vmap(lambda q: jnp.diag(plant.mass_matrix(q, twin.params))))(q)
+    pushed = masses[:, :-1] * jnp.diff(v, axis=1) / twin.dt
+    inertial = jnp.median(jnp.abs(pushed), (0, 1)) * 1.4826
+    size = jnp.where(inertial > 0.0, _OUTPUT * inertial, 1.0)
+    fresh = found[1].fresh(jax.random.key(seed))
+    return fresh | {
+        "input_mean": jnp.mean(inputs, 0),
+        "input_scale": jnp.where(scale > 1e-6, scale, 1.0),
+        "output_scale": size,
+    }
+
+
+def _train(
+    twin: Twin,
+    key: str,
+    tensors: dict[str, Any],
+    shots: Shots,
+    offsets: np.ndarray,
+    scale: np.ndarray,
+    learned: np.ndarray,
+    held: np.ndarray,
+    n_members: int,
+    seed: int,
+) -> tuple[dict[str, Any], int]:
+    """Adam on each member by itself, stopped where held-out windows get no better."""
+    single = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), tensors)
+    weights = single.pop("weights")
+    singles = Shots(*(jnp.asarray(leaf, jnp.float32) for leaf in shots))
+    given = (
+        jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), twin.params),
+        single,
+        singles,
+        jnp.asarray(offsets, jnp.float32),
+        jnp.asarray(scale, jnp.float32),
+    )
+    rng = np.random.default_rng(seed)
+    drawn = rng.exponential(size=(n_members, len(learned))) * learned
+    chances = jnp.asarray(drawn / drawn.sum(1, keepdims=True), jnp.float32)
+    state = jax.vmap(_optimiser().init)(weights)
+    best, idle, n_chunks = weights, 0, 0
+    best_loss = np.asarray(_held_loss(twin, key, weights, *given, jnp.asarray(held)))
+    keys = jax.random.split(jax.random.key(seed), _MOST_CHUNKS)
+    for k in keys:
+        weights, state = _steps(twin, key, weights, state, *given, chances, k)
+        loss = np.asarray(_held_loss(twin, key, weights, *given, jnp.asarray(held)))
+        n_chunks += 1
+        better = loss < best_loss
+        idle = 0 if (loss < 0.99 * best_loss).any() else idle + 1
+        best = jax.tree.map(partial(_chosen, better), weights, best)
+        best_loss = np.where(better, loss, best_loss)
+        if idle >= _PATIENCE:
+            break
+    return tensors | {"weights": best}, n_chunks * _CHUNK
+
+
+def _chosen(better: np.ndarray, new: Array, old: Array) -> Array:
+    """Member by member."""
+    return jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+
+def _optimiser() -> optax.GradientTransformation:
+    return optax.chain(
+        optax.clip_by_global_norm(1.0),
+        optax.adamw(_LEARNING_RATE, b2=0.99, weight_decay=_WEIGHT_DECAY),
+    )
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _steps(
+    twin: Twin,
+    key: str,
+    weights: Any,
+    state: Any,
+    params: Params,
+    scales: dict[str, Array],
+    shots: Shots,
+    offsets: Float[Array, "n free"],
+    unit: Float[Array, " obs"],
+    chances: Float[Array, "members n"],
+    rng: Array,
+) -> tuple[Any, Any]:
+    optimiser = _optimiser()
+
+    def loss(own: Any, rows: Array) -> Array:
+        error = partial(_error, twin, key, params, scales, unit, own)
+        picked, at = jax.tree.map(lambda leaf: leaf[rows], (shots, offsets))
+        return jnp.mean(jax.vmap(error)(picked, at))
+
+    def member(own: Any, state: Any, chance: Array, rng: Array) -> tuple[Any, Any]:
+        rows = jax.random.choice(rng, len(chance), (_BATCH,), p=chance)
+        gradient = jax.grad(loss)(own, rows)
+        finite = jnp.all(jnp.array([jnp.isfinite(g).all() for g in jax.tree.leaves(gradient)]))
+        gradient = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradient)
+        change, state = optimiser.update(gradient, state, own)
+        return optax.apply_updates(own, change), state
+
+    def step(carry: Any, rng: Array) -> tuple[Any, None]:
+        keys = jax.random.split(rng, chances.shape[0])
+        weights, state = carry
+        return jax.vmap(member)(weights, state, chances, keys), None
+
+    return jax.lax.scan(step, (weights, state), jax.random.split(rng, _CHUNK))[0]
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _held_loss(
+    twin: Twin,
+    key: str,
+    weights: Any,
+    params: Params,
+    scales: dict[str, Array],
+    shots: Shots,
+    offsets: Float[Array, "n free"],
+    unit: Float[Array, " obs"],
+    held: Array,
+) -> Float[Array, " members"]:
+    def member(own: Any) -> Array:
+        error = partial(_error, twin, key, params, scales, unit, own)
+        return jnp.sum(jnp.where(held, jax.vmap(error)(shots, offsets), 0.0)) / jnp.sum(held)
+
+    return jax.vmap(member)(weights)
+
+
+def _error(
+    twin: Twin,
+    key: str,
+    params: Params,
+    scales: dict[str, Array],
+    unit: Float[Array, " obs"],
+    own: Any,
+    shot: Shots,
+    offset: Array,
+) -> Array:
+    """Loss of one window under one member: as if the ensemble were that member alone."""
+    alone = jax.tree.map(lambda leaf: leaf[None], own)
+    tensors = {f"{key}.{name}": tree for name, tree in (scales | {"weights": alone}).items()}
+    values = {**params, **tensors, f"{key}.share": jnp.ones(())}
+    error = (simulate(twin, values, shot, offset) - shot.obs) / unit
+    size = jnp.abs(jnp.where(jnp.isfinite(error), error, 0.0))
+    small = jnp.minimum(size, _OUTLIER)
+    return jnp.mean(0.5 * small**2 + _OUTLIER * (size - small))
+
+
+def _mean_disagreement(twin: Twin, key: str, shots: Shots, learned: np.ndarray) -> float:
+    found = force_of(twin)
+    assert found is not None
+    own = _own(twin, key)
+    rows = Shots(*(leaf[learned] for leaf in shots))
+    disagree = lambda q, v, u: found[1].disagreement(q, v, u, own)  # noqa: E731
+    return float(jnp.mean(jax.vmap(jax.vmap(disagree))(*_seen(twin, rows))))

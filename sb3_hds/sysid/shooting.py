@@ -1,0 +1,223 @@
+"""
+Multiple shooting: measured data in short windows, each simulated from a start state of its own.
+
+Short windows keep a chaotic or unstable system from drowning the parameters in its sensitivity, and
+free start states keep the noise of one measurement from spoiling a whole window.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from sb3_hds.core import Obs, Params, State, Trajectories, Twin
+from sb3_hds.errors import TrajectoryError
+
+# Error that stands for a simulation that is not finite, in units of the noise.
+_NOT_FINITE = 1e6
+# Added to the normal equations of a start state, relative to their diagonal.
+_DAMPING = 1e-9
+# Commands before a window that memory (a delay, a lag) is filled with [s].
+_LEAD = 0.4
+
+Offset = Float[Array, " tangent"]
+
+
+class Shots(NamedTuple):
+    """
+    Windows of equal length, of NumPy or JAX. Leaves have one row for each window.
+
+    :param obs: shape ``(n, steps + 1, n_obs)``
+    :param actions: shape ``(n, steps, n_act)``
+    :param lead_obs: before the window, shape ``(n, lead, n_obs)``
+    :param lead_actions: before the window, shape ``(n, lead, n_act)``
+    :param lead_known: 0 where the episode had not begun yet, shape ``(n, lead)``
+    :param weight: 1, or 0 for a row that only fills up the shape
+    """
+
+    obs: Any
+    actions: Any
+    lead_obs: Any
+    lead_actions: Any
+    lead_known: Any
+    weight: Any
+
+    @property
+    def n(self) -> int:
+        """Number of rows, those that only fill up the shape among them."""
+        return len(self.weight)
+
+
+def shots_of(
+    data: Trajectories,
+    length: int,
+    twin: Twin,
+    n_rows: int | None = None,
+    seed: int | None = 0,
+) -> tuple[Shots, np.ndarray]:
+    """
+    Cut recordings into windows that share no measurement, so that their errors are independent.
+
+    :param data: trajectories sampled at the twin's ``dt``
+    :param length: steps of a window
+    :param twin: says whether commands before a window matter, because something remembers them
+    :param n_rows: fixed number of rows: a random choice of more windows, or padding of fewer. A
+        compiled program then serves again when more data have come.
+    :param seed: of that choice; None takes the latest windows instead
+    :return: the windows, in order of recording and time, and for each the recording that it is
+        from; padding has -1
+    :raises TrajectoryError: if no recording is long enough
+    """
+    cuts = [
+        (i, k) for i, n in enumerate(data.lengths) for k in range(0, n - length + 1, length + 1)
+    ]
+    if not cuts:
+        raise TrajectoryError(
+            f"No recording has {length} steps; the longest has {data.lengths.max()}. "
+            "Ask for shorter windows, or record for longer."
+        )
+    n = len(cuts) if n_rows is None else n_rows
+    if len(cuts) > n:
+        chosen = np.arange(len(cuts))[-n:]
+        if seed is not None:
+            chosen = np.random.default_rng(seed).choice(len(cuts), n, replace=False)
+        cuts = [cuts[i] for i in np.sort(chosen)]
+    lead = _lead_of(twin, data.dt)
+    rows = [_cut(data, i, k, length, lead) for i, k in cuts]
+    padding = [rows[0]._replace(weight=np.zeros(()))] * (n - len(rows))
+    shots = Shots(*(np.stack(leaves) for leaves in zip(*rows, *padding, strict=True)))
+    origin = np.array([data.origin[i] for i, _ in cuts] + [-1] * len(padding))
+    return shots, origin
+
+
+def simulate(twin: Twin, params: Params, shot: Shots, offset: Offset) -> Float[Array, "rows obs"]:
+    """
+    :param shot: one window
+    :param offset: of the start state from what the first measurement says, as a tangent vector of
+        positions and velocities
+    :return: what the twin's sensors would have reported, shape ``(steps + 1, n_obs)``
+    """
+    start = _start(twin, params, shot, offset)
+
+    def advance(state: State, action: Array) -> tuple[State, Obs]:
+        after = twin.step(state, action, params)
+        return after, twin.observe(after, params)
+
+    _, obs = jax.lax.scan(advance, start, shot.actions)
+    return jnp.concatenate([twin.observe(start, params)[None], obs])
+
+
+def n_free(twin: Twin) -> int:
+    """:return: numbers that a start state has: positions and velocities"""
+    return 2 * len(twin.joints)
+
+
+def residuals(
+    twin: Twin,
+    params: Params,
+    shot: Shots,
+    offset: Offset,
+    noise: Obs,
+    threshold: float | None = None,
+) -> Float[Array, " residuals"]:
+    """
+    :param threshold: of the Huber loss: half the sum of squares of what is returned is that loss;
+        None for plain squares
+    :return: simulated minus measured, in units of the noise, flattened; zero for padding, and large
+        where the simulation is not finite
+    """
+    error = (simulate(twin, params, shot, offset) - shot.obs) / noise
+    error = jnp.where(jnp.isfinite(error), error, _NOT_FINITE).ravel()
+    if threshold is not None:
+        far = jnp.maximum(jnp.abs(error), threshold)
+        bent = jnp.sign(error) * jnp.sqrt(2.0 * threshold * far - threshold**2)
+        error = jnp.where(jnp.abs(error) > threshold, bent, error)
+    return jnp.sqrt(shot.weight) * error
+
+
+def fit_start(
+    twin: Twin,
+    params: Params,
+    shot: Shots,
+    noise: Obs,
+    first: Offset,
+    n_iterations: int,
+    threshold: float | None = None,
+) -> Offset:
+    """
+    The start state under which the twin comes closest to one window: Gauss-Newton steps, each of
+    which is taken only if it brings the simulation closer.
+
+    :param first: where to begin
+    :return: the offset, without derivative
+    """
+
+    def error(offset: Offset) -> Array:
+        return residuals(twin, params, shot, offset, noise, threshold)
+
+    def improve(offset: Offset, _: None) -> tuple[Offset, None]:
+        now, slopes = error(offset), jax.jacfwd(error)(offset)
+        step = -solve_normal(slopes, now)
+        # Half a step is tried too: far from the optimum a whole one often goes too far.
+        candidates = jnp.stack([offset, offset + 0.5 * step, offset + step])
+        costs = jax.vmap(lambda x: jnp.sum(error(x) ** 2))(candidates)
+        costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
+        return candidates[jnp.argmin(costs)], None
+
+    return jax.lax.stop_gradient(jax.lax.scan(improve, first, None, length=n_iterations)[0])
+
+
+def solve_normal(slopes: Array, right: Array) -> Array:
+    """
+    :return: least-squares solution of ``slopes @ x = right`` by the normal equations, which are
+        tiny; a direction without slope is left alone
+    """
+    normal = slopes.T @ slopes
+    normal = normal + (_DAMPING * jnp.trace(normal) + 1e-300) * jnp.eye(normal.shape[0])
+    return jnp.linalg.solve(normal, slopes.T @ right)
+
+
+def _start(twin: Twin, params: Params, shot: Shots, offset: Offset) -> State:
+    state = _remembering(twin, params, shot)
+    rest = ravel_pytree(state.memory)[0]
+    return twin.retract(state, jnp.concatenate([offset, jnp.zeros_like(rest)]))
+
+
+def _remembering(twin: Twin, params: Params, shot: Shots) -> State:
+    """What the first measurement says, with the memory that the commands before it left."""
+    here = twin.infer(shot.obs[0], params)
+    if not shot.lead_actions.shape[0]:
+        return here
+
+    def advance(memory, given):
+        obs, action, known = given
+        state = twin.infer(obs, params)
+        after = twin.step(state._replace(memory=memory), action, params).memory
+        return jax.tree.map(lambda new, old: jnp.where(known > 0.0, new, old), after, memory), None
+
+    lead = (shot.lead_obs, shot.lead_actions, shot.lead_known)
+    memory, _ = jax.lax.scan(advance, twin.infer(shot.lead_obs[0], params).memory, lead)
+    return here._replace(memory=memory)
+
+
+def _lead_of(twin: Twin, dt: float) -> int:
+    obs = jnp.zeros(len(twin.channels))
+    remembers = jax.eval_shape(lambda: twin.infer(obs, twin.params).memory)
+    return int(np.ceil(_LEAD / dt)) if jax.tree.leaves(remembers) else 0
+
+
+def _cut(data: Trajectories, i: int, k: int, length: int, lead: int) -> Shots:
+    before = np.arange(k - lead, k)
+    known = before >= 0
+    before = np.maximum(before, 0)
+    return Shots(
+        data.obs[i, k : k + length + 1],
+        data.actions[i, k : k + length],
+        data.obs[i, before],
+        data.actions[i, before],
+        known.astype(float),
+        np.ones(()),
+    )

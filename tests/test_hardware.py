@@ -1,0 +1,236 @@
+"""The stand-ins for hardware: independent of the twins, and as their arguments say."""
+
+import gymnasium
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env as check_gymnasium
+from stable_baselines3.common.env_checker import check_env as check_sb3
+
+from sb3_hds import envs, twins
+from sb3_hds.core import State, rollout
+
+PENDULUM, CART = "sb3_hds/PendulumReal-v1", "sb3_hds/InvertedPendulumFriction-v5"
+HIDDEN = {
+    PENDULUM: [
+        {"damping": 0.2},
+        {"friction": 0.3},
+        {"drag": 0.1},
+        {"gain": 0.7},
+        {"delay": 0.07},
+        {"lag": 0.08},
+        {"payload": 0.3},
+    ],
+    CART: [
+        {"slider_damping": 5.0},
+        {"hinge_damping": 1.0},
+        {"slider_friction": 20.0},
+        {"hinge_friction": 1.0},
+    ],
+}
+CASES = [(env_id, hidden) for env_id, cases in HIDDEN.items() for hidden in cases]
+
+
+def driven(env, actions, state):
+    """True positions and velocities along an episode, shape ``(T + 1, 2 dof)``."""
+    env.reset(seed=0)
+    bare = env.unwrapped
+    bare.data.qpos[:], bare.data.qvel[:] = state
+    path = [np.concatenate([bare.data.qpos, bare.data.qvel])]
+    for action in actions:
+        env.step(action)
+        path.append(np.concatenate([bare.data.qpos, bare.data.qvel]))
+    return np.array(path)
+
+
+def simulated(twin, actions, state):
+    q, v = (jnp.asarray(part, jnp.float64) for part in state)
+    start = twin.infer(twin.observe(State(q, v, {}), twin.params), twin.params)
+    path = rollout(twin, twin.params, start._replace(q=q, v=v), jnp.asarray(actions)).states
+    return np.concatenate([path.q, path.v], 1)
+
+
+def commands(env, n_steps, seed=0):
+    high = env.action_space.high
+    return 0.4 * np.random.default_rng(seed).uniform(-high, high, (n_steps, len(high)))
+
+
+def start_of(env_id):
+    return (
+        (np.array([2.0]), np.array([0.5]))
+        if env_id == PENDULUM
+        else (np.array([0.0, 3.0]), np.zeros(2))
+    )
+
+
+def made(env_id, **settings):
+    return gymnasium.make(env_id, **settings, **({"swing_up": True} if env_id == CART else {}))
+
+
+@pytest.mark.parametrize("env_id", HIDDEN)
+def test_both_checkers_accept_them(env_id):
+    env = gymnasium.make(env_id).unwrapped
+    check_gymnasium(env, skip_render_check=True)
+    check_sb3(env, skip_render_check=True)
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"mass": 1.3, "length": 0.6, "gravity": 9.81, "damping": 0.1, "dt": 0.02}]
+)
+def test_the_pendulums_twin_follows_the_engine_to_a_millionth(settings, x64):
+    env = gymnasium.make(PENDULUM, **settings)
+    twin = twins.from_env(env)
+    actions = commands(env, 20)
+
+    for seed in range(5):
+        angle, speed = np.random.default_rng(seed).uniform([-3.0, -8.0], [3.0, 8.0])
+        path = driven(env, actions, ([angle], [speed]))
+        for before, after, action in zip(path[:-1], path[1:], actions, strict=True):
+            state = State(jnp.asarray(before[:1]), jnp.asarray(before[1:]), {})
+            predicted = twin.step(state, jnp.asarray(action), twin.params)
+            # Four Runge-Kutta steps of the twin against twenty of the engine.
+            np.testing.assert_allclose(np.r_[predicted.q, predicted.v], after, rtol=0.0, atol=1e-6)
+
+
+def test_pendulum_v1_is_not_this_pendulum(x64):
+    """Its Euler steps are a mismatch of their own: after a second, a few percent of the scale."""
+    env, fine, coarse, truth = gymnasium.make(PENDULUM), [], [], []
+    for seed in range(20):
+        angle, speed = np.random.default_rng(seed).uniform([-3.0, -1.0], [3.0, 1.0])
+        given = 2.5 * commands(env, 20, seed), ([angle], [speed])
+        truth.append(driven(env, *given))
+        fine.append(simulated(twins.make("PendulumReal"), *given))
+        coarse.append(simulated(twins.make("Pendulum"), *given))
+
+    scale = np.std(truth, (0, 1))
+    missed = np.array(coarse)[:, -1] - np.array(truth)[:, -1]
+    assert np.abs(np.array(fine) - truth).max() < 1e-6
+    assert (np.sqrt(np.mean(missed**2, 0)) > 0.02 * scale).all()
+
+
+@pytest.mark.parametrize(("env_id", "hidden"), CASES, ids=lambda v: str(v))
+def test_the_truth_is_far_closer_than_the_data_sheet(env_id, hidden, x64):
+    env = made(env_id, **hidden)
+    actions, state = commands(env, 15), start_of(env_id)
+    truth = driven(env, actions, state)
+
+    nominal = simulated(twins.from_env(env), actions, state)
+    known = simulated(envs.true_twin(env), actions, state)
+
+    # MuJoCo's dry friction is a soft constraint, the twin's a smooth function of speed; the cart's
+    # engine steps by 20 ms, in which either stops it.
+    ratio, share = (4.0, 0.06) if "friction" in str(hidden) and env_id == CART else (10.0, 0.02)
+    missed = np.abs(nominal - truth).max() if "damping" not in hidden else np.inf
+    assert missed > ratio * np.abs(known - truth).max()
+    assert np.abs(known - truth).max() < share * np.ptp(truth)
+
+
+def test_the_nominal_cart_follows_the_engine(x64):
+    env = gymnasium.make(CART, swing_up=True)
+    actions, state = commands(env, 10), start_of(CART)
+
+    truth = driven(env, actions, state)
+
+    np.testing.assert_allclose(
+        simulated(twins.from_env(env), actions, state), truth, rtol=0.0, atol=1e-9
+    )
+
+
+def test_the_rail_ends_where_the_engine_ends_it(x64):
+    env = gymnasium.make(CART, swing_up=True)
+    state = (np.array([0.9, np.pi]), np.array([2.0, 0.0]))
+    actions = np.full((10, 1), 0.5)
+
+    truth = driven(env, actions, state)
+    path = simulated(twins.from_env(env), actions, state)
+
+    assert truth[:, 0].max() > 1.0
+    assert np.abs(path[:, 0] - truth[:, 0]).max() < 0.03
+    assert driven(gymnasium.make(CART, swing_up=True, rail_ends=False), actions, state)[-1, 0] > 1.2
+
+
+def test_swinging_up_rewards_being_upright_most():
+    env = gymnasium.make(CART, swing_up=True).unwrapped
+    rewards = {}
+    for angle in np.linspace(-np.pi, np.pi, 33):
+        env.reset(seed=0)
+        env.set_state(np.array([0.0, angle]), np.zeros(2))
+        rewards[angle] = env.step(np.zeros(1))[1]
+
+    assert max(rewards, key=rewards.get) == pytest.approx(0.0)
+    assert min(rewards, key=lambda a: rewards[a]) == pytest.approx(-np.pi)
+
+
+@pytest.mark.parametrize("env_id", HIDDEN)
+def test_rewards_are_those_of_the_twin(env_id, x64):
+    env = made(env_id)
+    twin = twins.from_env(env)
+    env.reset(seed=1)
+    bare = env.unwrapped
+    for action in commands(env, 10):
+        state = State(jnp.array(bare.data.qpos), jnp.array(bare.data.qvel), {})
+        reward = env.step(action)[1]
+        after = twin.step(state, jnp.asarray(action), twin.params)
+        expected = twin.reward(state, jnp.asarray(action), after, twin.params)
+        assert reward == pytest.approx(float(expected), abs=1e-5)
+
+
+@pytest.mark.parametrize("env_id", HIDDEN)
+def test_noise_has_the_size_asked_for_and_follows_the_seed(env_id):
+    still, noisy = gymnasium.make(env_id).unwrapped, gymnasium.make(env_id, noise=0.1).unwrapped
+    errors = []
+    for seed in range(60):
+        errors.append(noisy.reset(seed=seed)[0] - still.reset(seed=seed)[0])
+
+    assert np.std(errors) == pytest.approx(0.1, rel=0.15)
+    np.testing.assert_array_equal(noisy.reset(seed=3)[0], noisy.reset(seed=3)[0])
+
+
+def test_a_payload_may_come_between_two_steps():
+    env = gymnasium.make(PENDULUM).unwrapped
+    env.reset(options={"state": (1.0, 0.0)})
+    env.set_payload(1.0)
+
+    assert env.data.qpos[0] == 1.0
+    env.step(np.zeros(1))
+    # (m / 2 + p) g sin / (m / 3 + p) l, over one interval of 0.05 s.
+    assert env.data.qvel[0] == pytest.approx(0.05 * 15.0 * np.sin(1.0) / (4.0 / 3.0), rel=0.01)
+
+
+def test_it_renders():
+    env = gymnasium.make(PENDULUM, render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    env.step(np.array([2.0]))
+
+    assert first.shape == (400, 400, 3)
+    assert (env.render() != first).any()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "settings", "message"),
+    [
+        (PENDULUM, {"mass": 0.0}, "mass must be finite, above 0"),
+        (PENDULUM, {"friction": -0.1}, "friction must be finite, at least 0"),
+        (PENDULUM, {"delay": 0.5}, "at most 0.2"),
+        (PENDULUM, {"noise": float("nan")}, "noise must be finite"),
+        (CART, {"hinge_friction": -1.0}, "hinge_friction must be finite"),
+    ],
+)
+def test_impossible_hardware_is_refused(env_id, settings, message):
+    with pytest.raises((ValueError, gymnasium.error.Error), match=message):
+        gymnasium.make(env_id, **settings)
+
+
+def test_a_wrong_state_or_torque_is_refused():
+    env = gymnasium.make(PENDULUM).unwrapped
+    with pytest.raises(ValueError, match="'state'"):
+        env.reset(options={"angle": 1.0})
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="one finite torque"):
+        env.step(np.array([np.nan]))
+
+
+def test_the_truth_of_another_environment_is_not_known():
+    with pytest.raises(TypeError, match=r"twins\.make"):
+        envs.true_twin(gymnasium.make("Pendulum-v1"))

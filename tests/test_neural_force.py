@@ -1,0 +1,187 @@
+"""The learned residual: an effect like any other, that is learned, saved, and refused when bad."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sb3_hds import effects, twins
+from sb3_hds.core import Trajectories, rollout
+from sb3_hds.effects import NeuralForce
+from sb3_hds.errors import CalibrationError, EffectError
+from sb3_hds.sysid import fit_residual
+
+SYSTEMS = ["Pendulum", "CartPole", "InvertedDoublePendulum"]
+every_system = pytest.mark.parametrize("name", SYSTEMS)
+
+
+def simulated(twin, n=6, n_steps=60, noise=0.0, seed=0):
+    """Episodes of random commands in a twin, as if they had been measured."""
+    rng = np.random.default_rng(seed)
+    (actuator,) = twin.actuators
+    actions = rng.uniform(actuator.low, actuator.high, (n, n_steps, 1))
+    starts = jax.vmap(lambda k: twin.initial(k, twin.params))(
+        jax.random.split(jax.random.key(1), n)
+    )
+    run = jax.jit(jax.vmap(lambda s, u: rollout(twin, twin.params, s, u).obs))
+    obs = np.asarray(run(starts, jnp.asarray(actions, jnp.float32)), np.float64)
+    return Trajectories.from_arrays(
+        obs + noise * rng.standard_normal(obs.shape), actions, dt=twin.dt
+    )
+
+
+def end_of(twin, params=None, n_steps=20):
+    params = twin.params if params is None else params
+    start = twin.initial(jax.random.key(3), params)
+    actions = 0.3 * jnp.ones((n_steps, len(twin.actuators)))
+    return rollout(twin, params, start, actions).obs[-1]
+
+
+@every_system
+def test_with_no_share_it_changes_nothing(name, x64):
+    twin = twins.make(name)
+    np.testing.assert_allclose(
+        end_of(twin.extend(NeuralForce())), end_of(twin), rtol=1e-9, atol=1e-9
+    )
+    assert np.abs(end_of(twin.extend(NeuralForce(share=1.0))) - end_of(twin)).max() > 1e-6
+
+
+@every_system
+def test_its_gradient_is_that_of_finite_differences(name, x64):
+    twin = twins.make(name).extend(NeuralForce(share=0.5))
+    (key,) = {k.rpartition(".")[0] for k in twin.tensors}
+
+    def moved(change):
+        scale = twin.tensors[f"{key}.output_scale"] + change[0]
+        values = {f"{key}.output_scale": scale, f"{key}.share": 0.5 + change[1]}
+        return end_of(twin, twin.params | values, n_steps=3)
+
+    slopes = jax.jit(jax.jacfwd(moved))(jnp.zeros(2))
+    width = 1e-5
+    for i in range(2):
+        step = width * jnp.eye(2)[i]
+        difference = (moved(step) - moved(-step)) / (2.0 * width)
+        np.testing.assert_allclose(slopes[:, i], difference, rtol=1e-5, atol=1e-8)
+        assert np.abs(slopes[:, i]).max() > 0.0
+    np.testing.assert_allclose(jax.jit(jax.jacrev(moved))(jnp.zeros(2)), slopes, rtol=1e-8)
+
+
+def test_it_turns_with_a_hinge_and_is_bounded(x64):
+    force = NeuralForce(share=1.0).fitted_to(twins.make("Pendulum"))
+    own = {"share": 1.0, **force.tensors}
+    q, v, u = (jnp.array([x]) for x in (0.4, 1.0, 0.5))
+
+    once = force.forces(q, v, u, own)
+    np.testing.assert_allclose(force.forces(q + 2.0 * jnp.pi, v, u, own), once, rtol=1e-12)
+    assert np.abs(force.forces(q, 1e9 * v, u, own)).max() <= 3.0
+    assert once.shape == (5, 1)
+    assert force.disagreement(q, v, u, own) > 0.0
+
+
+def test_caution_makes_disagreement_cost_something():
+    twin = twins.make("Pendulum")
+    bold, careful = (
+        twin.extend(NeuralForce(share=1.0, caution=caution)) for caution in (0.0, 10.0)
+    )
+    state, action = twin.initial(jax.random.key(0), twin.params), jnp.array([0.5])
+    state = bold.infer(bold.observe(state, bold.params), bold.params)
+
+    paid = [
+        t.planning_reward(state, action, state, t.params) - t.reward(state, action, state, t.params)
+        for t in (bold, careful)
+    ]
+    assert paid[0] == 0.0
+    assert paid[1] < 0.0
+
+
+def test_it_survives_a_file(tmp_path):
+    twin = twins.make("CartPole").extend(NeuralForce(n_members=3, net_arch=(5,), share=0.7))
+    (effect,) = twin.effects_with_values()
+    path = effect.save(tmp_path / "force")
+
+    loaded = twins.make("CartPole").extend(NeuralForce.load(path))
+
+    np.testing.assert_array_equal(end_of(loaded), end_of(twin))
+    np.load(path, allow_pickle=False).close()
+
+
+def test_it_survives_its_spec_with_its_tensors():
+    twin = twins.make("Pendulum").extend(NeuralForce(n_members=2, net_arch=(4,), share=1.0))
+
+    again = twins.from_spec(twin.to_spec(), effects.KNOWN).with_tensors(twin.tensors)
+
+    assert again == twin
+    np.testing.assert_array_equal(end_of(again), end_of(twin))
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path):
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    with pytest.raises(EffectError, match=r"not written by NeuralForce\.save"):
+        NeuralForce.load(tmp_path / "other.npz")
+    with pytest.raises(EffectError, match="no file"):
+        NeuralForce.load(tmp_path / "missing.npz")
+    with pytest.raises(EffectError, match="attach it"):
+        NeuralForce().save(tmp_path / "nothing")
+
+
+def test_a_file_that_was_cut_off_is_refused(tmp_path):
+    (effect,) = twins.make("Pendulum").extend(NeuralForce()).effects_with_values()
+    path = effect.save(tmp_path / "force")
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(EffectError, match="damaged"):
+        NeuralForce.load(path)
+
+
+def test_a_force_of_another_machine_is_refused():
+    (effect,) = twins.make("Pendulum").extend(NeuralForce()).effects_with_values()
+    with pytest.raises(EffectError, match="other kinds"):
+        twins.make("CartPole").extend(effect)
+
+
+@pytest.mark.parametrize("sizes", [{"n_members": 0}, {"net_arch": (8, 0)}])
+def test_an_ensemble_of_nothing_is_refused(sizes):
+    with pytest.raises(EffectError, match="members and units"):
+        NeuralForce(**sizes)
+
+
+def test_it_learns_a_friction_that_the_twin_lacks():
+    twin = twins.make("Pendulum")
+    data = simulated(twin.extend(effects.CoulombFriction(0, tau_c=0.4)), n_steps=100)
+
+    found = fit_residual(twin, data)
+
+    assert found.accepted
+    assert found.twin.values[f"{found.key}.share"] == 1.0
+    ratio = np.sqrt(np.mean(found.error_after**2) / np.mean(found.error_before**2))
+    assert ratio < 0.5
+    # Against the direction of motion.
+    force = found.twin.effects_with_values()[0]
+    own = {"share": 1.0, **force.tensors}
+    zero = jnp.zeros(1)
+    ahead, back = (force.force_at(zero + 0.5, zero + v, zero, own)[0] for v in (3.0, -3.0))
+    assert ahead < -0.15 and back > 0.15
+
+
+def test_a_force_learned_from_garbage_is_refused():
+    twin = twins.make("Pendulum")
+    data = simulated(twin, n_steps=100)
+    rng = np.random.default_rng(0)
+    noise = Trajectories.from_arrays(
+        rng.standard_normal(data.obs.shape), list(data.actions), dt=data.dt
+    )
+
+    found = fit_residual(twin, noise, seed=1)
+
+    assert not found.accepted
+    assert found.twin.values[f"{found.key}.share"] == 0.0
+
+
+def test_nothing_is_learned_where_nothing_is_wrong():
+    twin = twins.make("Pendulum")
+    assert not fit_residual(twin, simulated(twin, noise=0.02)).accepted
+
+
+def test_too_few_data_are_refused():
+    twin = twins.make("Pendulum")
+    with pytest.raises(CalibrationError, match="too few"):
+        fit_residual(twin, simulated(twin, n=1, n_steps=12), window=10)
