@@ -71,7 +71,7 @@ class NeuralForce(ForceEffect):
         where: int | str = 0,
         *,
         n_members: int = 5,
-        net_arch: Sequence[int] = (16,),
+        net_arch: Sequence[int] = (8, 8),
         caution: float = 0.0,
         **values: float,
     ) -> None:

@@ -39,14 +39,18 @@ def window_errors(
         return np.asarray(found)
 
 
-def start_offsets(
+def start_states(
     twin: Twin, params: Params, shots: Shots, scale: Float[np.ndarray, " obs"]
-) -> Float[np.ndarray, "n free"]:
-    """:return: of each window, the start state under which the twin comes closest to it"""
+) -> tuple[Float[np.ndarray, "n free"], Float[np.ndarray, "n residuals free"]]:
+    """
+    :return: of each window, the start state under which the twin comes closest to it, and an
+        orthonormal basis of the errors (in units of ``scale``, flattened) that moving it can make
+    """
     with jax.enable_x64(True):
         doubles = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
-        found = _errors(twin, doubles, Shots(*map(jnp.asarray, shots)), jnp.asarray(scale))[1]
-        return np.asarray(found)
+        found = _errors(twin, doubles, Shots(*map(jnp.asarray, shots)), jnp.asarray(scale))
+        slopes = np.nan_to_num(np.asarray(found[2]), posinf=0.0, neginf=0.0)
+        return np.asarray(found[1]), np.linalg.qr(slopes)[0]
 
 
 def single_step_errors(
@@ -135,12 +139,12 @@ def _single_steps(
 @partial(jax.jit, static_argnums=0)
 def _errors(
     twin: Twin, params: Params, shots: Shots, scale: Float[Array, " obs"]
-) -> tuple[Float[Array, " n"], Float[Array, "n free"]]:
-    def one(shot: Shots) -> tuple[Array, Array]:
+) -> tuple[Float[Array, " n"], Float[Array, "n free"], Float[Array, "n residuals free"]]:
+    def one(shot: Shots) -> tuple[Array, Array, Array]:
         first = jnp.zeros(n_free(twin), shot.obs.dtype)
         offset = fit_start(twin, params, shot, scale, first, _N_STEPS)
-        error = (simulate(twin, params, shot, offset) - shot.obs) / scale
-        rms = jnp.sqrt(jnp.mean(error**2))
-        return jnp.where(jnp.isfinite(rms), rms, jnp.inf), offset
+        error = lambda x: ((simulate(twin, params, shot, x) - shot.obs) / scale).ravel()  # noqa: E731
+        rms = jnp.sqrt(jnp.mean(error(offset) ** 2))
+        return jnp.where(jnp.isfinite(rms), rms, jnp.inf), offset, jax.jacfwd(error)(offset)
 
     return jax.vmap(one)(shots)
