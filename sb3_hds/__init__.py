@@ -12,13 +12,25 @@ from typing import TYPE_CHECKING, Any
 from sb3_hds.envs.registration import register_environments
 
 if TYPE_CHECKING:
-    from sb3_hds import effects, envs, planning, twins
+    from sb3_hds import effects, envs, planning, sysid, twins, wrappers
     from sb3_hds.algos import HDS, PODS
     from sb3_hds.core import Trajectories
+    from sb3_hds.sysid import calibrate
 
-__all__ = ["HDS", "PODS", "Trajectories", "effects", "envs", "planning", "twins"]
+__all__ = [
+    "HDS",
+    "PODS",
+    "Trajectories",
+    "calibrate",
+    "effects",
+    "envs",
+    "planning",
+    "sysid",
+    "twins",
+    "wrappers",
+]
 
-_CLASSES = {"HDS": "algos", "PODS": "algos", "Trajectories": "core"}
+_CLASSES = {"HDS": "algos", "PODS": "algos", "Trajectories": "core", "calibrate": "sysid"}
 
 try:
     __version__ = version("sb3-hds")

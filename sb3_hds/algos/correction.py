@@ -26,8 +26,8 @@ from sb3_hds.sysid.shooting import Shots, shots_of
 _N_WINDOWS = 128
 # A twin whose windows miss by less than this share of the channels' spread needs no correction.
 _EXACT = 1e-3
-# The same for a single step, and how many are looked at.
-_EXACT_STEP, _N_SINGLE = 1e-4, 256
+# The same for most of the latest single steps: how little, which share, of how many.
+_EXACT_STEP, _MOST_STEPS, _N_SINGLE = 1e-4, 0.9, 256
 # Fewer windows than this are too few to check on some what was learned from others.
 _FEWEST = 6
 # Share of windows to check on, and that share where there are not many.
@@ -111,8 +111,9 @@ def correct(
     check_fits(twin, data)
     if twin.values == wishes.nominal:
         single = single_step_errors(twin, data, spread_of(data), _N_SINGLE)
-        if np.median(single) < _EXACT_STEP:
-            return Correction(twin, beta, changed=False, error_twin=float(np.median(single)))
+        typical = float(np.quantile(single, _MOST_STEPS))
+        if typical < _EXACT_STEP:
+            return Correction(twin, beta, changed=False, error_twin=typical)
     try:
         shots, origin = shots_of(data, default_window(data), twin, _N_WINDOWS, seed=None)
     except TrajectoryError:

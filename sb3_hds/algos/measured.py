@@ -1,11 +1,13 @@
 """The real steps that a model has seen, and how they travel with it."""
 
+import copy
 import os
 import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_hds.core import Trajectories
 from sb3_hds.errors import TrajectoryError
@@ -45,7 +47,7 @@ class Measured:
         """:return: the latest steps, oldest first, shape ``(steps, n_envs, ...)``; earlier data"""
         limit = self._model.max_saved_steps if self._model.save_data else 0
         saved: dict[str, th.Tensor] = {}
-        buffer = self._model.replay_buffer
+        buffer = _up_to_date(self._model)
         if buffer is not None and limit and buffer.size() > 0:
             order = np.arange(buffer.pos)
             if buffer.full:
@@ -86,6 +88,23 @@ class Measured:
                 )
             kept[:n] = values[-n:]
         buffer.pos, buffer.full = n % buffer.buffer_size, n == buffer.buffer_size
+
+
+def _up_to_date(model: "HDS") -> Any:
+    """The replay buffer, with the step that callbacks have seen and SB3 has not stored yet."""
+    buffer, step = model.replay_buffer, model.unstored_step
+    if buffer is None or step is None:
+        return buffer
+    buffer = copy.copy(buffer)
+    before = model._last_obs, model._last_original_obs
+    OffPolicyAlgorithm._store_transition(model, buffer, **_named(step))
+    model._last_obs, model._last_original_obs = before
+    return buffer
+
+
+def _named(step: dict[str, Any]) -> dict[str, Any]:
+    names = {"buffer_actions": "buffer_action", "rewards": "reward"}
+    return {names.get(name, name): value for name, value in step.items()}
 
 
 def data_from(source: Any) -> Trajectories | None:

@@ -38,6 +38,10 @@ class Pretraining(BaseCallback):
                 break
 
     def _on_step(self) -> bool:
+        """SB3 stores a step after the callbacks have seen it, checkpoints among them."""
+        model: TwinAlgorithm = self.model  # type: ignore[assignment]
+        names = ("buffer_actions", "new_obs", "rewards", "dones", "infos")
+        model.unstored_step = {name: self.locals[name] for name in names}
         return True
 
     def _shown(self, epochs: range):

@@ -177,6 +177,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         self.least_gain = least_gain
         self.randomisation = randomisation
         self.recent_gain, self.recent_return = 0.0, 0.0
+        self.unstored_step: dict[str, Any] | None = None
         self.saved_by = type(self).__name__
         self.n_pretrained = 0
         self.twin_timesteps = 0
@@ -226,6 +227,10 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """One planning epoch with ``gradient_steps`` regression steps, between real steps."""
         self.run_epoch(gradient_steps)
+
+    def _store_transition(self, *args: Any, **kwargs: Any) -> None:
+        super()._store_transition(*args, **kwargs)
+        self.unstored_step = None
 
     def run_epoch(self, gradient_steps: int) -> Report:
         """
@@ -451,5 +456,5 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         return ["policy", "policy.optimizer"], []
 
     def _excluded_save_params(self) -> list[str]:
-        ours = ["policy", "twin", "key", "_workspace", "_device_name"]
+        ours = ["policy", "twin", "key", "_workspace", "_device_name", "unstored_step"]
         return [*super()._excluded_save_params(), *ours]

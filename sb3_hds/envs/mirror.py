@@ -33,6 +33,7 @@ from sb3_hds.twins import registry
 _NEUTRAL = {
     "Autoreset": "gymnasium",
     "HumanRendering": "gymnasium",
+    "ManualReset": "sb3_hds",
     "Monitor": "stable_baselines3",
     "OrderEnforcing": "gymnasium",
     "PassiveEnvChecker": "gymnasium",

@@ -60,12 +60,13 @@ def single_step_errors(
     Errors of single steps from measured states: quick to compile, and enough to see that a twin is
     exact. Where measurements are noisy, or states not fully observed, they say little.
 
-    :param n_rows: the latest steps of the longest recording are looked at, at most so many
+    :param n_rows: the latest steps are looked at, so many; where there are fewer, some count twice
     :return: root mean square over the channels of each step, in units of ``scale``
     """
-    obs, actions = data.episode(int(np.argmax(data.lengths)))
-    rows = np.minimum(np.arange(n_rows), len(actions) - 1) + max(0, len(actions) - n_rows)
-    given = (jnp.asarray(x, jnp.float32) for x in (obs[rows], actions[rows], obs[rows + 1], scale))
+    episodes = [data.episode(i) for i in range(len(data))]
+    steps = [np.concatenate(part) for part in zip(*((x[:-1], u, x[1:]) for x, u in episodes))]  # noqa: B905
+    rows = np.resize(np.arange(len(steps[0]))[-n_rows:], n_rows)
+    given = (jnp.asarray(x, jnp.float32) for x in (*(part[rows] for part in steps), scale))
     return np.asarray(_single_steps(twin, twin.params, *given))
 
 

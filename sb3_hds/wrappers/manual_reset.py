@@ -1,0 +1,48 @@
+"""An episode that ends because somebody wants to put the robot back."""
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+
+
+class ManualReset(gymnasium.Wrapper):
+    """
+    Ends an episode when asked to: with a key, a foot switch, or from another thread.
+
+    The step during which the request comes is truncated, not terminated: nothing about the task
+    made it end, so what would have come after still counts. Observations, actions and rewards are
+    left alone.
+
+    :param env: of any kind
+    :param wanted: asked after every step whether to end; default: only :meth:`request` ends
+    """
+
+    def __init__(self, env: gymnasium.Env, wanted: Callable[[], bool] | None = None) -> None:
+        super().__init__(env)
+        self._wanted = wanted
+        self._requested = threading.Event()
+
+    def request(self) -> None:
+        """End the episode with the step that is running, or the next one. Any thread may call."""
+        self._requested.set()
+
+    def reset(self, **settings: Any) -> tuple[Any, dict[str, Any]]:
+        self._requested.clear()
+        return self.env.reset(**settings)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """:return: as the environment, with ``info["manual_reset"]`` where it was asked to end"""
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        if self._requested.is_set() or (self._wanted is not None and self._wanted()):
+            self._requested.clear()
+            return obs, reward, terminated, True, info | {"manual_reset": True}
+        return obs, reward, terminated, truncated, info
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_requested": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._requested = threading.Event()

@@ -1,0 +1,37 @@
+"""Data as a rig would give them, simulated by a twin whose truth is known."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sb3_hds.core import Trajectories, rollout
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _observed(twin, params, keys, actions):
+    def one(key, action):
+        return rollout(twin, params, twin.initial(key, params), action).obs
+
+    return jax.vmap(one)(keys, actions)
+
+
+def measured(twin, n=8, n_steps=60, noise=0.0, seed=0, share=0.8):
+    """
+    :param noise: standard deviation of each channel
+    :param share: of the range of commands that is used
+    :return: episodes of smooth random commands
+    """
+    rng = np.random.default_rng(seed)
+    low, high = (np.array([getattr(a, end) for a in twin.actuators]) for end in ("low", "high"))
+    wander = rng.standard_normal((n, n_steps, len(low))).cumsum(1)
+    wander = np.sin(0.7 * wander + rng.uniform(0.0, 6.0, (n, 1, 1)))
+    actions = low + (0.5 + 0.5 * share * wander) * (high - low)
+    keys = jax.random.split(jax.random.key(seed), n)
+    with jax.enable_x64(True):
+        params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), twin.params)
+        obs = np.asarray(_observed(twin, params, keys, jnp.asarray(actions)))
+    return Trajectories.from_arrays(
+        obs + noise * rng.standard_normal(obs.shape), actions, dt=twin.dt
+    )

@@ -1,0 +1,230 @@
+"""Estimates: right, as sure as they say, and honest where the data cannot tell."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from measuring import measured
+from scipy.optimize import least_squares
+
+from sb3_hds import effects, twins
+from sb3_hds.core import Trajectories, rollout
+from sb3_hds.errors import CalibrationError, TrajectoryError
+from sb3_hds.sysid import calibrate
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+TRUTH = {"mass": 1.2, "length": 0.9}
+FREE = tuple(TRUTH)
+
+
+def truth():
+    return twins.make("PendulumReal", damping=0.05, **TRUTH)
+
+
+def nominal():
+    return twins.make("PendulumReal", damping=0.05)
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    return measured(truth(), noise=0.02)
+
+
+@pytest.fixture(scope="module")
+def fit(noisy):
+    return calibrate(nominal(), noisy, free=FREE)
+
+
+def test_planted_parameters_are_found_within_three_standard_errors(fit):
+    assert fit.converged
+    assert fit.caveats == ()
+    for name, value in TRUTH.items():
+        found = fit[name]
+        assert abs(found.estimate - value) < 3.0 * found.stderr
+        assert 0.0 < found.stderr < 0.01
+        assert found.low < found.estimate < found.high
+        assert fit.twin.values[name] == found.estimate
+
+
+def test_noise_and_errors_are_those_of_the_data(fit):
+    np.testing.assert_allclose(fit.noise, 0.02, rtol=0.2)
+    # Over a window, start states take up some of the noise.
+    assert (fit.error_after < 1.1 * 0.02).all()
+    assert fit.error_before[2] > 5.0 * fit.error_after[2]
+
+
+def test_without_noise_the_truth_is_found_exactly():
+    fit = calibrate(nominal(), measured(truth()), free=FREE)
+    for name, value in TRUTH.items():
+        assert fit[name].estimate == pytest.approx(value, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("InvertedPendulumFriction", {"hinge_damping": 1.5, "pole_mass": 4.5}),
+        ("CartPole", {"pole_mass": 0.13, "half_length": 0.45}),
+        ("MountainCar", {"gravity": 0.0028}),
+    ],
+)
+def test_other_systems_too(name, values):
+    settings = {"swing_up": True} if name == "InvertedPendulumFriction" else {}
+    plain = twins.make(name, **settings)
+    if not set(values) <= set(plain.parameters):
+        pytest.skip(f"{name} has other parameters")
+    data = measured(plain.with_parameters(**values), noise=1e-3, share=0.2)
+
+    fit = calibrate(plain, data, free=values)
+
+    for parameter, value in values.items():
+        found = fit[parameter]
+        assert abs(found.estimate - value) < 4.0 * found.stderr
+        assert found.stderr < 0.1 * value
+
+
+def test_effects_are_estimated_like_any_parameter():
+    plain = twins.make("PendulumReal")
+    hidden = {"coulomb_friction.hinge.tau_c": 0.15, "action_delay.torque.delay": 0.06}
+    with_effects = plain.extend(effects.ActionDelay(0), effects.CoulombFriction(0))
+    data = measured(with_effects.with_parameters(**hidden), noise=0.01)
+
+    fit = calibrate(with_effects, data, free=hidden)
+
+    for name, value in hidden.items():
+        found = fit[name]
+        assert abs(found.estimate - value) < max(4.0 * found.stderr, 0.002)
+        assert found.unit in ("N m", "s")
+
+
+def test_it_agrees_with_scipy_on_the_whole_problem(x64):
+    """Parameters and start states together, by another solver, without elimination."""
+    data = measured(truth(), n=3, n_steps=21, noise=0.02)
+    fit = calibrate(nominal(), data, free=FREE, window=10, loss="linear")
+    windows = data.windows(10, 11)
+    twin, noise = nominal(), jnp.asarray(fit.noise)
+
+    @jax.jit
+    def errors(unknown):
+        params = twin.params | dict(zip(FREE, unknown[: len(FREE)], strict=True))
+        offsets = unknown[len(FREE) :].reshape(len(windows), 2)
+
+        def one(obs, actions, offset):
+            start = twin.infer(obs[0], params)
+            start = start._replace(q=start.q + offset[:1], v=start.v + offset[1:])
+            return (rollout(twin, params, start, actions).obs - obs) / noise
+
+        return jax.vmap(one)(windows.obs, windows.actions, offsets).ravel()
+
+    begin = np.concatenate([[1.0, 1.0], np.zeros(2 * len(windows))])
+    found = least_squares(errors, begin, jac=jax.jit(jax.jacfwd(errors)), xtol=1e-12, ftol=1e-12)
+
+    ours = [fit[name].estimate for name in FREE]
+    np.testing.assert_allclose(ours, found.x[: len(FREE)], rtol=1e-4)
+
+
+def test_outliers_count_less():
+    data = measured(truth(), noise=0.01)
+    obs = data.obs.copy()
+    hit = np.random.default_rng(1).random(obs.shape) < 0.01
+    obs[hit] += 3.0
+    spoiled = Trajectories.from_arrays(obs, data.actions, dt=data.dt)
+
+    robust, plain = (calibrate(nominal(), spoiled, free=FREE, loss=k) for k in ("huber", "linear"))
+
+    missed = [sum(abs(f[name].estimate - v) for name, v in TRUTH.items()) for f in (robust, plain)]
+    assert missed[0] < 0.02
+    assert missed[0] < 0.5 * missed[1]
+
+
+def test_a_bound_is_kept_and_said():
+    """The truth has no damping, so noise pushes the estimate below zero half of the time."""
+    plain = twins.make("PendulumReal")
+    fits = [
+        calibrate(plain, measured(plain, n=2, noise=0.05, seed=seed), free=["damping"])
+        for seed in range(6)
+    ]
+
+    assert all(fit["damping"].estimate >= 0.0 and fit["damping"].low >= 0.0 for fit in fits)
+    assert any(fit["damping"].at_bound for fit in fits)
+    (caveat,) = next(fit.caveats for fit in fits if fit["damping"].at_bound)
+    assert "physical bound: damping" in caveat
+
+
+def test_what_the_data_do_not_determine_is_said():
+    """Torques are known, so inertia and weight are: three numbers of two cannot be told apart."""
+    data = measured(twins.make("PendulumReal"), n=4, noise=0.02)
+
+    fit = calibrate(twins.make("PendulumReal"), data, free=("mass", "length", "gravity"))
+
+    assert len(fit.undetermined) == 1
+    assert np.isinf([e.stderr for e in fit.estimates]).any()
+    assert any("only combinations" in caveat for caveat in fit.caveats)
+    believed = calibrate(
+        twins.make("PendulumReal"), data, free=("mass", "length", "gravity"), prior=1.0
+    )
+    assert believed.undetermined == ()
+    for e in believed.estimates:
+        scale = believed.twin.parameters[e.name].scale
+        assert 0.01 * scale < e.stderr < 1.5 * scale
+        assert e.low < e.before < e.high
+
+
+def test_padding_changes_nothing(noisy, fit):
+    padded = calibrate(nominal(), noisy, free=FREE, n_windows=200)
+
+    assert padded.n_windows == fit.n_windows
+    for name in FREE:
+        assert padded[name].estimate == pytest.approx(fit[name].estimate, rel=1e-6)
+        assert padded[name].stderr == pytest.approx(fit[name].stderr, rel=1e-6)
+
+
+def test_it_prints_itself_and_is_plain_data(fit, tmp_path):
+    text = str(fit)
+    assert max(map(len, text.splitlines())) <= 80
+    assert "mass" in text and "kg" in text
+    plain = json.loads(json.dumps(fit.to_dict(), allow_nan=False))
+    assert plain["estimates"][0]["name"] == "mass"
+    fit.plot(tmp_path / "fit.png")
+    assert (tmp_path / "fit.png").stat().st_size > 10_000
+    with pytest.raises(KeyError, match="'gravity' was not free"):
+        fit["gravity"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"free": ["weight"]}, r"free must name parameters .*gravity, mass"),
+        ({"free": []}, "free must name"),
+        ({"free": ["mass", "mass"]}, "each once"),
+        ({"loss": "cauchy"}, "'huber' or 'linear'"),
+        ({"level": 1.5}, "level must lie"),
+    ],
+)
+def test_a_wrong_wish_is_refused(noisy, settings, message):
+    with pytest.raises(CalibrationError, match=message):
+        calibrate(nominal(), noisy, **settings)
+
+
+def test_data_of_another_system_or_interval_are_refused(noisy):
+    with pytest.raises(CalibrationError, match="observes 5 channels"):
+        calibrate(twins.make("CartPole"), noisy)
+    with pytest.raises(CalibrationError, match=r"data\.resample\(dt=0\.02\)"):
+        calibrate(twins.make("PendulumReal", dt=0.02), noisy)
+    with pytest.raises(TrajectoryError, match="shorter windows"):
+        calibrate(nominal(), noisy, window=500)
+    with pytest.raises(CalibrationError, match="unknowns"):
+        calibrate(nominal(), noisy.windows(1)[:1])
+
+
+@pytest.mark.expensive
+def test_intervals_cover_the_truth_as_often_as_they_say():
+    """200 seeds; at 95 %, fewer than 180 or all of them would be chance once in a thousand."""
+    hits = {name: 0 for name in FREE}
+    for seed in range(200):
+        fit = calibrate(nominal(), measured(truth(), n=20, noise=0.02, seed=seed), free=FREE)
+        for name, value in TRUTH.items():
+            hits[name] += fit[name].low <= value <= fit[name].high
+    assert all(180 <= n <= 199 for n in hits.values()), hits

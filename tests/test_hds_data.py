@@ -1,0 +1,320 @@
+"""HDS and the data that it measures: what they correct, what they may not spoil, what is kept."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from measuring import measured
+from small_models import logged, small, steps_of
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_hds import HDS, PODS, effects, twins
+from sb3_hds.algos.correction import Wishes, correct
+from sb3_hds.core import Trajectories
+from sb3_hds.errors import CalibrationError, EffectError, TrajectoryError
+from sb3_hds.sysid.residual import force_of
+from sb3_hds.wrappers import ManualReset
+
+REAL = "sb3_hds/PendulumReal-v1"
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+
+def wishes(twin, **changes):
+    names = tuple(twin.parameters)
+    plain = {"names": names, "residual": False, "residual_kwargs": {}, "beta": "auto", "seed": 0}
+    return Wishes(nominal=dict(twin.values), **(plain | changes))
+
+
+def corrected(twin, data, n_new=10_000, beta=0.0, **changes):
+    return correct(twin, data, wishes(twin, **changes), beta, learn_force=True, n_new=n_new)
+
+
+@pytest.fixture(scope="module")
+def heavier():
+    return measured(twins.make("PendulumReal", mass=1.3, damping=0.1), noise=0.01)
+
+
+# --- what is corrected
+
+
+def test_a_twin_that_is_exact_is_left_alone():
+    twin = twins.make("PendulumReal")
+    found = corrected(twin, measured(twin))
+
+    assert found.twin is twin and not found.changed and found.fit is None
+    assert found.error_twin < 1e-4
+
+
+def test_parameters_are_corrected_and_plans_made_anew(heavier):
+    found = corrected(twins.make("PendulumReal"), heavier)
+
+    twin = found.twin
+    inertia = (twin.values["mass"] / 3.0 + twin.values["payload"]) * twin.values["length"] ** 2
+    assert found.changed
+    assert found.error_calibrated < 0.5 * found.error_twin
+    assert inertia == pytest.approx(1.3 / 3.0, rel=0.02)
+    assert twin.values["damping"] == pytest.approx(0.1, rel=0.1)
+
+
+def test_once_corrected_nothing_changes_any_more(heavier):
+    first = corrected(twins.make("PendulumReal"), heavier)
+    again = correct(
+        first.twin, heavier, wishes(twins.make("PendulumReal")), 0.0, learn_force=False, n_new=1000
+    )
+
+    assert not again.changed
+    assert again.error_calibrated <= first.error_calibrated * 1.001
+
+
+def test_a_nuisance_that_may_not_be_corrected_stays(heavier):
+    found = corrected(twins.make("PendulumReal"), heavier, names=("damping",))
+    assert found.twin.values["mass"] == 1.0
+
+
+def test_what_has_no_parameter_is_left_to_the_learned_force():
+    twin = twins.make("PendulumReal")
+    data = measured(twin.extend(effects.CoulombFriction(0, tau_c=0.4)), noise=0.005, n=10)
+
+    found = corrected(twin, data, residual=True)
+
+    assert found.beta > 0.0
+    assert force_of(found.twin) is not None
+    assert found.error_hybrid < 0.9 * found.error_calibrated < 0.9 * found.error_twin
+
+
+def test_a_learned_force_that_does_not_help_is_not_even_attached(heavier):
+    found = corrected(twins.make("PendulumReal"), heavier, residual=True)
+
+    assert found.residual is not None and not found.residual.accepted
+    assert found.beta == 0.0 and force_of(found.twin) is None
+
+
+def test_data_from_before_a_change_are_forgotten():
+    before = measured(twins.make("PendulumReal"), n=4)
+    after = measured(twins.make("PendulumReal", payload=0.5), n=4, seed=1)
+    both = Trajectories.concatenate([before, after])
+
+    found = corrected(twins.make("PendulumReal"), both, n_new=after.n_steps)
+    mixed = corrected(twins.make("PendulumReal"), both, n_new=both.n_steps)
+
+    assert found.forgotten and not mixed.forgotten
+    assert found.error_calibrated < 1e-3 < mixed.error_calibrated
+
+
+def test_too_few_data_change_nothing():
+    twin = twins.make("PendulumReal")
+    found = corrected(twin, measured(twins.make("PendulumReal", mass=2.0), n=1, n_steps=4))
+    assert found.twin is twin and not found.changed
+
+
+# --- in the algorithm
+
+
+def test_on_a_planted_mismatch_hds_does_better_than_pods():
+    """Both pretrain in the same wrong twin; HDS sees 200 steps of the real system."""
+    settings = {"mass": 1.25, "length": 1.3}
+    returns = {}
+    for algorithm in (PODS, HDS):
+        model = algorithm(
+            gymnasium.make(REAL, **settings),
+            twin=twins.make("PendulumReal", substeps=2),
+            seed=0,
+            pretrain_epochs=60,
+            n_rollouts=64,
+            train_freq=100,
+        )
+        model.learn(200)
+        returns[algorithm] = return_of(model, gymnasium.make(REAL, **settings))
+
+    assert returns[HDS] > returns[PODS] + 20.0
+
+
+def return_of(model, env, n=20):
+    total = 0.0
+    for seed in range(n):
+        obs, _ = env.reset(seed=1000 + seed)
+        for _ in range(200):
+            obs, reward, *_ = env.step(model.predict(obs, deterministic=True)[0])
+            total += reward
+    return total / n
+
+
+def test_what_the_data_say_is_logged():
+    model = small("hds", gymnasium.make(REAL, mass=1.4), twin="PendulumReal", train_freq=100)
+    lines = logged(model)
+
+    model.learn(200, log_interval=1)
+
+    for key in ("error_twin", "error_calibrated", "error_hybrid", "beta", "mass", "mass_low"):
+        assert lines.column(f"model/{key}"), key
+
+
+def test_a_share_of_the_rollouts_is_in_the_learned_model():
+    twin = twins.make("PendulumReal").extend(effects.NeuralForce(n_members=1, net_arch=(2,)))
+    model = small("hds", REAL, twin=twin, n_rollouts=8)
+    for share in (0.0, 0.25, 1.0):
+        model.model_beta = share
+        (chosen,) = model.varied(model.twin).values()
+        assert sorted(set(np.asarray(chosen).tolist())) in ([0.0], [0.0, 1.0], [1.0])
+        assert chosen.mean() == share
+    model.learn(0)
+
+
+def test_rollouts_differ_under_domain_randomisation():
+    model = small("pods", randomisation=1.0)
+    drawn = model.varied(model.twin)
+
+    assert set(drawn) == set(model.twin.parameters)
+    assert np.std(drawn["mass"]) > 0.05
+    model.learn(0)
+    assert small("pods").varied(model.twin) == {}
+
+
+def test_effects_are_attached_by_name_or_as_they_are():
+    model = small("hds", REAL, effects=["coulomb_friction", effects.QuadraticDrag(0, c=0.01)])
+
+    assert model.twin.values["coulomb_friction.hinge.tau_c"] == 0.0
+    assert model.twin.values["quadratic_drag.hinge.c"] == 0.01
+    with pytest.raises(EffectError, match="viscous_friction"):
+        small("hds", REAL, effects=["magic"])
+    with pytest.raises(CalibrationError, match="Its parameters are: gravity"):
+        small("hds", REAL, calibrated=["weight"])
+
+
+def test_data_from_a_file_correct_the_model_before_the_first_plan(tmp_path, heavier):
+    path = heavier.save(tmp_path / "log")
+    model = small("hds", REAL, twin="PendulumReal", pretrain_data=str(path), residual=False)
+
+    model.learn(0)
+
+    assert model.twin.values["damping"] == pytest.approx(0.1, rel=0.15)
+    with pytest.raises(TrajectoryError, match="no file"):
+        small("hds", REAL, pretrain_data=str(tmp_path / "missing.npz"))
+    with pytest.raises(TrajectoryError, match="Trajectories or the path"):
+        small("hds", REAL, pretrain_data=3)
+
+
+# --- what is kept
+
+
+def columns(model):
+    buffer = model.replay_buffer
+    n = buffer.size()
+    return {
+        name: getattr(buffer, name)[:n]
+        for name in ("observations", "next_observations", "actions", "rewards", "timeouts")
+    }
+
+
+def test_data_and_corrections_travel_with_the_model(tmp_path, heavier):
+    model = small("hds", REAL, twin="PendulumReal", pretrain_data=heavier, residual=False)
+    model.learn(125).save(tmp_path / "model")
+
+    loaded = HDS.load(tmp_path / "model", env=gymnasium.make(REAL))
+
+    for name, values in columns(model).items():
+        np.testing.assert_array_equal(columns(loaded)[name], values, err_msg=name)
+    assert loaded.twin.values == model.twin.values
+    assert loaded.nominal == model.nominal
+    assert loaded.measured.trajectories().n_steps == heavier.n_steps + 125
+    loaded.learn(25, reset_num_timesteps=False)
+    assert loaded.replay_buffer.size() == 150
+
+
+def test_a_learned_force_travels_as_tensors(tmp_path):
+    twin = twins.make("PendulumReal").extend(effects.NeuralForce(share=1.0))
+    model = small("hds", REAL, twin=twin)
+    model.save(tmp_path / "model")
+
+    loaded = HDS.load(tmp_path / "model")
+
+    (key,) = {name for name in twin.tensors if name.endswith("weights")}
+    for one, other in zip(
+        *(m.twin.tensors[key]["Dense_0"].values() for m in (model, loaded)), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_how_much_is_saved_may_be_limited(tmp_path):
+    for name, settings, kept in (
+        ("some", {"max_saved_steps": 40}, 40),
+        ("none", {"save_data": False}, 0),
+    ):
+        model = small("hds", **settings).learn(60)
+        model.save(tmp_path / name)
+        loaded = HDS.load(tmp_path / name, env=gymnasium.make("Pendulum-v1"))
+        assert loaded.replay_buffer.size() == kept
+        if kept:
+            latest = columns(model)["observations"][-kept:]
+            np.testing.assert_array_equal(columns(loaded)["observations"], latest)
+
+
+def test_another_number_of_copies_takes_the_data_too(tmp_path):
+    model = small("hds", make_vec_env("Pendulum-v1", 2, seed=0)).learn(100)
+    model.save(tmp_path / "model")
+
+    loaded = HDS.load(tmp_path / "model", env=gymnasium.make("Pendulum-v1"))
+
+    assert loaded.measured.trajectories().n_steps == 100
+
+
+def test_an_episode_that_was_ended_by_hand_is_truncated():
+    env = ManualReset(gymnasium.make(REAL, mass=1.2))
+    model = small("hds", env, twin="PendulumReal", refit_freq=0)
+    asked = []
+
+    def press(_locals, _globals):
+        if model.num_timesteps == 10:
+            env.request()
+            asked.append(model.num_timesteps)
+        return True
+
+    model.learn(25, callback=press)
+
+    assert asked
+    assert np.flatnonzero(model.replay_buffer.timeouts[:25, 0]).tolist() == [10]
+    assert model.measured.trajectories().lengths.tolist() == [11, 14]
+
+
+SCRIPT = """
+import glob, os, signal, sys
+import gymnasium, torch
+from small_models import small
+from stable_baselines3.common.callbacks import CheckpointCallback
+
+write, calls = torch.save, []
+
+def deadly(*args, **kwargs):
+    calls.append(len(glob.glob(sys.argv[1] + "/*.zip")))
+    if calls.count(2) == 4:
+        os.kill(os.getpid(), signal.SIGKILL)
+    write(*args, **kwargs)
+
+torch.save = deadly
+env = gymnasium.make("sb3_hds/PendulumReal-v1", mass=1.3)
+small("hds", env, twin="PendulumReal", residual=False, replan_epochs=1).learn(
+    1_000, callback=CheckpointCallback(100, sys.argv[1])
+)
+"""
+
+
+def test_a_killed_run_resumes_with_its_data_and_its_corrected_twin(tmp_path):
+    environ = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
+    killed = subprocess.run([sys.executable, "-c", SCRIPT, str(tmp_path)], env=environ)
+
+    assert killed.returncode == -signal.SIGKILL
+    last = max(tmp_path.glob("*.zip"), key=steps_of)
+    model = HDS.load(last, env=gymnasium.make(REAL, mass=1.3))
+    assert model.num_timesteps == steps_of(last) == 200
+    assert model.replay_buffer.size() == 200
+    inertia = model.twin.values["mass"] / 3.0 * model.twin.values["length"] ** 2
+    inertia += model.twin.values["payload"] * model.twin.values["length"] ** 2
+    assert inertia == pytest.approx(1.3 / 3.0, rel=0.02)
+    model.learn(50, reset_num_timesteps=False)
+    assert model.replay_buffer.size() == 250
