@@ -106,6 +106,23 @@ def test_data_from_before_a_change_are_forgotten():
     assert found.error_calibrated < 1e-3 < mixed.error_calibrated
 
 
+def test_a_load_that_comes_and_goes_is_followed():
+    """The algorithm remembers since when the data count."""
+    env = gymnasium.make(REAL)
+    model = small("hds", env, twin="PendulumReal", residual=False, train_freq=120, replan_epochs=1)
+    corrections = []
+    correct_model = model.correct_model
+    model.correct_model = lambda *a: corrections.append(correct_model(*a)) or corrections[-1]
+    for payload in (0.0, 0.5, 0.0):
+        env.unwrapped.set_payload(payload)
+        model.learn(360, reset_num_timesteps=False)
+        twin = model.twin
+        rod, load = twin.values["mass"] / 3.0, twin.values["payload"]
+        inertia = (rod + load) * twin.values["length"] ** 2
+        assert inertia == pytest.approx(1.0 / 3.0 + payload, rel=0.02)
+    assert [c.forgotten for c in corrections].count(True) == 2
+
+
 def test_too_few_data_change_nothing():
     twin = twins.make("PendulumReal")
     found = corrected(twin, measured(twins.make("PendulumReal", mass=2.0), n=1, n_steps=4))

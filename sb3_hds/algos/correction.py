@@ -122,8 +122,11 @@ def correct(
     nominal = twin.with_parameters(**wishes.nominal)
     bare, now = (window_errors(t, _without_force(t), shots, spread) for t in (nominal, twin))
     real = origin >= 0
-    if real.sum() < _FEWEST or np.median(bare[real]) < _EXACT:
+    if real.sum() < _FEWEST:
         return Correction(twin, beta, changed=False, error_twin=_mean(bare[real]))
+    if np.median(bare[real]) < _EXACT:
+        changed = gain(bare[real], now[real]) > _NOTICEABLE
+        return Correction(nominal, 0.0, changed=changed, error_twin=_mean(bare[real]))
     shots, origin, forgotten = _since_change(shots, origin, now, n_new)
     held = hold_out(origin, _HELD if real.sum() >= _MANY else _HELD_OF_FEW)
     learned = shots._replace(weight=shots.weight * ~held)

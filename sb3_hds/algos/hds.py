@@ -207,7 +207,9 @@ class HDS(TwinAlgorithm):
         self.nominal: dict[str, float] = {}
         self.measured = Measured(self, data_from(pretrain_data))
         self.learned_force = Tensors(self)
-        self._n_blocks, self._steps_at_refit, self._steps_at_force = 0, 0, 0
+        self._n_blocks, self._refitted_at, self._steps_at_force = 0, 0, 0
+        self._changed_at: int | None = None
+        self._saw_earlier = False
         self._replanning = 0
         super().__init__(
             policy,
@@ -270,8 +272,9 @@ class HDS(TwinAlgorithm):
         super().train(gradient_steps, batch_size)
 
     def before_planning(self) -> None:
-        if self.measured.earlier is not None and not self._steps_at_refit:
+        if self.measured.earlier is not None and not self._saw_earlier:
             self.correct_model()
+            self._saw_earlier = True
 
     def correct_model(self, gradient_steps: int = 0) -> Correction | None:
         """
@@ -281,20 +284,22 @@ class HDS(TwinAlgorithm):
         :return: what the data say; None before anything was measured
         :raises NoTwinError: if the model was loaded without environment and without twin
         """
-        data = self.measured.trajectories()
+        since = self._changed_at
+        data = self.measured.trajectories(None if since is None else self.num_timesteps - since)
         if data is None or self.twin is None:
             return None
         n_steps = data.n_steps
-        learn_force = n_steps >= _GROWTH * self._steps_at_force
         found = correct(
             self.twin,
             data,
             self._wishes(self.twin),
             self.model_beta,
-            learn_force,
-            n_steps - self._steps_at_refit,
+            learn_force=n_steps >= _GROWTH * self._steps_at_force,
+            n_new=self.num_timesteps - self._refitted_at,
         )
-        self._steps_at_refit = n_steps
+        if found.forgotten:
+            self._changed_at, self._steps_at_force = self._refitted_at, 0
+        self._refitted_at = self.num_timesteps
         if found.residual is not None:
             self._steps_at_force = n_steps
         if found.twin != self.twin:

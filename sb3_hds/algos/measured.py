@@ -30,8 +30,11 @@ class Measured:
         self._model = model
         self.earlier = earlier
 
-    def trajectories(self) -> Trajectories | None:
-        """:return: everything measured, oldest first; None before anything was"""
+    def trajectories(self, latest: int | None = None) -> Trajectories | None:
+        """
+        :param latest: only so many steps
+        :return: everything measured, oldest first; None before anything was
+        """
         buffer, twin = self._model.replay_buffer, self._model.twin
         parts = [] if self.earlier is None else [self.earlier]
         if buffer is not None and buffer.size() > 0 and twin is not None:
@@ -41,7 +44,8 @@ class Measured:
                 parts.append(found)
             except TrajectoryError:  # none of the steps is finite
                 pass
-        return Trajectories.concatenate(parts) if parts else None
+        data = Trajectories.concatenate(parts) if parts else None
+        return data if data is None or latest is None else _latest(data, latest)
 
     def state_dict(self) -> dict[str, th.Tensor]:
         """:return: the latest steps, oldest first, shape ``(steps, n_envs, ...)``; earlier data"""
@@ -120,6 +124,20 @@ def data_from(source: Any) -> Trajectories | None:
         f"pretrain_data takes Trajectories or the path of a file, got {source!r}. "
         "Use Trajectories.from_arrays."
     )
+
+
+def _latest(data: Trajectories, n_steps: int) -> Trajectories:
+    """The end of the data; the recording in which it begins is cut."""
+    obs, actions, left = [], [], max(n_steps, 1)
+    for i in reversed(range(len(data))):
+        seen, taken = data.episode(i)
+        obs.insert(0, seen[-left - 1 :])
+        actions.insert(0, taken[-left:])
+        left -= len(actions[0])
+        if left <= 0:
+            break
+    labels = data.conditions[len(data) - len(obs) :]
+    return Trajectories.from_arrays(obs, actions, dt=data.dt, conditions=labels)
 
 
 def _for_copies(columns: dict[str, np.ndarray], n_envs: int) -> dict[str, np.ndarray]:
