@@ -15,7 +15,7 @@ import resource
 import sys
 import time
 
-from runs import fresh_process, save, seconds_since_start
+from runs import RESULTS, fresh_process, save, seconds_since_start
 
 ROLLOUTS = (64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384)
 N_EPOCHS = 5
@@ -34,6 +34,25 @@ def main() -> None:
         rows.append({"n_rollouts": n_rollouts, **fresh_process(__file__, n_rollouts)})
         table = save(rows, "epoch_cost")
     print(table.to_string(index=False, float_format="%.3f"))
+    figure(table)
+
+
+def figure(table) -> None:
+    """Time of an epoch and of its planning, and memory, against the number of rollouts."""
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=(8.0, 3.0), layout="constrained")
+    left, right = drawing.subplots(1, 2)
+    left.loglog(table["n_rollouts"], table["epoch_ms"], "o-", color="#27496d", label="epoch")
+    left.loglog(table["n_rollouts"], table["planning_ms"], "o--", color="#d1495b", label="planning")
+    left.set_ylabel("time [ms]")
+    left.legend(frameon=False)
+    right.semilogx(table["n_rollouts"], table["peak_memory_MiB"], "o-", color="#27496d")
+    right.set_ylim(bottom=0.0)
+    right.set_ylabel("peak memory of the process [MiB]")
+    for panel in (left, right):
+        panel.set_xlabel("rollouts in an epoch")
+    drawing.savefig(RESULTS / "epoch_cost.png", dpi=150)
 
 
 def worker(n_rollouts: int) -> dict:
