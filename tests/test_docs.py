@@ -45,6 +45,7 @@ SMALL = {
     "terminal_value": False,
     "train_freq": 1000,
 }
+SMALL_HDS = {"residual": False, "replan_epochs": 1}
 
 _FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _PLACEHOLDER = re.compile(r"<[^>]*>")
@@ -78,7 +79,7 @@ def commands(page: Path) -> list[list[str]]:
 def small_and_tidy(monkeypatch, tmp_path):
     """Small plans, a folder to write in, and registries that forget what a page registered."""
     for algorithm in (HDS, PODS):
-        for name, value in SMALL.items():
+        for name, value in (SMALL | (SMALL_HDS if algorithm is HDS else {})).items():
             monkeypatch.setitem(algorithm.__init__.__kwdefaults__, name, value)
         monkeypatch.setattr(algorithm, "default_timesteps", 20)
     monkeypatch.setattr(twins.registry, "_TWINS", dict(twins.registry._TWINS))
