@@ -54,7 +54,7 @@ def learn(model: HDS, stop: threading.Event) -> None:
     model.learn(0)
     while not stop.is_set():
         n_steps = model.replay_buffer.size()
-        model.num_timesteps = n_steps
+        model.real_timesteps = n_steps
         if n_steps - corrected_at >= BLOCK:
             corrected_at = n_steps
             model.correct_model(model.gradient_steps)

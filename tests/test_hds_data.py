@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 
 import gymnasium
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from measuring import measured
@@ -14,10 +16,12 @@ from small_models import logged, small, steps_of
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_hds import HDS, PODS, effects, twins
+from sb3_hds.algos.arguments import knobs_of
 from sb3_hds.algos.correction import Wishes, correct
+from sb3_hds.algos.epoch import plan_ahead
 from sb3_hds.core import Trajectories
+from sb3_hds.effects import force_of
 from sb3_hds.errors import CalibrationError, EffectError, TrajectoryError
-from sb3_hds.sysid.residual import force_of
 from sb3_hds.wrappers import ManualReset
 
 REAL = "sb3_hds/PendulumReal-v1"
@@ -193,6 +197,33 @@ def test_rollouts_differ_under_domain_randomisation():
     assert small("pods").varied(model.twin) == {}
 
 
+def test_each_rollout_is_planned_in_a_twin_of_its_own():
+    """Consecutive states of a kept plan follow from one another under that rollout's parameters."""
+    model = small("pods", randomisation=1.0)
+    learner, settings = model.learn(0)._learner(), model._settings
+    knobs = knobs_of(model, settings.twin, 1.0, 4)
+
+    samples = plan_ahead(settings, learner, knobs)[0].workspace.samples
+
+    shape = (model.plan_memory, settings.horizon, model.n_rollouts)
+    n_planned = int(learner.progress.n_epochs) % model.plan_memory
+    obs, control = (np.asarray(x)[n_planned].reshape(*shape[1:], -1) for x in samples[:2])
+    for params, follows in (
+        (model.twin.params | knobs.varied, True),
+        (model.twin.params, False),
+    ):
+        after = [
+            model.twin.step(
+                model.twin.infer(jnp.asarray(obs[0, i]), model.twin.params),
+                2.0 * jnp.asarray(control[0, i]),
+                {name: leaf[i] if jnp.ndim(leaf) else leaf for name, leaf in params.items()},
+            )
+            for i in range(model.n_rollouts)
+        ]
+        reached = np.stack([model.twin.observe(state, model.twin.params) for state in after])
+        assert np.allclose(reached, obs[1], atol=1e-4) == follows
+
+
 def test_effects_are_attached_by_name_or_as_they_are():
     model = small("hds", REAL, effects=["coulomb_friction", effects.QuadraticDrag(0, c=0.01)])
 
@@ -256,6 +287,60 @@ def test_a_learned_force_travels_as_tensors(tmp_path):
         *(m.twin.tensors[key]["Dense_0"].values() for m in (model, loaded)), strict=True
     ):
         np.testing.assert_array_equal(one, other)
+
+
+def test_pods_keeps_the_weights_of_a_learned_force_too(tmp_path):
+    twin = twins.make("PendulumReal")
+    force = effects.NeuralForce(share=1.0).fitted_to(twin)
+    twin = twin.extend(force.with_tensors(**force.fresh(jax.random.key(7))))
+    small("pods", REAL, twin=twin).save(tmp_path / "model")
+
+    loaded = PODS.load(tmp_path / "model")
+
+    for one, other in zip(
+        jax.tree.leaves(twin.tensors), jax.tree.leaves(loaded.twin.tensors), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_data_count_since_the_change_though_learn_starts_counting_again():
+    env = gymnasium.make(REAL)
+    model = small("hds", env, twin="PendulumReal", residual=False, train_freq=120, replan_epochs=1)
+    model.learn(360)
+    env.unwrapped.set_payload(0.5)
+    model.learn(360)
+    model.learn(120)
+
+    assert model.num_timesteps == 120 and model.real_timesteps == 840
+    twin = model.twin
+    inertia = (twin.values["mass"] / 3.0 + twin.values["payload"]) * twin.values["length"] ** 2
+    assert inertia == pytest.approx(1.0 / 3.0 + 0.5, rel=0.02)
+    assert model.measured.trajectories(model.real_timesteps - model._changed_at).n_steps == 480
+
+
+def test_the_data_sheet_is_that_of_the_environment_that_came_last(tmp_path):
+    model = small("hds", gymnasium.make(REAL), residual=False)
+    assert model.nominal["mass"] == 1.0
+
+    model.set_env(gymnasium.make(REAL, mass=1.4))
+
+    assert model.nominal["mass"] == model.twin.values["mass"] == 1.4
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("beta", "always", "'auto' or a number from 0 to 1"),
+        ("beta", 1.5, "'auto' or a number from 0 to 1"),
+        ("residual_kwargs", {"members": 3}, "n_members, net_arch, caution"),
+        ("refit_freq", -1, "at least 0"),
+        ("replan_epochs", 0.5, "whole number"),
+        ("max_saved_steps", 0, "at least 1"),
+    ],
+)
+def test_settings_of_learning_from_data_are_checked_at_the_door(name, value, expected):
+    with pytest.raises(ValueError, match=expected):
+        small("hds", REAL, **{name: value})
 
 
 def test_how_much_is_saved_may_be_limited(tmp_path):

@@ -35,6 +35,9 @@ _AT_LEAST = {
     "pretrain_epochs": 0,
     "batch_size": 1,
     "gradient_steps": -1,
+    "refit_freq": 0,
+    "replan_epochs": 0,
+    "max_saved_steps": 1,
 }
 _DERIVED = ("horizon", "lookahead")
 _SHARES = (
@@ -48,6 +51,7 @@ _SHARES = (
     "exploration_decay",
     "temperature_decay",
 )
+_OF_RESIDUAL = ("n_members", "net_arch", "caution")
 _CHOICES = {
     "order": (1, 2),
     "planner": (None, *PLANNERS),
@@ -124,7 +128,9 @@ def check_arguments(model: "TwinAlgorithm") -> None:
 
 def _broken_rules(model: "TwinAlgorithm") -> Iterator[tuple[str, str]]:
     for name, least in _AT_LEAST.items():
-        if not _is_count(getattr(model, name), least, may_be_none=name in _DERIVED):
+        if hasattr(model, name) and not _is_count(
+            getattr(model, name), least, may_be_none=name in _DERIVED
+        ):
             yield name, f"a whole number of at least {least}" + " or None" * (name in _DERIVED)
     for name in _SHARES:
         if not _between(getattr(model, name), 0.0, 1.0):
@@ -138,6 +144,11 @@ def _broken_rules(model: "TwinAlgorithm") -> Iterator[tuple[str, str]]:
         rate = getattr(model, name)
         if isinstance(rate, numbers.Real) and not _between(rate, 0.0, math.inf):
             yield name, "a finite number of at least 0, or a schedule"
+    beta, kwargs = getattr(model, "beta", "auto"), getattr(model, "residual_kwargs", None)
+    if beta != "auto" and not _between(beta, 0.0, 1.0):
+        yield "beta", "'auto' or a number from 0 to 1"
+    if not set(kwargs or ()) <= set(_OF_RESIDUAL):
+        yield "residual_kwargs", f"a dictionary with some of {', '.join(_OF_RESIDUAL)}"
     for name, choices in _CHOICES.items():
         if getattr(model, name) not in choices:
             yield name, f"one of {', '.join(map(repr, choices))}"

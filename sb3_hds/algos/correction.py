@@ -8,9 +8,17 @@ import numpy as np
 from jaxtyping import Float
 
 from sb3_hds.core import Trajectories, Twin
+from sb3_hds.effects import force_of
 from sb3_hds.errors import CalibrationError, TrajectoryError
 from sb3_hds.sysid import Fit
-from sb3_hds.sysid.calibrate import check_fits, default_window, fit_windows, spread_of
+from sb3_hds.sysid.calibrate import (
+    check_fits,
+    default_window,
+    every_name,
+    fit_windows,
+    free_names,
+    spread_of,
+)
 from sb3_hds.sysid.prediction import (
     gain,
     has_grown,
@@ -19,7 +27,7 @@ from sb3_hds.sysid.prediction import (
     single_step_errors,
     window_errors,
 )
-from sb3_hds.sysid.residual import Residual, fit_force, force_of
+from sb3_hds.sysid.residual import Residual, fit_force
 from sb3_hds.sysid.shooting import Shots, shots_of
 
 # Rows of the compiled programs: the latest windows are used.
@@ -124,10 +132,11 @@ def correct(
     real = origin >= 0
     if real.sum() < _FEWEST:
         return Correction(twin, beta, changed=False, error_twin=_mean(bare[real]))
-    if np.median(bare[real]) < _EXACT:
+    latest = _latest(shots, origin, n_new)
+    if max(np.median(bare[real]), np.median(bare[latest])) < _EXACT:
         changed = gain(bare[real], now[real]) > _NOTICEABLE
         return Correction(nominal, 0.0, changed=changed, error_twin=_mean(bare[real]))
-    shots, origin, forgotten = _since_change(shots, origin, now, n_new)
+    shots, origin, forgotten = _since_change(shots, origin, now, latest)
     held = hold_out(origin, _HELD if real.sum() >= _MANY else _HELD_OF_FEW)
     learned = shots._replace(weight=shots.weight * ~held)
 
@@ -142,9 +151,10 @@ def correct(
         error_twin=_mean(bare[held]),
         error_calibrated=_mean(errors[held]),
     )
-    found = _with_residual(found, shots, held, errors, spread, wishes, beta, learn_force)
-    new, old = _of(found, errors, shots, spread, held), _of_old(twin, beta, shots, spread, held)
-    return dataclasses.replace(found, changed=gain(new, old) > _NOTICEABLE)
+    if beta > 0.0:
+        now = window_errors(twin, twin.params, shots, spread)
+    found, errors = _with_residual(found, shots, held, errors, spread, wishes, learn_force)
+    return dataclasses.replace(found, changed=gain(errors[held], now[held]) > _NOTICEABLE)
 
 
 def _calibrated(
@@ -199,9 +209,9 @@ def _with_residual(
     errors: np.ndarray,
     spread: np.ndarray,
     wishes: Wishes,
-    beta: float,
     learn_force: bool,
-) -> Correction:
+) -> tuple[Correction, np.ndarray]:
+    """:return: the correction, and the errors of the model that is planned in"""
     twin, residual = found.twin, None
     wanted = wishes.residual and wishes.beta != 0.0 and np.median(errors[held]) > _EXACT
     if wanted and learn_force:
@@ -219,46 +229,36 @@ def _with_residual(
     key = next(iter(_shares(twin)), None)
     if key is None:
         hybrid = np.nan if residual is None else _mean(residual.error_after)
-        return dataclasses.replace(found, residual=residual, error_hybrid=hybrid)
+        return dataclasses.replace(found, residual=residual, error_hybrid=hybrid), errors
     whole = window_errors(twin, {**twin.params, key: 1.0}, shots, spread)
     helps = is_better(whole[held], errors[held])
     share = 0.0
     if helps:
         trust = min(1.0, gain(whole[held], errors[held]) / _TRUSTED)
-        share = trust if wishes.beta == "auto" else wishes.beta
+        share = trust if wishes.beta == "auto" else float(wishes.beta)
     twin = twin.with_parameters(**{key: 1.0 if helps else 0.0})
-    return dataclasses.replace(
+    found = dataclasses.replace(
         found,
         twin=twin,
-        beta=float(share),
+        beta=share,
         residual=residual,
         error_hybrid=_mean(whole[held]),
     )
+    return found, whole if share > 0.0 else errors
 
 
-def _of(
-    found: Correction, errors: np.ndarray, shots: Shots, spread: np.ndarray, held: np.ndarray
-) -> np.ndarray:
-    if found.beta == 0.0:
-        return errors[held]
-    return window_errors(found.twin, found.twin.params, shots, spread)[held]
-
-
-def _of_old(
-    twin: Twin, beta: float, shots: Shots, spread: np.ndarray, held: np.ndarray
-) -> np.ndarray:
-    params = twin.params if beta > 0.0 else _without_force(twin)
-    return window_errors(twin, params, shots, spread)[held]
+def _latest(shots: Shots, origin: np.ndarray, n_new: int) -> np.ndarray:
+    """:return: indices of the windows that came since the last correction"""
+    n_latest = max(_FEWEST, n_new // (shots.actions.shape[1] + 1))
+    return np.flatnonzero(origin >= 0)[-n_latest:]
 
 
 def _since_change(
-    shots: Shots, origin: np.ndarray, errors: np.ndarray, n_new: int
+    shots: Shots, origin: np.ndarray, errors: np.ndarray, latest: np.ndarray
 ) -> tuple[Shots, np.ndarray, bool]:
     """Leave out what was measured before the system became another one, if it did."""
-    real = np.flatnonzero(origin >= 0)
-    n_latest = max(_FEWEST, n_new // (shots.actions.shape[1] + 1))
-    older, latest = real[:-n_latest], real[-n_latest:]
-    if len(older) < _FEWEST:
+    older = np.setdiff1d(np.flatnonzero(origin >= 0), latest)
+    if len(older) < _FEWEST or np.median(errors[latest]) < _EXACT:
         return shots, origin, False
     if not has_grown(errors[latest], errors[older]):
         return shots, origin, False
@@ -285,14 +285,6 @@ def names_to_estimate(twin: Twin, wanted: str | Sequence[str] | None) -> tuple[s
     :param wanted: ``"all"``, names of parameters, or None
     :raises CalibrationError: for a name that the twin does not have
     """
-    every = tuple(name for name in twin.parameters if name not in _shares(twin))
-    if wanted is None:
-        return ()
-    names = every if wanted == "all" else (wanted,) if isinstance(wanted, str) else tuple(wanted)
-    unknown = [name for name in names if name not in every]
-    if unknown:
-        raise CalibrationError(
-            f"calibrated names {', '.join(unknown)}, which {twin.name} does not have. "
-            f"Its parameters are: {', '.join(every) or 'none'}. 'all' estimates all of them."
-        )
-    return names
+    if wanted == "all":
+        return every_name(twin)
+    return free_names(twin, wanted) if wanted else ()

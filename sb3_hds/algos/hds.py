@@ -15,10 +15,9 @@ from sb3_hds.algos.correction import Correction, Wishes, correct, names_to_estim
 from sb3_hds.algos.log import record_correction
 from sb3_hds.algos.measured import Measured, data_from
 from sb3_hds.algos.model import missing_effects
-from sb3_hds.algos.persistence import Tensors
 from sb3_hds.algos.twin_algorithm import TwinAlgorithm
 from sb3_hds.core import Effect, Params, Trajectories, Twin
-from sb3_hds.sysid.residual import force_of
+from sb3_hds.effects import force_of
 
 # The learned force is learned again when the data have grown by this factor.
 _GROWTH = 2.0
@@ -206,7 +205,6 @@ class HDS(TwinAlgorithm):
         self.model_beta = 0.0
         self.nominal: dict[str, float] = {}
         self.measured = Measured(self, data_from(pretrain_data))
-        self.learned_force = Tensors(self)
         self._n_blocks, self._refitted_at, self._steps_at_force = 0, 0, 0
         self._changed_at: int | None = None
         self._saw_earlier = False
@@ -285,7 +283,7 @@ class HDS(TwinAlgorithm):
         :raises NoTwinError: if the model was loaded without environment and without twin
         """
         since = self._changed_at
-        data = self.measured.trajectories(None if since is None else self.num_timesteps - since)
+        data = self.measured.trajectories(None if since is None else self.real_timesteps - since)
         if data is None or self.twin is None:
             return None
         n_steps = data.n_steps
@@ -295,16 +293,16 @@ class HDS(TwinAlgorithm):
             self._wishes(self.twin),
             self.model_beta,
             learn_force=n_steps >= _GROWTH * self._steps_at_force,
-            n_new=self.num_timesteps - self._refitted_at,
+            n_new=self.real_timesteps - self._refitted_at,
         )
         if found.forgotten:
             self._changed_at, self._steps_at_force = self._refitted_at, 0
-        self._refitted_at = self.num_timesteps
+        self._refitted_at = self.real_timesteps
         if found.residual is not None:
             self._steps_at_force = n_steps
         if found.twin != self.twin:
             self._workspace = None
-        if found.fit is not None:
+        if found.twin != self.twin or found.twin.values != self.twin.values:
             self.twin_spec = found.twin.to_spec()
         self.twin, self.model_beta = found.twin, found.beta
         record_correction(self, found)
@@ -336,7 +334,7 @@ class HDS(TwinAlgorithm):
     def _prepared(self, twin: Twin) -> Twin:
         missing = missing_effects(twin, self.effects)
         twin = twin.extend(*missing) if missing else twin
-        if not self.nominal or set(self.nominal) - set(twin.values):
+        if self.twin_spec is None or not self.nominal:
             self.nominal = dict(twin.values)
             names_to_estimate(twin, self.calibrated)
         return twin
@@ -349,7 +347,7 @@ class HDS(TwinAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names, variables = super()._get_torch_save_params()
-        return [*names, "learned_force", "measured"], variables
+        return [*names, "measured"], variables
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "measured", "learned_force"]
+        return [*super()._excluded_save_params(), "measured"]

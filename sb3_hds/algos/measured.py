@@ -62,7 +62,7 @@ class Measured:
                     saved[name] = th.as_tensor(getattr(buffer, name)[order].copy())
         if self.earlier is not None and limit:
             early = self.earlier
-            for name in ("obs", "actions", "lengths", "origin"):
+            for name in ("obs", "actions", "lengths"):
                 saved[f"earlier.{name}"] = th.as_tensor(np.array(getattr(early, name)))
             saved["earlier.dt"] = th.as_tensor(early.dt, dtype=th.float64)
         return saved

@@ -45,7 +45,7 @@ from sb3_hds.algos.learner import (
 from sb3_hds.algos.log import record_epoch
 from sb3_hds.algos.model import check_reward, required, twin_from_spec
 from sb3_hds.algos.normalisation import prepare_statistics, view_of
-from sb3_hds.algos.persistence import damage_reported, write_whole
+from sb3_hds.algos.persistence import Tensors, damage_reported, write_whole
 from sb3_hds.algos.pretraining import Pretraining
 from sb3_hds.algos.selection import choose_policy, twin_steps_per_comparison
 from sb3_hds.algos.twin_policy import TwinPolicy, all_finite
@@ -178,6 +178,8 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         self.randomisation = randomisation
         self.recent_gain, self.recent_return = 0.0, 0.0
         self.unstored_step: dict[str, Any] | None = None
+        self.real_timesteps = 0
+        self.learned_force = Tensors(self)
         self.saved_by = type(self).__name__
         self.n_pretrained = 0
         self.twin_timesteps = 0
@@ -231,6 +233,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
     def _store_transition(self, *args: Any, **kwargs: Any) -> None:
         super()._store_transition(*args, **kwargs)
         self.unstored_step = None
+        self.real_timesteps += self.n_envs
 
     def run_epoch(self, gradient_steps: int) -> Report:
         """
@@ -453,8 +456,16 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         return super()._init_callback([Pretraining(progress_bar), *given], progress_bar)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "policy.optimizer"], []
+        return ["policy", "policy.optimizer", "learned_force"], []
 
     def _excluded_save_params(self) -> list[str]:
-        ours = ["policy", "twin", "key", "_workspace", "_device_name", "unstored_step"]
+        ours = [
+            "policy",
+            "twin",
+            "key",
+            "_workspace",
+            "_device_name",
+            "unstored_step",
+            "learned_force",
+        ]
         return [*super()._excluded_save_params(), *ours]

@@ -19,7 +19,8 @@ class AnalyticTwin(Twin):
 
     A subclass gives :math:`\tau` (:meth:`actuate`), :math:`M` (:meth:`mass_matrix`) and :math:`c`
     (:meth:`bias`: gravity, Coriolis, centrifugal and the twin's own damping), and names the
-    integrator that its environment uses. Effects are evaluated wherever the equation of motion is.
+    integrator that its environment uses. Effects are evaluated wherever the equation of motion is,
+    but for those that are held over a sub-step.
     """
 
     integrator: Integrator = staticmethod(semi_implicit_euler)
@@ -58,11 +59,12 @@ class AnalyticTwin(Twin):
                     q, v, actuator, self.bias(q, v, params), self.mass_matrix(q, params), h
                 )
 
+            held = effects.force(moment(state.q, state.v), memory, held=True)
+
             def acceleration(q: Position, v: Velocity) -> Velocity:
                 now = moment(q, v)
-                return solve_spd(
-                    now.mass_matrix, now.actuator + effects.force(now, memory) - now.load
-                )
+                added = held + effects.force(now, memory, held=False)
+                return solve_spd(now.mass_matrix, now.actuator + added - now.load)
 
             q, v = self.integrator(acceleration, state.q, state.v, h, self.limit_velocity)
             q, v = self.limit(q, v)

@@ -173,6 +173,9 @@ class ForceEffect(Effect):
     """Adds a generalised force to the equation of motion."""
 
     slot: ClassVar[str] = "joint"
+    #: whether it is evaluated once, at the start of each sub-step, and not at every stage of the
+    #: integrator
+    held: ClassVar[bool] = False
 
     def memory(self, twin: "Twin") -> Memory:
         """:return: what the effect remembers when an episode starts; a pytree of float arrays"""
@@ -311,11 +314,12 @@ class EffectChain:
             action, memory = action.at[attached.index].set(command), memory | {attached.key: after}
         return action, memory
 
-    def force(self, moment: Moment, memory: dict[str, Memory]) -> Force:
-        """:return: the sum of all force effects, shape ``(dof,)``"""
+    def force(self, moment: Moment, memory: dict[str, Memory], held: bool) -> Force:
+        """:return: the sum of all force effects that are held, or of all others, ``(dof,)``"""
         total = jnp.zeros_like(moment.v)
         for attached, effect, params in self._forces:
-            total = total + effect.force(moment, attached.index, memory[attached.key], params)
+            if effect.held == held:
+                total = total + effect.force(moment, attached.index, memory[attached.key], params)
         return total
 
     def advance(self, moment: Moment, memory: dict[str, Memory]) -> dict[str, Memory]:

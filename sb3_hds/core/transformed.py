@@ -67,15 +67,15 @@ class TransformedTwin(Twin):
     def step(
         self, state: State, action: Action, params: Params, effects: EffectChain = NO_EFFECTS
     ) -> State:
-        return self.base.step(state, self._command(action), params, effects)
+        return self.base.step(state, self.command(action), params, effects)
 
     def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        return self.base.reward(state, self._command(action), next_state, params)
+        return self.base.reward(state, self.command(action), next_state, params)
 
     def planning_reward(
         self, state: State, action: Action, next_state: State, params: Params
     ) -> Scalar:
-        return self.base.planning_reward(state, self._command(action), next_state, params)
+        return self.base.planning_reward(state, self.command(action), next_state, params)
 
     def terminated(self, state: State, params: Params) -> Flag:
         return self.base.terminated(state, params)
@@ -103,7 +103,8 @@ class TransformedTwin(Twin):
         inside = ", ".join(repr(part) for part in parts if part is not None)
         return f"{type(self).__name__}({inside})"
 
-    def _command(self, action: Action) -> Action:
+    def command(self, action: Action) -> Action:
+        """:return: what the twin below is told"""
         return action if self.action is None else self.action.apply(action, self.base.actuators)
 
     def _base_with_values(self) -> Twin:

@@ -3,7 +3,7 @@
 from sb3_hds.core import Effect
 from sb3_hds.effects.actuator import ActionDelay, MotorLag, TorqueGain
 from sb3_hds.effects.joint import CoulombFriction, QuadraticDrag, ViscousFriction
-from sb3_hds.effects.neural import NeuralForce
+from sb3_hds.effects.neural import NeuralForce, force_of
 
 ALL: tuple[type[Effect], ...] = (
     ViscousFriction,
@@ -28,4 +28,5 @@ __all__ = [
     "QuadraticDrag",
     "TorqueGain",
     "ViscousFriction",
+    "force_of",
 ]

@@ -45,7 +45,8 @@ class NeuralForce(ForceEffect):
 
     Angles enter by cosine and sine, sliders as they are. Inputs and output are normalised by
     :math:`\mu, \sigma, \sigma_\tau`, which belong to the weights. It is bounded, so it cannot run
-    away where there were no data. It is evaluated at every internal sub-step, like any force.
+    away where there were no data. It is evaluated once at the start of each sub-step and held: at
+    every stage of the integrator, networks would be most of the cost of planning.
 
     It is never the name of a cause: it measures what is left when the named causes are accounted
     for, and it lets a policy be learned all the same.
@@ -62,6 +63,7 @@ class NeuralForce(ForceEffect):
     """
 
     name = "neural_force"
+    held = True
     parameters = {"share": Parameter(null=0.0, scale=1.0, unit="1", lower=0.0, upper=1.0)}
     explanation = "Something acts on the joints that has no name here, and was learned from data."
     source = "Chua et al. 2018; Heiden et al. 2021"
@@ -226,3 +228,13 @@ class _Member(nn.Module):
         for width in self.net_arch:
             seen = jnp.tanh(nn.Dense(width)(seen))
         return nn.Dense(self.n_out)(seen)
+
+
+def force_of(twin: "Twin") -> tuple[str, NeuralForce] | None:
+    """:return: full name and effect of the learned force that a twin has; None without one"""
+    while not hasattr(twin, "attached") and hasattr(twin, "base"):
+        twin = twin.base  # type: ignore[attr-defined]
+    for a in getattr(twin, "attached", ()):
+        if isinstance(a.effect, NeuralForce):
+            return a.key, a.effect
+    return None

@@ -11,6 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from sb3_hds.core import Params, Trajectories, Twin
+from sb3_hds.effects import force_of
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.bounds import bounds_of
 from sb3_hds.sysid.covariance import covariance_of
@@ -284,12 +285,19 @@ def check_fits(twin: Twin, data: Trajectories) -> None:
         )
 
 
+def every_name(twin: Twin) -> tuple[str, ...]:
+    """:return: names of all parameters but the share of a learned force"""
+    force = force_of(twin)
+    learned = () if force is None else (f"{force[0]}.share",)
+    return tuple(name for name in twin.parameters if name not in learned)
+
+
 def free_names(twin: Twin, free: Iterable[str] | None) -> tuple[str, ...]:
     """
-    :param free: names of parameters; None for all
+    :param free: names of parameters; None for all but the share of a learned force
     :raises CalibrationError: for a name that the twin does not have, or none at all
     """
-    names = tuple(twin.parameters if free is None else [free] if isinstance(free, str) else free)
+    names = every_name(twin) if free is None else (free,) if isinstance(free, str) else tuple(free)
     unknown = [name for name in names if name not in twin.parameters]
     if unknown or not names or len(set(names)) < len(names):
         known = ", ".join(twin.parameters) or "none"

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from sb3_hds.core import AnalyticTwin, Params, State, Trajectories, Twin
-from sb3_hds.effects import NeuralForce
+from sb3_hds.core import AnalyticTwin, Params, State, Trajectories, TransformedTwin, Twin
+from sb3_hds.effects import NeuralForce, force_of
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.calibrate import check_fits, default_window, spread_of
 from sb3_hds.sysid.prediction import hold_out, is_better, start_states, window_errors
@@ -24,13 +24,36 @@ _UNIT_ERROR = 0.05
 _OUTPUT = 0.3
 _LEARNING_RATE, _WEIGHT_DECAY = 1e-2, 1e-3
 _BATCH = 32
-# Steps between two looks at the held-out windows; after this many looks without gain it stops.
+# One in so many of the windows to learn from is kept for early stopping.
+_EVERY = 4
+# Steps between two looks at those windows; after this many looks without gain it stops.
 _CHUNK, _PATIENCE = 50, 6
 _MOST_CHUNKS = 40
 # How often start states are found again, with the force as learned, and learning goes on.
 _ROUNDS = 2
 # Beyond this, in units of the channels' scale, an error counts in proportion, not by its square.
 _OUTLIER = 3.0
+
+
+Numbers = Array | np.ndarray
+
+
+class Lesson(NamedTuple):
+    """
+    What a force is learned from.
+
+    :param params: full parameters of the twin
+    :param scales: of the force's inputs and outputs
+    :param shots: windows
+    :param starts: of each window, see ``start_states``
+    :param unit: what an error of one means in each channel
+    """
+
+    params: Params
+    scales: dict[str, Array]
+    shots: Shots
+    starts: tuple[Float[Numbers, "n free"], Float[Numbers, "n residuals free"]]
+    unit: Float[Numbers, " obs"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,8 +94,9 @@ def fit_residual(
     """
     Attach a learned force to a twin, and keep it only if held-out windows say that it helps.
 
-    Each member of the ensemble sees a bootstrap sample of the windows and stops where held-out
-    windows get no better. The loss is the error over whole windows, so the force is learned where
+    Each member of the ensemble sees a bootstrap sample of the windows and stops where a quarter of
+    them, kept aside, gets no better. Further windows, seen by neither, decide whether the force is
+    kept. The loss is the error over whole windows, so the force is learned where
     the simulation goes, and through the integrator that will use it. A force that the twin has
     already goes on from its weights.
 
@@ -131,7 +155,7 @@ def fit_force(
         )
     real = np.asarray(shots.weight) > 0.0
     held, learned = held & real, real & ~held
-    if not (held.any() and learned.any()):
+    if not held.any() or learned.sum() < 2:
         raise CalibrationError(
             f"{real.sum()} windows are too few to learn from some and check on others. "
             "Record more, or ask for shorter windows."
@@ -139,32 +163,22 @@ def fit_force(
     has_force = force_of(twin) is not None
     extended, key = _with_force(twin, n_members, net_arch, caution)
     without = {**extended.params, f"{key}.share": 0.0}
-    starts = start_states(extended, without, shots, scale)
     tensors = _own(extended, key)
     if not has_force:
         tensors = _normalised(extended, key, shots, learned, seed)
-    n_steps = 0
+    params, n_steps = without, 0
     for _ in range(_ROUNDS):
-        tensors, n_more = _train(
-            extended, key, tensors, shots, starts, scale, learned, held, n_members, seed
-        )
+        starts = start_states(extended, params, shots, scale)
+        lesson = Lesson(extended.params, tensors, shots, starts, scale)
+        tensors, n_more = _train(extended, key, lesson, learned, n_members, seed)
         extended = extended.with_tensors({f"{key}.{name}": t for name, t in tensors.items()})
-        whole, n_steps = {**extended.params, f"{key}.share": 1.0}, n_steps + n_more
-        starts = start_states(extended, whole, shots, scale)
+        params, n_steps = {**extended.params, f"{key}.share": 1.0}, n_steps + n_more
     before = window_errors(extended, without, shots, scale)[held]
-    after = window_errors(extended, whole, shots, scale)[held]
+    after = window_errors(extended, params, shots, scale)[held]
     accepted = is_better(after, before)
     extended = extended.with_parameters(**{f"{key}.share": 1.0 if accepted else 0.0})
     doubt = _mean_disagreement(extended, key, shots, learned)
     return Residual(extended, key, accepted, before, after, n_steps, doubt)
-
-
-def force_of(twin: Twin) -> tuple[str, NeuralForce] | None:
-    """:return: full name and effect of the learned force that a twin has; None without one"""
-    for a in getattr(_extended(twin), "attached", ()):
-        if isinstance(a.effect, NeuralForce):
-            return a.key, a.effect
-    return None
 
 
 def _with_force(
@@ -177,11 +191,12 @@ def _with_force(
     return twin, found[0]
 
 
-def _extended(twin: Twin) -> Twin:
-    """Below the wrappers."""
-    while not hasattr(twin, "attached") and hasattr(twin, "base"):
+def _command(twin: Twin, action: Array) -> Array:
+    """What the plant is told, below the wrappers."""
+    while hasattr(twin, "base"):
+        action = twin.command(action) if isinstance(twin, TransformedTwin) else action
         twin = twin.base  # type: ignore[attr-defined]
-    return twin
+    return action
 
 
 def _plant(twin: Twin) -> AnalyticTwin | None:
@@ -203,7 +218,7 @@ def _seen(twin: Twin, shots: Shots) -> tuple[Array, Array, Array]:
 
     def one(obs: Array, action: Array) -> tuple[Array, Array, Array]:
         state: State = twin.infer(obs, params)
-        return state.q, state.v, plant.actuate(state, action, params)
+        return state.q, state.v, plant.actuate(state, _command(twin, action), params)
 
     obs = jnp.asarray(shots.obs[:, :-1], jnp.float32)
     return jax.vmap(jax.vmap(one))(obs, jnp.asarray(shots.actions, jnp.float32))
@@ -233,38 +248,24 @@ def _normalised(
 
 
 def _train(
-    twin: Twin,
-    key: str,
-    tensors: dict[str, Any],
-    shots: Shots,
-    starts: tuple[np.ndarray, np.ndarray],
-    scale: np.ndarray,
-    learned: np.ndarray,
-    held: np.ndarray,
-    n_members: int,
-    seed: int,
+    twin: Twin, key: str, lesson: Lesson, learned: np.ndarray, n_members: int, seed: int
 ) -> tuple[dict[str, Any], int]:
-    """Adam on each member by itself, stopped where held-out windows get no better."""
-    single = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), tensors)
-    weights = single.pop("weights")
-    singles = Shots(*(jnp.asarray(leaf, jnp.float32) for leaf in shots))
-    given = (
-        jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), twin.params),
-        single,
-        singles,
-        tuple(jnp.asarray(leaf, jnp.float32) for leaf in starts),
-        jnp.asarray(scale, jnp.float32),
+    """Adam on each member by itself, stopped where windows that it does not see get no better."""
+    rows = np.flatnonzero(learned)
+    watched = np.isin(
+        np.arange(len(learned)), rows[_EVERY - 1 :: _EVERY] if len(rows) >= _EVERY else rows[-1:]
     )
-    rng = np.random.default_rng(seed)
-    drawn = rng.exponential(size=(n_members, len(learned))) * learned
+    single: Lesson = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), lesson)
+    weights = single.scales.pop("weights")
+    drawn = np.random.default_rng(seed).exponential(size=(n_members, len(learned)))
+    drawn *= learned & ~watched
     chances = jnp.asarray(drawn / drawn.sum(1, keepdims=True), jnp.float32)
     state = jax.vmap(_optimiser().init)(weights)
-    best, idle, n_chunks = weights, 0, 0
-    best_loss = np.asarray(_held_loss(twin, key, weights, *given, jnp.asarray(held)))
-    keys = jax.random.split(jax.random.key(seed), _MOST_CHUNKS)
-    for k in keys:
-        weights, state = _steps(twin, key, weights, state, *given, chances, k)
-        loss = np.asarray(_held_loss(twin, key, weights, *given, jnp.asarray(held)))
+    loss_of = lambda w: np.asarray(_watched_loss(twin, key, w, single, jnp.asarray(watched)))  # noqa: E731
+    best, best_loss, idle, n_chunks = weights, loss_of(weights), 0, 0
+    for k in jax.random.split(jax.random.key(seed), _MOST_CHUNKS):
+        weights, state = _steps(twin, key, weights, state, single, chances, k)
+        loss = loss_of(weights)
         n_chunks += 1
         better = loss < best_loss
         idle = 0 if (loss < 0.99 * best_loss).any() else idle + 1
@@ -272,7 +273,7 @@ def _train(
         best_loss = np.where(better, loss, best_loss)
         if idle >= _PATIENCE:
             break
-    return tensors | {"weights": best}, n_chunks * _CHUNK
+    return lesson.scales | {"weights": best}, n_chunks * _CHUNK
 
 
 def _chosen(better: np.ndarray, new: Array, old: Array) -> Array:
@@ -293,20 +294,15 @@ def _steps(
     key: str,
     weights: Any,
     state: Any,
-    params: Params,
-    scales: dict[str, Array],
-    shots: Shots,
-    starts: tuple[Float[Array, "n free"], Float[Array, "n residuals free"]],
-    unit: Float[Array, " obs"],
+    lesson: Lesson,
     chances: Float[Array, "members n"],
     rng: Array,
 ) -> tuple[Any, Any]:
     optimiser = _optimiser()
 
     def loss(own: Any, rows: Array) -> Array:
-        error = partial(_error, twin, key, params, scales, unit, own)
-        picked, at = jax.tree.map(lambda leaf: leaf[rows], (shots, starts))
-        return jnp.mean(jax.vmap(error)(picked, at))
+        picked, at = jax.tree.map(lambda leaf: leaf[rows], (lesson.shots, lesson.starts))
+        return jnp.mean(jax.vmap(partial(_error, twin, key, lesson, own))(picked, at))
 
     def member(own: Any, state: Any, chance: Array, rng: Array) -> tuple[Any, Any]:
         rows = jax.random.choice(rng, len(chance), (_BATCH,), p=chance)
@@ -325,20 +321,12 @@ def _steps(
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _held_loss(
-    twin: Twin,
-    key: str,
-    weights: Any,
-    params: Params,
-    scales: dict[str, Array],
-    shots: Shots,
-    starts: tuple[Float[Array, "n free"], Float[Array, "n residuals free"]],
-    unit: Float[Array, " obs"],
-    held: Array,
+def _watched_loss(
+    twin: Twin, key: str, weights: Any, lesson: Lesson, watched: Array
 ) -> Float[Array, " members"]:
     def member(own: Any) -> Array:
-        error = partial(_error, twin, key, params, scales, unit, own)
-        return jnp.sum(jnp.where(held, jax.vmap(error)(shots, starts), 0.0)) / jnp.sum(held)
+        errors = jax.vmap(partial(_error, twin, key, lesson, own))(lesson.shots, lesson.starts)
+        return jnp.sum(jnp.where(watched, errors, 0.0)) / jnp.sum(watched)
 
     return jax.vmap(member)(weights)
 
@@ -346,12 +334,10 @@ def _held_loss(
 def _error(
     twin: Twin,
     key: str,
-    params: Params,
-    scales: dict[str, Array],
-    unit: Float[Array, " obs"],
+    lesson: Lesson,
     own: Any,
     shot: Shots,
-    start: tuple[Array, Array],
+    start: tuple[Numbers, Numbers],
 ) -> Array:
     """
     Loss of one window under one member, as if the ensemble were that member alone. What moving the
@@ -360,9 +346,9 @@ def _error(
     """
     offset, basis = start
     alone = jax.tree.map(lambda leaf: leaf[None], own)
-    tensors = {f"{key}.{name}": tree for name, tree in (scales | {"weights": alone}).items()}
-    values = {**params, **tensors, f"{key}.share": jnp.ones(())}
-    error = ((simulate(twin, values, shot, offset) - shot.obs) / unit).ravel()
+    tensors = {f"{key}.{name}": tree for name, tree in (lesson.scales | {"weights": alone}).items()}
+    values = {**lesson.params, **tensors, f"{key}.share": jnp.ones(())}
+    error = ((simulate(twin, values, shot, jnp.asarray(offset)) - shot.obs) / lesson.unit).ravel()
     error = jnp.where(jnp.isfinite(error), error, 0.0)
     size = jnp.abs(error - basis @ (basis.T @ error))
     small = jnp.minimum(size, _OUTLIER)

@@ -100,10 +100,18 @@ class InvertedPendulum(AnalyticTwin):
     @classmethod
     def from_env(cls, env: Any) -> Self:
         """:raises EnvironmentMismatchError: for an XML of another structure"""
+        return cls(**cls.described_by(env))
+
+    @staticmethod
+    def described_by(env: Any) -> dict[str, Any]:
+        """
+        :return: parameters and options as the XML of ``env`` has them
+        :raises EnvironmentMismatchError: for an XML of another structure
+        """
         found = cart_and_poles.read(env, poles=1)
         limits = env.unwrapped.model.actuator_ctrlrange[0]
         cart_and_poles.require(limits[1] == -limits[0] == _MAX_COMMAND, "commands within 3")
-        return cls(**found)
+        return found
 
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
         """Everything uniform in plus and minus ``reset_noise_scale``."""

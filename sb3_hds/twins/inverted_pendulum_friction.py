@@ -17,7 +17,6 @@ from sb3_hds.core import (
     State,
     Velocity,
 )
-from sb3_hds.twins import cart_and_poles
 from sb3_hds.twins.inverted_pendulum import InvertedPendulum
 
 _MAX_COMMAND = 3.0
@@ -72,7 +71,7 @@ class InvertedPendulumFriction(InvertedPendulum):
     @classmethod
     def from_env(cls, env: Any) -> Self:
         env = env.unwrapped
-        found = cart_and_poles.read(env.nominal, poles=1)
+        found = cls.described_by(env.nominal)
         return cls(**found, swing_up=env.swing_up, rail_ends=env.rail_ends)
 
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
