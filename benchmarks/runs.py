@@ -1,4 +1,4 @@
-"""Fresh processes with an empty compilation cache, and tables that survive an interrupted run."""
+"""Fresh processes, and tables that survive an interrupted run."""
 
 import json
 import os
@@ -6,28 +6,35 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import pandas as pd
 
 RESULTS = Path(__file__).parent / "results"
+#: what may be thrown away: compiled programs, and models that several runs start from
+CACHE = Path(__file__).parent / ".cache"
 
 
-def fresh_process(script: str, *arguments: Any) -> dict[str, Any]:
+def fresh_process(script: str, *arguments: Any, cache: Path | None = None) -> dict[str, Any]:
     """
     Run a benchmark's worker in a process of its own.
 
     The worker finds the moment of its start [s since the epoch] in ``BENCHMARK_START`` and prints
     one line of JSON last.
 
+    :param cache: where compiled programs are kept; None: nowhere, the worker compiles everything
     :raises RuntimeError: with the worker's last lines, if it failed
     """
-    with tempfile.TemporaryDirectory() as cache:
+    folder = nullcontext(cache) if cache else tempfile.TemporaryDirectory()
+    with folder as kept:
         surroundings = os.environ | {
-            "SB3_HDS_CACHE": cache,
-            "JAX_COMPILATION_CACHE_DIR": "",
+            "SB3_HDS_CACHE": str(kept),
+            "JAX_COMPILATION_CACHE_DIR": str(kept) if cache else "",
             "BENCHMARK_START": repr(time.time()),
         }
         command = [sys.executable, script, "--worker", *map(str, arguments)]
@@ -50,3 +57,38 @@ def save(rows: Sequence[dict[str, Any]], name: str) -> pd.DataFrame:
     table.to_csv(temporary, index=False, float_format="%.6g")
     temporary.replace(path)
     return table
+
+
+def resume(
+    name: str,
+    keys: Sequence[str],
+    wanted: Iterable[tuple[Any, ...]],
+    work: Callable[..., list[dict[str, Any]]],
+    jobs: int,
+) -> None:
+    """
+    Add to ``results/NAME.csv`` what is not in it yet. A run that fails is reported and left out.
+
+    :param keys: columns that tell runs apart
+    :param wanted: their values, run by run
+    :param work: from these values to the run's rows
+    :param jobs: how many runs at a time
+    """
+    path = RESULTS / f"{name}.csv"
+    rows = pd.read_csv(path).to_dict("records") if path.exists() else []
+    done, lock = {tuple(row[key] for key in keys) for row in rows}, Lock()
+
+    def one(run: tuple[Any, ...]) -> None:
+        label = ", ".join(map(str, run))
+        try:
+            found = work(*run)
+        except RuntimeError as error:
+            print(f"{label}: {error}", file=sys.stderr, flush=True)
+            return
+        with lock:
+            rows.extend(dict(zip(keys, run, strict=True)) | row for row in found)
+            save(rows, name)
+        print(f"{time.strftime('%H:%M:%S')} {label}", file=sys.stderr, flush=True)
+
+    with ThreadPoolExecutor(jobs) as pool:
+        list(pool.map(one, [run for run in wanted if run not in done]))

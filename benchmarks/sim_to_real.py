@@ -2,7 +2,7 @@
 The gap between simulation and reality, and who closes it with how many real steps.
 
     python benchmarks/sim_to_real.py                       # all cells and methods, five seeds
-    python benchmarks/sim_to_real.py --cells heavy --seeds 2
+    python benchmarks/sim_to_real.py --cells heavy --seeds 2 --jobs 1
     python benchmarks/sim_to_real.py --figure              # draw the figure again from the table
 
 Each cell is a stand-in for hardware that its data sheet describes wrongly. Wrong twin, HDS and
@@ -14,37 +14,23 @@ above three standard errors count.
 
 import argparse
 import json
-import sys
 
 import numpy as np
 import pandas as pd
-from runs import RESULTS, fresh_process, save, seconds_since_start
+from hardware import CELLS, length_of, make, pretrained, return_of
+from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
 
-PENDULUM, CART = "sb3_hds/PendulumReal-v1", "sb3_hds/InvertedPendulumFriction-v5"
-EPISODE, SWING_UP = 200, 250
-CELLS = {
-    "light": (PENDULUM, {"mass": 0.75}),
-    "heavy": (PENDULUM, {"mass": 1.25}),
-    "short": (PENDULUM, {"length": 0.5}),
-    "long": (PENDULUM, {"length": 1.5}),
-    "heavy, long": (PENDULUM, {"mass": 1.25, "length": 1.25}),
-    "heavy, long, noise 0.1": (PENDULUM, {"mass": 1.25, "length": 1.25, "noise": 0.1}),
-    "heavy, long, noise 0.2": (PENDULUM, {"mass": 1.25, "length": 1.25, "noise": 0.2}),
-    "friction": (PENDULUM, {"friction": 0.3, "noise": 0.01}),
-    "drag": (PENDULUM, {"drag": 0.04, "noise": 0.01}),
-    "delay": (PENDULUM, {"delay": 0.1, "noise": 0.01}),
-    "cart friction": (CART, {"hinge_friction": 2.0, "slider_friction": 20.0, "swing_up": True}),
-}
 METHODS = ("ceiling", "wrong_twin", "randomised", "hds", "sac", "tqc", "droq")
 STEPS = (1, 5, 10)  # real episodes after which learners are evaluated
-N_STARTS = 50
+SWEEP = [cell for cell in CELLS if cell != "worn"]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--cells", nargs="*", default=list(CELLS))
+    parser.add_argument("--cells", nargs="*", default=SWEEP)
     parser.add_argument("--methods", nargs="*", default=list(METHODS))
+    parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--figure", action="store_true")
     parser.add_argument("--worker", nargs=3, metavar=("CELL", "METHOD", "SEED"))
     arguments = parser.parse_args()
@@ -53,101 +39,61 @@ def main() -> None:
         print(json.dumps(worker(cell, method, int(seed))))
         return
     if not arguments.figure:
-        run(arguments.cells, arguments.methods, arguments.seeds)
+        wanted = [
+            (cell, method, seed)
+            for seed in range(arguments.seeds)
+            for cell in arguments.cells
+            for method in arguments.methods
+        ]
+        in_process = lambda *run: fresh_process(__file__, *run, cache=CACHE)["rows"]  # noqa: E731
+        resume("sim_to_real", ("cell", "method", "seed"), wanted, in_process, arguments.jobs)
     report()
-
-
-def run(cells: list[str], methods: list[str], n_seeds: int) -> None:
-    path = RESULTS / "sim_to_real.csv"
-    rows = pd.read_csv(path).to_dict("records") if path.exists() else []
-    done = {(row["cell"], row["method"], row["seed"]) for row in rows}
-    for seed in range(n_seeds):
-        for cell in cells:
-            for method in methods:
-                if (cell, method, seed) in done:
-                    continue
-                print(f"{cell}, {method}, seed {seed} ...", file=sys.stderr, flush=True)
-                found = fresh_process(__file__, cell, method, seed)["rows"]
-                key = {"cell": cell, "method": method, "seed": seed}
-                rows += [key | row for row in found]
-                save(rows, "sim_to_real")
 
 
 def worker(cell: str, method: str, seed: int) -> dict:
     """Train once; evaluate after each number of real episodes."""
-    env_id, settings = CELLS[cell]
-    env = make(env_id, settings)
-    length = SWING_UP if env_id == CART else EPISODE
     if method in ("ceiling", "wrong_twin", "randomised"):
-        model = planner(method, env, env_id, settings, seed).learn(0)
-        return {"rows": [evaluated(model, env_id, settings, 0)]}
-    model = learner(method, env, env_id, settings, seed)
-    rows = []
+        return {"rows": [evaluated(planner(method, cell, seed), cell, 0)]}
+    model, rows = learner(method, cell, seed), []
     for episodes in STEPS:
-        model.learn(episodes * length - model.num_timesteps, reset_num_timesteps=False)
-        rows.append(evaluated(model, env_id, settings, episodes))
+        missing = episodes * length_of(cell) - model.num_timesteps
+        model.learn(missing, reset_num_timesteps=False)
+        rows.append(evaluated(model, cell, episodes))
     return {"rows": rows}
 
 
-def make(env_id: str, settings: dict):
-    import gymnasium
-
-    import sb3_hds  # noqa: F401
-
-    limit = {"max_episode_steps": SWING_UP} if env_id == CART else {}
-    return gymnasium.make(env_id, **settings, **limit)
-
-
-def data_sheet(env_id: str):
-    """The twin as its maker describes the system: nothing of what is hidden."""
-    from sb3_hds import twins
-
-    return twins.make(env_id, **({"swing_up": True} if env_id == CART else {}))
-
-
-def planner(method: str, env, env_id: str, settings: dict, seed: int):
+def planner(method: str, cell: str, seed: int):
+    """HDS that never sees data is PODS with the same planning settings as HDS beside it."""
     from sb3_hds import HDS, envs
 
-    twin = envs.true_twin(env) if method == "ceiling" else data_sheet(env_id)
-    spread = 1.0 if method == "randomised" else 0.0
-    # HDS that never sees data is PODS with the same planning settings as HDS beside it.
-    return HDS(env, twin=twin, refit_freq=0, randomisation=spread, seed=seed)
+    if method == "ceiling":
+        env = make(cell)
+        return HDS(env, twin=envs.true_twin(env), seed=seed).learn(0)
+    return pretrained(cell, seed, **({"randomisation": 1.0} if method == "randomised" else {}))
 
 
-def learner(method: str, env, env_id: str, settings: dict, seed: int):
+def learner(method: str, cell: str, seed: int):
+    """The hyperparameters of SAC and TQC are those of RL Zoo for Pendulum-v1."""
     if method == "hds":
-        from sb3_hds import HDS
-
-        return HDS(env, twin=data_sheet(env_id), seed=seed).learn(0)
+        return pretrained(cell, seed)
     from sbx import SAC, TQC
 
-    rates = {"learning_rate": 1e-3}
+    given = {"policy": "MlpPolicy", "env": make(cell), "seed": seed, "learning_rate": 1e-3}
     if method == "sac":
-        return SAC("MlpPolicy", env, seed=seed, **rates)
+        return SAC(**given)
     if method == "tqc":
-        return TQC("MlpPolicy", env, seed=seed, **rates)
-    # DroQ (Hiraoka et al. 2022): dropout, layer norm and 20 gradient steps for each real one.
+        return TQC(**given)
+    # Hiraoka et al. 2022: dropout, layer norm, and 20 gradient steps for each real one.
     nets = {"dropout_rate": 0.01, "layer_norm": True}
-    return SAC(
-        "MlpPolicy", env, seed=seed, gradient_steps=20, policy_delay=20, policy_kwargs=nets, **rates
-    )
+    return SAC(**given, gradient_steps=20, policy_delay=20, policy_kwargs=nets)
 
 
-def evaluated(model, env_id: str, settings: dict, episodes: int) -> dict:
-    seconds, env, returns = seconds_since_start(), make(env_id, settings), []
-    for start in range(N_STARTS):
-        obs, _ = env.reset(seed=50_000 + start)
-        total, over = 0.0, False
-        while not over:
-            obs, reward, terminated, truncated, _ = env.step(
-                model.predict(obs, deterministic=True)[0]
-            )
-            total, over = total + float(reward), terminated or truncated
-        returns.append(total)
+def evaluated(model, cell: str, episodes: int) -> dict:
+    seconds = seconds_since_start()
     return {
         "episodes": episodes,
         "real_steps": model.num_timesteps,
-        "return": float(np.mean(returns)),
+        "return": return_of(model, cell),
         "seconds": seconds,
     }
 

@@ -66,6 +66,7 @@ class Report(NamedTuple):
 
     :param policy_loss: mean regression loss of the epoch
     :param value_loss: mean regression loss of the value
+    :param gradient_norm: mean norm of the policy's gradient before it is clipped
     """
 
     before: jax.Array
@@ -74,6 +75,7 @@ class Report(NamedTuple):
     dropped: jax.Array
     policy_loss: jax.Array
     value_loss: jax.Array
+    gradient_norm: jax.Array
 
 
 class Choice(NamedTuple):
@@ -131,7 +133,7 @@ def plan_ahead(settings: Settings, learner: Learner, knobs: Knobs) -> tuple[Lear
 @partial(jax.jit, static_argnums=0)
 def learn_from_plans(
     settings: Settings, learner: Learner, knobs: Knobs
-) -> tuple[Learner, Float[Array, " 2"]]:
+) -> tuple[Learner, Float[Array, " 3"]]:
     """The second half of an epoch: the regression."""
     key = jax.random.wrap_key_data(learner.progress.key, impl=GENERATOR)
     key, k_regress = jax.random.split(key)

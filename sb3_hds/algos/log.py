@@ -26,6 +26,7 @@ def record_epoch(model: "TwinAlgorithm", report: Report, knobs: Knobs, returns: 
         record("train/return_of_best", float(max(returns)))
     record("train/policy_loss", float(report.policy_loss))
     record("train/value_loss", float(report.value_loss))
+    record("train/gradient_norm", float(report.gradient_norm))
     record("train/worsened_plans", int(report.worsened))
     record("train/dropped_samples", int(report.dropped))
     record("train/exploration_noise", knobs.noise)

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sb3_hds.algos.learner import Knobs, Learner, Samples, Settings, optimiser
@@ -107,7 +108,7 @@ def rescale(learner: Learner, samples: Samples) -> Learner:
 
 def regress(
     settings: Settings, learner: Learner, knobs: Knobs, key: PRNGKeyArray
-) -> tuple[Learner, Float[Array, " 2"]]:
+) -> tuple[Learner, Float[Array, " 3"]]:
     r"""
     Adam on minibatches of the remembered samples.
 
@@ -118,7 +119,8 @@ def regress(
     control scale: a squared error averages between turning left and turning right, and blurs the
     moments of switching. The paper's :math:`w\,e^2/2`, in units of the control, is a setting.
 
-    :return: the learner, and the mean losses of policy and value
+    :return: the learner; the mean losses of policy and value, and the mean norm of the policy's
+        gradient before it is clipped
     """
     adam, work = optimiser(settings.max_grad_norm), learner.workspace
     filled = jnp.minimum(work.n_filled, settings.plan_memory)
@@ -146,6 +148,7 @@ def regress(
         actor, value, actor_state, value_state, losses = carry
         k_policy, k_value = jax.random.split(jax.random.fold_in(key, i))
         loss_p, slope = jax.value_and_grad(policy_loss)(actor, draw(k_policy, n_early))
+        norm = optax.global_norm(slope)
         actor, actor_state = _descend(adam, slope, actor, actor_state, knobs.learning_rate)
         loss_v = jnp.zeros(())
         if settings.terminal_value:
@@ -153,11 +156,11 @@ def regress(
             value, value_state = _descend(
                 adam, slope, value, value_state, knobs.value_learning_rate
             )
-        return actor, value, actor_state, value_state, losses + jnp.stack([loss_p, loss_v])
+        return actor, value, actor_state, value_state, losses + jnp.stack([loss_p, loss_v, norm])
 
     nets, progress = learner.networks, learner.progress
     optimisers = (progress.actor_optimiser, progress.value_optimiser)
-    first = (nets.actor, nets.value, *optimisers, jnp.zeros(2))
+    first = (nets.actor, nets.value, *optimisers, jnp.zeros(3))
     actor, value, actor_state, value_state, losses = jax.lax.fori_loop(
         0, knobs.gradient_steps, update, first
     )

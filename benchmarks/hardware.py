@@ -1,0 +1,80 @@
+"""Stand-ins for hardware that its data sheet describes wrongly, and how policies do on them."""
+
+import numpy as np
+from runs import CACHE
+
+PENDULUM, CART = "sb3_hds/PendulumReal-v1", "sb3_hds/InvertedPendulumFriction-v5"
+CELLS = {
+    "light": (PENDULUM, {"mass": 0.75}),
+    "heavy": (PENDULUM, {"mass": 1.25}),
+    "short": (PENDULUM, {"length": 0.5}),
+    "long": (PENDULUM, {"length": 1.5}),
+    "heavy, long": (PENDULUM, {"mass": 1.25, "length": 1.25}),
+    "heavy, long, noise 0.1": (PENDULUM, {"mass": 1.25, "length": 1.25, "noise": 0.1}),
+    "heavy, long, noise 0.2": (PENDULUM, {"mass": 1.25, "length": 1.25, "noise": 0.2}),
+    "friction": (PENDULUM, {"friction": 0.3, "noise": 0.01}),
+    "drag": (PENDULUM, {"drag": 0.04, "noise": 0.01}),
+    "delay": (PENDULUM, {"delay": 0.1, "noise": 0.01}),
+    "cart friction": (CART, {"hinge_friction": 2.0, "slider_friction": 20.0, "swing_up": True}),
+    "worn": (PENDULUM, {"mass": 1.25, "length": 1.25, "friction": 0.2, "noise": 0.01}),
+}
+#: steps of an episode
+LENGTH = {PENDULUM: 200, CART: 250}
+N_STARTS = 50
+
+
+def make(cell: str):
+    """:return: the system as it is"""
+    import gymnasium
+
+    import sb3_hds  # noqa: F401
+
+    env_id, settings = CELLS[cell]
+    return gymnasium.make(env_id, **settings, max_episode_steps=LENGTH[env_id])
+
+
+def length_of(cell: str) -> int:
+    return LENGTH[CELLS[cell][0]]
+
+
+def data_sheet(env_id: str):
+    """:return: the twin as its maker describes the system: nothing of what is hidden"""
+    from sb3_hds import twins
+
+    return twins.make(env_id, **({"swing_up": True} if env_id == CART else {}))
+
+
+def pretrained(cell: str, seed: int, **changes):
+    """
+    :return: HDS that has planned in the data sheet's twin and has seen no data yet, in the cell's
+        environment. It is trained once for all cells that share a data sheet.
+    """
+    from sb3_hds import HDS
+
+    env_id = CELLS[cell][0]
+    label = "_".join(f"{name}={value}" for name, value in sorted(changes.items()))
+    path = CACHE / "models" / f"{env_id.split('/')[1]}_{seed}_{label or 'plain'}.zip"
+    if not path.exists():
+        model = HDS(make(cell), twin=data_sheet(env_id), seed=seed, **changes)
+        model.learn(0).save(path)
+    return HDS.load(path, env=make(cell))
+
+
+def mean_return(predict, cell: str) -> float:
+    """
+    :param predict: from observation to action
+    :return: mean over the same start states of the real system, whoever asks
+    """
+    env, returns = make(cell), []
+    for start in range(N_STARTS):
+        obs, _ = env.reset(seed=50_000 + start)
+        total, over = 0.0, False
+        while not over:
+            obs, reward, terminated, truncated, _ = env.step(predict(obs))
+            total, over = total + float(reward), terminated or truncated
+        returns.append(total)
+    return float(np.mean(returns))
+
+
+def return_of(model, cell: str) -> float:
+    return mean_return(lambda obs: model.predict(obs, deterministic=True)[0], cell)

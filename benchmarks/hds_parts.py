@@ -1,0 +1,215 @@
+"""
+What each part of HDS is worth: one changed at a time, on hardware that wore out.
+
+    python benchmarks/hds_parts.py                        # beta, parts and weaknesses, five seeds
+    python benchmarks/hds_parts.py --tables parts --seeds 2 --jobs 1
+
+The cell "worn" of `hardware.py` is heavier and longer than its data sheet says and has dry friction
+that no parameter of the twin accounts for. Runs with the same seed start from the same policy where
+the change does not touch the pretraining. Returns are means over the same 50 start states; finished
+runs are kept.
+
+beta: the share of plans made in the model with the learned force. Beside the return, what the HDS
+project asked about numerical stability: samples that were dropped because they were not finite, the
+norm of the policy's gradient, and that of the derivative of the return of 100 steps by the first
+action, at the median and at its worst over 256 start states, in the model that was learned.
+
+parts: each remedy and each way to use the data switched off.
+
+weaknesses: the four that the authors of HDS name, with the remedy off and on, without data.
+"""
+
+import argparse
+import json
+
+import numpy as np
+import pandas as pd
+from hardware import N_STARTS, PENDULUM, data_sheet, length_of, make, pretrained, return_of
+from runs import CACHE, RESULTS, fresh_process, resume
+
+CELL, EPISODES = "worn", 5
+BETAS = (0.0, 0.05, 0.1, 0.3, 1.0, "auto")
+PARTS = {
+    "as it is": {},
+    "noise does not decay": {"exploration_decay": 1.0},
+    "best step always": {"temperature": 0.0},
+    "no terminal value": {"terminal_value": False},
+    "no relabelling": {"relabel_share": 0.0},
+    "no calibration": {"calibrated": None},
+    "no learned force": {"residual": False},
+    "beta 0.05": {"beta": 0.05},
+    "no data": {"refit_freq": 0},
+}
+PRETRAINED_WITH = ("exploration_decay", "temperature", "terminal_value", "relabel_share")
+TABLES = ("beta", "parts", "weaknesses")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--tables", nargs="*", default=list(TABLES), choices=TABLES)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--worker", nargs=3, metavar=("TABLE", "VARIANT", "SEED"))
+    arguments = parser.parse_args()
+    if arguments.worker:
+        table, variant, seed = arguments.worker
+        print(json.dumps({"rows": [WORK[table](variant, int(seed))]}))
+        return
+    variants = {"beta": BETAS, "parts": PARTS, "weaknesses": WEAKNESSES}
+    for table in arguments.tables:
+        wanted = [(str(v), seed) for seed in range(arguments.seeds) for v in variants[table]]
+        work = lambda v, seed, t=table: fresh_process(__file__, t, v, seed, cache=CACHE)["rows"]  # noqa: E731
+        resume(f"hds_{table}", ("variant", "seed"), wanted, work, arguments.jobs)
+        report(table)
+
+
+def learned(changes: dict, seed: int) -> tuple:
+    """:return: HDS after some real episodes, with what happened in each of its epochs"""
+    first = {name: value for name, value in changes.items() if name in PRETRAINED_WITH}
+    model, reports = pretrained(CELL, seed, **first), []
+    for name, value in changes.items():
+        setattr(model, name, value)
+    run_epoch = model.run_epoch
+    model.run_epoch = lambda n: reports.append(run_epoch(n)) or reports[-1]
+    model.learn(EPISODES * length_of(CELL), reset_num_timesteps=False)
+    return model, reports
+
+
+def beta(variant: str, seed: int) -> dict:
+    model, reports = learned({"beta": variant if variant == "auto" else float(variant)}, seed)
+    norms = derivative_norms(model)
+    return {
+        "return": return_of(model, CELL),
+        "beta": model.model_beta,
+        "dropped_samples": int(sum(int(r.dropped) for r in reports)),
+        "gradient_norm": float(np.mean([float(r.gradient_norm) for r in reports])),
+        "derivative_median": float(np.median(norms)),
+        "derivative_worst": float(np.max(norms)),
+    }
+
+
+def derivative_norms(model, n_steps: int = 100, n_starts: int = 256) -> np.ndarray:
+    """Of the return of random torques by the first of them, in the model that is planned in."""
+    import jax
+    import jax.numpy as jnp
+
+    twin, key = model.twin, jax.random.key(0)
+    params = twin.params
+
+    def total(first, state, rest):
+        def step(state, action):
+            after = twin.step(state, action, params)
+            return after, twin.reward(state, action, after, params)
+
+        actions = jnp.concatenate([first[None], rest])
+        return jnp.sum(jax.lax.scan(step, state, actions)[1])
+
+    starts = jax.vmap(lambda k: twin.initial(k, params))(jax.random.split(key, n_starts))
+    actions = jax.random.uniform(key, (n_starts, n_steps, 1), minval=-2.0, maxval=2.0)
+    slopes = jax.jit(jax.vmap(jax.grad(total)))(actions[:, 0], starts, actions[:, 1:])
+    return np.linalg.norm(np.asarray(slopes), axis=1)
+
+
+def parts(variant: str, seed: int) -> dict:
+    model, _ = learned(PARTS[variant], seed)
+    return {"return": return_of(model, CELL)}
+
+
+def in_twin(cell: str, **changes):
+    """Return on the real system of what was planned in the data sheet's twin."""
+
+    def work(seed: int) -> float:
+        return return_of(pretrained(cell, seed, **changes), cell)
+
+    return work
+
+
+def balanced(counted: bool):
+    """
+    Steps upright of a cart-pole whose planning reward is never positive, so that ending an episode
+    early would pay if nothing were set against it.
+    """
+
+    def work(seed: int) -> float:
+        import gymnasium
+        from stable_baselines3.common.evaluation import evaluate_policy
+
+        from sb3_hds import HDS
+        from sb3_hds.planning import Problem
+        from sb3_hds.twins.inverted_pendulum import InvertedPendulum
+
+        class Costly(InvertedPendulum):
+            def planning_reward(self, state, action, next_state, params):
+                return super().planning_reward(state, action, next_state, params) - 1.0
+
+        if not counted:
+            Problem.value_when_terminated = property(lambda problem: 0.0)
+        env = gymnasium.make("InvertedPendulum-v5")
+        model = HDS(env, twin=Costly.from_env(env), seed=seed, pretrain_epochs=60).learn(0)
+        return float(evaluate_policy(model, env, 20)[0])
+
+    return work
+
+
+def open_loop(closed: bool):
+    """The policy's own commands, either seen through in the twin beforehand, or as it goes."""
+
+    def work(seed: int) -> float:
+        model, env = pretrained("heavy, long", seed), make("heavy, long")
+        if closed:
+            return return_of(model, "heavy, long")
+        from sb3_hds import envs
+
+        mirror, returns = envs.TwinEnv(data_sheet(PENDULUM)), []
+        for start in range(N_STARTS):
+            env.reset(seed=50_000 + start)
+            data = env.unwrapped.data
+            obs, _ = mirror.reset(options={"state": (data.qpos.copy(), data.qvel.copy())})
+            total = 0.0
+            for _ in range(length_of("heavy, long")):
+                action = model.predict(obs, deterministic=True)[0]
+                obs = mirror.step(action)[0]
+                total += float(env.step(action)[1])
+            returns.append(total)
+        return float(np.mean(returns))
+
+    return work
+
+
+SHORT = {"pretrain_epochs": 60}
+WEAKNESSES = {
+    "long rollouts, off": in_twin(
+        "heavy", horizon=100, terminal_value=False, lookahead=0, n_rollouts=32, **SHORT
+    ),
+    "long rollouts, on": in_twin("heavy", n_rollouts=32, **SHORT),
+    "contact, off": in_twin(
+        "cart friction", horizon=100, terminal_value=False, lookahead=0, n_rollouts=32, **SHORT
+    ),
+    "contact, on": in_twin("cart friction", n_rollouts=32, **SHORT),
+    "termination, off": balanced(counted=False),
+    "termination, on": balanced(counted=True),
+    "local minima, off": in_twin(
+        "heavy", n_random_plans=0, reset_share=1.0, exploration_noise=0.0, temperature=0.0
+    ),
+    "local minima, on": in_twin("heavy"),
+    "open loop, off": open_loop(closed=False),
+    "open loop, on": open_loop(closed=True),
+}
+
+
+def weaknesses(variant: str, seed: int) -> dict:
+    return {"return": WEAKNESSES[variant](seed)}
+
+
+WORK = {"beta": beta, "parts": parts, "weaknesses": weaknesses}
+
+
+def report(table: str) -> None:
+    rows = pd.read_csv(RESULTS / f"hds_{table}.csv")
+    columns = [name for name in rows.columns if name not in ("variant", "seed")]
+    found = rows.groupby("variant", sort=False)[columns].agg(["mean", "min", "max"])
+    print(found.to_string(float_format=lambda x: f"{x:.4g}"))
+
+
+if __name__ == "__main__":
+    main()
