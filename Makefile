@@ -48,10 +48,10 @@ commit-checks: install
 
 # Two processes, each with whole files, so that a file shares its fixtures and compiled functions.
 test: install
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not expensive" $(TESTS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not expensive" $(TESTS)
 
 test-all: install
-	$(BIN)/python -m pytest -n 2 --dist loadfile $(TESTS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(TESTS)
 
 docs: install
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html

@@ -40,6 +40,8 @@ _EXACT_STEP, _MOST_STEPS, _N_SINGLE = 1e-4, 0.9, 256
 _FEWEST = 6
 # Share of windows to check on, and that share where there are not many.
 _HELD, _HELD_OF_FEW, _MANY = 0.25, 0.5, 24
+# Of the solver, in each of its passes: the next correction goes on where this one ends.
+_SOLVER_STEPS = 20
 # Plans are made anew where the corrected model's error is lower by this share.
 _NOTICEABLE = 0.1
 # A calibrated twin needs less proof than a learned force: it has few parameters, and a prior.
@@ -172,7 +174,14 @@ def _calibrated(
     start = twin.with_parameters(**{k: 0.0 for k in _shares(twin)})
     try:
         return fit_windows(
-            start, wishes.names, learned, origin, spread, prior=1.0, believed=believed
+            start,
+            wishes.names,
+            learned,
+            origin,
+            spread,
+            prior=1.0,
+            believed=believed,
+            max_steps=_SOLVER_STEPS,
         )
     except CalibrationError:
         return None

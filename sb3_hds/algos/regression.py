@@ -148,7 +148,7 @@ def regress(
         actor, value, actor_state, value_state, losses = carry
         k_policy, k_value = jax.random.split(jax.random.fold_in(key, i))
         loss_p, slope = jax.value_and_grad(policy_loss)(actor, draw(k_policy, n_early))
-        norm = optax.global_norm(slope)
+        norm = optax.tree.norm(slope)
         actor, actor_state = _descend(adam, slope, actor, actor_state, knobs.learning_rate)
         loss_v = jnp.zeros(())
         if settings.terminal_value:
