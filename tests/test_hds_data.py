@@ -127,6 +127,18 @@ def test_a_load_that_comes_and_goes_is_followed():
     assert [c.forgotten for c in corrections].count(True) == 2
 
 
+def test_a_wrong_twin_is_seen_though_the_system_mostly_rests():
+    moving = measured(twins.make("PendulumReal", mass=0.75), n=1)
+    resting = Trajectories.from_arrays(
+        obs=[np.tile([1.0, 0.0, 0.0], (201, 1))], actions=[np.zeros((200, 1))], dt=0.05
+    )
+
+    found = corrected(twins.make("PendulumReal"), Trajectories.concatenate([resting, moving]))
+
+    assert found.changed
+    assert found.error_calibrated < 0.1 * found.error_twin
+
+
 def test_too_few_data_change_nothing():
     twin = twins.make("PendulumReal")
     found = corrected(twin, measured(twins.make("PendulumReal", mass=2.0), n=1, n_steps=4))

@@ -8,6 +8,9 @@ from tables import table
 
 BENCHMARKS = Path(__file__).parent.parent.parent / "benchmarks"
 
+# Longer tables are for programs to read.
+_MOST_ROWS = 60
+
 _NONE = (
     "There are no results in this checkout yet. Run one of the commands above, then `make docs`.\n"
 )
@@ -41,5 +44,9 @@ def _first_line(path: Path) -> str:
 def _as_section(path: Path) -> str:
     with path.open(newline="") as file:
         columns, *rows = csv.reader(file)
-    title = path.stem.replace("_", " ")
-    return f"### {title}\n\n{table(columns, rows)}From `{path.parent.name}/{path.name}`.\n\n"
+    title, name = path.stem.replace("_", " "), f"`{path.parent.name}/{path.name}`"
+    shown = table(columns, rows) if len(rows) <= _MOST_ROWS else f"{len(rows)} rows.\n\n"
+    picture = path.with_suffix(".png")
+    if picture.exists():
+        shown += f"![{title}](../../benchmarks/results/{picture.name})\n\n"
+    return f"### {title}\n\n{shown}From {name}.\n\n"

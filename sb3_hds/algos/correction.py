@@ -34,8 +34,9 @@ from sb3_hds.sysid.shooting import Shots, shots_of
 _N_WINDOWS = 128
 # A twin whose windows miss by less than this share of the channels' spread needs no correction.
 _EXACT = 1e-3
-# The same for most of the latest single steps: how little, which share, of how many.
-_EXACT_STEP, _MOST_STEPS, _N_SINGLE = 1e-4, 0.9, 256
+# The same for nearly all of the latest single steps, since at rest any twin is exact: how little,
+# which share, of how many.
+_EXACT_STEP, _MOST_STEPS, _N_SINGLE = 1e-4, 0.98, 256
 # Fewer windows than this are too few to check on some what was learned from others.
 _FEWEST = 6
 # Share of windows to check on, and that share where there are not many.
@@ -135,7 +136,7 @@ def correct(
     if real.sum() < _FEWEST:
         return Correction(twin, beta, changed=False, error_twin=_mean(bare[real]))
     latest = _latest(shots, origin, n_new)
-    if max(np.median(bare[real]), np.median(bare[latest])) < _EXACT:
+    if max(_mean(bare[real]), _mean(bare[latest])) < _EXACT:
         changed = gain(bare[real], now[real]) > _NOTICEABLE
         return Correction(nominal, 0.0, changed=changed, error_twin=_mean(bare[real]))
     shots, origin, forgotten = _since_change(shots, origin, now, latest)
@@ -222,7 +223,7 @@ def _with_residual(
 ) -> tuple[Correction, np.ndarray]:
     """:return: the correction, and the errors of the model that is planned in"""
     twin, residual = found.twin, None
-    wanted = wishes.residual and wishes.beta != 0.0 and np.median(errors[held]) > _EXACT
+    wanted = wishes.residual and wishes.beta != 0.0 and _mean(errors[held]) > _EXACT
     if wanted and learn_force:
         scale = 0.05 * spread if found.fit is None else found.fit.noise
         scale = np.maximum(scale, 1e-3 * spread)
@@ -267,7 +268,7 @@ def _since_change(
 ) -> tuple[Shots, np.ndarray, bool]:
     """Leave out what was measured before the system became another one, if it did."""
     older = np.setdiff1d(np.flatnonzero(origin >= 0), latest)
-    if len(older) < _FEWEST or np.median(errors[latest]) < _EXACT:
+    if len(older) < _FEWEST or _mean(errors[latest]) < _EXACT:
         return shots, origin, False
     if not has_grown(errors[latest], errors[older]):
         return shots, origin, False

@@ -68,7 +68,7 @@ def covariance_of(
     n_groups, n_measured = len(labels), n * (m - n_start)
     correction = n_groups / max(n_groups - 1, 1) * (n_measured - 1) / max(n_measured - p, 1)
     covariance = bread @ (correction * summed.T @ summed + prior**2 * np.eye(p)) @ bread
-    stderr = np.sqrt(np.diag(covariance))
+    stderr = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     touched = (np.abs(directions[:, weak]) > 0.1).any(1)
     stderr = np.where(touched, np.inf, stderr)
     covariance = covariance.copy()
