@@ -6,9 +6,9 @@ A load is hung on in the middle: how many episodes until a learner is what it wa
 `sb3_hds/PendulumReal-v1` as its data sheet says, plus sensor noise. After some real episodes a
 point mass of 0.25 kg is fastened to its tip (the rod weighs 1 kg) and nobody is told. HDS and SAC
 (SBX, RL Zoo's settings for Pendulum-v1) learn for ten episodes before; as SAC has learned little by
-then, it also gets fifty. Returns are means over the same 50 start states of the loaded system; a learner
-has recovered from the first evaluation on after which all are within a tenth of what the load costs
-(the policy that never heard of it, against PODS on the true twin).
+then, it also gets fifty. Returns are means over the same 50 start states of the loaded system; a
+learner has recovered from the first evaluation on after which all are within a tenth of what the
+load costs (the policy that never heard of it, against PODS on the true twin).
 """
 
 import argparse
