@@ -12,16 +12,19 @@ from typing import TYPE_CHECKING, Any
 from sb3_hds.envs.registration import register_environments
 
 if TYPE_CHECKING:
-    from sb3_hds import effects, envs, planning, sysid, twins, wrappers
+    from sb3_hds import data, effects, envs, planning, sysid, twins, wrappers
     from sb3_hds.algos import HDS, PODS
-    from sb3_hds.core import Trajectories
-    from sb3_hds.sysid import calibrate
+    from sb3_hds.data import Trajectories, audit
+    from sb3_hds.sysid import calibrate, diagnose
 
 __all__ = [
     "HDS",
     "PODS",
     "Trajectories",
+    "audit",
     "calibrate",
+    "data",
+    "diagnose",
     "effects",
     "envs",
     "planning",
@@ -30,7 +33,14 @@ __all__ = [
     "wrappers",
 ]
 
-_CLASSES = {"HDS": "algos", "PODS": "algos", "Trajectories": "core", "calibrate": "sysid"}
+_CLASSES = {
+    "HDS": "algos",
+    "PODS": "algos",
+    "Trajectories": "data",
+    "audit": "data",
+    "calibrate": "sysid",
+    "diagnose": "sysid",
+}
 
 try:
     __version__ = version("sb3-hds")

@@ -1,7 +1,18 @@
 """System identification: what measured data say about a twin."""
 
 from sb3_hds.sysid.calibrate import calibrate
+from sb3_hds.sysid.diagnose import diagnose
+from sb3_hds.sysid.diagnosis import Diagnosis, Finding
 from sb3_hds.sysid.residual import Residual, fit_residual
 from sb3_hds.sysid.results import Estimate, Fit
 
-__all__ = ["Estimate", "Fit", "Residual", "calibrate", "fit_residual"]
+__all__ = [
+    "Diagnosis",
+    "Estimate",
+    "Finding",
+    "Fit",
+    "Residual",
+    "calibrate",
+    "diagnose",
+    "fit_residual",
+]

@@ -1,0 +1,113 @@
+"""Which of two models predicts better: units of evidence are recordings, not samples."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy import stats
+
+from sb3_hds.core import Trajectories
+
+# Blocks into which recordings are cut where there are too few of them to be the units.
+_FEWEST_UNITS = 8
+# Ratios of errors beyond this say no more.
+_MOST_RATIO = 1e6
+
+
+class Comparison(NamedTuple):
+    """
+    One model against another on the same windows.
+
+    :param gain: share by which the mean square error is lower, by the geometric mean of the units
+    :param p_value: one-sided: chance of such a gain if there were none
+    :param low: lower end of the 90 % interval of the gain
+    :param high: upper end
+    :param n_units: pieces of evidence
+    """
+
+    gain: float
+    p_value: float
+    low: float
+    high: float
+    n_units: int
+
+
+class Split(NamedTuple):
+    """
+    :param unit: piece of evidence of each window, -1 for padding, shape ``(n,)``
+    :param confirm: whether the window is kept from selection, shape ``(n,)``
+    """
+
+    unit: Int[np.ndarray, " n"]
+    confirm: np.ndarray
+
+
+def compare(
+    new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], unit: Int[np.ndarray, " n"]
+) -> Comparison:
+    """
+    A t test on the logarithms of error ratios, one for each unit: ratios of single windows, or
+    differences instead of ratios, have tails too heavy for it.
+
+    :param new: mean square error of each window
+    :param old: the same of the model that is to be beaten
+    :param unit: piece of evidence of each window; negative: does not count
+    """
+    labels = np.unique(unit[unit >= 0])
+    sums = [[errors[unit == label].sum() for label in labels] for errors in (new, old)]
+    after, before = (np.maximum(np.array(s), 1e-300) for s in sums)
+    ratio = np.clip(np.log(before / after), -np.log(_MOST_RATIO), np.log(_MOST_RATIO))
+    n = len(ratio)
+    if n < 2:
+        return Comparison(float(1.0 - np.exp(-ratio.mean())), 1.0, -np.inf, 1.0, n)
+    stderr = max(ratio.std(ddof=1) / np.sqrt(n), 1e-12)
+    p_value = float(stats.t.sf(ratio.mean() / stderr, n - 1))
+    half = stats.t.ppf(0.95, n - 1) * stderr
+    low, gain, high = (1.0 - np.exp(-x) for x in (-half, 0.0, half) + ratio.mean())
+    return Comparison(float(gain), p_value, float(low), float(high), n)
+
+
+def split(data: Trajectories, origin: Int[np.ndarray, " n"], seed: int) -> Split:
+    """
+    Half of the units to select on, half to confirm. Where there are several recordings of each
+    condition, both halves see all conditions; where recordings are few, stretches of them are the
+    units.
+
+    :param origin: recording of each window, -1 for padding, in order of time
+    """
+    recordings = np.unique(origin[origin >= 0])
+    unit = origin.copy()
+    if len(recordings) < _FEWEST_UNITS:
+        unit = _in_blocks(origin, recordings)
+    rng, confirm = np.random.default_rng(seed), np.zeros(len(origin), bool)
+    labels = np.unique(unit[unit >= 0])
+    condition = {
+        label: data.conditions[int(np.flatnonzero(data.origin == origin[unit == label][0])[0])]
+        for label in labels
+    }
+    turn = 0
+    for name in dict.fromkeys(condition.values()):
+        own = rng.permutation([label for label in labels if condition[label] == name])
+        for label in own:
+            confirm |= (unit == label) & bool(turn % 2)
+            turn += 1
+    return Split(unit, confirm)
+
+
+def effective_size(raw: Float[np.ndarray, "n rows obs"]) -> float:
+    """:return: how many independent numbers these errors are worth, by their lag-one correlation"""
+    before, after = raw[:, :-1], raw[:, 1:]
+    power = np.sum(raw**2, (0, 1)) + 1e-300
+    correlation = np.clip(np.sum(before * after, (0, 1)) / power, 0.0, 0.999)
+    return float(raw.shape[0] * raw.shape[1] * np.sum((1 - correlation) / (1 + correlation)))
+
+
+def _in_blocks(origin: np.ndarray, recordings: np.ndarray) -> np.ndarray:
+    """Stretches of recordings, about as many windows each."""
+    unit, label = np.full(len(origin), -1), 0
+    n_blocks = -(-_FEWEST_UNITS // max(len(recordings), 1))
+    for recording in recordings:
+        for rows in np.array_split(np.flatnonzero(origin == recording), n_blocks):
+            if len(rows):
+                unit[rows], label = label, label + 1
+    return unit

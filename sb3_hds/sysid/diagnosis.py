@@ -1,0 +1,187 @@
+"""What a diagnosis says."""
+
+import dataclasses
+import math
+import textwrap
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from sb3_hds.core import Params, Twin
+from sb3_hds.sysid.results import Estimate
+
+Verdict = Literal["named", "ambiguous", "none", "unknown", "not_identifiable"]
+
+_WIDTH = 80
+_SENTENCE = {
+    "named": "The data name what is missing.",
+    "ambiguous": "Something is missing, and the data cannot tell which of several causes it is.",
+    "none": "The data show nothing that the simulation gets wrong.",
+    "unknown": "Something is there that none of the candidates explains.",
+    "not_identifiable": "These data cannot support a verdict.",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """
+    One cause.
+
+    :param effect: name in the catalogue, or ``"parameter.NAME"``
+    :param where: ``slot``, ``index`` and ``name`` of its place
+    :param parameters: estimates with intervals and units, by short name
+    :param alternatives: what the data cannot tell from it, by name and place
+    :param p_value: that held-out recordings would gain as much by chance
+    :param gain: share by which it lowers the mean square error of held-out recordings
+    :param explanation: one sentence for people
+    """
+
+    effect: str
+    where: Mapping[str, Any]
+    parameters: Mapping[str, Estimate]
+    alternatives: tuple[str, ...]
+    p_value: float
+    gain: float
+    explanation: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Rejected:
+    """
+    A candidate that was not accepted.
+
+    :param name: effect and place
+    :param gain: share by which it lowers the mean square error of held-out recordings, after what
+        was accepted
+    :param p_value: that they would gain as much by chance
+    :param why: in words
+    """
+
+    name: str
+    gain: float
+    p_value: float
+    why: str
+
+
+@dataclasses.dataclass(frozen=True)
+class HorizonGain:
+    """
+    Error of predictions so many steps ahead, on held-out recordings, over all channels, in units of
+    their noise.
+
+    :param steps: ahead
+    :param before: root mean square error of the twin as it came, nuisances refitted
+    :param after: of the extended one
+    :param low: lower end of the 90 % interval of the relative gain
+    :param high: upper end
+    """
+
+    steps: int
+    before: float
+    after: float
+    low: float
+    high: float
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Diagnosis:
+    """
+    Result of :func:`~sb3_hds.sysid.diagnose`. Prints itself.
+
+    :param verdict: ``"named"``, ``"ambiguous"``, ``"none"``, ``"unknown"`` or
+        ``"not_identifiable"``
+    :param findings: causes, in the order in which they were found
+    :param unexplained: what remains after them, in words; empty if nothing does
+    :param gain: by horizon in steps
+    :param explained: share of the explainable error that is explained
+    :param detectable: by effect and place, the smallest size that these data would have shown
+    :param rejected: the other candidates, with numbers
+    :param caveats: what to keep in mind, in words
+    :param twin: extended, ready to train in
+    :param data_hash: of the data
+    :param versions: of the libraries that computed this
+    :param seed: of the split and of what else was drawn
+    """
+
+    verdict: Verdict
+    findings: tuple[Finding, ...]
+    unexplained: str
+    gain: Mapping[int, HorizonGain]
+    explained: float
+    detectable: Mapping[str, Mapping[str, float]]
+    rejected: tuple[Rejected, ...]
+    caveats: tuple[str, ...]
+    twin: Twin
+    data_hash: str
+    versions: Mapping[str, str]
+    seed: int
+
+    @property
+    def params(self) -> Params:
+        """All parameters of the extended twin."""
+        return self.twin.params
+
+    def summary(self) -> str:
+        """:return: all of it in 80 columns"""
+        lines = [f"{self.verdict}: {_SENTENCE[self.verdict]}", "=" * _WIDTH]
+        for finding in self.findings:
+            lines += _of_finding(finding)
+        if self.unexplained:
+            lines += _wrapped(f"Unexplained: {self.unexplained}")
+        if self.gain:
+            lines.append("Held-out error, in units of the noise, by steps ahead:")
+            lines += [
+                f"  {g.steps:5d}: {g.before:9.3g} -> {g.after:9.3g}   "
+                f"(90 % interval of the gain {g.low:.0%} to {g.high:.0%})"
+                for g in self.gain.values()
+            ]
+        if self.rejected:
+            lines.append("Not accepted, best first:")
+            lines += [
+                f"  {r.name:<40.40} gain {r.gain:7.1%}   p {r.p_value:.2g}  {r.why}"[:_WIDTH]
+                for r in self.rejected[:5]
+            ]
+        for caveat in self.caveats:
+            lines += _wrapped(f"Caveat: {caveat}")
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """:return: the same, as plain data for JSON"""
+        found = {
+            field.name: getattr(self, field.name)
+            for field in dataclasses.fields(self)
+            if field.name != "twin"
+        }
+        return _plain(found) | {"twin": _plain(self.twin.to_spec())}
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    __repr__ = __str__
+
+
+def _of_finding(finding: Finding) -> list[str]:
+    place = finding.where["name"]
+    lines = [f"{finding.effect} at {finding.where['slot']} {place}"]
+    lines += _wrapped(finding.explanation, "  ")
+    for name, e in finding.parameters.items():
+        lines.append(f"  {name} = {e.estimate:.4g} [{e.low:.4g}, {e.high:.4g}] {e.unit}")
+    lines.append(f"  held-out gain {finding.gain:.1%}, p = {finding.p_value:.2g}")
+    if finding.alternatives:
+        lines += _wrapped(f"cannot be told from: {', '.join(finding.alternatives)}", "  ")
+    return lines
+
+
+def _wrapped(text: str, indent: str = "") -> list[str]:
+    return textwrap.wrap(text, _WIDTH, initial_indent=indent, subsequent_indent=indent + "  ")
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return _plain({f.name: getattr(value, f.name) for f in dataclasses.fields(value)})
+    if isinstance(value, Mapping):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

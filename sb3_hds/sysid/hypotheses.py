@@ -1,0 +1,202 @@
+"""What may be wrong with a twin: all candidates at once, each switched by its parameters."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from sb3_hds.core import Effect, Twin
+from sb3_hds.effects import NeuralForce
+from sb3_hds.errors import CalibrationError, EffectError
+
+#: the slot of a twin's own parameter, beside those of effects
+PARAMETER = "parameter"
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """
+    A cause that data may confirm.
+
+    :param name: of the effect; ``"parameter.mass"`` for a parameter of the twin
+    :param slot: ``"joint"``, ``"actuator"``, ``"channel"`` or ``"parameter"``
+    :param place: name of the joint, actuator or channel; of the parameter
+    :param index: of the joint, actuator or channel; of the parameter among those of the twin
+    :param parameters: full names in the extended twin
+    :param explanation: one sentence for people
+    :param equivalents: names of effects that data may not tell from this one, and when
+    """
+
+    name: str
+    slot: str
+    place: str
+    index: int
+    parameters: tuple[str, ...]
+    explanation: str
+    equivalents: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def key(self) -> str:
+        """Name and place: unique."""
+        return self.name if self.slot == PARAMETER else f"{self.name}.{self.place}"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """
+    A twin with every candidate attached, all at the value at which they change nothing.
+
+    :param believed: the twin as it came
+    :param twin: extended by all effects
+    :param candidates: what may be named
+    :param names: all parameters that may move, nuisances first
+    :param null: their values when nothing is wrong, shape ``(p,)``
+    :param scale: their typical deviations
+    :param lower: smallest admissible values
+    :param upper: largest admissible values
+    :param nuisances: indices of those that are refitted under every hypothesis
+    """
+
+    believed: Twin
+    twin: Twin
+    candidates: tuple[Candidate, ...]
+    names: tuple[str, ...]
+    null: Float[np.ndarray, " p"]
+    scale: Float[np.ndarray, " p"]
+    lower: Float[np.ndarray, " p"]
+    upper: Float[np.ndarray, " p"]
+    nuisances: tuple[int, ...]
+
+    @classmethod
+    def about(
+        cls, twin: Twin, effects: Sequence[type[Effect]], calibrate: Sequence[str]
+    ) -> "Hypotheses":
+        """
+        :param twin: as it is believed
+        :param effects: classes that are tried at every place
+        :param calibrate: parameters of the twin that are not believed, and not worth a finding
+        :raises CalibrationError: for a name in ``calibrate`` that the twin does not have
+        """
+        unknown = [name for name in calibrate if name not in twin.parameters]
+        if unknown:
+            raise CalibrationError(
+                f"calibrate names {', '.join(unknown)}, which {twin.name} does not have. "
+                f"Its parameters are: {', '.join(twin.parameters) or 'none'}."
+            )
+        own = tuple(name for name in twin.parameters if not name.endswith(".share"))
+        extended, found = _attached(twin, effects)
+        native = _native_targets(twin, found)
+        candidates = [
+            Candidate(f"parameter.{name}", PARAMETER, name, i, (name,), _OF_PARAMETER.format(name))
+            for i, name in enumerate(own)
+            if name not in calibrate and name not in native.values()
+        ]
+        candidates += [c for c in found if native.get(c.parameters[0]) not in calibrate]
+        moving = (*calibrate, *dict.fromkeys(p for c in candidates for p in c.parameters))
+        every = {name: extended.parameters[name] for name in moving}
+        values = np.array([extended.values[name] for name in moving], float)
+        lower = np.array([every[name].lower for name in moving], float)
+        for i, name in enumerate(moving):
+            if name in native:
+                # The twin has some of it already: there may be less than it believes.
+                target = native[name]
+                lower[i] = twin.parameters[target].lower - twin.values[target]
+        return cls(
+            believed=twin,
+            twin=extended,
+            candidates=tuple(candidates),
+            names=moving,
+            null=values,
+            scale=np.array([every[name].scale for name in moving], float),
+            lower=lower,
+            upper=np.array([every[name].upper for name in moving], float),
+            nuisances=tuple(range(len(calibrate))),
+        )
+
+    def indices(self, candidate: Candidate) -> tuple[int, ...]:
+        return tuple(self.names.index(name) for name in candidate.parameters)
+
+    def extended_by(self, causes: Sequence[str], theta: Float[np.ndarray, " p"]) -> Twin:
+        """
+        :param causes: names and places of candidates
+        :param theta: all parameters, shape ``(p,)``
+        :return: the twin as it came, with the nuisances refitted and these causes in it
+        """
+        value = dict(zip(self.names, map(float, theta), strict=True))
+        chosen = [c for c in self.candidates if c.key in causes]
+        own = {self.names[i]: value[self.names[i]] for i in self.nuisances}
+        native = _native_targets(self.believed, chosen)
+        for name in (name for c in chosen for name in c.parameters):
+            if name in native:
+                own[native[name]] = self.believed.values[native[name]] + value[name]
+            elif name in self.believed.parameters:
+                own[name] = value[name]
+        there = {a.key for a in _attached_of(self.believed)}
+        new = [
+            a.effect.with_values(**{n: value[f"{a.key}.{n}"] for n in a.effect.parameters})
+            for a in _attached_of(self.twin)
+            if a.key in causes
+            and a.key not in there
+            and not any(f"{a.key}.{n}" in native for n in a.effect.parameters)
+        ]
+        twin = self.believed.with_parameters(**own) if own else self.believed
+        return twin.extend(*new) if new else twin
+
+    def place_of(self, candidate: Candidate) -> dict[str, str | int]:
+        """:return: where it is, as plain data"""
+        return {"slot": candidate.slot, "index": candidate.index, "name": candidate.place}
+
+
+_OF_PARAMETER = "The twin's {} is not that of the system."
+
+
+def _attached(twin: Twin, effects: Sequence[type[Effect]]) -> tuple[Twin, list[Candidate]]:
+    """Every effect at every place where it is not already."""
+    there = {a.key for a in _attached_of(twin)}
+    wanted: list[Effect] = []
+    places = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}
+    for kind in effects:
+        if issubclass(kind, NeuralForce):
+            raise EffectError(
+                "NeuralForce is never the name of a cause. Leave it out: what remains is "
+                "reported by itself."
+            )
+        for i, place in enumerate(places[kind.slot]):
+            if f"{kind.name}.{place.name}" not in there:
+                wanted.append(kind(i))
+    extended = twin.extend(*wanted) if wanted else twin
+    candidates = []
+    for a in _attached_of(extended):
+        if isinstance(a.effect, NeuralForce):
+            continue
+        candidates.append(
+            Candidate(
+                a.effect.name,
+                a.effect.slot,
+                places[a.effect.slot][a.index].name,
+                a.index,
+                tuple(f"{a.key}.{name}" for name in a.effect.parameters),
+                a.effect.explanation,
+                tuple(a.effect.equivalents.items()),
+            )
+        )
+    return extended, candidates
+
+
+def _attached_of(twin: Twin) -> tuple:
+    while not hasattr(twin, "attached") and hasattr(twin, "base"):
+        twin = twin.base  # type: ignore[attr-defined]
+    return getattr(twin, "attached", ())
+
+
+def _native_targets(twin: Twin, candidates: Sequence[Candidate]) -> dict[str, str]:
+    """Full name of an effect's parameter -> the twin's own parameter that it adds to."""
+    plant = twin
+    while hasattr(plant, "base"):
+        plant = plant.base  # type: ignore[attr-defined]
+    return {
+        f"{c.key}.{name}": target
+        for c in candidates
+        for name, target in plant.native_effects.get((c.name, c.index), {}).items()
+    }
