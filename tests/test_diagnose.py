@@ -229,7 +229,7 @@ def test_a_level_is_kept_where_errors_differ_by_chance():
     for _ in range(1000):
         old, new = np.exp(rng.standard_normal((2, 40)))
         alarms += compare(new, old, unit).p_value < 0.05
-    # Binomial(1000, 0.05) lies within 30 and 73 in 998 of 1000 cases; the test errs to the safe side.
+    # Binomial(1000, 0.05) is above 73 once in 1000 cases.
     assert alarms <= 73
 
 

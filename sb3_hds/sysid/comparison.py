@@ -63,7 +63,7 @@ def compare(
     stderr = max(ratio.std(ddof=1) / np.sqrt(n), 1e-12)
     p_value = float(stats.t.sf(ratio.mean() / stderr, n - 1))
     half = stats.t.ppf(0.95, n - 1) * stderr
-    low, gain, high = (1.0 - np.exp(-x) for x in (-half, 0.0, half) + ratio.mean())
+    low, gain, high = 1.0 - np.exp(-ratio.mean() - np.array([-half, 0.0, half]))
     return Comparison(float(gain), p_value, float(low), float(high), n)
 
 

@@ -1,6 +1,5 @@
 """Find out what a simulation gets wrong: propose on some recordings, confirm once on others."""
 
-import dataclasses
 import hashlib
 import importlib.metadata
 from collections.abc import Sequence
@@ -11,7 +10,7 @@ from scipy import stats
 
 from sb3_hds.core import Effect, Trajectories, Twin
 from sb3_hds.effects import ALL
-from sb3_hds.errors import CalibrationError, TrajectoryError
+from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.calibrate import check_fits, spread_of
 from sb3_hds.sysid.comparison import Comparison, Split, compare, effective_size, split
 from sb3_hds.sysid.diagnosis import Diagnosis, Finding, HorizonGain, Rejected
@@ -250,7 +249,7 @@ class _Inquiry:
     def _alternatives(
         self, best: Tried, tried: Sequence[Tried], base: tuple[Point, Point]
     ) -> tuple[str, ...]:
-        """What is not significantly worse than the best, and not just the same with more freedom."""
+        """What is not significantly worse than the best, without more freedom."""
         found = []
         for other in tried:
             if other is best or len(other.candidate.parameters) > len(best.candidate.parameters):
