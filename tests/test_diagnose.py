@@ -1,6 +1,9 @@
 """What is wrong with a twin: causes are planted in another simulator, and must be found."""
 
+import html
 import json
+import shutil
+import subprocess
 
 import gymnasium
 import jax.numpy as jnp
@@ -192,6 +195,41 @@ def test_what_would_have_been_seen_is_said(rubbing):
 def test_the_same_seed_tells_the_same():
     data = on_engine(n=8, friction=0.1)
     assert asked(data).to_dict() == asked(data).to_dict()
+
+
+def test_the_report_is_one_page_that_needs_no_network(rubbing, tmp_path):
+    path = rubbing.to_html(tmp_path / "report.html")
+
+    text = path.read_text()
+    assert "coulomb friction at hinge" in text
+    assert text.count("data:image/png;base64,") == 4
+    assert "http" not in text and "<script" not in text
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+@pytest.mark.skipif(not shutil.which("chromium"), reason="chromium is not installed")
+@pytest.mark.parametrize("width", [500, 1400])
+def test_the_report_fits_a_browser(rubbing, tmp_path, width):
+    """Chromium reports the width of the laid-out page; pictures that do not load have no width."""
+    page = rubbing.to_html(tmp_path / "report.html")
+    probe = (
+        "<script>addEventListener('load', () => { document.title = JSON.stringify("
+        "[document.documentElement.scrollWidth, innerWidth, "
+        "[...document.images].every(i => i.complete && i.naturalWidth > 0)]) })</script>"
+    )
+    page.write_text(page.read_text().replace("</body>", f"{probe}</body>"))
+    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom"]
+
+    shown = subprocess.run(
+        [*command, f"--window-size={width},900", page.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+    title = html.unescape(shown.stdout.partition("<title>")[2].partition("</title>")[0])
+    laid_out, visible, loaded = json.loads(title)
+    assert laid_out <= visible and loaded
 
 
 # --- at the door

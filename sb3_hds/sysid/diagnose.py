@@ -16,7 +16,8 @@ from sb3_hds.sysid.comparison import Comparison, Split, compare, effective_size,
 from sb3_hds.sysid.diagnosis import Diagnosis, Finding, HorizonGain, Rejected
 from sb3_hds.sysid.evidence import Evidence, Point
 from sb3_hds.sysid.hypotheses import PARAMETER, Candidate, Hypotheses
-from sb3_hds.sysid.remainder import Remainder, missing_force, remainder, weighed
+from sb3_hds.sysid.pictures import Pictures, replay_of
+from sb3_hds.sysid.remainder import MissingForce, Remainder, missing_force, remainder, weighed
 from sb3_hds.sysid.results import Estimate
 from sb3_hds.sysid.shooting import Shots, shots_of
 
@@ -102,6 +103,14 @@ def diagnose(
     return inquiry.refused(reason) if reason else inquiry.run()
 
 
+class _Left(NamedTuple):
+    """What a twin leaves: what can be predicted of it, its mean square, and all of it."""
+
+    remainder: Remainder | None
+    power: float
+    missing: MissingForce
+
+
 class _Inquiry:
     """One diagnosis on its way."""
 
@@ -163,28 +172,31 @@ class _Inquiry:
             self.theta = best.point.theta
             self.free += [i for i in self.hypotheses.indices(best.candidate)]
             base = (best.point, best.kept)
-        left, power = self._left(_keys(found), base[0].theta)
-        if found and left is not None:
-            before = self._left([], start[0].theta)[1]
-            if left.power > _MOST_LEFT * max(before - power, 0.0):
+        before = left = self._left([], start[0].theta)
+        if found:
+            left = self._left(_keys(found), base[0].theta)
+            explained = max(before.power - left.power, 0.0)
+            if left.remainder is not None and left.remainder.power > _MOST_LEFT * explained:
                 found, base, self.free = [], start, list(self.hypotheses.nuisances)
-                left, _ = self._left([], start[0].theta)
+                left = before
         named = {t.candidate.key for t, *_ in found}
         rejected = [pair for pair in first if pair[0].candidate.key not in named]
-        return self._told(found, rejected, start, base, left)
+        self._set_noise(base[0])
+        pictures = self._pictures(start[1], base[1], before.missing, left.missing)
+        return self._told(found, rejected, start, base, left.remainder, pictures)
 
     def refused(self, reason: str) -> Diagnosis:
         return self._diagnosis(
             "not_identifiable", (), {}, 0.0, {}, (), (reason,), self.hypotheses.null
         )
 
-    def _left(self, causes: Sequence[str], theta: np.ndarray) -> tuple[Remainder | None, float]:
-        """:return: what the twin with these causes leaves, and the mean square of missing forces"""
+    def _left(self, causes: Sequence[str], theta: np.ndarray) -> "_Left":
+        """:return: what the twin with these causes leaves"""
         twin = self.hypotheses.extended_by(causes, theta)
         missing = missing_force(twin, self.data, self.select.noise)
         joints = tuple(joint.name for joint in twin.joints)
         power = float(np.mean(np.sum(weighed(missing) ** 2, 1)))
-        return remainder(missing, self.data, joints, self.seed), power
+        return _Left(remainder(missing, self.data, joints, self.seed), power, missing)
 
     def _settle_noise(self) -> None:
         """What is left under the best explanation, of whatever kind, is the noise."""
@@ -273,6 +285,7 @@ class _Inquiry:
         start: tuple[Point, Point],
         base: tuple[Point, Point],
         left: Remainder | None,
+        pictures: Pictures,
     ) -> Diagnosis:
         stderr = self._standard_errors(base[0])
         findings = tuple(self._finding(*one, base[0].theta, stderr) for one in found)
@@ -297,6 +310,7 @@ class _Inquiry:
             (),
             base[0].theta,
             "" if left is None else _in_words(left),
+            pictures,
         )
 
     def _finding(
@@ -389,6 +403,27 @@ class _Inquiry:
             found[ahead] = HorizonGain(ahead, rms[0], rms[1], gained.low, gained.high)
         return found
 
+    def _pictures(
+        self, before: Point, after: Point, missing: MissingForce, left: MissingForce
+    ) -> Pictures:
+        twin, unit = self.hypotheses.twin, self.unit[1]
+        rows = np.flatnonzero(unit == np.unique(unit[unit >= 0])[0])
+        measured = np.asarray(self.confirm.shots.obs)[rows]
+        errors = [
+            np.sqrt(np.mean((point.raw[unit >= 0] / self.confirm.noise) ** 2, (0, 2)))
+            for point in (before, after)
+        ]
+        return Pictures(
+            channels=tuple((c.name, c.unit) for c in twin.channels),
+            joints=tuple((j.name, "N" if j.unit == "m" else "N m") for j in twin.joints),
+            actuators=tuple((a.name, a.unit) for a in twin.actuators),
+            replay=replay_of(measured, before.raw[rows], after.raw[rows], self.data.dt),
+            steps=np.arange(measured.shape[1]),
+            errors=np.stack(errors),
+            missing=missing,
+            left=left,
+        )
+
     def _diagnosis(
         self,
         verdict: Any,
@@ -400,6 +435,7 @@ class _Inquiry:
         caveats: tuple[str, ...],
         theta: np.ndarray,
         unexplained: str = "",
+        pictures: Pictures | None = None,
     ) -> Diagnosis:
         causes = [_key(finding) for finding in findings]
         return Diagnosis(
@@ -417,6 +453,7 @@ class _Inquiry:
                 name: importlib.metadata.version(name) for name in ("sb3-hds", "jax", "numpy")
             },
             seed=self.seed,
+            pictures=pictures,
         )
 
 

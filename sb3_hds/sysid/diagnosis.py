@@ -2,17 +2,21 @@
 
 import dataclasses
 import math
+import os
 import textwrap
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 from sb3_hds.core import Params, Twin
+from sb3_hds.sysid.pictures import Pictures
 from sb3_hds.sysid.results import Estimate
 
 Verdict = Literal["named", "ambiguous", "none", "unknown", "not_identifiable"]
 
 _WIDTH = 80
-_SENTENCE = {
+#: what each verdict means
+SENTENCES = {
     "named": "The data name what is missing.",
     "ambiguous": "Something is missing, and the data cannot tell which of several causes it is.",
     "none": "The data show nothing that the simulation gets wrong.",
@@ -100,6 +104,7 @@ class Diagnosis:
     :param data_hash: of the data
     :param versions: of the libraries that computed this
     :param seed: of the split and of what else was drawn
+    :param pictures: numbers ready to draw; not part of :meth:`to_dict`
     """
 
     verdict: Verdict
@@ -114,6 +119,7 @@ class Diagnosis:
     data_hash: str
     versions: Mapping[str, str]
     seed: int
+    pictures: Pictures | None = None
 
     @property
     def params(self) -> Params:
@@ -122,7 +128,7 @@ class Diagnosis:
 
     def summary(self) -> str:
         """:return: all of it in 80 columns"""
-        lines = [f"{self.verdict}: {_SENTENCE[self.verdict]}", "=" * _WIDTH]
+        lines = [f"{self.verdict}: {SENTENCES[self.verdict]}", "=" * _WIDTH]
         for finding in self.findings:
             lines += _of_finding(finding)
         if self.unexplained:
@@ -149,9 +155,21 @@ class Diagnosis:
         found = {
             field.name: getattr(self, field.name)
             for field in dataclasses.fields(self)
-            if field.name != "twin"
+            if field.name not in ("twin", "pictures")
         }
         return _plain(found) | {"twin": _plain(self.twin.to_spec())}
+
+    def to_html(self, path: str | os.PathLike[str]) -> Path:
+        """
+        Write one self-contained page: the verdict, its evidence, pictures, caveats.
+
+        :param path: of the file; one of that name is replaced as a whole
+        :return: its path
+        :raises ImportError: without matplotlib and jinja2 (extra ``report``)
+        """
+        from sb3_hds.sysid.report import write_report
+
+        return write_report(self, path)
 
     def __str__(self) -> str:
         return self.summary()
