@@ -1,4 +1,4 @@
-"""The contract every effect keeps, at every joint of every twin, and what friction does."""
+"""The contract every effect keeps. What each of them does is in ``test_effects_*.py``."""
 
 import functools
 import json
@@ -8,59 +8,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from free_mass import Mass
 
 from sb3_hds import effects, twins
 from sb3_hds.core import (
     ActionEffect,
-    Actuator,
-    AnalyticTwin,
-    Channel,
     ForceEffect,
-    Joint,
     JointEffect,
-    JointMoment,
     Parameter,
     SensorEffect,
     State,
-    explicit_euler,
-    rk4,
     rollout,
-    semi_implicit_euler,
 )
 from sb3_hds.effects import CoulombFriction, ViscousFriction
 from sb3_hds.errors import EffectError, ParameterError
 
-
-class Mass(AnalyticTwin):
-    """A free mass on a rail, driven by a force; its own damping is a parameter."""
-
-    name = "Mass"
-    dt = 0.1
-    joints = (Joint("rail", "m"),)
-    actuators = (Actuator("push", "N", -10.0, 10.0),)
-    channels = (Channel("position", "m"), Channel("speed", "m/s"))
-    parameters = {
-        "mass": Parameter(null=1.0, scale=0.1, unit="kg", lower=0.1),
-        "damping": Parameter(null=0.0, scale=0.1, unit="N s/m", lower=0.0),
-    }
-
-    def initial(self, key, params):
-        return State(jnp.zeros(1), jax.random.normal(key, (1,)), {})
-
-    def infer(self, obs, params):
-        return State(obs[:1], obs[1:], {})
-
-    def observe(self, state, params):
-        return jnp.concatenate([state.q, state.v])
-
-    def actuate(self, state, action, params):
-        return jnp.clip(action, -10.0, 10.0)
-
-    def mass_matrix(self, q, params):
-        return params["mass"] * jnp.ones((1, 1), q.dtype)
-
-    def bias(self, q, v, params):
-        return params["damping"] * v
+pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 class DampedMass(Mass):
@@ -156,28 +119,50 @@ class Halved(SensorEffect):
         return measured
 
 
+FRICTION = (ViscousFriction, CoulombFriction)
 DOUBLES = (Lag, DrivenSpring, LateSensor, Halved)
 PLACES = {"joint": "joints", "actuator": "actuators", "channel": "channels"}
+
+# Every effect meets these: one joint with clips and one long step; one without clips and with four
+# Runge-Kutta steps; a cart-pole whose drive does not act on the hinge. Together, they also meet
+# three joints under a servo that reacts to the state.
+SYSTEMS = ("Pendulum", "PendulumReal", "InvertedPendulum")
+# These are cheap, and meet every joint and every actuator of every twin.
+EVERYWHERE = (effects.ViscousFriction, effects.TorqueGain)
+
+# Where the generic size, null + 0.7 scale, is not felt within three steps.
+SIZES = {"backlash": {"gap": 1e-4}}
+# Zero is absence and the smallest number is not (its docstring says why): no slope at null.
+JUMP_AT_NULL = {"joint_elasticity", "saturation", "sign_flip"}
+# Switches and numbers that do nothing at null for another reason: their slope is zero there.
+WITHOUT_SLOPE = {"sign_flip.flipped"}
 
 
 def places(effect, twin):
     return range(len(getattr(twin, PLACES[effect.slot])))
 
 
-CASES = [
-    pytest.param(effect, name, where, id=f"{effect.name}-{name}-{where}")
-    for known, systems in (
-        (effects.ALL, twins.names()),
-        (DOUBLES, ["Pendulum"]),
-    )
-    for name in systems
-    for effect in known
+def last_place(effect, name):
+    return places(effect, twins.make(name))[-1]
+
+
+CASES = [(effect, name, last_place(effect, name)) for effect in effects.ALL for name in SYSTEMS]
+CASES += [(effect, "Pendulum", 0) for effect in DOUBLES]
+CASES += [
+    (effect, name, where)
+    for effect in EVERYWHERE
+    for name in twins.names()
     for where in places(effect, twins.make(name))
+    if (effect, name, where) not in CASES
 ]
-every_case = pytest.mark.parametrize(("effect", "name", "where"), CASES)
+every_case = pytest.mark.parametrize(
+    ("effect", "name", "where"),
+    [pytest.param(*case, id=f"{case[0].name}-{case[1]}-{case[2]}") for case in CASES],
+)
 every_effect = pytest.mark.parametrize(
     "effect", (*effects.ALL, *DOUBLES), ids=lambda effect: effect.name
 )
+every_entry = pytest.mark.parametrize("effect", effects.ALL, ids=lambda effect: effect.name)
 
 
 def sample_actions(twin, n):
@@ -210,51 +195,125 @@ def test_a_null_effect_changes_nothing(x64, effect, name, where):
     np.testing.assert_allclose(replay(extended), replay_plain(name), rtol=1e-9, atol=1e-9)
 
 
-def outcome_of(effect, name, where):
-    """Where two steps lead, as a function of the effect's parameters; and their values."""
-    values = {name: p.null + p.scale for name, p in effect.parameters.items()}
-    twin = twins.make(name).extend(effect(where, **values))
-    state = twin.initial(jax.random.key(0), twin.params)
-    # Slower than any twin's limit, so that no clip hides the effect, and away from standstill.
-    state = state._replace(v=jnp.full_like(state.v, 0.03))
-    actions = sample_actions(twin, 2)
-    keys = [key for key in twin.params if key.startswith(effect.name)]
+def sizes(effect, share=0.7):
+    """Values off null, and off the grids of samples and sub-steps, where delays have a kink."""
+    generic = {name: p.null + share * p.scale for name, p in effect.parameters.items()}
+    return generic | SIZES.get(effect.name, {})
+
+
+def outcome_of(twin):
+    """
+    Where a few steps lead, as a function of the parameters of all effects; and their values. Joints
+    move both ways, and so do commands.
+    """
+    start = twin.initial(jax.random.key(0), twin.params)
+    some = sample_actions(twin, 3)
+    actions = jnp.stack([some, some.sum(0) - some])
+    keys = [key for key in twin.params if key not in twin.base.params]
 
     def outcome(own):
         params = twin.params | dict(zip(keys, own, strict=True))
-        result = rollout(twin, params, state, actions)
-        return jnp.concatenate([result.states.v[-1], result.obs[-1]])
 
-    return outcome, jnp.array([twin.params[key] for key in keys])
+        def final(speed, actions):
+            # Slower than any twin's limit, so that no clip hides the effect, and not at standstill.
+            state = start._replace(v=jnp.full_like(start.v, speed))
+            result = rollout(twin, params, state, actions)
+            return jnp.concatenate([result.states.v[-1], result.obs[-1]])
+
+        return jax.vmap(final)(jnp.array([0.03, -0.03]), actions).ravel()
+
+    return outcome, np.array([twin.params[key] for key in keys])
+
+
+def assert_gradient_is_that_of_finite_differences(outcome, at):
+    """:return: the slopes, one row for each parameter"""
+
+    along = jax.jit(lambda point, direction: jax.jvp(outcome, (point,), (direction,)))
+    slopes = []
+    for direction in np.eye(len(at)):
+        # Small in units of the parameter: a gap is 1e-4 rad here.
+        step = 1e-5 * min(1.0, abs(float(at @ direction)) or 1.0)
+        ahead, behind = (along(at + way * step * direction, direction)[0] for way in (1, -1))
+        slopes.append(np.asarray(along(at, direction)[1]))
+        # Central differences: rounding of 1e-13 / step, and a third derivative times step^2.
+        difference = np.subtract(ahead, behind) / (2.0 * step)
+        np.testing.assert_allclose(slopes[-1], difference, rtol=1e-5, atol=1e-13 / step)
+    return slopes
 
 
 @every_case
 def test_the_gradient_by_a_parameter_is_that_of_finite_differences(x64, effect, name, where):
-    outcome, at = outcome_of(effect, name, where)
+    twin = twins.make(name).extend(effect(where, **sizes(effect)))
+
+    slopes = assert_gradient_is_that_of_finite_differences(*outcome_of(twin))
+
+    for parameter, slope in zip(effect.parameters, slopes, strict=True):
+        assert np.any(slope != 0.0) == (f"{effect.name}.{parameter}" not in WITHOUT_SLOPE)
+
+
+def test_the_gradient_is_right_where_all_effects_act_at_once(x64):
+    # No limit, which would hide how commands came about, and no flip, which has no slope.
+    chosen = [e for e in effects.ALL if e.name not in ("saturation", "sign_flip")]
+    twin = twins.make("PayloadPendulum").extend(*(e(0, **sizes(e)) for e in chosen))
+
+    assert_gradient_is_that_of_finite_differences(*outcome_of(twin))
+
+
+@every_entry
+def test_the_gradient_at_null_is_that_of_the_smallest_size(x64, effect):
+    """Searches begin there. Where null is a bound, it is the slope to the side that is left."""
+    outcome, at = outcome_of(twins.make("Pendulum").extend(effect(0)))
+    outcome = jax.jit(outcome)
+    here, slopes = outcome(at), jax.jit(jax.jacfwd(outcome))(at)
+
+    if effect.name in JUMP_AT_NULL:
+        np.testing.assert_array_equal(slopes, 0.0)
+        return
+    for slope, direction in zip(slopes.T, 1e-7 * np.eye(len(at)), strict=True):
+        # One-sided: rounding of 1e-15 / 1e-7, and a second derivative times 1e-7.
+        np.testing.assert_allclose(slope, (outcome(at + direction) - here) / 1e-7, 1e-4, 1e-5)
+    assert jnp.any(slopes != 0.0)
+
+
+def slopes_of(*kinds):
+    """
+    Slopes of a few steps by all that they depend on, in forward and in reverse mode: with these
+    effects at null and not, at rest without a command and in motion.
+    """
+    twin = twins.make("Pendulum").extend(*(kind(0) for kind in kinds))
+    keys = [key for key in twin.params if key not in twin.base.params]
+
+    def outcome(own, q, v, command):
+        params = twin.params | dict(zip(keys, own, strict=True))
+        start = twin.infer(jnp.stack([jnp.cos(q), jnp.sin(q), v]), params)
+        return rollout(twin, params, start, jnp.full((3, 1), command)).obs[-1]
 
     @jax.jit
-    def along(own, direction):
-        return jax.jvp(outcome, (own,), (direction,))
+    @jax.vmap
+    def slopes(*given):
+        return [mode(outcome, (0, 1, 2, 3))(*given) for mode in (jax.jacfwd, jax.jacrev)]
 
-    for direction in jnp.eye(len(at)):
-        ahead, behind = (
-            along(at + 1e-5 * direction, direction),
-            along(at - 1e-5 * direction, direction),
-        )
-        _, slope = along(at, direction)
-        # Central differences: rounding of 1e-16 / 1e-5, and a third derivative times 1e-10.
-        np.testing.assert_allclose(slope, (ahead[0] - behind[0]) / 2e-5, rtol=1e-5, atol=1e-8)
-        assert jnp.any(slope != 0.0)
+    null = [twin.values[key] for key in keys]
+    some = [value for kind in kinds for value in sizes(kind).values()]
+    at_rest, moving = (0.0, 0.0, 0.0), (2.0, 1.0, -0.5)
+    state = jnp.array([at_rest, moving, at_rest, moving]).T
+    return slopes(jnp.array([null, null, some, some]), *state)
 
 
 @every_effect
 def test_reverse_mode_agrees_with_forward_mode(x64, effect):
-    outcome, at = outcome_of(effect, "Pendulum", 0)
+    forward, reverse = slopes_of(effect)
 
     # The same derivative, summed in another order.
-    np.testing.assert_allclose(
-        jax.jit(jax.jacrev(outcome))(at), jax.jit(jax.jacfwd(outcome))(at), rtol=1e-10, atol=1e-14
-    )
+    for one, other in zip(forward, reverse, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11)
+        assert jnp.isfinite(one).all()
+
+
+def test_derivatives_are_finite_in_single_precision():
+    for slope in jax.tree.leaves(slopes_of(*effects.ALL)):
+        assert slope.dtype == jnp.float32
+        assert jnp.isfinite(slope).all()
 
 
 @every_effect
@@ -285,8 +344,18 @@ def test_a_catalogue_entry_states_its_equation_and_where_it_comes_from():
         assert ".. math::" in effect.__doc__ and "Source:" in effect.__doc__
     names = [effect.name for effect in effects.ALL]
     assert len(set(names)) == len(names)
-    known = set(names)
-    assert all(set(effect.equivalents) <= known for effect in effects.ALL)
+
+
+def test_what_cannot_be_told_apart_is_known_and_says_so_on_both_sides():
+    declared = {effect.name: effect.equivalents for effect in effects.ALL}
+    parameters = {
+        f"parameter.{name}" for twin in twins.names() for name in twins.get(twin).parameters
+    }
+    for name, others in declared.items():
+        assert set(others) <= set(declared) | parameters
+        for other, condition in others.items():
+            assert condition[0].islower() and not condition.endswith(".")
+            assert other in parameters or name in declared[other]
 
 
 @every_effect
@@ -325,140 +394,49 @@ def test_attaching_an_effect_twice_is_an_error(effect):
             attach()
 
 
-# --- what friction does
-
-FRICTION = (ViscousFriction, CoulombFriction)
-every_friction = pytest.mark.parametrize("effect", FRICTION, ids=lambda effect: effect.name)
-every_integrator = pytest.mark.parametrize(
-    "integrator", [explicit_euler, semi_implicit_euler, rk4], ids=lambda i: i.__name__
-)
-
-
-@every_friction
-def test_friction_never_adds_energy(x64, effect):
-    rng = np.random.default_rng(0)
-    v = jnp.asarray(rng.choice([-1.0, 0.0, 1.0], 1000) * np.exp(rng.uniform(-6, 6, 1000)))
-    inertia, h, size = jnp.asarray(np.exp(rng.uniform(-6, 6, (3, 1000))))
-    (name,) = effect.parameters
-
-    def power(v, inertia, h, size):
-        joint = JointMoment(*map(jnp.asarray, (0.0, v, 0.0, 0.0, inertia)), h)
-        return effect(0).torque(joint, (), {name: size}) * v
-
-    powers = jax.vmap(power)(v, inertia, h, size)
-
-    assert powers.max() <= 0.0 and powers.min() < 0.0
-
-
-def coast(effect, integrator, h, v, steps=1, mass=0.5):
-    """
-    Speed of a free mass after each step under friction alone.
-
-    :param effect: with its value
-    :param v: initial speeds
-    :return: shape ``(len(v), steps + 1)``
-    """
-
-    class Coasting(Mass):
-        pass
-
-    Coasting.integrator = staticmethod(integrator)
-    twin = Coasting(dt=h, mass=mass).extend(effect)
-    (size,) = effect.parameters
-
-    def speeds(v, size_value):
-        params = twin.params | {f"{effect.name}.rail.{size}": size_value}
-        start = twin.infer(jnp.stack([jnp.zeros(()), v]), params)
-        return rollout(twin, params, start, jnp.zeros((steps, 1))).states.v[:, 0]
-
-    v = jnp.asarray(v)
-    return np.asarray(jax.jit(jax.vmap(speeds))(v, jnp.full(v.shape, effect.values[size])))
-
-
-@every_integrator
-@every_friction
-@pytest.mark.parametrize("h", [1e-3, 0.1, 10.0])
-def test_friction_alone_brings_to_rest_without_overshoot_at_any_step(x64, effect, integrator, h):
-    (name,) = effect.parameters
-    v = jnp.array([-3.0, 0.02, 1e-3])
-
-    for size in (0.01, 1.0, 100.0):
-        speeds = coast(effect(0, **{name: size}), integrator, h, v, steps=30)
-        # Rounding may leave 1e-16 of the other sign where a sub-step stops exactly.
-        assert np.all(speeds * np.sign(v)[:, None] >= -1e-14)
-        assert np.all(np.diff(np.abs(speeds), axis=1) <= 1e-14)
-
-
-def test_viscous_friction_decays_exponentially(x64):
-    speeds = coast(ViscousFriction(b=0.4), rk4, 0.01, [2.0], steps=100)[0]
-
-    exact = 2.0 * np.exp(-0.4 * 0.01 * np.arange(101) / 0.5)
-    np.testing.assert_allclose(speeds, exact, rtol=1e-10)  # RK4: (b h / m)^5 / 120 per step
-
-
-def test_viscous_friction_is_linear_up_to_what_a_sub_step_can_stop(x64):
-    # One sub-step takes b h / m of the speed: the plain equation until that is all of it.
-    for b, left in ((0.5, 0.9), (2.5, 0.5), (5.0, 0.0), (50.0, 0.0)):
-        after = coast(ViscousFriction(b=b), semi_implicit_euler, 0.1, [2.0])[0, -1]
-        assert after == pytest.approx(2.0 * left, abs=1e-14)
-
-
-def test_dry_friction_decelerates_evenly_and_then_stops(x64):
-    # tau_c / m = 0.4 m/s2: from 2 m/s standstill after 5 s.
-    speeds = coast(CoulombFriction(tau_c=0.2), semi_implicit_euler, 0.01, [2.0], steps=700)[0]
-
-    time = 0.01 * np.arange(701)
-    sliding = 2.0 - 0.4 * time > 0.1  # ten times the width over which the sign is smoothed
-    np.testing.assert_allclose(speeds[sliding], (2.0 - 0.4 * time)[sliding], rtol=1e-6)
-    # At standstill the smoothed law leaves exp(-0.4 / 0.01 * t): nothing after two more seconds.
-    assert abs(speeds[-1]) < 1e-9
-
-
-def test_dry_friction_creeps_under_a_load_as_its_docstring_says(x64):
-    twin = Mass(dt=0.01).extend(CoulombFriction(tau_c=2.0))
-    load, width = 1.0, max(0.01, 2.0 * 0.01 / 1.0)
-    start = twin.infer(jnp.zeros(2), twin.params)
-
-    result = rollout(twin, twin.params, start, jnp.full((200, 1), load))
-
-    assert float(result.states.v[-1, 0]) == pytest.approx(width * np.arctanh(load / 2.0), rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (
-            lambda: ViscousFriction(b=-0.1),
-            "Parameter 'viscous_friction.b' must be finite and within [0.0, inf] N m s/rad, "
-            "got -0.1.",
-        ),
-        (
-            lambda: CoulombFriction(tau_c=-0.1),
-            "Parameter 'coulomb_friction.tau_c' must be finite and within [0.0, inf] N m, "
-            "got -0.1.",
-        ),
-    ],
-)
-def test_negative_friction_is_refused(make, message):
-    with pytest.raises(ParameterError, match=f"^{re.escape(message)}$"):
-        make()
-
-
 # --- composition
 
 
-def test_units_follow_the_joint():
+def test_units_follow_the_place():
     twin = twins.make("InvertedPendulum").extend(
-        *(effect(where) for effect in FRICTION for where in ("slider", "hinge"))
+        *(effect(where) for effect in FRICTION for where in ("slider", "hinge")),
+        effects.DeadZone("motor"),
+        effects.SensorBias("rate"),
     )
 
-    units = {key: p.unit for key, p in twin.parameters.items() if "friction" in key}
-    assert units == {
+    own = {key: p.unit for key, p in twin.parameters.items() if key not in twin.base.parameters}
+    assert own == {
         "viscous_friction.slider.b": "N s/m",
         "viscous_friction.hinge.b": "N m s/rad",
         "coulomb_friction.slider.tau_c": "N",
         "coulomb_friction.hinge.tau_c": "N m",
+        "dead_zone.motor.width": "1",
+        "sensor_bias.rate.bias": "rad/s",
     }
+    # A tenth of the largest command, which is 3.
+    assert twin.parameters["dead_zone.motor.width"].scale == pytest.approx(0.3)
+
+
+def test_at_a_slider_no_unit_is_that_of_a_hinge():
+    sliding = [effect for effect in effects.ALL if effect.slot == "joint"]
+    twin = Mass().extend(*(effect(0) for effect in sliding))
+
+    units = {key: parameter.unit for key, parameter in twin.parameters.items()}
+    assert not [key for key, unit in units.items() if "rad" in unit or "N m" in unit]
+
+
+@pytest.mark.parametrize("name", ["PendulumReal", "PayloadPendulum"])
+def test_the_whole_catalogue_at_null_changes_nothing(x64, name):
+    """Neither what happens, nor what is reported of a state that was moved without its memory."""
+    plain = twins.make(name)
+    everything = plain.extend(*(effect(0) for effect in effects.ALL))
+    np.testing.assert_allclose(replay(everything), replay_plain(name), rtol=1e-9, atol=1e-9)
+
+    start = everything.initial(jax.random.key(0), everything.params)
+    elsewhere = start._replace(q=start.q + 0.1)
+    np.testing.assert_array_equal(
+        everything.observe(elsewhere, everything.params), plain.observe(elsewhere, plain.params)
+    )
 
 
 def test_forces_of_several_effects_add_up(x64):

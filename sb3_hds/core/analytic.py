@@ -59,7 +59,8 @@ class AnalyticTwin(Twin):
                     q, v, actuator, self.bias(q, v, params), self.mass_matrix(q, params), h
                 )
 
-            held = effects.force(moment(state.q, state.v), memory, held=True)
+            start = moment(state.q, state.v)
+            held = effects.force(start, memory, held=True)
 
             def acceleration(q: Position, v: Velocity) -> Velocity:
                 now = moment(q, v)
@@ -69,7 +70,7 @@ class AnalyticTwin(Twin):
             q, v = self.integrator(acceleration, state.q, state.v, h, self.limit_velocity)
             q, v = self.limit(q, v)
             # With the new velocity: an elastic memory then keeps energy, as the twin itself does.
-            return State(q, v, effects.advance(moment(q, v), memory)), None
+            return State(q, v, effects.advance(start, moment(q, v), memory)), None
 
         if self.substeps == 1:
             return substep(state, None)[0]

@@ -91,13 +91,15 @@ class Effect(abc.ABC):
     name: ClassVar[str]
     #: ``"joint"``, ``"actuator"`` or ``"channel"``
     slot: ClassVar[str]
-    #: units are those of a rotary joint
+    #: units are those of a rotary joint; ``"command unit"`` and ``"channel unit"`` become those of
+    #: the place, and a scale in command units is a share of the largest command
     parameters: ClassVar[Mapping[str, Parameter]]
     #: one sentence for people
     explanation: ClassVar[str]
     #: where the equation comes from
     source: ClassVar[str]
-    #: names of effects that data cannot tell from this one -> the condition under which they cannot
+    #: names of causes that data cannot tell from this one -> the condition under which they cannot;
+    #: a cause is an effect, or a parameter of the twin: ``"parameter.mass"``
     equivalents: ClassVar[Mapping[str, str]] = {}
     #: learned arrays by name, pytrees that travel with the parameters; most effects have none
     tensors: Mapping[str, Any] = MappingProxyType({})
@@ -174,7 +176,7 @@ class ForceEffect(Effect):
 
     slot: ClassVar[str] = "joint"
     #: whether it is evaluated once, at the start of each sub-step, and not at every stage of the
-    #: integrator
+    #: integrator; its memory then advances from the same moment, so that force and memory agree
     held: ClassVar[bool] = False
 
     def memory(self, twin: "Twin") -> Memory:
@@ -192,7 +194,10 @@ class ForceEffect(Effect):
         """
 
     def advance(self, moment: Moment, index: int, memory: Memory, params: Params) -> Memory:
-        """:return: the memory after one sub-step that ends at ``moment``"""
+        """
+        :param moment: the end of a sub-step; its start if the effect is held
+        :return: the memory after that sub-step
+        """
         return memory
 
 
@@ -234,7 +239,8 @@ class SensorEffect(Effect):
     """
     Changes one measurement on its way out of the plant, once per control interval.
 
-    Of several at one channel, each measures what the one before it reports.
+    Of several at one channel, each measures what the one before it reports. What is reported may
+    lie beyond the limits that the channel declares.
     """
 
     slot: ClassVar[str] = "channel"
@@ -322,9 +328,10 @@ class EffectChain:
                 total = total + effect.force(moment, attached.index, memory[attached.key], params)
         return total
 
-    def advance(self, moment: Moment, memory: dict[str, Memory]) -> dict[str, Memory]:
-        """:return: the memory of the force effects after a sub-step that ends at ``moment``"""
+    def advance(self, start: Moment, end: Moment, memory: dict[str, Memory]) -> dict[str, Memory]:
+        """:return: the memory of the force effects after the sub-step from ``start`` to ``end``"""
         for attached, effect, params in self._forces:
+            moment = start if effect.held else end
             after = effect.advance(moment, attached.index, memory[attached.key], params)
             memory = memory | {attached.key: after}
         return memory

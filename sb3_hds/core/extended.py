@@ -1,5 +1,7 @@
 """A twin with effects attached is again a twin."""
 
+import dataclasses
+import math
 from collections import Counter
 from typing import Any
 
@@ -189,6 +191,15 @@ def _attach(effect: Effect, twin: Twin) -> Attached:
 
 
 def _in_units_of(parameter: Parameter, twin: Twin, attached: Attached) -> Parameter:
-    """Effects state the units of a rotary joint."""
-    sliding = attached.effect.slot == "joint" and twin.joints[attached.index].unit == "m"
-    return parameter.prismatic() if sliding else parameter
+    """Effects state the units of a rotary joint, and those of commands and channels by name."""
+    slot, index = attached.effect.slot, attached.index
+    if slot == "joint" and twin.joints[index].unit == "m":
+        return parameter.prismatic()
+    if parameter.unit == "channel unit":
+        return dataclasses.replace(parameter, unit=twin.channels[index].unit)
+    if parameter.unit == "command unit":
+        actuator = twin.actuators[index]
+        largest = max(abs(actuator.low), abs(actuator.high))
+        scale = parameter.scale * (largest if 0.0 < largest < math.inf else 1.0)
+        return dataclasses.replace(parameter, unit=actuator.unit, scale=scale)
+    return parameter

@@ -1,17 +1,60 @@
 """The catalogue of effects: a class listed in ``ALL`` is tested, offered and documented."""
 
 from sb3_hds.core import Effect
-from sb3_hds.effects.actuator import ActionDelay, MotorLag, TorqueGain
-from sb3_hds.effects.joint import CoulombFriction, QuadraticDrag, ViscousFriction
+from sb3_hds.effects.actuator import (
+    ActionDelay,
+    DeadZone,
+    DirectionalGain,
+    MotorLag,
+    Saturation,
+    TorqueGain,
+)
+from sb3_hds.effects.joint import (
+    CoulombFriction,
+    DirectionalCoulombFriction,
+    DirectionalViscousFriction,
+    LoadDependentFriction,
+    QuadraticDrag,
+    StribeckFriction,
+    ViscousFriction,
+)
 from sb3_hds.effects.neural import NeuralForce, force_of
+from sb3_hds.effects.position import Cogging, ConstantForce, CubicStiffness, Stiffness
+from sb3_hds.effects.sensor import (
+    SensorBias,
+    SensorDelay,
+    SensorScale,
+    SignFlip,
+    reversed_joint,
+)
+from sb3_hds.effects.transmission import Backlash, JointElasticity
 
+# In the order in which a signal meets them: a bus, then the drive, then its motor; a sensor, then
+# its bus.
 ALL: tuple[type[Effect], ...] = (
     ViscousFriction,
+    DirectionalViscousFriction,
     CoulombFriction,
+    DirectionalCoulombFriction,
+    StribeckFriction,
+    LoadDependentFriction,
     QuadraticDrag,
-    TorqueGain,
-    MotorLag,
+    Stiffness,
+    CubicStiffness,
+    Cogging,
+    ConstantForce,
+    JointElasticity,
+    Backlash,
     ActionDelay,
+    DeadZone,
+    TorqueGain,
+    DirectionalGain,
+    Saturation,
+    MotorLag,
+    SignFlip,
+    SensorScale,
+    SensorBias,
+    SensorDelay,
 )
 
 #: Everything that a saved twin may have attached: the catalogue, and the learned residual, which is
@@ -22,11 +65,29 @@ __all__ = [
     "ALL",
     "KNOWN",
     "ActionDelay",
+    "Backlash",
+    "Cogging",
+    "ConstantForce",
     "CoulombFriction",
+    "CubicStiffness",
+    "DeadZone",
+    "DirectionalCoulombFriction",
+    "DirectionalGain",
+    "DirectionalViscousFriction",
+    "JointElasticity",
+    "LoadDependentFriction",
     "MotorLag",
     "NeuralForce",
     "QuadraticDrag",
+    "Saturation",
+    "SensorBias",
+    "SensorDelay",
+    "SensorScale",
+    "SignFlip",
+    "Stiffness",
+    "StribeckFriction",
     "TorqueGain",
     "ViscousFriction",
     "force_of",
+    "reversed_joint",
 ]

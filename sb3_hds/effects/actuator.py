@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import jax.numpy as jnp
 
 from sb3_hds.core import ActionEffect, Memory, Parameter, Params, Scalar
+from sb3_hds.effects.shapes import beyond
 
 if TYPE_CHECKING:
     from sb3_hds.core import Twin
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 _AT_REST = 0.0
 # Longest delay that can be simulated [s].
 _LONGEST_DELAY = 0.2
-# Time constants below this share of a sub-step act at once.
+# Time constants below this share of a sub-step leave nothing of the past: exp(-1000) is zero.
 _INSTANT = 1e-3
 
 
@@ -32,6 +33,10 @@ class TorqueGain(ActionEffect):
     parameters = {"gain": Parameter(null=1.0, scale=0.1, unit="1", lower=0.0, upper=10.0)}
     explanation = "The drive is stronger or weaker than the model says, in proportion."
     source = "Armstrong-Hélouvry et al. 1994"
+    equivalents = {
+        "directional_gain": "while commands keep their sign",
+        "parameter.mass": "where the mass scales inertia and weight alike: a gain is one over it",
+    }
 
     def act(
         self, command: Scalar, memory: Memory, h: float, params: Params
@@ -46,7 +51,7 @@ class MotorLag(ActionEffect):
     .. math:: T\,\dot u' = u - u'
 
     What reaches the plant during a sub-step is the mean of :math:`u'` over it. At the start of an
-    episode the drive is at rest.
+    episode the drive is at rest. At :math:`T = 0` the derivative is that of a growing :math:`T`.
 
     Source: Åström and Murray, *Feedback Systems*, Princeton University Press 2021, section 3.
     """
@@ -55,6 +60,7 @@ class MotorLag(ActionEffect):
     parameters = {"time_constant": Parameter(null=0.0, scale=0.02, unit="s", lower=0.0, upper=2.0)}
     explanation = "The drive takes time to reach what it is told, as a motor with inductance does."
     source = "Åström and Murray 2021, section 3"
+    equivalents = {"action_delay": "where commands change slowly compared with either"}
 
     def memory(self, twin: "Twin") -> Memory:
         return jnp.asarray(_AT_REST)
@@ -62,12 +68,11 @@ class MotorLag(ActionEffect):
     def act(
         self, command: Scalar, memory: Memory, h: float, params: Params
     ) -> tuple[Scalar, Memory]:
-        ratio = h / jnp.maximum(params["time_constant"], _INSTANT * h)
-        kept = jnp.exp(-ratio)
+        time_constant = params["time_constant"]
+        kept = jnp.exp(-h / jnp.maximum(time_constant, _INSTANT * h))
         after = command + (memory - command) * kept
-        mean = command + (memory - command) * (1.0 - kept) / ratio
-        at_once = params["time_constant"] <= 0.0
-        return jnp.where(at_once, command, mean), jnp.where(at_once, command, after)
+        mean = command + (memory - command) * (1.0 - kept) * time_constant / h
+        return mean, after
 
 
 class ActionDelay(ActionEffect):
@@ -79,6 +84,8 @@ class ActionDelay(ActionEffect):
     Commands are held over a control interval, and what reaches the plant during a sub-step is their
     mean over it, so the delay need not be a multiple of either. Attach it before effects that
     change a command within the interval. Before the first command of an episode, zero arrives.
+    Where the delay is a multiple of the sub-step, zero included, the derivative is that of a
+    growing delay.
 
     Source: Åström and Murray, *Feedback Systems*, Princeton University Press 2021, section 10.
     """
@@ -89,6 +96,10 @@ class ActionDelay(ActionEffect):
     }
     explanation = "Commands reach the drive late, as over a bus or a radio link."
     source = "Åström and Murray 2021, section 10"
+    equivalents = {
+        "motor_lag": "where commands change slowly compared with either",
+        "sensor_delay": "where every channel is as late and nothing is fed back",
+    }
 
     def memory(self, twin: "Twin") -> Memory:
         """The commands of the last control intervals, the latest first, and a clock."""
@@ -112,7 +123,92 @@ class ActionDelay(ActionEffect):
         begin = elapsed - params["delay"]
         held_from = -interval * jnp.arange(commands.shape[0])
         held_to = jnp.where(jnp.arange(commands.shape[0]) == 0, jnp.inf, held_from + interval)
-        overlap = jnp.minimum(begin + h, held_to) - jnp.maximum(begin, held_from)
-        shares = jnp.maximum(overlap, 0.0) / h
+        # Not minimum and maximum: where both are equal, those take half of the derivative.
+        until = jnp.where(begin + h <= held_to, begin + h, held_to)
+        since = jnp.where(begin > held_from, begin, held_from)
+        arrives = (begin + h > held_from) & (begin <= held_to)
+        shares = jnp.where(arrives, until - since, 0.0) / h
         arrived = jnp.sum(shares * commands)
         return arrived, {"commands": commands, "elapsed": elapsed + h, "interval": interval}
+
+
+class DirectionalGain(ActionEffect):
+    r"""
+    The drive does more, or less, than it is told, one way more than the other.
+
+    .. math:: u' = \begin{cases} k_+ u & u > 0 \\ k_- u & u \le 0 \end{cases}
+
+    A command of one sign says nothing about the other: there the derivative is zero. At
+    :math:`u = 0`, the derivative with respect to the command is :math:`k_-`.
+
+    Source: Armstrong-Hélouvry, Dupont and Canudas de Wit, *A survey of models, analysis tools and
+    compensation methods for the control of machines with friction*, Automatica 30(7), 1994.
+    """
+
+    name = "directional_gain"
+    parameters = {
+        "gain_pos": Parameter(null=1.0, scale=0.1, unit="1", lower=0.0, upper=10.0),
+        "gain_neg": Parameter(null=1.0, scale=0.1, unit="1", lower=0.0, upper=10.0),
+    }
+    explanation = "The drive is stronger one way than the other."
+    source = "Armstrong-Hélouvry et al. 1994"
+    equivalents = {"torque_gain": "while commands keep their sign"}
+
+    def act(
+        self, command: Scalar, memory: Memory, h: float, params: Params
+    ) -> tuple[Scalar, Memory]:
+        gain = jnp.where(command > 0.0, params["gain_pos"], params["gain_neg"])
+        return gain * command, memory
+
+
+class DeadZone(ActionEffect):
+    r"""
+    Small commands do nothing, and larger ones lose as much.
+
+    .. math:: u' = \max(u - w / 2, 0) + \min(u + w / 2, 0)
+
+    The width :math:`w` is that of the whole zone, from :math:`-w / 2` to :math:`w / 2`. Inside, the
+    derivative is zero, so planning cannot feel its way out.
+
+    Source: Slotine and Li, *Applied Nonlinear Control*, Prentice Hall 1991, section 5.2.
+    """
+
+    name = "dead_zone"
+    parameters = {"width": Parameter(null=0.0, scale=0.1, unit="command unit", lower=0.0)}
+    explanation = "Small commands do not move the drive, and larger ones lose as much."
+    source = "Slotine and Li 1991, section 5.2"
+    equivalents = {"coulomb_friction": "while the joint moves the way it is driven"}
+
+    def act(
+        self, command: Scalar, memory: Memory, h: float, params: Params
+    ) -> tuple[Scalar, Memory]:
+        return beyond(command, 0.5 * params["width"]), memory
+
+
+class Saturation(ActionEffect):
+    r"""
+    The drive does no more than it can.
+
+    .. math:: u' = \min(\max(u, -l), l)
+
+    :math:`l = 0` stands for no limit: as with every effect, zero is absence. True absence is
+    :math:`l \to \infty`, where no command reaches the limit and nothing has a derivative; so the
+    effect jumps at zero, where there is no derivative either, and a search has to begin at a limit
+    that commands reach. By :math:`l`, the derivative is the sign of a command beyond it, and zero
+    for one within.
+
+    Source: Slotine and Li, *Applied Nonlinear Control*, Prentice Hall 1991, section 5.2.
+    """
+
+    name = "saturation"
+    parameters = {"limit": Parameter(null=0.0, scale=0.2, unit="command unit", lower=0.0)}
+    explanation = (
+        "The drive does not reach the largest commands, because of its current or voltage."
+    )
+    source = "Slotine and Li 1991, section 5.2"
+
+    def act(
+        self, command: Scalar, memory: Memory, h: float, params: Params
+    ) -> tuple[Scalar, Memory]:
+        limited = command - beyond(command, params["limit"])
+        return jnp.where(params["limit"] > 0.0, limited, command), memory

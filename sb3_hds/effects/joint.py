@@ -1,11 +1,12 @@
-"""Forces at a joint."""
+"""Friction and drag at a joint."""
 
 import jax.numpy as jnp
 
 from sb3_hds.core import JointEffect, JointMoment, Memory, Parameter, Params, Scalar
+from sb3_hds.effects.shapes import dry_friction
 
-# Speed below which dry friction is smoothed [rad/s] or [m/s]: true friction jumps at standstill.
-_STANDSTILL = 0.01
+# Smallest speed at which friction can be said to fall [rad/s] or [m/s]: there it is smoothed.
+_SLOWEST = 0.01
 
 
 class ViscousFriction(JointEffect):
@@ -28,9 +29,41 @@ class ViscousFriction(JointEffect):
         "The joint resists motion in proportion to its speed, as a lubricated bearing does."
     )
     source = "Olsson et al. 1998, section 2"
+    equivalents = {"directional_viscous_friction": "while the joint moves in one direction"}
 
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
         return -jnp.minimum(params["b"], joint.inertia / joint.h) * joint.v
+
+
+class DirectionalViscousFriction(JointEffect):
+    r"""
+    Friction that grows with speed, in one direction more than in the other.
+
+    .. math::
+        \tau = -\min(b,\; I / h)\,v, \qquad
+        b = \begin{cases} b_+ & v > 0 \\ b_- & v \le 0 \end{cases}
+
+    The bound is the same as that of :class:`ViscousFriction`. A motion in one direction says
+    nothing about the other: there the derivative is zero.
+
+    Source: Olsson et al., *Friction models and friction compensation*, European Journal of Control
+    4(3), 1998, section 2 (curves of friction over speed need not be symmetrical).
+    """
+
+    name = "directional_viscous_friction"
+    parameters = {
+        "b_pos": Parameter(null=0.0, scale=0.05, unit="N m s/rad", lower=0.0),
+        "b_neg": Parameter(null=0.0, scale=0.05, unit="N m s/rad", lower=0.0),
+    }
+    explanation = (
+        "The joint resists motion in proportion to its speed, one way more than the other."
+    )
+    source = "Olsson et al. 1998, section 2"
+    equivalents = {"viscous_friction": "while the joint moves in one direction"}
+
+    def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
+        b = jnp.where(joint.v > 0.0, params["b_pos"], params["b_neg"])
+        return -jnp.minimum(b, joint.inertia / joint.h) * joint.v
 
 
 class CoulombFriction(JointEffect):
@@ -55,10 +88,112 @@ class CoulombFriction(JointEffect):
         "The joint resists motion with a force that does not depend on speed, as dry surfaces do."
     )
     source = "Olsson et al. 1998, section 2"
+    equivalents = {
+        "directional_coulomb_friction": "while the joint moves in one direction",
+        "stribeck_friction": "while the joint moves several times faster than v_s",
+        "load_dependent_friction": "where the joint transmits the same force all the time",
+        "constant_force": "while the joint moves in one direction",
+        "dead_zone": "while the joint moves the way it is driven",
+    }
 
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
-        width = jnp.maximum(_STANDSTILL, params["tau_c"] * joint.h / joint.inertia)
-        return -params["tau_c"] * jnp.tanh(joint.v / width)
+        return dry_friction(joint, params["tau_c"])
+
+
+class DirectionalCoulombFriction(JointEffect):
+    r"""
+    Dry friction that is stronger in one direction than in the other.
+
+    .. math::
+        \tau = -\tau \tanh(v / w), \qquad
+        \tau = \begin{cases} \tau_+ & v > 0 \\ \tau_- & v \le 0 \end{cases}
+
+    It is smoothed over :math:`w` as :class:`CoulombFriction` is, at the same cost. While the joint
+    moves, it is Coulomb friction of :math:`(\tau_+ + \tau_-) / 2` and a constant force of
+    :math:`(\tau_- - \tau_+) / 2`; at standstill the constant force would go on pushing, and this
+    does not.
+
+    Source: Janot, Gautier and Brunot, *Data set and reference models of EMPS*, Workshop on
+    Nonlinear System Identification Benchmarks, 2019 (there as Coulomb friction and an offset).
+    """
+
+    name = "directional_coulomb_friction"
+    parameters = {
+        "tau_pos": Parameter(null=0.0, scale=0.1, unit="N m", lower=0.0),
+        "tau_neg": Parameter(null=0.0, scale=0.1, unit="N m", lower=0.0),
+    }
+    explanation = "The joint resists motion with a constant force, one way more than the other."
+    source = "Janot, Gautier and Brunot 2019"
+    equivalents = {
+        "coulomb_friction": "together with a constant_force, while the joint moves",
+        "constant_force": "together with a coulomb_friction, while the joint moves",
+    }
+
+    def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
+        return dry_friction(joint, jnp.where(joint.v > 0.0, params["tau_pos"], params["tau_neg"]))
+
+
+class StribeckFriction(JointEffect):
+    r"""
+    Dry friction that falls as the joint begins to move.
+
+    .. math::
+        \tau = -\Big(\tau_c + (\tau_s - \tau_c)\,e^{-(v / v_s)^2}\Big) \tanh(v / w)
+
+    It is smoothed over :math:`w` as :class:`CoulombFriction` is, at the same cost, so what is left
+    of breaking away is a hump of friction at speeds between :math:`w` and :math:`v_s`; a
+    :math:`v_s` below :math:`w` does not show. Without friction, :math:`v_s` has no derivative.
+    :math:`\tau_s < \tau_c` is admitted: friction that rises as the joint begins to move.
+
+    Source: Olsson et al., *Friction models and friction compensation*, European Journal of Control
+    4(3), 1998, section 2 (exponent 2).
+    """
+
+    name = "stribeck_friction"
+    parameters = {
+        "tau_c": Parameter(null=0.0, scale=0.1, unit="N m", lower=0.0),
+        "tau_s": Parameter(null=0.0, scale=0.15, unit="N m", lower=0.0),
+        "v_s": Parameter(null=0.1, scale=0.1, unit="rad/s", lower=_SLOWEST),
+    }
+    explanation = "The joint resists most just as it begins to move, and less once it slides."
+    source = "Olsson et al. 1998, section 2"
+    equivalents = {"coulomb_friction": "while the joint moves several times faster than v_s"}
+
+    def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
+        sticking = jnp.exp(-((joint.v / params["v_s"]) ** 2))
+        level = params["tau_c"] + (params["tau_s"] - params["tau_c"]) * sticking
+        return dry_friction(joint, level)
+
+
+class LoadDependentFriction(JointEffect):
+    r"""
+    Dry friction that grows with what the joint transmits, as between the teeth of a gear.
+
+    .. math::
+        \tau = -(\tau_c + \mu\,|\tau_g|) \tanh(v / w), \qquad \tau_g = \tau_\text{act} + c(q, v)
+
+    Here :math:`\tau_g` is the torque that presses the teeth together: that of the motor from one
+    side, and from the other what gravity, Coriolis forces and the twin's own damping put on the
+    joint. As :math:`M \dot v = \tau_\text{act} - c`, both add up where the motor holds its load:
+    :math:`\tau_g` is then twice the motor's torque, as in the source. Torques of other effects are
+    left out. It is smoothed over :math:`w` as :class:`CoulombFriction` is, at the same cost.
+
+    Source: Duclusaud et al., *Extended friction models for the physics simulation of servo
+    actuators*, arXiv 2410.08650, 2024, model M3 (without its viscous friction).
+    """
+
+    name = "load_dependent_friction"
+    parameters = {
+        "tau_c": Parameter(null=0.0, scale=0.1, unit="N m", lower=0.0),
+        "mu": Parameter(null=0.0, scale=0.1, unit="1", lower=0.0, upper=1.0),
+    }
+    explanation = "The joint resists motion the more, the more force it has to transmit."
+    source = "Duclusaud et al. 2024, model M3"
+    equivalents = {"coulomb_friction": "where the joint transmits the same force all the time"}
+
+    def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
+        transmitted = joint.actuator + joint.load
+        return dry_friction(joint, params["tau_c"] + params["mu"] * jnp.abs(transmitted))
 
 
 class QuadraticDrag(JointEffect):

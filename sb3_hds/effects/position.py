@@ -1,0 +1,119 @@
+"""Forces that depend on where a joint is, or on nothing."""
+
+import math
+
+import jax.numpy as jnp
+
+from sb3_hds.core import JointEffect, JointMoment, Memory, Parameter, Params, Scalar
+
+
+class Stiffness(JointEffect):
+    r"""
+    A spring pulls the joint to where it rests.
+
+    .. math:: \tau = -\min(k,\; I / h^2)\,(q - q_0)
+
+    The bound is the stiffness whose oscillation a sub-step :math:`h` can just follow (:math:`I` is
+    the joint's effective inertia); beyond it the derivative with respect to :math:`k` is zero. The
+    position counts whole turns. Without a spring, :math:`q_0` has no derivative.
+
+    Source: Rao, *Mechanical Vibrations*, Prentice Hall 2011, section 1.7 (spring elements).
+    """
+
+    name = "stiffness"
+    parameters = {
+        "k": Parameter(null=0.0, scale=0.2, unit="N m/rad", lower=0.0),
+        "q0": Parameter(null=0.0, scale=0.2, unit="rad"),
+    }
+    explanation = "Something elastic, such as a cable or a hose, pulls the joint to one position."
+    source = "Rao 2011, section 1.7"
+    equivalents = {
+        "constant_force": "where the joint hardly moves",
+        "parameter.gravity": "where a joint under gravity swings but little",
+    }
+
+    def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
+        k = jnp.minimum(params["k"], joint.inertia / joint.h**2)
+        return -k * (joint.q - params["q0"])
+
+
+class CubicStiffness(JointEffect):
+    r"""
+    A spring at zero that hardens: it hardly acts near zero, and pulls back strongly far from it.
+
+    .. math:: \tau = -\min(k_3\,q^2,\; I / h^2)\,q
+
+    The bound is the same as that of :class:`Stiffness`. Springs that soften are not meant: alone,
+    they would pull the joint away.
+
+    Source: Kovacic and Brennan, *The Duffing Equation*, Wiley 2011, chapter 2.
+    """
+
+    name = "cubic_stiffness"
+    parameters = {"k3": Parameter(null=0.0, scale=0.05, unit="N m/rad3", lower=0.0)}
+    explanation = "Something elastic resists large deflections much more than small ones."
+    source = "Kovacic and Brennan 2011, chapter 2"
+
+    def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
+        return -jnp.minimum(params["k3"] * joint.q**2, joint.inertia / joint.h**2) * joint.q
+
+
+class Cogging(JointEffect):
+    r"""
+    The joint snaps to equally spaced positions, as a motor with magnets and slots does.
+
+    .. math:: \tau = -\min\!\Big(A,\; \frac{\lambda I}{2 \pi h^2}\Big)
+              \sin\frac{2 \pi\,(q - \varphi)}{\lambda}
+
+    It rests at :math:`q = \varphi`, and at every period :math:`\lambda` from there: both are
+    positions of the joint. The bound is the same as that of :class:`Stiffness`, for the steepest
+    place. Without amplitude, period and phase have no derivative; and whoever searches for a period
+    finds the nearest one that fits at all.
+
+    Source: *MuJoCo DC motor model*, Google DeepMind 2026, section 1.2 (its phase is
+    :math:`\pi - 2 \pi \varphi / \lambda`).
+    """
+
+    name = "cogging"
+    parameters = {
+        "amplitude": Parameter(null=0.0, scale=0.1, unit="N m", lower=0.0),
+        # One sixth of a turn: the coarsest that motors are built with.
+        "period": Parameter(null=math.pi / 3.0, scale=0.2, unit="rad", lower=0.01),
+        "phase": Parameter(null=0.0, scale=0.2, unit="rad"),
+    }
+    explanation = "The joint snaps to equally spaced positions, as motors with magnets do."
+    source = "MuJoCo DC motor model 2026, section 1.2"
+
+    def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
+        per_period = 2.0 * math.pi / params["period"]
+        steepest = joint.inertia / (joint.h**2 * per_period)
+        amplitude = jnp.minimum(params["amplitude"], steepest)
+        return -amplitude * jnp.sin(per_period * (joint.q - params["phase"]))
+
+
+class ConstantForce(JointEffect):
+    r"""
+    The same force at all times and everywhere.
+
+    .. math:: \tau = \tau_0
+
+    At a hinge whose axis is level, a mass off the axis makes a force that turns with the joint:
+    that is gravity, not this.
+
+    Source: Janot, Gautier and Brunot, *Data set and reference models of EMPS*, Workshop on
+    Nonlinear System Identification Benchmarks, 2019 (the offset).
+    """
+
+    name = "constant_force"
+    parameters = {"tau_0": Parameter(null=0.0, scale=0.1, unit="N m")}
+    explanation = "Something pushes the joint the same way all the time, as an offset of its drive."
+    source = "Janot, Gautier and Brunot 2019"
+    equivalents = {
+        "coulomb_friction": "while the joint moves in one direction",
+        "directional_coulomb_friction": "together with a coulomb_friction, while the joint moves",
+        "stiffness": "where the joint hardly moves",
+        "parameter.gravity_x": "at a slider, or where a hinge hardly turns",
+    }
+
+    def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
+        return jnp.asarray(params["tau_0"], joint.q.dtype)

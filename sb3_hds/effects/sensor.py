@@ -1,0 +1,168 @@
+"""What happens to a measurement on its way out of the plant."""
+
+import math
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sb3_hds.core import Memory, Parameter, Params, Scalar, SensorEffect
+from sb3_hds.errors import EffectError
+
+if TYPE_CHECKING:
+    from sb3_hds.core import Twin
+
+# Longest delay that can be simulated [s].
+_LONGEST_DELAY = 0.2
+
+
+class SensorBias(SensorEffect):
+    r"""
+    A sensor is off by a constant.
+
+    .. math:: y' = y + \beta
+
+    Of an angle that is measured as cosine and sine, a wrong zero is no such bias: it turns both.
+
+    Source: *International vocabulary of metrology*, JCGM 200:2012, 4.20 (instrumental bias).
+    """
+
+    name = "sensor_bias"
+    parameters = {"bias": Parameter(null=0.0, scale=0.05, unit="channel unit")}
+    explanation = "A sensor reports too much, or too little, by the same amount all the time."
+    source = "JCGM 200:2012, 4.20"
+    equivalents = {"parameter.gravity_x": "in free swing, where it is a tilt of the whole system"}
+
+    def sense(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Scalar:
+        return measured + params["bias"]
+
+    def invert(self, reported: Scalar, params: Params) -> Scalar:
+        return reported - params["bias"]
+
+
+class SensorScale(SensorEffect):
+    r"""
+    A sensor reports too much, or too little, in proportion.
+
+    .. math:: y' = k\,y
+
+    A factor below zero is :class:`SignFlip`.
+
+    Source: *International vocabulary of metrology*, JCGM 200:2012, 4.12 (sensitivity).
+    """
+
+    name = "sensor_scale"
+    parameters = {"scale": Parameter(null=1.0, scale=0.05, unit="1", lower=0.1, upper=10.0)}
+    explanation = "A sensor reports too much, or too little, in proportion, as in a wrong unit."
+    source = "JCGM 200:2012, 4.12"
+
+    def sense(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Scalar:
+        return params["scale"] * measured
+
+    def invert(self, reported: Scalar, params: Params) -> Scalar:
+        return reported / params["scale"]
+
+
+class SensorDelay(SensorEffect):
+    r"""
+    A sensor reports the past.
+
+    .. math:: y'(t) = y(t - d)
+
+    Linear between samples, so the delay need not be a multiple of the control interval; on a sample
+    the derivative is that of a growing delay. Before an episode, the channel is taken to have stood
+    where it was found: there one report tells the truth, and later it does not.
+
+    Source: Åström and Murray, *Feedback Systems*, Princeton University Press 2021, section 10.
+    """
+
+    name = "sensor_delay"
+    parameters = {
+        "delay": Parameter(null=0.0, scale=0.02, unit="s", lower=0.0, upper=_LONGEST_DELAY)
+    }
+    explanation = "Measurements arrive late, as from a camera or a filter."
+    source = "Åström and Murray 2021, section 10"
+    equivalents = {"action_delay": "where every channel is as late and nothing is fed back"}
+
+    def memory(self, measured: Scalar, twin: "Twin") -> Memory:
+        """The last measurements, the latest first."""
+        return jnp.full(math.ceil(_LONGEST_DELAY / twin.dt - 1e-9) + 1, measured)
+
+    def sense(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Scalar:
+        # Whoever moves a state without its memory sees the new one at once.
+        values = memory.at[0].set(measured)
+        age = params["delay"] / dt
+        younger = jnp.clip(jnp.floor(age).astype(int), 0, len(memory) - 2)
+        share = age - younger
+        return (1.0 - share) * values[younger] + share * values[younger + 1]
+
+    def invert(self, reported: Scalar, params: Params) -> Scalar:
+        return reported
+
+    def advance(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Memory:
+        return jnp.concatenate([measured[None], memory[:-1]])
+
+
+class SignFlip(SensorEffect):
+    r"""
+    A sensor has the wrong sign: it is mounted or wired the wrong way round.
+
+    .. math:: y' = \begin{cases} y & f < 1/2 \\ -y & f \ge 1/2 \end{cases}
+
+    There is nothing between right and wrong: the one parameter :math:`f` is a switch, off at 0 and
+    on at 1, and has no derivative. Where the direction of a whole joint is wrong, its position and
+    its velocity are: :func:`reversed_joint` finds the channels.
+
+    Source: *International vocabulary of metrology*, JCGM 200:2012, 4.12 (a sensitivity of -1).
+    """
+
+    name = "sign_flip"
+    parameters = {"flipped": Parameter(null=0.0, scale=1.0, unit="1", lower=0.0, upper=1.0)}
+    explanation = (
+        "A sensor reports the wrong sign, because it is mounted or wired the wrong way round."
+    )
+    source = "JCGM 200:2012, 4.12"
+
+    def sense(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Scalar:
+        return jnp.where(params["flipped"] >= 0.5, -measured, measured)
+
+    def invert(self, reported: Scalar, params: Params) -> Scalar:
+        return jnp.where(params["flipped"] >= 0.5, -reported, reported)
+
+
+def reversed_joint(twin: "Twin", joint: int | str) -> tuple[SignFlip, ...]:
+    """
+    What measures a joint whose direction is taken the wrong way round.
+
+    :param joint: index or name
+    :return: a flip for each channel that changes sign with position and velocity of the joint: of a
+        pendulum the sine and the speed, and not the cosine
+    :raises EffectError: for a joint that the twin does not have, or a channel that neither keeps
+        its size nor changes its sign alone, which no flip of channels can say
+    """
+    while hasattr(twin, "base"):
+        twin = twin.base  # type: ignore[attr-defined]
+    names = [each.name for each in twin.joints]
+    index = names.index(joint) if joint in names else joint
+    if not isinstance(index, int) or not 0 <= index < len(names):
+        raise EffectError(f"{twin.name} has no joint {joint!r}. It has: {', '.join(names)}.")
+    state = twin.initial(jax.random.key(0), twin.params)
+    # Some position and velocity at which no channel is zero by chance.
+    q, v = 0.3 + 0.1 * jnp.arange(len(names)), 0.7 - 0.1 * jnp.arange(len(names))
+    turned = [x.at[index].multiply(-1.0) for x in (q, v)]
+    here, there = (
+        np.asarray(twin.observe(state._replace(q=x, v=y), twin.params)) for x, y in ((q, v), turned)
+    )
+    changed = ~np.isclose(there, here)
+    odd = changed & np.isclose(there, -here)
+    if (changed & ~odd).any():
+        mixed = [c.name for c, bad in zip(twin.channels, changed & ~odd, strict=True) if bad]
+        raise EffectError(
+            f"Turning {names[index]} round changes more than the sign of: {', '.join(mixed)}. "
+            "A flip of channels cannot say that."
+        )
+    flips = (
+        SignFlip(c.name, flipped=1.0) for c, flip in zip(twin.channels, odd, strict=True) if flip
+    )
+    return tuple(flips)

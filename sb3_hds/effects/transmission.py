@@ -1,0 +1,181 @@
+"""What lies between a motor and its load: the joint's inertia is split into two."""
+
+import abc
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+
+from sb3_hds.core import (
+    Force,
+    ForceEffect,
+    Memory,
+    Moment,
+    Parameter,
+    Params,
+    Scalar,
+    solve_spd,
+)
+from sb3_hds.effects.shapes import beyond
+from sb3_hds.errors import EffectError
+
+if TYPE_CHECKING:
+    from sb3_hds.core import Twin
+
+# Share of a joint's inertia that turns with the motor, where nobody says: gears are commonly chosen
+# so that the motor's inertia, seen from the load, equals the load's.
+_MATCHED = 0.5
+
+
+class Transmission(ForceEffect):
+    r"""
+    Lets a motor move relative to its load, where the twin has one rigid joint.
+
+    The twin knows one inertia :math:`I` of the joint; the share :math:`\sigma` of it belongs to the
+    motor. With the motor's lead :math:`\delta` over the load (whose position the twin's joint is),
+    and :math:`s` the torque between the two,
+
+    .. math::
+        \sigma (1 - \sigma) I\,\ddot\delta = \tau_\text{act} - \sigma I \dot v_\text{rigid} - s,
+        \qquad \tau = -\sigma I\,\ddot\delta
+
+    where :math:`\dot v_\text{rigid}` is the acceleration of the twin without effects. The force
+    :math:`\tau` on the joint is what the motor's own motion takes away, so the momentum of both
+    together is that of the rigid joint. Forces of other effects are taken to act on both sides, in
+    proportion to their inertia: they move the two together. Where the joint's inertia depends on
+    the position of other joints, so does the motor's here.
+
+    The memory is :math:`\delta` and its speed. An episode starts with neither, as if nothing had
+    been transmitted before.
+    """
+
+    held = True
+
+    def __init__(
+        self, where: int | str = 0, *, motor_share: float = _MATCHED, **values: float
+    ) -> None:
+        super().__init__(where, **values)
+        if not 0.0 < motor_share < 1.0:
+            raise EffectError(
+                f"motor_share is the share of the joint's inertia that turns with the motor: "
+                f"between 0 and 1, both excluded, got {motor_share}."
+            )
+        self.motor_share = float(motor_share)
+
+    @abc.abstractmethod
+    def lead(
+        self, memory: Memory, drive: Scalar, inertia: Scalar, h: float, params: Params
+    ) -> Memory:
+        """
+        :param memory: ``lead`` [rad] and its ``speed`` [rad/s] at the start of a sub-step
+        :param drive: what would turn the motor against the load if nothing held them together [N m]
+        :param inertia: of that motion [kg m2]
+        :param h: length of the sub-step [s]
+        :return: the same at its end
+        """
+
+    def memory(self, twin: "Twin") -> Memory:
+        return {"lead": jnp.zeros(()), "speed": jnp.zeros(())}
+
+    def force(self, moment: Moment, index: int, memory: Memory, params: Params) -> Force:
+        inertia, _ = self._apart(moment, index)
+        after = self.advance(moment, index, memory, params)
+        torque = self.motor_share * inertia * (memory["speed"] - after["speed"]) / moment.h
+        return jnp.zeros_like(moment.v).at[index].set(torque)
+
+    def advance(self, moment: Moment, index: int, memory: Memory, params: Params) -> Memory:
+        inertia, drive = self._apart(moment, index)
+        share = self.motor_share
+        return self.lead(memory, drive, share * (1.0 - share) * inertia, moment.h, params)
+
+    def structure(self) -> tuple[Any, ...]:
+        return (*super().structure(), self.motor_share)
+
+    def to_spec(self) -> dict[str, Any]:
+        return super().to_spec() | {"options": {"motor_share": self.motor_share}}
+
+    def _apart(self, moment: Moment, index: int) -> tuple[Scalar, Scalar]:
+        """The joint's effective inertia, and what drives the motor apart from the load."""
+        unit = jnp.zeros_like(moment.v).at[index].set(1.0)
+        given = jnp.stack([unit, moment.actuator - moment.load], -1)
+        by_unit, rigid = solve_spd(moment.mass_matrix, given)[index]
+        inertia = 1.0 / by_unit
+        return inertia, moment.actuator[index] - self.motor_share * inertia * rigid
+
+
+class JointElasticity(Transmission):
+    r"""
+    A spring between motor and load, as in a belt, a long shaft or a harmonic drive.
+
+    .. math:: s = k\,\delta + d\,\dot\delta, \qquad
+              \omega_r^2 = \frac{k}{\sigma (1 - \sigma) I}
+
+    with :math:`\delta, \sigma, I` of :class:`~sb3_hds.effects.transmission.Transmission`, and
+    :math:`\omega_r` the frequency at which the two swing against each other. That motion is solved
+    by the implicit midpoint rule, which is stable at any sub-step: where :math:`\omega_r h \gg 1`
+    the frequency is not resolved, but neither does the energy grow.
+
+    :math:`k = 0` stands for a rigid joint, without a spring in it: as with every effect, zero is
+    absence. True rigidity is :math:`k \to \infty`, which is no number; so the effect jumps at zero,
+    and the smallest :math:`k` is the softest joint. At zero there is no derivative, and a search
+    has to begin at a stiffness. A :math:`d` without :math:`k` does nothing. Of :math:`k` and
+    :math:`\sigma`, the resonance tells one number only.
+
+    Source: De Luca and Book, *Robots with flexible elements*, Springer Handbook of Robotics 2008,
+    section 13.1.1; Spong, *Modeling and control of elastic joint robots*, Journal of Dynamic
+    Systems, Measurement, and Control 109(4), 1987.
+
+    :param motor_share: option; :math:`\sigma`, share of the joint's inertia that turns with the
+        motor
+    :raises EffectError: unless it lies between 0 and 1
+    """
+
+    name = "joint_elasticity"
+    parameters = {
+        "k": Parameter(null=0.0, scale=20.0, unit="N m/rad", lower=0.0),
+        "d": Parameter(null=0.0, scale=0.1, unit="N m s/rad", lower=0.0),
+    }
+    explanation = "The drive is springy: its motor can turn a little before the load follows."
+    source = "De Luca and Book 2008, section 13.1.1"
+
+    def lead(
+        self, memory: Memory, drive: Scalar, inertia: Scalar, h: float, params: Params
+    ) -> Memory:
+        k, d, momentum = params["k"], params["d"], 2.0 * inertia / h
+        pull = momentum * memory["speed"] + drive - k * memory["lead"]
+        halfway = jnp.where(k > 0.0, pull / (momentum + d + 0.5 * k * h), 0.0)
+        return {"lead": memory["lead"] + h * halfway, "speed": 2.0 * halfway - memory["speed"]}
+
+
+class Backlash(Transmission):
+    r"""
+    Play between motor and load, as between the teeth of a worn gear.
+
+    .. math:: |\delta| \le g / 2, \qquad
+              s = 0 \ \text{ inside the gap}
+
+    with :math:`\delta` of :class:`~sb3_hds.effects.transmission.Transmission`. Inside the gap the
+    motor does not reach the load. At its ends the two move together, as the rigid joint does; they
+    meet without rebound, so energy is lost and never gained (Moreau's time stepping: first order in
+    the sub-step). Teeth that bend or bounce are not simulated.
+
+    An episode starts in the middle of the gap.
+
+    Source: Nordin and Gutman, *Controlling mechanical systems with backlash: a survey*, Automatica
+    38(10), 2002, section 2.
+
+    :param motor_share: option; share of the joint's inertia that turns with the motor
+    :raises EffectError: unless it lies between 0 and 1
+    """
+
+    name = "backlash"
+    parameters = {"gap": Parameter(null=0.0, scale=0.02, unit="rad", lower=0.0)}
+    explanation = "The drive has play: when it turns round, it moves before the load does."
+    source = "Nordin and Gutman 2002, section 2"
+
+    def lead(
+        self, memory: Memory, drive: Scalar, inertia: Scalar, h: float, params: Params
+    ) -> Memory:
+        speed = memory["speed"] + h * drive / inertia
+        lead = memory["lead"] + h * speed
+        too_far = beyond(lead, 0.5 * params["gap"])
+        return {"lead": lead - too_far, "speed": speed - too_far / h}

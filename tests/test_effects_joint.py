@@ -1,0 +1,349 @@
+"""What friction, springs and constant forces do, by the formulas of mechanics."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from free_mass import Mass, mass_with, moved
+from scipy.special import ellipk
+
+from sb3_hds import twins
+from sb3_hds.core import (
+    JointMoment,
+    State,
+    explicit_euler,
+    rk4,
+    rollout,
+    semi_implicit_euler,
+)
+from sb3_hds.effects import (
+    Cogging,
+    ConstantForce,
+    CoulombFriction,
+    CubicStiffness,
+    DirectionalCoulombFriction,
+    DirectionalViscousFriction,
+    LoadDependentFriction,
+    QuadraticDrag,
+    Stiffness,
+    StribeckFriction,
+    ViscousFriction,
+)
+from sb3_hds.errors import ParameterError
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+FRICTION = (
+    ViscousFriction,
+    DirectionalViscousFriction,
+    CoulombFriction,
+    DirectionalCoulombFriction,
+    StribeckFriction,
+    LoadDependentFriction,
+    QuadraticDrag,
+)
+every_friction = pytest.mark.parametrize("effect", FRICTION, ids=lambda effect: effect.name)
+every_integrator = pytest.mark.parametrize(
+    "integrator", [explicit_euler, semi_implicit_euler, rk4], ids=lambda i: i.__name__
+)
+
+
+def torque_of(effect, v=0.0, q=0.0, actuator=0.0, load=0.0, inertia=1.0, h=1e-3):
+    """:return: what an effect with values does to a joint [N m]"""
+    joint = JointMoment(*map(jnp.asarray, (q, v, actuator, load, inertia)), h)
+    return float(effect.torque(joint, (), effect.values))
+
+
+def energy_of_a_mass(states, mass, potential):
+    return 0.5 * mass * states.v[:, 0] ** 2 + potential(states.q[:, 0])
+
+
+# --- friction
+
+
+@every_friction
+def test_friction_never_adds_energy(x64, effect):
+    rng = np.random.default_rng(0)
+    v = jnp.asarray(rng.choice([-1.0, 0.0, 1.0], 1000) * np.exp(rng.uniform(-6, 6, 1000)))
+    inertia, h = jnp.asarray(np.exp(rng.uniform(-6, 6, (2, 1000))))
+    actuator, load = jnp.asarray(rng.normal(size=(2, 1000)))
+    sizes = jnp.asarray(np.exp(rng.uniform(-6, 6, (1000, len(effect.parameters)))))
+
+    def power(v, inertia, h, actuator, load, own):
+        joint = JointMoment(jnp.zeros(()), v, actuator, load, inertia, h)
+        return effect(0).torque(joint, (), dict(zip(effect.parameters, own, strict=True))) * v
+
+    powers = jax.vmap(power)(v, inertia, h, actuator, load, sizes)
+
+    assert powers.max() <= 0.0 and powers.min() < 0.0
+
+
+def coast(effect, integrator, h, v, steps=1, mass=0.5):
+    """
+    Speed of a free mass after each step under friction alone.
+
+    :param effect: with its values
+    :param v: initial speeds
+    :return: shape ``(len(v), steps + 1)``
+    """
+    twin = mass_with(integrator, dt=h, mass=mass).extend(effect)
+
+    def speeds(v, own):
+        params = twin.params | {f"{effect.name}.rail.{name}": x for name, x in own.items()}
+        start = twin.infer(jnp.stack([jnp.zeros(()), v]), params)
+        return rollout(twin, params, start, jnp.zeros((steps, 1))).states.v[:, 0]
+
+    v = jnp.asarray(v)
+    own = {name: jnp.full(v.shape, value) for name, value in effect.values.items()}
+    return np.asarray(jax.jit(jax.vmap(speeds))(v, own))
+
+
+@every_integrator
+@every_friction
+@pytest.mark.parametrize("h", [1e-3, 0.1, 10.0])
+def test_friction_alone_brings_to_rest_without_overshoot_at_any_step(x64, effect, integrator, h):
+    v = jnp.array([-3.0, 0.02, 1e-3])
+
+    for size in (0.01, 1.0, 100.0):
+        values = {name: size for name in effect.parameters if name not in ("v_s", "mu")}
+        speeds = coast(effect(0, **values), integrator, h, v, steps=30)
+        # Rounding may leave 1e-16 of the other sign where a sub-step stops exactly.
+        assert np.all(speeds * np.sign(v)[:, None] >= -1e-14)
+        assert np.all(np.diff(np.abs(speeds), axis=1) <= 1e-14)
+
+
+@pytest.mark.parametrize(
+    ("effect", "v", "b"),
+    [
+        (ViscousFriction(b=0.4), 2.0, 0.4),
+        (DirectionalViscousFriction(b_pos=0.4, b_neg=0.9), 2.0, 0.4),
+        (DirectionalViscousFriction(b_pos=0.4, b_neg=0.9), -2.0, 0.9),
+    ],
+)
+def test_viscous_friction_decays_exponentially(x64, effect, v, b):
+    speeds = coast(effect, rk4, 0.01, [v], steps=100)[0]
+
+    exact = v * np.exp(-b * 0.01 * np.arange(101) / 0.5)
+    np.testing.assert_allclose(speeds, exact, rtol=2e-9)  # RK4: (b h / m)^5 / 120 per step
+
+
+def test_viscous_friction_is_linear_up_to_what_a_sub_step_can_stop(x64):
+    # One sub-step takes b h / m of the speed: the plain equation until that is all of it.
+    for b, left in ((0.5, 0.9), (2.5, 0.5), (5.0, 0.0), (50.0, 0.0)):
+        after = coast(ViscousFriction(b=b), semi_implicit_euler, 0.1, [2.0])[0, -1]
+        assert after == pytest.approx(2.0 * left, abs=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("effect", "v"),
+    [
+        (CoulombFriction(tau_c=0.2), 2.0),
+        (DirectionalCoulombFriction(tau_pos=0.2, tau_neg=0.05), 2.0),
+        (DirectionalCoulombFriction(tau_pos=0.05, tau_neg=0.2), -2.0),
+        (StribeckFriction(tau_c=0.2, tau_s=0.2, v_s=0.1), 2.0),
+        (LoadDependentFriction(tau_c=0.2, mu=0.5), 2.0),
+    ],
+)
+def test_dry_friction_decelerates_evenly_and_then_stops(x64, effect, v):
+    # tau_c / m = 0.4 m/s2: from 2 m/s standstill after 5 s.
+    speeds = np.sign(v) * coast(effect, semi_implicit_euler, 0.01, [v], steps=700)[0]
+
+    time = 0.01 * np.arange(701)
+    sliding = 2.0 - 0.4 * time > 0.1  # ten times the width over which the sign is smoothed
+    np.testing.assert_allclose(speeds[sliding], (2.0 - 0.4 * time)[sliding], rtol=1e-6)
+    # At standstill the smoothed law leaves exp(-0.4 / 0.01 * t): nothing after two more seconds.
+    assert abs(speeds[-1]) < 1e-9
+
+
+def test_dry_friction_creeps_under_a_load_as_its_docstring_says(x64):
+    twin = Mass(dt=0.01).extend(CoulombFriction(tau_c=2.0))
+    load, width = 1.0, max(0.01, 2.0 * 0.01 / 1.0)
+
+    result = moved(twin, np.full(200, load))
+
+    assert float(result.states.v[-1, 0]) == pytest.approx(width * np.arctanh(load / 2.0), rel=1e-6)
+
+
+@pytest.mark.parametrize("v", [0.04, -0.1, 0.25, 1.0])
+def test_the_stribeck_curve_falls_from_static_to_sliding_friction(x64, v):
+    # 0.04 rad/s is four times the width of smoothing: what that takes off is below 1e-3.
+    found = torque_of(StribeckFriction(tau_c=0.3, tau_s=0.8, v_s=0.1), v)
+
+    law = -np.sign(v) * (0.3 + 0.5 * np.exp(-((v / 0.1) ** 2)))
+    assert found == pytest.approx(law, rel=1e-3)
+
+
+def test_without_a_rise_stribeck_friction_is_coulomb_friction(x64):
+    for v in (-1.0, -0.003, 0.0, 0.02):
+        both = (StribeckFriction(tau_c=0.3, tau_s=0.3), CoulombFriction(tau_c=0.3))
+        assert torque_of(both[0], v) == pytest.approx(torque_of(both[1], v), rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("actuator", "load", "transmitted"),
+    [
+        (0.0, 0.0, 0.0),
+        (0.0, -1.5, 1.5),  # the load turns a motor that is off
+        (2.0, 0.0, 2.0),  # the motor accelerates an inertia
+        (1.5, 1.5, 3.0),  # the motor holds the load: the teeth are pressed from both sides
+        (1.5, -1.5, 0.0),  # motor and weight push the same way
+    ],
+)
+def test_load_dependent_friction_counts_both_sides_of_the_gear(x64, actuator, load, transmitted):
+    effect = LoadDependentFriction(tau_c=0.1, mu=0.2)
+
+    found = torque_of(effect, v=-1.0, actuator=actuator, load=load)
+
+    assert found == pytest.approx(0.1 + 0.2 * transmitted, rel=1e-9)
+
+
+def test_the_load_of_a_pendulum_is_its_weight(x64):
+    # Horizontal: weight m g l / 2 = 4.9 N m helps to fall, a torque of 1 N m against it does not.
+    plain = twins.make("PendulumReal", gravity=9.8, dt=1e-6, substeps=1)
+    extended = plain.extend(LoadDependentFriction(mu=0.1))
+    start = State(jnp.array([jnp.pi / 2]), jnp.array([1.0]), {})
+    slower = [
+        float(twin.step(start._replace(memory=memory), jnp.array([-1.0]), twin.params).v[0])
+        for twin, memory in ((plain, {}), (extended, {"load_dependent_friction.hinge": ()}))
+    ]
+
+    # The bias is -4.9: actuator + bias = -5.9. Inertia 1/3.
+    assert (slower[1] - slower[0]) / 1e-6 == pytest.approx(-0.1 * 5.9 * 3.0, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: ViscousFriction(b=-0.1),
+            "Parameter 'viscous_friction.b' must be finite and within [0.0, inf] N m s/rad, "
+            "got -0.1.",
+        ),
+        (
+            lambda: CoulombFriction(tau_c=-0.1),
+            "Parameter 'coulomb_friction.tau_c' must be finite and within [0.0, inf] N m, "
+            "got -0.1.",
+        ),
+        (
+            lambda: LoadDependentFriction(mu=1.5),
+            "Parameter 'load_dependent_friction.mu' must be finite and within [0.0, 1.0] 1, "
+            "got 1.5.",
+        ),
+    ],
+)
+def test_friction_that_cannot_be_is_refused(make, message):
+    with pytest.raises(ParameterError, match=f"^{re.escape(message)}$"):
+        make()
+
+
+# --- springs, magnets, constant forces
+
+
+def test_a_spring_makes_a_mass_oscillate_about_its_rest(x64):
+    # omega = sqrt(k / m) = 2 rad/s.
+    twin = mass_with(rk4, dt=0.05, mass=0.5).extend(Stiffness(k=2.0, q0=0.3))
+
+    states = moved(twin, np.zeros(400), position=1.3).states
+
+    # RK4: a phase error of (omega h)^5 / 120 per step, 3e-5 rad after 20 s.
+    exact = 0.3 + np.cos(2.0 * 0.05 * np.arange(401))
+    np.testing.assert_allclose(states.q[:, 0], exact, atol=1e-4)
+
+
+def test_a_hardening_spring_has_the_period_of_the_cubic_oscillator(x64):
+    # m q'' = -k3 q^3 from A at rest: T = 4 K(1/2) / (A sqrt(k3 / m)), K the elliptic integral.
+    twin = mass_with(rk4, dt=0.01, mass=0.5).extend(CubicStiffness(k3=2.0))
+    period = 4.0 * ellipk(0.5) / (1.5 * np.sqrt(2.0 / 0.5))
+    n = int(np.ceil(2.0 * period / 0.01))
+
+    q = moved(twin, np.zeros(n), position=1.5).states.q[:, 0]
+
+    time = 0.01 * np.arange(n + 1)
+    falling = np.flatnonzero((q[:-1] > 0.0) & (q[1:] <= 0.0))
+    crossings = time[falling] + 0.01 * q[falling] / (q[falling] - q[falling + 1])
+    # Linear between samples: h^2 / 8 times the curvature, which is zero at the crossing.
+    assert crossings[1] - crossings[0] == pytest.approx(period, abs=1e-4)
+
+
+def test_cogging_snaps_to_places_one_period_apart(x64):
+    cogging = Cogging(amplitude=0.4, period=0.5, phase=0.1)
+
+    for rest in (0.1, 0.6, -0.4):
+        assert torque_of(cogging, q=rest) == pytest.approx(0.0, abs=1e-12)
+        # A quarter of a period off, it pulls back with its amplitude.
+        assert torque_of(cogging, q=rest + 0.125) == pytest.approx(-0.4, rel=1e-12)
+        assert torque_of(cogging, q=rest - 0.125) == pytest.approx(0.4, rel=1e-12)
+
+
+def test_near_a_detent_cogging_is_a_spring(x64):
+    # Stiffness 2 pi A / period = 4 pi 0.4 [N/m]; 1e-3 m off is 0.6 % of a radian of its sine.
+    twin = mass_with(rk4, dt=0.02, mass=0.5).extend(Cogging(amplitude=0.4, period=0.5))
+    omega = np.sqrt(4.0 * np.pi * 0.4 / 0.5)
+
+    states = moved(twin, np.zeros(200), position=1e-3).states
+
+    exact = 1e-3 * np.cos(omega * 0.02 * np.arange(201))
+    np.testing.assert_allclose(states.q[:, 0], exact, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("effect", "potential"),
+    [
+        (Stiffness(k=2.0, q0=0.3), lambda q: 1.0 * (q - 0.3) ** 2),
+        (CubicStiffness(k3=2.0), lambda q: 0.5 * q**4),
+        (
+            Cogging(amplitude=0.4, period=0.5, phase=0.1),
+            lambda q: -0.4 * 0.5 / (2 * np.pi) * np.cos(2 * np.pi * (q - 0.1) / 0.5),
+        ),
+        (ConstantForce(tau_0=0.2), lambda q: -0.2 * q),
+    ],
+    ids=lambda x: getattr(x, "name", ""),
+)
+def test_forces_that_depend_on_position_keep_energy(x64, effect, potential):
+    twin = mass_with(rk4, dt=0.01, mass=0.5).extend(effect)
+
+    states = moved(twin, np.zeros(500), position=0.4, speed=1.0).states
+
+    energy = energy_of_a_mass(states, 0.5, potential)
+    np.testing.assert_allclose(energy, energy[0], atol=1e-6)  # RK4: 1e-9 per step at most
+
+
+@every_integrator
+@pytest.mark.parametrize(
+    "effect",
+    [Stiffness(k=1e6), CubicStiffness(k3=1e6), Cogging(amplitude=1e6, period=0.1)],
+    ids=lambda effect: effect.name,
+)
+@pytest.mark.parametrize("h", [1e-3, 0.1, 10.0])
+def test_springs_beyond_what_a_sub_step_can_follow_do_not_run_away(x64, effect, integrator, h):
+    # The stiffest that acts is m / h^2, where omega h = 1: symplectic Euler and RK4 stay bounded;
+    # explicit Euler grows by sqrt(2) per step, as it does with any spring of that frequency.
+    twin = mass_with(integrator, dt=h, mass=0.5).extend(effect)
+
+    q = moved(twin, np.zeros(30), position=1.0).states.q[:, 0]
+
+    assert np.isfinite(q).all()
+    assert np.abs(q).max() < (1e6 if integrator is explicit_euler else 100.0)
+
+
+def test_a_constant_force_accelerates_evenly(x64):
+    twin = Mass(mass=0.5).extend(ConstantForce(tau_0=-0.2))
+
+    states = moved(twin, np.zeros(50)).states
+
+    np.testing.assert_allclose(states.v[:, 0], -0.4 * 0.1 * np.arange(51), rtol=1e-12)
+
+
+def test_direction_dependent_friction_is_friction_and_a_constant_force_while_moving(x64):
+    one = Mass(dt=0.01).extend(DirectionalCoulombFriction(tau_pos=0.5, tau_neg=0.2))
+    two = Mass(dt=0.01).extend(CoulombFriction(tau_c=0.35), ConstantForce(tau_0=-0.15))
+
+    for speed in (2.0, -2.0):
+        a, b = (moved(twin, np.zeros(150), speed=speed).states.v for twin in (one, two))
+        assert np.abs(a).min() > 1.0  # far above the width of smoothing
+        np.testing.assert_allclose(a, b, rtol=1e-12)
+    # At rest the one stays, and the other creeps away.
+    assert moved(one, np.zeros(50)).states.q[-1, 0] == 0.0
+    assert moved(two, np.zeros(50)).states.q[-1, 0] < -1e-3

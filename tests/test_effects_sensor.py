@@ -1,0 +1,149 @@
+"""What sensors report: too much, in another unit, late, the wrong way round."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from free_mass import Mass, moved
+
+from sb3_hds import twins
+from sb3_hds.core import rollout
+from sb3_hds.effects import SensorBias, SensorDelay, SensorScale, SignFlip, reversed_joint
+from sb3_hds.errors import EffectError, ParameterError
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+
+@pytest.mark.parametrize(
+    ("effect", "reported"),
+    [
+        (SensorBias(bias=-0.3), lambda true: true - 0.3),
+        (SensorScale(scale=1.2), lambda true: 1.2 * true),
+        (SignFlip(flipped=1.0), lambda true: -true),
+        (SignFlip(), lambda true: true),
+        (SensorDelay(), lambda true: true),
+    ],
+)
+def test_a_channel_reports_this_and_the_others_the_truth(x64, effect, reported):
+    twin = Mass().extend(effect.at("position"))
+    pushes = np.random.default_rng(0).uniform(-1.0, 1.0, 20)
+    start = twin.base.infer(jnp.array([0.5, 1.0]), twin.params)
+    true = moved(Mass(), pushes, 0.5, 1.0).states
+
+    # A mass that is inferred from a report stands where it truly is.
+    begin = float(
+        twin.observe(twin.infer(twin.base.observe(start, {}), twin.params), twin.params)[0]
+    )
+    result = moved(twin, pushes, float(reported(0.5)), 1.0)
+
+    assert begin == pytest.approx(0.5, rel=1e-14)
+    np.testing.assert_allclose(result.states.q, true.q, rtol=1e-12)
+    np.testing.assert_allclose(result.obs[:, 0], reported(true.q[:, 0]), rtol=1e-12)
+    np.testing.assert_allclose(result.obs[:, 1], true.v[:, 0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.03, 0.05, 0.125, 0.2])
+def test_a_late_sensor_reports_the_signal_shifted(x64, delay):
+    # A uniform motion is linear between samples, so interpolation is exact.
+    twin = Mass(dt=0.05).extend(SensorDelay("position", delay=delay))
+
+    obs = moved(twin, np.zeros(30), position=4.0, speed=2.0).obs
+
+    time = 0.05 * np.arange(31)
+    np.testing.assert_allclose(obs[:, 0], 4.0 + 2.0 * np.maximum(time - delay, 0.0), rtol=1e-12)
+    np.testing.assert_allclose(obs[:, 1], 2.0)
+
+
+def test_between_samples_a_late_sensor_is_right_to_second_order(x64):
+    # Accelerating at 3 m/s2, a chord of 0.05 s is off by at most 3 * 0.05^2 / 8.
+    plain, late = Mass(dt=0.05), Mass(dt=0.05).extend(SensorDelay("position", delay=0.075))
+
+    obs, true = moved(late, 3.0 * np.ones(40)).obs, moved(plain, 3.0 * np.ones(40)).states.q
+
+    # Semi-implicit Euler: q = 3 t (t + h) / 2 at the samples.
+    past = 0.05 * np.arange(2, 41) - 0.075
+    np.testing.assert_allclose(true[:, 0], 1.5 * 0.05**2 * np.arange(41) * np.arange(1, 42))
+    np.testing.assert_allclose(obs[2:, 0], 1.5 * past * (past + 0.05), atol=3.0 * 0.05**2 / 8)
+
+
+def test_a_delay_that_begins_takes_the_speed_away(x64):
+    # d/dd of x(t - d) is -2 m/s, also on the grid of samples, zero included.
+    twin = Mass(dt=0.05).extend(SensorDelay("position"))
+
+    def report(delay):
+        params = twin.params | {"sensor_delay.position.delay": delay}
+        start = twin.infer(jnp.array([0.0, 2.0]), params)
+        return rollout(twin, params, start, jnp.zeros((10, 1))).obs[-1, 0]
+
+    for delay in (0.0, 0.02, 0.05):
+        assert float(jax.grad(report)(delay)) == pytest.approx(-2.0, rel=1e-12)
+
+
+def test_a_scale_of_zero_would_say_nothing():
+    with pytest.raises(ParameterError, match=r"'sensor_scale.scale' must be finite and within"):
+        SensorScale(scale=0.0)
+
+
+# --- the wrong way round
+
+
+@pytest.mark.parametrize(
+    ("name", "joint", "channels"),
+    [
+        ("Pendulum", "hinge", ["sin", "speed"]),
+        ("PendulumReal", 0, ["sin", "speed"]),
+        ("InvertedPendulum", "hinge", ["angle", "rate"]),
+        ("CartPole", "track", ["position", "speed"]),
+        ("Acrobot", "elbow", ["sin2", "rate2"]),
+        ("InvertedDoublePendulum", 1, ["sin1", "rate1"]),
+    ],
+)
+def test_a_joint_the_wrong_way_round_turns_what_is_odd_in_it(name, joint, channels):
+    flips = reversed_joint(twins.make(name), joint)
+
+    assert all(isinstance(flip, SignFlip) and flip.values == {"flipped": 1.0} for flip in flips)
+    twin = twins.make(name).extend(*flips)
+    found = [a.index for a in twin.attached]
+    assert len(found) == len(channels)
+    if name != "InvertedDoublePendulum":
+        assert [flip.where for flip in flips] == channels
+
+
+def test_a_pendulum_measured_the_wrong_way_round_is_one_driven_the_wrong_way(x64):
+    # Its equation of motion is odd: angle, speed and torque may all change sign.
+    plain = twins.make("PendulumReal")
+    flipped = plain.extend(*reversed_joint(plain, "hinge"))
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (40, 1))
+    obs = jnp.array([np.cos(1.0), np.sin(1.0), 0.5])
+
+    seen, mirrored = (
+        rollout(twin, twin.params, twin.infer(obs, twin.params), jnp.asarray(sign * actions)).obs
+        for twin, sign in ((flipped, 1.0), (plain, -1.0))
+    )
+
+    np.testing.assert_allclose(seen, mirrored, rtol=1e-12, atol=1e-14)
+
+
+def test_below_a_wrapper_and_beside_other_effects_it_finds_the_channels():
+    twin = twins.make("Pendulum").extend(SensorBias("cos", bias=0.1))
+
+    assert [flip.where for flip in reversed_joint(twin, 0)] == ["sin", "speed"]
+
+
+def test_what_flips_cannot_say_is_refused():
+    class Slope(Mass):
+        """Its position is reported from another origin."""
+
+        name = "Slope"
+
+        def observe(self, state, params):
+            return jnp.concatenate([state.q + 1.0, state.v])
+
+    with pytest.raises(
+        EffectError, match=r"^Turning rail round changes more than the sign of: position"
+    ):
+        reversed_joint(Slope(), "rail")
+    with pytest.raises(EffectError, match=re.escape("Mass has no joint 'hinge'. It has: rail.")):
+        reversed_joint(Mass(), "hinge")

@@ -1,0 +1,288 @@
+"""Elasticity and play between motor and load, by the mechanics of two bodies."""
+
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from free_mass import mass_with, moved
+from scipy.integrate import solve_ivp
+
+from sb3_hds import twins
+from sb3_hds.core import State, explicit_euler, rk4, rollout, semi_implicit_euler
+from sb3_hds.effects import Backlash, JointElasticity
+from sb3_hds.errors import EffectError
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+every_transmission = pytest.mark.parametrize(
+    "effect", [JointElasticity(k=5.0, d=0.1), Backlash(gap=0.2)], ids=lambda effect: effect.name
+)
+every_integrator = pytest.mark.parametrize(
+    "integrator", [explicit_euler, semi_implicit_euler, rk4], ids=lambda i: i.__name__
+)
+
+
+def lead_of(states, key):
+    """Lead of the motor over the load, and its speed."""
+    memory = states.memory[key]
+    return np.asarray(memory["lead"]), np.asarray(memory["speed"])
+
+
+# --- both
+
+
+@every_integrator
+@every_transmission
+@pytest.mark.parametrize("h", [1e-3, 0.1, 10.0])
+@pytest.mark.parametrize("share", [0.1, 0.5])
+def test_motor_and_load_together_have_the_momentum_of_the_rigid_joint(
+    x64, effect, integrator, h, share
+):
+    rng = np.random.default_rng(0)
+    pushes = rng.uniform(-1.0, 1.0, 100)
+    effect = type(effect)(0, motor_share=share, **effect.values)
+    twin = mass_with(integrator, dt=h, mass=0.5)
+
+    rigid, both = (moved(x, pushes, speed=1.0).states for x in (twin, twin.extend(effect)))
+
+    _, speed = lead_of(both, f"{effect.name}.rail")
+    momentum = 0.5 * (both.v[:, 0] + share * speed)
+    np.testing.assert_allclose(momentum, 0.5 * rigid.v[:, 0], rtol=1e-9, atol=1e-12 + 1e-13 * h)
+    assert np.abs(speed).max() > 1e-6
+
+
+@pytest.mark.parametrize("k", [1e-3, 1.0, 1e3, 1e9])
+@pytest.mark.parametrize("h", [1e-3, 0.1, 10.0])
+@every_integrator
+def test_a_spring_never_gains_energy_however_long_the_sub_step(x64, integrator, k, h):
+    twin = mass_with(integrator, dt=h, mass=0.5).extend(JointElasticity(k=k, d=0.01))
+    start = twin.infer(jnp.array([0.0, 1.0]), twin.params)
+    start = start._replace(
+        memory={"joint_elasticity.rail": {"lead": jnp.array(0.1), "speed": jnp.array(-2.0)}}
+    )
+
+    states = rollout(twin, twin.params, start, jnp.zeros((200, 1))).states
+
+    lead, speed = lead_of(states, "joint_elasticity.rail")
+    load, motor = states.v[:, 0], states.v[:, 0] + speed
+    energy = 0.5 * 0.25 * (load**2 + motor**2) + 0.5 * k * lead**2
+    assert np.all(np.diff(energy) <= 1e-12 * energy[0])
+    assert energy[-1] < energy[0]
+
+
+@pytest.mark.parametrize("gap", [1e-6, 0.1, 10.0])
+@pytest.mark.parametrize("h", [1e-3, 0.1, 10.0])
+@every_integrator
+def test_play_never_gains_energy_however_long_the_sub_step(x64, integrator, gap, h):
+    twin = mass_with(integrator, dt=h, mass=0.5).extend(Backlash(gap=gap))
+    start = twin.infer(jnp.array([0.0, 1.0]), twin.params)
+    start = start._replace(memory={"backlash.rail": {"lead": jnp.zeros(()), "speed": jnp.ones(())}})
+
+    states = rollout(twin, twin.params, start, jnp.zeros((200, 1))).states
+
+    _, speed = lead_of(states, "backlash.rail")
+    load, motor = states.v[:, 0], states.v[:, 0] + speed
+    energy = 0.5 * 0.25 * (load**2 + motor**2)
+    assert np.all(np.diff(energy) <= 1e-12 * energy[0])
+
+
+@every_transmission
+def test_under_gravity_the_energy_of_both_only_falls(x64, effect):
+    # A pendulum of 1 kg and 1 m: inertia 1/3, weight 5 N m; half of the inertia is the motor's.
+    twin = twins.make("PendulumReal", dt=0.002, substeps=1).extend(effect)
+    start = twin.infer(jnp.array([np.cos(2.0), np.sin(2.0), 0.0]), twin.params)
+
+    states = rollout(twin, twin.params, start, jnp.zeros((5000, 1))).states
+
+    lead, speed = lead_of(states, f"{effect.name}.hinge")
+    (q,), (v,) = states.q.T, states.v.T
+    spring = 0.5 * effect.values.get("k", 0.0) * lead**2
+    energy = 0.5 / 6.0 * (v**2 + (v + speed) ** 2) + 5.0 * np.cos(q) + spring
+    # First order in a step of 2 ms, over an exchange of 10 J.
+    assert np.maximum.accumulate(energy)[-1] - energy[0] < 0.02
+    assert energy[-1] < energy[0] - 0.2
+
+
+@every_transmission
+def test_a_whole_joint_follows_two_bodies_that_are_integrated_by_another_solver(x64, effect):
+    """A pendulum under a wandering torque: its motor and its rod as bodies of their own."""
+    share, inertia, step = 0.3, 1.0 / 3.0, 1e-3
+    effect = type(effect)(0, motor_share=share, **effect.values)
+    twin = twins.make("PendulumReal", dt=step, substeps=1).extend(effect)
+    k, d, gap = (effect.values.get(name, 0.0) for name in ("k", "d", "gap"))
+
+    def transmitted(lead, speed):
+        if k:
+            return k * lead + d * speed
+        # Stiff teeth, so strongly damped (20 times critically) that they do not rebound.
+        depth = max(abs(lead) - 0.5 * gap, 0.0)
+        hard = 2e5 * depth + (4.7e3 * np.sign(lead) * speed if depth else 0.0)
+        return np.sign(lead) * max(hard, 0.0)
+
+    def two_bodies(t, x):
+        rod, motor, v, w = x
+        s = transmitted(motor - rod, w - v)
+        u = 1.5 * np.sin(3.0 * t)
+        return [
+            v,
+            w,
+            (s + 5.0 * np.sin(rod)) / ((1 - share) * inertia),
+            (u - s) / (share * inertia),
+        ]
+
+    time = step * np.arange(1501)
+    reference = solve_ivp(
+        two_bodies,
+        (0.0, 1.5),
+        [2.5, 2.5, 0.0, 0.0],
+        "LSODA",
+        time,
+        rtol=1e-9,
+        atol=1e-11,
+        max_step=step,
+    )
+    start = twin.infer(jnp.array([np.cos(2.5), np.sin(2.5), 0.0]), twin.params)
+    torques = 1.5 * np.sin(3.0 * (time[:-1] + 0.5 * step))
+
+    states = rollout(twin, twin.params, start, jnp.asarray(torques)[:, None]).states
+
+    rigid = twin.base
+    without = rollout(rigid, rigid.params, start._replace(memory={}), jnp.asarray(torques)[:, None])
+    error = np.abs(states.q[:, 0] - reference.y[0]).max()
+    difference = np.abs(without.states.q[:, 0] - reference.y[0]).max()
+    # First order in a step of 1 ms, at speeds up to 1 rad/s.
+    assert error < 1e-3
+    assert difference > 0.03
+
+
+@every_transmission
+def test_between_several_joints_it_acts_as_two_bodies_do(x64, effect):
+    """The load's acceleration is that of the mechanism without the motor's inertia."""
+    plain = twins.make("Acrobot", dt=1e-7)
+    twin = plain.extend(type(effect)(1, **effect.values))
+    q, v = jnp.array([0.3, -0.2]), jnp.array([0.5, 1.0])
+    memory = {"lead": jnp.array(0.05), "speed": jnp.array(0.4)}
+    command = jnp.array([0.7])
+
+    key = f"{effect.name}.elbow"
+    after = twin.step(State(q, v, {key: memory}), command, twin.params)
+
+    inertia = np.array(plain.mass_matrix(q, plain.params))
+    motor = 0.5 / np.linalg.inv(inertia)[1, 1]
+    between = 5.0 * 0.05 + 0.1 * 0.4 if effect.name == "joint_elasticity" else 0.0
+    load = inertia - motor * np.diag([0.0, 1.0])
+    force = np.array([0.0, between]) - np.array(plain.bias(q, v, plain.params))
+    accelerations = np.linalg.solve(load, force)
+    # First order in a step of 1e-7 s.
+    np.testing.assert_allclose((after.v - v) / 1e-7, accelerations, rtol=1e-5)
+    relative = (0.7 - between) / motor - accelerations[1]
+    assert float(after.memory[key]["speed"] - 0.4) / 1e-7 == pytest.approx(relative, rel=1e-5)
+
+
+@pytest.mark.parametrize("kind", [JointElasticity, Backlash])
+@pytest.mark.parametrize("share", [0.0, 1.0, -0.2])
+def test_a_motor_without_inertia_or_a_load_without_is_refused(kind, share):
+    message = (
+        "motor_share is the share of the joint's inertia that turns with the motor: "
+        f"between 0 and 1, both excluded, got {share}."
+    )
+    with pytest.raises(EffectError, match=f"^{re.escape(message)}$"):
+        kind(motor_share=share)
+
+
+def test_the_motors_share_survives_the_spec_and_makes_another_program():
+    twin = twins.make("Pendulum").extend(JointElasticity(k=3.0, motor_share=0.2))
+
+    again = twins.from_spec(twin.to_spec(), [JointElasticity])
+
+    assert again == twin and again.effects[0].motor_share == 0.2
+    assert twins.make("Pendulum").extend(JointElasticity(k=3.0)) != twin
+
+
+# --- elasticity
+
+
+@pytest.mark.parametrize("d", [0.0, 0.05])
+@pytest.mark.parametrize("share", [0.2, 0.5])
+def test_a_push_makes_motor_and_load_swing_as_two_masses_on_a_spring(x64, share, d):
+    # With mu = s (1 - s) m, the lead obeys mu x'' + d x' + k x = (1 - s) f from rest.
+    mass, k, push, h = 0.5, 2.0, 0.4, 0.005
+    effect = JointElasticity(k=k, d=d, motor_share=share)
+    twin = mass_with(rk4, dt=h, mass=mass).extend(effect)
+
+    states = moved(twin, np.full(800, push)).states
+
+    t, mu = h * np.arange(801), share * (1.0 - share) * mass
+    damping = d / (2.0 * mu)
+    omega = np.sqrt(k / mu - damping**2)
+    swing = np.exp(-damping * t) * (np.cos(omega * t) + damping / omega * np.sin(omega * t))
+    lead = (1.0 - share) * push / k * (1.0 - swing)
+    load = 0.5 * push / mass * t**2 - share * lead
+    # Implicit midpoint: a phase error of (omega h)^2 / 12 = 2e-4 of up to 30 rad.
+    np.testing.assert_allclose(lead_of(states, "joint_elasticity.rail")[0], lead, atol=2e-3)
+    np.testing.assert_allclose(states.q[:, 0], load, atol=2e-3)
+    assert lead.max() > 0.15
+
+
+def test_a_stiff_joint_is_nearly_rigid_at_any_sub_step(x64):
+    twin = twins.make("Pendulum")
+    actions = 1.5 * np.sin(0.3 * np.arange(60))[:, None]
+
+    def positions(twin):
+        start = twin.infer(jnp.array([-1.0, 0.0, 0.0]), twin.params)
+        return rollout(twin, twin.params, start, jnp.asarray(actions)).states.q[:, 0]
+
+    rigid, stiffnesses = positions(twin), 10.0 ** np.arange(3, 9)
+    errors = [
+        np.abs(positions(twin.extend(JointElasticity(k=k, d=1.0))) - rigid).max()
+        for k in stiffnesses
+    ]
+
+    # What gives way is of the order of torque / k.
+    assert (np.array(errors) < 10.0 / stiffnesses).all()
+
+
+# --- play
+
+
+def test_inside_the_gap_the_motor_does_not_reach_the_load(x64):
+    # A motor of 0.25 kg crosses half the gap in sqrt(2 * 0.1 * 0.25 / 0.4) = 0.354 s.
+    twin = mass_with(rk4, dt=0.001, mass=0.5).extend(Backlash(gap=0.2))
+
+    states = moved(twin, np.full(800, 0.4)).states
+
+    time, meeting = 0.001 * np.arange(801), np.sqrt(2.0 * 0.1 * 0.25 / 0.4)
+    before, later = time < meeting - 0.002, time > meeting + 0.003
+    np.testing.assert_allclose(states.q[before, 0], 0.0, atol=1e-12)
+    lead, speed = lead_of(states, "backlash.rail")
+    np.testing.assert_allclose(lead[before], 0.5 * 0.4 / 0.25 * time[before] ** 2, atol=1e-3)
+    # They meet without rebound, and go on as one body that has had the push from the beginning.
+    np.testing.assert_allclose(lead[later], 0.1, rtol=1e-12)
+    np.testing.assert_allclose(speed[later], 0.0, atol=1e-12)
+    np.testing.assert_allclose(states.v[later, 0], 0.4 / 0.5 * time[later], rtol=1e-9)
+
+
+def test_a_load_that_nothing_drives_hangs_still_while_its_motor_turns(x64):
+    # The rod hangs; a motor with half of 1/3 kg m2 needs sqrt(2 * 0.1 * (1/6) / 0.5) = 0.258 s.
+    twin = twins.make("PendulumReal", dt=0.01).extend(Backlash(gap=0.2))
+    start = twin.infer(jnp.array([-1.0, 0.0, 0.0]), twin.params)
+
+    states = rollout(twin, twin.params, start, jnp.full((40, 1), 0.5)).states
+
+    angle = np.abs(states.q[:, 0] - states.q[0, 0])
+    assert angle[:25].max() < 1e-9
+    assert angle[30] > 1e-4
+
+
+def test_turning_round_costs_the_whole_gap(x64):
+    # The load is where both are together, less half the gap the way that the motor pushes.
+    rigid = mass_with(semi_implicit_euler, dt=0.01, mass=0.5)
+    twin = rigid.extend(Backlash(gap=0.06))
+    pushes = np.repeat([1.0, -1.0, 1.0], 100)
+
+    with_play, without = (moved(each, pushes).states.q[:, 0] for each in (twin, rigid))
+
+    lag = with_play - without
+    # The motor's half of the mass: sigma * gap / 2 = 0.015, to the one side and to the other.
+    np.testing.assert_allclose(lag[90:300:100], [-0.015, 0.015, -0.015], rtol=1e-9)
