@@ -30,7 +30,7 @@ TABLES = {"pandas", "rich", "yaml"}
 LIBRARIES = {
     "errors": set(),
     "core": ARRAYS,
-    "data": ARRAYS | TABLES,
+    "data": ARRAYS | TABLES | {"scipy", "minari"},
     "twins": ARRAYS | {"mujoco"},
     "effects": ARRAYS,
     "effects/neural.py": SOLVERS,

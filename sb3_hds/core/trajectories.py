@@ -1,10 +1,11 @@
 """Measured data."""
 
 import dataclasses
+import glob
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,6 +38,8 @@ class Trajectories:
     :param conditions: a label for what was different, one per trajectory: a load, a gain
     :param origin: number of the recorded trajectory that each is a part of, shape ``(n,)``; windows
         of one recording share it, because they are one piece of evidence
+    :param report: what reading logs changed, a ``data.Reading``; a note that goes with selections
+        and windows, but neither into files nor through transformations of JAX
     :raises TrajectoryError: if these do not fit together
     """
 
@@ -46,6 +49,7 @@ class Trajectories:
     dt: float
     conditions: tuple[str, ...]
     origin: Int[np.ndarray, " n"]
+    report: Any = None
 
     def __post_init__(self) -> None:
         n, steps = self.mask.shape
@@ -146,11 +150,38 @@ class Trajectories:
         return write_npz(path, arrays | labels | marks | {"origin": self.origin})
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> "Trajectories":
+    def load(
+        cls,
+        files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+        columns: Any = None,
+    ) -> "Trajectories":
         """
-        :param path: as given to :meth:`save`
-        :raises TrajectoryError: if there is no such file, or if it is damaged or of another kind
+        Read what :meth:`save` wrote, recordings, and logs of any kind.
+
+        Row k of a log is observation k, with the action that acts from then on. Uneven time stamps
+        are resampled; what that changed is warned of and stays in ``report``.
+
+        :param files: path, or pattern with ``*``, or several: ``.npz``, ``.jsonl`` (a recording),
+            ``.csv``, ``.parquet``, ``.mat``, ``.json``; or ``minari:`` and the name of a data set
+        :param columns: what the columns of a log mean, as a dict or the path of a yml file; not
+            needed for what :meth:`save` or a recorder wrote
+        :raises TrajectoryError: if there is no such file, if it is damaged or of another kind, if
+            a column is missing, holds no finite numbers, or if time decreases
         """
+        if columns is None and isinstance(files, str | os.PathLike):
+            path = Path(files)
+            if _log_reader is None or _is_npz(path):
+                return cls._load_npz(path)
+        if _log_reader is None:
+            raise TrajectoryError(
+                "Logs are read by sb3_hds.data, which is not imported. Import it, or use "
+                "'from sb3_hds import Trajectories'."
+            )
+        return _log_reader(files, columns)
+
+    @classmethod
+    def _load_npz(cls, path: str | os.PathLike[str]) -> "Trajectories":
+        """One file that :meth:`save` wrote."""
         stored = read_npz(path)
         if stored.get("format", np.array("")).tolist() != _FORMAT:
             raise TrajectoryError(
@@ -311,7 +342,7 @@ class Trajectories:
             )
         pieces = [resample(*self.episode(i), ratio, int(n), angles) for i, n in enumerate(lengths)]
         changed = self.from_arrays(*_unzip(pieces), dt=dt, conditions=self.conditions)
-        return dataclasses.replace(changed, origin=self.origin)
+        return dataclasses.replace(changed, origin=self.origin, report=self.report)
 
     def __repr__(self) -> str:
         lengths = np.sort(self.lengths)
@@ -324,6 +355,26 @@ class Trajectories:
             f"  channels: {self.n_obs} observed, {self.n_act} commanded\n"
             f"  conditions: {', '.join(counts[:4])}{more}"
         )
+
+
+_LogReader = Callable[[Any, Any], Trajectories]
+_log_reader: _LogReader | None = None
+
+
+def read_logs_by(reader: _LogReader) -> None:
+    """
+    Say who reads logs: ``core`` may not know tables.
+
+    :param reader: of files and columns, as :meth:`Trajectories.load` takes them
+    """
+    global _log_reader
+    _log_reader = reader
+
+
+def _is_npz(path: Path) -> bool:
+    """Whether it names one file that :meth:`Trajectories.save` may have written."""
+    stored = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
+    return stored.is_file() or (path.suffix == ".npz" and not glob.has_magic(str(path)))
 
 
 def _unzip(
@@ -344,7 +395,8 @@ def _flatten_with_keys(data: Trajectories) -> tuple[Any, tuple[float, tuple[str,
 def _unflatten(static: tuple[float, tuple[str, ...]], leaves: Iterable[Any]) -> Trajectories:
     """Past the checks: under ``vmap`` and ``tree.map``, leaves are whatever JAX puts there."""
     data = object.__new__(Trajectories)
-    for name, value in zip((*_LEAVES, "dt", "conditions"), (*leaves, *static), strict=True):
+    names = (*_LEAVES, "dt", "conditions", "report")
+    for name, value in zip(names, (*leaves, *static, None), strict=True):
         object.__setattr__(data, name, value)
     return data
 

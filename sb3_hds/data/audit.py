@@ -1,0 +1,125 @@
+"""Are these data fit for a verdict? Asked before any physics."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sb3_hds.core.signals import Channel
+from sb3_hds.core.trajectories import Trajectories
+from sb3_hds.data import continuity
+from sb3_hds.data.excitation import excitation
+from sb3_hds.data.finding import Finding, Place
+from sb3_hds.data.findings import (
+    Gaps,
+    RepeatedStamps,
+    StandingStill,
+    UnevenSampling,
+    WithinNoise,
+)
+from sb3_hds.data.report import Reading
+from sb3_hds.data.resolution import resolutions
+from sb3_hds.data.results import Audit, ChannelSummary
+from sb3_hds.data.stillness import stillness_of
+from sb3_hds.data.stretches import stretches_of
+from sb3_hds.data.velocity import velocity_shifts
+from sb3_hds.errors import TrajectoryError
+
+
+def audit(data: Trajectories, channels: Sequence[str | Channel] | None = None) -> Audit:
+    """
+    Look for defects of the recording, which physics would have to explain otherwise.
+
+    Uneven, repeated and missing samples; channels that are stuck or cut off; a state that was put
+    back inside a recording; a velocity that comes late or early; the noise while standing still;
+    too little motion. Where the data were read from logs, rows are checked as they were measured.
+    It is *not* told which channels are velocities: it finds them by their correlation with the
+    derivatives of others, and finds none in data that hardly move. What is judged by its motion is
+    not judged in data without any.
+
+    :param data: of any kind
+    :param channels: names of the observation channels, or a twin's ``channels``; default: those
+        that were read, or ``obs[0]``, ``obs[1]``, ...
+    :raises TrajectoryError: if the number of names is not that of the channels
+    """
+    report = data.report if isinstance(data.report, Reading) else None
+    named = _channels(data, channels, report)
+    names = [channel.name for channel in named]
+    actions = report.actions if report else [f"action[{j}]" for j in range(data.n_act)]
+    rows = stretches_of(data)
+    # Interpolation has blurred the steps of what was resampled: the report remembers them.
+    known = report and np.array(report.resolution)
+    resolution = resolutions([stretch.obs for stretch in rows]) if known is None else known
+    still = stillness_of(rows, resolution)
+    found = [*excitation(data, still, names, actions), *_sampling(data, report)]
+    if not any(isinstance(finding, StandingStill | WithinNoise) for finding in found):
+        found += [
+            *continuity.reinitialised(rows, names, resolution),
+            *velocity_shifts(data, names),
+            *continuity.stuck(rows, names, resolution),
+            *continuity.saturated(rows, names, resolution),
+            *continuity.repeated_samples(rows, names, resolution),
+        ]
+    values = np.concatenate([stretch.obs for stretch in rows])
+    summaries = tuple(
+        ChannelSummary(
+            channel.name,
+            channel.unit,
+            float(values[:, j].min()),
+            float(values[:, j].max()),
+            float(still.noise[j]) if np.isfinite(still.noise[j]) else None,
+            float(resolution[j]),
+        )
+        for j, channel in enumerate(named)
+    )
+    return Audit(
+        tuple(sorted(found, key=lambda finding: not finding.blocks)),
+        summaries,
+        still.share,
+        data.conditions,
+        tuple(data.lengths.tolist()),
+        data.dt,
+        report is not None,
+    )
+
+
+def _channels(
+    data: Trajectories, channels: Sequence[str | Channel] | None, report: Reading | None
+) -> list[Channel]:
+    if channels is None:
+        channels = report.obs if report else [f"obs[{j}]" for j in range(data.n_obs)]
+    named = [Channel(c, "") if isinstance(c, str) else c for c in channels]
+    if len(named) != data.n_obs or len({channel.name for channel in named}) < len(named):
+        raise TrajectoryError(
+            f"channels must hold a name of its own for each of the {data.n_obs} observation "
+            f"channels, got {[channel.name for channel in named]}."
+        )
+    return named
+
+
+def _sampling(data: Trajectories, report: Reading | None) -> list[Finding]:
+    """What the time stamps of the recordings say that the data are from."""
+    if report is None:
+        return []
+    chosen = {o: i for i, o in reversed(list(enumerate(data.origin.tolist())))}
+    recordings = [(chosen[o], r) for o, r in enumerate(report.recordings) if o in chosen]
+    found: list[Finding] = []
+    uneven = [(i, r) for i, r in recordings if r.resampled and r.uneven]
+    if uneven:
+        n = sum(r.rows - 1 for _, r in uneven)
+        found.append(
+            UnevenSampling(
+                "time",
+                tuple(Place(r.source, 0, r.rows - 1, i) for i, r in uneven),
+                min(r.intervals[0] for _, r in uneven),
+                float(np.median([r.intervals[1] for _, r in uneven])),
+                max(r.intervals[2] for _, r in uneven),
+                sum(r.uneven for _, r in uneven) / n,
+            )
+        )
+    stamps = tuple(Place(r.source, k, k, i) for i, r in recordings for k in r.repeated)
+    if stamps:
+        found.append(RepeatedStamps("time", stamps, len(stamps)))
+    gaps = [(Place(r.source, k, k, i), seconds) for i, r in recordings for k, seconds in r.gaps]
+    if gaps:
+        found.append(Gaps("time", tuple(place for place, _ in gaps), max(s for _, s in gaps)))
+    return found

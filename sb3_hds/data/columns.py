@@ -1,0 +1,232 @@
+"""What the columns of a log mean: said in a dict or a yml file."""
+
+import dataclasses
+import difflib
+import math
+import os
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from sb3_hds.core.episodes import check_dt
+from sb3_hds.errors import TrajectoryError
+
+_FORM = (
+    "columns names what a log holds: {'time': NAME, 'obs': [{'column': NAME, 'scale': 1.0}, ...], "
+    "'actions': [{'column': NAME, 'scale': 1.0}, ...]}, or is the path of a yml file with that."
+)
+
+
+class Entry(NamedTuple):
+    """
+    One channel: ``scale * column + offset``, or ``offset`` alone where nothing was recorded.
+
+    :param name: of the channel; default: that of its column
+    :param column: in the log; None for a channel that is constant
+    :param scale: factor to the unit of the twin, as pi / 180 for degrees
+    :param offset: added after scaling, in the unit of the twin
+    :param angle: whether the result wraps to [-pi, pi) [rad]: it then turns the shorter way
+    """
+
+    name: str
+    column: str | None
+    scale: float = 1.0
+    offset: float = 0.0
+    angle: bool = False
+
+
+class Label(NamedTuple):
+    """
+    Where the label of a trajectory is from.
+
+    :param column: in the log; None: the name of the file, without folder and suffix
+    """
+
+    column: str | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Columns:
+    """
+    What the columns of a log mean.
+
+    :param obs: observation channels, in the order of the twin; None: as the file itself says
+    :param actions: action channels, in the order of the twin; None: as the file itself says
+    :param time: stamps, scaled to seconds; None where rows are exactly ``dt`` apart
+    :param condition: where the label is from; default: all trajectories have the same one
+    :param episode: the column that changes where a new episode begins
+    :param dt: sampling interval of the result [s]; default: the one in the log
+    :param gap: a longer time between two rows ends the episode [s]; default: five intervals
+    """
+
+    obs: tuple[Entry, ...] | None = None
+    actions: tuple[Entry, ...] | None = None
+    time: Entry | None = None
+    condition: Label | None = None
+    episode: str | None = None
+    dt: float | None = None
+    gap: float | None = None
+
+    @property
+    def wanted(self) -> frozenset[str]:
+        """Names of all columns that are read."""
+        entries = [*(self.obs or ()), *(self.actions or ()), *([self.time] if self.time else [])]
+        labels = [self.condition.column] if self.condition else []
+        names = [*(entry.column for entry in entries), *labels, self.episode]
+        return frozenset(name for name in names if name is not None)
+
+    def over(self, own: "Columns | None") -> "Columns":
+        """
+        :param own: what a file says about itself
+        :return: that, where these columns leave something open
+        :raises TrajectoryError: if observations or actions are said by neither
+        """
+        merged = self
+        if own is not None:
+            names = [field.name for field in dataclasses.fields(self)]
+            left = {name: getattr(own, name) for name in names if getattr(self, name) is None}
+            merged = dataclasses.replace(self, **left)
+        missing = [name for name in ("obs", "actions") if getattr(merged, name) is None]
+        if missing:
+            raise TrajectoryError(f"columns does not say which are the {missing[0]}. {_FORM}")
+        if merged.time is None and merged.dt is None:
+            raise TrajectoryError(
+                "columns must name the column of time stamps, as time: NAME, or say how far rows "
+                "are apart, as dt: SECONDS."
+            )
+        return merged
+
+
+def columns_from(source: Any) -> Columns:
+    """
+    :param source: a dict as in the guide, the path of a yml file with one, or ``Columns``
+    :raises TrajectoryError: if it cannot be read, or for a key or a value that is not known
+    """
+    if isinstance(source, Columns):
+        return source
+    where = "columns"
+    if isinstance(source, str | os.PathLike):
+        where = f"'{source}'"
+        source = _read_yml(Path(source).expanduser())
+    if not isinstance(source, Mapping):
+        raise TrajectoryError(f"{where} holds a {type(source).__name__}. {_FORM}")
+    _check_keys(where, source, [field.name for field in dataclasses.fields(Columns)])
+    seconds = {key: source[key] for key in ("dt", "gap") if source.get(key) is not None}
+    return Columns(
+        obs=_entries(where, "obs", source.get("obs")),
+        actions=_entries(where, "actions", source.get("actions")),
+        time=None if source.get("time") is None else _entry(f"{where}: time", source["time"]),
+        condition=_condition(where, source.get("condition")),
+        episode=_episode(where, source.get("episode")),
+        **{key: check_dt(value) for key, value in seconds.items()},
+    )
+
+
+def _read_yml(path: Path) -> Any:
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise TrajectoryError(
+            f"The columns file '{path}' could not be read: {error.strerror} (in {Path.cwd()})."
+        ) from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise TrajectoryError(f"The columns file '{path}' is not valid yml: {reason}.") from error
+
+
+def _check_keys(where: str, given: Mapping[Any, Any], known: Sequence[str]) -> None:
+    for key in given:
+        if key not in known:
+            close = difflib.get_close_matches(str(key), known, 1)
+            hint = f" Did you mean '{close[0]}'?" if close else ""
+            raise TrajectoryError(
+                f"{where} has the key '{key}', which is not known. "
+                f"Known are: {', '.join(known)}.{hint}"
+            )
+
+
+def _entries(where: str, key: str, given: Any) -> tuple[Entry, ...] | None:
+    if given is None:
+        return None
+    if isinstance(given, str | Mapping) or not isinstance(given, Iterable):
+        raise TrajectoryError(f"{where}: {key} must be a list of columns, got {given!r}. {_FORM}")
+    entries = tuple(
+        _entry(f"{where}: {key}[{i}]", item, f"{key}[{i}]") for i, item in enumerate(given)
+    )
+    twice = [name for name, n in Counter(entry.name for entry in entries).items() if n > 1]
+    if twice:
+        raise TrajectoryError(
+            f"{where}: two channels of {key} are called '{twice[0]}'. Give one another name: "
+            "{column: NAME, name: OTHER}."
+        )
+    if key == "obs" and not entries:
+        raise TrajectoryError(f"{where}: obs must name at least one column. {_FORM}")
+    return entries
+
+
+def _entry(where: str, given: Any, name_of_constant: str = "") -> Entry:
+    if not isinstance(given, Mapping):
+        name = _column_name(where, given)
+        return Entry(name, name)
+    _check_keys(where, given, ("column", "scale", "offset", "angle", "constant", "name"))
+    if ("column" in given) == ("constant" in given and bool(name_of_constant)):
+        raise TrajectoryError(
+            f"{where} needs either 'column' (its name in the log) or 'constant' (a value that was "
+            f"not recorded), got {dict(given)}."
+        )
+    if "constant" in given:
+        value = _number(f"{where}: constant", given["constant"])
+        return Entry(str(given.get("name", name_of_constant)), None, offset=value)
+    column = _column_name(where, given["column"])
+    return Entry(
+        str(given.get("name", column)),
+        column,
+        _number(f"{where}: scale", given.get("scale", 1.0)),
+        _number(f"{where}: offset", given.get("offset", 0.0)),
+        bool(given.get("angle", False)),
+    )
+
+
+def _condition(where: str, given: Any) -> Label | None:
+    if given is None:
+        return None
+    if isinstance(given, Mapping):
+        _check_keys(f"{where}: condition", given, ("column", "from"))
+        if given == {"from": "filename"}:
+            return Label(None)
+        if set(given) == {"column"}:
+            return Label(_column_name(f"{where}: condition", given["column"]))
+    raise TrajectoryError(
+        f"{where}: condition must be {{column: NAME}} or {{from: filename}}, got {given!r}."
+    )
+
+
+def _episode(where: str, given: Any) -> str | None:
+    if given is None:
+        return None
+    if isinstance(given, Mapping):
+        _check_keys(f"{where}: episode", given, ("column",))
+        given = given.get("column")
+    return _column_name(f"{where}: episode", given)
+
+
+def _column_name(where: str, given: Any) -> str:
+    if isinstance(given, bool) or not isinstance(given, str | int | float):
+        raise TrajectoryError(
+            f"{where} must be the name of a column, got {given!r}. "
+            "Names that yml takes for something else (on, off, yes, no) need quotes."
+        )
+    return str(given)
+
+
+def _number(where: str, given: Any) -> float:
+    try:
+        value = math.nan if isinstance(given, bool) else float(given)
+    except (TypeError, ValueError):
+        value = math.nan
+    if not math.isfinite(value):
+        raise TrajectoryError(f"{where} must be a finite number, got {given!r}.")
+    return value

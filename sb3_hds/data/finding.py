@@ -1,0 +1,91 @@
+"""What every finding of an audit is: a sentence with channel, samples, and what to do."""
+
+import abc
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
+
+_PLACES = 2  # that a sentence names
+
+
+class Place(NamedTuple):
+    """
+    Samples of one recording.
+
+    :param source: trajectory, or file
+    :param first: first sample, or row of the file, from 0
+    :param last: last one
+    :param trajectory: its number in the data
+    :param time: of the first sample, since the beginning of the trajectory [s]
+    :param before: time of the sample before it [s]
+    """
+
+    source: str
+    first: int
+    last: int
+    trajectory: int
+    time: float = 0.0
+    before: float = 0.0
+
+    def __str__(self) -> str:
+        samples = f"sample {self.first}" if self.first == self.last else f"samples {self.first}"
+        return f"{self.source}, {samples}" + ("" if self.first == self.last else f" to {self.last}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding(abc.ABC):
+    """
+    One defect.
+
+    :param channel: name of the channel, or of what has the defect
+    :param places: where it was seen
+    """
+
+    blocks: ClassVar[bool] = False
+    """Whether no verdict can be had from data with this defect."""
+
+    remedy: ClassVar[str]
+    """What to do about it."""
+
+    channel: str
+    places: tuple[Place, ...]
+
+    @property
+    @abc.abstractmethod
+    def sentence(self) -> str:
+        """What is the case."""
+
+    def __str__(self) -> str:
+        return f"{self.sentence} {self.remedy}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """:return: plain data for JSON"""
+        fields = dataclasses.asdict(self)
+        places = [place._asdict() for place in self.places]
+        kind = {"kind": type(self).__name__, "blocks": self.blocks, "text": str(self)}
+        return kind | fields | {"places": places}
+
+
+def percent(share: float) -> str:
+    """:return: a share, for people"""
+    return f"{100.0 * share:.2g} %" if share < 0.995 else "100 %"
+
+
+def counted(n: int, noun: str) -> str:
+    """:return: a number of things, for people"""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def listed(places: Sequence[Place]) -> str:
+    """:return: the first places, and how many more there are"""
+    shown = "; ".join(map(str, places[:_PLACES]))
+    more = len(places) - _PLACES
+    return f"{shown}; and {counted(more, 'more place')}" if more > 0 else shown
+
+
+def recordings(places: Sequence[Place]) -> str:
+    """:return: the first recordings that are concerned as a whole, and how many more there are"""
+    sources = list(dict.fromkeys(place.source for place in places))
+    names = ", ".join(sources[:_PLACES])
+    more = len(sources) - _PLACES
+    return f"all samples of {names}" + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,296 @@
+"""The kinds of defects that an audit finds."""
+
+import dataclasses
+
+from sb3_hds.data.finding import Finding, counted, listed, percent, recordings
+
+
+@dataclasses.dataclass(frozen=True)
+class UnevenSampling(Finding):
+    """
+    :param shortest: interval between two rows [s]
+    :param median: [s]
+    :param longest: [s]
+    :param share: of the intervals that differ from the median by more than 10 %
+    """
+
+    shortest: float
+    median: float
+    longest: float
+    share: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"Time stamps jitter: rows are {1e3 * self.shortest:.3g} to "
+            f"{1e3 * self.longest:.3g} ms apart, the median is {1e3 * self.median:.3g} ms and "
+            f"{percent(self.share)} differ from it by more than 10 % ({recordings(self.places)})."
+        )
+
+    remedy = (
+        "The rows were resampled; compare the error of that (print data.report) with the noise. "
+        "Next time, let one clock trigger command and measurement."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class RepeatedStamps(Finding):
+    """:param n_rows: rows that were left out"""
+
+    n_rows: int
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"{counted(self.n_rows, 'row')} with the time stamp of the row before "
+            f"{'was' if self.n_rows == 1 else 'were'} left out ({listed(self.places)})."
+        )
+
+    remedy = "Find out whether the logger writes twice or the clock is too coarse."
+
+
+@dataclasses.dataclass(frozen=True)
+class Gaps(Finding):
+    """:param longest: [s]"""
+
+    longest: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"The recording has {counted(len(self.places), 'gap')} of up to {self.longest:.3g} s "
+            f"({listed(self.places)})."
+        )
+
+    remedy = "It was cut there. Look for what held up the logger."
+
+
+@dataclasses.dataclass(frozen=True)
+class RepeatedSamples(Finding):
+    """:param share: of the samples of a moving channel that repeat the one before"""
+
+    share: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' repeats its last value while it moves, in {percent(self.share)} of "
+            f"its moving samples ({listed(self.places)})."
+        )
+
+    remedy = "The sensor is read more often than it measures: log at its rate, or resample to it."
+
+
+@dataclasses.dataclass(frozen=True)
+class StuckChannel(Finding):
+    """:param value: at which the channel stays, in its unit"""
+
+    value: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' stays at exactly {self.value:.4g} while other channels move "
+            f"({listed(self.places)})."
+        )
+
+    remedy = "Check cable and driver of this sensor; leave the channel or these samples out."
+
+
+@dataclasses.dataclass(frozen=True)
+class SaturatedChannel(Finding):
+    """
+    :param value: that the channel does not exceed, in its unit
+    :param share: of the samples that are there
+    """
+
+    value: float
+    share: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' is cut off at {self.value:.4g}: {percent(self.share)} of its "
+            f"samples are exactly there ({listed(self.places)})."
+        )
+
+    remedy = (
+        "Choose a larger range of the sensor, or leave these samples out. A mechanical stop looks "
+        "the same: then the twin needs one."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class ReinitialisedState(Finding):
+    """
+    :param to_start: whether the state jumps to where a recording begins
+    :param size: of the largest jump, in the unit of its channel
+    """
+
+    to_start: bool
+    size: float
+
+    @property
+    def sentence(self) -> str:
+        target = "to where a recording begins" if self.to_start else "as no motion does"
+        return (
+            f"'{self.channel}' jumps by up to {self.size:.3g} from one sample to the next, "
+            f"{target} ({listed(self.places)})."
+        )
+
+    remedy = (
+        "The system was put back inside the recording: audit.corrected(data) cuts there. Or name "
+        "the column that counts episodes when loading."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class VelocityShift(Finding):
+    """
+    :param position: name of the channel whose derivative it is
+    :param samples: by how many it comes late; negative: early
+    :param seconds: the same [s]
+    :param stderr: standard error of ``samples``
+    """
+
+    position: str
+    samples: float
+    seconds: float
+    stderr: float
+
+    @property
+    def sentence(self) -> str:
+        verb = "lags" if self.samples > 0 else "leads"
+        return (
+            f"'{self.channel}' {verb} the derivative of '{self.position}' by "
+            f"{abs(self.samples):.2f} +- {self.stderr:.2f} samples, "
+            f"{1e3 * abs(self.seconds):.3g} ms ({recordings(self.places)})."
+        )
+
+    remedy = (
+        "Shift it: audit.corrected(data). A filter in the drive is the usual cause; uncorrected, "
+        "it passes for a delay or for friction."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class StandingStill(Finding):
+    """:param share: of the time during which nothing moves beyond noise"""
+
+    blocks = True
+    share: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"The system stands still {percent(self.share)} of the time "
+            f"({recordings(self.places)}): this tells the noise of its sensors and nothing about "
+            "its motion."
+        )
+
+    remedy = "Record motion, with commands that use the range that matters to you."
+
+
+@dataclasses.dataclass(frozen=True)
+class TooShort(Finding):
+    """
+    :param n_steps: that there are
+    :param needed: at least so many
+    """
+
+    blocks = True
+    n_steps: int
+    needed: int
+
+    @property
+    def sentence(self) -> str:
+        return f"There are {self.n_steps} steps in all; a verdict needs {self.needed} at least."
+
+    remedy = "Record longer, or more often."
+
+
+@dataclasses.dataclass(frozen=True)
+class WeakMotion(Finding):
+    """:param ratio: spread of the channel by its noise"""
+
+    ratio: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' moves by only {self.ratio:.1f} times its noise "
+            f"({recordings(self.places)})."
+        )
+
+    remedy = "Move it further: what acts on it cannot be estimated from this."
+
+
+@dataclasses.dataclass(frozen=True)
+class WithinNoise(Finding):
+    """:param ratio: largest spread of a channel by its noise"""
+
+    blocks = True
+    ratio: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"No channel moves by more than {self.ratio:.1f} times its noise "
+            f"({recordings(self.places)})."
+        )
+
+    remedy = "Record larger motion: nothing can be estimated from this."
+
+
+@dataclasses.dataclass(frozen=True)
+class MostlyStill(Finding):
+    """:param share: of the time during which nothing moves beyond noise"""
+
+    share: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"The system stands still {percent(self.share)} of the time "
+            f"({recordings(self.places)})."
+        )
+
+    remedy = "Only the rest tells anything about its motion: record more of it."
+
+
+@dataclasses.dataclass(frozen=True)
+class ConstantCommand(Finding):
+    """:param value: of the command, in its unit"""
+
+    value: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"The command '{self.channel}' is {self.value:.4g} throughout "
+            f"({recordings(self.places)})."
+        )
+
+    remedy = (
+        "Gain, delay and lag of this actuator cannot be estimated from this. If it is meant to do "
+        "so (free swing), go on."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class DependentCommand(Finding):
+    """:param r2: share of its variance that follows from the observations"""
+
+    r2: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"The command '{self.channel}' follows from the observations of the same moment "
+            f"(R2 = {self.r2:.5f}), as under linear feedback ({recordings(self.places)})."
+        )
+
+    remedy = (
+        "Feedback and dynamics cannot be told apart from this: add a signal to the command, or "
+        "change the set point."
+    )

@@ -1,0 +1,239 @@
+"""A recording that survives its recorder: one line per step, whole or not at all."""
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_hds.core.episodes import check_dt
+from sb3_hds.data.columns import Columns, Entry, Label
+from sb3_hds.errors import TrajectoryError
+
+_FORMAT, _VERSION, SUFFIX = "sb3_hds.Recording", 1, ".jsonl"
+_RESERVED = ("time", "condition")
+
+
+class Recorder:
+    """
+    Writes what a system does while it does it, for ``Trajectories.load(path)``.
+
+    Each call appends one line of JSON to the file and hands it to the operating system: a process
+    that is killed loses nothing that was recorded, at most the line that it was writing. Against a
+    power failure the disk is asked to write too, but only when an episode starts and at the end.
+
+    **Action k acts from observation k to observation k + 1**: give :meth:`step` the command and
+    what was measured *after* it.
+
+    :param path: ``.jsonl`` is appended where it is missing
+    :param dt: intended sampling interval [s]; loading resamples to it
+    :param obs: names of the observation channels
+    :param actions: names of the action channels
+    :param condition: label of the episodes to come; may be changed at any time
+    :param clock: returns the time [s], as ``time.monotonic``, where the interval varies; default:
+        steps are taken to be exactly ``dt`` apart
+    :param append: continue an existing file of the same channels; otherwise it is refused
+    :raises TrajectoryError: if the file cannot be written, exists, or has other channels
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        dt: float,
+        *,
+        obs: Sequence[str],
+        actions: Sequence[str],
+        condition: str = "default",
+        clock: Callable[[], float] | None = None,
+        append: bool = False,
+    ) -> None:
+        target = Path(path).expanduser()
+        self.path = target if target.suffix == SUFFIX else target.with_name(target.name + SUFFIX)
+        self.dt = check_dt(dt)
+        self.condition = condition
+        self._obs, self._actions = _names(obs, actions)
+        self._clock = clock
+        self._time: float | None = None
+        header = {"format": _FORMAT, "version": _VERSION, "dt": self.dt}
+        header |= {"obs": self._obs, "actions": self._actions}
+        try:
+            continued = append and self._cut_to_whole_lines(header)
+            self._file = self.path.open("ab" if continued else "xb", buffering=0)
+            if not continued:
+                self._write(header)
+        except FileExistsError as error:
+            raise TrajectoryError(
+                f"'{self.path}' exists; a recording is never overwritten. Choose another name, or "
+                "continue it with append=True."
+            ) from error
+        except OSError as error:
+            raise TrajectoryError(
+                f"'{self.path}' could not be written: {error.strerror}. "
+                "The folder must exist and be writable, with space left on the disk."
+            ) from error
+
+    def start(self, obs: Any, time: float | None = None) -> None:
+        """
+        Begin an episode.
+
+        :param obs: the first observation, shape ``(n_obs,)``
+        :param time: when it was measured [s]; default: the clock, or 0
+        :raises TrajectoryError: for another shape, or after :meth:`close`
+        """
+        self._time = self._now(0.0) if time is None else float(time)
+        self._write(
+            {"time": self._time, "obs": _row("obs", obs, self._obs), "condition": self.condition}
+        )
+        os.fsync(self._file.fileno())
+
+    def step(self, action: Any, obs: Any, time: float | None = None) -> None:
+        """
+        :param action: the command, shape ``(n_act,)``
+        :param obs: what was measured after it, shape ``(n_obs,)``
+        :param time: when that was measured [s]; default: the clock, or ``dt`` after the last one
+        :raises TrajectoryError: for another shape, before :meth:`start`, or after :meth:`close`
+        """
+        if self._time is None:
+            raise TrajectoryError("No episode has begun: call start(obs) with the first one.")
+        self._time = self._now(self._time + self.dt) if time is None else float(time)
+        taken = _row("action", action, self._actions)
+        self._write({"time": self._time, "action": taken, "obs": _row("obs", obs, self._obs)})
+
+    def close(self) -> None:
+        """Leave the file on the disk. A second call does nothing."""
+        if not self._file.closed:
+            os.fsync(self._file.fileno())
+            self._file.close()
+
+    def __enter__(self) -> "Recorder":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _now(self, otherwise: float) -> float:
+        return otherwise if self._clock is None else float(self._clock())
+
+    def _write(self, line: dict[str, Any]) -> None:
+        if self._file.closed:
+            raise TrajectoryError(f"The recording '{self.path}' is closed.")
+        text = (json.dumps(line, separators=(",", ":")) + "\n").encode()
+        if self._file.write(text) < len(text):
+            raise TrajectoryError(f"'{self.path}' could not be written: the disk is full.")
+
+    def _cut_to_whole_lines(self, header: dict[str, Any]) -> bool:
+        """Whether there is a file to continue; a line that was cut off is taken away."""
+        if not self.path.exists():
+            return False
+        content = self.path.read_bytes()
+        end = content.rfind(b"\n") + 1
+        if not end:
+            self.path.unlink()
+            return False
+        earlier = _parse(content.partition(b"\n")[0], self.path, 1)
+        if earlier != header:
+            raise TrajectoryError(
+                f"'{self.path}' has another interval or other channels and cannot be continued: "
+                f"{earlier}, now {header}."
+            )
+        os.truncate(self.path, end)
+        return True
+
+
+def read_recording(path: Path) -> tuple[list[dict[str, np.ndarray]], Columns]:
+    """
+    :param path: of a file that a :class:`Recorder` wrote, or was writing
+    :return: one table per episode with at least one step, and what their columns mean
+    :raises TrajectoryError: if it is of another kind or damaged; a cut last line is no damage
+    """
+    *lines, cut = path.read_bytes().split(b"\n")
+    header = _parse(lines[0], path, 1) if lines else {}
+    if header.get("format") != _FORMAT:
+        raise TrajectoryError(
+            f"'{path}' is no recording, or it was interrupted before its first line was written: "
+            f"it begins with {(lines or [cut])[0][:60]!r}."
+        )
+    if header["version"] > _VERSION:
+        raise TrajectoryError(
+            f"'{path}' is of version {header['version']}, this sb3_hds reads up to {_VERSION}. "
+            "Upgrade sb3_hds."
+        )
+    episodes: list[list[dict[str, Any]]] = []
+    for number, line in enumerate(lines[1:], start=2):
+        row = _parse(line, path, number)
+        if "action" not in row:
+            episodes.append([])
+        if not episodes:
+            raise _damaged(path, number, "a step before the start of an episode")
+        episodes[-1].append(row)
+    tables = [_table(rows, header, path) for rows in episodes if len(rows) > 1]
+    if not tables:
+        raise TrajectoryError(f"The recording '{path}' holds no step yet.")
+    return tables, Columns(
+        obs=tuple(Entry(name, name) for name in header["obs"]),
+        actions=tuple(Entry(name, name) for name in header["actions"]),
+        time=Entry("time", "time"),
+        condition=Label("condition"),
+        dt=header["dt"],
+    )
+
+
+def _table(rows: list[dict[str, Any]], header: dict[str, Any], path: Path) -> dict[str, np.ndarray]:
+    """Columns of one episode. Row k has the action that followed it; the last row has none."""
+    n_act = len(header["actions"])
+    try:
+        obs = np.array([row["obs"] for row in rows], float).reshape(len(rows), len(header["obs"]))
+        actions = np.array([row["action"] for row in rows[1:]], float).reshape(-1, n_act)
+        columns = dict(zip(header["obs"], obs.T, strict=True))
+        columns |= dict(
+            zip(header["actions"], np.vstack([actions, np.full(n_act, np.nan)]).T, strict=True)
+        )
+        times = np.array([row["time"] for row in rows], float)
+        return columns | {"time": times, "condition": np.array(str(rows[0]["condition"]))}
+    except (KeyError, ValueError, TypeError) as error:
+        raise TrajectoryError(
+            f"An episode of '{path}' does not fit its header ({error}). Restore it from a copy."
+        ) from error
+
+
+def _parse(line: bytes, path: Path, number: int) -> dict[str, Any]:
+    try:
+        row = json.loads(line)
+        if not isinstance(row, dict):
+            raise ValueError("no object")
+        return row
+    except ValueError as error:
+        raise _damaged(path, number, str(error)) from error
+
+
+def _damaged(path: Path, number: int, reason: str) -> TrajectoryError:
+    return TrajectoryError(
+        f"Line {number} of '{path}' is damaged ({reason}). Restore the file from a copy, or remove "
+        "that line and, up to the next line with a condition, those after it."
+    )
+
+
+def _names(obs: Sequence[str], actions: Sequence[str]) -> tuple[list[str], list[str]]:
+    for argument, names in (("obs", obs), ("actions", actions)):
+        if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+            raise TrajectoryError(f"{argument} must be a list of names, got {names!r}.")
+    used = [*obs, *actions]
+    if not obs or len({*used, *_RESERVED}) < len(used) + len(_RESERVED):
+        raise TrajectoryError(
+            "A recording needs at least one observation channel, and a name of its own for each "
+            f"channel, other than {' and '.join(_RESERVED)}; got obs {list(obs)} and actions "
+            f"{list(actions)}."
+        )
+    return list(obs), list(actions)
+
+
+def _row(argument: str, values: Any, names: list[str]) -> list[float]:
+    row = np.asarray(values, float).ravel()
+    if len(row) != len(names):
+        raise TrajectoryError(
+            f"{argument} must have {len(names)} numbers ({', '.join(names)}), got shape "
+            f"{np.shape(values)}."
+        )
+    return row.tolist()

@@ -1,0 +1,166 @@
+"""What reading a log changed."""
+
+import dataclasses
+import math
+import textwrap
+from typing import Any, NamedTuple
+
+from sb3_hds.data.rows import Rows
+
+_LISTED = 20
+
+
+@dataclasses.dataclass(frozen=True)
+class Sampling:
+    """
+    The time stamps of one recording, and what became of its rows.
+
+    :param source: file, and episode where it holds several
+    :param rows: number of rows
+    :param intervals: shortest, median and longest time between two rows, gaps apart [s]
+    :param uneven: number of intervals that differ from the median by more than 10 %
+    :param repeated: rows left out because they have the stamp of the row before
+    :param gaps: row before which a gap lies, and its length [s]; the recording is cut there
+    :param unused: number of rows left out because a piece between gaps is shorter than a step
+    :param resampled: whether observations were interpolated
+    :param moved: longest time from a sample to the row closest to it [s]
+    :param error: of the rows, when they are interpolated back from the samples: root mean square,
+        one per observation channel, in its unit
+    """
+
+    source: str
+    rows: int
+    intervals: tuple[float, float, float]
+    uneven: int
+    repeated: tuple[int, ...]
+    gaps: tuple[tuple[int, float], ...]
+    unused: int
+    resampled: bool
+    moved: float
+    error: tuple[float, ...]
+
+    @property
+    def altered(self) -> bool:
+        """Whether the samples are anything other than the rows."""
+        return self.resampled or bool(self.repeated or self.gaps)
+
+
+class Part(NamedTuple):
+    """
+    What one trajectory was made of.
+
+    :param recording: number of the recording
+    :param rows: without gaps and repeated stamps
+    :param begin: time of the first sample, on the clock of the rows [s]
+    :param n_steps: of the trajectory
+    """
+
+    recording: int
+    rows: Rows
+    begin: float
+    n_steps: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Reading:
+    """
+    What reading logs into ``Trajectories`` changed; prints itself.
+
+    :param dt: sampling interval of the result [s]
+    :param obs: names of the observation channels
+    :param actions: names of the action channels
+    :param resolution: smallest step of each observation channel whose rows are multiples of one,
+        otherwise 0
+    :param recordings: one for each that was read, in order; ``Trajectories.origin`` counts them
+    :param parts: the rows as measured that each trajectory was made of, in order
+    """
+
+    dt: float
+    obs: tuple[str, ...]
+    actions: tuple[str, ...]
+    resolution: tuple[float, ...]
+    recordings: tuple[Sampling, ...]
+    parts: tuple[Part, ...] = dataclasses.field(default=(), repr=False, compare=False)
+
+    @property
+    def altered(self) -> bool:
+        """Whether anything is not as it stands in the files."""
+        return any(recording.altered for recording in self.recordings)
+
+    def summary(self) -> str:
+        """:return: what was changed, in one sentence for each kind of change"""
+        uneven = [r for r in self.recordings if r.resampled]
+        repeated = [r for r in self.recordings if r.repeated]
+        gaps = [r for r in self.recordings if r.gaps]
+        said = []
+        if uneven:
+            errors = [max(values) for values in zip(*(r.error for r in uneven), strict=True)]
+            pairs = ", ".join(f"{n} {e:.2g}" for n, e in zip(self.obs, errors, strict=True))
+            said.append(
+                f"{_subject(uneven)} resampled to dt = {self.dt:g} s: rows were "
+                f"{_ms(min(r.intervals[0] for r in uneven))} to "
+                f"{_ms(max(r.intervals[2] for r in uneven))} apart, samples are up to "
+                f"{_ms(max(r.moved for r in uneven))} from the closest row; interpolated back, "
+                f"rows differ by (rms) {pairs}"
+            )
+        if repeated:
+            n = sum(len(r.repeated) for r in repeated)
+            said.append(
+                f"In {_place(repeated)}, {_counted(n, 'row')} with the stamp of the row before "
+                f"{'was' if n == 1 else 'were'} left out"
+            )
+        if gaps:
+            n, unused = sum(len(r.gaps) for r in gaps), sum(r.unused for r in gaps)
+            longest = max(length for r in gaps for _, length in r.gaps)
+            left_out = f"; {_counted(unused, 'row')} in shorter pieces left out" if unused else ""
+            said.append(
+                f"{_subject(gaps)} cut at {_counted(n, 'gap')} of up to {longest:.3g} s{left_out}"
+            )
+        return ". ".join(said) + "." if said else "Nothing was changed."
+
+    def to_dict(self) -> dict[str, Any]:
+        """:return: plain data for JSON"""
+        plain = dataclasses.asdict(dataclasses.replace(self, parts=()))
+        return {name: value for name, value in plain.items() if name != "parts"}
+
+    def __str__(self) -> str:
+        shown = self.recordings[:_LISTED]
+        width = max(9, *(len(r.source) for r in shown))
+        width = min(width, 34)
+        lines = [
+            f"Read {_counted(len(self.recordings), 'recording')} at dt = {self.dt:g} s",
+            _row(width, "recording", "rows", "interval [ms]", "repeated", "gaps"),
+        ]
+        for r in shown:
+            low, median, high = (f"{1e3 * value:.4g}" for value in r.intervals)
+            interval = median if low == high else f"{low}..{median}..{high}"
+            name = r.source if len(r.source) <= width else "..." + r.source[3 - width :]
+            lines.append(_row(width, name, r.rows, interval, len(r.repeated), len(r.gaps)))
+        if len(self.recordings) > _LISTED:
+            lines.append(f"  and {len(self.recordings) - _LISTED} more")
+        return "\n".join([*lines, *_wrapped(self.summary())])
+
+
+def _row(width: int, name: str, *values: Any) -> str:
+    rows, interval, repeated, gaps = values
+    return f"  {name:<{width}} {rows:>7} {interval:>21} {repeated:>8} {gaps:>4}"
+
+
+def _place(recordings: list[Sampling]) -> str:
+    return recordings[0].source if len(recordings) == 1 else f"{len(recordings)} recordings"
+
+
+def _subject(recordings: list[Sampling]) -> str:
+    return f"{_place(recordings)} {'was' if len(recordings) == 1 else 'were'}"
+
+
+def _counted(n: int, noun: str) -> str:
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def _ms(seconds: float) -> str:
+    return "?" if math.isnan(seconds) else f"{1e3 * seconds:.3g} ms"
+
+
+def _wrapped(text: str) -> list[str]:
+    return textwrap.wrap(text, 78, initial_indent="  ", subsequent_indent="  ")

@@ -1,0 +1,42 @@
+"""The smallest step of quantised values."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+_NEAR = 50  # smallest steps: beyond, quantisation cannot be told from rounding
+_FEWEST = 10  # steps that tell
+
+
+def resolutions(rows: Sequence[np.ndarray]) -> Float64[np.ndarray, " n_obs"]:
+    """
+    Of values that were interpolated since, those that stayed equal still tell.
+
+    :param rows: observations of each stretch, each of shape ``(rows, n_obs)``
+    :return: smallest step of each channel whose values are multiples of one, otherwise 0
+    """
+    return np.array([_resolution([x[:, j] for x in rows]) for j in range(rows[0].shape[1])])
+
+
+def _resolution(values: Sequence[np.ndarray]) -> float:
+    span = float(np.ptp(np.concatenate(values)))
+    steps = np.concatenate([np.diff(x) for x in values])
+    kept = np.unique(np.concatenate([x[1:][np.diff(x) == 0.0] for x in values]))
+    return _common_step(np.diff(kept), span) or _common_step(np.abs(steps), span)
+
+
+def _common_step(steps: np.ndarray, span: float) -> float:
+    """What all steps are multiples of, or 0."""
+    # Differences of decimals are exact to some 1e-16 of the values; what is smaller is no step.
+    moving = steps[steps > 1e-9 * span]
+    if len(moving) < _FEWEST:
+        return 0.0
+    # The smallest step that was made may be a few of the smallest possible.
+    for quantile in (0.01, 0.001, 0.0):
+        smallest = float(np.quantile(moving, quantile, method="lower"))
+        for step in (smallest, smallest / 2.0, smallest / 3.0):
+            ratios = moving[moving < _NEAR * step] / step
+            if len(ratios) >= _FEWEST and (np.abs(ratios - np.round(ratios)) < 0.1).mean() > 0.9:
+                return step
+    return 0.0

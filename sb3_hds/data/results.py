@@ -1,0 +1,148 @@
+"""The result of an audit, and how it prints."""
+
+import dataclasses
+import textwrap
+from collections.abc import Sequence
+from typing import Any
+
+from sb3_hds.core.trajectories import Trajectories
+from sb3_hds.data.corrections import cut, shifted
+from sb3_hds.data.finding import Finding, percent
+from sb3_hds.data.findings import ReinitialisedState, VelocityShift
+from sb3_hds.errors import TrajectoryError
+
+_WIDTH = 80
+
+
+@dataclasses.dataclass(frozen=True)
+class ChannelSummary:
+    """
+    :param name: of the observation channel
+    :param unit: empty where it is not known
+    :param lowest: measured value
+    :param highest: measured value
+    :param noise: standard deviation while the system stands still; None where it never does
+    :param resolution: smallest step of a quantised channel, otherwise 0
+    """
+
+    name: str
+    unit: str
+    lowest: float
+    highest: float
+    noise: float | None
+    resolution: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Audit:
+    """
+    What is wrong with data, before any physics; prints itself.
+
+    :param findings: what was found, the most serious first
+    :param channels: of the observation
+    :param stands_still: share of the time during which nothing moves beyond noise
+    :param conditions: labels of the data
+    :param lengths: number of steps of each trajectory
+    :param dt: sampling interval [s]
+    :param stamps: whether the time stamps of the rows were there to be looked at
+    """
+
+    findings: tuple[Finding, ...]
+    channels: tuple[ChannelSummary, ...]
+    stands_still: float
+    conditions: tuple[str, ...]
+    lengths: tuple[int, ...]
+    dt: float
+    stamps: bool
+
+    @property
+    def usable(self) -> bool:
+        """Whether the data can support a verdict at all."""
+        return not any(finding.blocks for finding in self.findings)
+
+    @property
+    def reason(self) -> str:
+        """Why they cannot; empty if they can."""
+        return " ".join(finding.sentence for finding in self.findings if finding.blocks)
+
+    @property
+    def velocity_shift(self) -> dict[str, float]:
+        """By how much each shifted velocity channel comes late [s]; negative: early."""
+        shifts = [f for f in self.findings if isinstance(f, VelocityShift)]
+        return {shift.channel: shift.seconds for shift in shifts}
+
+    @property
+    def noise(self) -> dict[str, float | None]:
+        """Standard deviation of each channel at rest, in its unit; None where it never rests."""
+        return {channel.name: channel.noise for channel in self.channels}
+
+    def corrected(self, data: Trajectories) -> Trajectories:
+        """
+        Cut where the state was put back, and shift velocities to where they belong.
+
+        :param data: those that were audited
+        :return: new trajectories; the same ones if there is nothing to correct
+        :raises TrajectoryError: for other data, or if an episode is shorter than the shifts
+        """
+        if tuple(data.lengths.tolist()) != self.lengths or data.dt != self.dt:
+            raise TrajectoryError("These are not the data of this audit: call audit(data) first.")
+        jumps = [f for f in self.findings if isinstance(f, ReinitialisedState)]
+        places = [(p.trajectory, p.before, p.time) for jump in jumps for p in jump.places]
+        if places:
+            data = cut(data, places)
+        names = [channel.name for channel in self.channels]
+        shifts = [f for f in self.findings if isinstance(f, VelocityShift)]
+        lags = {names.index(shift.channel): shift.samples for shift in shifts}
+        return shifted(data, lags) if lags else data
+
+    def to_dict(self) -> dict[str, Any]:
+        """:return: plain data for JSON"""
+        return {
+            "usable": self.usable,
+            "reason": self.reason,
+            "n_trajectories": len(self.lengths),
+            "n_steps": sum(self.lengths),
+            "dt": self.dt,
+            "conditions": sorted(set(self.conditions)),
+            "stands_still": self.stands_still,
+            "channels": [dataclasses.asdict(channel) for channel in self.channels],
+            "velocity_shift": self.velocity_shift,
+            "findings": [finding.to_dict() for finding in self.findings],
+        }
+
+    def __str__(self) -> str:
+        n, steps, labels = len(self.lengths), sum(self.lengths), len(set(self.conditions))
+        verdict = "yes" if self.usable else f"NO. {self.reason}"
+        head = (
+            f"Audit of {n} {'trajectory' if n == 1 else 'trajectories'}, "
+            f"{labels} {'condition' if labels == 1 else 'conditions'}: {steps} steps, "
+            f"{steps * self.dt:.4g} s at dt = {self.dt:g} s"
+        )
+        lines = [head, *_wrapped(f"usable: {verdict}", "", "  "), "", *_table(self.channels)]
+        lines += ["", f"It stands still {percent(self.stands_still)} of the time."]
+        lines += ["", "Findings:" if self.findings else "Nothing else was found."]
+        for number, finding in enumerate(self.findings, start=1):
+            lines += _wrapped(f"{number}. {finding.sentence}", "  ", "     ")
+            lines += _wrapped(f"-> {finding.remedy}", "     ", "        ")
+        if not self.stamps:
+            lines += ["", "Time stamps were not looked at: these data do not come with any."]
+        return "\n".join(lines)
+
+
+def _table(channels: Sequence[ChannelSummary]) -> list[str]:
+    names = [f"{c.name} [{c.unit}]" if c.unit else c.name for c in channels]
+    width = min(max(len("channel"), *map(len, names)), 30)
+    lines = [f"  {'channel':<{width}} {'lowest':>10} {'highest':>10} {'noise':>10} {'step':>10}"]
+    for name, c in zip(names, channels, strict=True):
+        noise = "?" if c.noise is None else f"{c.noise:.3g}"
+        step = f"{c.resolution:.3g}" if c.resolution else "-"
+        shown = name if len(name) <= width else name[: width - 3] + "..."
+        lines.append(
+            f"  {shown:<{width}} {c.lowest:>10.4g} {c.highest:>10.4g} {noise:>10} {step:>10}"
+        )
+    lines.append("  noise: standard deviation while standing still; step: of quantised values")
+    return lines
+
+
+def _wrapped(text: str, first: str, rest: str) -> list[str]:
+    return textwrap.wrap(text, _WIDTH, initial_indent=first, subsequent_indent=rest)

@@ -1,0 +1,59 @@
+"""Uninterrupted rows, as measured: what the checks of the audit look at."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int
+
+from sb3_hds.core.trajectories import Trajectories
+from sb3_hds.data.report import Part
+
+
+class Stretch(NamedTuple):
+    """
+    Rows without a gap.
+
+    :param source: recording, for people
+    :param trajectory: number of the trajectory that was made of them
+    :param numbers: of the rows in the recording, from 0
+    :param times: since the first sample of the trajectory [s]
+    :param obs: shape ``(rows, n_obs)``
+    """
+
+    source: str
+    trajectory: int
+    numbers: Int[np.ndarray, " rows"]
+    times: Float64[np.ndarray, " rows"]
+    obs: Float64[np.ndarray, "rows n_obs"]
+
+    @property
+    def dt(self) -> float:
+        """Median interval [s]."""
+        return float(np.median(np.diff(self.times)))
+
+
+def stretches_of(data: Trajectories) -> list[Stretch]:
+    """:return: the rows of the log that each trajectory was read from, or else its samples"""
+    parts = _parts_of(data)
+    if parts:
+        return [
+            Stretch(p.rows.source, i, p.rows.numbers, p.rows.times - p.begin, p.rows.obs)
+            for i, p in enumerate(parts)
+        ]
+    numbers = [np.arange(n + 1) for n in data.lengths]
+    return [
+        Stretch(f"trajectory {i}", i, k, data.dt * k, data.obs[i, : len(k)])
+        for i, k in enumerate(numbers)
+    ]
+
+
+def _parts_of(data: Trajectories) -> list[Part]:
+    """What each trajectory was made of; nothing if they are not, one for one, what was read."""
+    if data.report is None:
+        return []
+    chosen = set(data.origin.tolist())
+    parts = [part for part in data.report.parts if part.recording in chosen]
+    same = [part.recording for part in parts] == data.origin.tolist() and [
+        part.n_steps for part in parts
+    ] == data.lengths.tolist()
+    return parts if same else []

@@ -1,0 +1,100 @@
+"""Recording whatever an environment does, a robot's included."""
+
+import numbers
+import os
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from sb3_hds.data.recording import Recorder
+from sb3_hds.errors import TrajectoryError
+
+
+class Record(gymnasium.Wrapper):
+    """
+    Writes every reset and step to a file that ``Trajectories.load(path)`` reads.
+
+    Each step is on its way to the disk when ``step`` returns: what was recorded before the process
+    is killed is readable. Observations, actions and rewards are left alone. Put it directly around
+    the environment, inside wrappers that scale. A loop without an environment uses
+    :class:`sb3_hds.data.Recorder`.
+
+    :param env: its observations are arrays of one axis, its actions too, or numbers
+    :param path: ``.jsonl`` is appended where it is missing; an existing file is never overwritten
+    :param dt: control interval [s]; default: the environment's own ``dt`` or ``tau``
+    :param obs_names: of the observation channels; default: ``obs[0]``, ``obs[1]``, ...
+    :param action_names: of the action channels; default: ``action[0]``, ...
+    :param condition: label of what was different: a load, a gain; ``recorder.condition`` changes
+        it for the episodes to come
+    :param clock: returns the time [s], as ``time.monotonic``, for a robot whose steps vary
+    :param append: continue an existing file
+    :raises TrajectoryError: for other spaces, an unknown interval, or a file that exists
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        path: str | os.PathLike[str],
+        *,
+        dt: float | None = None,
+        obs_names: Sequence[str] | None = None,
+        action_names: Sequence[str] | None = None,
+        condition: str = "default",
+        clock: Callable[[], float] | None = None,
+        append: bool = False,
+    ) -> None:
+        super().__init__(env)
+        self.recorder = Recorder(
+            path,
+            _interval(env) if dt is None else dt,
+            obs=_names("obs", env.observation_space, obs_names),
+            actions=_names("action", env.action_space, action_names),
+            condition=condition,
+            clock=clock,
+            append=append,
+        )
+
+    def reset(self, **settings: Any) -> tuple[Any, dict[str, Any]]:
+        obs, info = self.env.reset(**settings)
+        self.recorder.start(obs)
+        return obs, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """:return: as the environment; the action is recorded as it was passed, before clipping"""
+        taken = np.array(action, float)  # an environment may change it in place
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        self.recorder.step(taken, obs)
+        return obs, reward, terminated, truncated, info
+
+    def close(self) -> None:
+        self.recorder.close()
+        super().close()
+
+
+def _interval(env: gymnasium.Env) -> float:
+    inner = env.unwrapped
+    for owner in (inner, getattr(inner, "twin", None)):
+        for name in ("dt", "tau"):
+            if isinstance(value := getattr(owner, name, None), numbers.Real):
+                return float(value)
+    raise TrajectoryError(
+        f"{inner} does not say how long a step is: it has no attribute dt. Pass dt=SECONDS."
+    )
+
+
+def _names(kind: str, space: spaces.Space, names: Sequence[str] | None) -> Sequence[str]:
+    single = isinstance(space, spaces.Discrete) and kind == "action"
+    if not single and not (isinstance(space, spaces.Box) and len(space.shape) == 1):
+        raise TrajectoryError(
+            f"Record takes observations and actions that are boxes of one axis, got the {kind} "
+            f"space {space}. Flatten it first: gymnasium.wrappers.FlattenObservation."
+        )
+    size = 1 if single else int(np.prod(space.shape or ()))
+    if names is None:
+        return [f"{kind}[{i}]" for i in range(size)]
+    if len(names) != size:
+        raise TrajectoryError(f"The {kind} space has {size} channels, got the names {list(names)}.")
+    return names

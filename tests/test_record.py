@@ -1,0 +1,259 @@
+"""Recordings: what was recorded before the process died is readable, and nothing is overwritten."""
+
+import itertools
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from sb3_hds import Trajectories
+from sb3_hds.data import Recorder, SamplingWarning
+from sb3_hds.errors import TrajectoryError
+from sb3_hds.wrappers import Record
+
+# Counts its steps into its observation, so that a reader can tell what it lost.
+SCRIPT = """
+import sys
+from sb3_hds.data import Recorder
+
+with Recorder(sys.argv[1], dt=0.01, obs=["k", "square"], actions=["u"]) as recorder:
+    recorder.start([0, 0])
+    for k in range(1, 10**9):
+        recorder.step([-k], [k, k * k])
+        if k in (1, 500):
+            print(k, flush=True)
+"""
+
+
+class Counter(gymnasium.Env):
+    """Observes the number of its step and the action; says nothing of its interval."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = spaces.Discrete(3)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.k = 0
+        return np.zeros(2), {}
+
+    def step(self, action):
+        self.k += 1
+        return np.array([self.k, action], float), 0.0, False, False, {}
+
+
+def recorder(path, **settings):
+    return Recorder(path, 0.1, **({"obs": ["q", "v"], "actions": ["u"]} | settings))
+
+
+def test_an_environment_is_recorded_as_it_was_seen(tmp_path):
+    env = Record(gymnasium.make("Pendulum-v1", max_episode_steps=7), tmp_path / "run")
+    obs, actions = [], []
+    for episode in range(3):
+        obs.append([env.reset(seed=episode)[0]])
+        actions.append([])
+        truncated = False
+        while not truncated:
+            actions[-1].append(env.action_space.sample())
+            seen, _, _, truncated, _ = env.step(actions[-1][-1])
+            obs[-1].append(seen)
+    env.close()
+
+    data = Trajectories.load(tmp_path / "run.jsonl")
+
+    np.testing.assert_array_equal(data.obs, np.array(obs, np.float64))
+    np.testing.assert_array_equal(data.actions, np.array(actions, np.float64))
+    assert (data.dt, data.report.obs[2], data.report.altered) == (0.05, "obs[2]", False)
+
+
+@pytest.mark.parametrize("wanted", [1, 500])
+def test_everything_before_a_kill_is_readable(wanted, tmp_path):
+    path = tmp_path / "run.jsonl"
+    process = subprocess.Popen([sys.executable, "-c", SCRIPT, path], stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if int(line) == wanted:
+            break
+    process.send_signal(signal.SIGKILL)
+
+    assert process.wait() == -signal.SIGKILL
+    [data] = [Trajectories.load(path)]
+    k = np.arange(data.n_steps + 1)
+    assert data.n_steps >= wanted
+    np.testing.assert_array_equal(data.obs[0], np.stack([k, k**2], axis=1))
+    np.testing.assert_array_equal(data.actions[0, :, 0], -k[1:])
+
+
+def test_a_file_that_is_cut_anywhere_loses_one_step_at_most(tmp_path):
+    with recorder(tmp_path / "run") as whole:
+        whole.start([0.0, 0.0])
+        for k in range(5):
+            whole.step([k], [k + 1.0, 0.5])
+    content = whole.path.read_bytes()
+    ends = [i for i, byte in enumerate(content) if byte == ord("\n")]
+
+    for size in range(len(content) + 1):
+        whole.path.write_bytes(content[:size])
+        n_steps = sum(end < size for end in ends) - 2  # without header and first observation
+        if n_steps < 1:
+            with pytest.raises(TrajectoryError, match=r"interrupted before|holds no step yet"):
+                Trajectories.load(whole.path)
+        else:
+            assert Trajectories.load(whole.path).obs[0, :, 0].tolist() == list(range(n_steps + 1))
+
+
+def test_a_damaged_line_inside_is_named(tmp_path):
+    with recorder(tmp_path / "run") as whole:
+        whole.start([0.0, 0.0])
+        for k in range(5):
+            whole.step([k], [k + 1.0, 0.5])
+    lines = whole.path.read_text().splitlines(keepends=True)
+    whole.path.write_text("".join([*lines[:3], lines[3][:-10] + "\n", *lines[4:]]))
+
+    with pytest.raises(TrajectoryError, match=r"Line 4 of '.*run.jsonl' is damaged"):
+        Trajectories.load(whole.path)
+
+
+def test_a_loop_without_an_environment_and_its_conditions(tmp_path):
+    clock = itertools.count(100.0, 0.1)
+    with recorder(tmp_path / "run", clock=lambda: next(clock), condition="empty") as robot:
+        for label in ("empty", "loaded"):
+            robot.condition = label
+            robot.start([0.0, 1.0])
+            for k in range(4):
+                robot.step([k], [k, 1.0])
+        robot.start([5.0, 5.0])  # an episode without a step is no trajectory
+
+    data = Trajectories.load(tmp_path / "run.jsonl")
+
+    assert data.conditions == ("empty", "loaded") and data.lengths.tolist() == [4, 4]
+    assert data.actions[1, :, 0].tolist() == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_steps_of_uneven_length_are_resampled_to_the_intended_interval(tmp_path):
+    rng = np.random.default_rng(0)
+    times = np.cumsum(rng.uniform(0.08, 0.14, 60))
+    with recorder(tmp_path / "run") as robot:
+        robot.start([2.0 * times[0], 2.0], time=times[0])
+        for t in times[1:]:
+            robot.step([0.0], [2.0 * t, 2.0], time=t)
+
+    with pytest.warns(SamplingWarning, match="resampled to dt = 0.1 s"):
+        data = Trajectories.load(tmp_path / "run.jsonl")
+
+    # A straight line survives linear interpolation.
+    expected = 2.0 * (times[0] + 0.1 * np.arange(data.lengths[0] + 1))
+    np.testing.assert_allclose(data.obs[0, :, 0], expected, rtol=1e-12)
+
+
+def test_channels_of_a_recording_can_be_chosen_and_scaled(tmp_path):
+    with recorder(tmp_path / "run") as robot:
+        robot.start([0.0, 180.0])
+        robot.step([1.0], [1.0, 90.0])
+
+    columns = {"obs": [{"column": "v", "scale": np.pi / 180.0}]}
+    data = Trajectories.load(tmp_path / "run.jsonl", columns=columns)
+
+    np.testing.assert_allclose(data.obs[0, :, 0], [np.pi, np.pi / 2.0])
+
+
+def test_a_recording_is_never_overwritten_but_can_be_continued(tmp_path):
+    for run in range(2):
+        with recorder(tmp_path / "run", append=True) as robot:
+            robot.start([run, 0.0])
+            robot.step([1.0], [run, 1.0])
+        with robot.path.open("ab") as file:
+            file.write(b'{"time":0.2,"act')  # what a kill leaves behind
+
+    assert Trajectories.load(robot.path).obs[:, 0, 0].tolist() == [0.0, 1.0]
+    with pytest.raises(TrajectoryError, match="exists; a recording is never overwritten"):
+        recorder(tmp_path / "run")
+    with pytest.raises(TrajectoryError, match="has another interval or other channels"):
+        recorder(tmp_path / "run", append=True, actions=["torque"])
+
+
+def test_recordings_with_other_channels_are_not_mixed(tmp_path):
+    for name, channels in (("a", ["q", "v"]), ("b", ["q", "w"])):
+        with recorder(tmp_path / name, obs=channels) as robot:
+            robot.start([0.0, 0.0])
+            robot.step([1.0], [1.0, 1.0])
+
+    with pytest.raises(
+        TrajectoryError, match=r"must have the same obs, but .*a.jsonl' has \['q', 'v'"
+    ):
+        Trajectories.load(str(tmp_path / "*.jsonl"))
+
+
+@pytest.mark.parametrize(
+    ("use", "message"),
+    [
+        (lambda path: recorder(path / "no" / "where"), "The folder must exist and be writable"),
+        (lambda path: recorder(path / "a", obs=[]), "needs at least one observation channel"),
+        (lambda path: recorder(path / "b", obs=["u", "q"]), "a name of its own for each channel"),
+        (lambda path: recorder(path / "c", obs=["time"]), "other than time and condition"),
+        (lambda path: recorder(path / "d", obs="qv"), "obs must be a list of names, got 'qv'"),
+        (
+            lambda path: recorder(path / "e").step([0.0], [0.0, 0.0]),
+            "call start(obs) with the first",
+        ),
+        (
+            lambda path: recorder(path / "f").start([0.0]),
+            "obs must have 2 numbers (q, v), got shape",
+        ),
+        (lambda path: Recorder(path / "g", 0.0, obs=["q"], actions=[]), "dt must be the sampling"),
+        (lambda path: Record(Counter(), path / "h"), "does not say how long a step is"),
+        (
+            lambda path: Record(gymnasium.make("Pendulum-v1"), path / "i", obs_names=["q"]),
+            "The obs space has 3 channels, got the names ['q']",
+        ),
+    ],
+)
+def test_wrong_use_is_refused_with_the_way_out(use, message, tmp_path):
+    with pytest.raises(TrajectoryError, match=re.escape(message)):
+        use(tmp_path)
+
+
+def test_spaces_that_are_no_boxes_of_one_axis_are_refused(tmp_path):
+    env = Counter()
+    env.observation_space = spaces.Box(0.0, 1.0, (4, 4))
+
+    with pytest.raises(TrajectoryError, match=r"boxes of one axis, .*FlattenObservation"):
+        Record(env, tmp_path / "run", dt=0.1)
+    assert os.listdir(tmp_path) == []
+
+
+def test_discrete_actions_are_one_channel(tmp_path):
+    env = Record(Counter(), tmp_path / "run", dt=0.1, action_names=["gear"])
+    env.reset()
+    env.step(2)
+    env.close()
+
+    data = Trajectories.load(tmp_path / "run.jsonl")
+
+    assert data.actions.tolist() == [[[2.0]]] and data.report.actions == ("gear",)
+    with pytest.raises(TrajectoryError, match="is closed"):
+        env.step(1)
+
+
+def test_a_step_is_on_its_way_to_the_disk_when_it_returns_and_costs_little(tmp_path):
+    with recorder(tmp_path / "run") as robot:
+        robot.start([0.0, 0.0])
+        began = time.perf_counter()
+        for k in range(1000):
+            robot.step([k], [k, k])
+        seconds = (time.perf_counter() - began) / 1000
+        lines = robot.path.read_text().splitlines()
+
+    assert json.loads(lines[-1]) == {
+        "time": pytest.approx(100.0),
+        "action": [999.0],
+        "obs": [999.0] * 2,
+    }
+    assert seconds < 1e-3  # a loop of 1 kHz; some 15 us on an idle machine
