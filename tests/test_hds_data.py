@@ -188,6 +188,18 @@ def test_what_the_data_say_is_logged():
         assert lines.column(f"model/{key}"), key
 
 
+def test_a_model_diagnoses_its_data_sheet_by_what_it_has_measured(heavier):
+    model = small("hds", REAL, twin="PendulumReal", pretrain_data=heavier, residual=False)
+    with pytest.raises(TrajectoryError, match="learn"):
+        small("hds", REAL).diagnose()
+    model.learn(0)
+
+    found = model.diagnose(effects=[effects.CoulombFriction], calibrate=["mass"], progress=False)
+
+    assert [f.effect for f in found.findings] == ["parameter.damping"]
+    assert found.twin.values["mass"] == pytest.approx(1.3, rel=0.05)
+
+
 def test_a_share_of_the_rollouts_is_in_the_learned_model():
     twin = twins.make("PendulumReal").extend(effects.NeuralForce(n_members=1, net_arch=(2,)))
     model = small("hds", REAL, twin=twin, n_rollouts=8)

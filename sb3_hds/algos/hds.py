@@ -14,10 +14,12 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_hds.algos.correction import Correction, Wishes, correct, names_to_estimate
 from sb3_hds.algos.log import record_correction
 from sb3_hds.algos.measured import Measured, data_from
-from sb3_hds.algos.model import missing_effects
+from sb3_hds.algos.model import missing_effects, required
 from sb3_hds.algos.twin_algorithm import TwinAlgorithm
 from sb3_hds.core import Effect, Params, Trajectories, Twin
 from sb3_hds.effects import force_of
+from sb3_hds.errors import TrajectoryError
+from sb3_hds.sysid import Diagnosis, diagnose
 
 # The learned force is learned again when the data have grown by this factor.
 _GROWTH = 2.0
@@ -282,8 +284,7 @@ class HDS(TwinAlgorithm):
         :return: what the data say; None before anything was measured
         :raises NoTwinError: if the model was loaded without environment and without twin
         """
-        since = self._changed_at
-        data = self.measured.trajectories(None if since is None else self.real_timesteps - since)
+        data = self.measured.trajectories(self._since_change())
         if data is None or self.twin is None:
             return None
         n_steps = data.n_steps
@@ -312,6 +313,27 @@ class HDS(TwinAlgorithm):
                 self.run_epoch(gradient_steps)
             self._replanning = 0
         return found
+
+    def diagnose(self, **arguments: Any) -> Diagnosis:
+        """
+        What the data measured so far say about the twin as it was before any of them.
+
+        :param arguments: as of :func:`sb3_hds.diagnose`
+        :raises TrajectoryError: before anything was measured
+        :raises NoTwinError: if the model was loaded without environment and without twin
+        """
+        data = self.measured.trajectories(self._since_change())
+        if data is None:
+            raise TrajectoryError(
+                "Nothing was measured yet. Let the model learn(...) on the real system first."
+            )
+        force = force_of(twin := required(self.twin, self.twin_spec))
+        silent = {} if force is None else {f"{force[0]}.share": 0.0}
+        return diagnose(twin.with_parameters(**self.nominal | silent), data, **arguments)
+
+    def _since_change(self) -> int | None:
+        """:return: real steps that count, where the system changed; None if all do"""
+        return None if self._changed_at is None else self.real_timesteps - self._changed_at
 
     def varied(self, twin: Twin) -> Params:
         drawn, force = super().varied(twin), force_of(twin)

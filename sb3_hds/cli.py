@@ -1,0 +1,151 @@
+"""
+``sb3-hds``: what is wrong with a simulation, from the command line.
+
+    sb3-hds diagnose --twin PendulumReal --data 'logs/*.csv' --columns map.yml --report out.html
+    sb3-hds effects
+    sb3-hds twins
+"""
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """
+    :param arguments: as on the command line; default: those of this process
+    :return: 0 on any verdict; 1 where the question makes no sense, with one line on why
+    """
+    given = _parser().parse_args(arguments)
+    from sb3_hds.errors import SB3HDSError
+
+    try:
+        {"diagnose": _diagnose, "effects": _effects, "twins": _twins}[given.command](given)
+    except BrokenPipeError:
+        return 0
+    except (SB3HDSError, OSError, ImportError) as error:
+        print(f"sb3-hds: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("sb3-hds: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="sb3-hds", description="Find out what a simulation gets wrong."
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    ask = commands.add_parser("diagnose", help="name the cause, from measured data")
+    ask.add_argument("--twin", required=True, help="name or environment id, see 'sb3-hds twins'")
+    ask.add_argument("--data", required=True, nargs="+", help="files, or patterns in quotes")
+    ask.add_argument("--columns", help="yml file: what the columns of a log mean")
+    ask.add_argument("--set", nargs="*", default=[], metavar="NAME:VALUE", help="of the twin")
+    ask.add_argument("--calibrate", nargs="*", default=[], help="parameters that are not believed")
+    ask.add_argument("--effects", nargs="*", help="candidates; default: all, see 'sb3-hds effects'")
+    ask.add_argument("--budget", choices=("full", "quick"), default="full")
+    ask.add_argument("--seed", type=int, default=0)
+    ask.add_argument("--report", help="HTML page to write")
+    ask.add_argument("--json", help="JSON file to write")
+    commands.add_parser("effects", help="list the candidates, with units and explanations")
+    commands.add_parser("twins", help="list the simulations, with their parameters")
+    return parser
+
+
+def _diagnose(given: argparse.Namespace) -> None:
+    from sb3_hds import Trajectories, diagnose, twins
+    from sb3_hds.effects import ALL
+    from sb3_hds.errors import EffectError
+
+    known = {effect.name: effect for effect in ALL}
+    unknown = [name for name in given.effects or () if name not in known]
+    if unknown:
+        raise EffectError(
+            f"There is no effect {', '.join(unknown)}. There are: {', '.join(known)}."
+        )
+    twin = twins.make(given.twin, **dict(map(_setting, given.set)))
+    files = given.data[0] if len(given.data) == 1 else given.data
+    data = Trajectories.load(files, columns=given.columns)
+    chosen = ALL if given.effects is None else tuple(known[name] for name in given.effects)
+    found = diagnose(
+        twin,
+        data,
+        effects=chosen,
+        calibrate=given.calibrate,
+        seed=given.seed,
+        budget=given.budget,
+        progress=sys.stderr.isatty(),
+    )
+    print(found)
+    if given.json:
+        _write(Path(given.json), json.dumps(found.to_dict(), indent=1, allow_nan=False) + "\n")
+    if given.report:
+        print(f"The report is {found.to_html(given.report)}.")
+
+
+def _setting(text: str) -> tuple[str, float]:
+    from sb3_hds.errors import ParameterError
+
+    name, _, value = text.partition(":")
+    try:
+        return name, float(value)
+    except ValueError:
+        raise ParameterError(f"--set takes NAME:VALUE with a number, got '{text}'.") from None
+
+
+def _write(path: Path, text: str) -> None:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _effects(given: argparse.Namespace) -> None:
+    from sb3_hds.effects import ALL
+
+    _show(
+        ("effect", "acts on", "parameters", "what it is"),
+        [
+            (
+                effect.name,
+                effect.slot,
+                ", ".join(f"{name} [{p.unit}]" for name, p in effect.parameters.items()),
+                effect.explanation,
+            )
+            for effect in ALL
+        ],
+    )
+
+
+def _twins(given: argparse.Namespace) -> None:
+    from sb3_hds import twins
+
+    rows = []
+    for name in twins.names():
+        twin = twins.make(name)
+        described = ", ".join(
+            f"{key} {value:g} {twin.parameters[key].unit}" for key, value in twin.values.items()
+        )
+        rows.append((name, twin.env_id or "", described))
+    _show(("twin", "environment", "parameters"), rows)
+
+
+def _show(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(*columns)
+    for row in rows:
+        table.add_row(*map(str, row))
+    Console(width=None if sys.stdout.isatty() else 120).print(table)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
