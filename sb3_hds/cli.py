@@ -58,9 +58,11 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _diagnose(given: argparse.Namespace) -> None:
-    from sb3_hds import Trajectories, diagnose, twins
+    from sb3_hds.data import Trajectories
     from sb3_hds.effects import ALL
     from sb3_hds.errors import EffectError
+    from sb3_hds.sysid import diagnose
+    from sb3_hds.twins import make
 
     known = {effect.name: effect for effect in ALL}
     unknown = [name for name in given.effects or () if name not in known]
@@ -68,7 +70,7 @@ def _diagnose(given: argparse.Namespace) -> None:
         raise EffectError(
             f"There is no effect {', '.join(unknown)}. There are: {', '.join(known)}."
         )
-    twin = twins.make(given.twin, **dict(map(_setting, given.set)))
+    twin = make(given.twin, **dict(map(_setting, given.set)))
     files = given.data[0] if len(given.data) == 1 else given.data
     data = Trajectories.load(files, columns=given.columns)
     chosen = ALL if given.effects is None else tuple(known[name] for name in given.effects)
@@ -125,11 +127,11 @@ def _effects(given: argparse.Namespace) -> None:
 
 
 def _twins(given: argparse.Namespace) -> None:
-    from sb3_hds import twins
+    from sb3_hds.twins import make, names
 
     rows = []
-    for name in twins.names():
-        twin = twins.make(name)
+    for name in names():
+        twin = make(name)
         described = ", ".join(
             f"{key} {value:g} {twin.parameters[key].unit}" for key, value in twin.values.items()
         )
