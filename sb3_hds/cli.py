@@ -20,7 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :param arguments: as on the command line; default: those of this process
     :return: 0 on any verdict; 1 where the question makes no sense, with one line on why
     """
-    given = _parser().parse_args(arguments)
+    given = parser().parse_args(arguments)
     from sb3_hds.errors import SB3HDSError
 
     try:
@@ -36,11 +36,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def parser() -> argparse.ArgumentParser:
+    """:return: what the command understands"""
+    every = argparse.ArgumentParser(
         prog="sb3-hds", description="Find out what a simulation gets wrong."
     )
-    commands = parser.add_subparsers(dest="command", required=True)
+    commands = every.add_subparsers(dest="command", required=True)
     ask = commands.add_parser("diagnose", help="name the cause, from measured data")
     ask.add_argument("--twin", required=True, help="name or environment id, see 'sb3-hds twins'")
     ask.add_argument("--data", required=True, nargs="+", help="files, or patterns in quotes")
@@ -54,7 +55,7 @@ def _parser() -> argparse.ArgumentParser:
     ask.add_argument("--json", help="JSON file to write")
     commands.add_parser("effects", help="list the candidates, with units and explanations")
     commands.add_parser("twins", help="list the simulations, with their parameters")
-    return parser
+    return every
 
 
 def _diagnose(given: argparse.Namespace) -> None:

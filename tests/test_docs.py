@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from rl_zoo_plugin.tables import ALGORITHMS
-from sb3_hds import HDS, PODS, algos, effects, twins
+from sb3_hds import HDS, PODS, algos, cli, effects, twins
 from sb3_hds.algos.log import record_epoch
 from sb3_hds.envs.registration import HARDWARE, STEP_LIMITS
 
@@ -121,6 +121,7 @@ def test_commands_that_do_not_exist_are_found():
         "rl_zoo3 train --algo hsd",
         "rl_zoo3 train --algo hds -params n_rolouts:5",
         "python benchmarks/nothing.py",
+        "sb3-hds diagnose --twin PendulumReal",
         "python examples/demo.py --fodler demo",
         "rm -rf everything",
     )
@@ -263,6 +264,12 @@ def objection(words: list[str]) -> str | None:
             return _wrong_zoo_command(command, options)
         case ["python", "-m", module, *options] if module.startswith("rl_zoo3."):
             return _wrong_zoo_command(module.removeprefix("rl_zoo3."), options)
+        case ["sb3-hds", *options]:
+            try:
+                cli.parser().parse_args(options)
+            except SystemExit:
+                return f"sb3-hds does not take {' '.join(options)}"
+            return None
         case ["python", script, *options]:
             if not (ROOT / script).is_file():
                 return f"no script {script}"
