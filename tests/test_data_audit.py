@@ -478,3 +478,12 @@ def test_names_must_be_one_per_channel(data):
         audit(data, ["q", "v"])
     with pytest.raises(TrajectoryError, match="a name of its own"):
         audit(data, ["q", "q", "v"])
+
+
+@pytest.mark.parametrize("n", [5, 12, 20, 41, 60])
+def test_short_recordings_are_no_error(n):
+    time = 0.05 * np.arange(n)
+    obs = np.stack([np.cos(time), np.sin(time), np.ones(n)], 1)
+    data = Trajectories.from_arrays([obs], [np.sin(3.0 * time[:-1, None])], dt=0.05)
+
+    assert audit(data).velocity_shift == {}

@@ -90,6 +90,8 @@ def lags_of(data: Trajectories, names: Sequence[str]) -> list[Lag]:
         for name, positions in _positions(episodes, names, v):
             pairs = [(q, x[:, v]) for q, x in zip(positions, episodes, strict=True)]
             for width in _WIDTHS:
+                if any(len(x) <= 4 * reach + width for x in episodes):
+                    continue
                 scores = _Scores.of(pairs, data.dt, reach, width)
                 if scores.highest > _CLEAR:
                     scored.append((scores.highest, name, pairs, scores, width))
