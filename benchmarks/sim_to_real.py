@@ -21,6 +21,7 @@ from hardware import CELLS, length_of, make, pretrained, return_of
 from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
 
 METHODS = ("ceiling", "wrong_twin", "randomised", "hds", "sac", "tqc", "droq")
+_DEEPEST = 1800.0  # below the best return, in the figure
 STEPS = (1, 5, 10)  # real episodes after which learners are evaluated
 SWEEP = [cell for cell in CELLS if cell != "worn"]
 
@@ -185,6 +186,9 @@ def figure(shown: pd.DataFrame) -> None:
         for method, colour in styles.items():
             rows = group[group["method"] == method]
             panel.plot(rows["episodes"], rows["return"], "o-", color=colour, label=method)
+        # Where a learner first spins, the rest would be a line.
+        best = group["return"].max()
+        panel.set_ylim(bottom=max(panel.get_ylim()[0], best - _DEEPEST))
         panel.set_title(cell, fontsize=9)
         panel.set_xlabel("real episodes", fontsize=8)
         panel.tick_params(labelsize=8)

@@ -21,6 +21,7 @@ def quick_compilation():
 
 # Few tests, much time: a worker that gets such a file last keeps everybody waiting.
 _LONG = (
+    "test_diagnose.py",
     "test_hds_data.py",
     "test_calibrate.py",
     "test_zoo_plugin.py",
