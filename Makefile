@@ -58,6 +58,7 @@ docs: install
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/python examples/demo.py --folder demo
+	$(BIN)/python examples/demo_diagnosis.py --folder demo
 
 clean:
 	rm -rf $(VENV) build dist demo docs/_build .pytest_cache .ruff_cache

@@ -1,7 +1,17 @@
 """Fixtures that every test module may use."""
 
-import jax
-import pytest
+import gc
+import os
+import tempfile
+from pathlib import Path
+
+# Programs that one process has compiled serve the others: workers and what they start inherit it.
+_FOLDER = tempfile.TemporaryDirectory(prefix="sb3_hds_tests_")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _FOLDER.name)
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
 
 
 @pytest.fixture
@@ -17,6 +27,22 @@ def quick_compilation():
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
+
+
+_MAPS = Path("/proc/self/maps")
+_MOST_MAPS = 20_000
+
+
+@pytest.fixture(autouse=True)
+def few_programs():
+    """Drop compiled programs before Linux runs out of memory maps for them.
+
+    Each takes some; beyond ``vm.max_map_count`` (65,530) XLA cannot allocate, then crashes.
+    """
+    yield
+    if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > _MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 # Few tests, much time: a worker that gets such a file last keeps everybody waiting.

@@ -62,8 +62,18 @@ def blocks(page: Path, language: str) -> list[str]:
     return ["\n" * text.count("\n", 0, match.start(2)) + match[2] for match in found]
 
 
+# Their code learns from data, for minutes.
+LONG = ("docs/guide/measured.md", "docs/guide/diagnose.md")
+
+
 def pages_with(language: str) -> list:
-    return [pytest.param(page, id=name_of(page)) for page in PAGES if blocks(page, language)]
+    """Pages with code in a language."""
+    marks = {name: pytest.mark.expensive for name in LONG if language == "python"}
+    return [
+        pytest.param(page, id=name_of(page), marks=marks.get(name_of(page), ()))
+        for page in PAGES
+        if blocks(page, language)
+    ]
 
 
 def commands(page: Path) -> list[list[str]]:

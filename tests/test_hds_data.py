@@ -80,6 +80,7 @@ def test_a_nuisance_that_may_not_be_corrected_stays(heavier):
     assert found.twin.values["mass"] == 1.0
 
 
+@pytest.mark.expensive
 def test_what_has_no_parameter_is_left_to_the_learned_force():
     twin = twins.make("PendulumReal")
     data = measured(twin.extend(effects.CoulombFriction(0, tau_c=0.4)), noise=0.005, n=10)
@@ -148,6 +149,7 @@ def test_too_few_data_change_nothing():
 # --- in the algorithm
 
 
+@pytest.mark.expensive
 def test_on_a_planted_mismatch_hds_does_better_than_pods():
     """Both pretrain in the same wrong twin; HDS sees 200 steps of the real system."""
     settings = {"mass": 1.25, "length": 1.3}

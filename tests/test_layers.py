@@ -40,7 +40,7 @@ LIBRARIES = {
     "wrappers": STEPPING,
     "algos": LEARNING,
     "deploy": LEARNING | {"onnx", "onnxruntime"},
-    "experiments": LEARNING | TABLES,
+    "experiments": LEARNING | TABLES | {"scipy"},
     "cli": LEARNING | TABLES,
     "rl_zoo_plugin": {"rl_zoo3", "optuna"},
     "rl_zoo_plugin/compilation_cache.py": {"jax"},

@@ -84,7 +84,7 @@ def _section(twin: type[Twin]) -> str:
         "Commands:\n\n",
         _signals(twin.actuators),
         "Observations:\n\n",
-        _signals(twin.channels),
+        _signals(twin().channels),
         "Parameters:\n\n",
         _parameters(twin.parameters),
     ]

@@ -37,6 +37,7 @@ _AT_LEAST = {
     "gradient_steps": -1,
     "refit_freq": 0,
     "replan_epochs": 0,
+    "diagnose_freq": 0,
     "max_saved_steps": 1,
 }
 _DERIVED = ("horizon", "lookahead")

@@ -17,14 +17,16 @@ from sb3_hds.algos.measured import Measured, data_from
 from sb3_hds.algos.model import missing_effects, required
 from sb3_hds.algos.twin_algorithm import TwinAlgorithm
 from sb3_hds.core import Effect, Params, Trajectories, Twin
-from sb3_hds.effects import force_of
+from sb3_hds.effects import ALL, force_of
 from sb3_hds.errors import TrajectoryError
-from sb3_hds.sysid import Diagnosis, diagnose
+from sb3_hds.sysid import Diagnosis, Finding, diagnose
 
 # The learned force is learned again when the data have grown by this factor.
 _GROWTH = 2.0
 # Where the model has changed, learning rates go back to this point of their schedule.
 _AGAIN_FROM = 0.5
+
+_CATALOGUE = {effect.name: effect for effect in ALL}
 
 
 class HDS(TwinAlgorithm):
@@ -117,6 +119,8 @@ class HDS(TwinAlgorithm):
         them from a quarter on. The HDS project: 0.05.
     :param refit_freq: blocks of ``train_freq`` from one correction to the next; 0: never
     :param replan_epochs: planning epochs after a correction that changes the model noticeably
+    :param diagnose_freq: blocks of ``train_freq`` from one diagnosis to the next, which attaches
+        the effects that the data name; 0: never
     :param pretrain_data: ``Trajectories``, or a file of them, from which the model is corrected
         before the first plan. The HDS project: random motion.
     :param save_data: whether the measured steps are saved with the model
@@ -183,6 +187,7 @@ class HDS(TwinAlgorithm):
         beta: float | str = "auto",
         refit_freq: int = 1,
         replan_epochs: int = 30,
+        diagnose_freq: int = 0,
         pretrain_data: Trajectories | str | None = None,
         save_data: bool = True,
         max_saved_steps: int = 100_000,
@@ -202,6 +207,7 @@ class HDS(TwinAlgorithm):
         self.beta = beta
         self.refit_freq = refit_freq
         self.replan_epochs = replan_epochs
+        self.diagnose_freq = diagnose_freq
         self.save_data = save_data
         self.max_saved_steps = max_saved_steps
         self.model_beta = 0.0
@@ -267,6 +273,8 @@ class HDS(TwinAlgorithm):
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """Correct the model where a correction is due, then plan."""
         self._n_blocks += 1
+        if self.diagnose_freq and self._n_blocks % self.diagnose_freq == 0:
+            self.extend_model()
         if self.refit_freq and self._n_blocks % self.refit_freq == 0:
             self.correct_model(gradient_steps)
         super().train(gradient_steps, batch_size)
@@ -331,6 +339,32 @@ class HDS(TwinAlgorithm):
         silent = {} if force is None else {f"{force[0]}.share": 0.0}
         return diagnose(twin.with_parameters(**self.nominal | silent), data, **arguments)
 
+    def extend_model(self, **arguments: Any) -> Diagnosis | None:
+        """
+        Diagnose what was measured, and attach the effects that the data name to the twin.
+
+        Parameters that corrections estimate anyway are no findings here. The next correction
+        estimates the new effects with them, and learns the remaining force anew.
+
+        :param arguments: as of :func:`sb3_hds.diagnose`
+        :return: what the data say; None before anything was measured
+        """
+        if self.twin is None or self.measured.trajectories(self._since_change()) is None:
+            return None
+        nuisances = names_to_estimate(self.twin, self.calibrated)
+        own = {"budget": "quick", "progress": False, "calibrate": nuisances} | arguments
+        found = self.diagnose(**own)
+        causes = [_effect_of(f) for f in found.findings if f.effect in _CATALOGUE]
+        if causes:
+            self.twin = self.twin.extend(*causes)
+            for effect in causes:
+                for name, parameter in effect.parameters.items():
+                    self.nominal[f"{effect.name}.{effect.where}.{name}"] = parameter.null
+            self.twin_spec, self._workspace = self.twin.to_spec(), None
+            self._steps_at_force = 0
+        self.logger.record("model/diagnosed_effects", len(causes))
+        return found
+
     def _since_change(self) -> int | None:
         """:return: real steps that count, where the system changed; None if all do"""
         return None if self._changed_at is None else self.real_timesteps - self._changed_at
@@ -373,3 +407,9 @@ class HDS(TwinAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "measured"]
+
+
+def _effect_of(finding: Finding) -> Effect:
+    """:return: the named effect as the data have it"""
+    values = {name: found.estimate for name, found in finding.parameters.items()}
+    return _CATALOGUE[finding.effect](finding.where["name"], **values)

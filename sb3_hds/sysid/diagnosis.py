@@ -5,6 +5,7 @@ import math
 import os
 import textwrap
 from collections.abc import Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -93,6 +94,10 @@ class Diagnosis:
 
     :param verdict: ``"named"``, ``"ambiguous"``, ``"none"``, ``"unknown"`` or
         ``"not_identifiable"``
+    :param believed: the twin as it came
+    :param twin: extended, ready to train in
+    :param data_hash: of the data
+    :param seed: of the split and of what else was drawn
     :param findings: causes, in the order in which they were found
     :param unexplained: what remains after them, in words; empty if nothing does
     :param gain: by horizon in steps
@@ -100,25 +105,25 @@ class Diagnosis:
     :param detectable: by effect and place, the smallest size that these data would have shown
     :param rejected: the other candidates, with numbers
     :param caveats: what to keep in mind, in words
-    :param twin: extended, ready to train in
-    :param data_hash: of the data
     :param versions: of the libraries that computed this
-    :param seed: of the split and of what else was drawn
     :param pictures: numbers ready to draw; not part of :meth:`to_dict`
     """
 
     verdict: Verdict
-    findings: tuple[Finding, ...]
-    unexplained: str
-    gain: Mapping[int, HorizonGain]
-    explained: float
-    detectable: Mapping[str, Mapping[str, float]]
-    rejected: tuple[Rejected, ...]
-    caveats: tuple[str, ...]
+    believed: Twin
     twin: Twin
     data_hash: str
-    versions: Mapping[str, str]
     seed: int
+    findings: tuple[Finding, ...] = ()
+    unexplained: str = ""
+    gain: Mapping[int, HorizonGain] = dataclasses.field(default_factory=dict)
+    explained: float = 0.0
+    detectable: Mapping[str, Mapping[str, float]] = dataclasses.field(default_factory=dict)
+    rejected: tuple[Rejected, ...] = ()
+    caveats: tuple[str, ...] = ()
+    versions: Mapping[str, str] = dataclasses.field(
+        default_factory=lambda: {name: version(name) for name in ("sb3-hds", "jax", "numpy")}
+    )
     pictures: Pictures | None = None
 
     @property
@@ -155,21 +160,25 @@ class Diagnosis:
         found = {
             field.name: getattr(self, field.name)
             for field in dataclasses.fields(self)
-            if field.name not in ("twin", "pictures")
+            if field.name not in ("believed", "twin", "pictures")
         }
-        return _plain(found) | {"twin": _plain(self.twin.to_spec())}
+        twins = {"believed": self.believed.to_spec(), "twin": self.twin.to_spec()}
+        return _plain(found) | _plain(twins)
 
-    def to_html(self, path: str | os.PathLike[str]) -> Path:
+    def to_html(
+        self, path: str | os.PathLike[str], policy_gain: Mapping[str, Any] | None = None
+    ) -> Path:
         """
         Write one self-contained page: the verdict, its evidence, pictures, caveats.
 
         :param path: of the file; one of that name is replaced as a whole
+        :param policy_gain: ``measure_policy_gain(...).to_dict()``, where that was measured
         :return: its path
         :raises ImportError: without matplotlib and jinja2 (extra ``report``)
         """
         from sb3_hds.sysid.report import write_report
 
-        return write_report(self, path)
+        return write_report(self, path, policy_gain)
 
     def __str__(self) -> str:
         return self.summary()

@@ -1,7 +1,8 @@
 """How well hypotheses explain windows of data: one compiled program for all of them."""
 
-from collections.abc import Sequence
-from functools import partial
+import dataclasses
+from collections.abc import Iterator, Sequence
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import jax
@@ -17,12 +18,19 @@ from sb3_hds.sysid.shooting import Shots, n_free, simulate
 _HUBER = 3.0
 # Stands for the error of a simulation that is not finite, in units of the noise.
 _NOT_FINITE = 1e4
-# Damping of the first step, relative to the curvature, and how it changes.
-_DAMPING, _LESS, _MORE = 1e-2, 0.2, 5.0
+# Damping of the first step, relative to the curvature, how it changes, and where it ends.
+_DAMPING, _LESS, _MORE, _MOST_DAMPING = 1e-3, 0.2, 8.0, 1e6
 # A step that lowers the cost by a smaller share than this is the last.
-_ENOUGH = 1e-5
+_ENOUGH = 1e-4
 # Added to curvatures, relative to their trace, so that what moves nothing stays where it is.
 _RIDGE = 1e-9
+# Most windows that are simulated at a time.
+_PORTION = 64
+
+
+def portion_for(n: int) -> int:
+    """:return: windows to simulate at a time where there are ``n`` or fewer"""
+    return min(_PORTION, 1 << max(n - 1, 1).bit_length())
 
 
 class Point(NamedTuple):
@@ -33,52 +41,80 @@ class Point(NamedTuple):
     :param offsets: of the start states, shape ``(n, free)``
     :param errors: mean square over each window, in units of the noise, shape ``(n,)``
     :param raw: simulated minus measured, shape ``(n, steps + 1, n_obs)``
+    :param cost: what fits minimise: large errors count in proportion
     """
 
     theta: np.ndarray
     offsets: np.ndarray
     errors: np.ndarray
     raw: np.ndarray
+    cost: float
 
 
 class Slopes(NamedTuple):
     """
     At a point, start states eliminated, parameters in units of their scale.
 
-    :param curvature: of half the squared error of each window, shape ``(n, p, p)``
-    :param scores: its slopes, shape ``(n, p)``
+    :param curvature: of the cost of each window, shape ``(n, p, p)``
+    :param scores: slopes of the cost of each window, shape ``(n, p)``
     """
 
     curvature: np.ndarray
     scores: np.ndarray
 
 
+class _Blocks(NamedTuple):
+    """Normal equations of windows: of start states, of parameters, and between them."""
+
+    raw: np.ndarray
+    cost: np.ndarray
+    own: np.ndarray
+    cross: np.ndarray
+    shared: np.ndarray
+    by_start: np.ndarray
+    by_theta: np.ndarray
+
+
+class _Step(NamedTuple):
+    """Normal equations with the start states eliminated, and how those follow."""
+
+    curvature: np.ndarray
+    scores: np.ndarray
+    from_score: np.ndarray
+    from_step: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Evidence:
     """
     Windows of data under the hypotheses.
 
     :param hypotheses: what may move
-    :param shots: windows; those of weight zero do not count
+    :param shots: windows, all of weight one
     :param noise: of each channel, shape ``(n_obs,)``
     :param width: most parameters that move at a time
+    :param rows: whether a row of a window counts, shape ``(steps + 1,)``; default: all do
+    :param portion: windows that are simulated at a time: one program serves data of every size
     """
 
-    def __init__(
-        self, hypotheses: Hypotheses, shots: Shots, noise: Float[np.ndarray, " obs"], width: int
-    ) -> None:
-        self.hypotheses, self.shots, self.noise, self.width = hypotheses, shots, noise, width
+    hypotheses: Hypotheses
+    shots: Shots
+    noise: Float[np.ndarray, " obs"]
+    width: int
+    rows: Float[np.ndarray, " rows"] | None = None
+    portion: int = _PORTION
 
     def with_noise(self, noise: Float[np.ndarray, " obs"]) -> "Evidence":
-        return Evidence(self.hypotheses, self.shots, noise, self.width)
+        return dataclasses.replace(self, noise=noise)
 
-    def on(self, shots: Shots) -> "Evidence":
-        """:return: the same hypotheses on other windows, as many"""
-        return Evidence(self.hypotheses, shots, self.noise, self.width)
+    def on(self, shots: Shots, rows: Float[np.ndarray, " rows"] | None = None) -> "Evidence":
+        """:return: the same hypotheses on other windows of the same length"""
+        return dataclasses.replace(self, shots=shots, rows=rows)
 
     def fit(
         self,
         theta: Float[np.ndarray, " p"],
-        moving: Sequence[int],
+        free: Sequence[int],
         offsets: Float[np.ndarray, "n free"] | None = None,
         n_steps: int = 15,
     ) -> Point:
@@ -86,181 +122,195 @@ class Evidence:
         Levenberg-Marquardt over the start states and some parameters, within their bounds.
 
         :param theta: where to begin
-        :param moving: indices of the parameters that move; none: only start states do
+        :param free: indices of the parameters that move; none: only start states do
+        :param offsets: of the start states, where to begin; default: as measured
+        :param n_steps: at most
         """
-        h = self.hypotheses
-        index = np.full(self.width, len(theta))
-        index[: len(moving)] = list(moving)
-        first = np.zeros((self.shots.n, n_free(h.twin))) if offsets is None else offsets
+        h, moving = self.hypotheses, np.array(free, int)
+        low, high, size = h.lower[moving], h.upper[moving], h.scale[moving]
+        theta = np.array(theta, float)
+        offsets = self._unmoved() if offsets is None else offsets
+        now, damping = self._blocks(theta, moving, offsets), _DAMPING
+        for _ in range(n_steps):
+            step = _eliminated(now, damping)
+            new = theta.copy()
+            new[moving] = _moved(theta[moving], step, size, low, high, damping)
+            z = (new[moving] - theta[moving]) / size
+            ahead = offsets + step.from_score + step.from_step @ z
+            then = self._blocks(new, moving, ahead)
+            if not len(moving):
+                # Start states of different windows have nothing to do with each other.
+                better = then.cost < now.cost
+                gained = np.sum((now.cost - then.cost)[better])
+                offsets = np.where(better[:, None], ahead, offsets)
+                now = _Blocks(
+                    *(
+                        np.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+                        for a, b in zip(then, now, strict=True)
+                    )
+                )
+            elif gained := max(now.cost.sum() - then.cost.sum(), 0.0):
+                theta, offsets, now = new, ahead, then
+            damping *= _LESS if gained else _MORE
+            if (gained and gained < _ENOUGH * now.cost.sum()) or damping > _MOST_DAMPING:
+                break
+        counted = now.raw / self.noise * self._counted[:, None]
+        errors = np.sum(counted**2, (1, 2)) / (self._counted.sum() * now.raw.shape[2])
+        return Point(theta, offsets, errors, now.raw, float(now.cost.sum()))
+
+    def slopes(self, point: Point, index: Sequence[int] | None = None) -> Slopes:
+        """
+        :param index: of the parameters; default: all
+        """
+        every = np.arange(len(point.theta)) if index is None else np.array(index, int)
+        step = _eliminated(self._blocks(point.theta, every, point.offsets), 0.0)
+        return Slopes(step.curvature, step.scores)
+
+    def _unmoved(self) -> np.ndarray:
+        return np.zeros((self.shots.n, n_free(self.hypotheses.twin)))
+
+    @cached_property
+    def _counted(self) -> np.ndarray:
+        return np.ones(self.shots.obs.shape[1]) if self.rows is None else self.rows
+
+    @cached_property
+    def _portions(self) -> list[tuple[Shots, slice]]:
+        """Windows, some at a time, the last ones filled up."""
+        found = []
         with jax.enable_x64(True):
-            given = map(jnp.asarray, (theta, index, first, self.noise, h.scale, h.lower, h.upper))
-            found = _fit(
-                h.twin,
-                h.names,
-                _doubles(h.twin.params),
-                Shots(*map(jnp.asarray, self.shots)),
-                n_steps,
-                *given,
-            )
-            return Point(*map(np.asarray, found))
+            for first in range(0, self.shots.n, self.portion):
+                index = np.minimum(np.arange(first, first + self.portion), self.shots.n - 1)
+                portion = Shots(*(jnp.asarray(leaf[index], jnp.float64) for leaf in self.shots))
+                found.append((portion, slice(first, min(first + self.portion, self.shots.n))))
+        return found
 
-    def slopes(self, point: Point) -> Slopes:
+    def _blocks(self, theta: np.ndarray, index: np.ndarray, offsets: np.ndarray) -> _Blocks:
+        """Normal equations at a point, of the parameters named by ``index``."""
+        found = [
+            self._portion(shots, theta, index, offsets[rows], rows.stop - rows.start)
+            for shots, rows in self._portions
+        ]
+        return _Blocks(*map(np.concatenate, zip(*found, strict=True)))
+
+    def _portion(
+        self, shots: Shots, theta: np.ndarray, index: np.ndarray, offsets: np.ndarray, n: int
+    ) -> _Blocks:
         h = self.hypotheses
-        with jax.enable_x64(True):
-            given = map(jnp.asarray, (point.theta, point.offsets, self.noise, h.scale))
-            found = _slopes(
-                h.twin,
-                h.names,
-                _doubles(h.twin.params),
-                Shots(*map(jnp.asarray, self.shots)),
-                *given,
-            )
-            return Slopes(*map(np.asarray, found))
+        filled = np.zeros((self.portion, offsets.shape[1]))
+        filled[:n] = offsets
+        slopes = []
+        for chosen in _in_groups(index, self.width, len(theta)):
+            with jax.enable_x64(True):
+                found = _look(h.twin, h.names, h.fixed, shots, theta, chosen, filled, h.scale)
+            raw, by_start, by_theta = (np.asarray(leaf)[:n] for leaf in found)
+            slopes.append(by_theta)
+        by_theta = np.concatenate(slopes, -1)[..., : len(index)]
+        return _normal(raw, by_start, by_theta, self.noise, self._counted)
 
 
-def _doubles(params: Params) -> Params:
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
-
-
-def _error(
-    twin: Twin,
-    names: tuple[str, ...],
-    fixed: Params,
-    noise: Array,
-    theta: Array,
-    offset: Array,
-    shot: Shots,
-) -> Float[Array, " residuals"]:
-    params = fixed | {name: theta[i] for i, name in enumerate(names)}
-    error = ((simulate(twin, params, shot, offset) - shot.obs) / noise).ravel()
-    return shot.weight * jnp.where(jnp.isfinite(error), error, _NOT_FINITE)
-
-
-def _weights(error: Array) -> Array:
-    return jnp.minimum(1.0, _HUBER / jnp.maximum(jnp.abs(error), 1e-12))
-
-
-def _cost(error: Array) -> Array:
-    size = jnp.abs(error)
-    small = jnp.minimum(size, _HUBER)
-    return jnp.sum(0.5 * small**2 + _HUBER * (size - small))
-
-
-class _Normal(NamedTuple):
-    """Normal equations of one window, its start state eliminated."""
-
-    curvature: Array
-    score: Array
-    from_score: Array
-    from_step: Array
-
-
-def _normal(error: Array, by_start: Array, by_theta: Array) -> _Normal:
-    weight = _weights(error)[:, None]
-    own = by_start.T @ (weight * by_start)
-    own = own + (_RIDGE * jnp.trace(own) + 1e-300) * jnp.eye(own.shape[0])
-    cross = by_start.T @ (weight * by_theta)
-    right = by_start.T @ (weight[:, 0] * error)
-    solved = jnp.linalg.solve(own, jnp.concatenate([right[:, None], cross], 1))
-    curvature = by_theta.T @ (weight * by_theta) - cross.T @ solved[:, 1:]
-    score = by_theta.T @ (weight[:, 0] * error) - cross.T @ solved[:, 0]
-    return _Normal(curvature, score, -solved[:, 0], -solved[:, 1:])
-
-
-@partial(jax.jit, static_argnums=(0, 1, 4))
-def _fit(
-    twin: Twin,
-    names: tuple[str, ...],
-    fixed: Params,
-    shots: Shots,
-    n_steps: int,
-    theta: Array,
-    index: Array,
-    offsets: Array,
-    noise: Array,
-    scale: Array,
-    lower: Array,
-    upper: Array,
-) -> tuple[Array, Array, Array, Array]:
-    n_theta = len(names)
-    real = index < n_theta
-    at = jnp.where(real, index, 0)
-    size = jnp.where(real, scale[at], 0.0)
-    low = jnp.where(real, lower[at], -jnp.inf)
-    high = jnp.where(real, upper[at], jnp.inf)
-    error = partial(_error, twin, names, fixed, noise)
-
-    def moved(theta: Array, values: Array) -> Array:
-        # The last place takes what belongs to no parameter.
-        extended = jnp.concatenate([theta, jnp.zeros(1, theta.dtype)])
-        return extended.at[index].set(values)[:n_theta]
-
-    def total(values: Array, offsets: Array) -> Array:
-        errors = jax.vmap(lambda o, s: _cost(error(moved(theta, values), o, s)))(offsets, shots)
-        return jnp.sum(errors)
-
-    def equations(values: Array, offset: Array, shot: Shots) -> _Normal:
-        n = offset.shape[0]
-
-        def of(both: Array) -> Array:
-            return error(moved(theta, values + size * both[n:]), offset + both[:n], shot)
-
-        here, push = jax.linearize(of, jnp.zeros(n + index.shape[0], theta.dtype))
-        slopes = jax.vmap(push)(jnp.eye(n + index.shape[0], dtype=theta.dtype)).T
-        return _normal(here, slopes[:, :n], slopes[:, n:])
-
-    def step(carry):
-        values, offsets, cost, damping, k, _ = carry
-        normal = jax.vmap(equations, (None, 0, 0))(values, offsets, shots)
-        curvature, score = normal.curvature.sum(0), normal.score.sum(0)
-        stuck = ((values <= low) & (score > 0.0)) | ((values >= high) & (score < 0.0))
-        free = real & ~stuck
-        curvature = jnp.where(free[:, None] & free[None], curvature, 0.0)
-        diagonal = jnp.diag(curvature)
-        ridge = damping * diagonal + _RIDGE * jnp.trace(curvature) + 1e-300
-        solved = jnp.linalg.solve(
-            curvature + jnp.diag(jnp.where(free, ridge, 1.0)), jnp.where(free, score, 0.0)
-        )
-        new = jnp.clip(values - size * solved, low, high)
-        z = jnp.where(size > 0.0, (new - values) / jnp.where(size > 0.0, size, 1.0), 0.0)
-        ahead = offsets + normal.from_score + jnp.einsum("nfk,k->nf", normal.from_step, z)
-        new_cost = total(new, ahead)
-        better = new_cost < cost
-        finished = better & (cost - new_cost < _ENOUGH * cost)
-        values, offsets = jnp.where(better, new, values), jnp.where(better, ahead, offsets)
-        damping = jnp.where(better, _LESS, _MORE) * damping
-        return values, offsets, jnp.where(better, new_cost, cost), damping, k + 1, finished
-
-    values = jnp.where(real, theta[at], 0.0)
-    first = (values, offsets, total(values, offsets), jnp.asarray(_DAMPING, theta.dtype), 0, False)
-    going = lambda carry: (carry[4] < n_steps) & ~carry[5]  # noqa: E731
-    values, offsets, *_ = jax.lax.while_loop(going, step, first)
-    theta = moved(theta, values)
-    raw = jax.vmap(lambda o, s: error(theta, o, s))(offsets, shots)
-    shape = shots.obs.shape
-    return theta, offsets, jnp.mean(raw**2, 1), raw.reshape(shape) * noise
+def _in_groups(index: np.ndarray, width: int, nothing: int) -> Iterator[np.ndarray]:
+    """Indices, so many at a time, the last ones filled up by one that names nothing."""
+    for first in range(0, max(len(index), 1), width):
+        own = index[first : first + width]
+        yield np.concatenate([own, np.full(width - len(own), nothing)])
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _slopes(
+def _look(
     twin: Twin,
     names: tuple[str, ...],
     fixed: Params,
     shots: Shots,
-    theta: Array,
-    offsets: Array,
-    noise: Array,
-    scale: Array,
-) -> tuple[Array, Array]:
-    error = partial(_error, twin, names, fixed, noise)
+    theta: Float[Array, " p"],
+    index: Array,
+    offsets: Float[Array, "n free"],
+    scale: Float[Array, " p"],
+) -> tuple[Array, Array, Array]:
+    """
+    :return: simulated minus measured, and its slopes by start state and by the parameters that
+        ``index`` names (in units of their scale)
+    """
+    n = offsets.shape[1]
+    basis = jnp.eye(n + index.shape[0], dtype=theta.dtype)
 
-    def one(offset: Array, shot: Shots) -> tuple[Array, Array]:
-        n = offset.shape[0]
-        of = lambda both: error(theta + scale * both[n:], offset + both[:n], shot)  # noqa: E731
-        here, push = jax.linearize(of, jnp.zeros(n + len(names), theta.dtype))
-        slopes = jax.vmap(push)(jnp.eye(n + len(names), dtype=theta.dtype)).T
-        slopes = jnp.nan_to_num(slopes, posinf=0.0, neginf=0.0)
-        normal = _normal(here, slopes[:, :n], slopes[:, n:])
-        return normal.curvature, normal.score
+    def one(offset: Array, shot: Shots) -> tuple[Array, Array, Array]:
+        def of(both: Array) -> Array:
+            # The last place takes what belongs to no parameter.
+            step = jnp.zeros(len(names) + 1, theta.dtype).at[index].set(both[n:])
+            values = theta + scale * step[:-1]
+            params = fixed | {name: values[i] for i, name in enumerate(names)}
+            return simulate(twin, params, shot, offset + both[:n]) - shot.obs
+
+        along = lambda way: jax.jvp(of, (jnp.zeros_like(way),), (way,))  # noqa: E731
+        error, slopes = jax.vmap(along, out_axes=(None, -1))(basis)
+        return error, slopes[..., :n], slopes[..., n:]
 
     return jax.vmap(one)(offsets, shots)
+
+
+def _normal(
+    raw: np.ndarray,
+    by_start: np.ndarray,
+    by_theta: np.ndarray,
+    noise: np.ndarray,
+    counted: np.ndarray,
+) -> _Blocks:
+    n = len(raw)
+    finite = np.isfinite(raw)
+    error = np.where(finite, raw / noise, _NOT_FINITE) * counted[:, None]
+    size = np.abs(error)
+    small = np.minimum(size, _HUBER)
+    cost = np.sum(0.5 * small**2 + _HUBER * (size - small), (1, 2))
+    weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(size, 1e-12)))
+    factor = (weight * counted[:, None] / noise)[..., None]
+    start, theta = (
+        np.where(np.isfinite(slopes), slopes, 0.0) * factor for slopes in (by_start, by_theta)
+    )
+    numbers = raw[0].size
+    start, theta = (x.reshape(n, numbers, x.shape[-1]) for x in (start, theta))
+    right = (weight * error).reshape(n, -1, 1)
+    across = start.transpose(0, 2, 1)
+    return _Blocks(
+        raw=raw,
+        cost=cost,
+        own=across @ start,
+        cross=across @ theta,
+        shared=theta.transpose(0, 2, 1) @ theta,
+        by_start=(across @ right)[..., 0],
+        by_theta=(theta.transpose(0, 2, 1) @ right)[..., 0],
+    )
+
+
+def _eliminated(blocks: _Blocks, damping: float) -> _Step:
+    free = blocks.own.shape[1]
+    diagonal = np.einsum("nff->nf", blocks.own)
+    ridge = damping * diagonal + _RIDGE * diagonal.sum(1, keepdims=True) + 1e-300
+    own = blocks.own + ridge[:, :, None] * np.eye(free)
+    solved = np.linalg.solve(own, np.concatenate([blocks.by_start[..., None], blocks.cross], 2))
+    back = blocks.cross.transpose(0, 2, 1)
+    return _Step(
+        curvature=blocks.shared - back @ solved[..., 1:],
+        scores=blocks.by_theta - (back @ solved[..., :1])[..., 0],
+        from_score=-solved[..., 0],
+        from_step=-solved[..., 1:],
+    )
+
+
+def _moved(
+    values: np.ndarray,
+    step: _Step,
+    size: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    damping: float,
+) -> np.ndarray:
+    """Where the damped step leads; what would leave its bounds stays."""
+    curvature, score = step.curvature.sum(0), step.scores.sum(0)
+    free = ~(((values <= low) & (score > 0.0)) | ((values >= high) & (score < 0.0)))
+    if not free.any():
+        return values
+    inner = curvature[np.ix_(free, free)]
+    ridge = damping * np.diag(inner) + _RIDGE * np.trace(inner) + 1e-300
+    moved = values.copy()
+    moved[free] -= size[free] * np.linalg.solve(inner + np.diag(ridge), score[free])
+    return np.clip(moved, low, high)

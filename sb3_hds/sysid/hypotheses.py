@@ -2,12 +2,15 @@
 
 import dataclasses
 from collections.abc import Sequence
+from functools import cached_property
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.core import Effect, Twin
-from sb3_hds.effects import NeuralForce
+from sb3_hds.core import Effect, Params, Twin
+from sb3_hds.effects import ConstantForce, NeuralForce
 from sb3_hds.errors import CalibrationError, EffectError
 
 #: the slot of a twin's own parameter, beside those of effects
@@ -56,6 +59,7 @@ class Hypotheses:
     :param lower: smallest admissible values
     :param upper: largest admissible values
     :param nuisances: indices of those that are refitted under every hypothesis
+    :param pushes: index of a constant force at each joint, to measure what force is missing
     """
 
     believed: Twin
@@ -67,6 +71,7 @@ class Hypotheses:
     lower: Float[np.ndarray, " p"]
     upper: Float[np.ndarray, " p"]
     nuisances: tuple[int, ...]
+    pushes: tuple[int, ...]
 
     @classmethod
     def about(
@@ -85,7 +90,11 @@ class Hypotheses:
                 f"Its parameters are: {', '.join(twin.parameters) or 'none'}."
             )
         own = tuple(name for name in twin.parameters if not name.endswith(".share"))
-        extended, found = _attached(twin, effects)
+        pushed = () if ConstantForce in effects else (ConstantForce,)
+        extended, found = _attached(twin, (*effects, *pushed))
+        pushes = tuple(f"{ConstantForce.name}.{joint.name}.tau_0" for joint in twin.joints)
+        if pushed:
+            found = [c for c in found if c.parameters[0] not in pushes]
         native = _native_targets(twin, found)
         candidates = [
             Candidate(f"parameter.{name}", PARAMETER, name, i, (name,), _OF_PARAMETER.format(name))
@@ -94,6 +103,7 @@ class Hypotheses:
         ]
         candidates += [c for c in found if native.get(c.parameters[0]) not in calibrate]
         moving = (*calibrate, *dict.fromkeys(p for c in candidates for p in c.parameters))
+        moving += tuple(name for name in pushes if name not in moving)
         every = {name: extended.parameters[name] for name in moving}
         values = np.array([extended.values[name] for name in moving], float)
         lower = np.array([every[name].lower for name in moving], float)
@@ -112,7 +122,14 @@ class Hypotheses:
             lower=lower,
             upper=np.array([every[name].upper for name in moving], float),
             nuisances=tuple(range(len(calibrate))),
+            pushes=tuple(moving.index(name) for name in pushes),
         )
+
+    @cached_property
+    def fixed(self) -> Params:
+        """All parameters of the extended twin, in double precision."""
+        with jax.enable_x64(True):
+            return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), self.twin.params)
 
     def indices(self, candidate: Candidate) -> tuple[int, ...]:
         return tuple(self.names.index(name) for name in candidate.parameters)

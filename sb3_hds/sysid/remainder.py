@@ -3,25 +3,14 @@
 from itertools import combinations
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.core import (
-    JointEffect,
-    JointMoment,
-    Memory,
-    Parameter,
-    Params,
-    Scalar,
-    Trajectories,
-    Twin,
-)
+from sb3_hds.core import Trajectories
 from sb3_hds.sysid.comparison import Split, split
 from sb3_hds.sysid.evidence import Evidence
-from sb3_hds.sysid.hypotheses import Hypotheses
-from sb3_hds.sysid.shooting import shots_of
+from sb3_hds.sysid.motion import motion_of
+from sb3_hds.sysid.shooting import Shots, shots_of
 
 # Length of a window over which the missing force counts as constant [s], and in steps.
 _WINDOW, _SHORTEST, _LONGEST = 0.25, 4, 25
@@ -34,18 +23,6 @@ _LEAST_GAIN, _LEVEL, _N_FLIPS = 0.05, 0.02, 4000
 # A smaller set of quantities that explains this share of what all explain tells where it lives.
 _MOST_OF_IT = 0.8
 _MOST_RATIO = 4.0
-
-
-class _Push(JointEffect):
-    """A constant force."""
-
-    name = "push"
-    parameters = {"tau": Parameter(null=0.0, scale=0.1, unit="N m")}
-    explanation = "Something pushes."
-    source = ""
-
-    def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
-        return params["tau"] * jnp.ones_like(joint.v)
 
 
 class MissingForce(NamedTuple):
@@ -86,31 +63,32 @@ class Remainder(NamedTuple):
     power: float
 
 
-def missing_force(twin: Twin, data: Trajectories, noise: Float[np.ndarray, " obs"]) -> MissingForce:
+def missing_force(
+    evidence: Evidence, theta: Float[np.ndarray, " p"], data: Trajectories
+) -> MissingForce:
     """
-    :param twin: whose values stay as they are
+    :param evidence: whose program simulates short windows too
+    :param theta: all parameters that may move, shape ``(p,)``; they stay as they are
     :param data: measured
-    :param noise: of each channel
     """
-    steps = int(np.clip(round(_WINDOW / data.dt), _SHORTEST, _LONGEST))
-    hypotheses = Hypotheses.about(twin, (_Push,), ())
-    shots, origin = shots_of(data, steps, hypotheses.twin)
-    evidence = Evidence(hypotheses, shots, noise, 1)
-    point = evidence.fit(hypotheses.null, ())
-    index = [hypotheses.names.index(f"push.{joint.name}.tau") for joint in twin.joints]
-    scale = hypotheses.scale[index]
-    slopes = evidence.slopes(point)
-    scores = slopes.scores[:, index]
-    informed = np.maximum(slopes.curvature[:, index, index], 1e-12)
-    seen = jax.vmap(jax.vmap(lambda obs: twin.infer(obs, twin.params)))(jnp.asarray(shots.obs))
-    q, v = np.asarray(seen.q, float), np.asarray(seen.v, float)
+    h = evidence.hypotheses
+    longest = evidence.shots.actions.shape[1]
+    steps = min(int(np.clip(round(_WINDOW / data.dt), _SHORTEST, _LONGEST)), longest)
+    shots, origin = shots_of(data, steps, h.twin)
+    counted = (np.arange(longest + 1) <= steps).astype(float)
+    short = evidence.on(_lengthened(shots, longest), counted)
+    point = short.fit(theta, ())
+    scale = h.scale[list(h.pushes)]
+    slopes = short.slopes(point, h.pushes)
+    informed = np.maximum(np.einsum("njj->nj", slopes.curvature), 1e-12)
+    q, v = motion_of(h.believed, shots.obs, data.dt)
     counter = {recording: 0 for recording in origin}
     time = np.zeros(len(origin))
     for i, recording in enumerate(origin):
         time[i] = counter[recording] * (steps + 1) * data.dt
         counter[recording] += 1
     return MissingForce(
-        force=-scale * scores / informed,
+        force=-scale * slopes.scores / informed,
         stderr=scale / np.sqrt(informed),
         position=np.unwrap(q, axis=1).mean(1),
         velocity=v.mean(1),
@@ -118,6 +96,16 @@ def missing_force(twin: Twin, data: Trajectories, noise: Float[np.ndarray, " obs
         time=time,
         origin=origin,
     )
+
+
+def _lengthened(shots: Shots, steps: int) -> Shots:
+    """Windows of so many steps, the last ones of which are not measured."""
+
+    def filled(rows: np.ndarray, length: int) -> np.ndarray:
+        missing = length - rows.shape[1]
+        return np.concatenate([rows, np.repeat(rows[:, -1:], missing, 1)], 1)
+
+    return shots._replace(obs=filled(shots.obs, steps + 1), actions=filled(shots.actions, steps))
 
 
 def remainder(

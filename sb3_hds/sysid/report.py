@@ -3,7 +3,7 @@
 import base64
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,6 +60,12 @@ th { font-weight: 600; font-size: .9rem; } code { overflow-wrap: anywhere; }
 <figure><img src="data:image/png;base64,{{ picture.data }}" alt="{{ picture.title }}"
 width="{{ picture.width }}" height="{{ picture.height }}">
 <figcaption>{{ picture.caption }}</figcaption></figure>{% endfor %}
+{% if policy %}<h2>What it buys</h2>
+<p>Return on the real system of policies that were trained in each simulation: interquartile mean
+over {{ policy.runs }} runs and {{ policy.episodes }} start states each.</p>
+<div class="scroll"><table><tr><th>trained in</th><th>return</th><th>90 % interval</th></tr>
+{% for row in policy.rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
+{% endfor %}</table></div>{% endif %}
 {% if d.detectable %}<h2>What these data would have shown</h2>
 <p class="quiet">The smallest size of each candidate that lowers the error by 5 %, to first order.
 Where there is none, the effect cannot be seen by its slope at zero.</p>
@@ -72,9 +78,14 @@ Where there is none, the effect cannot be seen by its slope at zero.</p>
 """
 
 
-def write_report(diagnosis: Diagnosis, path: str | os.PathLike[str]) -> Path:
+def write_report(
+    diagnosis: Diagnosis,
+    path: str | os.PathLike[str],
+    policy_gain: Mapping[str, Any] | None = None,
+) -> Path:
     """
     :param path: of the page; a file of that name is replaced as a whole
+    :param policy_gain: as plain data
     :raises ImportError: without matplotlib and jinja2
     """
     try:
@@ -83,7 +94,7 @@ def write_report(diagnosis: Diagnosis, path: str | os.PathLike[str]) -> Path:
     except ImportError as error:
         raise ImportError(_INSTALL) from error
     page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    text = page.from_string(_PAGE).render(**_content(diagnosis))
+    text = page.from_string(_PAGE).render(**_content(diagnosis), policy=_policy(policy_gain))
     target = Path(path)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:
@@ -127,6 +138,21 @@ def _content(d: Diagnosis) -> dict[str, Any]:
         "findings": findings,
         "detectable": detectable,
         "pictures": [] if d.pictures is None else _drawn(d, d.pictures),
+    }
+
+
+def _policy(gain: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    if gain is None:
+        return None
+    names = {"believed": "the twin as believed", "extended": "the extended twin"}
+    rows = [(names.get(name, "the true twin"), r) for name, r in gain["simulations"].items()]
+    rows.append(("gain, extended over believed", gain["gain"]))
+    return {
+        "runs": gain["runs"],
+        "episodes": gain["episodes"],
+        "rows": [
+            (name, f"{r['mean']:.1f}", f"{r['low']:.1f} to {r['high']:.1f}") for name, r in rows
+        ],
     }
 
 

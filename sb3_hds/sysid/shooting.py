@@ -95,19 +95,34 @@ def shots_of(
 
 def simulate(twin: Twin, params: Params, shot: Shots, offset: Offset) -> Float[Array, "rows obs"]:
     """
+    Commands before the window fill what the twin remembers: the motion is measured there.
+
     :param shot: one window
     :param offset: of the start state from what the first measurement says, as a tangent vector of
         positions and velocities
     :return: what the twin's sensors would have reported, shape ``(steps + 1, n_obs)``
     """
-    start = _start(twin, params, shot, offset)
+    lead, steps = shot.lead_actions.shape[0], shot.actions.shape[0]
+    obs = jnp.concatenate([shot.lead_obs, shot.obs[:-1]])
+    actions = jnp.concatenate([shot.lead_actions, shot.actions])
+    known = jnp.concatenate([shot.lead_known, jnp.ones(steps)]) > 0.0
+    place = jnp.arange(lead + steps) - lead
 
-    def advance(state: State, action: Array) -> tuple[State, Obs]:
+    def advance(state: State, given: tuple[Array, ...]) -> tuple[State, Obs]:
+        obs, action, known, place = given
+        seen = twin.infer(obs, params)
+        seen = _moved(twin, seen, jnp.where(place == 0, offset, 0.0))
+        q, v = (jnp.where(place > 0, *pair) for pair in zip(state[:2], seen[:2], strict=True))
+        state = State(q, v, state.memory)
         after = twin.step(state, action, params)
-        return after, twin.observe(after, params)
+        memory = jax.tree.map(
+            lambda new, old: jnp.where(known, new, old), after.memory, state.memory
+        )
+        return after._replace(memory=memory), twin.observe(state, params)
 
-    _, obs = jax.lax.scan(advance, start, shot.actions)
-    return jnp.concatenate([twin.observe(start, params)[None], obs])
+    first = twin.infer(obs[0], params)
+    last, seen = jax.lax.scan(advance, first, (obs, actions, known, place))
+    return jnp.concatenate([seen[lead:], twin.observe(last, params)[None]])
 
 
 def n_free(twin: Twin) -> int:
@@ -180,27 +195,9 @@ def solve_normal(slopes: Array, right: Array) -> Array:
     return jnp.linalg.solve(normal, slopes.T @ right)
 
 
-def _start(twin: Twin, params: Params, shot: Shots, offset: Offset) -> State:
-    state = _remembering(twin, params, shot)
+def _moved(twin: Twin, state: State, offset: Offset) -> State:
     rest = ravel_pytree(state.memory)[0]
     return twin.retract(state, jnp.concatenate([offset, jnp.zeros_like(rest)]))
-
-
-def _remembering(twin: Twin, params: Params, shot: Shots) -> State:
-    """What the first measurement says, with the memory that the commands before it left."""
-    here = twin.infer(shot.obs[0], params)
-    if not shot.lead_actions.shape[0]:
-        return here
-
-    def advance(memory, given):
-        obs, action, known = given
-        state = twin.infer(obs, params)
-        after = twin.step(state._replace(memory=memory), action, params).memory
-        return jax.tree.map(lambda new, old: jnp.where(known > 0.0, new, old), after, memory), None
-
-    lead = (shot.lead_obs, shot.lead_actions, shot.lead_known)
-    memory, _ = jax.lax.scan(advance, twin.infer(shot.lead_obs[0], params).memory, lead)
-    return here._replace(memory=memory)
 
 
 def _lead_of(twin: Twin, dt: float) -> int:

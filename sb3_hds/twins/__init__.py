@@ -2,38 +2,58 @@
 
 from sb3_hds.twins.acrobot import Acrobot
 from sb3_hds.twins.cart_pole import CartPole
+from sb3_hds.twins.double_pendulum import DoublePendulum
+from sb3_hds.twins.duffing import Duffing
+from sb3_hds.twins.free_pendulum import FreePendulum
+from sb3_hds.twins.furuta import Furuta
 from sb3_hds.twins.inverted_double_pendulum import InvertedDoublePendulum
 from sb3_hds.twins.inverted_pendulum import InvertedPendulum
 from sb3_hds.twins.inverted_pendulum_friction import InvertedPendulumFriction
+from sb3_hds.twins.linear_axis import LinearAxis
 from sb3_hds.twins.mountain_car import MountainCar
 from sb3_hds.twins.payload_pendulum import PayloadPendulum
 from sb3_hds.twins.pendulum import Pendulum
 from sb3_hds.twins.pendulum_real import PendulumReal
 from sb3_hds.twins.registry import all_ids, from_env, from_spec, get, make, names, register
+from sb3_hds.twins.rig import Rig
+from sb3_hds.twins.servo_pendulum import ServoPendulum
 
 for _twin in (
     Acrobot,
     CartPole,
+    DoublePendulum,
+    Duffing,
+    FreePendulum,
+    Furuta,
     InvertedDoublePendulum,
     InvertedPendulum,
     InvertedPendulumFriction,
+    LinearAxis,
     MountainCar,
     PayloadPendulum,
     Pendulum,
     PendulumReal,
+    ServoPendulum,
 ):
     register(_twin)
 
 __all__ = [
     "Acrobot",
     "CartPole",
+    "DoublePendulum",
+    "Duffing",
+    "FreePendulum",
+    "Furuta",
     "InvertedDoublePendulum",
     "InvertedPendulum",
     "InvertedPendulumFriction",
+    "LinearAxis",
     "MountainCar",
     "PayloadPendulum",
     "Pendulum",
     "PendulumReal",
+    "Rig",
+    "ServoPendulum",
     "all_ids",
     "from_env",
     "from_spec",

@@ -1,5 +1,7 @@
 """Twin of ``sb3_hds/CartPoleSwingUp-v0``: ``CartPole-v1`` with another task."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -7,7 +9,6 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from sb3_hds.core import (
     Action,
     Actuator,
-    AnalyticTwin,
     Channel,
     Force,
     Joint,
@@ -19,12 +20,15 @@ from sb3_hds.core import (
     Scalar,
     State,
     Velocity,
+    rk4,
+    semi_implicit_euler,
 )
+from sb3_hds.twins.rig import Rig
 
 _MAX_FORCE = 10.0  # [N]
 
 
-class CartPole(AnalyticTwin):
+class CartPole(Rig):
     r"""
     A pole swung up by pushing the cart that it stands on.
 
@@ -40,11 +44,17 @@ class CartPole(AnalyticTwin):
     .. math::
         r = -2\,(1 - \cos\theta) - 0.2\,x^2
             - 0.01\,\big(\dot x^2 + \omega^2 + (u / 10\,\mathrm{N})^2\big)
+
+    :param observe: ``"task"`` for the environment's observations and its integrator; ``"q"`` or
+        ``"qv"`` for a rig in continuous time
     """
 
     name = "CartPole"
     env_id = "sb3_hds/CartPoleSwingUp-v0"
     dt = 0.02
+    substeps = 1
+    integrator = staticmethod(semi_implicit_euler)
+    observable = ("task", "q", "qv")
     max_episode_steps = 250
     joints = (Joint("track", "m"), Joint("hinge", "rad"))
     actuators = (Actuator("force", "N", -_MAX_FORCE, _MAX_FORCE),)
@@ -62,6 +72,15 @@ class CartPole(AnalyticTwin):
         "half_length": Parameter(null=0.5, scale=0.1, unit="m", lower=1e-3),
     }
 
+    def __init__(self, *, observe: str = "task", **settings: Any) -> None:
+        rig = observe != "task"
+        super().__init__(observe=observe, **({"substeps": 4} if rig else {}) | settings)
+        if rig:
+            self.integrator = rk4
+
+    def channels_of(self, observe: str) -> tuple[Channel, ...]:
+        return type(self).channels if observe == "task" else super().channels_of(observe)
+
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
         """Uniform: position within 0.5 m, any angle, speed within 0.5 m/s, rate within 1 rad/s."""
         high = jnp.array([[0.5, jnp.pi], [0.5, 1.0]])
@@ -69,10 +88,14 @@ class CartPole(AnalyticTwin):
         return State(start[0], start[1], {})
 
     def infer(self, obs: Obs, params: Params) -> State:
+        if self.observed != "task":
+            return super().infer(obs, params)
         angle = jnp.arctan2(obs[2:3], obs[1:2])
         return State(jnp.concatenate([obs[:1], angle]), obs[3:], {})
 
     def observe(self, state: State, params: Params) -> Obs:
+        if self.observed != "task":
+            return super().observe(state, params)
         angle = state.q[1:]
         return jnp.concatenate([state.q[:1], jnp.cos(angle), jnp.sin(angle), state.v])
 

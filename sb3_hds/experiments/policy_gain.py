@@ -1,0 +1,195 @@
+"""What a diagnosis is worth for the policy: return on the real system."""
+
+import contextlib
+import dataclasses
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.wrappers import TimeLimit
+from jaxtyping import Float
+from rich.progress import track
+from scipy.stats import trim_mean
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_hds.algos import HDS
+from sb3_hds.core import Twin
+from sb3_hds.envs import TwinEnv, true_twin
+from sb3_hds.errors import TrajectoryError
+from sb3_hds.sysid import Diagnosis
+
+# Seeds of the start states, which no training uses.
+_FIRST_START = 70_000
+_N_RESAMPLES = 2000
+_LEVEL = 0.9
+
+
+@dataclasses.dataclass(frozen=True)
+class Return:
+    """
+    :param mean: interquartile mean over runs and episodes
+    :param low: lower end of its 90 % interval (stratified bootstrap over runs)
+    :param high: upper end
+    """
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class PolicyGain:
+    """
+    Return on the real system of policies that were trained in simulations. Prints itself.
+
+    :param returns: by simulation (``"believed"``, ``"extended"``, and ``"true"`` where there is
+        one): one row for each run, one column for each start state, shape ``(runs, episodes)``
+    :param gain: of the extended over the believed twin, paired by run and start state
+    """
+
+    returns: Mapping[str, Float[np.ndarray, "runs episodes"]]
+    gain: Return
+
+    def of(self, simulation: str) -> Return:
+        """:return: interquartile mean of the policies from one simulation, with its interval"""
+        return _summarised(self.returns[simulation])
+
+    @property
+    def share_of_ceiling(self) -> float | None:
+        """
+        How much of the gap to policies from the true twin was closed; None where there is none, or
+        no gap.
+        """
+        if "true" not in self.returns:
+            return None
+        believed, extended, true = (self.of(s).mean for s in ("believed", "extended", "true"))
+        return (extended - believed) / (true - believed) if true > believed else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """:return: numbers as plain data for JSON"""
+        return {
+            "simulations": {s: dataclasses.asdict(self.of(s)) for s in self.returns},
+            "gain": dataclasses.asdict(self.gain),
+            "share_of_ceiling": self.share_of_ceiling,
+            "runs": len(self.returns["believed"]),
+            "episodes": self.returns["believed"].shape[1],
+            "returns": {s: values.tolist() for s, values in self.returns.items()},
+        }
+
+    def plot(self, path: str | os.PathLike[str]) -> Path:
+        """
+        Draw the returns: one dot for each run, bars for the interquartile means.
+
+        :param path: of the picture
+        :raises ImportError: without matplotlib (extra ``report``)
+        """
+        from sb3_hds.experiments.plots import plot_policy_gain
+
+        return plot_policy_gain(self, path)
+
+    def __str__(self) -> str:
+        runs, episodes = self.returns["believed"].shape
+        lines = [
+            f"Return on the real system, {runs} runs, {episodes} start states each: "
+            "interquartile mean [90 % interval]"
+        ]
+        rows = {s: self.of(s) for s in self.returns} | {"gain": self.gain}
+        lines += [f"  {s:<9} {r.mean:9.1f} [{r.low:.1f}, {r.high:.1f}]" for s, r in rows.items()]
+        if self.share_of_ceiling is not None:
+            lines.append(f"  {self.share_of_ceiling:.0%} of the gap to the true twin is closed")
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+def measure_policy_gain(
+    diagnosis: Diagnosis,
+    env: gymnasium.Env | str | Callable[[], gymnasium.Env],
+    algorithm: type[BaseAlgorithm] = HDS,
+    *,
+    budget: int = 0,
+    seeds: int = 5,
+    n_episodes: int = 20,
+    progress: bool = True,
+    **arguments: Any,
+) -> PolicyGain:
+    """
+    Train with the same budget in the old and in the extended twin, and act on the real system.
+
+    Runs with the same seed differ in the twin only, and all act from the same start states. Where
+    ``env`` is one of our stand-ins for hardware, policies from its true twin are the ceiling.
+
+    :param diagnosis: whose ``believed`` and extended ``twin`` are compared
+    :param env: the real system, its id, or a function that makes it
+    :param algorithm: trained in the simulations only
+    :param budget: steps of the simulated environment; 0 is enough for an algorithm that plans in
+        its twin before it acts
+    :param seeds: runs in each simulation
+    :param n_episodes: start states on the real system
+    :param progress: whether a bar shows how far it is
+    :param arguments: of the algorithm
+    :return: returns by simulation, and the gain with its interval
+    :raises TrajectoryError: for a twin without task, or fewer than one run or episode
+    """
+    if min(seeds, n_episodes) < 1 or budget < 0:
+        raise TrajectoryError(
+            f"seeds and n_episodes must be at least 1 and budget at least 0, got seeds={seeds}, "
+            f"n_episodes={n_episodes}, budget={budget}."
+        )
+    if diagnosis.believed.max_episode_steps is None:
+        raise TrajectoryError(
+            f"{diagnosis.believed.name} has no episode length, so no task to be good at. "
+            "Give its class max_episode_steps and a reward."
+        )
+    real = _made(env)
+    simulations = {"believed": diagnosis.believed, "extended": diagnosis.twin}
+    with contextlib.suppress(TypeError):
+        simulations["true"] = true_twin(real)
+    runs = [(name, seed) for seed in range(seeds) for name in simulations]
+    returns: dict[str, list[np.ndarray]] = {name: [] for name in simulations}
+    for name, seed in track(runs, "training", transient=True, disable=not progress):
+        model = algorithm("MlpPolicy", _task(simulations[name]), seed=seed, **arguments)
+        model.learn(budget)
+        returns[name].append(_returns(model, real, n_episodes))
+    found = {name: np.stack(rows) for name, rows in returns.items()}
+    return PolicyGain(found, _summarised(found["extended"] - found["believed"]))
+
+
+def _made(env: gymnasium.Env | str | Callable[[], gymnasium.Env]) -> gymnasium.Env:
+    if isinstance(env, str):
+        return gymnasium.make(env)
+    return env if isinstance(env, gymnasium.Env) else env()
+
+
+def _task(twin: Twin) -> gymnasium.Env:
+    assert twin.max_episode_steps is not None
+    return TimeLimit(TwinEnv(twin), twin.max_episode_steps)
+
+
+def _returns(model: BaseAlgorithm, env: gymnasium.Env, n_episodes: int) -> np.ndarray:
+    totals = np.zeros(n_episodes)
+    for episode in range(n_episodes):
+        obs, _ = env.reset(seed=_FIRST_START + episode)
+        done = False
+        while not done:
+            action, _ = model.predict(obs, deterministic=True)
+            obs, reward, terminated, truncated, _ = env.step(action)
+            totals[episode] += float(reward)
+            done = terminated or truncated
+    return totals
+
+
+def _summarised(values: Float[np.ndarray, "runs episodes"]) -> Return:
+    """Interquartile mean, and what resampling the runs makes of it."""
+    rng, n = np.random.default_rng(0), len(values)
+    drawn = [_interquartile_mean(values[rng.integers(n, size=n)]) for _ in range(_N_RESAMPLES)]
+    low, high = np.quantile(drawn, [0.5 - 0.5 * _LEVEL, 0.5 + 0.5 * _LEVEL])
+    return Return(_interquartile_mean(values), float(low), float(high))
+
+
+def _interquartile_mean(values: np.ndarray) -> float:
+    """Agarwal et al., *Deep RL at the edge of the statistical precipice*, NeurIPS 2021."""
+    return float(trim_mean(values.ravel(), 0.25))

@@ -1,0 +1,95 @@
+"""What a diagnosis tells beside its names: errors, what would have been seen, pictures."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sb3_hds.sysid.comparison import compare
+from sb3_hds.sysid.diagnosis import HorizonGain
+from sb3_hds.sysid.evidence import Evidence, Point
+from sb3_hds.sysid.pictures import Pictures, replay_of
+from sb3_hds.sysid.remainder import MissingForce
+from sb3_hds.sysid.search import LEAST_GAIN, Half
+
+
+def standard_errors(
+    evidence: Evidence, unit: Int[np.ndarray, " n"], point: Point, free: Sequence[int]
+) -> Float[np.ndarray, " p"]:
+    """
+    :param unit: piece of evidence of each window
+    :param free: indices of what was fitted
+    :return: of all parameters, by the sandwich clustered by units; infinite for what was not fitted
+    """
+    result = np.full(len(point.theta), np.inf)
+    if not free:
+        return result
+    slopes, labels = evidence.slopes(point, free), np.unique(unit)
+    scores = np.stack([slopes.scores[unit == label].sum(0) for label in labels])
+    bread = np.linalg.pinv(slopes.curvature.sum(0), rcond=1e-10)
+    correction = len(labels) / max(len(labels) - 1, 1)
+    covariance = correction * bread @ (scores.T @ scores) @ bread
+    variance = np.maximum(np.diag(covariance), 0.0)
+    result[list(free)] = np.sqrt(variance) * evidence.hypotheses.scale[list(free)]
+    return result
+
+
+def detectable(evidence: Evidence, point: Point) -> dict[str, dict[str, float]]:
+    """
+    :param point: the twin as it came, nuisances refitted
+    :return: by candidate and parameter, the smallest size that lowers the error by the least gain
+        that counts, to first order
+    """
+    h, total = evidence.hypotheses, evidence.slopes(point).curvature.sum(0)
+    numbers = point.raw.shape[1] * point.raw.shape[2]
+    needed = 0.5 * LEAST_GAIN * float(np.sum(point.errors)) * numbers
+    nuisances, found = list(h.nuisances), {}
+    inner = np.linalg.pinv(total[np.ix_(nuisances, nuisances)], rcond=1e-10)
+    for candidate in h.candidates:
+        sizes = {}
+        for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
+            cross = total[i, nuisances]
+            curvature = total[i, i] - cross @ inner @ cross
+            size = np.sqrt(2.0 * needed / curvature) if curvature > 1e-12 else np.inf
+            sizes[name.rpartition(".")[2]] = float(size * h.scale[i])
+        found[candidate.key] = sizes
+    return found
+
+
+def by_horizon(half: Half, before: Point, after: Point) -> dict[int, HorizonGain]:
+    """:return: errors some steps ahead, by the number of steps"""
+    found, last = {}, before.raw.shape[1] - 1
+    for ahead in sorted({1, max(last // 4, 1), last}):
+        old, new = (
+            np.mean((point.raw[:, ahead] / half.evidence.noise) ** 2, 1)
+            for point in (before, after)
+        )
+        gained = compare(new, old, half.unit)
+        rms = [float(np.sqrt(np.mean(errors))) for errors in (old, new)]
+        found[ahead] = HorizonGain(ahead, rms[0], rms[1], gained.low, gained.high)
+    return found
+
+
+def pictures_of(
+    half: Half, before: Point, after: Point, missing: MissingForce, left: MissingForce
+) -> Pictures:
+    """
+    :param missing: force before
+    :param left: force after
+    """
+    evidence, twin = half.evidence, half.evidence.hypotheses.twin
+    rows = np.flatnonzero(half.unit == half.unit[0])
+    measured = np.asarray(evidence.shots.obs)[rows]
+    errors = [
+        np.sqrt(np.mean((point.raw / evidence.noise) ** 2, (0, 2))) for point in (before, after)
+    ]
+    return Pictures(
+        channels=tuple((c.name, c.unit) for c in twin.channels),
+        joints=tuple((j.name, "N" if j.unit == "m" else "N m") for j in twin.joints),
+        actuators=tuple((a.name, a.unit) for a in twin.actuators),
+        replay=replay_of(measured, before.raw[rows], after.raw[rows], twin.dt),
+        steps=np.arange(measured.shape[1]),
+        errors=np.stack(errors),
+        missing=missing,
+        left=left,
+    )

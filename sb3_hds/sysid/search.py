@@ -1,0 +1,248 @@
+"""Which candidate explains what is left: proposed on some windows, confirmed on others."""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float, Int
+from rich.progress import track
+
+from sb3_hds.sysid.comparison import Comparison, compare, effective_size
+from sb3_hds.sysid.evidence import Evidence, Point
+from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
+
+# What confirms a candidate: by which share the mean square error of held-out recordings falls, at
+# which level, and by how much the information criterion of the others.
+LEAST_GAIN, LEVEL, LEAST_BIC = 0.05, 0.025, 10.0
+# Another candidate belongs into the set unless it is worse than the best at this level.
+_LEVEL_OF_SET = 0.05
+# Errors that differ by a smaller share are the same, however surely they differ.
+_SAME = 0.01
+# Steps of fits to the end, and of start states alone.
+_ALL_STEPS, _KEPT_STEPS = 25, 6
+
+_Given = TypeVar("_Given")
+_Told = TypeVar("_Told")
+
+
+class Half(NamedTuple):
+    """
+    :param evidence: windows of one half of the recordings
+    :param unit: piece of evidence of each window, shape ``(n,)``
+    """
+
+    evidence: Evidence
+    unit: Int[np.ndarray, " n"]
+
+    def total(self, point: Point) -> float:
+        return float(point.errors.sum())
+
+
+class Base(NamedTuple):
+    """
+    What is believed so far.
+
+    :param point: fitted to the windows for selection
+    :param kept: the same parameters on the other windows, start states refitted
+    :param free: indices of the parameters that are refitted under every hypothesis
+    """
+
+    point: Point
+    kept: Point
+    free: tuple[int, ...]
+
+
+class Tried(NamedTuple):
+    """
+    A candidate beside what is believed, and how it did.
+
+    :param candidate: which
+    :param point: the best that was found on the windows for selection
+    :param kept: the same parameters on the other windows, start states refitted
+    :param criterion: by which the information criterion is lower than without it
+    """
+
+    candidate: Candidate
+    point: Point
+    kept: Point
+    criterion: float
+
+
+class Effort(NamedTuple):
+    """
+    :param starts: where fits begin, in units of each parameter's scale from its null
+    :param finalists: candidates that are fitted to the end
+    :param windows: most windows on which the others are compared
+    :param steps: of the fits that choose the finalists
+    """
+
+    starts: tuple[float, ...]
+    finalists: int
+    windows: int
+    steps: int
+
+
+class Search:
+    """
+    Candidates on two halves of the evidence.
+
+    :param select: on which candidates are fitted and ranked
+    :param confirm: on which the best is confirmed
+    :param effort: how long to search
+    :param progress: whether a bar shows how far it is
+    """
+
+    def __init__(self, select: Half, confirm: Half, effort: Effort, progress: bool) -> None:
+        self.select, self.confirm, self.effort, self.progress = select, confirm, effort, progress
+        self._reached: dict[str, np.ndarray] = {}
+
+    @property
+    def hypotheses(self) -> Hypotheses:
+        return self.select.evidence.hypotheses
+
+    @property
+    def noise(self) -> Float[np.ndarray, " obs"]:
+        return self.select.evidence.noise
+
+    def set_noise(self, noise: Float[np.ndarray, " obs"]) -> None:
+        self.select, self.confirm = (
+            half._replace(evidence=half.evidence.with_noise(noise))
+            for half in (self.select, self.confirm)
+        )
+
+    def base(self, theta: Float[np.ndarray, " p"], free: Sequence[int]) -> Base:
+        """:return: what is believed, ``free`` refitted from ``theta``"""
+        point = self.select.evidence.fit(theta, free)
+        return Base(point, self.confirm.evidence.fit(point.theta, ()), tuple(free))
+
+    def finalists(self, base: Base, accepted: Sequence[str]) -> list[Tried]:
+        """:return: the most promising candidates, each fitted to the end, best first"""
+        left = [c for c in self.hypotheses.candidates if c.key not in accepted]
+        sample = self._sample()
+        first = base.point._replace(offsets=base.point.offsets[sample])
+        evidence = self.select.evidence
+        if len(sample) < evidence.shots.n:
+            evidence = evidence.on(type(evidence.shots)(*(x[sample] for x in evidence.shots)))
+
+        def glance(candidate: Candidate) -> Point:
+            return self._fitted(candidate, base.free, first, evidence, self.effort.steps)
+
+        points = self._each(glance, left, f"comparing {len(left)} causes")
+        ranked = sorted(zip(left, points, strict=True), key=lambda pair: pair[1].cost)
+        for candidate, point in ranked:
+            self._reached[candidate.key] = point.theta
+
+        def finish(candidate: Candidate) -> Tried:
+            point = self._continued(candidate, base)
+            kept = self.confirm.evidence.fit(point.theta, (), base.kept.offsets, _KEPT_STEPS)
+            return Tried(candidate, point, kept, self._criterion(candidate, point, base.point))
+
+        best = [candidate for candidate, _ in ranked[: self.effort.finalists]]
+        tried = self._each(finish, best, f"fitting the {len(best)} most likely")
+        return sorted(tried, key=lambda t: -t.criterion)
+
+    def others(self, base: Base, tried: Sequence[Tried]) -> list[tuple[Candidate, Comparison]]:
+        """:return: candidates that were no finalists, as they were left, on the other half"""
+        done = [t.candidate.key for t in tried]
+        rest = [c for c in self.hypotheses.candidates if c.key not in done]
+
+        def verdict(candidate: Candidate) -> Comparison:
+            theta = self._reached[candidate.key]
+            kept = self.confirm.evidence.fit(theta, (), base.kept.offsets, _KEPT_STEPS)
+            return self.against(kept, base.kept)
+
+        return list(zip(rest, self._each(verdict, rest, "weighing the others"), strict=True))
+
+    def best(self, tried: Sequence[Tried], base: Base) -> Tried | None:
+        """
+        :param tried: best first
+        :return: the candidate that selection prefers, if the other recordings confirm it; of two
+            that predict equally well, the one with fewer parameters
+        """
+        if not tried or tried[0].criterion < LEAST_BIC:
+            return None
+        best = tried[0]
+        for other in tried[1:]:
+            fewer = len(other.candidate.parameters) < len(best.candidate.parameters)
+            as_good = self.against(best.kept, other.kept).p_value > _LEVEL_OF_SET
+            if fewer and other.criterion >= LEAST_BIC and as_good:
+                best = other
+        return best if passes(self.against(best.kept, base.kept)) else None
+
+    def alternatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
+        """:return: what is not significantly worse than the best, without more freedom"""
+        found = []
+        for other in tried:
+            if other is best or len(other.candidate.parameters) > len(best.candidate.parameters):
+                continue
+            worse = self.against(best.kept, other.kept)
+            same = worse.p_value > _LEVEL_OF_SET or worse.gain < _SAME
+            if same and passes(self.against(other.kept, base.kept)):
+                found.append(other.candidate.key)
+        return tuple(found)
+
+    def needed(self, candidate: Candidate, base: Base) -> bool:
+        """:return: whether what is believed gets worse without this part of it"""
+        own = self.hypotheses.indices(candidate)
+        theta = base.point.theta.copy()
+        theta[list(own)] = self.hypotheses.null[list(own)]
+        without = self.base(theta, [i for i in base.free if i not in own])
+        return passes(self.against(base.kept, without.kept))
+
+    def against(self, new: Point, old: Point) -> Comparison:
+        """:return: one against another, both on the half that confirms"""
+        return compare(new.errors, old.errors, self.confirm.unit)
+
+    def _fitted(
+        self,
+        candidate: Candidate,
+        free: Sequence[int],
+        base: Point,
+        evidence: Evidence,
+        n_steps: int,
+    ) -> Point:
+        """The best of several short fits."""
+        h, own = self.hypotheses, list(self.hypotheses.indices(candidate))
+        begins = [h.null[own] + distance * h.scale[own] for distance in self.effort.starts]
+        if candidate.key in self._reached:
+            begins.append(self._reached[candidate.key][own])
+        best = base
+        for begin in begins:
+            theta = base.theta.copy()
+            theta[own] = np.clip(begin, h.lower[own], h.upper[own])
+            point = evidence.fit(theta, [*free, *own], base.offsets, n_steps)
+            best = min(best, point, key=lambda p: p.cost)
+        return best
+
+    def _continued(self, candidate: Candidate, base: Base) -> Point:
+        own = list(self.hypotheses.indices(candidate))
+        reached = self._reached[candidate.key]
+        evidence, moving = self.select.evidence, [*base.free, *own]
+        point = evidence.fit(reached, moving, base.point.offsets, _ALL_STEPS)
+        return min(base.point, point, key=lambda p: p.cost)
+
+    def _criterion(self, candidate: Candidate, point: Point, base: Point) -> float:
+        n = effective_size(base.raw / self.noise)
+        ratio = np.log(self.select.total(base) / self.select.total(point))
+        return n * ratio - len(candidate.parameters) * np.log(max(n, 2.0))
+
+    def _sample(self) -> np.ndarray:
+        n = self.select.evidence.shots.n
+        if n <= self.effort.windows:
+            return np.arange(n)
+        return np.sort(np.random.default_rng(0).choice(n, self.effort.windows, replace=False))
+
+    def _each(
+        self, work: Callable[[_Given], _Told], given: Sequence[_Given], what: str
+    ) -> list[_Told]:
+        """Compiled programs leave the interpreter free, so threads share the cores."""
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            done = pool.map(work, given)
+            shown = track(done, what, total=len(given), transient=True, disable=not self.progress)
+            return list(shown)
+
+
+def passes(verdict: Comparison) -> bool:
+    return verdict.gain >= LEAST_GAIN and verdict.p_value < LEVEL

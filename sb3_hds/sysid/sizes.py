@@ -1,0 +1,60 @@
+"""How large a parameter is on a given machine: a servo and an axis of 100 kg share a catalogue."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from sb3_hds.core import Trajectories
+from sb3_hds.sysid.evidence import Evidence
+from sb3_hds.sysid.hypotheses import Hypotheses
+from sb3_hds.sysid.motion import motion_of
+
+# A typical size moves what is predicted by this share of what is measured.
+_SHARE = 0.05
+# Of the largest command, speed and excursion, where a parameter moves nothing at its null.
+_OF_COMMAND, _OF_SPEED, _OF_POSITION = 0.2, 0.1, 0.2
+# Of an admissible range.
+_OF_RANGE = 0.1
+_NOTHING = 1e-9
+
+
+def sized(evidence: Evidence, data: Trajectories) -> Hypotheses:
+    """
+    :param evidence: windows, with the spread of each channel as its noise
+    :return: the hypotheses, with a scale for each parameter that these windows can see
+    """
+    h = evidence.hypotheses
+    point = evidence.fit(h.null, ())
+    curvature = np.diag(evidence.slopes(point).curvature.sum(0))
+    seen = curvature > _NOTHING * point.raw.size
+    scale = np.where(seen, h.scale, _unseen(h, data))
+    scale[seen] *= _SHARE * np.sqrt(point.raw.size / curvature[seen])
+    return dataclasses.replace(h, scale=np.minimum(scale, _OF_RANGE * (h.upper - h.lower)))
+
+
+def _unseen(h: Hypotheses, data: Trajectories) -> Float[np.ndarray, " p"]:
+    """Scales of what has no slope at its null, by the unit: a limit, a speed, a place."""
+    scale = h.scale.copy()
+    commands = np.abs(data.actions).max((0, 1)) if data.n_act else np.zeros(0)
+    speeds, excursions = _motion(h, data)
+    for candidate in h.candidates:
+        for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
+            unit = h.twin.parameters[name].unit
+            if candidate.slot == "actuator":
+                if unit == h.twin.actuators[candidate.index].unit and commands[candidate.index]:
+                    scale[i] = _OF_COMMAND * commands[candidate.index]
+            elif candidate.slot == "joint":
+                joint = h.twin.joints[candidate.index]
+                if unit == f"{joint.unit}/s" and speeds[candidate.index]:
+                    scale[i] = _OF_SPEED * speeds[candidate.index]
+                elif unit == joint.unit and joint.unit == "m" and excursions[candidate.index]:
+                    scale[i] = _OF_POSITION * excursions[candidate.index]
+    return scale
+
+
+def _motion(h: Hypotheses, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
+    """Largest speed and largest excursion of each joint."""
+    parts = [motion_of(h.believed, data.episode(i)[0][None], data.dt) for i in range(len(data))]
+    q, v = (np.concatenate([part[k][0] for part in parts]) for k in (0, 1))
+    return np.quantile(np.abs(v), 0.98, axis=0), q.max(0) - q.min(0)

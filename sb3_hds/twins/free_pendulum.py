@@ -1,0 +1,71 @@
+"""A pendulum that swings by itself."""
+
+import math
+
+import jax.numpy as jnp
+
+from sb3_hds.core import (
+    Action,
+    Actuator,
+    Force,
+    Joint,
+    MassMatrix,
+    Parameter,
+    Params,
+    Position,
+    State,
+    Velocity,
+)
+from sb3_hds.errors import ParameterError
+from sb3_hds.twins.rig import Rig
+
+_ZEROS = ("down", "up")
+_MOTOR = Actuator("motor", "N m", -math.inf, math.inf)
+
+
+class FreePendulum(Rig):
+    r"""
+    A compound pendulum, by default without a motor.
+
+    .. math:: (I + m a^2)\,\dot\omega = -m g a \sin(\theta + \theta_0) - b\,\omega + u
+
+    with the distance :math:`a` from the pivot to the centre of mass and the moment of inertia
+    :math:`I` about that. :math:`\theta_0` is 0 where the angle counts from hanging, and
+    :math:`\pi` where it counts from upright. Only :math:`m g a / (I + m a^2)` and
+    :math:`b / (I + m a^2)` show in the motion.
+
+    :param zero: option; ``"down"`` or ``"up"``: where the angle is zero
+    :param driven: option; whether a motor at the pivot takes a torque
+    """
+
+    name = "FreePendulum"
+    options = {"zero": "down", "driven": False}
+    zero: str
+    driven: bool
+    joints = (Joint("hinge", "rad"),)
+    actuators = ()
+    parameters = {
+        "gravity": Parameter(null=9.81, scale=0.5, unit="m/s2", lower=0.0),
+        "mass": Parameter(null=0.15, scale=0.02, unit="kg", lower=1e-6),
+        "com": Parameter(null=0.15, scale=0.02, unit="m", lower=1e-6),
+        "inertia": Parameter(null=1e-4, scale=1e-4, unit="kg m2", lower=0.0),
+        "damping": Parameter(null=0.0, scale=1e-4, unit="N m s/rad", lower=0.0),
+    }
+    native_effects = {("viscous_friction", 0): {"b": "damping"}}
+
+    def __init__(self, **settings: object) -> None:
+        super().__init__(**settings)  # type: ignore[arg-type]
+        if self.zero not in _ZEROS:
+            raise ParameterError(f"zero must be 'down' or 'up', got {self.zero!r}.")
+        self.actuators = (_MOTOR,) if self.driven else ()
+
+    def actuate(self, state: State, action: Action, params: Params) -> Force:
+        return action if self.driven else jnp.zeros_like(state.q)
+
+    def mass_matrix(self, q: Position, params: Params) -> MassMatrix:
+        return (params["inertia"] + params["mass"] * params["com"] ** 2 + 0.0 * q).reshape(1, 1)
+
+    def bias(self, q: Position, v: Velocity, params: Params) -> Force:
+        side = 1.0 if self.zero == "down" else -1.0
+        pull = side * params["mass"] * params["gravity"] * params["com"] * jnp.sin(q)
+        return pull + jnp.asarray(params["damping"], v.dtype) * v

@@ -1,0 +1,66 @@
+"""Machines on a bench: measured joint by joint, without a task."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
+
+from sb3_hds.core import AnalyticTwin, Channel, Obs, Params, State, rk4
+from sb3_hds.errors import ParameterError
+
+
+class Rig(AnalyticTwin):
+    """
+    A machine whose joints are measured directly, and that nobody gives a reward.
+
+    Runge-Kutta steps follow continuous time. Recordings begin anywhere, so :meth:`initial` only
+    serves to try the rig out: at rest, within 0.1 [rad or m] of where positions are zero. Where
+    velocities are not observed, :meth:`infer` says zero.
+
+    :param observe: ``"q"`` if encoders report positions only, ``"qv"`` for velocities too
+    :param settings: as of every twin
+    :raises ParameterError: for another ``observe``
+    """
+
+    dt = 0.01
+    substeps = 2
+    integrator = staticmethod(rk4)
+    #: what ``observe`` may be
+    observable: tuple[str, ...] = ("q", "qv")
+    observed: str
+
+    def __init__(self, *, observe: str = "qv", **settings: Any) -> None:
+        super().__init__(**settings)
+        if observe not in self.observable:
+            choices = " or ".join(map(repr, self.observable))
+            raise ParameterError(f"{self.name} can observe {choices}, got {observe!r}.")
+        self.observed = observe
+        self.channels = self.channels_of(observe)
+
+    def channels_of(self, observe: str) -> tuple[Channel, ...]:
+        """:return: named after the joints, positions first"""
+        positions = tuple(Channel(f"{joint.name}_position", joint.unit) for joint in self.joints)
+        if observe == "q":
+            return positions
+        speeds = (Channel(f"{joint.name}_velocity", f"{joint.unit}/s") for joint in self.joints)
+        return (*positions, *speeds)
+
+    def initial(self, key: PRNGKeyArray, params: Params) -> State:
+        q = jax.random.uniform(key, (len(self.joints),), minval=-0.1, maxval=0.1)
+        return State(q, jnp.zeros_like(q), {})
+
+    def infer(self, obs: Obs, params: Params) -> State:
+        dof = len(self.joints)
+        q = obs[:dof]
+        return State(q, obs[dof:] if self.observed == "qv" else jnp.zeros_like(q), {})
+
+    def observe(self, state: State, params: Params) -> Obs:
+        return jnp.concatenate([state.q, state.v]) if self.observed == "qv" else state.q
+
+    def to_spec(self) -> dict[str, Any]:
+        spec = super().to_spec()
+        return spec | {"options": spec["options"] | {"observe": self.observed}}
+
+    def structure(self) -> tuple[Any, ...]:
+        return (*super().structure(), self.observed)

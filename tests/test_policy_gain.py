@@ -1,0 +1,103 @@
+"""What a diagnosis is worth for the policy."""
+
+import dataclasses
+
+import gymnasium
+import numpy as np
+import pytest
+from stable_baselines3 import SAC
+
+from sb3_hds import HDS, effects, twins
+from sb3_hds.errors import TrajectoryError
+from sb3_hds.experiments import PolicyGain, measure_policy_gain
+from sb3_hds.experiments.policy_gain import _summarised
+from sb3_hds.sysid import Diagnosis
+
+ROBOT = "sb3_hds/PendulumReal-v1"
+SMALL = {"pretrain_epochs": 2, "n_rollouts": 4, "n_random_plans": 0, "compare_every": 0}
+
+
+def a_diagnosis(believed="PendulumReal"):
+    twin = twins.make(believed)
+    extended = twin.extend(effects.CoulombFriction(0, tau_c=0.3))
+    return Diagnosis(verdict="named", believed=twin, twin=extended, data_hash="", seed=0)
+
+
+def robot():
+    return gymnasium.make(ROBOT, friction=0.3, max_episode_steps=20)
+
+
+@pytest.fixture(scope="module")
+def measured():
+    return measure_policy_gain(a_diagnosis(), robot, seeds=2, n_episodes=3, progress=False, **SMALL)
+
+
+def test_every_twin_gets_the_same_runs_and_start_states(measured):
+    assert set(measured.returns) == {"believed", "extended", "true"}
+    assert all(values.shape == (2, 3) for values in measured.returns.values())
+    # The extended twin is the true one here, so its policies are the same.
+    np.testing.assert_array_equal(measured.returns["extended"], measured.returns["true"])
+
+
+def test_the_gain_is_paired():
+    believed = np.array([[-100.0, -900.0], [-110.0, -910.0]])
+    extended = believed + np.array([[9.0, 11.0], [10.0, 10.0]])
+
+    gain = PolicyGain(
+        {"believed": believed, "extended": extended}, _summarised(extended - believed)
+    )
+
+    assert gain.gain.mean == pytest.approx(10.0)
+    assert gain.gain.low <= 10.0 <= gain.gain.high
+    assert gain.share_of_ceiling is None
+
+
+def test_the_share_of_the_gap_is_that_of_the_means():
+    at = lambda value: np.full((2, 4), value)  # noqa: E731
+    returns = {"believed": at(-300.0), "extended": at(-200.0), "true": at(-180.0)}
+    gain = PolicyGain(returns, _summarised(returns["extended"] - returns["believed"]))
+
+    assert gain.share_of_ceiling == pytest.approx(100.0 / 120.0)
+    assert "83% of the gap" in str(gain)
+
+
+def test_an_outlier_among_runs_does_not_move_the_interquartile_mean():
+    values = np.arange(16.0).reshape(4, 4)
+    expected = _summarised(values).mean
+    values[3, 3] = 1e6
+    assert _summarised(values).mean == expected
+
+
+def test_other_algorithms_train_in_the_simulation_for_a_budget():
+    found = measure_policy_gain(
+        a_diagnosis(),
+        gymnasium.make("Pendulum-v1"),
+        SAC,
+        budget=30,
+        seeds=1,
+        n_episodes=1,
+        progress=False,
+        learning_starts=10,
+    )
+
+    assert set(found.returns) == {"believed", "extended"}
+    assert found.to_dict()["runs"] == 1
+
+
+def test_it_is_drawn_and_told_in_the_report(measured, tmp_path):
+    assert measured.plot(tmp_path / "gain.png").stat().st_size > 5_000
+    page = a_diagnosis().to_html(tmp_path / "report.html", measured.to_dict()).read_text()
+    assert "What it buys" in page and "the extended twin" in page
+    assert "What it buys" not in a_diagnosis().to_html(tmp_path / "report.html").read_text()
+
+
+@pytest.mark.parametrize("wrong", [{"seeds": 0}, {"n_episodes": 0}, {"budget": -1}])
+def test_nothing_to_measure_is_an_error(wrong):
+    with pytest.raises(TrajectoryError, match="at least 1"):
+        measure_policy_gain(a_diagnosis(), ROBOT, HDS, **wrong)
+
+
+def test_a_rig_has_no_task_to_be_good_at():
+    rig = dataclasses.replace(a_diagnosis(), believed=twins.make("LinearAxis"))
+    with pytest.raises(TrajectoryError, match="no episode length"):
+        measure_policy_gain(rig, ROBOT)

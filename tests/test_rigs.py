@@ -1,0 +1,224 @@
+"""Rigs follow the physics of other simulators: MuJoCo's engine, and SciPy's integrators."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from sb3_hds import twins
+from sb3_hds.core import rollout
+from sb3_hds.errors import ParameterError
+
+RIGS = ("DoublePendulum", "Duffing", "FreePendulum", "Furuta", "LinearAxis", "ServoPendulum")
+
+DOUBLE_PENDULUM = """
+<mujoco>
+  <option gravity="0 0 -9.81" timestep="0.0005" integrator="RK4"/>
+  <worldbody>
+    <body>
+      <joint name="joint1" axis="0 -1 0" damping="0.01"/>
+      <inertial pos="0 0 -0.25" mass="0.5" diaginertia="0.01 0.02 0.01"/>
+      <body pos="0 0 -0.3">
+        <joint name="joint2" axis="0 -1 0" damping="0.02"/>
+        <inertial pos="0 0 -0.15" mass="0.6" diaginertia="0.01 0.015 0.01"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="joint1"/><motor joint="joint2"/></actuator>
+</mujoco>
+"""
+
+# The pendulum is slender along its rod (z), and swings about the arm (x).
+FURUTA = """
+<mujoco>
+  <option gravity="0 0 -9.81" timestep="0.0005" integrator="RK4"/>
+  <worldbody>
+    <body>
+      <joint name="arm" axis="0 0 1" damping="0.001"/>
+      <inertial pos="0 0 0" mass="0.1" diaginertia="6e-4 6e-4 6e-4"/>
+      <body pos="0.1 0 0">
+        <joint name="pendulum" axis="1 0 0" damping="0.0001"/>
+        <inertial pos="0 0 -0.07" mass="0.03" diaginertia="4e-5 4e-5 1e-12"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="arm"/></actuator>
+</mujoco>
+"""
+
+
+def on_engine(xml, start, torques, dt):
+    """:return: positions and velocities, shape ``(T + 1, 2 dof)``"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    data.qpos[:] = start
+    rows = [np.concatenate([data.qpos, data.qvel])]
+    for torque in torques:
+        data.ctrl[:] = torque
+        mujoco.mj_step(model, data, round(dt / model.opt.timestep))
+        rows.append(np.concatenate([data.qpos, data.qvel]))
+    return np.array(rows)
+
+
+def replayed(twin, start, actions):
+    obs = jnp.concatenate([jnp.asarray(start, float), jnp.zeros(len(start))])
+    states = rollout(twin, twin.params, twin.infer(obs, twin.params), jnp.asarray(actions)).states
+    return np.asarray(jax.vmap(lambda s: twin.observe(s, twin.params))(states))
+
+
+def torques(n_steps, n, size):
+    rng = np.random.default_rng(0)
+    return size * np.sin(0.2 * rng.standard_normal((n_steps, n)).cumsum(0))
+
+
+@pytest.mark.parametrize(
+    ("name", "xml", "size", "parameters"),
+    [
+        (
+            "DoublePendulum",
+            DOUBLE_PENDULUM,
+            0.5,
+            {
+                "mass1": 0.5,
+                "mass2": 0.6,
+                "length1": 0.3,
+                "com1": 0.25,
+                "com2": 0.15,
+                "inertia1": 0.02 + 0.5 * 0.25**2,
+                "inertia2": 0.015 + 0.6 * 0.15**2,
+                "damping1": 0.01,
+                "damping2": 0.02,
+            },
+        ),
+        (
+            "Furuta",
+            FURUTA,
+            0.01,
+            {
+                "arm_inertia": 6e-4,
+                "arm_length": 0.1,
+                "mass": 0.03,
+                "com": 0.07,
+                "inertia": 4e-5,
+                "arm_damping": 1e-3,
+                "pendulum_damping": 1e-4,
+            },
+        ),
+    ],
+)
+def test_two_joints_move_as_in_mujoco(x64, name, xml, size, parameters):
+    twin = twins.make(name, **parameters)
+    start, actions = np.array([0.3, 1.0]), torques(100, len(twin.actuators), size)
+
+    found = replayed(twin, start, actions)
+
+    # Both integrate by Runge-Kutta; the twin's steps are ten times as long.
+    np.testing.assert_allclose(found, on_engine(xml, start, actions, twin.dt), atol=2e-4)
+
+
+def test_one_motor_leaves_the_other_joint_alone(x64):
+    actions = torques(20, 1, 0.5)
+    for driven, column in (("first", 0), ("second", 1)):
+        pair = np.zeros((20, 2))
+        pair[:, column] = actions[:, 0]
+        one = replayed(twins.make("DoublePendulum", driven=driven), [0.1, 0.2], actions)
+        np.testing.assert_array_equal(one, replayed(twins.make("DoublePendulum"), [0.1, 0.2], pair))
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "acceleration"),
+    [
+        ("LinearAxis", {"mass": 2.0, "damping": 0.3}, lambda q, v, u: (u - 0.3 * v) / 2.0),
+        (
+            "Duffing",
+            {"mass": 0.5, "damping": 0.1, "stiffness": -1.0, "cubic_stiffness": 3.0},
+            lambda q, v, u: (u - 0.1 * v + q - 3.0 * q**3) / 0.5,
+        ),
+        (
+            "FreePendulum",
+            {"mass": 0.2, "com": 0.2, "inertia": 1e-3, "damping": 1e-3, "zero": "up"},
+            lambda q, v, u: (0.2 * 9.81 * 0.2 * np.sin(q) - 1e-3 * v) / (1e-3 + 0.2 * 0.2**2),
+        ),
+        (
+            "ServoPendulum",
+            {"kp": 200.0, "torque_constant": 0.5, "resistance": 2.0, "voltage": 6.0},
+            lambda q, v, u: (
+                (
+                    0.5 / 2.0 * (6.0 * np.clip(200.0 * 2.877e-3 * (u - q), -1.0, 1.0) - 0.5 * v)
+                    - 0.5 * 9.81 * 0.1 * np.sin(q)
+                )
+                / (0.5 * 0.1**2 + 0.002)
+            ),
+        ),
+    ],
+)
+def test_one_joint_moves_as_its_equation_says(x64, name, settings, acceleration):
+    twin = twins.make(name, **settings)
+    actions, q, v = torques(60, len(twin.actuators), 2.0), 0.4, 0.0
+    expected = [(q, v)]
+    for step in range(60):
+        u = actions[step, 0] if twin.actuators else 0.0
+        solved = solve_ivp(
+            lambda _, x, u=u: (x[1], acceleration(x[0], x[1], u)),
+            (0.0, twin.dt),
+            expected[-1],
+            rtol=1e-10,
+            atol=1e-12,
+        )
+        expected.append(tuple(solved.y[:, -1]))
+
+    np.testing.assert_allclose(replayed(twin, [q], actions), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_a_servo_that_is_switched_off_swings_freely(x64):
+    off = twins.make("ServoPendulum", commands="goal, enable")
+    length, mass, armature = 0.1, 0.5, 0.002
+    free = twins.make("FreePendulum", mass=mass, com=length, inertia=armature, dt=off.dt)
+
+    found = replayed(off, [0.5], np.tile([2.0, 0.0], (50, 1)))
+
+    np.testing.assert_allclose(found, replayed(free, [0.5], np.zeros((50, 0))), rtol=1e-9)
+
+
+def test_a_logged_gain_takes_the_place_of_the_parameter(x64):
+    plain = twins.make("ServoPendulum", kp=123.0)
+    logged = twins.make("ServoPendulum", commands="goal, enable, gain")
+    goals = torques(40, 1, 1.0)
+
+    found = replayed(logged, [0.1], np.column_stack([goals, np.ones(40), np.full(40, 123.0)]))
+
+    np.testing.assert_allclose(found, replayed(plain, [0.1], goals), rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", (*RIGS, "CartPole"))
+@pytest.mark.parametrize("observe", ["q", "qv"])
+def test_encoders_report_positions_and_if_wanted_velocities(name, observe):
+    twin = twins.make(name, observe=observe)
+    state = twin.initial(jax.random.key(0), twin.params)._replace(v=jnp.ones(len(twin.joints)))
+
+    obs = twin.observe(state, twin.params)
+
+    expected = [state.q] if observe == "q" else [state.q, state.v]
+    np.testing.assert_array_equal(obs, np.concatenate(expected))
+    assert len(twin.channels) == len(obs)
+    again = twins.from_spec(twin.to_spec())
+    assert again == twin and again.channels == twin.channels
+    other = twins.make(name, observe="qv" if observe == "q" else "q")
+    assert other != twin
+
+
+@pytest.mark.parametrize(
+    ("name", "setting", "message"),
+    [
+        ("LinearAxis", {"observe": "v"}, "can observe 'q' or 'qv', got 'v'"),
+        ("CartPole", {"observe": "v"}, "'task' or 'q' or 'qv'"),
+        ("FreePendulum", {"zero": "left"}, "'down' or 'up'"),
+        ("DoublePendulum", {"driven": "none"}, "'both', 'first', 'second'"),
+        ("ServoPendulum", {"commands": "torque"}, "'goal', 'goal, enable'"),
+    ],
+)
+def test_a_rig_that_does_not_exist_is_refused(name, setting, message):
+    with pytest.raises(ParameterError, match=message):
+        twins.make(name, **setting)
