@@ -237,7 +237,7 @@ def run(system: str, case: int, budget: str, only_noise: str | None = None) -> d
         slot = "actuator" if p.effect in COMMANDS else "channel" if p.effect in SENSOR else "joint"
         truth = f"{p.effect}.{places[slot][p.index].name}"
     first = found.findings[0] if found.findings else None
-    named = f"{first.effect}.{first.where['name']}" if first else ""
+    named = key(first) if first else ""
     if first and named == truth:
         estimate = {
             name: (e.estimate, e.low, e.high, planted[0].values.get(name))
@@ -255,13 +255,18 @@ def run(system: str, case: int, budget: str, only_noise: str | None = None) -> d
         "verdict": found.verdict,
         "named": named,
         "set": ";".join((named, *first.alternatives)) if first else "",
-        "more": ";".join(f"{f.effect}.{f.where['name']}" for f in found.findings[1:]),
+        "more": ";".join(map(key, found.findings[1:])),
         "gain": first.gain if first else 0.0,
         "explained": found.explained,
         "unexplained": bool(found.unexplained),
         "estimate": json.dumps(estimate),
         "seconds": seconds,
     }
+
+
+def key(finding) -> str:
+    inside = finding.where["slot"] == "parameter"
+    return finding.effect if inside else f"{finding.effect}.{finding.where['name']}"
 
 
 def wilson(hits: int, n: int) -> str:

@@ -63,14 +63,15 @@ class System:
     :param torque: typical command of each motor
     :param start: spread of the positions in which recordings begin
     :param dof: joints
-    :param base: parameter of the twin that may be wrong, and the body whose mass it is
+    :param base: parameter of the twin that may be wrong, the body that it belongs to, and whether
+        it is the body's mass or its inertia
     """
 
     xml: str
     twin: tuple[str, dict[str, Any]]
     torque: tuple[float, ...]
     start: tuple[float, ...]
-    base: tuple[str, int]
+    base: tuple[str, int, str]
 
     @property
     def dof(self) -> int:
@@ -83,14 +84,14 @@ SYSTEMS = {
         ("FreePendulum", {"driven": True, "mass": 0.5, "com": 0.2, "inertia": 0.004}),
         (0.5,),
         (1.0,),
-        ("mass", 1),
+        ("mass", 1, "mass"),
     ),
     "cart_pole": System(
         _CART_POLE,
         ("CartPole", {"gravity": 9.81, "cart_mass": 1.0, "pole_mass": 0.3, "half_length": 0.5}),
         (3.0,),
         (0.1, math.pi),
-        ("cart_mass", 1),
+        ("cart_mass", 1, "mass"),
     ),
     "double_pendulum": System(
         _DOUBLE,
@@ -108,7 +109,7 @@ SYSTEMS = {
         ),
         (0.4, 0.15),
         (0.5, 0.5),
-        ("mass1", 1),
+        ("inertia1", 1, "inertia"),
     ),
     "furuta": System(
         _FURUTA,
@@ -126,10 +127,10 @@ SYSTEMS = {
         ),
         (0.015,),
         (0.5, 1.0),
-        ("arm_inertia", 1),
+        ("arm_inertia", 1, "inertia"),
     ),
     "linear_axis": System(
-        _AXIS, ("LinearAxis", {"mass": 2.0, "damping": 3.0}), (6.0,), (0.2,), ("mass", 1)
+        _AXIS, ("LinearAxis", {"mass": 2.0, "damping": 3.0}), (6.0,), (0.2,), ("mass", 1, "mass")
     ),
 }
 
@@ -264,9 +265,8 @@ def simulate(
     :return: noiseless observations and commands of each recording
     """
     model = mujoco.MjModel.from_xml_string(system.xml)
-    body = system.base[1]
-    model.body_mass[body] *= wrong_base
-    model.body_inertia[body] *= wrong_base
+    _, body, what = system.base
+    getattr(model, f"body_{what}")[body] *= wrong_base
     for p in planted:
         if p.effect == "viscous_friction":
             model.dof_damping[p.index] += p.values["b"]

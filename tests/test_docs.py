@@ -169,7 +169,7 @@ def test_every_twin_effect_and_environment_is_listed_with_its_parameters():
     shown = catalogue.twins_as_markdown()
     for name in [*twins.names()]:
         section = shown.partition(f"\n## {name}\n")[2].partition("\n## ")[0]
-        twin = twins.get(name)
+        twin = twins.make(name)
         named = [*twin.parameters, *(s.name for s in (*twin.actuators, *twin.channels))]
         assert [n for n in (*named, *twin.options) if f"`{n}`" not in section] == []
 

@@ -71,6 +71,10 @@ class ExtendedTwin(Twin):
             (a, a.effect) for a in self._simulated if isinstance(a.effect, SensorEffect)
         )
 
+    def at_interval(self, dt: float, substeps: int) -> "ExtendedTwin":
+        base = self._base_with_values().at_interval(dt, substeps)
+        return ExtendedTwin(base, *self.effects_with_values())
+
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
         return self._remember(self.base.initial(key, self._base_params(params)), params)
 

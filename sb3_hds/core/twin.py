@@ -138,6 +138,16 @@ class Twin(abc.ABC):
         changed.tensors = {**self.tensors, **tensors}
         return changed
 
+    def at_interval(self, dt: float, substeps: int) -> "Twin":
+        """
+        :param dt: another control interval [s]
+        :param substeps: internal steps per control interval
+        :return: the same system, with the same values
+        """
+        changed = copy.copy(self)
+        changed.dt, changed.substeps = float(dt), int(substeps)
+        return changed
+
     def extend(self, *effects: "Effect") -> "Twin":
         """:return: this twin plus ``effects``, in the order in which a signal meets them"""
         from sb3_hds.core.extended import ExtendedTwin

@@ -34,15 +34,15 @@ def standard_errors(
     return result
 
 
-def detectable(evidence: Evidence, point: Point) -> dict[str, dict[str, float]]:
+def detectable(half: Half, point: Point) -> dict[str, dict[str, float]]:
     """
     :param point: the twin as it came, nuisances refitted
     :return: by candidate and parameter, the smallest size that lowers the error by the least gain
         that counts, to first order
     """
-    h, total = evidence.hypotheses, evidence.slopes(point).curvature.sum(0)
+    h, total = half.evidence.hypotheses, half.evidence.slopes(point).curvature.sum(0)
     numbers = point.raw.shape[1] * point.raw.shape[2]
-    needed = 0.5 * LEAST_GAIN * float(np.sum(point.errors)) * numbers
+    needed = 0.5 * LEAST_GAIN * half.total(point) * numbers
     nuisances, found = list(h.nuisances), {}
     inner = np.linalg.pinv(total[np.ix_(nuisances, nuisances)], rcond=1e-10)
     for candidate in h.candidates:
@@ -56,8 +56,11 @@ def detectable(evidence: Evidence, point: Point) -> dict[str, dict[str, float]]:
     return found
 
 
-def by_horizon(half: Half, before: Point, after: Point) -> dict[int, HorizonGain]:
-    """:return: errors some steps ahead, by the number of steps"""
+def by_horizon(half: Half, before: Point, after: Point, every: int) -> dict[int, HorizonGain]:
+    """
+    :param every: steps of the data in one of the windows
+    :return: errors some steps ahead, by the number of steps of the data
+    """
     found, last = {}, before.raw.shape[1] - 1
     for ahead in sorted({1, max(last // 4, 1), last}):
         old, new = (
@@ -66,7 +69,7 @@ def by_horizon(half: Half, before: Point, after: Point) -> dict[int, HorizonGain
         )
         gained = compare(new, old, half.unit)
         rms = [float(np.sqrt(np.mean(errors))) for errors in (old, new)]
-        found[ahead] = HorizonGain(ahead, rms[0], rms[1], gained.low, gained.high)
+        found[ahead * every] = HorizonGain(ahead * every, rms[0], rms[1], gained.low, gained.high)
     return found
 
 

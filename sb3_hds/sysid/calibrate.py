@@ -15,6 +15,7 @@ from sb3_hds.effects import force_of
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.bounds import bounds_of
 from sb3_hds.sysid.covariance import covariance_of
+from sb3_hds.sysid.motion import first_offsets
 from sb3_hds.sysid.results import Estimate, Fit
 from sb3_hds.sysid.shooting import (
     Offset,
@@ -161,7 +162,8 @@ def fit_windows(
         believed, noise = values if believed is None else believed, _FIRST_NOISE * spread
         fixed, shots = _doubles(twin.params), Shots(*map(jnp.asarray, shots))
         look = partial(evaluate, twin, names, threshold, fixed, shots)
-        at = look(values, jnp.zeros((shots.n, n_free(twin))), noise)
+        begin = first_offsets(twin, np.asarray(shots.obs), twin.dt)
+        at = look(values, jnp.asarray(begin), noise)
         before = np.asarray(at.raw)
         search = partial(solve, twin, names, threshold, max_steps, fixed)
         for _ in range(_PASSES):

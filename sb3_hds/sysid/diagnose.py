@@ -23,18 +23,25 @@ from sb3_hds.sysid.results import Estimate
 from sb3_hds.sysid.search import LEAST_GAIN, LEVEL, Base, Effort, Half, Search, Tried
 from sb3_hds.sysid.shooting import Shots, shots_of
 from sb3_hds.sysid.sizes import sized
+from sb3_hds.sysid.thinning import thinned
+from sb3_hds.sysid.timing import in_step
 
 # Length of a window [s], within these numbers of steps.
-_WINDOW, _SHORTEST, _LONGEST = 1.0, 8, 1000
+_WINDOW, _SHORTEST, _LONGEST = 1.0, 8, 200
 # A cause that leaves more than this share of what it explains, in a way that can be predicted, is
 # not the cause.
-_MOST_LEFT = 0.2
+_MOST_LEFT = 0.4
 # Causes that are looked for.
 _MOST = 3
 # How long to search.
 _EFFORTS = {"full": Effort((0.0, 3.0), 8, 256, 4), "quick": Effort((0.0, 3.0), 4, 64, 1)}
-# Noise before it is known, and the least that is believed, in shares of a channel's spread.
-_FIRST_NOISE, _LEAST_NOISE = 0.05, 1e-6
+# Errors that nobody minds, in shares of a channel's spread: no simulation is exact, and a finding
+# must matter.
+_IRRELEVANT = 5e-3
+# A force that moves a short window by a smaller share of that is no remainder.
+_OF_IRRELEVANT = 0.25
+# Noise before it is known, in the same units.
+_FIRST_NOISE = 0.05
 # Parameters that a cause has at most, and fewer units of evidence than these cannot say anything.
 _WIDEST, _FEWEST_UNITS = 3, 4
 _CONFIDENCE = 0.9
@@ -78,8 +85,7 @@ def diagnose(
     check_fits(twin, data)
     if budget not in _EFFORTS:
         raise CalibrationError(f"budget must be 'full' or 'quick', got {budget!r}.")
-    hypotheses = Hypotheses.about(twin, effects, tuple(calibrate))
-    inquiry = _Inquiry(hypotheses, data, seed, budget, progress)
+    inquiry = _Inquiry(twin, data, tuple(effects), tuple(calibrate), seed, budget, progress)
     reason = inquiry.poor()
     return inquiry.refused(reason) if reason else inquiry.run()
 
@@ -104,14 +110,25 @@ class _Inquiry:
     """One diagnosis on its way."""
 
     def __init__(
-        self, hypotheses: Hypotheses, data: Trajectories, seed: int, budget: str, progress: bool
+        self,
+        twin: Twin,
+        data: Trajectories,
+        effects: tuple[type[Effect], ...],
+        calibrate: tuple[str, ...],
+        seed: int,
+        budget: str,
+        progress: bool,
     ) -> None:
-        self.hypotheses, self.data, self.seed = hypotheses, data, seed
-        self.audit = audit(data, channels=hypotheses.twin.channels)
-        self.spread = spread_of(data)
-        steps = int(np.clip(round(_WINDOW / data.dt), _SHORTEST, _LONGEST))
-        self.shots, origin = shots_of(data, min(steps, int(data.lengths.max())), hypotheses.twin)
-        self.parts = split(data, origin, seed)
+        self.believed, self.seed = twin, seed
+        self.audit, self.data_hash = audit(data, channels=twin.channels), _hash(data)
+        data, self.moved = in_step(twin, data)
+        coarse, self.data, self.every = thinned(twin, data)
+        self.hypotheses = Hypotheses.about(coarse, effects, calibrate)
+        self.spread, dt = spread_of(self.data), self.data.dt
+        steps = int(np.clip(round(_WINDOW / dt), _SHORTEST, _LONGEST))
+        longest = int(self.data.lengths.max())
+        self.shots, origin = shots_of(self.data, min(steps, longest), self.hypotheses.twin)
+        self.parts = split(self.data, origin, seed)
         self.effort, self.progress = _EFFORTS[budget], progress
 
     def poor(self) -> str:
@@ -141,7 +158,7 @@ class _Inquiry:
             evidence, hypotheses=self.hypotheses, noise=_FIRST_NOISE * self.spread
         )
         halves = [
-            Half(evidence.on(own), self.parts.unit[chosen])
+            Half(evidence.on(own), self.parts.unit[chosen], _IRRELEVANT * self.spread)
             for own, chosen in zip(shots, rows, strict=True)
         ]
         self.search = Search(halves[0], halves[1], self.effort, self.progress)
@@ -170,7 +187,9 @@ class _Inquiry:
             left = self._left(base)
             explained = max(before.power - left.power, 0.0)
             if left.remainder is not None and left.remainder.power > _MOST_LEFT * explained:
-                found, base, left = [], start, before
+                # Something is there, and this is not it.
+                found, base = [], start
+                left = before if before.remainder is not None else left
         rejected = [pair for pair in rejected if pair[0].key not in _keys(found)]
         self._set_noise(base.point)
         return self._told(found, rejected, start, base, before, left)
@@ -178,10 +197,10 @@ class _Inquiry:
     def refused(self, reason: str) -> Diagnosis:
         return Diagnosis(
             verdict="not_identifiable",
-            believed=self.hypotheses.believed,
+            believed=self.believed,
             caveats=(reason,),
-            twin=self.hypotheses.extended_by([], self.hypotheses.null),
-            data_hash=_hash(self.data),
+            twin=self.believed,
+            data_hash=self.data_hash,
             seed=self.seed,
         )
 
@@ -193,8 +212,8 @@ class _Inquiry:
         self._set_noise(min((base.point, *(t.point for t in tried)), key=lambda p: p.cost))
 
     def _set_noise(self, point: Point) -> None:
-        noise = np.sqrt(np.mean(point.raw**2, (0, 1)))
-        self.search.set_noise(np.maximum(noise, _LEAST_NOISE * self.spread))
+        noise = np.mean(point.raw**2, (0, 1)) + (_IRRELEVANT * self.spread) ** 2
+        self.search.set_noise(np.sqrt(noise))
 
     def _pruned(self, found: list[_Accepted], base: Base) -> tuple[list[_Accepted], Base]:
         """Without causes that later ones have made superfluous."""
@@ -212,7 +231,9 @@ class _Inquiry:
         missing = missing_force(self.search.select.evidence, base.point.theta, self.data)
         joints = tuple(joint.name for joint in self.hypotheses.twin.joints)
         power = float(np.mean(np.sum(weighed(missing) ** 2, 1)))
-        return _Left(remainder(missing, self.data, joints, self.seed), power, missing)
+        mind = float(np.mean((_IRRELEVANT * self.spread / self.search.noise) ** 2))
+        least = _OF_IRRELEVANT**2 * mind * missing.numbers
+        return _Left(remainder(missing, self.data, joints, self.seed, least), power, missing)
 
     def _told(
         self,
@@ -234,19 +255,24 @@ class _Inquiry:
         total, after = confirm.total(start.kept), confirm.total(base.kept)
         return Diagnosis(
             verdict=verdict,
-            believed=self.hypotheses.believed,
+            believed=self.believed,
             findings=findings,
             unexplained="" if left.remainder is None else _in_words(left.remainder),
-            gain=by_horizon(confirm, start.kept, base.kept),
+            gain=by_horizon(confirm, start.kept, base.kept, self.every),
             explained=1.0 - after / total if findings else 0.0,
-            detectable=detectable(select.evidence, start.point),
+            detectable=detectable(select, start.point),
             rejected=tuple(
                 Rejected(candidate.key, c.gain, c.p_value, _why(c))
                 for candidate, c in sorted(rejected, key=lambda pair: -pair[1].gain)
             ),
-            caveats=tuple(f"{found.sentence} {found.remedy}" for found in self.audit.findings),
-            twin=self.hypotheses.extended_by(_keys(found), theta),
-            data_hash=_hash(self.data),
+            caveats=(
+                *(f"{found.sentence} {found.remedy}" for found in self.audit.findings),
+                *self.moved,
+            ),
+            twin=self.hypotheses.extended_by(_keys(found), theta).at_interval(
+                self.believed.dt, self.believed.substeps
+            ),
+            data_hash=self.data_hash,
             seed=self.seed,
             pictures=pictures_of(confirm, start.kept, base.kept, before.missing, left.missing),
         )

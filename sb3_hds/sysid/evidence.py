@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 
 from sb3_hds.core import Params, Twin
 from sb3_hds.sysid.hypotheses import Hypotheses
-from sb3_hds.sysid.shooting import Shots, n_free, simulate
+from sb3_hds.sysid.motion import first_offsets
+from sb3_hds.sysid.shooting import Shots, simulate
 
 # Beyond this, in units of the noise, an error counts in proportion, not by its square.
 _HUBER = 3.0
@@ -129,7 +130,7 @@ class Evidence:
         h, moving = self.hypotheses, np.array(free, int)
         low, high, size = h.lower[moving], h.upper[moving], h.scale[moving]
         theta = np.array(theta, float)
-        offsets = self._unmoved() if offsets is None else offsets
+        offsets = self._begin if offsets is None else offsets
         now, damping = self._blocks(theta, moving, offsets), _DAMPING
         for _ in range(n_steps):
             step = _eliminated(now, damping)
@@ -166,8 +167,10 @@ class Evidence:
         step = _eliminated(self._blocks(point.theta, every, point.offsets), 0.0)
         return Slopes(step.curvature, step.scores)
 
-    def _unmoved(self) -> np.ndarray:
-        return np.zeros((self.shots.n, n_free(self.hypotheses.twin)))
+    @cached_property
+    def _begin(self) -> np.ndarray:
+        twin = self.hypotheses.believed
+        return first_offsets(twin, np.asarray(self.shots.obs), twin.dt)
 
     @cached_property
     def _counted(self) -> np.ndarray:

@@ -101,7 +101,11 @@ class Hypotheses:
             for i, name in enumerate(own)
             if name not in calibrate and name not in native.values()
         ]
-        candidates += [c for c in found if native.get(c.parameters[0]) not in calibrate]
+        candidates += [
+            c
+            for c in found
+            if native.get(c.parameters[0]) not in calibrate and not {*c.parameters} <= {*calibrate}
+        ]
         moving = (*calibrate, *dict.fromkeys(p for c in candidates for p in c.parameters))
         moving += tuple(name for name in pushes if name not in moving)
         every = {name: extended.parameters[name] for name in moving}

@@ -7,6 +7,9 @@ from jaxtyping import Float
 
 from sb3_hds.core import Twin
 
+# Samples from which the first velocity is told.
+_FEW = 5
+
 
 def motion_of(
     twin: Twin, obs: Float[np.ndarray, "n rows obs"], dt: float
@@ -20,3 +23,20 @@ def motion_of(
     if q.shape[1] > 1 and not v.any():
         v = np.gradient(q, dt, axis=1)
     return q, v
+
+
+def first_offsets(
+    twin: Twin, obs: Float[np.ndarray, "n rows n_obs"], dt: float
+) -> Float[np.ndarray, "n free"]:
+    """
+    Where a search for start states begins.
+
+    :return: offsets from what first measurements say: zero, but for velocities that are not
+        observed, which differences of positions tell
+    """
+    dof = len(twin.joints)
+    q, v = motion_of(twin, obs[:, :_FEW], dt)
+    first = jax.vmap(lambda row: twin.infer(row, twin.params).v)(jnp.asarray(obs[:, 0]))
+    if np.asarray(first).any():
+        return np.zeros((len(obs), 2 * dof))
+    return np.concatenate([np.zeros_like(q[:, 0]), v.mean(1)], 1)

@@ -36,6 +36,7 @@ class MissingForce(NamedTuple):
     :param command: mean over the window, shape ``(n, n_act)``
     :param time: since the recording began [s], shape ``(n,)``
     :param origin: recording, shape ``(n,)``
+    :param numbers: measurements in a window
     """
 
     force: np.ndarray
@@ -45,6 +46,7 @@ class MissingForce(NamedTuple):
     command: np.ndarray
     time: np.ndarray
     origin: np.ndarray
+    numbers: int
 
 
 class Remainder(NamedTuple):
@@ -95,6 +97,7 @@ def missing_force(
         command=shots.actions.mean(1),
         time=time,
         origin=origin,
+        numbers=(steps + 1) * data.n_obs,
     )
 
 
@@ -109,12 +112,17 @@ def _lengthened(shots: Shots, steps: int) -> Shots:
 
 
 def remainder(
-    missing: MissingForce, data: Trajectories, joints: tuple[str, ...], seed: int
+    missing: MissingForce,
+    data: Trajectories,
+    joints: tuple[str, ...],
+    seed: int,
+    least_power: float = 0.0,
 ) -> Remainder | None:
     """
     Whether a smooth function of position, velocity, command and time, learned on one half of the
     recordings, predicts the missing force of the other half, and the other way round.
 
+    :param least_power: of what is predicted, below which nobody minds
     :return: where it is and what it goes with; None if nothing is left that can be predicted
     """
     parts = split(data, missing.origin, seed)
@@ -130,18 +138,21 @@ def remainder(
             "command": missing.command,
             "time": missing.time[:, None],
         }
+        quantities = {name: values for name, values in quantities.items() if values.shape[1]}
         force = weighed(missing)[:, j]
         force = np.clip(force, -_MOST_RATIO * force.std(), _MOST_RATIO * force.std())
         told = {
             names: _predicted([quantities[n] for n in names], force, parts)
-            for k in (1, 2, 4)
+            for k in (1, 2, len(quantities))
             for names in combinations(quantities, k)
         }
         most, p_value = max(told.values())
         if most < _LEAST_GAIN or p_value * len(told) >= _LEVEL:
             continue
         enough = min((names for names in told if told[names][0] >= _MOST_OF_IT * most), key=len)
-        power = told[enough][0] * float(np.mean(force**2))
+        power = told[enough][0] * max(float(np.mean(force**2)), 1.0)
+        if power < least_power:
+            continue
         found.append(Remainder(joint, enough, *told[enough], power))
     return max(found, key=lambda r: r.gain, default=None)
 
@@ -172,7 +183,9 @@ def _predicted(
     for learn, check in ((~parts.confirm, parts.confirm), (parts.confirm, ~parts.confirm)):
         rows = np.flatnonzero(learn)[:_MOST_WINDOWS]
         guess[check] = _ridge(features[rows], force[rows], features[check])
-    gain = 1.0 - np.sum((force - guess) ** 2) / np.sum(force**2)
+    # Forces are in units of their errors: below one, there is nothing to predict.
+    total = max(float(np.sum(force**2)), len(force))
+    gain = (np.sum(force**2) - np.sum((force - guess) ** 2)) / total
     agreement = np.array(
         [np.sum(force[own] * guess[own]) for own in map(parts.unit.__eq__, np.unique(parts.unit))]
     )

@@ -3,7 +3,7 @@
 import base64
 import io
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -251,17 +251,20 @@ def _horizons(d: Diagnosis, p: "Pictures") -> Any:
 
 
 def _missing(p: "Pictures") -> Any:
-    figure, panels = _figure(len(p.joints), 4, 9.0, 0.5 + 2.2 * len(p.joints))
+    columns = 4 if p.actuators else 3
+    figure, panels = _figure(len(p.joints), columns, 9.0, 0.5 + 2.2 * len(p.joints))
     explained = p.missing.force - p.left.force
     for j, (name, unit) in enumerate(p.joints):
         joint_unit = "m" if unit == "N" else "rad"
-        command = min(j, p.missing.command.shape[1] - 1)
-        against: Sequence[tuple[str, np.ndarray]] = (
+        against: list[tuple[str, np.ndarray]] = [
             (f"position [{joint_unit}]", p.missing.position[:, j]),
             (f"velocity [{joint_unit}/s]", p.missing.velocity[:, j]),
-            ("command [{1}]".format(*p.actuators[command]), p.missing.command[:, command]),
             ("time [s]", p.missing.time),
-        )
+        ]
+        if p.actuators:
+            command = min(j, len(p.actuators) - 1)
+            label = f"command [{p.actuators[command][1]}]"
+            against.insert(2, (label, p.missing.command[:, command]))
         low, high = np.quantile(p.missing.force[:, j], [0.01, 0.99])
         margin = 0.2 * (high - low) + 1e-12
         for axes, (label, values) in zip(panels[j], against, strict=True):

@@ -15,13 +15,13 @@ from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
 
 # What confirms a candidate: by which share the mean square error of held-out recordings falls, at
 # which level, and by how much the information criterion of the others.
-LEAST_GAIN, LEVEL, LEAST_BIC = 0.05, 0.025, 10.0
+LEAST_GAIN, LEVEL, LEAST_BIC = 0.05, 0.025, 6.0
 # Another candidate belongs into the set unless it is worse than the best at this level.
 _LEVEL_OF_SET = 0.05
 # Errors that differ by a smaller share are the same, however surely they differ.
 _SAME = 0.01
-# Steps of fits to the end, and of start states alone.
-_ALL_STEPS, _KEPT_STEPS = 25, 6
+# Steps of fits to the end, and of start states alone: to the end, and for a rough comparison.
+_ALL_STEPS, _KEPT_STEPS, _ROUGH_STEPS = 25, 6, 3
 
 _Given = TypeVar("_Given")
 _Told = TypeVar("_Told")
@@ -31,13 +31,19 @@ class Half(NamedTuple):
     """
     :param evidence: windows of one half of the recordings
     :param unit: piece of evidence of each window, shape ``(n,)``
+    :param irrelevant: error of each channel that nobody minds, shape ``(n_obs,)``
     """
 
     evidence: Evidence
     unit: Int[np.ndarray, " n"]
+    irrelevant: Float[np.ndarray, " obs"]
+
+    def errors(self, point: Point) -> Float[np.ndarray, " n"]:
+        """:return: mean square of each window, with what is irrelevant added"""
+        return point.errors + float(np.mean((self.irrelevant / self.evidence.noise) ** 2))
 
     def total(self, point: Point) -> float:
-        return float(point.errors.sum())
+        return float(self.errors(point).sum())
 
 
 class Base(NamedTuple):
@@ -150,7 +156,7 @@ class Search:
 
         def verdict(candidate: Candidate) -> Comparison:
             theta = self._reached[candidate.key]
-            kept = self.confirm.evidence.fit(theta, (), base.kept.offsets, _KEPT_STEPS)
+            kept = self.confirm.evidence.fit(theta, (), base.kept.offsets, _ROUGH_STEPS)
             return self.against(kept, base.kept)
 
         return list(zip(rest, self._each(verdict, rest, "weighing the others"), strict=True))
@@ -193,7 +199,8 @@ class Search:
 
     def against(self, new: Point, old: Point) -> Comparison:
         """:return: one against another, both on the half that confirms"""
-        return compare(new.errors, old.errors, self.confirm.unit)
+        half = self.confirm
+        return compare(half.errors(new), half.errors(old), half.unit)
 
     def _fitted(
         self,
@@ -207,7 +214,7 @@ class Search:
         h, own = self.hypotheses, list(self.hypotheses.indices(candidate))
         begins = [h.null[own] + distance * h.scale[own] for distance in self.effort.starts]
         if candidate.key in self._reached:
-            begins.append(self._reached[candidate.key][own])
+            begins = [h.null[own], self._reached[candidate.key][own]]
         best = base
         for begin in begins:
             theta = base.theta.copy()

@@ -16,7 +16,7 @@ _SHARE = 0.05
 _OF_COMMAND, _OF_SPEED, _OF_POSITION = 0.2, 0.1, 0.2
 # Of an admissible range.
 _OF_RANGE = 0.1
-_NOTHING = 1e-9
+_NOTHING = 1e-15
 
 
 def sized(evidence: Evidence, data: Trajectories) -> Hypotheses:
