@@ -354,7 +354,11 @@ class HDS(TwinAlgorithm):
         nuisances = names_to_estimate(self.twin, self.calibrated)
         own = {"budget": "quick", "progress": False, "calibrate": nuisances} | arguments
         found = self.diagnose(**own)
-        causes = [_effect_of(f) for f in found.findings if f.effect in _CATALOGUE]
+        causes = [
+            _effect_of(f)
+            for f in found.findings
+            if f.effect in _CATALOGUE and not self._estimates(f"{f.effect}.{f.where['name']}")
+        ]
         if causes:
             self.twin = self.twin.extend(*causes)
             for effect in causes:
@@ -364,6 +368,11 @@ class HDS(TwinAlgorithm):
             self._steps_at_force = 0
         self.logger.record("model/diagnosed_effects", len(causes))
         return found
+
+    def _estimates(self, effect: str) -> bool:
+        """:return: whether the twin has this effect at this place already"""
+        known = required(self.twin, self.twin_spec).parameters
+        return any(name.startswith(f"{effect}.") for name in known)
 
     def _since_change(self) -> int | None:
         """:return: real steps that count, where the system changed; None if all do"""
