@@ -21,7 +21,7 @@ from sb3_hds.envs.registration import HARDWARE, STEP_LIMITS
 from sb3_hds.errors import NoTwinError, ParameterError
 from sb3_hds.twins import Pendulum
 
-ALL = twins.names()
+ALL = [name for name in twins.names() if twins.get(name).env_id]  # rigs have no task
 # What the spaces of real systems cannot avoid: torques in N m, positions without limit. And an
 # environment that is not made by its id cannot be made again by the checker.
 _UNAVOIDABLE = ("normalized", "infinity", "not having a spec")

@@ -9,6 +9,9 @@ import os
 import hidden_effects
 import pytest
 
+# Twenty diagnoses take some ten minutes.
+pytestmark = pytest.mark.expensive
+
 SALT = int(os.environ.get("SB3_HDS_SALT", "0"))
 N_CASES = 20
 
