@@ -202,6 +202,25 @@ def test_a_model_diagnoses_its_data_sheet_by_what_it_has_measured(heavier):
     assert found.twin.values["mass"] == pytest.approx(1.3, rel=0.05)
 
 
+def test_what_the_data_name_is_attached_and_estimated_from_then_on(tmp_path):
+    rubbing = twins.make("PendulumReal").extend(effects.CoulombFriction(0, tau_c=0.3))
+    data = measured(rubbing, n=10, n_steps=100, noise=0.01)
+    model = small("hds", REAL, twin="PendulumReal", pretrain_data=data, residual=False)
+    assert small("hds", REAL, twin="PendulumReal").extend_model() is None
+
+    found = model.extend_model(effects=[effects.CoulombFriction, effects.ActionDelay])
+
+    assert [f.effect for f in found.findings] == ["coulomb_friction"]
+    name = "coulomb_friction.hinge.tau_c"
+    assert model.twin.values[name] == pytest.approx(0.3, rel=0.1)
+    assert model.nominal[name] == 0.0
+    # Again, there is nothing new to attach.
+    assert not model.extend_model(effects=[effects.CoulombFriction]).findings[1:]
+    model.learn(0)
+    model.save(tmp_path / "model")
+    assert HDS.load(tmp_path / "model", env=model.get_env()).twin == model.twin
+
+
 def test_diagnoses_come_as_often_as_asked_for():
     model = small("hds", REAL, twin="PendulumReal", diagnose_freq=2, train_freq=10)
     asked = []

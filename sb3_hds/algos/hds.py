@@ -274,7 +274,8 @@ class HDS(TwinAlgorithm):
         """Correct the model where a correction is due, then plan."""
         self._n_blocks += 1
         if self.diagnose_freq and self._n_blocks % self.diagnose_freq == 0:
-            self.extend_model()
+            found = self.extend_model()
+            self.logger.record("model/diagnosed_effects", len(found.findings) if found else 0)
         if self.refit_freq and self._n_blocks % self.refit_freq == 0:
             self.correct_model(gradient_steps)
         super().train(gradient_steps, batch_size)
@@ -366,7 +367,6 @@ class HDS(TwinAlgorithm):
                     self.nominal[f"{effect.name}.{effect.where}.{name}"] = parameter.null
             self.twin_spec, self._workspace = self.twin.to_spec(), None
             self._steps_at_force = 0
-        self.logger.record("model/diagnosed_effects", len(causes))
         return found
 
     def _estimates(self, effect: str) -> bool:
