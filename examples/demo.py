@@ -19,10 +19,10 @@ from rich.console import Console
 from rich.table import Table
 
 import sb3_hds
+from sb3_hds.experiments import returns_of
 
 ENV_ID = "Pendulum-v1"
 N_EPISODES = 50
-FIRST_START = 1_000  # seeds of the start states, which no training uses
 TRAINING_SEED = 0
 
 
@@ -39,7 +39,8 @@ def main() -> None:
 
     untrained = sb3_hds.HDS("MlpPolicy", ENV_ID, seed=TRAINING_SEED)
     trained = sb3_hds.HDS.load(run / f"{ENV_ID}.zip")
-    before, after = returns(untrained), returns(trained)
+    env = gym.make(ENV_ID)
+    before, after = (returns_of(model, env, N_EPISODES) for model in (untrained, trained))
 
     picture = options.folder / "learning_curve.png"
     draw(run, picture, before, after)
@@ -56,24 +57,6 @@ def train(folder: Path, n_timesteps: int) -> Path:
     subprocess.run([zoo, *words.split(), *budget, "-f", str(logs)], check=True)
     runs = logs.glob(f"hds/{ENV_ID}_*")
     return max(runs, key=lambda run: int(run.name.rpartition("_")[2]))
-
-
-def returns(model: sb3_hds.HDS) -> np.ndarray:
-    """
-    :param model: a policy
-    :return: return of each of the episodes, undiscounted, shape ``(N_EPISODES,)``
-    """
-    env = gym.make(ENV_ID)
-    totals = np.zeros(N_EPISODES)
-    for episode in range(N_EPISODES):
-        obs, _ = env.reset(seed=FIRST_START + episode)
-        done = False
-        while not done:
-            action, _ = model.predict(obs, deterministic=True)
-            obs, reward, terminated, truncated, _ = env.step(action)
-            totals[episode] += float(reward)
-            done = terminated or truncated
-    return totals
 
 
 def draw(run: Path, picture: Path, before: np.ndarray, after: np.ndarray) -> None:

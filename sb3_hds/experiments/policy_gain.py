@@ -19,10 +19,9 @@ from sb3_hds.algos import HDS
 from sb3_hds.core import Twin
 from sb3_hds.envs import TwinEnv, true_twin
 from sb3_hds.errors import TrajectoryError
+from sb3_hds.experiments.returns import returns_of
 from sb3_hds.sysid import Diagnosis
 
-# Seeds of the start states, which no training uses.
-_FIRST_START = 70_000
 _N_RESAMPLES = 2000
 _LEVEL = 0.9
 
@@ -153,7 +152,7 @@ def measure_policy_gain(
     for name, seed in track(runs, "training", transient=True, disable=not progress):
         model = algorithm("MlpPolicy", _task(simulations[name]), seed=seed, **arguments)
         model.learn(budget)
-        returns[name].append(_returns(model, real, n_episodes))
+        returns[name].append(returns_of(model, real, n_episodes))
     found = {name: np.stack(rows) for name, rows in returns.items()}
     return PolicyGain(found, _summarised(found["extended"] - found["believed"]))
 
@@ -167,19 +166,6 @@ def _made(env: gymnasium.Env | str | Callable[[], gymnasium.Env]) -> gymnasium.E
 def _task(twin: Twin) -> gymnasium.Env:
     assert twin.max_episode_steps is not None
     return TimeLimit(TwinEnv(twin), twin.max_episode_steps)
-
-
-def _returns(model: BaseAlgorithm, env: gymnasium.Env, n_episodes: int) -> np.ndarray:
-    totals = np.zeros(n_episodes)
-    for episode in range(n_episodes):
-        obs, _ = env.reset(seed=_FIRST_START + episode)
-        done = False
-        while not done:
-            action, _ = model.predict(obs, deterministic=True)
-            obs, reward, terminated, truncated, _ = env.step(action)
-            totals[episode] += float(reward)
-            done = terminated or truncated
-    return totals
 
 
 def _summarised(values: Float[np.ndarray, "runs episodes"]) -> Return:
