@@ -20,6 +20,11 @@ LEAST_GAIN, LEVEL, LEAST_BIC = 0.05, 0.025, 6.0
 _LEVEL_OF_SET = 0.05
 # Errors that differ by a smaller share are the same, however surely they differ.
 _SAME = 0.01
+# Where fits begin of what has no slope at its null, in units of each parameter's scale from it.
+_AWAY = 3.0
+# Curvature, per measurement, below which there is no slope; directions below this share of the
+# largest curvature do not move.
+_FLAT, _RANK = 1e-15, 1e-9
 # Steps of fits to the end, and of start states alone: to the end, and for a rough comparison.
 _ALL_STEPS, _KEPT_STEPS, _ROUGH_STEPS = 25, 6, 3
 
@@ -76,15 +81,27 @@ class Tried(NamedTuple):
     criterion: float
 
 
+class _Guess(NamedTuple):
+    """
+    :param gain: by which the cost would fall
+    :param theta: where to begin a fit, shape ``(p,)``
+    :param blind: some parameter has no slope where nothing is wrong
+    """
+
+    gain: float
+    theta: Float[np.ndarray, " p"]
+    blind: bool
+
+
 class Effort(NamedTuple):
     """
-    :param starts: where fits begin, in units of each parameter's scale from its null
+    :param guessed: candidates that one Newton step must favour to be fitted at all
     :param finalists: candidates that are fitted to the end
     :param windows: most windows on which the others are compared
     :param steps: of the fits that choose the finalists
     """
 
-    starts: tuple[float, ...]
+    guessed: int
     finalists: int
     windows: int
     steps: int
@@ -132,11 +149,24 @@ class Search:
         if len(sample) < evidence.shots.n:
             evidence = evidence.on(type(evidence.shots)(*(x[sample] for x in evidence.shots)))
 
-        def glance(candidate: Candidate) -> Point:
-            return self._fitted(candidate, base.free, first, evidence, self.effort.steps)
+        guesses = self._guessed(left, base.free, first, evidence)
+        for candidate, guess in zip(left, guesses, strict=True):
+            self._reached.setdefault(candidate.key, guess.theta)
+        blind = [c for c, guess in zip(left, guesses, strict=True) if guess.blind]
+        seen = [(guess.gain, c) for c, guess in zip(left, guesses, strict=True) if not guess.blind]
+        seen = sorted(seen, key=lambda pair: -pair[0])[: self.effort.guessed]
+        likely = [*blind, *(candidate for _, candidate in seen)]
 
-        points = self._each(glance, left, f"comparing {len(left)} causes")
-        ranked = sorted(zip(left, points, strict=True), key=lambda pair: pair[1].cost)
+        def glance(candidate: Candidate) -> Point:
+            own = list(self.hypotheses.indices(candidate))
+            theta = first.theta.copy()
+            theta[own] = self._reached[candidate.key][own]
+            free = [*base.free, *own]
+            point = evidence.fit(theta, free, first.offsets, self.effort.steps)
+            return min(first, point, key=lambda p: p.cost)
+
+        points = self._each(glance, likely, f"comparing {len(likely)} causes")
+        ranked = sorted(zip(likely, points, strict=True), key=lambda pair: pair[1].cost)
         for candidate, point in ranked:
             self._reached[candidate.key] = point.theta
 
@@ -202,26 +232,24 @@ class Search:
         half = self.confirm
         return compare(half.errors(new), half.errors(old), half.unit)
 
-    def _fitted(
-        self,
-        candidate: Candidate,
-        free: Sequence[int],
-        base: Point,
-        evidence: Evidence,
-        n_steps: int,
-    ) -> Point:
-        """The best of several short fits."""
-        h, own = self.hypotheses, list(self.hypotheses.indices(candidate))
-        begins = [h.null[own] + distance * h.scale[own] for distance in self.effort.starts]
-        if candidate.key in self._reached:
-            begins = [h.null[own], self._reached[candidate.key][own]]
-        best = base
-        for begin in begins:
-            theta = base.theta.copy()
-            theta[own] = np.clip(begin, h.lower[own], h.upper[own])
-            point = evidence.fit(theta, [*free, *own], base.offsets, n_steps)
-            best = min(best, point, key=lambda p: p.cost)
-        return best
+    def _guessed(
+        self, candidates: Sequence[Candidate], free: Sequence[int], base: Point, evidence: Evidence
+    ) -> list[_Guess]:
+        """What one Newton step promises, and where it leads; elsewhere if there is no slope."""
+        h, slopes = self.hypotheses, evidence.slopes(base)
+        curvature, score = slopes.curvature.sum(0), slopes.scores.sum(0)
+        flat = np.diag(curvature) < _FLAT * base.raw.size
+        room = (h.lower - base.theta) / h.scale, (h.upper - base.theta) / h.scale
+        found = []
+        for candidate in candidates:
+            own = list(h.indices(candidate))
+            step, gain = _newton(curvature, score, [*free, *own], room)
+            theta, blind = base.theta + h.scale * step, bool(flat[own].any())
+            if blind:
+                away = h.null[own] + _AWAY * h.scale[own]
+                theta[own] = np.clip(away, h.lower[own], h.upper[own])
+            found.append(_Guess(gain, theta, blind))
+        return found
 
     def _continued(self, candidate: Candidate, base: Base) -> Point:
         own = list(self.hypotheses.indices(candidate))
@@ -249,6 +277,25 @@ class Search:
             done = pool.map(work, given)
             shown = track(done, what, total=len(given), transient=True, disable=not self.progress)
             return list(shown)
+
+
+def _newton(
+    curvature: np.ndarray, score: np.ndarray, moving: list[int], room: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, float]:
+    """
+    :param moving: indices; what would leave its room ends at its border
+    :return: the step of all parameters, and by how much the cost would fall
+    """
+    step = np.zeros(len(score))
+    while moving:
+        inner = np.linalg.pinv(curvature[np.ix_(moving, moving)], rcond=_RANK, hermitian=True)
+        step[moving] -= inner @ (score + curvature @ step)[moving]
+        wanted, allowed = step[moving], np.clip(step[moving], room[0][moving], room[1][moving])
+        step[moving] = allowed
+        if (inside := wanted == allowed).all():
+            break
+        moving = [i for i, kept in zip(moving, inside, strict=True) if kept]
+    return step, -float(score @ step + 0.5 * step @ curvature @ step)
 
 
 def passes(verdict: Comparison) -> bool:

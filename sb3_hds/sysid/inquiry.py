@@ -1,0 +1,298 @@
+"""How a diagnosis goes: propose on some recordings, confirm once on others, see what is left."""
+
+import dataclasses
+import hashlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from sb3_hds.core import Effect, Trajectories, Twin
+from sb3_hds.data import audit
+from sb3_hds.sysid.account import by_horizon, detectable, pictures_of, standard_errors
+from sb3_hds.sysid.calibrate import spread_of
+from sb3_hds.sysid.comparison import Comparison, split
+from sb3_hds.sysid.diagnosis import Diagnosis, Finding, Rejected
+from sb3_hds.sysid.evidence import Evidence, Point, portion_for
+from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
+from sb3_hds.sysid.remainder import MissingForce, Remainder, missing_force, remainder, weighed
+from sb3_hds.sysid.results import Estimate
+from sb3_hds.sysid.search import LEAST_GAIN, LEVEL, Base, Effort, Half, Search, Tried
+from sb3_hds.sysid.shooting import Shots, shots_of
+from sb3_hds.sysid.sizes import sized
+from sb3_hds.sysid.thinning import thinned
+from sb3_hds.sysid.timing import in_step
+
+# Length of a window [s], within these numbers of steps.
+_WINDOW, _SHORTEST, _LONGEST = 1.0, 8, 200
+# A cause that leaves more than this share of what it explains, in a way that can be predicted, is
+# not the cause.
+_MOST_LEFT = 0.4
+# Causes that are looked for.
+_MOST = 3
+# How long to search.
+EFFORTS = {"full": Effort(16, 8, 256, 4), "quick": Effort(8, 4, 64, 2)}
+# Errors that nobody minds, in shares of a channel's spread: no simulation is exact, and a finding
+# must matter.
+_IRRELEVANT = 5e-3
+# A force that moves a short window by a smaller share of that is no remainder.
+_OF_IRRELEVANT = 0.25
+# Noise before it is known, in the same units.
+_FIRST_NOISE = 0.05
+# Parameters that a cause has at most, and fewer units of evidence than these cannot say anything.
+_WIDEST, _FEWEST_UNITS = 3, 4
+_CONFIDENCE = 0.9
+
+
+class _Accepted(NamedTuple):
+    """A cause that was confirmed, and what the data cannot tell from it."""
+
+    tried: Tried
+    verdict: Comparison
+    alternatives: tuple[str, ...]
+
+
+class _Left(NamedTuple):
+    """What a twin leaves: what can be predicted of it, its mean square, and all of it."""
+
+    remainder: Remainder | None
+    power: float
+    missing: MissingForce
+
+
+class Inquiry:
+    """
+    One diagnosis on its way.
+
+    :param twin: as it is believed
+    :param data: measured
+    :param effects: classes of what may be wrong
+    :param calibrate: names of nuisances
+    :param seed: of the split
+    :param budget: how long to search: a key of ``EFFORTS``
+    :param progress: whether bars show how far it is
+    """
+
+    def __init__(
+        self,
+        twin: Twin,
+        data: Trajectories,
+        effects: tuple[type[Effect], ...],
+        calibrate: tuple[str, ...],
+        seed: int,
+        budget: str,
+        progress: bool,
+    ) -> None:
+        self.believed, self.seed = twin, seed
+        self.audit, self.data_hash = audit(data, channels=twin.channels), _hash(data)
+        data, self.moved = in_step(twin, data)
+        coarse, self.data, self.every = thinned(twin, data)
+        self.hypotheses = Hypotheses.about(coarse, effects, calibrate)
+        self.spread, dt = spread_of(self.data), self.data.dt
+        steps = int(np.clip(round(_WINDOW / dt), _SHORTEST, _LONGEST))
+        longest = int(self.data.lengths.max())
+        self.shots, origin = shots_of(self.data, min(steps, longest), self.hypotheses.twin)
+        self.parts = split(self.data, origin, seed)
+        self.effort, self.progress = EFFORTS[budget], progress
+
+    def poor(self) -> str:
+        """:return: why these data cannot support a verdict; empty if they may"""
+        rows = ~self.parts.confirm, self.parts.confirm
+        units = [len(np.unique(self.parts.unit[own])) for own in rows]
+        if min(units) < _FEWEST_UNITS // 2:
+            return (
+                f"{sum(units)} pieces of evidence are too few to propose on some and confirm on "
+                "others. Record at least four times as long, or several recordings."
+            )
+        return self.audit.reason
+
+    def prepare(self) -> None:
+        """Two halves of the evidence, and sizes of parameters that suit the machine."""
+        rows = ~self.parts.confirm, self.parts.confirm
+        shots = [_rows_of(self.shots, own) for own in rows]
+        evidence = Evidence(
+            self.hypotheses,
+            shots[0],
+            self.spread,
+            width=len(self.hypotheses.nuisances) + _WIDEST,
+            portion=portion_for(max(own.n for own in shots)),
+        )
+        self.hypotheses = sized(evidence, self.data)
+        evidence = dataclasses.replace(
+            evidence, hypotheses=self.hypotheses, noise=_FIRST_NOISE * self.spread
+        )
+        halves = [
+            Half(evidence.on(own), self.parts.unit[chosen], _IRRELEVANT * self.spread)
+            for own, chosen in zip(shots, rows, strict=True)
+        ]
+        self.search = Search(halves[0], halves[1], self.effort, self.progress)
+
+    def run(self) -> Diagnosis:
+        self.prepare()
+        self.settle_noise()
+        start = base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
+        found: list[_Accepted] = []
+        rejected: list[tuple[Candidate, Comparison]] = []
+        while len(found) < _MOST:
+            tried = self.search.finalists(base, _keys(found))
+            if not found:
+                rejected = [(t.candidate, self.search.against(t.kept, base.kept)) for t in tried]
+                rejected += self.search.others(base, tried)
+            best = self.search.best(tried, base)
+            if best is None:
+                break
+            others = self.search.alternatives(best, tried, base)
+            found.append(_Accepted(best, self.search.against(best.kept, base.kept), others))
+            own = self.hypotheses.indices(best.candidate)
+            base = Base(best.point, best.kept, (*base.free, *own))
+        found, base = self._pruned(found, base)
+        before = left = self._left(start)
+        if found:
+            left = self._left(base)
+            explained = max(before.power - left.power, 0.0)
+            if left.remainder is not None and left.remainder.power > _MOST_LEFT * explained:
+                # Something is there, and this is not it.
+                found, base = [], start
+                left = before if before.remainder is not None else left
+        rejected = [pair for pair in rejected if pair[0].key not in _keys(found)]
+        self._set_noise(base.point)
+        return self._told(found, rejected, start, base, before, left)
+
+    def refused(self, reason: str) -> Diagnosis:
+        return Diagnosis(
+            verdict="not_identifiable",
+            believed=self.believed,
+            caveats=(reason,),
+            twin=self.believed,
+            data_hash=self.data_hash,
+            seed=self.seed,
+        )
+
+    def settle_noise(self) -> None:
+        """What is left under the best explanation, of whatever kind, is the noise."""
+        base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
+        self._set_noise(base.point)
+        tried = self.search.finalists(base, [])
+        self._set_noise(min((base.point, *(t.point for t in tried)), key=lambda p: p.cost))
+
+    def _set_noise(self, point: Point) -> None:
+        noise = np.mean(point.raw**2, (0, 1)) + (_IRRELEVANT * self.spread) ** 2
+        self.search.set_noise(np.sqrt(noise))
+
+    def _pruned(self, found: list[_Accepted], base: Base) -> tuple[list[_Accepted], Base]:
+        """Without causes that later ones have made superfluous."""
+        for one in found[:-1]:
+            if not self.search.needed(one.tried.candidate, base):
+                own = self.hypotheses.indices(one.tried.candidate)
+                theta = base.point.theta.copy()
+                theta[list(own)] = self.hypotheses.null[list(own)]
+                base = self.search.base(theta, [i for i in base.free if i not in own])
+                found = [other for other in found if other is not one]
+        return found, base
+
+    def _left(self, base: Base) -> _Left:
+        """:return: what the twin leaves as it is believed now"""
+        missing = missing_force(self.search.select.evidence, base.point.theta, self.data)
+        joints = tuple(joint.name for joint in self.hypotheses.twin.joints)
+        power = float(np.mean(np.sum(weighed(missing) ** 2, 1)))
+        mind = float(np.mean((_IRRELEVANT * self.spread / self.search.noise) ** 2))
+        least = _OF_IRRELEVANT**2 * mind * missing.numbers
+        return _Left(remainder(missing, self.data, joints, self.seed, least), power, missing)
+
+    def _told(
+        self,
+        found: Sequence[_Accepted],
+        rejected: Sequence[tuple[Candidate, Comparison]],
+        start: Base,
+        base: Base,
+        before: _Left,
+        left: _Left,
+    ) -> Diagnosis:
+        select, confirm, theta = self.search.select, self.search.confirm, base.point.theta
+        stderr = standard_errors(select.evidence, select.unit, base.point, base.free)
+        findings = tuple(_finding(self.hypotheses, one, theta, stderr) for one in found)
+        verdict = "none"
+        if findings:
+            verdict = "ambiguous" if findings[0].alternatives else "named"
+        elif left.remainder is not None:
+            verdict = "unknown"
+        total, after = confirm.total(start.kept), confirm.total(base.kept)
+        return Diagnosis(
+            verdict=verdict,
+            believed=self.believed,
+            findings=findings,
+            unexplained="" if left.remainder is None else _in_words(left.remainder),
+            gain=by_horizon(confirm, start.kept, base.kept, self.every),
+            explained=1.0 - after / total if findings else 0.0,
+            detectable=detectable(select, start.point),
+            rejected=tuple(
+                Rejected(candidate.key, c.gain, c.p_value, _why(c))
+                for candidate, c in sorted(rejected, key=lambda pair: -pair[1].gain)
+            ),
+            caveats=(
+                *(f"{found.sentence} {found.remedy}" for found in self.audit.findings),
+                *self.moved,
+            ),
+            twin=self.hypotheses.extended_by(_keys(found), theta).at_interval(
+                self.believed.dt, self.believed.substeps
+            ),
+            data_hash=self.data_hash,
+            seed=self.seed,
+            pictures=pictures_of(confirm, start.kept, base.kept, before.missing, left.missing),
+        )
+
+
+def _finding(h: Hypotheses, accepted: _Accepted, theta: np.ndarray, stderr: np.ndarray) -> Finding:
+    candidate, verdict = accepted.tried.candidate, accepted.verdict
+    parameters = {}
+    for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
+        half = stats.t.ppf(0.5 + 0.5 * _CONFIDENCE, verdict.n_units - 1) * stderr[i]
+        parameters[name.rpartition(".")[2]] = Estimate(
+            name=name,
+            estimate=float(theta[i]),
+            stderr=float(stderr[i]),
+            low=float(max(theta[i] - half, h.lower[i])),
+            high=float(min(theta[i] + half, h.upper[i])),
+            unit=h.twin.parameters[name].unit,
+            before=float(h.null[i]),
+            at_bound=bool(theta[i] <= h.lower[i] or theta[i] >= h.upper[i]),
+        )
+    return Finding(
+        candidate.name,
+        h.place_of(candidate),
+        parameters,
+        accepted.alternatives,
+        verdict.p_value,
+        verdict.gain,
+        candidate.explanation,
+    )
+
+
+def _why(verdict: Comparison) -> str:
+    if verdict.gain < LEAST_GAIN:
+        return "gains too little"
+    return "may be chance" if verdict.p_value >= LEVEL else "others gain more"
+
+
+def _keys(found: Sequence[_Accepted]) -> list[str]:
+    return [one.tried.candidate.key for one in found]
+
+
+def _in_words(left: Remainder) -> str:
+    share = f"{left.gain:.0%}"
+    return (
+        f"a force at {left.joint} goes with {' and '.join(left.goes_with)}; {share} of its "
+        f"variance is predictable on held-out recordings (p = {left.p_value:.2g})."
+    )
+
+
+def _rows_of(shots: Shots, rows: np.ndarray) -> Shots:
+    return Shots(*(np.asarray(leaf)[rows] for leaf in shots))
+
+
+def _hash(data: Trajectories) -> str:
+    digest = hashlib.sha256()
+    for leaf in (data.obs, data.actions, data.mask):
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()[:16]
