@@ -18,14 +18,24 @@ import time
 
 import numpy as np
 import pandas as pd
-from independent_rigs import COMMANDS, FORCES, OUTSIDE, SYSTEMS, Planted, simulate
+from independent_rigs import (
+    COMMANDS,
+    FORCES,
+    OUTSIDE,
+    SYSTEMS,
+    TRANSMISSIONS,
+    Planted,
+    simulate,
+)
+from other_rules import asked
 from runs import CACHE, RESULTS, fresh_process, resume
 
 DT, N_STEPS, BLOCK = 0.02, 200, 10
 NOISES = {"tick": 2e-3, "1 %": 0.01, "5 %": 0.05}
 #: kind of case and its share
 KINDS = {
-    "effect": 0.46,
+    "effect": 0.40,
+    "pair": 0.06,
     "null": 0.12,
     "null, disturbed": 0.12,
     "null, wrong base": 0.12,
@@ -46,7 +56,8 @@ JOINT = (
     "cogging",
     "constant_force",
 )
-SENSOR = ("sensor_bias", "sensor_scale", "sensor_delay")
+SENSOR = ("sensor_bias", "sensor_scale", "sensor_delay", "sign_flip")
+PARAMETER = "parameter"
 
 
 def main() -> None:
@@ -136,10 +147,18 @@ def smallest(system: str, noise: str) -> dict[str, dict[str, float]]:
 def planted_effect(system: str, noise: str, factor: float, rng) -> Planted:
     """One effect of the catalogue, so many times as large as what would have shown."""
     rig, twin = SYSTEMS[system], believed(system)
-    kind = str(rng.choice((*JOINT, *COMMANDS, *SENSOR)))
-    slot = "joint" if kind in JOINT else "actuator" if kind in COMMANDS else "channel"
+    apart = tuple(TRANSMISSIONS) if rig.apart else ()
+    kind = str(rng.choice((*JOINT, *COMMANDS, *SENSOR, *apart, PARAMETER)))
+    if kind == PARAMETER:
+        name = f"parameter.{rig.base[0]}"
+        size = smallest(system, noise)[name][rig.base[0]]
+        return Planted(name, 0, {rig.base[0]: factor * size * float(rng.choice((-1.0, 1.0)))})
+    slot = slot_of(kind)
     places = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}[slot]
     index = int(rng.integers(len(places)))
+    # How far a motor that is apart leads its load, or the load lags: in units of the noise.
+    lead = factor * 2.0 * NOISES[noise] * spread(system)[index]
+    stiffness = rig.torque[min(index, len(rig.torque) - 1)] / lead
     found = smallest(system, noise).get(f"{kind}.{places[index].name}", {})
     s = {name: factor * (size or np.nan) for name, size in found.items()}
     side = float(rng.choice((-1.0, 1.0)))
@@ -167,8 +186,27 @@ def planted_effect(system: str, noise: str, factor: float, rng) -> Planted:
         "motor_lag": lambda: {"time_constant": min(s["time_constant"], 0.3)},
         "action_delay": lambda: {"delay": min(s["delay"], 0.15)},
         "sensor_delay": lambda: {"delay": min(s["delay"], 0.15)},
+        "joint_elasticity": lambda: {
+            "k": stiffness,
+            "d": 0.2 * np.sqrt(stiffness * 0.25 * rig.inertia),
+        },
+        "backlash": lambda: {"gap": lead},
+        "sign_flip": lambda: {"flipped": 1.0},
     }.get(kind, lambda: s)()
     return Planted(kind, index, values)
+
+
+def slot_of(effect: str) -> str:
+    return "actuator" if effect in COMMANDS else "channel" if effect in SENSOR else "joint"
+
+
+def name_of(planted: Planted, system: str) -> str:
+    """:return: effect and place, as a diagnosis names them"""
+    twin, slot = believed(system), slot_of(planted.effect)
+    if planted.effect.startswith(PARAMETER):
+        return planted.effect
+    places = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}[slot]
+    return f"{planted.effect}.{places[planted.index].name}"
 
 
 def planted_outside(system: str, noise: str, rng) -> Planted:
@@ -195,73 +233,137 @@ def planted_outside(system: str, noise: str, rng) -> Planted:
     return Planted(kind, index, values)
 
 
-def run(system: str, case: int, budget: str, only_noise: str | None = None) -> dict | None:
-    """One case: everything about it is drawn from its number; None if it cannot be planted."""
-    from sb3_hds import diagnose
+def run(
+    system: str,
+    case: int,
+    budget: str,
+    only_noise: str | None = None,
+    most: int = 20,
+    rules: bool = True,
+) -> dict | None:
+    """
+    One case: everything about it is drawn from its number.
+
+    :param only_noise: instead of one that is drawn
+    :param most: recordings
+    :param rules: whether other rules are asked too
+    :return: what was planted and what was said; None if it cannot be planted
+    """
+    from sb3_hds import effects
+    from sb3_hds.sysid.inquiry import Inquiry
 
     rng = np.random.default_rng([case, list(SYSTEMS).index(system)])
     kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
     noise = only_noise or str(rng.choice(list(NOISES), p=(0.4, 0.4, 0.2)))
     factor = float(rng.choice((2.0, 4.0, 8.0)))
-    n = int(rng.choice((8, 10, 14, 20)))
+    n = min(int(rng.choice((8, 10, 14, 20))), most)
     base_wrong = kind == "null, wrong base" or (kind == "effect" and rng.random() < 0.3)
     disturbed = kind == "null, disturbed" or (kind == "effect" and rng.random() < 0.3)
+    off = float(rng.choice((0.9, 1.1)))
     planted = []
-    if kind == "effect":
-        planted = [planted_effect(system, noise, factor, rng)]
-        if any(not np.isfinite(v) for v in planted[0].values.values()):
+    if kind in ("effect", "pair"):
+        planted = [planted_effect(system, noise, factor, rng) for _ in range(1 + (kind == "pair"))]
+        sizes = [value for p in planted for value in p.values.values()]
+        names = {name_of(p, system) for p in planted}
+        apart = [p for p in planted if p.effect in TRANSMISSIONS]
+        if not np.all(np.isfinite(sizes)) or len(names) < len(planted) or len(apart) > 1:
             return None
+        base_wrong &= not apart and not planted[0].effect.startswith(PARAMETER)
+        for p in planted:
+            if p.effect.startswith(PARAMETER):
+                off = 1.0 + p.values[SYSTEMS[system].base[0]] / base_value(system)
+                if apart or not 0.3 < off < 3.0:
+                    return None
     elif kind == "outside":
         planted = [planted_outside(system, noise, rng)]
+    wrong = base_wrong or any(p.effect.startswith(PARAMETER) for p in planted)
     data = recorded(
         system,
         planted,
         noise,
         rng,
         n,
-        wrong_base=float(rng.choice((0.9, 1.1))) if base_wrong else 1.0,
+        wrong_base=off if wrong else 1.0,
         disturbance=float(rng.choice((0.02, 0.05))) if disturbed else 0.0,
         excited=kind != "still",
     )
     nuisances = (SYSTEMS[system].base[0],) if base_wrong else ()
     started = time.time()
-    found = diagnose(
-        believed(system), data, calibrate=nuisances, seed=case, budget=budget, progress=False
-    )
+    inquiry = Inquiry(believed(system), data, effects.ALL, nuisances, case, budget, False)
+    reason = inquiry.poor()
+    found = inquiry.refused(reason) if reason else inquiry.run()
     seconds = time.time() - started
-    twin = believed(system)
-    places = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}
-    truth, estimate = "", {}
-    if planted:
-        p = planted[0]
-        slot = "actuator" if p.effect in COMMANDS else "channel" if p.effect in SENSOR else "joint"
-        truth = f"{p.effect}.{places[slot][p.index].name}"
+    truths = [name_of(p, system) for p in planted] if kind != "outside" else []
     first = found.findings[0] if found.findings else None
-    named = key(first) if first else ""
-    if first and named == truth:
-        estimate = {
-            name: (e.estimate, e.low, e.high, planted[0].values.get(name))
-            for name, e in first.parameters.items()
-        }
+    estimate = {}
+    for finding in found.findings[:1]:
+        for p, truth in zip(planted, truths, strict=False):
+            if key(finding) == truth:
+                estimate = {
+                    name: (e.estimate, e.low, e.high, true_value(p, name, system))
+                    for name, e in finding.parameters.items()
+                }
+    more = {}
+    if rules and not reason:
+        more = {f"rule: {rule}": name for rule, name in asked(inquiry).items()}
     return {
         "case": case,
         "kind": kind,
-        "truth": truth,
+        "truth": ";".join(truths) or (planted[0].effect if planted else ""),
         "factor": factor,
         "noise": noise,
         "recordings": n,
         "wrong_base": base_wrong,
         "disturbed": disturbed,
         "verdict": found.verdict,
-        "named": named,
-        "set": ";".join((named, *first.alternatives)) if first else "",
+        "named": key(first) if first else "",
+        "set": ";".join((key(first), *first.alternatives)) if first else "",
         "more": ";".join(map(key, found.findings[1:])),
         "gain": first.gain if first else 0.0,
         "explained": found.explained,
+        "at_the_end": reached(found),
+        "oracle": oracle(inquiry, planted, system) if truths and not reason else np.nan,
         "unexplained": bool(found.unexplained),
         "estimate": json.dumps(estimate),
         "seconds": seconds,
+        **more,
     }
+
+
+def base_value(system: str) -> float:
+    return believed(system).values[SYSTEMS[system].base[0]]
+
+
+def true_value(planted: Planted, name: str, system: str) -> float | None:
+    added = base_value(system) if planted.effect.startswith(PARAMETER) else 0.0
+    return added + planted.values[name] if name in planted.values else None
+
+
+def reached(found) -> float:
+    """By which share what was found lowers held-out errors at the end of a window."""
+    if not found.gain:
+        return np.nan
+    last = found.gain[max(found.gain)]
+    return 1.0 - (last.after / last.before) ** 2
+
+
+def oracle(inquiry, planted: list[Planted], system: str) -> float:
+    """By which share the planted effects, fitted from their truth, lower held-out errors."""
+    search, h = inquiry.search, inquiry.hypotheses
+    start = search.base(h.null, h.nuisances)
+    theta, free = start.point.theta.copy(), [*start.free]
+    for p in planted:
+        wanted = name_of(p, system)
+        candidate = next((c for c in h.candidates if c.key == wanted), None)
+        if candidate is None:
+            return np.nan
+        for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
+            value = true_value(p, name.rpartition(".")[2], system)
+            theta[i] = theta[i] if value is None else value
+            free.append(i)
+    best = search.base(theta, free)
+    before, after = (np.mean((x.kept.raw[:, -1] / search.noise) ** 2) for x in (start, best))
+    return float(1.0 - after / before)
 
 
 def key(finding) -> str:
@@ -279,54 +381,97 @@ def wilson(hits: int, n: int) -> str:
     return f"{hits / n:.3f} [{low:.3f}, {high:.3f}] of {n}"
 
 
+def same(named: str, truth: str) -> bool:
+    """Whether two names mean the same, or are declared not to be told apart."""
+    from sb3_hds.effects import ALL
+
+    if named == truth:
+        return True
+    one, other = (
+        name if name.startswith(PARAMETER) else name.split(".")[0] for name in (named, truth)
+    )
+    declared = {kind.name: kind.equivalents for kind in ALL}
+    return other in declared.get(one, ()) or one in declared.get(other, ())
+
+
+def hit(truths: str, names: str) -> bool:
+    """Whether one of the names is one of the causes."""
+    return any(
+        same(name, truth) for name in names.split(";") if name for truth in truths.split(";")
+    )
+
+
+def share(rows: pd.DataFrame, test) -> str:
+    return wilson(sum(test(row) for _, row in rows.iterrows()), len(rows))
+
+
 def report(table: pd.DataFrame) -> None:
-    table = table.fillna("")
-    named = table["verdict"].isin(["named", "ambiguous"])
+    texts = table.select_dtypes(exclude="number").columns
+    table = table.assign(**{name: table[name].fillna("") for name in texts})
+    spoke = table["verdict"].isin(["named", "ambiguous"])
+    nulls = table["kind"].str.startswith("null")
     for kind in (k for k in KINDS if k.startswith("null")):
         rows = table[table["kind"] == kind]
-        print(f"false alarms, {kind:<18} {wilson(int(named[rows.index].sum()), len(rows))}")
-        unknown = (rows["verdict"] == "unknown").sum()
-        print(f'  and "unknown"                {wilson(int(unknown), len(rows))}')
+        print(f"false alarms, {kind:<18} {share(rows, lambda r: spoke[r.name])}")
+        print(f'  and "unknown"                {share(rows, lambda r: r["verdict"] == "unknown")}')
     rows = table[table["kind"] == "outside"]
-    print(f"refused, outside                {wilson(int((~named[rows.index]).sum()), len(rows))}")
+    print(f"refused, outside                {share(rows, lambda r: not spoke[r.name])}")
     rows = table[table["kind"] == "still"]
-    refused = (rows["verdict"] == "not_identifiable").sum()
-    print(f"refused, standing still         {wilson(int(refused), len(rows))}")
+    refused = share(rows, lambda r: r["verdict"] == "not_identifiable")
+    print(f"refused, standing still         {refused}")
     effects = table[table["kind"] == "effect"]
-    for disturbed in (False, True):
-        rows = effects[effects["disturbed"] == disturbed]
-        label = "coloured disturbance" if disturbed else "white noise"
+    for label, rows in (
+        ("white noise up to 1 %", effects[~effects["disturbed"] & (effects["noise"] != "5 %")]),
+        ("white noise of 5 %", effects[~effects["disturbed"] & (effects["noise"] == "5 %")]),
+        ("coloured disturbance", effects[effects["disturbed"]]),
+    ):
         for factor in (2.0, 4.0, 8.0):
             some = rows[rows["factor"] == factor]
-            right = [t in s.split(";") for t, s in zip(some["truth"], some["set"], strict=True)]
-            first = (some["truth"] == some["named"]).sum()
             print(
-                f"{label}, {factor:.0f} times: first name right {wilson(int(first), len(some))}, "
-                f"in the set {wilson(sum(right), len(some))}"
+                f"{label}, {factor:.0f} times: right name "
+                f"{share(some, lambda r: hit(r['truth'], r['named']))}, "
+                f"to the letter {share(some, lambda r: r['truth'] == r['named'])}"
             )
-    spoken = effects[named[effects.index]]
-    inside = [t in s.split(";") for t, s in zip(spoken["truth"], spoken["set"], strict=True)]
-    sizes = [len(s.split(";")) for s in spoken["set"]]
-    print(f"truth within what was named     {wilson(sum(inside), len(spoken))}")
+    said = effects[spoke[effects.index]]
+    alone = said[said["verdict"] == "named"]
+    print(f"right among single names        {share(alone, lambda r: hit(r['truth'], r['named']))}")
+    print(f"truth within what was named     {share(said, lambda r: hit(r['truth'], r['set']))}")
+    sizes = [len(names.split(";")) for names in said["set"]]
     print(f"mean size of the set            {np.mean(sizes) if sizes else float('nan'):.2f}")
-    alone = spoken[spoken["verdict"] == "named"]
-    print(
-        f"right among single names        "
-        f"{wilson(int((alone['truth'] == alone['named']).sum()), len(alone))}"
-    )
+    pairs = table[table["kind"] == "pair"]
+    every = lambda r: f"{r['set']};{r['more']}"  # noqa: E731
+    both = share(pairs, lambda r: all(hit(t, every(r)) for t in r["truth"].split(";")))
+    print(f"pairs: one of them is named     {share(pairs, lambda r: hit(r['truth'], every(r)))}")
+    print(f"pairs: both are                 {both}")
+    _report_sizes(said)
+    print(f"median seconds                  {np.median(table['seconds']):.0f}")
+    for rule in (name for name in table if name.startswith("rule: ")):
+        asked = table[table[rule].notna()]
+        alarms = share(asked[nulls[asked.index]], lambda r, rule=rule: bool(r[rule]))
+        right = share(
+            asked[asked["kind"] == "effect"], lambda r, rule=rule: hit(r["truth"], r[rule])
+        )
+        print(f"{rule:<24} alarms {alarms}, right {right}")
+    wrong = said[[not hit(r["truth"], r["set"]) for _, r in said.iterrows()]]
+    if len(wrong):
+        print(wrong[["system", "case", "truth", "factor", "noise", "set"]].to_string())
+
+
+def _report_sizes(said: pd.DataFrame) -> None:
+    """Parameters of right names, and what they explain beside what the truth does."""
     covered, errors = [], []
-    for text in effects["estimate"]:
+    for text in said["estimate"]:
         for value, low, high, true in json.loads(text or "{}").values():
-            if true is not None and true:
+            if true:
                 covered.append(low <= true <= high)
                 errors.append(abs(value - true) / abs(true))
     print(f"90 % intervals that cover       {wilson(sum(covered), len(covered))}")
     if errors:
         print(f"median error of a parameter     {np.median(errors):.1%}")
-    print(f"median seconds                  {np.median(table['seconds']):.0f}")
-    wrong = spoken[[not i for i in inside]]
-    if len(wrong):
-        print(wrong[["system", "case", "truth", "factor", "noise", "set"]].to_string())
+    right = said[[hit(r["truth"], r["named"]) for _, r in said.iterrows()]]
+    ratio = right["at_the_end"] / right["oracle"]
+    if len(ratio):
+        print(f"median gain beside the oracle's {np.nanmedian(ratio):.0%}")
 
 
 assert set(JOINT) - set(FORCES) == {"viscous_friction", "coulomb_friction", "stiffness"}

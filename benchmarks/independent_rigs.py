@@ -47,6 +47,25 @@ _FURUTA = (
 <inertial pos="0 0 -0.07" mass="0.05" diaginertia="8e-5 8e-5 1e-12"/></body></body></worldbody>
 <actuator><motor joint="arm"/></actuator></mujoco>"""
 )
+# Motor and load apart, each with half of the inertia; a tendon holds them together.
+_TENDON = """<tendon><fixed {hold}><joint joint="rotor" coef="1"/><joint joint="load" coef="-1"/>
+</fixed></tendon><actuator><motor joint="rotor"/></actuator></mujoco>"""
+_PENDULUM_APART = (
+    _HEAD
+    + """<worldbody><body><joint name="load" axis="0 -1 0"/>
+<inertial pos="0 0 -0.1" mass="1.0" diaginertia="0.002 0.002 0.002"/></body>
+<body><joint name="rotor" axis="0 -1 0"/>
+<inertial pos="0 0 0" mass="0.1" diaginertia="0.012 0.012 0.012"/></body></worldbody>"""
+    + _TENDON
+)
+_AXIS_APART = (
+    _HEAD
+    + """<worldbody><body><joint name="load" type="slide" axis="1 0 0" damping="1.5"/>
+<inertial pos="0 0 0" mass="1.0" diaginertia="0.01 0.01 0.01"/></body>
+<body><joint name="rotor" type="slide" axis="1 0 0" damping="1.5"/>
+<inertial pos="0 0 0" mass="1.0" diaginertia="0.01 0.01 0.01"/></body></worldbody>"""
+    + _TENDON
+)
 _AXIS = (
     _HEAD
     + """<worldbody><body><joint name="axis" type="slide" axis="1 0 0" damping="3"/>
@@ -65,6 +84,8 @@ class System:
     :param dof: joints
     :param base: parameter of the twin that may be wrong, the body that it belongs to, and whether
         it is the body's mass or its inertia
+    :param apart: for the engine, where motor and load are two, with a place for what holds them
+    :param inertia: of the rigid joint, where that is
     """
 
     xml: str
@@ -72,6 +93,8 @@ class System:
     torque: tuple[float, ...]
     start: tuple[float, ...]
     base: tuple[str, int, str]
+    apart: str = ""
+    inertia: float = math.nan
 
     @property
     def dof(self) -> int:
@@ -85,6 +108,8 @@ SYSTEMS = {
         (0.5,),
         (1.0,),
         ("mass", 1, "mass"),
+        _PENDULUM_APART,
+        0.024,
     ),
     "cart_pole": System(
         _CART_POLE,
@@ -130,7 +155,13 @@ SYSTEMS = {
         ("arm_inertia", 1, "inertia"),
     ),
     "linear_axis": System(
-        _AXIS, ("LinearAxis", {"mass": 2.0, "damping": 3.0}), (6.0,), (0.2,), ("mass", 1, "mass")
+        _AXIS,
+        ("LinearAxis", {"mass": 2.0, "damping": 3.0}),
+        (6.0,),
+        (0.2,),
+        ("mass", 1, "mass"),
+        _AXIS_APART,
+        2.0,
     ),
 }
 
@@ -243,6 +274,12 @@ COMMANDS = (
     "motor_lag",
     "action_delay",
 )
+TRANSMISSIONS: dict[str, Callable[..., str]] = {
+    "joint_elasticity": lambda k, d: f'stiffness="{k}" damping="{d}"',
+    "backlash": lambda gap: (
+        f'limited="true" range="{-0.5 * gap} {0.5 * gap}" solreflimit="0.002 1"'
+    ),
+}
 SENSORS = ("sensor_bias", "sensor_scale", "sensor_delay", "sign_flip")
 
 
@@ -264,9 +301,15 @@ def simulate(
         the typical command
     :return: noiseless observations and commands of each recording
     """
-    model = mujoco.MjModel.from_xml_string(system.xml)
+    xml = system.xml
+    for p in planted:
+        if p.effect in TRANSMISSIONS:
+            xml = system.apart.format(hold=TRANSMISSIONS[p.effect](**p.values))
+    model = mujoco.MjModel.from_xml_string(xml)
     _, body, what = system.base
     getattr(model, f"body_{what}")[body] *= wrong_base
+    # The engine keeps inertias of simple joints from when it read the file.
+    mujoco.mj_setConst(model, mujoco.MjData(model))
     for p in planted:
         if p.effect == "viscous_friction":
             model.dof_damping[p.index] += p.values["b"]
@@ -296,6 +339,7 @@ def _recording(
 ) -> tuple[np.ndarray, np.ndarray]:
     data = mujoco.MjData(model)
     if excited:
+        # A motor that is apart begins where its load does.
         data.qpos[:] = rng.uniform(-1.0, 1.0, system.dof) * np.array(system.start)
     n_motors = len(system.torque)
     wander = rng.standard_normal((n_steps, n_motors)).cumsum(0) * 0.7
@@ -303,22 +347,22 @@ def _recording(
     actions = actions if excited else np.zeros_like(actions)
     commands = Commands([p for p in planted if p.effect in COMMANDS])
     forces = [(p, {}) for p in planted if p.effect in FORCES]
-    rows, fine, push = [_state(data)], [_state(data)], np.zeros(system.dof)
+    rows, fine, push = [_state(data, system)], [_state(data, system)], np.zeros(system.dof)
     size = disturbance * np.array([*system.torque, *system.torque])[: system.dof]
     keep = math.exp(-_STEP / 0.1)
     for action in actions:
         for _ in range(per_step):
             data.ctrl[:] = [commands(i, u) for i, u in enumerate(action)]
             push = keep * push + math.sqrt(1.0 - keep**2) * size * rng.standard_normal(system.dof)
-            data.qfrc_applied[:] = push if disturbance else 0.0
+            data.qfrc_applied[: system.dof] = push if disturbance else 0.0
             for p, memory in forces:
                 i = p.index
                 motor = data.ctrl[i] if i < n_motors else 0.0
                 at = Moment(data.qpos[i], data.qvel[i], motor, data.qfrc_bias[i], data.time, memory)
                 data.qfrc_applied[i] += FORCES[p.effect](at, **p.values)
             mujoco.mj_step(model, data)
-            fine.append(_state(data))
-        rows.append(_state(data))
+            fine.append(_state(data, system))
+        rows.append(_state(data, system))
     obs, fine = np.array(rows), np.array(fine)
     for p in planted:
         j = p.index
@@ -334,5 +378,5 @@ def _recording(
     return obs, actions
 
 
-def _state(data: Any) -> np.ndarray:
-    return np.concatenate([data.qpos, data.qvel])
+def _state(data: Any, system: System) -> np.ndarray:
+    return np.concatenate([data.qpos[: system.dof], data.qvel[: system.dof]])

@@ -9,6 +9,12 @@ from pathlib import Path
 _FOLDER = tempfile.TemporaryDirectory(prefix="sb3_hds_tests_")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _FOLDER.name)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+# Programs that run for moments need not be fast: two thirds of the time that tests take.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1 "
+    "--xla_llvm_disable_expensive_passes=true",
+)
 
 import jax  # noqa: E402
 import pytest  # noqa: E402

@@ -17,17 +17,15 @@ def _observed(twin, params, keys, actions):
     return jax.vmap(one)(keys, actions)
 
 
-def measured(twin, n=8, n_steps=60, noise=0.0, seed=0, share=0.8):
+def measured(twin, n=8, n_steps=60, noise=0.0, seed=0, share=0.8, commands=None):
     """
     :param noise: standard deviation of each channel
     :param share: of the range of commands that is used
+    :param commands: instead of smooth random ones, shape ``(n, n_steps, n_act)``
     :return: episodes of smooth random commands
     """
     rng = np.random.default_rng(seed)
-    low, high = (np.array([getattr(a, end) for a in twin.actuators]) for end in ("low", "high"))
-    wander = rng.standard_normal((n, n_steps, len(low))).cumsum(1)
-    wander = np.sin(0.7 * wander + rng.uniform(0.0, 6.0, (n, 1, 1)))
-    actions = low + (0.5 + 0.5 * share * wander) * (high - low)
+    actions = wandering(twin, n, n_steps, share, rng) if commands is None else commands
     keys = jax.random.split(jax.random.key(seed), n)
     with jax.enable_x64(True):
         params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), twin.params)
@@ -35,3 +33,10 @@ def measured(twin, n=8, n_steps=60, noise=0.0, seed=0, share=0.8):
     return Trajectories.from_arrays(
         obs + noise * rng.standard_normal(obs.shape), actions, dt=twin.dt
     )
+
+
+def wandering(twin, n, n_steps, share, rng):
+    low, high = (np.array([getattr(a, end) for a in twin.actuators]) for end in ("low", "high"))
+    wander = rng.standard_normal((n, n_steps, len(low))).cumsum(1)
+    wander = np.sin(0.7 * wander + rng.uniform(0.0, 6.0, (n, 1, 1)))
+    return low + (0.5 + 0.5 * share * wander) * (high - low)

@@ -17,6 +17,7 @@ from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.comparison import compare, split
 from sb3_hds.sysid.evidence import Evidence
 from sb3_hds.sysid.hypotheses import Hypotheses
+from sb3_hds.sysid.search import _newton
 from sb3_hds.sysid.shooting import shots_of
 
 CATALOGUE = (
@@ -131,6 +132,27 @@ def test_two_causes_are_found_one_after_the_other():
     assert {f.effect for f in found.findings} == {"coulomb_friction", "action_delay"}
     assert found.twin.values["coulomb_friction.hinge.tau_c"] == pytest.approx(0.1, rel=0.15)
     assert found.twin.values["action_delay.torque.delay"] == pytest.approx(0.05, rel=0.15)
+
+
+def test_a_joint_whose_direction_is_wrong_is_found_as_a_whole():
+    """Each of its channels alone makes predictions worse."""
+    pushed = twins.make("FreePendulum", driven=True, dt=0.02)
+    wander = np.random.default_rng(0).standard_normal((10, 120, 1)).cumsum(1)
+    actions = 0.05 * np.sin(0.7 * wander)
+    data = measured(pushed, n=10, n_steps=120, noise=0.005, commands=actions)
+    obs = [data.episode(i)[0] * [-1.0, -1.0] for i in range(len(data))]
+    found = asked(
+        Trajectories.from_arrays(obs, list(actions), dt=pushed.dt),
+        pushed,
+        effects=[effects.SignFlip, effects.ViscousFriction],
+    )
+
+    (finding,) = found.findings
+    assert (finding.effect, finding.where["slot"]) == ("sign_flip", "joint")
+    assert {a.key for a in found.twin.attached} == {
+        "sign_flip.hinge_position",
+        "sign_flip.hinge_velocity",
+    }
 
 
 def test_standing_still_supports_no_verdict():
@@ -309,3 +331,16 @@ def test_a_fit_stays_within_physical_bounds():
         assert (found >= hypotheses.lower).all() and (found <= hypotheses.upper).all()
         others = [i for i in range(len(found)) if i not in moving]
         np.testing.assert_array_equal(found[others], hypotheses.null[others])
+
+
+def test_a_guess_stays_within_its_room():
+    """The second of two coupled parameters may not move below zero: the first moves alone then."""
+    curvature, score = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([-2.0, 1.0])
+    nowhere = np.array([np.inf, np.inf])
+
+    step, gain = _newton(curvature, score, [0, 1], (np.array([-np.inf, 0.0]), nowhere))
+    np.testing.assert_allclose(step, [1.0, 0.0])
+    assert gain == pytest.approx(1.0)
+    step, gain = _newton(curvature, score, [0, 1], (-nowhere, nowhere))
+    np.testing.assert_allclose(step, np.linalg.solve(curvature, -score))
+    assert gain == pytest.approx(0.5 * score @ np.linalg.solve(curvature, score))

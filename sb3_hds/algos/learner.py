@@ -13,15 +13,13 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sb3_hds.algos.networks import Actor, Value, output, value_of
 from sb3_hds.core import Obs, Params, State, Twin
+from sb3_hds.core.compilation import QUICK_COMPILATION
 from sb3_hds.planning import Plan, Problem, best_of_random
 
 # The typical shortfall of the first rollouts becomes this many units of the objective.
 _TYPICAL_SHORTFALL = 12.0
 # The random generator that XLA compiles fastest.
 GENERATOR = "unsafe_rbg"
-# For programs of many small operations: XLA's newer code generator takes a third longer to compile
-# them and they run no faster. (Matrix products do: the regression is compiled as usual.)
-QUICK_COMPILATION = {"xla_cpu_use_fusion_emitters": False}
 # Without discounting, or nearly so, a value counts rewards of at most this many steps.
 _LONGEST = 1000.0
 # Rows that are vectorised together, see `for_each`.

@@ -8,9 +8,13 @@ from jaxtyping import Float, Int
 from sb3_hds.sysid.comparison import compare
 from sb3_hds.sysid.diagnosis import HorizonGain
 from sb3_hds.sysid.evidence import Evidence, Point
+from sb3_hds.sysid.hypotheses import Candidate
 from sb3_hds.sysid.pictures import Pictures, replay_of
 from sb3_hds.sysid.remainder import MissingForce
 from sb3_hds.sysid.search import LEAST_GAIN, Half
+
+# Cosine of the angle between what two causes do beyond which they look alike.
+_IMITATION = 0.95
 
 
 def standard_errors(
@@ -56,6 +60,33 @@ def detectable(half: Half, point: Point) -> dict[str, dict[str, float]]:
     return found
 
 
+def imitators(half: Half, point: Point, found: Candidate, nuisances: Sequence[int]) -> list[str]:
+    """
+    :param point: where the twin with this cause has been fitted
+    :param found: the cause
+    :param nuisances: indices of what else is refitted
+    :return: other candidates that could stand for nearly all of what the cause does to these
+        windows, to first order: the cosine between the two exceeds 0.95
+    """
+    h, total = half.evidence.hypotheses, half.evidence.slopes(point).curvature.sum(0)
+    rest = list(nuisances)
+    inner = np.linalg.pinv(total[np.ix_(rest, rest)], rcond=1e-10, hermitian=True)
+    total = total - total[:, rest] @ inner @ total[rest]
+    own = list(h.indices(found))
+    direction = ((point.theta - h.null) / h.scale)[own]
+    strength = direction @ total[np.ix_(own, own)] @ direction
+    names = []
+    for candidate in h.candidates:
+        other = list(h.indices(candidate))
+        if set(other) & {*own, *rest} or np.diag(total)[other].min() <= 1e-9 * strength:
+            continue
+        shared = total[np.ix_(other, own)] @ direction
+        caught = shared @ np.linalg.pinv(total[np.ix_(other, other)], hermitian=True) @ shared
+        if caught > _IMITATION**2 * strength:
+            names.append(candidate.key)
+    return names
+
+
 def by_horizon(half: Half, before: Point, after: Point, every: int) -> dict[int, HorizonGain]:
     """
     :param every: steps of the data in one of the windows
@@ -86,11 +117,12 @@ def pictures_of(
     errors = [
         np.sqrt(np.mean((point.raw / evidence.noise) ** 2, (0, 2))) for point in (before, after)
     ]
+    rms = np.sqrt(np.mean(after.raw**2, 0))
     return Pictures(
         channels=tuple((c.name, c.unit) for c in twin.channels),
         joints=tuple((j.name, "N" if j.unit == "m" else "N m") for j in twin.joints),
         actuators=tuple((a.name, a.unit) for a in twin.actuators),
-        replay=replay_of(measured, before.raw[rows], after.raw[rows], twin.dt),
+        replay=replay_of(measured, before.raw[rows], after.raw[rows], rms, twin.dt),
         steps=np.arange(measured.shape[1]),
         errors=np.stack(errors),
         missing=missing,

@@ -11,6 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from sb3_hds.core import Params, Trajectories, Twin
+from sb3_hds.core.compilation import QUICKEST_COMPILATION
 from sb3_hds.effects import force_of
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.bounds import bounds_of
@@ -176,7 +177,7 @@ def fit_windows(
     return _fit(twin, names, errors, before, origin, values, noise, found, level, prior)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+@partial(jax.jit, static_argnums=(0, 1, 2, 3), compiler_options=QUICKEST_COMPILATION)
 def solve(
     twin: Twin,
     names: tuple[str, ...],
@@ -212,7 +213,7 @@ def solve(
     return Solution(bounds.outside(found.value), converged, found.stats["num_steps"])
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=QUICKEST_COMPILATION)
 def evaluate(
     twin: Twin,
     names: tuple[str, ...],

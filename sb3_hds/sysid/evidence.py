@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sb3_hds.core import Params, Twin
+from sb3_hds.core.compilation import QUICKEST_COMPILATION
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.motion import first_offsets
 from sb3_hds.sysid.shooting import Shots, simulate
@@ -40,14 +41,12 @@ class Point(NamedTuple):
 
     :param theta: all parameters that may move, shape ``(p,)``
     :param offsets: of the start states, shape ``(n, free)``
-    :param errors: mean square over each window, in units of the noise, shape ``(n,)``
     :param raw: simulated minus measured, shape ``(n, steps + 1, n_obs)``
     :param cost: what fits minimise: large errors count in proportion
     """
 
     theta: np.ndarray
     offsets: np.ndarray
-    errors: np.ndarray
     raw: np.ndarray
     cost: float
 
@@ -155,9 +154,7 @@ class Evidence:
             damping *= _LESS if gained else _MORE
             if (gained and gained < _ENOUGH * now.cost.sum()) or damping > _MOST_DAMPING:
                 break
-        counted = now.raw / self.noise * self._counted[:, None]
-        errors = np.sum(counted**2, (1, 2)) / (self._counted.sum() * now.raw.shape[2])
-        return Point(theta, offsets, errors, now.raw, float(now.cost.sum()))
+        return Point(theta, offsets, now.raw, float(now.cost.sum()))
 
     def slopes(self, point: Point, index: Sequence[int] | None = None) -> Slopes:
         """
@@ -218,7 +215,7 @@ def _in_groups(index: np.ndarray, width: int, nothing: int) -> Iterator[np.ndarr
         yield np.concatenate([own, np.full(width - len(own), nothing)])
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(jax.jit, static_argnums=(0, 1), compiler_options=QUICKEST_COMPILATION)
 def _look(
     twin: Twin,
     names: tuple[str, ...],

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sb3_hds.core import Effect, Params, Twin
-from sb3_hds.effects import ConstantForce, NeuralForce
+from sb3_hds.effects import ConstantForce, NeuralForce, SignFlip, reversed_joint
 from sb3_hds.errors import CalibrationError, EffectError
 
 #: the slot of a twin's own parameter, beside those of effects
@@ -154,10 +154,11 @@ class Hypotheses:
             elif name in self.believed.parameters:
                 own[name] = value[name]
         there = {a.key for a in _attached_of(self.believed)}
+        wanted = {name.rpartition(".")[0] for c in chosen for name in c.parameters}
         new = [
             a.effect.with_values(**{n: value[f"{a.key}.{n}"] for n in a.effect.parameters})
             for a in _attached_of(self.twin)
-            if a.key in causes
+            if a.key in wanted
             and a.key not in there
             and not any(f"{a.key}.{n}" in native for n in a.effect.parameters)
         ]
@@ -170,6 +171,7 @@ class Hypotheses:
 
 
 _OF_PARAMETER = "The twin's {} is not that of the system."
+_OF_DIRECTION = "The direction of the joint is taken the wrong way round, in position and velocity."
 
 
 def _attached(twin: Twin, effects: Sequence[type[Effect]]) -> tuple[Twin, list[Candidate]]:
@@ -202,7 +204,23 @@ def _attached(twin: Twin, effects: Sequence[type[Effect]]) -> tuple[Twin, list[C
                 tuple(a.effect.equivalents.items()),
             )
         )
+    if SignFlip in effects:
+        candidates += _reversed_joints(twin)
     return extended, candidates
+
+
+def _reversed_joints(twin: Twin) -> list[Candidate]:
+    """Joints whose direction may be wrong: several channels have the wrong sign together."""
+    found = []
+    for i, joint in enumerate(twin.joints):
+        try:
+            flips = reversed_joint(twin, i)
+        except EffectError:
+            continue
+        if len(flips) > 1:
+            names = tuple(f"{SignFlip.name}.{flip.where}.flipped" for flip in flips)
+            found.append(Candidate(SignFlip.name, "joint", joint.name, i, names, _OF_DIRECTION))
+    return found
 
 
 def _attached_of(twin: Twin) -> tuple:

@@ -10,7 +10,13 @@ from scipy import stats
 
 from sb3_hds.core import Effect, Trajectories, Twin
 from sb3_hds.data import audit
-from sb3_hds.sysid.account import by_horizon, detectable, pictures_of, standard_errors
+from sb3_hds.sysid.account import (
+    by_horizon,
+    detectable,
+    imitators,
+    pictures_of,
+    standard_errors,
+)
 from sb3_hds.sysid.calibrate import spread_of
 from sb3_hds.sysid.comparison import Comparison, split
 from sb3_hds.sysid.diagnosis import Diagnosis, Finding, Rejected
@@ -26,9 +32,8 @@ from sb3_hds.sysid.timing import in_step
 
 # Length of a window [s], within these numbers of steps.
 _WINDOW, _SHORTEST, _LONGEST = 1.0, 8, 200
-# A cause that leaves more than this share of what it explains, in a way that can be predicted, is
-# not the cause.
-_MOST_LEFT = 0.4
+# A cause that explains less than this share of what can be explained is not the cause.
+_LEAST_SHARE = 0.7
 # Causes that are looked for.
 _MOST = 3
 # How long to search.
@@ -95,6 +100,7 @@ class Inquiry:
         self.shots, origin = shots_of(self.data, min(steps, longest), self.hypotheses.twin)
         self.parts = split(self.data, origin, seed)
         self.effort, self.progress = EFFORTS[budget], progress
+        self.undetermined: set[str] = set()
 
     def poor(self) -> str:
         """:return: why these data cannot support a verdict; empty if they may"""
@@ -139,7 +145,7 @@ class Inquiry:
             if not found:
                 rejected = [(t.candidate, self.search.against(t.kept, base.kept)) for t in tried]
                 rejected += self.search.others(base, tried)
-            best = self.search.best(tried, base)
+            best = self.search.best([t for t in tried if self._determined(t, base)], base)
             if best is None:
                 break
             others = self.search.alternatives(best, tried, base)
@@ -150,14 +156,23 @@ class Inquiry:
         before = left = self._left(start)
         if found:
             left = self._left(base)
-            explained = max(before.power - left.power, 0.0)
-            if left.remainder is not None and left.remainder.power > _MOST_LEFT * explained:
+            if _share(before, left) < _LEAST_SHARE:
                 # Something is there, and this is not it.
                 found, base = [], start
                 left = before if before.remainder is not None else left
         rejected = [pair for pair in rejected if pair[0].key not in _keys(found)]
         self._set_noise(base.point)
         return self._told(found, rejected, start, base, before, left)
+
+    def _determined(self, tried: Tried, base: Base) -> bool:
+        """Whether the interval of some parameter leaves out the value at which nothing changes."""
+        half, own = self.search.select, list(self.hypotheses.indices(tried.candidate))
+        free = [*base.free, *own]
+        stderr = standard_errors(half.evidence, half.unit, tried.point, free)[own]
+        moved = np.abs(tried.point.theta - self.hypotheses.null)[own]
+        if not (sure := bool((moved > _margin(len(np.unique(half.unit)), stderr)).any())):
+            self.undetermined.add(tried.candidate.key)
+        return sure
 
     def refused(self, reason: str) -> Diagnosis:
         return Diagnosis(
@@ -200,6 +215,22 @@ class Inquiry:
         least = _OF_IRRELEVANT**2 * mind * missing.numbers
         return _Left(remainder(missing, self.data, joints, self.seed, least), power, missing)
 
+    def _look_alike(self, found: Sequence[_Accepted], base: Base) -> list[str]:
+        """Sentences on candidates that others imitate, though held-out recordings prefer these."""
+        sentences = []
+        for one in found:
+            own = self.hypotheses.indices(one.tried.candidate)
+            rest = [i for i in base.free if i not in own]
+            alike = imitators(self.search.select, base.point, one.tried.candidate, rest)
+            alike = [name for name in alike if name not in one.alternatives]
+            if alike:
+                sentences.append(
+                    f"In these data {', '.join(alike)} would do nearly the same as "
+                    f"{one.tried.candidate.key}, which held-out recordings prefer. Recordings that "
+                    "excite other speeds, positions and commands would tell them further apart."
+                )
+        return sentences
+
     def _told(
         self,
         found: Sequence[_Accepted],
@@ -217,22 +248,22 @@ class Inquiry:
             verdict = "ambiguous" if findings[0].alternatives else "named"
         elif left.remainder is not None:
             verdict = "unknown"
-        total, after = confirm.total(start.kept), confirm.total(base.kept)
         return Diagnosis(
             verdict=verdict,
             believed=self.believed,
             findings=findings,
             unexplained="" if left.remainder is None else _in_words(left.remainder),
             gain=by_horizon(confirm, start.kept, base.kept, self.every),
-            explained=1.0 - after / total if findings else 0.0,
+            explained=_share(before, left) if findings else 0.0,
             detectable=detectable(select, start.point),
             rejected=tuple(
-                Rejected(candidate.key, c.gain, c.p_value, _why(c))
+                Rejected(candidate.key, c.gain, c.p_value, self._why(candidate, c))
                 for candidate, c in sorted(rejected, key=lambda pair: -pair[1].gain)
             ),
             caveats=(
                 *(f"{found.sentence} {found.remedy}" for found in self.audit.findings),
                 *self.moved,
+                *self._look_alike(found, base),
             ),
             twin=self.hypotheses.extended_by(_keys(found), theta).at_interval(
                 self.believed.dt, self.believed.substeps
@@ -242,12 +273,19 @@ class Inquiry:
             pictures=pictures_of(confirm, start.kept, base.kept, before.missing, left.missing),
         )
 
+    def _why(self, candidate: Candidate, verdict: Comparison) -> str:
+        if verdict.gain < LEAST_GAIN:
+            return "gains too little"
+        if candidate.key in self.undetermined:
+            return "has no certain size"
+        return "may be chance" if verdict.p_value >= LEVEL else "others gain more"
+
 
 def _finding(h: Hypotheses, accepted: _Accepted, theta: np.ndarray, stderr: np.ndarray) -> Finding:
     candidate, verdict = accepted.tried.candidate, accepted.verdict
     parameters = {}
     for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
-        half = stats.t.ppf(0.5 + 0.5 * _CONFIDENCE, verdict.n_units - 1) * stderr[i]
+        half = _margin(verdict.n_units, stderr[i])
         parameters[name.rpartition(".")[2]] = Estimate(
             name=name,
             estimate=float(theta[i]),
@@ -269,10 +307,16 @@ def _finding(h: Hypotheses, accepted: _Accepted, theta: np.ndarray, stderr: np.n
     )
 
 
-def _why(verdict: Comparison) -> str:
-    if verdict.gain < LEAST_GAIN:
-        return "gains too little"
-    return "may be chance" if verdict.p_value >= LEVEL else "others gain more"
+def _margin(n_units: int, stderr: np.ndarray) -> np.ndarray:
+    """:return: half the width of an interval"""
+    return stats.t.ppf(0.5 + 0.5 * _CONFIDENCE, max(n_units - 1, 1)) * stderr
+
+
+def _share(before: _Left, left: _Left) -> float:
+    """:return: of the missing force that can be predicted, how much is not missing any more"""
+    gone = max(before.power - left.power, 0.0)
+    rest = left.remainder.power if left.remainder is not None else 0.0
+    return gone / (gone + rest) if gone + rest else 1.0
 
 
 def _keys(found: Sequence[_Accepted]) -> list[str]:

@@ -7,6 +7,9 @@ from jaxtyping import Float
 
 from sb3_hds.sysid.remainder import MissingForce
 
+# Of a normal distribution, 90 % lie within so many standard deviations.
+_NORMAL_90 = 1.645
+
 
 class Replay(NamedTuple):
     """
@@ -16,12 +19,14 @@ class Replay(NamedTuple):
     :param measured: shape ``(rows, n_obs)``
     :param before: by the twin as it came, nuisances refitted
     :param after: by the extended twin
+    :param margin: half the width of its 90 % interval, by what it misses in all held-out windows
     """
 
     time: Float[np.ndarray, " rows"]
     measured: Float[np.ndarray, "rows obs"]
     before: Float[np.ndarray, "rows obs"]
     after: Float[np.ndarray, "rows obs"]
+    margin: Float[np.ndarray, "rows obs"]
 
 
 class Pictures(NamedTuple):
@@ -51,12 +56,14 @@ def replay_of(
     measured: Float[np.ndarray, "n rows obs"],
     before: Float[np.ndarray, "n rows obs"],
     after: Float[np.ndarray, "n rows obs"],
+    rms: Float[np.ndarray, "rows obs"],
     dt: float,
 ) -> Replay:
     """
     :param measured: windows of one recording, one after the other
     :param before: simulated minus measured
     :param after: simulated minus measured
+    :param rms: what the extended twin misses in any window, root mean square
     """
     n, rows = measured.shape[:2]
     gap = lambda windows: np.concatenate(  # noqa: E731
@@ -65,4 +72,5 @@ def replay_of(
     time = np.arange(n * (rows + 1), dtype=float) * dt
     time -= np.repeat(np.arange(n), rows + 1) * dt
     time[rows :: rows + 1] = np.nan
-    return Replay(time, gap(measured), gap(measured + before), gap(measured + after))
+    margin = gap(np.broadcast_to(_NORMAL_90 * rms, measured.shape))
+    return Replay(time, gap(measured), gap(measured + before), gap(measured + after), margin)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from scipy import stats
 
 from sb3_hds.core import Params, Trajectories, Twin
+from sb3_hds.core.compilation import QUICKEST_COMPILATION
 from sb3_hds.sysid.shooting import Shots, fit_start, n_free, simulate
 
 # Gauss-Newton steps of a start state.
@@ -125,7 +126,7 @@ def hold_out(origin: np.ndarray, share: float = 0.25) -> np.ndarray:
     return (position % every == every - 1) & (origin >= 0)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
 def _single_steps(
     twin: Twin, params: Params, obs: Array, actions: Array, after: Array, scale: Array
 ) -> Float[Array, " n"]:
@@ -137,7 +138,7 @@ def _single_steps(
     return jax.vmap(one)(obs, actions, after)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
 def _errors(
     twin: Twin, params: Params, shots: Shots, scale: Float[Array, " obs"]
 ) -> tuple[Float[Array, " n"], Float[Array, "n free"], Float[Array, "n residuals free"]]:

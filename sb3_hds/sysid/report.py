@@ -168,7 +168,8 @@ def _drawn(d: Diagnosis, p: "Pictures") -> list[dict[str, Any]]:
         _as_png(
             _rollouts(p),
             "Before and after",
-            "A held-out recording, in windows that are simulated from a start state of their own.",
+            "A held-out recording, in windows that are simulated from a start state of their own. "
+            "Shaded: 90 % interval of the extended twin, by what it misses in all such windows.",
         ),
         _as_png(
             _horizons(d, p),
@@ -224,6 +225,9 @@ def _rollouts(p: "Pictures") -> Any:
             left.plot(seen.time, values[:, j], color=colour, lw=1.2, label=label)
             missed = values[:, j] - seen.measured[:, j]
             right.plot(seen.time, missed, color=colour, lw=1.2, label=label)
+        for axes, centre in ((left, seen.after), (right, seen.after - seen.measured)):
+            ends = [centre[:, j] + side * seen.margin[:, j] for side in (-1.0, 1.0)]
+            axes.fill_between(seen.time, *ends, color=_AFTER, alpha=0.15, lw=0.0)
         right.axhline(0.0, color=_MEASURED, lw=0.6)
         left.set_ylabel(f"{name} [{unit}]", fontsize=8)
     panels[0, 0].set_title("simulated and measured", fontsize=9)

@@ -22,9 +22,13 @@ _LEVEL_OF_SET = 0.05
 _SAME = 0.01
 # Where fits begin of what has no slope at its null, in units of each parameter's scale from it.
 _AWAY = 3.0
+# A Newton step promises nothing beyond, in the same units.
+_FARTHEST = 10.0
 # Curvature, per measurement, below which there is no slope; directions below this share of the
 # largest curvature do not move.
 _FLAT, _RANK = 1e-15, 1e-9
+# Mean square error of a window that cannot be simulated, in units of the noise.
+_NOT_FINITE = 1e8
 # Steps of fits to the end, and of start states alone: to the end, and for a rough comparison.
 _ALL_STEPS, _KEPT_STEPS, _ROUGH_STEPS = 25, 6, 3
 
@@ -45,7 +49,9 @@ class Half(NamedTuple):
 
     def errors(self, point: Point) -> Float[np.ndarray, " n"]:
         """:return: mean square of each window, with what is irrelevant added"""
-        return point.errors + float(np.mean((self.irrelevant / self.evidence.noise) ** 2))
+        noise = self.evidence.noise
+        errors = np.nan_to_num(np.mean((point.raw / noise) ** 2, (1, 2)), nan=_NOT_FINITE)
+        return errors + float(np.mean((self.irrelevant / noise) ** 2))
 
     def total(self, point: Point) -> float:
         return float(self.errors(point).sum())
@@ -239,7 +245,10 @@ class Search:
         h, slopes = self.hypotheses, evidence.slopes(base)
         curvature, score = slopes.curvature.sum(0), slopes.scores.sum(0)
         flat = np.diag(curvature) < _FLAT * base.raw.size
-        room = (h.lower - base.theta) / h.scale, (h.upper - base.theta) / h.scale
+        room = (
+            np.maximum((h.lower - base.theta) / h.scale, -_FARTHEST),
+            np.minimum((h.upper - base.theta) / h.scale, _FARTHEST),
+        )
         found = []
         for candidate in candidates:
             own = list(h.indices(candidate))

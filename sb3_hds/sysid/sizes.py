@@ -30,7 +30,9 @@ def sized(evidence: Evidence, data: Trajectories) -> Hypotheses:
     seen = curvature > _NOTHING * point.raw.size
     scale = np.where(seen, h.scale, _unseen(h, data))
     scale[seen] *= _SHARE * np.sqrt(point.raw.size / curvature[seen])
-    return dataclasses.replace(h, scale=np.minimum(scale, _OF_RANGE * (h.upper - h.lower)))
+    # Without a slope a parameter may be a switch, which a tenth of its range does not turn.
+    most = np.where(seen, _OF_RANGE, 1.0) * (h.upper - h.lower)
+    return dataclasses.replace(h, scale=np.minimum(scale, most))
 
 
 def _unseen(h: Hypotheses, data: Trajectories) -> Float[np.ndarray, " p"]:

@@ -1,0 +1,138 @@
+"""What simpler rules would have said of the same data: the peers of `hidden_effects.py`."""
+
+import numpy as np
+
+# By how much an information criterion has to be lower, by common advice "very strong evidence".
+_STRONG = 10.0
+# A coefficient of the sparse regression stays if it moves this share of the force's spread.
+_THRESHOLD = 0.1
+_N_PRUNINGS = 10
+# Hidden layer of the network, steps of its training, and their size.
+_HIDDEN, _N_STEPS, _RATE = 16, 400, 0.02
+
+
+def asked(inquiry) -> dict[str, str]:
+    """
+    :param inquiry: a `sb3_hds.sysid.inquiry.Inquiry` that has run
+    :return: by rule, the name that it gives; empty for none. A network has no names: it says "?".
+    """
+    search, h = inquiry.search, inquiry.hypotheses
+    start = search.base(h.null, h.nuisances)
+    tried = search.finalists(start, [])
+    return {
+        "naive BIC": by_bic(search, start, tried),
+        "best held-out": by_held_out(search, start, tried),
+        "all parameters": by_parameters(search, h, start),
+        "sparse regression": by_regression(inquiry, start),
+        "residual network": by_network(inquiry, start),
+    }
+
+
+def squares(search, point) -> float:
+    return float(np.sum((point.raw / search.noise) ** 2))
+
+
+def by_bic(search, start, tried) -> str:
+    """The lowest Bayesian information criterion, every sample a piece of evidence."""
+    n = start.point.raw.size
+    before = squares(search, start.point)
+
+    def criterion(t) -> float:
+        lower = n * np.log(before / squares(search, t.point))
+        return lower - len(t.candidate.parameters) * np.log(n)
+
+    best = max(tried, key=criterion)
+    return best.candidate.key if criterion(best) > _STRONG else ""
+
+
+def by_held_out(search, start, tried) -> str:
+    """The lowest error on held-out recordings, if it is lower at all."""
+    best = min(tried, key=lambda t: squares(search, t.kept))
+    return best.candidate.key if squares(search, best.kept) < squares(search, start.kept) else ""
+
+
+def by_parameters(search, h, start) -> str:
+    """Fit what the twin has; the parameter that moved most, in standard errors, is the cause."""
+    from sb3_hds.sysid.account import standard_errors
+
+    own = [h.indices(c)[0] for c in h.candidates if c.slot == "parameter"]
+    free = [*start.free, *own]
+    fitted = search.base(start.point.theta, free)
+    if not own or squares(search, fitted.kept) > 0.95 * squares(search, start.kept):
+        return ""
+    stderr = standard_errors(search.select.evidence, search.select.unit, fitted.point, free)
+    moved = np.abs(fitted.point.theta - h.null)[own] / np.maximum(stderr[own], 1e-300)
+    return f"parameter.{h.names[own[int(np.argmax(moved))]]}"
+
+
+def by_regression(inquiry, start) -> str:
+    """Sequentially thresholded least squares (SINDy) of the missing force."""
+    from sb3_hds.sysid.remainder import missing_force, weighed
+
+    missing = missing_force(inquiry.search.select.evidence, start.point.theta, inquiry.data)
+    twin, found = inquiry.hypotheses.twin, []
+    for j, joint in enumerate(twin.joints):
+        q, v = missing.position[:, j], missing.velocity[:, j]
+        columns = {
+            f"viscous_friction.{joint.name}": v,
+            f"coulomb_friction.{joint.name}": np.sign(v),
+            f"quadratic_drag.{joint.name}": v * np.abs(v),
+            f"stiffness.{joint.name}": q,
+            f"cubic_stiffness.{joint.name}": q**3,
+            f"constant_force.{joint.name}": np.ones_like(q),
+        }
+        for k, actuator in enumerate(twin.actuators):
+            columns[f"torque_gain.{actuator.name}"] = missing.command[:, k]
+        force = weighed(missing)[:, j]
+        matrix = np.stack(list(columns.values()), 1) * (force / missing.force[:, j])[:, None]
+        moved = _sparse(matrix, force)
+        best = int(np.argmax(np.abs(moved)))
+        if moved[best]:
+            found.append((abs(moved[best]), list(columns)[best]))
+    return max(found)[1] if found else ""
+
+
+def _sparse(matrix: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """How far each column moves the force, in units of its spread; 0 where it was pruned."""
+    size = matrix.std(0) + 1e-300
+    kept = np.ones(matrix.shape[1], bool)
+    moved = np.zeros(matrix.shape[1])
+    for _ in range(_N_PRUNINGS):
+        moved[:] = 0.0
+        if not kept.any():
+            break
+        answer = np.linalg.lstsq(matrix[:, kept], force, rcond=None)[0]
+        moved[kept] = answer * size[kept] / force.std()
+        again = kept & (np.abs(moved) > _THRESHOLD)
+        if (again == kept).all():
+            break
+        kept = again
+    return moved
+
+
+def by_network(inquiry, start) -> str:
+    """A network learns the missing force; something is wrong if it predicts any of the rest."""
+    import torch
+
+    from sb3_hds.sysid.comparison import split
+    from sb3_hds.sysid.remainder import missing_force, weighed
+
+    missing = missing_force(inquiry.search.select.evidence, start.point.theta, inquiry.data)
+    inputs = np.concatenate(
+        [np.cos(missing.position), np.sin(missing.position), missing.velocity, missing.command], 1
+    )
+    inputs = (inputs - inputs.mean(0)) / (inputs.std(0) + 1e-9)
+    confirm = split(inquiry.data, missing.origin, inquiry.seed).confirm
+    x, y = (torch.tensor(a, dtype=torch.float32) for a in (inputs, weighed(missing)))
+    torch.manual_seed(0)
+    net = torch.nn.Sequential(
+        torch.nn.Linear(x.shape[1], _HIDDEN), torch.nn.Tanh(), torch.nn.Linear(_HIDDEN, y.shape[1])
+    )
+    optimiser = torch.optim.Adam(net.parameters(), _RATE, weight_decay=1e-4)
+    for _ in range(_N_STEPS):
+        optimiser.zero_grad()
+        torch.mean((net(x[~confirm]) - y[~confirm]) ** 2).backward()
+        optimiser.step()
+    with torch.no_grad():
+        left = torch.sum((net(x[confirm]) - y[confirm]) ** 2)
+    return "?" if left < torch.sum(y[confirm] ** 2) else ""
