@@ -246,7 +246,7 @@ def run(
 
     :param only_noise: instead of one that is drawn
     :param most: recordings
-    :param rules: whether other rules are asked too
+    :param rules: whether other rules are asked, and an oracle
     :return: what was planted and what was said; None if it cannot be planted
     """
     from sb3_hds import effects
@@ -322,7 +322,7 @@ def run(
         "gain": first.gain if first else 0.0,
         "explained": found.explained,
         "at_the_end": reached(found),
-        "oracle": oracle(inquiry, planted, system) if truths and not reason else np.nan,
+        "oracle": oracle(inquiry, planted, system) if rules and truths and not reason else np.nan,
         "unexplained": bool(found.unexplained),
         "estimate": json.dumps(estimate),
         "seconds": seconds,

@@ -101,7 +101,8 @@ class Diagnosis:
     :param findings: causes, in the order in which they were found
     :param unexplained: what remains after them, in words; empty if nothing does
     :param gain: by horizon in steps
-    :param explained: share of the explainable error that is explained
+    :param explained: share that the findings explain of the force that is missing and can be
+        predicted, or 0
     :param detectable: by effect and place, the smallest size that these data would have shown
     :param rejected: the other candidates, with numbers
     :param caveats: what to keep in mind, in words

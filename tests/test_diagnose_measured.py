@@ -1,0 +1,87 @@
+"""What others have measured and published comes out right. Minutes each: `pytest -m measured`."""
+
+import os
+
+import measured_rigs
+import numpy as np
+import pytest
+
+from sb3_hds import diagnose
+from sb3_hds.sysid.calibrate import spread_of
+from sb3_hds.sysid.evidence import Evidence, portion_for
+from sb3_hds.sysid.hypotheses import Hypotheses
+from sb3_hds.sysid.shooting import shots_of
+
+pytestmark = [
+    pytest.mark.measured,
+    pytest.mark.expensive,
+    pytest.mark.skipif("SB3_HDS_DATA" not in os.environ, reason="data outside the repository"),
+]
+
+
+def asked(question, **arguments):
+    return diagnose(
+        question.twin, question.data, calibrate=question.calibrate, progress=False, **arguments
+    )
+
+
+def error_over(twin, data, seconds):
+    """Root mean square over windows whose start states are fitted, all channels."""
+    twin = twin.at_interval(data.dt, 1)
+    hypotheses = Hypotheses.about(twin, (), ())
+    shots, _ = shots_of(data, round(seconds / data.dt), twin)
+    evidence = Evidence(hypotheses, shots, spread_of(data), 1, portion=portion_for(shots.n))
+    return np.sqrt(np.mean(evidence.fit(hypotheses.null, (), n_steps=25).raw ** 2))
+
+
+def test_a_free_pendulum_lacks_nothing():
+    found = asked(measured_rigs.multiarm())
+
+    assert found.verdict == "none", found
+
+
+def test_an_axis_has_friction_that_depends_on_the_direction():
+    question = measured_rigs.emps()
+    found = asked(question)
+
+    assert found.findings[0].effect == "directional_viscous_friction", found
+    offset = "constant_force.axis.tau_0"
+    assert abs(found.twin.values[offset]) < 0.5 * abs(question.twin.values[offset])
+    official = measured_rigs.emps("emps/DATA_EMPS_PULSES.mat").data
+    assert error_over(found.twin, official, 1.0) <= 1.40e-3
+
+
+def test_a_servos_friction_depends_on_its_load():
+    question = measured_rigs.bam_xl330()
+    held_out = np.array([condition == "200" for condition in map(str, question.data.conditions)])
+    assert held_out.any() and not held_out.all()
+    found = asked(question._replace(data=question.data[~held_out]))
+
+    first, *others = found.findings
+    assert first.effect == "load_dependent_friction", found
+    assert all(f.where["slot"] == "joint" and "friction" in f.effect for f in others), found
+    unseen = question.data[held_out]
+    before = asked(question._replace(data=question.data[~held_out]), effects=())
+    after = error_over(found.twin, unseen, 1.0)
+    assert after <= 0.7 * error_over(before.twin, unseen, 1.0)
+
+
+def test_a_double_pendulum_has_dry_friction_at_both_joints():
+    found = asked(measured_rigs.dfki())
+
+    sizes = {
+        f.where["name"]: f.parameters["tau_c"].estimate
+        for f in found.findings
+        if f.effect == "coulomb_friction"
+    }
+    assert sizes == {
+        "joint1": pytest.approx(0.093, rel=0.3),
+        "joint2": pytest.approx(0.078, rel=0.3),
+    }, found
+
+
+def test_a_servo_that_hardly_moves_supports_no_confident_name():
+    found = asked(measured_rigs.bam_sts3250())
+
+    assert found.verdict != "named", found
+    assert found.caveats, found
