@@ -112,6 +112,7 @@ def measure_policy_gain(
     budget: int = 0,
     seeds: int = 5,
     n_episodes: int = 20,
+    ceiling: bool = True,
     progress: bool = True,
     **arguments: Any,
 ) -> PolicyGain:
@@ -128,6 +129,7 @@ def measure_policy_gain(
         its twin before it acts
     :param seeds: runs in each simulation
     :param n_episodes: start states on the real system
+    :param ceiling: whether policies from the true twin are trained too, where there is one
     :param progress: whether a bar shows how far it is
     :param arguments: of the algorithm
     :return: returns by simulation, and the gain with its interval
@@ -145,8 +147,9 @@ def measure_policy_gain(
         )
     real = _made(env)
     simulations = {"believed": diagnosis.believed, "extended": diagnosis.twin}
-    with contextlib.suppress(TypeError):
-        simulations["true"] = true_twin(real)
+    if ceiling:
+        with contextlib.suppress(TypeError):
+            simulations["true"] = true_twin(real)
     runs = [(name, seed) for seed in range(seeds) for name in simulations]
     returns: dict[str, list[np.ndarray]] = {name: [] for name in simulations}
     for name, seed in track(runs, "training", transient=True, disable=not progress):
