@@ -3,8 +3,7 @@ Find out what is wrong with a simulation, mend it, and train in the mended one.
 
     python examples/demo_diagnosis.py --folder demo
 
-The "robot" is a pendulum on MuJoCo's engine whose bearing has dry friction; `diagnose` is not told.
-Writes the recordings, ``report.html`` and ``policy_gain.png`` into ``demo/``, and prints the return
+The "robot" is a pendulum on MuJoCo's engine that stirs the air; `diagnose` is not told. Writes the recordings, ``report.html`` and ``policy_gain.png`` into ``demo/``, and prints the return
 on the robot of policies from both twins.
 """
 
@@ -19,9 +18,9 @@ from sb3_hds.experiments import measure_policy_gain
 from sb3_hds.wrappers import Record
 
 ROBOT = "sb3_hds/PendulumReal-v1"
-HIDDEN = {"friction": 0.25, "noise": 0.01}
+HIDDEN = {"drag": 0.04, "noise": 0.01}
 N_RECORDINGS, N_STEPS = 10, 200
-EPOCHS = 80  # of planning: a demonstration must not take long
+EPOCHS = 50  # of planning: a demonstration must not take long
 
 
 def main() -> None:

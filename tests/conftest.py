@@ -9,7 +9,7 @@ from pathlib import Path
 _FOLDER = tempfile.TemporaryDirectory(prefix="sb3_hds_tests_")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _FOLDER.name)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
-# Programs that run for moments need not be fast: two thirds of the time that tests take.
+# Programs that run for moments need not be fast: these take half as long to compile.
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1 "
