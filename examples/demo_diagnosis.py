@@ -3,8 +3,9 @@ Find out what is wrong with a simulation, mend it, and train in the mended one.
 
     python examples/demo_diagnosis.py --folder demo
 
-The "robot" is a pendulum on MuJoCo's engine that stirs the air; `diagnose` is not told. Writes the recordings, ``report.html`` and ``policy_gain.png`` into ``demo/``, and prints the return
-on the robot of policies from both twins.
+The "robot" is a pendulum on MuJoCo's engine that stirs the air; `diagnose` is not told. Writes the
+recordings, ``report.html`` and ``policy_gain.png`` into ``demo/``, and prints the return on the
+robot of policies from both twins.
 """
 
 import argparse
