@@ -22,7 +22,7 @@ def measured(twin, n=8, n_steps=60, noise=0.0, seed=0, share=0.8, commands=None)
     :param noise: standard deviation of each channel
     :param share: of the range of commands that is used
     :param commands: instead of smooth random ones, shape ``(n, n_steps, n_act)``
-    :return: episodes of smooth random commands
+    :return: episodes, all from the twin's own start states
     """
     rng = np.random.default_rng(seed)
     actions = wandering(twin, n, n_steps, share, rng) if commands is None else commands

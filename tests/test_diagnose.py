@@ -155,6 +155,20 @@ def test_a_joint_whose_direction_is_wrong_is_found_as_a_whole():
     }
 
 
+def test_what_looks_alike_is_said_and_how_sure_predictions_are_is_drawn():
+    """Two dry frictions, one for each direction, can be one; they have more freedom."""
+    kinds = [effects.CoulombFriction, effects.DirectionalCoulombFriction, effects.MotorLag]
+    found = asked(on_engine(friction=0.1), effects=kinds)
+
+    assert [f.effect for f in found.findings] == ["coulomb_friction"]
+    (alike,) = [c for c in found.caveats if "would do nearly the same" in c]
+    assert "directional_coulomb_friction.hinge" in alike and "motor_lag" not in alike
+    seen = found.pictures.replay
+    rows = np.isfinite(seen.time)
+    inside = np.abs(seen.after - seen.measured)[rows] <= seen.margin[rows]
+    assert 0.8 < inside.mean() < 0.99
+
+
 def test_standing_still_supports_no_verdict():
     rng = np.random.default_rng(0)
     still = [np.array([-1.0, 0.0, 0.0]) + 0.01 * rng.standard_normal((101, 3)) for _ in range(8)]

@@ -33,7 +33,7 @@ from sb3_hds.sysid.timing import in_step
 # Length of a window [s], within these numbers of steps.
 _WINDOW, _SHORTEST, _LONGEST = 1.0, 8, 200
 # A cause that explains less than this share of what can be explained is not the cause.
-_LEAST_SHARE = 0.7
+_LEAST_SHARE = 0.72
 # Causes that are looked for.
 _MOST = 3
 # How long to search.

@@ -50,7 +50,8 @@ class Half(NamedTuple):
     def errors(self, point: Point) -> Float[np.ndarray, " n"]:
         """:return: mean square of each window, with what is irrelevant added"""
         noise = self.evidence.noise
-        errors = np.nan_to_num(np.mean((point.raw / noise) ** 2, (1, 2)), nan=_NOT_FINITE)
+        errors = np.mean((point.raw / noise) ** 2, (1, 2))
+        errors = np.nan_to_num(errors, nan=_NOT_FINITE, posinf=_NOT_FINITE)
         return errors + float(np.mean((self.irrelevant / noise) ** 2))
 
     def total(self, point: Point) -> float:
