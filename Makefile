@@ -21,11 +21,11 @@ install: $(VENV)/.installed-dev
 $(VENV)/.torch: constraints.txt
 	@test -n "$(PYTHON)" || { echo "No Python 3.11 or later was found. Name one: make PYTHON=/path/to/python"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(PIP) install --quiet --retries 1 --constraint constraints.txt --extra-index-url $(TORCH_INDEX) torch
+	$(PIP) install --quiet --no-compile --retries 1 --constraint constraints.txt --extra-index-url $(TORCH_INDEX) torch
 	@touch $@
 
 $(VENV)/.installed-%: pyproject.toml constraints.txt $(VENV)/.torch
-	$(PIP) install --quiet --constraint constraints.txt --editable ".[$(EXTRAS)]"
+	$(PIP) install --quiet --no-compile --constraint constraints.txt --editable ".[$(EXTRAS)]"
 	@touch $@
 
 $(VENV)/.installed-demo: EXTRAS := zoo,report

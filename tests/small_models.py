@@ -28,7 +28,10 @@ _PLANNING = {
     "policy_kwargs": {"net_arch": [8]},
 }
 #: an algorithm is tested as soon as it has an entry here, under its id in ``algos.ALL``
-SMALL: dict[str, dict[str, Any]] = {"pods": _PLANNING, "hds": _PLANNING}
+SMALL: dict[str, dict[str, Any]] = {
+    "pods": _PLANNING,
+    "hds": _PLANNING | {"residual_kwargs": {"n_members": 2, "net_arch": [4]}},
+}
 
 NAMES = list(algos.ALL)
 #: the algorithms that plan in a twin

@@ -14,8 +14,6 @@ from sb3_hds.core import Trajectories, rollout
 from sb3_hds.errors import CalibrationError, TrajectoryError
 from sb3_hds.sysid import calibrate
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 TRUTH = {"mass": 1.2, "length": 0.9}
 FREE = tuple(TRUTH)
 

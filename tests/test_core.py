@@ -168,10 +168,11 @@ def integrate(integrator, h, duration=2.0):
     def acceleration(q, v):
         return -4.0 * q - 0.3 * v
 
-    q, v = jnp.ones(1), jnp.zeros(1)
-    for _ in range(round(duration / h)):
-        q, v = integrator(acceleration, q, v, h, lambda v: v)
-    return np.concatenate([q, v])
+    def step(_, state):
+        return integrator(acceleration, *state, h, lambda v: v)
+
+    n_steps = round(duration / h)
+    return np.concatenate(jax.lax.fori_loop(0, n_steps, step, (jnp.ones(1), jnp.zeros(1))))
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,6 @@ from small_models import NAMES, steps_of
 
 from sb3_hds import algos
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 # Several files of tensors go into each checkpoint: the process dies within the third one.
 SCRIPT = """
 import glob, os, signal, sys
@@ -35,20 +33,12 @@ small(sys.argv[1]).learn(1_000, callback=CheckpointCallback(50, sys.argv[2]))
 """
 
 
-@pytest.fixture(scope="module")
-def environ(tmp_path_factory) -> dict[str, str]:
-    """One compilation cache for all processes: they compile the same functions."""
-    return {
-        **os.environ,
-        "PYTHONPATH": str(Path(__file__).parent),
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-        "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("cache")),
-    }
+ENVIRON = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_last_checkpoint_of_a_killed_process_loads_and_trains_on(name, environ, tmp_path):
-    process = subprocess.run([sys.executable, "-c", SCRIPT, name, str(tmp_path)], env=environ)
+def test_the_last_checkpoint_of_a_killed_process_loads_and_trains_on(name, tmp_path):
+    process = subprocess.run([sys.executable, "-c", SCRIPT, name, str(tmp_path)], env=ENVIRON)
 
     assert process.returncode == -signal.SIGKILL
     checkpoints = sorted(tmp_path.glob("*.zip"), key=lambda path: path.stat().st_mtime)
