@@ -125,14 +125,18 @@ def multiarm() -> Question:
 
 
 def dfki(parameters: str = "params_design_A.0_model_2.0.yml") -> Question:
-    """A double pendulum whose friction somebody set to zero."""
+    """
+    A double pendulum whose friction somebody set to zero.
+
+    Torques are those that the drives report, and what friction may hide in is refitted.
+    """
     folder = Path(os.environ["SB3_HDS_DATA"]) / "dfki_double_pendulum"
     data = load(
         "dfki_double_pendulum/*sys_id*.csv",
         {
             "time": "time",
             "obs": ["pos_meas1", "pos_meas2", "vel_meas1", "vel_meas2"],
-            "actions": ["tau_con1", "tau_con2"],
+            "actions": ["tau_meas1", "tau_meas2"],
         },
     )
     published = yaml.safe_load((folder / parameters).read_text())
@@ -149,7 +153,8 @@ def dfki(parameters: str = "params_design_A.0_model_2.0.yml") -> Question:
         "gear_ratio": "gr",
     }
     values = {ours: published[name] for ours, name in theirs.items()}
-    return Question(twins.make("DoublePendulum", dt=data.dt, substeps=1, **values), data, ())
+    twin = twins.make("DoublePendulum", dt=data.dt, substeps=1, **values)
+    return Question(twin, data, ("inertia1", "inertia2", "com1", "com2", "rotor_inertia"))
 
 
 RIGS = {

@@ -26,13 +26,16 @@ _DAMPING, _LESS, _MORE, _MOST_DAMPING = 1e-3, 0.2, 8.0, 1e6
 _ENOUGH = 1e-4
 # Added to curvatures, relative to their trace, so that what moves nothing stays where it is.
 _RIDGE = 1e-9
-# Most windows that are simulated at a time.
-_PORTION = 64
+# Most windows that are simulated at a time, and of what their number is a multiple.
+_PORTION, _ROUND = 64, 8
+# Steps of all windows beyond which a second program, for start states alone, is worth compiling.
+_MANY_STEPS = 2_500
 
 
 def portion_for(n: int) -> int:
     """:return: windows to simulate at a time where there are ``n`` or fewer"""
-    return min(_PORTION, 1 << max(n - 1, 1).bit_length())
+    n_portions = -(-n // _PORTION)
+    return _ROUND * -(-n // (_ROUND * n_portions))
 
 
 class Point(NamedTuple):
@@ -184,6 +187,10 @@ class Evidence:
                 found.append((portion, slice(first, min(first + self.portion, self.shots.n))))
         return found
 
+    def _width_for(self, index: np.ndarray) -> int:
+        n, rows = self.shots.obs.shape[:2]
+        return 0 if not len(index) and n * rows > _MANY_STEPS else self.width
+
     def _blocks(self, theta: np.ndarray, index: np.ndarray, offsets: np.ndarray) -> _Blocks:
         """Normal equations at a point, of the parameters named by ``index``."""
         found = [
@@ -199,7 +206,7 @@ class Evidence:
         filled = np.zeros((self.portion, offsets.shape[1]))
         filled[:n] = offsets
         slopes = []
-        for chosen in _in_groups(index, self.width, len(theta)):
+        for chosen in _in_groups(index, self._width_for(index), len(theta)):
             with jax.enable_x64(True):
                 found = _look(h.twin, h.names, h.fixed, shots, theta, chosen, filled, h.scale)
             raw, by_start, by_theta = (np.asarray(leaf)[:n] for leaf in found)
@@ -210,7 +217,7 @@ class Evidence:
 
 def _in_groups(index: np.ndarray, width: int, nothing: int) -> Iterator[np.ndarray]:
     """Indices, so many at a time, the last ones filled up by one that names nothing."""
-    for first in range(0, max(len(index), 1), width):
+    for first in range(0, max(len(index), 1), max(width, 1)):
         own = index[first : first + width]
         yield np.concatenate([own, np.full(width - len(own), nothing)])
 

@@ -143,13 +143,13 @@ class Inquiry:
         while len(found) < _MOST:
             tried = self.search.finalists(base, _keys(found))
             if not found:
-                rejected = [(t.candidate, self.search.against(t.kept, base.kept)) for t in tried]
+                rejected = [(t.candidate, self.search.confirmed(t.kept, base.kept)) for t in tried]
                 rejected += self.search.others(base, tried)
             best = self.search.best([t for t in tried if self._determined(t, base)], base)
             if best is None:
                 break
             others = self.search.alternatives(best, tried, base)
-            found.append(_Accepted(best, self.search.against(best.kept, base.kept), others))
+            found.append(_Accepted(best, self.search.confirmed(best.kept, base.kept), others))
             own = self.hypotheses.indices(best.candidate)
             base = Base(best.point, best.kept, (*base.free, *own))
         found, base = self._pruned(found, base)
@@ -188,7 +188,7 @@ class Inquiry:
         """What is left under the best explanation, of whatever kind, is the noise."""
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
         self._set_noise(base.point)
-        tried = self.search.finalists(base, [])
+        tried = self.search.finalists(base, [], most=_MOST)
         self._set_noise(min((base.point, *(t.point for t in tried)), key=lambda p: p.cost))
 
     def _set_noise(self, point: Point) -> None:

@@ -142,7 +142,7 @@ def remainder(
         force = weighed(missing)[:, j]
         force = np.clip(force, -_MOST_RATIO * force.std(), _MOST_RATIO * force.std())
         told = {
-            names: _predicted([quantities[n] for n in names], force, parts)
+            names: _predicted(_together(quantities, names), force, parts)
             for k in (1, 2, len(quantities))
             for names in combinations(quantities, k)
         }
@@ -161,6 +161,18 @@ def weighed(missing: MissingForce) -> Float[np.ndarray, "n dof"]:
     """:return: forces in units of their errors; those of windows that tell little count less"""
     typical = np.median(missing.stderr, 0)
     return missing.force / missing.stderr * np.minimum(1.0, typical / missing.stderr)
+
+
+def _together(quantities: dict[str, np.ndarray], names: tuple[str, ...]) -> list[np.ndarray]:
+    """Quantities, and products of friction's sign with where or when: few windows teach no more."""
+    found = [quantities[name] for name in names]
+    if "velocity" in names:
+        sign = np.tanh(3.0 * _scaled(quantities["velocity"]))
+        others = [_scaled(quantities[name]) for name in names if name in ("position", "time")]
+        found += [
+            sign[:, i : i + 1] * values for values in others for i in range(sign.shape[1] // 2)
+        ]
+    return found
 
 
 def _scaled(values: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from rich.progress import track
 
-from sb3_hds.sysid.comparison import Comparison, compare, effective_size
+from sb3_hds.sysid.comparison import Comparison, compare, confirm, effective_size
 from sb3_hds.sysid.evidence import Evidence, Point
 from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
 
@@ -147,8 +147,14 @@ class Search:
         point = self.select.evidence.fit(theta, free)
         return Base(point, self.confirm.evidence.fit(point.theta, ()), tuple(free))
 
-    def finalists(self, base: Base, accepted: Sequence[str]) -> list[Tried]:
-        """:return: the most promising candidates, each fitted to the end, best first"""
+    def finalists(
+        self, base: Base, accepted: Sequence[str], most: int | None = None
+    ) -> list[Tried]:
+        """
+        :param accepted: keys of candidates that belong to what is believed
+        :param most: candidates that are fitted to the end; default: as many as the effort says
+        :return: the most promising candidates, best first
+        """
         left = [c for c in self.hypotheses.candidates if c.key not in accepted]
         sample = self._sample()
         first = base.point._replace(offsets=base.point.offsets[sample])
@@ -182,7 +188,7 @@ class Search:
             kept = self.confirm.evidence.fit(point.theta, (), base.kept.offsets, _KEPT_STEPS)
             return Tried(candidate, point, kept, self._criterion(candidate, point, base.point))
 
-        best = [candidate for candidate, _ in ranked[: self.effort.finalists]]
+        best = [candidate for candidate, _ in ranked[: most or self.effort.finalists]]
         tried = self._each(finish, best, f"fitting the {len(best)} most likely")
         return sorted(tried, key=lambda t: -t.criterion)
 
@@ -194,7 +200,7 @@ class Search:
         def verdict(candidate: Candidate) -> Comparison:
             theta = self._reached[candidate.key]
             kept = self.confirm.evidence.fit(theta, (), base.kept.offsets, _ROUGH_STEPS)
-            return self.against(kept, base.kept)
+            return self.confirmed(kept, base.kept)
 
         return list(zip(rest, self._each(verdict, rest, "weighing the others"), strict=True))
 
@@ -212,7 +218,7 @@ class Search:
             as_good = self.against(best.kept, other.kept).p_value > _LEVEL_OF_SET
             if fewer and other.criterion >= LEAST_BIC and as_good:
                 best = other
-        return best if passes(self.against(best.kept, base.kept)) else None
+        return best if passes(self.confirmed(best.kept, base.kept)) else None
 
     def alternatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
         """:return: what is not significantly worse than the best, without more freedom"""
@@ -220,9 +226,9 @@ class Search:
         for other in tried:
             if other is best or len(other.candidate.parameters) > len(best.candidate.parameters):
                 continue
-            worse = self.against(best.kept, other.kept)
+            worse = self.confirmed(best.kept, other.kept)
             same = worse.p_value > _LEVEL_OF_SET or worse.gain < _SAME
-            if same and passes(self.against(other.kept, base.kept)):
+            if same and passes(self.confirmed(other.kept, base.kept)):
                 found.append(other.candidate.key)
         return tuple(found)
 
@@ -232,12 +238,17 @@ class Search:
         theta = base.point.theta.copy()
         theta[list(own)] = self.hypotheses.null[list(own)]
         without = self.base(theta, [i for i in base.free if i not in own])
-        return passes(self.against(base.kept, without.kept))
+        return passes(self.confirmed(base.kept, without.kept))
 
     def against(self, new: Point, old: Point) -> Comparison:
-        """:return: one against another, both on the half that confirms"""
+        """:return: one candidate beside another, both on the half that confirms"""
         half = self.confirm
         return compare(half.errors(new), half.errors(old), half.unit)
+
+    def confirmed(self, new: Point, old: Point) -> Comparison:
+        """:return: whether one is better than another, both on the half that confirms"""
+        half = self.confirm
+        return confirm(half.errors(new), half.errors(old), half.unit)
 
     def _guessed(
         self, candidates: Sequence[Candidate], free: Sequence[int], base: Point, evidence: Evidence
