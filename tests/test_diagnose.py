@@ -14,9 +14,10 @@ from measuring import measured
 from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import JointEffect, Parameter, Trajectories
 from sb3_hds.errors import CalibrationError
-from sb3_hds.sysid.comparison import compare, split
+from sb3_hds.sysid.comparison import compare, confirm, split
 from sb3_hds.sysid.evidence import Evidence
 from sb3_hds.sysid.hypotheses import Hypotheses
+from sb3_hds.sysid.remainder import MissingForce, remainder
 from sb3_hds.sysid.search import _newton
 from sb3_hds.sysid.shooting import shots_of
 
@@ -310,6 +311,50 @@ def test_a_level_is_kept_where_errors_differ_by_chance():
         alarms += compare(new, old, unit).p_value < 0.05
     # Binomial(1000, 0.05) is above 73 once in 1000 cases.
     assert alarms <= 73
+
+
+def test_every_window_may_confirm_where_few_units_gain_unequally():
+    unit = np.repeat(np.arange(5), 4)
+    old, gain = np.full(20, 100.0), np.repeat([1.02, 1.05, 2.0, 50.0, 9000.0], 4)
+
+    assert compare(old / gain, old, unit).p_value > 0.025
+    assert confirm(old / gain, old, unit).p_value < 0.025
+    assert confirm(old, old, unit).p_value > 0.025
+    assert confirm(old * gain, old, unit).p_value > 0.025
+
+
+def test_a_second_chance_hardly_raises_the_level():
+    rng, alarms = np.random.default_rng(1), 0
+    unit = np.repeat(np.arange(5), 5)
+    for _ in range(1000):
+        old, new = np.exp(rng.standard_normal((2, 25)))
+        alarms += confirm(new, old, unit).p_value < 0.025
+    # Binomial(1000, 0.026) is above 43 once in 1000 cases.
+    assert alarms <= 43
+
+
+@pytest.mark.parametrize(("where", "seed"), [("position", 4), ("time", 0)])
+def test_friction_that_changes_with_place_or_time_is_left_over(where, seed):
+    rng, n = np.random.default_rng(seed), 200
+    velocity, position = rng.standard_normal((2, n, 1))
+    time = np.tile(np.arange(20.0), 10)
+    factor = np.cos(2.0 * position) if where == "position" else time[:, None] / 10.0 - 1.0
+    missing = MissingForce(
+        force=np.sign(velocity) * factor + rng.standard_normal((n, 1)),
+        stderr=np.ones((n, 1)),
+        position=position,
+        velocity=velocity,
+        command=rng.standard_normal((n, 1)),
+        time=time,
+        origin=np.repeat(np.arange(10), 20),
+        numbers=10,
+    )
+    data = Trajectories.from_arrays([np.zeros((21, 1))] * 10, [np.zeros((20, 1))] * 10, dt=0.1)
+
+    found = remainder(missing, data, ("hinge",), seed=0)
+
+    assert found is not None
+    assert {"velocity", where} <= set(found.goes_with)
 
 
 def test_both_halves_see_every_condition():

@@ -105,9 +105,15 @@ def by_horizon(half: Half, before: Point, after: Point, every: int) -> dict[int,
 
 
 def pictures_of(
-    half: Half, before: Point, after: Point, missing: MissingForce, left: MissingForce
+    half: Half,
+    before: Point,
+    after: Point,
+    every: int,
+    missing: MissingForce,
+    left: MissingForce,
 ) -> Pictures:
     """
+    :param every: steps of the data in one of the windows
     :param missing: force before
     :param left: force after
     """
@@ -123,7 +129,7 @@ def pictures_of(
         joints=tuple((j.name, "N" if j.unit == "m" else "N m") for j in twin.joints),
         actuators=tuple((a.name, a.unit) for a in twin.actuators),
         replay=replay_of(measured, before.raw[rows], after.raw[rows], rms, twin.dt),
-        steps=np.arange(measured.shape[1]),
+        steps=every * np.arange(measured.shape[1]),
         errors=np.stack(errors),
         missing=missing,
         left=left,

@@ -1,6 +1,6 @@
 """Which of two models predicts better: units of evidence are recordings, not samples."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -83,8 +83,8 @@ def confirm(
     ratio = np.log(before / after)
     if not np.any(ratio):
         return verdict
-    by_window = float(stats.wilcoxon(ratio, alternative="greater").pvalue)
-    return verdict._replace(p_value=min(verdict.p_value, _STRICTER * by_window))
+    by_window: Any = stats.wilcoxon(ratio, alternative="greater")
+    return verdict._replace(p_value=min(verdict.p_value, _STRICTER * float(by_window.pvalue)))
 
 
 def split(data: Trajectories, origin: Int[np.ndarray, " n"], seed: int) -> Split:

@@ -33,7 +33,7 @@ from sb3_hds.sysid.timing import in_step
 # Length of a window [s], within these numbers of steps.
 _WINDOW, _SHORTEST, _LONGEST = 1.0, 8, 200
 # A cause that explains less than this share of what can be explained is not the cause.
-_LEAST_SHARE = 0.72
+_LEAST_SHARE = 0.9
 # Causes that are looked for.
 _MOST = 3
 # How long to search.
@@ -145,7 +145,8 @@ class Inquiry:
             if not found:
                 rejected = [(t.candidate, self.search.confirmed(t.kept, base.kept)) for t in tried]
                 rejected += self.search.others(base, tried)
-            best = self.search.best([t for t in tried if self._determined(t, base)], base)
+            sure = [t for t in tried if self._determined(t, base)]
+            best = self.search.best(sure, base, len(found))
             if best is None:
                 break
             others = self.search.alternatives(best, tried, base)
@@ -270,7 +271,9 @@ class Inquiry:
             ),
             data_hash=self.data_hash,
             seed=self.seed,
-            pictures=pictures_of(confirm, start.kept, base.kept, before.missing, left.missing),
+            pictures=pictures_of(
+                confirm, start.kept, base.kept, self.every, before.missing, left.missing
+            ),
         )
 
     def _why(self, candidate: Candidate, verdict: Comparison) -> str:

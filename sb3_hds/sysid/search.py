@@ -204,9 +204,10 @@ class Search:
 
         return list(zip(rest, self._each(verdict, rest, "weighing the others"), strict=True))
 
-    def best(self, tried: Sequence[Tried], base: Base) -> Tried | None:
+    def best(self, tried: Sequence[Tried], base: Base, n_found: int = 0) -> Tried | None:
         """
         :param tried: best first
+        :param n_found: causes before this one: each makes the next harder to confirm
         :return: the candidate that selection prefers, if the other recordings confirm it; of two
             that predict equally well, the one with fewer parameters
         """
@@ -218,7 +219,8 @@ class Search:
             as_good = self.against(best.kept, other.kept).p_value > _LEVEL_OF_SET
             if fewer and other.criterion >= LEAST_BIC and as_good:
                 best = other
-        return best if passes(self.confirmed(best.kept, base.kept)) else None
+        verdict = self.confirmed(best.kept, base.kept)
+        return best if passes(verdict, LEVEL / (1 + n_found)) else None
 
     def alternatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
         """:return: what is not significantly worse than the best, without more freedom"""
@@ -319,5 +321,5 @@ def _newton(
     return step, -float(score @ step + 0.5 * step @ curvature @ step)
 
 
-def passes(verdict: Comparison) -> bool:
-    return verdict.gain >= LEAST_GAIN and verdict.p_value < LEVEL
+def passes(verdict: Comparison, level: float = LEVEL) -> bool:
+    return verdict.gain >= LEAST_GAIN and verdict.p_value < level
