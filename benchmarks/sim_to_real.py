@@ -187,8 +187,9 @@ def figure(shown: pd.DataFrame) -> None:
             rows = group[group["method"] == method]
             panel.plot(rows["episodes"], rows["return"], "o-", color=colour, label=method)
         # Where a learner first spins, the rest would be a line.
-        best = group["return"].max()
-        panel.set_ylim(bottom=max(panel.get_ylim()[0], best - _DEEPEST))
+        worst, best = group["return"].min(), group["return"].max()
+        deepest = max(worst, best - _DEEPEST)
+        panel.set_ylim(deepest - 0.05 * (best - deepest), best + 0.1 * (best - deepest))
         panel.set_title(cell, fontsize=9)
         panel.set_xlabel("real episodes", fontsize=8)
         panel.tick_params(labelsize=8)
