@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import binom
 
 # Twenty diagnoses take some ten minutes: `make test-hidden` runs them, and continuous integration.
-pytestmark = pytest.mark.expensive
+pytestmark = [pytest.mark.expensive, pytest.mark.timeout(3600)]
 
 SALT = int(os.environ.get("SB3_HDS_SALT", "0"))
 N_CASES = 20
