@@ -57,8 +57,12 @@ def few_programs():
 
 # Few tests, much time: a worker that gets such a file last keeps everybody waiting.
 _LONG = (
+    "test_zoo.py",
     "test_diagnose.py",
     "test_hds_data.py",
+    "test_effects.py",
+    "test_twin_algos.py",
+    "test_planning.py",
     "test_calibrate.py",
     "test_zoo_plugin.py",
     "test_neural_force.py",
