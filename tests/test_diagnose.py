@@ -303,14 +303,18 @@ def test_the_gain_is_the_geometric_mean_over_units():
     assert found.n_units == 2 and found.low <= found.gain <= found.high
 
 
-def test_a_level_is_kept_where_errors_differ_by_chance():
+# Binomial(1000, rate) is above the last number once in 1000 cases. Of the 5 units' 2.5 %, the test
+# on windows may add a tenth of a percent.
+@pytest.mark.parametrize(
+    ("judge", "n_units", "level", "most"), [(compare, 8, 0.05, 73), (confirm, 5, 0.025, 43)]
+)
+def test_a_level_is_kept_where_errors_differ_by_chance(judge, n_units, level, most):
     rng, alarms = np.random.default_rng(0), 0
-    unit = np.repeat(np.arange(8), 5)
+    unit = np.repeat(np.arange(n_units), 5)
     for _ in range(1000):
-        old, new = np.exp(rng.standard_normal((2, 40)))
-        alarms += compare(new, old, unit).p_value < 0.05
-    # Binomial(1000, 0.05) is above 73 once in 1000 cases.
-    assert alarms <= 73
+        old, new = np.exp(rng.standard_normal((2, len(unit))))
+        alarms += judge(new, old, unit).p_value < level
+    assert alarms <= most
 
 
 def test_every_window_may_confirm_where_few_units_gain_unequally():
@@ -321,16 +325,6 @@ def test_every_window_may_confirm_where_few_units_gain_unequally():
     assert confirm(old / gain, old, unit).p_value < 0.025
     assert confirm(old, old, unit).p_value > 0.025
     assert confirm(old * gain, old, unit).p_value > 0.025
-
-
-def test_a_second_chance_hardly_raises_the_level():
-    rng, alarms = np.random.default_rng(1), 0
-    unit = np.repeat(np.arange(5), 5)
-    for _ in range(1000):
-        old, new = np.exp(rng.standard_normal((2, 25)))
-        alarms += confirm(new, old, unit).p_value < 0.025
-    # Binomial(1000, 0.026) is above 43 once in 1000 cases.
-    assert alarms <= 43
 
 
 @pytest.mark.parametrize(("where", "seed"), [("position", 4), ("time", 0)])

@@ -212,7 +212,7 @@ def test_what_the_data_name_is_attached_and_estimated_from_then_on(tmp_path):
     model = small("hds", REAL, twin="PendulumReal", pretrain_data=data, residual=False)
     assert small("hds", REAL, twin="PendulumReal").extend_model() is None
 
-    found = model.extend_model(effects=[effects.CoulombFriction])
+    found = model.extend_model(effects=[effects.CoulombFriction, effects.ActionDelay])
 
     assert [f.effect for f in found.findings] == ["coulomb_friction"]
     name = "coulomb_friction.hinge.tau_c"

@@ -8,7 +8,6 @@ import os
 
 import hidden_effects
 import pytest
-from scipy.stats import binom
 
 # Twenty diagnoses take some ten minutes: `make test-hidden` runs them, and continuous integration.
 pytestmark = [pytest.mark.expensive, pytest.mark.timeout(3600)]
@@ -36,21 +35,18 @@ def spoken(row):
     return row["verdict"] in ("named", "ambiguous")
 
 
-def most(rate, n):
-    """:return: of ``n``, how many more than once in a thousand runs it would be chance to exceed"""
-    return int(binom.isf(1e-3, n, rate)) if n else 0
-
-
 def test_nothing_is_named_where_nothing_was_hidden(table):
     nulls = [row for row in table if row["kind"].startswith("null")]
     alarms = [row for row in nulls if spoken(row)]
-    assert len(alarms) <= most(0.025, len(nulls)), alarms
+    # At most 2.5 % of nulls: two of seven are seen once in 80 runs.
+    assert len(alarms) <= 1, alarms
 
 
 def test_names_are_right(table):
     named = [row for row in table if row["kind"] == "effect" and spoken(row)]
     wrong = [row for row in named if not hidden_effects.hit(row["truth"], row["set"])]
-    assert len(wrong) <= most(0.05, len(named)), wrong
+    # At least 95 % of the sets: three of ten are missed once in 90 runs.
+    assert len(wrong) <= 2, wrong
 
 
 def test_what_shows_is_found(table):
@@ -60,7 +56,7 @@ def test_what_shows_is_found(table):
         if row["kind"] == "effect" and row["factor"] >= 4.0 and not row["disturbed"]
     ]
     missed = [row for row in clear if not hidden_effects.hit(row["truth"], row["set"])]
-    assert len(missed) <= most(0.2, len(clear)), missed
+    assert len(missed) <= 1 + len(clear) // 4, missed
 
 
 def test_standing_still_says_nothing(table):

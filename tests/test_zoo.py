@@ -176,12 +176,12 @@ def test_our_environments_train_in_subprocesses_and_are_filmed(zoo):
 
 def test_optuna_trials_are_stored_and_one_of_them_can_be_trained(zoo):
     study = ("--storage", "study/journal.log", "--study-name", "hds", "-params", *QUICK)
-    budget = ("-n", "200", "--n-trials", "2", "--n-evaluations", "1", "--eval-episodes", "1")
+    budget = ("-n", "200", "--n-trials", "3", "--n-evaluations", "1", "--eval-episodes", "1")
 
     output = zoo.succeeds(
         *CONSOLE, "train", *train("-optimize", *budget, "--no-optim-plots", "-f", "tuned"), *study
     )
-    assert "Number of finished trials:  2" in output
+    assert "Number of finished trials:  3" in output
 
     # The zoo takes trial 0 for no trial at all.
     output = zoo.succeeds(

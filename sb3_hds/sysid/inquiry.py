@@ -34,8 +34,8 @@ from sb3_hds.sysid.timing import in_step
 _WINDOW, _SHORTEST, _LONGEST = 1.0, 8, 200
 # A cause that explains less than this share of what can be explained is not the cause.
 _LEAST_SHARE = 0.9
-# Causes that are looked for.
-_MOST = 3
+# Causes that are looked for, and candidates that are fitted to the end to settle the noise.
+_MOST, _FOR_NOISE = 3, 3
 # How long to search.
 EFFORTS = {"full": Effort(16, 8, 256, 4), "quick": Effort(8, 4, 64, 2)}
 # Errors that nobody minds, in shares of a channel's spread: no simulation is exact, and a finding
@@ -189,7 +189,7 @@ class Inquiry:
         """What is left under the best explanation, of whatever kind, is the noise."""
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
         self._set_noise(base.point)
-        tried = self.search.finalists(base, [], most=_MOST)
+        tried = self.search.finalists(base, [], most=_FOR_NOISE)
         self._set_noise(min((base.point, *(t.point for t in tried)), key=lambda p: p.cost))
 
     def _set_noise(self, point: Point) -> None:
