@@ -1,6 +1,9 @@
 """The stand-ins for hardware: independent of the twins, and as their arguments say."""
 
+import functools
+
 import gymnasium
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -44,10 +47,14 @@ def driven(env, actions, state):
 
 
 def simulated(twin, actions, state):
-    q, v = (jnp.asarray(part, jnp.float64) for part in state)
-    start = twin.infer(twin.observe(State(q, v, {}), twin.params), twin.params)
-    path = rollout(twin, twin.params, start._replace(q=q, v=v), jnp.asarray(actions)).states
-    return np.concatenate([path.q, path.v], 1)
+    return np.concatenate(_path(twin, twin.params, actions, *np.asarray(state, np.float64)), 1)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _path(twin, params, actions, q, v):
+    start = twin.infer(twin.observe(State(q, v, {}), params), params)
+    path = rollout(twin, params, start._replace(q=q, v=v), actions).states
+    return path.q, path.v
 
 
 def commands(env, n_steps, seed=0):
@@ -80,6 +87,7 @@ def test_both_checkers_accept_them(env_id):
 def test_the_pendulums_twin_follows_the_engine_to_a_millionth(settings, x64):
     env = gymnasium.make(PENDULUM, **settings)
     twin = twins.from_env(env)
+    step = jax.jit(twin.step)
     actions = commands(env, 20)
 
     for seed in range(5):
@@ -87,7 +95,7 @@ def test_the_pendulums_twin_follows_the_engine_to_a_millionth(settings, x64):
         path = driven(env, actions, ([angle], [speed]))
         for before, after, action in zip(path[:-1], path[1:], actions, strict=True):
             state = State(jnp.asarray(before[:1]), jnp.asarray(before[1:]), {})
-            predicted = twin.step(state, jnp.asarray(action), twin.params)
+            predicted = step(state, jnp.asarray(action), twin.params)
             # Four Runge-Kutta steps of the twin against twenty of the engine.
             np.testing.assert_allclose(np.r_[predicted.q, predicted.v], after, rtol=0.0, atol=1e-6)
 

@@ -174,11 +174,14 @@ def _task(twin: Twin) -> gymnasium.Env:
 def _summarised(values: Float[np.ndarray, "runs episodes"]) -> Return:
     """Interquartile mean, and what resampling the runs makes of it."""
     rng, n = np.random.default_rng(0), len(values)
-    drawn = [_interquartile_mean(values[rng.integers(n, size=n)]) for _ in range(_N_RESAMPLES)]
-    low, high = np.quantile(drawn, [0.5 - 0.5 * _LEVEL, 0.5 + 0.5 * _LEVEL])
-    return Return(_interquartile_mean(values), float(low), float(high))
+    drawn = values[rng.integers(n, size=(_N_RESAMPLES, n))]
+    means = _interquartile_means(np.concatenate([values[None], drawn]))
+    low, high = np.quantile(means[1:], [0.5 - 0.5 * _LEVEL, 0.5 + 0.5 * _LEVEL])
+    return Return(float(means[0]), float(low), float(high))
 
 
-def _interquartile_mean(values: np.ndarray) -> float:
+def _interquartile_means(
+    values: Float[np.ndarray, "samples runs episodes"],
+) -> Float[np.ndarray, " samples"]:
     """Agarwal et al., *Deep RL at the edge of the statistical precipice*, NeurIPS 2021."""
-    return float(trim_mean(values.ravel(), 0.25))
+    return trim_mean(values.reshape(len(values), -1), 0.25, axis=1)
