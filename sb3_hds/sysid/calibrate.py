@@ -23,9 +23,11 @@ from sb3_hds.sysid.shooting import (
     Shots,
     fit_start,
     n_free,
-    residuals,
     shots_of,
+    simulate,
     solve_normal,
+    weighed,
+    with_slopes,
 )
 
 # Length of a window where none is given [s], within these numbers of steps.
@@ -194,16 +196,26 @@ def solve(
     """The estimate for given noise: one program for all data of a shape."""
     bounds = bounds_of([twin.parameters[name] for name in names])
 
+    def both(values: Array) -> tuple[Array, Array]:
+        found = _evaluate(twin, names, threshold, fixed, shots, values, offsets, noise, _N_AGAIN)
+        from_belief = prior * (values - believed) / bounds.scale
+        pull = prior * jnp.diag(1.0 / bounds.scale)
+        return (
+            jnp.concatenate([found.bent.ravel(), from_belief]),
+            jnp.concatenate([found.slopes.reshape(-1, len(names)), pull]),
+        )
+
+    @jax.custom_jvp
+    def errors(values: Array) -> Array:
+        return both(values)[0]
+
+    @errors.defjvp
+    def _(values: tuple[Array], ways: tuple[Array]) -> tuple[Array, Array]:
+        found, slopes = both(*values)
+        return found, slopes @ ways[0]
+
     def objective(inside: Array, _: None) -> Array:
-        values = bounds.outside(inside)
-        params = fixed | dict(zip(names, jax.lax.stop_gradient(values), strict=True))
-
-        def one(values: Array, shot: Shots, first: Offset) -> Array:
-            at = fit_start(twin, params, shot, noise, first, _N_AGAIN, threshold)
-            return projected(twin, names, threshold, fixed, noise, values, shot, at)
-
-        errors = jax.vmap(one, (None, 0, 0))(values, shots, offsets)
-        return jnp.concatenate([errors.ravel(), prior * (values - believed) / bounds.scale])
+        return errors(bounds.outside(inside))
 
     solver = optx.LevenbergMarquardt(rtol=_TOLERANCE, atol=_TOLERANCE)
     found = optx.least_squares(
@@ -225,13 +237,26 @@ def evaluate(
     noise: Float[Array, " obs"],
 ) -> Errors:
     """Errors and their slopes at given values; start states are searched from ``offsets``."""
+    return _evaluate(twin, names, threshold, fixed, shots, values, offsets, noise, _N_FIRST)
+
+
+def _evaluate(
+    twin: Twin,
+    names: tuple[str, ...],
+    threshold: float | None,
+    fixed: Params,
+    shots: Shots,
+    values: Float[Array, " p"],
+    offsets: Float[Array, "n free"],
+    noise: Float[Array, " obs"],
+    n_iterations: int,
+) -> Errors:
+    """:param n_iterations: Gauss-Newton steps of each start state"""
     params = fixed | dict(zip(names, values, strict=True))
 
     def one(shot: Shots, first: Offset) -> Errors:
-        at = fit_start(twin, params, shot, noise, first, _N_FIRST, threshold)
-        error = lambda v: projected(twin, names, threshold, fixed, noise, v, shot, at)  # noqa: E731
-        raw = residuals(twin, params, shot, at, jnp.ones_like(noise)).reshape(shot.obs.shape)
-        return Errors(at, raw, error(values), jax.jacfwd(error)(values))
+        at = fit_start(twin, params, shot, noise, first, n_iterations, threshold)
+        return projected(twin, names, threshold, fixed, noise, values, shot, at)
 
     return jax.vmap(one)(shots, offsets)
 
@@ -245,18 +270,22 @@ def projected(
     values: Float[Array, " p"],
     shot: Shots,
     at: Offset,
-) -> Float[Array, " residuals"]:
+) -> Errors:
     """
-    Errors of one window as a function of the parameters alone: its start state, optimal for them,
-    follows. Only first derivatives are needed (Kaufman).
+    Errors of one window, and their slopes by the parameters alone: its start state, optimal for
+    them, follows. Only first derivatives are needed (Kaufman).
     """
-    frozen = fixed | dict(zip(names, jax.lax.stop_gradient(values), strict=True))
-    moving = fixed | dict(zip(names, values, strict=True))
-    from_start = lambda x: residuals(twin, frozen, shot, x, noise, threshold)  # noqa: E731
-    slopes = jax.lax.stop_gradient(jax.jacfwd(from_start)(at))
-    error = residuals(twin, moving, shot, at, noise, threshold)
-    change = error - jax.lax.stop_gradient(error)
-    return error - slopes @ solve_normal(slopes, change)
+    n = len(names)
+
+    def of(both: Array) -> tuple[Array, Array]:
+        params = fixed | dict(zip(names, both[:n], strict=True))
+        simulated = simulate(twin, params, shot, both[n:])
+        raw = weighed(simulated, shot, jnp.ones_like(noise)).reshape(simulated.shape)
+        return weighed(simulated, shot, noise, threshold), raw
+
+    (bent, raw), (slopes, _) = with_slopes(of, jnp.concatenate([values, at]))
+    direct, by_start = slopes[:, :n], slopes[:, n:]
+    return Errors(at, raw, bent, direct - by_start @ solve_normal(by_start, direct))
 
 
 def default_window(data: Trajectories) -> int:

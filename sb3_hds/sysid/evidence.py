@@ -14,7 +14,7 @@ from sb3_hds.core import Params, Twin
 from sb3_hds.core.compilation import QUICKEST_COMPILATION
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.motion import first_offsets
-from sb3_hds.sysid.shooting import Shots, simulate
+from sb3_hds.sysid.shooting import Shots, simulate, with_slopes
 
 # Beyond this, in units of the noise, an error counts in proportion, not by its square.
 _HUBER = 3.0
@@ -238,7 +238,6 @@ def _look(
         ``index`` names (in units of their scale)
     """
     n = offsets.shape[1]
-    basis = jnp.eye(n + index.shape[0], dtype=theta.dtype)
 
     def one(offset: Array, shot: Shots) -> tuple[Array, Array, Array]:
         def of(both: Array) -> Array:
@@ -248,8 +247,7 @@ def _look(
             params = fixed | {name: values[i] for i, name in enumerate(names)}
             return simulate(twin, params, shot, offset + both[:n]) - shot.obs
 
-        along = lambda way: jax.jvp(of, (jnp.zeros_like(way),), (way,))  # noqa: E731
-        error, slopes = jax.vmap(along, out_axes=(None, -1))(basis)
+        error, slopes = with_slopes(of, jnp.zeros(n + index.shape[0], theta.dtype))
         return error, slopes[..., :n], slopes[..., n:]
 
     return jax.vmap(one)(offsets, shots)

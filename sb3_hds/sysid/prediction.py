@@ -11,7 +11,7 @@ from scipy import stats
 
 from sb3_hds.core import Params, Trajectories, Twin
 from sb3_hds.core.compilation import QUICKEST_COMPILATION
-from sb3_hds.sysid.shooting import Shots, fit_start, n_free, simulate
+from sb3_hds.sysid.shooting import Shots, fit_start, n_free, simulate, with_slopes
 
 # Gauss-Newton steps of a start state.
 _N_STEPS = 8
@@ -146,7 +146,8 @@ def _errors(
         first = jnp.zeros(n_free(twin), shot.obs.dtype)
         offset = fit_start(twin, params, shot, scale, first, _N_STEPS)
         error = lambda x: ((simulate(twin, params, shot, x) - shot.obs) / scale).ravel()  # noqa: E731
-        rms = jnp.sqrt(jnp.mean(error(offset) ** 2))
-        return jnp.where(jnp.isfinite(rms), rms, jnp.inf), offset, jax.jacfwd(error)(offset)
+        left, slopes = with_slopes(error, offset)
+        rms = jnp.sqrt(jnp.mean(left**2))
+        return jnp.where(jnp.isfinite(rms), rms, jnp.inf), offset, slopes
 
     return jax.vmap(one)(shots)

@@ -5,6 +5,7 @@ Short windows keep a chaotic or unstable system from drowning the parameters in 
 free start states keep the noise of one measurement from spoiling a whole window.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -144,13 +145,29 @@ def residuals(
     :return: simulated minus measured, in units of the noise, flattened; zero for padding, and large
         where the simulation is not finite
     """
-    error = (simulate(twin, params, shot, offset) - shot.obs) / noise
+    return weighed(simulate(twin, params, shot, offset), shot, noise, threshold)
+
+
+def weighed(
+    simulated: Float[Array, "rows obs"], shot: Shots, noise: Obs, threshold: float | None = None
+) -> Float[Array, " residuals"]:
+    """As :func:`residuals`, of what was simulated already."""
+    error = (simulated - shot.obs) / noise
     error = jnp.where(jnp.isfinite(error), error, _NOT_FINITE).ravel()
     if threshold is not None:
         far = jnp.maximum(jnp.abs(error), threshold)
         bent = jnp.sign(error) * jnp.sqrt(2.0 * threshold * far - threshold**2)
         error = jnp.where(jnp.abs(error) > threshold, bent, error)
     return jnp.sqrt(shot.weight) * error
+
+
+def with_slopes(function: Callable[[Array], Any], x: Float[Array, " x"]) -> tuple[Any, Any]:
+    """
+    :param function: of a vector, to a tree of arrays
+    :return: what it returns, and its slopes, an axis longer: from one simulation
+    """
+    along = lambda way: jax.jvp(function, (x,), (way,))  # noqa: E731
+    return jax.vmap(along, out_axes=(None, -1))(jnp.eye(len(x), dtype=x.dtype))
 
 
 def fit_start(
@@ -173,16 +190,16 @@ def fit_start(
     def error(offset: Offset) -> Array:
         return residuals(twin, params, shot, offset, noise, threshold)
 
-    def improve(offset: Offset, _: None) -> tuple[Offset, None]:
-        now, slopes = error(offset), jax.jacfwd(error)(offset)
+    def improve(_: Array, offset: Offset) -> Offset:
+        now, slopes = with_slopes(error, offset)
         step = -solve_normal(slopes, now)
         # Half a step is tried too: far from the optimum a whole one often goes too far.
         candidates = jnp.stack([offset, offset + 0.5 * step, offset + step])
         costs = jax.vmap(lambda x: jnp.sum(error(x) ** 2))(candidates)
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
-        return candidates[jnp.argmin(costs)], None
+        return candidates[jnp.argmin(costs)]
 
-    return jax.lax.stop_gradient(jax.lax.scan(improve, first, None, length=n_iterations)[0])
+    return jax.lax.stop_gradient(jax.lax.fori_loop(0, n_iterations, improve, first))
 
 
 def solve_normal(slopes: Array, right: Array) -> Array:
