@@ -57,6 +57,7 @@ def few_programs():
 
 # Few tests, much time: a worker that gets such a file last keeps everybody waiting.
 _LONG = (
+    "test_hidden_effects.py",
     "test_zoo.py",
     "test_diagnose.py",
     "test_hds_data.py",

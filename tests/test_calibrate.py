@@ -63,7 +63,11 @@ def test_without_noise_the_truth_is_found_exactly():
 @pytest.mark.parametrize(
     ("name", "values"),
     [
-        ("InvertedPendulumFriction", {"hinge_damping": 1.5, "pole_mass": 4.5}),
+        pytest.param(
+            "InvertedPendulumFriction",
+            {"hinge_damping": 1.5, "pole_mass": 4.5},
+            marks=pytest.mark.expensive,
+        ),
         ("CartPole", {"pole_mass": 0.13, "half_length": 0.45}),
         ("MountainCar", {"gravity": 0.0028}),
     ],

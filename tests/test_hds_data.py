@@ -115,6 +115,7 @@ def test_data_from_before_a_change_are_forgotten():
     assert found.error_calibrated < 1e-3 < mixed.error_calibrated
 
 
+@pytest.mark.expensive
 def test_a_load_that_comes_and_goes_is_followed():
     """The algorithm remembers since when the data count."""
     env = gymnasium.make(REAL)
@@ -206,6 +207,7 @@ def test_a_model_diagnoses_its_data_sheet_by_what_it_has_measured(heavier):
     assert found.twin.values["mass"] == pytest.approx(1.3, rel=0.05)
 
 
+@pytest.mark.expensive
 def test_what_the_data_name_is_attached_and_estimated_from_then_on(tmp_path):
     rubbing = twins.make("PendulumReal").extend(effects.CoulombFriction(0, tau_c=0.3))
     data = measured(rubbing, n=10, n_steps=100, noise=0.01)

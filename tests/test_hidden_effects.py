@@ -9,7 +9,7 @@ import os
 import hidden_effects
 import pytest
 
-# Twenty diagnoses take some ten minutes: `make test-hidden` runs them, and continuous integration.
+# Twenty diagnoses take some ten minutes.
 pytestmark = [pytest.mark.expensive, pytest.mark.timeout(3600)]
 
 SALT = int(os.environ.get("SB3_HDS_SALT", "0"))

@@ -162,6 +162,7 @@ def test_enjoy_replays_the_best_agent(zoo, trained):
     assert "2 Episodes" in output and "Mean reward" in output
 
 
+@pytest.mark.expensive
 def test_our_environments_train_in_subprocesses_and_are_filmed(zoo):
     agent = ("--algo", "hds", "--env", "sb3_hds/PayloadPendulum-v0", "--seed", "0", "-f", "payload")
     schedule = ("-n", "200", "--eval-freq", "-1", "--vec-env", "subproc")
@@ -174,6 +175,7 @@ def test_our_environments_train_in_subprocesses_and_are_filmed(zoo):
     assert list(zoo.folder.glob("videos/*.mp4"))
 
 
+@pytest.mark.expensive
 def test_optuna_trials_are_stored_and_one_of_them_can_be_trained(zoo):
     study = ("--storage", "study/journal.log", "--study-name", "hds", "-params", *QUICK)
     budget = ("-n", "200", "--n-trials", "3", "--n-evaluations", "1", "--eval-episodes", "1")
