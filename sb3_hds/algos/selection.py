@@ -1,6 +1,7 @@
 """Which of the policies that came by is the one that acts."""
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sb3_hds.algos.epoch import learn_from_plans, plan_ahead
 from sb3_hds.algos.learner import (
     GENERATOR,
     Knobs,
@@ -46,6 +48,17 @@ def choose_policy(
     nets = learner.networks
     acting = nets._replace(acting=nets.average, acting_inside=nets.inside)
     return learner._replace(networks=acting), None
+
+
+def compile_together(settings: Settings, learner: Learner, knobs: Knobs, compares: bool) -> None:
+    """
+    Compile the programs of an epoch side by side, by running each once for nothing.
+
+    :param compares: whether policies will be compared
+    """
+    programs = [plan_ahead, learn_from_plans, *([keep_better] if compares else [])]
+    with ThreadPoolExecutor(len(programs)) as pool:
+        list(pool.map(lambda program: program(settings, learner, knobs), programs))
 
 
 def twin_steps_per_comparison(settings: Settings) -> int:

@@ -47,7 +47,11 @@ from sb3_hds.algos.model import check_reward, required, twin_from_spec
 from sb3_hds.algos.normalisation import prepare_statistics, view_of
 from sb3_hds.algos.persistence import Tensors, damage_reported, write_whole
 from sb3_hds.algos.pretraining import Pretraining
-from sb3_hds.algos.selection import choose_policy, twin_steps_per_comparison
+from sb3_hds.algos.selection import (
+    choose_policy,
+    compile_together,
+    twin_steps_per_comparison,
+)
 from sb3_hds.algos.twin_policy import TwinPolicy, all_finite
 from sb3_hds.core import Params, Twin
 from sb3_hds.envs.mirror import check_mirrors, twin_of
@@ -244,8 +248,12 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         :raises NoTwinError: if the model was loaded without environment and without twin
         :raises FloatingPointError: if the regression diverged; the model keeps its last good state
         """
+        first = self._workspace is None
         learner, settings = self._learner(), self._settings
         knobs = knobs_of(self, settings.twin, self._progress_remaining(), gradient_steps)
+        if first:
+            compares = 0 < self.compare_every <= self._epochs_planned
+            compile_together(settings, learner, knobs, compares)
         learner, report = epoch(settings, learner, knobs)
         learner, returns = choose_policy(settings, learner, knobs, self.compare_every)
         losses = float(report.policy_loss), float(report.value_loss)
