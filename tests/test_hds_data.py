@@ -79,6 +79,22 @@ def test_a_nuisance_that_may_not_be_corrected_stays(heavier):
     assert found.twin.values["mass"] == 1.0
 
 
+def test_a_system_that_friction_holds_fast_is_not_taken_for_a_heavier_one():
+    env = gymnasium.make(REAL, friction=0.3, noise=0.01, max_episode_steps=200)
+    obs, actions = [env.reset(seed=0, options={"state": ([0.06], [0.9])})[0]], []
+    for _ in range(200):
+        _, angle, speed = obs[-1]
+        actions.append(np.clip([-8.0 * angle - 2.0 * speed], -2.0, 2.0))
+        obs.append(env.step(actions[-1])[0])
+    assert np.abs(np.array(obs)[50:, 1]).max() < 0.2
+
+    twin = twins.make("PendulumReal")
+    found = corrected(twin, Trajectories.from_arrays([obs], [actions], dt=twin.dt))
+
+    assert found.fit["mass"].estimate > 1.5
+    assert found.twin.values == twin.values and not found.changed
+
+
 @pytest.mark.expensive
 def test_what_has_no_parameter_is_left_to_the_learned_force():
     twin = twins.make("PendulumReal")

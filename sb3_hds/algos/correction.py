@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import chi2
 
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.effects import force_of
@@ -23,6 +24,7 @@ from sb3_hds.sysid.prediction import (
     gain,
     has_grown,
     hold_out,
+    holds_out_recordings,
     is_better,
     single_step_errors,
     window_errors,
@@ -47,6 +49,9 @@ _SOLVER_STEPS = 20
 _NOTICEABLE = 0.1
 # A calibrated twin needs less proof than a learned force: it has few parameters, and a prior.
 _LEAST_OF_CALIBRATION = 0.02
+# Where held-out windows are of the same few recordings, values that the prior holds for so
+# improbable are not believed: a system that dry friction holds fast looks like a heavier one.
+_IMPROBABLE = 1e-3
 # A learned force that lowers the error by this share is planned in exclusively.
 _TRUSTED = 0.25
 
@@ -144,7 +149,7 @@ def correct(
     learned = shots._replace(weight=shots.weight * ~held)
 
     fit = _calibrated(nominal, twin, learned, origin, spread, wishes)
-    calibrated, errors = _best(nominal, twin, fit, bare, now, shots, spread, held)
+    calibrated, errors = _best(nominal, twin, fit, bare, now, shots, origin, spread, held)
     found = Correction(
         calibrated,
         0.0,
@@ -195,12 +200,15 @@ def _best(
     bare: np.ndarray,
     now: np.ndarray,
     shots: Shots,
+    origin: np.ndarray,
     spread: np.ndarray,
     held: np.ndarray,
 ) -> tuple[Twin, np.ndarray]:
     """:return: the calibrated twin if it predicts better, otherwise the twin as it is or was"""
     current = (twin, now) if now[held].mean() < bare[held].mean() else (nominal, bare)
     if fit is None or not all(np.isfinite(e.estimate) for e in fit.estimates):
+        return current
+    if not holds_out_recordings(origin) and _prior_of(fit, nominal) < _IMPROBABLE:
         return current
     new = twin.with_parameters(**{e.name: e.estimate for e in fit.estimates})
     errors = window_errors(new, _without_force(new), shots, spread)
@@ -210,6 +218,19 @@ def _best(
     ):
         return new, errors
     return current
+
+
+def _prior_of(fit: Fit, nominal: Twin) -> float:
+    """
+    How probable, by what was believed before any data, values at least so far from that are.
+
+    Source: Box, J. R. Stat. Soc. A 143, 1980 (checking a prior by its predictive distribution).
+    """
+    away = [
+        (e.estimate - nominal.values[e.name]) / nominal.parameters[e.name].scale
+        for e in fit.estimates
+    ]
+    return float(chi2.sf(np.sum(np.square(away)), len(away)))
 
 
 def _with_residual(

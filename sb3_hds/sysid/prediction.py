@@ -17,6 +17,8 @@ from sb3_hds.sysid.shooting import Shots, fit_start, n_free, simulate, with_slop
 _N_STEPS = 8
 # Better is what lowers the error by this share, at this level, judged by so many samples.
 _LEAST_GAIN, _LEVEL, _N_BOOTSTRAP = 0.05, 0.05, 1000
+# Recordings from which on whole ones are held out.
+_ENOUGH_RECORDINGS = 4
 # What `has_grown` asks for.
 _GROWN, _GROWN_LEVEL = 1.5, 1e-4
 
@@ -119,11 +121,15 @@ def hold_out(origin: np.ndarray, share: float = 0.25) -> np.ndarray:
     :return: shape ``(n,)``
     """
     every = max(2, round(1.0 / share))
-    recordings = np.unique(origin[origin >= 0])
-    if len(recordings) >= 4:
-        return np.isin(origin, recordings[every - 1 :: every])
+    if holds_out_recordings(origin):
+        return np.isin(origin, np.unique(origin[origin >= 0])[every - 1 :: every])
     position = np.arange(len(origin))
     return (position % every == every - 1) & (origin >= 0)
+
+
+def holds_out_recordings(origin: np.ndarray) -> bool:
+    """:return: whether :func:`hold_out` keeps whole recordings from learning"""
+    return len(np.unique(origin[origin >= 0])) >= _ENOUGH_RECORDINGS
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
