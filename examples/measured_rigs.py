@@ -170,6 +170,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("rig", choices=RIGS)
     parser.add_argument("--report", help="HTML page to write")
+    parser.add_argument("--pictures", help="folder for the pictures of that page")
     parser.add_argument("--budget", default="full", choices=("full", "quick"))
     arguments = parser.parse_args()
     question = RIGS[arguments.rig]()
@@ -179,6 +180,8 @@ def main() -> None:
     print(found)
     if arguments.report:
         print(found.to_html(arguments.report))
+    if arguments.pictures:
+        print(*found.save_pictures(arguments.pictures), sep="\n")
 
 
 if __name__ == "__main__":

@@ -249,6 +249,17 @@ def test_the_report_is_one_page_that_needs_no_network(rubbing, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 
+def test_its_pictures_are_files_too(rubbing, tmp_path):
+    saved = rubbing.save_pictures(tmp_path / "pictures")
+    assert [path.name for path in saved] == [
+        "before_and_after.png",
+        "error_against_horizon.png",
+        "the_missing_force.png",
+        "the_evidence_for_every_candidate.png",
+    ]
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in saved)
+
+
 @pytest.mark.skipif(not shutil.which("chromium"), reason="chromium is not installed")
 @pytest.mark.parametrize("width", [500, 1400])
 def test_the_report_fits_a_browser(rubbing, tmp_path, width):

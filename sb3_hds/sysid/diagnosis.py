@@ -181,6 +181,18 @@ class Diagnosis:
 
         return write_report(self, path, policy_gain)
 
+    def save_pictures(self, folder: str | os.PathLike[str]) -> list[Path]:
+        """
+        Write the pictures of the report as PNG files, for a page or a paper.
+
+        :param folder: is made where it is missing; files of the same names are replaced
+        :return: their paths
+        :raises ImportError: without matplotlib (extra ``report``)
+        """
+        from sb3_hds.sysid.report import write_pictures
+
+        return write_pictures(self, folder)
+
     def __str__(self) -> str:
         return self.summary()
 

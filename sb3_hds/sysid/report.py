@@ -93,12 +93,40 @@ def write_report(
         import matplotlib  # noqa: F401
     except ImportError as error:
         raise ImportError(_INSTALL) from error
+    pictures = [
+        {**picture, "data": base64.b64encode(picture["data"]).decode()}
+        for picture in _drawn(diagnosis)
+    ]
     page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    text = page.from_string(_PAGE).render(**_content(diagnosis), policy=_policy(policy_gain))
-    target = Path(path)
+    text = page.from_string(_PAGE).render(
+        **_content(diagnosis), pictures=pictures, policy=_policy(policy_gain)
+    )
+    return _written(Path(path), text.encode())
+
+
+def write_pictures(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list[Path]:
+    """
+    :param folder: is made where it is missing; files of the same names are replaced
+    :return: one PNG for each picture of the report
+    :raises ImportError: without matplotlib
+    """
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as error:
+        raise ImportError(_INSTALL) from error
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    return [
+        _written(
+            Path(folder) / f"{picture['title'].lower().replace(' ', '_')}.png", picture["data"]
+        )
+        for picture in _drawn(diagnosis)
+    ]
+
+
+def _written(target: Path, content: bytes) -> Path:
     temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_bytes(content)
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
@@ -137,7 +165,6 @@ def _content(d: Diagnosis) -> dict[str, Any]:
         "colour": colours.get(d.verdict, _QUIET),
         "findings": findings,
         "detectable": detectable,
-        "pictures": [] if d.pictures is None else _drawn(d, d.pictures),
     }
 
 
@@ -163,7 +190,10 @@ def _sentence(d: Diagnosis) -> str:
     return f"The simulation lacks {' and '.join(causes)}."
 
 
-def _drawn(d: Diagnosis, p: "Pictures") -> list[dict[str, Any]]:
+def _drawn(d: Diagnosis) -> list[dict[str, Any]]:
+    p = d.pictures
+    if p is None:
+        return []
     shown = [
         _as_png(
             _rollouts(p),
@@ -196,8 +226,13 @@ def _as_png(figure: Any, title: str, caption: str) -> dict[str, Any]:
     data = io.BytesIO()
     figure.savefig(data, dpi=120, format="png")
     width, height = (round(120 * inches) for inches in figure.get_size_inches())
-    encoded = base64.b64encode(data.getvalue()).decode()
-    return {"title": title, "caption": caption, "data": encoded, "width": width, "height": height}
+    return {
+        "title": title,
+        "caption": caption,
+        "data": data.getvalue(),
+        "width": width,
+        "height": height,
+    }
 
 
 def _figure(rows: int, columns: int, width: float, height: float) -> tuple[Any, np.ndarray]:
