@@ -4,6 +4,7 @@ import html
 import json
 import shutil
 import subprocess
+from types import SimpleNamespace
 
 import gymnasium
 import jax.numpy as jnp
@@ -14,11 +15,11 @@ from measuring import measured
 from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import JointEffect, Parameter, Trajectories
 from sb3_hds.errors import CalibrationError
-from sb3_hds.sysid.comparison import compare, confirm, split
+from sb3_hds.sysid.comparison import Comparison, compare, confirm, split
 from sb3_hds.sysid.evidence import Evidence
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.remainder import MissingForce, remainder
-from sb3_hds.sysid.search import _newton
+from sb3_hds.sysid.search import Search, _newton
 from sb3_hds.sysid.shooting import shots_of
 
 CATALOGUE = (
@@ -336,6 +337,23 @@ def test_every_window_may_confirm_where_few_units_gain_unequally():
     assert confirm(old / gain, old, unit).p_value < 0.025
     assert confirm(old, old, unit).p_value > 0.025
     assert confirm(old * gain, old, unit).p_value > 0.025
+
+
+@pytest.mark.parametrize(("p_of_simple", "chosen"), [(0.06, "rich"), (0.01, "simple")])
+def test_what_is_confirmed_is_not_given_up_for_something_simpler_that_is_not(p_of_simple, chosen):
+    p_values = {"rich": 0.003, "simple": p_of_simple}
+    rich, simple = (
+        SimpleNamespace(kept=name, criterion=60.0, candidate=SimpleNamespace(parameters=parameters))
+        for name, parameters in (("rich", ("tau_c", "mu")), ("simple", ("gain",)))
+    )
+    search = SimpleNamespace(
+        against=lambda new, old: Comparison(0.3, 0.2, -0.1, 0.6, 6),
+        confirmed=lambda new, old: Comparison(0.5, p_values[new], 0.2, 0.7, 6),
+    )
+
+    best = Search.best(search, [rich, simple], SimpleNamespace(kept="base"))
+
+    assert best.kept == chosen
 
 
 @pytest.mark.parametrize(("where", "seed"), [("position", 4), ("time", 0)])

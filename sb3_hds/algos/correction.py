@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import chi2
 
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.effects import force_of
@@ -26,6 +25,7 @@ from sb3_hds.sysid.prediction import (
     hold_out,
     holds_out_recordings,
     is_better,
+    probability_before,
     single_step_errors,
     window_errors,
 )
@@ -208,7 +208,7 @@ def _best(
     current = (twin, now) if now[held].mean() < bare[held].mean() else (nominal, bare)
     if fit is None or not all(np.isfinite(e.estimate) for e in fit.estimates):
         return current
-    if not holds_out_recordings(origin) and _prior_of(fit, nominal) < _IMPROBABLE:
+    if not holds_out_recordings(origin) and probability_before(fit, nominal) < _IMPROBABLE:
         return current
     new = twin.with_parameters(**{e.name: e.estimate for e in fit.estimates})
     errors = window_errors(new, _without_force(new), shots, spread)
@@ -218,19 +218,6 @@ def _best(
     ):
         return new, errors
     return current
-
-
-def _prior_of(fit: Fit, nominal: Twin) -> float:
-    """
-    How probable, by what was believed before any data, values at least so far from that are.
-
-    Source: Box, J. R. Stat. Soc. A 143, 1980 (checking a prior by its predictive distribution).
-    """
-    away = [
-        (e.estimate - nominal.values[e.name]) / nominal.parameters[e.name].scale
-        for e in fit.estimates
-    ]
-    return float(chi2.sf(np.sum(np.square(away)), len(away)))
 
 
 def _with_residual(

@@ -11,6 +11,7 @@ from scipy import stats
 
 from sb3_hds.core import Params, Trajectories, Twin
 from sb3_hds.core.compilation import QUICKEST_COMPILATION
+from sb3_hds.sysid.results import Fit
 from sb3_hds.sysid.shooting import Shots, fit_start, n_free, simulate, with_slopes
 
 # Gauss-Newton steps of a start state.
@@ -110,6 +111,21 @@ def has_grown(latest: Float[np.ndarray, " n"], older: Float[np.ndarray, " m"]) -
     new, old = (np.log(np.clip(errors, 1e-9, 1e9)) for errors in (latest, older))
     test: Any = stats.ttest_ind(new, old, equal_var=False, alternative="greater")
     return bool(new.mean() - old.mean() > np.log(_GROWN) and test.pvalue < _GROWN_LEVEL)
+
+
+def probability_before(fit: Fit, believed: Twin) -> float:
+    """
+    How probable, before any data, values were that are at least so far from what was believed.
+
+    Source: Box, J. R. Stat. Soc. A 143, 1980 (a prior is checked by its predictive distribution).
+
+    :param believed: its values are the centre of the prior, its parameters' ``scale`` the width
+    """
+    away = [
+        (e.estimate - believed.values[e.name]) / believed.parameters[e.name].scale
+        for e in fit.estimates
+    ]
+    return float(stats.chi2.sf(np.sum(np.square(away)), len(away)))
 
 
 def hold_out(origin: np.ndarray, share: float = 0.25) -> np.ndarray:

@@ -209,18 +209,20 @@ class Search:
         :param tried: best first
         :param n_found: causes before this one: each makes the next harder to confirm
         :return: the candidate that selection prefers, if the other recordings confirm it; of two
-            that predict equally well, the one with fewer parameters
+            that they confirm and that predict equally well, the one with fewer parameters
         """
         if not tried or tried[0].criterion < LEAST_BIC:
             return None
-        best = tried[0]
+        first = simplest = tried[0]
         for other in tried[1:]:
-            fewer = len(other.candidate.parameters) < len(best.candidate.parameters)
-            as_good = self.against(best.kept, other.kept).p_value > _LEVEL_OF_SET
+            fewer = len(other.candidate.parameters) < len(simplest.candidate.parameters)
+            as_good = self.against(simplest.kept, other.kept).p_value > _LEVEL_OF_SET
             if fewer and other.criterion >= LEAST_BIC and as_good:
-                best = other
-        verdict = self.confirmed(best.kept, base.kept)
-        return best if passes(verdict, LEVEL / (1 + n_found)) else None
+                simplest = other
+        for one in (simplest, first):
+            if passes(self.confirmed(one.kept, base.kept), LEVEL / (1 + n_found)):
+                return one
+        return None
 
     def alternatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
         """:return: what is not significantly worse than the best, without more freedom"""
