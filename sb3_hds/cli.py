@@ -8,10 +8,8 @@
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 
@@ -59,6 +57,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _diagnose(given: argparse.Namespace) -> None:
+    from sb3_hds.core.storage import write_bytes
     from sb3_hds.data import Trajectories
     from sb3_hds.effects import ALL
     from sb3_hds.errors import EffectError
@@ -86,7 +85,8 @@ def _diagnose(given: argparse.Namespace) -> None:
     )
     print(found)
     if given.json:
-        _write(Path(given.json), json.dumps(found.to_dict(), indent=1, allow_nan=False) + "\n")
+        text = json.dumps(found.to_dict(), indent=1, allow_nan=False) + "\n"
+        write_bytes(given.json, text.encode())
     if given.report:
         print(f"The report is {found.to_html(given.report)}.")
 
@@ -99,15 +99,6 @@ def _setting(text: str) -> tuple[str, float]:
         return name, float(value)
     except ValueError:
         raise ParameterError(f"--set takes NAME:VALUE with a number, got '{text}'.") from None
-
-
-def _write(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _effects(given: argparse.Namespace) -> None:

@@ -1,4 +1,4 @@
-"""Arrays in a file: all of them or none, and never a pickle."""
+"""Files that are written as a whole or not at all; arrays among them, never pickled."""
 
 import contextlib
 import os
@@ -14,6 +14,24 @@ import numpy as np
 from sb3_hds.errors import TrajectoryError
 
 _SUFFIX = ".npz"
+
+
+def write_bytes(path: str | os.PathLike[str], content: bytes) -> Path:
+    """
+    Write under a temporary name in the same folder, then rename: a reader never sees half a file.
+
+    :param path: a file of that name is replaced
+    :return: the path of the file
+    :raises OSError: if the file cannot be written; an older file there is left as it was
+    """
+    target = Path(path)
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
+    try:
+        temporary.write_bytes(content)
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return target
 
 
 def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> Path:

@@ -76,7 +76,7 @@ def solve(
     bounds = bounds_of([twin.parameters[name] for name in names])
 
     def both(values: Array) -> tuple[Array, Array]:
-        found = _evaluate(twin, names, threshold, fixed, shots, values, offsets, noise, _N_AGAIN)
+        found = errors_at(twin, names, threshold, fixed, shots, values, offsets, noise, _N_AGAIN)
         from_belief = prior * (values - believed) / bounds.scale
         pull = prior * jnp.diag(1.0 / bounds.scale)
         return (
@@ -104,8 +104,7 @@ def solve(
     return Solution(bounds.outside(found.value), converged, found.stats["num_steps"])
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=QUICKEST_COMPILATION)
-def evaluate(
+def errors_at(
     twin: Twin,
     names: tuple[str, ...],
     threshold: float | None,
@@ -114,23 +113,13 @@ def evaluate(
     values: Float[Array, " p"],
     offsets: Float[Array, "n free"],
     noise: Float[Array, " obs"],
+    n_iterations: int = _N_FIRST,
 ) -> Errors:
-    """Errors and their slopes at given values; start states are searched from ``offsets``."""
-    return _evaluate(twin, names, threshold, fixed, shots, values, offsets, noise, _N_FIRST)
+    """
+    Errors and their slopes at given values; start states are searched from ``offsets``.
 
-
-def _evaluate(
-    twin: Twin,
-    names: tuple[str, ...],
-    threshold: float | None,
-    fixed: Params,
-    shots: Shots,
-    values: Float[Array, " p"],
-    offsets: Float[Array, "n free"],
-    noise: Float[Array, " obs"],
-    n_iterations: int,
-) -> Errors:
-    """:param n_iterations: Gauss-Newton steps of each start state"""
+    :param n_iterations: Gauss-Newton steps of each start state
+    """
     params = fixed | dict(zip(names, values, strict=True))
 
     def one(shot: Shots, first: Offset) -> Errors:
@@ -138,6 +127,9 @@ def _evaluate(
         return _projected(twin, names, threshold, fixed, noise, values, shot, at)
 
     return jax.vmap(one)(shots, offsets)
+
+
+evaluate = jax.jit(errors_at, static_argnums=(0, 1, 2), compiler_options=QUICKEST_COMPILATION)
 
 
 def _projected(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_hds.core.storage import write_bytes
 from sb3_hds.sysid.diagnosis import SENTENCES, Diagnosis
 
 if TYPE_CHECKING:
@@ -90,7 +91,6 @@ def write_report(
     """
     try:
         import jinja2
-        import matplotlib  # noqa: F401
     except ImportError as error:
         raise ImportError(_INSTALL) from error
     pictures = [
@@ -101,7 +101,7 @@ def write_report(
     text = page.from_string(_PAGE).render(
         **_content(diagnosis), pictures=pictures, policy=_policy(policy_gain)
     )
-    return _written(Path(path), text.encode())
+    return write_bytes(path, text.encode())
 
 
 def write_pictures(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list[Path]:
@@ -110,27 +110,13 @@ def write_pictures(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list
     :return: one PNG for each picture of the report
     :raises ImportError: without matplotlib
     """
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError as error:
-        raise ImportError(_INSTALL) from error
     Path(folder).mkdir(parents=True, exist_ok=True)
     return [
-        _written(
+        write_bytes(
             Path(folder) / f"{picture['title'].lower().replace(' ', '_')}.png", picture["data"]
         )
         for picture in _drawn(diagnosis)
     ]
-
-
-def _written(target: Path, content: bytes) -> Path:
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(content)
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return target
 
 
 def _content(d: Diagnosis) -> dict[str, Any]:
@@ -191,6 +177,10 @@ def _sentence(d: Diagnosis) -> str:
 
 
 def _drawn(d: Diagnosis) -> list[dict[str, Any]]:
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as error:
+        raise ImportError(_INSTALL) from error
     p = d.pictures
     if p is None:
         return []
