@@ -6,8 +6,7 @@ The gap between simulation and reality, and who closes it with how many real ste
     python benchmarks/sim_to_real.py --figure              # draw the figure again from the table
 
 Each cell is a stand-in for hardware that its data sheet describes wrongly. Wrong twin, HDS and
-domain randomisation know the data sheet; `hds_friction` is HDS that is told to reckon with dry
-friction, of unknown size, at every joint; the ceiling is PODS on the true twin. Every policy is
+domain randomisation know the data sheet; the ceiling is PODS on the true twin. Every policy is
 evaluated on the same 50 start states of the real system. Finished runs are kept in the table: an
 interrupted benchmark goes on where it stopped. Only cells whose gap (ceiling minus wrong twin) is
 above three standard errors count.
@@ -21,7 +20,7 @@ import pandas as pd
 from hardware import CELLS, length_of, make, pretrained, return_of
 from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
 
-METHODS = ("ceiling", "wrong_twin", "randomised", "hds", "hds_friction", "sac", "tqc", "droq")
+METHODS = ("ceiling", "wrong_twin", "randomised", "hds", "sac", "tqc", "droq")
 _DEEPEST = 1800.0  # below the best return, in the figure
 STEPS = (1, 5, 10)  # real episodes after which learners are evaluated
 SWEEP = [cell for cell in CELLS if cell != "worn"]
@@ -78,8 +77,6 @@ def learner(method: str, cell: str, seed: int):
     """The hyperparameters of SAC and TQC are those of RL Zoo for Pendulum-v1."""
     if method == "hds":
         return pretrained(cell, seed)
-    if method == "hds_friction":
-        return pretrained(cell, seed, effects=["coulomb_friction"])
     from sbx import SAC, TQC
 
     given = {"policy": "MlpPolicy", "env": make(cell), "seed": seed, "learning_rate": 1e-3}
@@ -182,7 +179,6 @@ def figure(shown: pd.DataFrame) -> None:
     panels = drawing.subplots(lines, columns, squeeze=False).ravel()
     styles = {
         "hds": "#27496d",
-        "hds_friction": "#7fa6cc",
         "sac": "#d1495b",
         "tqc": "#edae49",
         "droq": "#66a182",

@@ -416,8 +416,13 @@ def test_units_follow_the_place():
         "dead_zone.motor.width": "1",
         "sensor_bias.rate.bias": "rad/s",
     }
-    # A tenth of the largest command, which is 3.
+    # A tenth of the largest command, which is 3; of the drive's 300 N; of the pole's weight.
     assert twin.parameters["dead_zone.motor.width"].scale == pytest.approx(0.3)
+    assert twin.parameters["coulomb_friction.slider.tau_c"].scale == pytest.approx(30.0)
+    weight = twin.base.values["pole_mass"] * 9.81 * twin.base.values["pole_com"]
+    assert twin.parameters["coulomb_friction.hinge.tau_c"].scale == pytest.approx(
+        0.1 * weight, rel=1e-3
+    )
 
 
 def test_at_a_slider_no_unit_is_that_of_a_hinge():

@@ -95,6 +95,37 @@ def test_a_system_that_friction_holds_fast_is_not_taken_for_a_heavier_one():
     assert found.twin.values == twin.values and not found.changed
 
 
+def test_suspected_effects_are_attached_once_the_twin_proves_inexact():
+    twin = twins.make("PendulumReal")
+    suspected = {"suspected": ("coulomb_friction",)}
+    name = "coulomb_friction.hinge.tau_c"
+
+    exact = corrected(twin, measured(twin), **suspected)
+    assert exact.twin is twin and not exact.attached
+
+    rubbing = twin.extend(effects.CoulombFriction(0, tau_c=0.3))
+    found = corrected(twin, measured(rubbing, noise=0.01), **suspected)
+    assert found.attached == {name: 0.0}
+    assert found.fit[name].estimate == pytest.approx(0.3, rel=0.1)
+    assert found.twin.values[name] == found.fit[name].estimate
+    assert found.error_calibrated < 0.6 * found.error_twin
+
+
+def test_what_is_suspected_is_estimated_with_the_rest_and_travels(tmp_path):
+    rubbing = twins.make("PendulumReal").extend(effects.CoulombFriction(0, tau_c=0.3))
+    data = measured(rubbing, noise=0.01)
+    model = small("hds", REAL, pretrain_data=data, residual=False).learn(0)
+    name = "coulomb_friction.hinge.tau_c"
+
+    assert model.nominal[name] == 0.0
+    assert model.twin.values[name] == pytest.approx(0.3, rel=0.1)
+    model.save(tmp_path / "model")
+    assert HDS.load(tmp_path / "model", env=model.get_env()).twin.values == model.twin.values
+    # Whoever says which parameters are corrected means no others.
+    only_mass = small("hds", REAL, pretrain_data=data, residual=False, calibrated=["mass"])
+    assert name not in only_mass.learn(0).twin.values
+
+
 @pytest.mark.expensive
 def test_what_has_no_parameter_is_left_to_the_learned_force():
     twin = twins.make("PendulumReal")
@@ -306,6 +337,8 @@ def test_effects_are_attached_by_name_or_as_they_are():
     assert model.twin.values["quadratic_drag.hinge.c"] == 0.01
     with pytest.raises(EffectError, match="viscous_friction"):
         small("hds", REAL, effects=["magic"])
+    with pytest.raises(EffectError, match="magic"):
+        small("hds", REAL, suspected=["magic"])
     with pytest.raises(CalibrationError, match="Its parameters are: gravity"):
         small("hds", REAL, calibrated=["weight"])
 

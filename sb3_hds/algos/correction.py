@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from sb3_hds.algos.model import missing_effects, nulls_of
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.effects import force_of
 from sb3_hds.errors import CalibrationError, TrajectoryError
@@ -67,6 +68,7 @@ class Wishes:
     :param residual_kwargs: further arguments of ``sysid.fit_residual``
     :param beta: share of rollouts in the learned model, or ``"auto"``
     :param seed: of whatever is drawn
+    :param suspected: effects that are attached, and estimated, once the twin proves inexact
     """
 
     names: tuple[str, ...]
@@ -75,6 +77,7 @@ class Wishes:
     residual_kwargs: Mapping[str, Any]
     beta: float | str
     seed: int
+    suspected: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,6 +90,8 @@ class Correction:
     :param beta: share of rollouts in the learned model
     :param changed: whether the model is so different that plans should be made anew
     :param forgotten: whether data from before a change of the system were left out
+    :param attached: what was believed of the parameters of effects that the twin has now and had
+        not before
     :param fit: of the parameters, if they were estimated
     :param residual: the learned force, if it was learned
     :param error_twin: of the twin as it was before any data
@@ -98,6 +103,7 @@ class Correction:
     beta: float
     changed: bool
     forgotten: bool = False
+    attached: Mapping[str, float] = dataclasses.field(default_factory=dict)
     fit: Fit | None = None
     residual: Residual | None = None
     error_twin: float = np.nan
@@ -144,6 +150,7 @@ def correct(
     if max(_mean(bare[real]), _mean(bare[latest])) < _EXACT:
         changed = gain(bare[real], now[real]) > _NOTICEABLE
         return Correction(nominal, 0.0, changed=changed, error_twin=_mean(bare[real]))
+    nominal, twin, wishes, added = _with_suspects(nominal, twin, wishes)
     shots, origin, forgotten = _since_change(shots, origin, now, latest)
     held = hold_out(origin, _HELD if real.sum() >= _MANY else _HELD_OF_FEW)
     learned = shots._replace(weight=shots.weight * ~held)
@@ -155,6 +162,7 @@ def correct(
         0.0,
         changed=False,
         forgotten=forgotten,
+        attached=added,
         fit=fit,
         error_twin=_mean(bare[held]),
         error_calibrated=_mean(errors[held]),
@@ -163,6 +171,26 @@ def correct(
         now = window_errors(twin, twin.params, shots, spread)
     found, errors = _with_residual(found, shots, held, errors, spread, wishes, learn_force)
     return dataclasses.replace(found, changed=gain(errors[held], now[held]) > _NOTICEABLE)
+
+
+def _with_suspects(
+    nominal: Twin, twin: Twin, wishes: Wishes
+) -> tuple[Twin, Twin, Wishes, dict[str, float]]:
+    """
+    Errors that are known already stay valid: new effects change nothing yet.
+
+    :return: both twins with the suspected effects, the wishes with their parameters, and what is
+        believed of these
+    """
+    missing = missing_effects(twin, wishes.suspected)
+    if not missing:
+        return nominal, twin, wishes, {}
+    nominal, twin = nominal.extend(*missing), twin.extend(*missing)
+    added = nulls_of(missing)
+    wishes = dataclasses.replace(
+        wishes, names=(*wishes.names, *added), nominal={**wishes.nominal, **added}
+    )
+    return nominal, twin, wishes, added
 
 
 def _calibrated(

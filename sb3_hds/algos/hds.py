@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_hds.algos.correction import Correction, Wishes, correct, names_to_estimate
 from sb3_hds.algos.log import record_correction
 from sb3_hds.algos.measured import Measured, data_from
-from sb3_hds.algos.model import missing_effects, required
+from sb3_hds.algos.model import check_known, missing_effects, nulls_of, required
 from sb3_hds.algos.twin_algorithm import TwinAlgorithm
 from sb3_hds.core import Effect, Params, Trajectories, Twin
 from sb3_hds.effects import ALL, force_of
@@ -112,6 +112,10 @@ class HDS(TwinAlgorithm):
         ``"all"``, names, or None
     :param effects: attached to the twin, so that data can inform them: names from ``effects.ALL``
         (then at every joint or actuator), or effects
+    :param suspected: names of effects that are attached, at every joint or actuator, once data show
+        that the twin is not exact; only with ``calibrated="all"``. Dry friction is nowhere absent,
+        rarely in a simulation, and neither another parameter nor a learned force stands for it
+        well, see the documentation.
     :param residual: whether a force is learned for what remains
     :param residual_kwargs: ``n_members``, ``net_arch``, ``caution``, see ``sysid.fit_residual``
     :param beta: share of rollouts in the model with the learned force, where that predicts held-out
@@ -182,6 +186,7 @@ class HDS(TwinAlgorithm):
         randomisation: float = 0.0,
         calibrated: str | Sequence[str] | None = "all",
         effects: Sequence[str | Effect] = (),
+        suspected: Sequence[str] = ("coulomb_friction",),
         residual: bool = True,
         residual_kwargs: dict[str, Any] | None = None,
         beta: float | str = "auto",
@@ -202,6 +207,7 @@ class HDS(TwinAlgorithm):
     ) -> None:
         self.calibrated = calibrated
         self.effects = [e if isinstance(e, str) else e.to_spec() for e in effects]
+        self.suspected = tuple(suspected)
         self.residual = residual
         self.residual_kwargs = residual_kwargs
         self.beta = beta
@@ -315,6 +321,7 @@ class HDS(TwinAlgorithm):
         if found.twin != self.twin or found.twin.values != self.twin.values:
             self.twin_spec = found.twin.to_spec()
         self.twin, self.model_beta = found.twin, found.beta
+        self.nominal |= found.attached
         record_correction(self, found)
         if found.changed and gradient_steps:
             for left in range(self.replan_epochs, 0, -1):
@@ -362,9 +369,7 @@ class HDS(TwinAlgorithm):
         ]
         if causes:
             self.twin = self.twin.extend(*causes)
-            for effect in causes:
-                for name, parameter in effect.parameters.items():
-                    self.nominal[f"{effect.name}.{effect.where}.{name}"] = parameter.null
+            self.nominal |= nulls_of(causes)
             self.twin_spec, self._workspace = self.twin.to_spec(), None
             self._steps_at_force = 0
         return found
@@ -394,9 +399,11 @@ class HDS(TwinAlgorithm):
             residual_kwargs=self.residual_kwargs or {},
             beta=self.beta,
             seed=self.seed or 0,
+            suspected=self.suspected if self.calibrated == "all" else (),
         )
 
     def _prepared(self, twin: Twin) -> Twin:
+        check_known(self.suspected)
         missing = missing_effects(twin, self.effects)
         twin = twin.extend(*missing) if missing else twin
         if self.twin_spec is None or not self.nominal:

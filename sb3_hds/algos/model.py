@@ -1,7 +1,7 @@
 """Which twin an algorithm plans in, and whether it can."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from sb3_hds import effects, twins
@@ -59,14 +59,8 @@ def missing_effects(twin: Twin, wanted: Sequence[str | dict[str, Any]]) -> list[
     :return: those that the twin does not have yet
     :raises EffectError: for a name that is not in the catalogue
     """
+    check_known(entry if isinstance(entry, str) else entry["effect"] for entry in wanted)
     known = {effect.name: effect for effect in effects.KNOWN}
-    names = [entry if isinstance(entry, str) else entry["effect"] for entry in wanted]
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise EffectError(
-            f"There is no effect called {', '.join(unknown)}. The catalogue has: "
-            f"{', '.join(effect.name for effect in effects.ALL)}."
-        )
     found: list[Effect] = []
     for entry in wanted:
         if isinstance(entry, str):
@@ -76,6 +70,31 @@ def missing_effects(twin: Twin, wanted: Sequence[str | dict[str, Any]]) -> list[
             effect, options = known[entry["effect"]], entry.get("options", {})
             found.append(effect(entry["where"], **options, **entry["parameters"]))
     return [effect for effect in found if not _has(twin, effect)]
+
+
+def check_known(names: Iterable[str]) -> None:
+    """
+    :raises EffectError: for a name that is not in the catalogue
+    """
+    known = {effect.name for effect in effects.KNOWN}
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise EffectError(
+            f"There is no effect called {', '.join(unknown)}. The catalogue has: "
+            f"{', '.join(effect.name for effect in effects.ALL)}."
+        )
+
+
+def nulls_of(attached: Sequence[Effect]) -> dict[str, float]:
+    """
+    :param attached: effects that name their place
+    :return: what is believed of their parameters before any data, by full name
+    """
+    return {
+        f"{effect.name}.{effect.where}.{name}": parameter.null
+        for effect in attached
+        for name, parameter in effect.parameters.items()
+    }
 
 
 def _has(twin: Twin, effect: Effect) -> bool:

@@ -1,14 +1,22 @@
 """Twins given by their equation of motion."""
 
 import abc
+import math
+from functools import lru_cache, partial
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
+from sb3_hds.core.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.effect import NO_EFFECTS, EffectChain, Moment
 from sb3_hds.core.integrators import Integrator, semi_implicit_euler
 from sb3_hds.core.linear import solve_spd
 from sb3_hds.core.twin import State, Twin
 from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Velocity
+
+# Turns of a rotary joint at which its load is asked for: at one of them gravity pulls hard.
+_TURNS = (0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi)
 
 
 class AnalyticTwin(Twin):
@@ -45,6 +53,9 @@ class AnalyticTwin(Twin):
         """Where the environment clips or wraps the state, after each sub-step."""
         return q, v
 
+    def typical_forces(self) -> tuple[float, ...]:
+        return _typical_forces(self)
+
     def step(
         self, state: State, action: Action, params: Params, effects: EffectChain = NO_EFFECTS
     ) -> State:
@@ -75,3 +86,30 @@ class AnalyticTwin(Twin):
         if self.substeps == 1:
             return substep(state, None)[0]
         return jax.lax.scan(substep, state, None, length=self.substeps)[0]
+
+
+@lru_cache(maxsize=64)
+def _typical_forces(twin: AnalyticTwin) -> tuple[float, ...]:
+    """What actuators and gravity can do to each joint, with the parameters at their nulls."""
+    params = {name: jnp.asarray(parameter.null) for name, parameter in twin.parameters.items()}
+    rotary = np.array([joint.unit == "rad" for joint in twin.joints], float)
+    turned = np.concatenate(
+        [np.outer(_TURNS, rotary), *(np.outer(_TURNS, r) for r in np.diag(rotary))]
+    )
+    limits = [max(abs(actuator.low), abs(actuator.high)) for actuator in twin.actuators]
+    largest = jnp.array([limit if math.isfinite(limit) else 0.0 for limit in limits])
+
+    @partial(jax.jit, compiler_options=QUICKEST_COMPILATION)
+    def forces(key: jax.Array, turned: jax.Array) -> jax.Array:
+        start = twin.initial(key, params)
+        standing = start._replace(v=jnp.zeros_like(start.v))
+
+        def at(turn: Position) -> Force:
+            state = standing._replace(q=start.q + turn)
+            driven = twin.actuate(state, largest, params)
+            return jnp.abs(driven) + jnp.abs(twin.bias(state.q, state.v, params))
+
+        return jax.vmap(at)(turned).max(0)
+
+    found = np.asarray(forces(jax.random.PRNGKey(0), jnp.asarray(turned)))
+    return tuple(float(force) if np.isfinite(force) else 0.0 for force in found)

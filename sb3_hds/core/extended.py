@@ -195,10 +195,16 @@ def _attach(effect: Effect, twin: Twin) -> Attached:
 
 
 def _in_units_of(parameter: Parameter, twin: Twin, attached: Attached) -> Parameter:
-    """Effects state the units of a rotary joint, and those of commands and channels by name."""
+    """
+    Effects state the units of a rotary joint, and those of commands and channels by name; scales of
+    forces are shares of what is typical at that joint, scales of commands of the largest one.
+    """
     slot, index = attached.effect.slot, attached.index
-    if slot == "joint" and twin.joints[index].unit == "m":
-        return parameter.prismatic()
+    if slot == "joint":
+        if parameter.unit == "N m":
+            typical = twin.typical_forces()[index]
+            parameter = dataclasses.replace(parameter, scale=parameter.scale * (typical or 1.0))
+        return parameter.prismatic() if twin.joints[index].unit == "m" else parameter
     if parameter.unit == "channel unit":
         return dataclasses.replace(parameter, unit=twin.channels[index].unit)
     if parameter.unit == "command unit":

@@ -164,6 +164,13 @@ class Twin(abc.ABC):
         """
         return cls()
 
+    def typical_forces(self) -> tuple[float, ...]:
+        """
+        :return: the largest force that actuators and gravity exert on each joint at rest [N m or
+            N], which says how large friction and the like may be; 0 where that is not known
+        """
+        return (0.0,) * len(self.joints)
+
     @abc.abstractmethod
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
         """Draw the state at the start of an episode."""
