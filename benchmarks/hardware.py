@@ -16,7 +16,10 @@ CELLS = {
     "drag": (PENDULUM, {"drag": 0.04, "noise": 0.01}),
     "delay": (PENDULUM, {"delay": 0.1, "noise": 0.01}),
     "cart friction": (CART, {"hinge_friction": 2.0, "slider_friction": 20.0, "swing_up": True}),
-    "worn": (PENDULUM, {"mass": 1.25, "length": 1.25, "friction": 0.2, "noise": 0.01}),
+    "worn": (
+        PENDULUM,
+        {"mass": 1.25, "length": 1.25, "friction": 0.2, "drag": 0.04, "noise": 0.01},
+    ),
 }
 #: steps of an episode
 LENGTH = {PENDULUM: 200, CART: 250}

@@ -4,10 +4,10 @@ What each part of HDS is worth: one changed at a time, on hardware that wore out
     python benchmarks/hds_parts.py                        # beta, parts and weaknesses, five seeds
     python benchmarks/hds_parts.py --tables parts --seeds 2 --jobs 1
 
-The cell "worn" of `hardware.py` is heavier and longer than its data sheet says and has dry friction
-that no parameter of the twin accounts for. Runs with the same seed start from the same policy where
-the change does not touch the pretraining. Returns are means over the same 50 start states; finished
-runs are kept.
+The cell "worn" of `hardware.py` is heavier and longer than its data sheet says, has dry friction,
+and stirs the air, for which the twin has no parameter and HDS suspects no effect. Runs with the
+same seed start from the same policy where the change does not touch the pretraining. Returns are
+means over the same 50 start states; finished runs are kept.
 
 beta: the share of plans made in the model with the learned force. Beside the return, what the HDS
 project asked about numerical stability: samples that were dropped because they were not finite, the
@@ -36,6 +36,7 @@ PARTS = {
     "no terminal value": {"terminal_value": False},
     "no relabelling": {"relabel_share": 0.0},
     "no calibration": {"calibrated": None},
+    "no dry friction suspected": {"suspected": ()},
     "no learned force": {"residual": False},
     "beta 0.05": {"beta": 0.05},
     "no data": {"refit_freq": 0},
