@@ -19,7 +19,7 @@ from sb3_hds.experiments import measure_policy_gain
 from sb3_hds.wrappers import Record
 
 ROBOT = "sb3_hds/PendulumReal-v1"
-HIDDEN = {"drag": 0.04, "noise": 0.01}
+HIDDEN = {"drag": 0.06, "noise": 0.01}
 N_RECORDINGS, N_STEPS = 10, 200
 EPOCHS = 50  # of planning: a demonstration must not take long
 

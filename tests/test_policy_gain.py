@@ -68,6 +68,16 @@ def test_an_outlier_among_runs_does_not_move_the_interquartile_mean():
     assert _summarised(values).mean == expected
 
 
+def test_a_single_run_is_resampled_over_its_start_states():
+    values = np.arange(16.0)[None]
+    found = _summarised(values)
+    assert found.low < found.mean < found.high
+
+    text = str(PolicyGain({"believed": values, "extended": values + 1.0}, found))
+    assert "1 run, 16 start states" in text and "interval over start states" in text
+    assert all(len(line) <= 80 for line in text.splitlines())
+
+
 def test_other_algorithms_train_in_the_simulation_for_a_budget():
     found = measure_policy_gain(
         a_diagnosis(),

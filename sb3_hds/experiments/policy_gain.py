@@ -30,7 +30,8 @@ _LEVEL = 0.9
 class Return:
     """
     :param mean: interquartile mean over runs and episodes
-    :param low: lower end of its 90 % interval (stratified bootstrap over runs)
+    :param low: lower end of its 90 % interval (bootstrap over runs; over start states where there
+        is a single run, so that it says nothing of other runs)
     :param high: upper end
     """
 
@@ -91,9 +92,11 @@ class PolicyGain:
 
     def __str__(self) -> str:
         runs, episodes = self.returns["believed"].shape
+        over = "runs" if runs > 1 else "start states"
         lines = [
-            f"Return on the real system, {runs} runs, {episodes} start states each: "
-            "interquartile mean [90 % interval]"
+            f"Return on the real system, {runs} {'runs' if runs > 1 else 'run'}, {episodes} start "
+            "states each:",
+            f"interquartile mean [90 % interval over {over}]",
         ]
         rows = {s: self.of(s) for s in self.returns} | {"gain": self.gain}
         lines += [f"  {s:<9} {r.mean:9.1f} [{r.low:.1f}, {r.high:.1f}]" for s, r in rows.items()]
@@ -172,9 +175,12 @@ def _task(twin: Twin) -> gymnasium.Env:
 
 
 def _summarised(values: Float[np.ndarray, "runs episodes"]) -> Return:
-    """Interquartile mean, and what resampling the runs makes of it."""
-    rng, n = np.random.default_rng(0), len(values)
-    drawn = values[rng.integers(n, size=(_N_RESAMPLES, n))]
+    """Interquartile mean, and what resampling makes of it: the runs, or what a single run did."""
+    rng, (n, episodes) = np.random.default_rng(0), values.shape
+    if n > 1:
+        drawn = values[rng.integers(n, size=(_N_RESAMPLES, n))]
+    else:
+        drawn = values[0, rng.integers(episodes, size=(_N_RESAMPLES, 1, episodes))]
     means = _interquartile_means(np.concatenate([values[None], drawn]))
     low, high = np.quantile(means[1:], [0.5 - 0.5 * _LEVEL, 0.5 + 0.5 * _LEVEL])
     return Return(float(means[0]), float(low), float(high))
