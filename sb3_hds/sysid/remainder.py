@@ -1,6 +1,6 @@
 """What no candidate explains: the missing force, and what it goes with."""
 
-from itertools import combinations
+from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +19,9 @@ _MOST_WINDOWS = 1500
 # Candidates of its regularisation, relative to the variance of the force.
 _RIDGES = (0.1, 1.0, 10.0, 100.0)
 # What counts as something: share of the force's variance that others' windows predict, and level.
-_LEAST_GAIN, _LEVEL, _N_FLIPS = 0.05, 0.02, 4000
+_LEAST_GAIN, _LEVEL = 0.05, 0.01
+# Patterns of signs: all of so many units, or so many drawn.
+_ALL_SIGNS_OF, _N_FLIPS = 12, 4096
 # A smaller set of quantities that explains this share of what all explain tells where it lives.
 _MOST_OF_IT = 0.8
 _MOST_RATIO = 4.0
@@ -63,6 +65,16 @@ class Remainder(NamedTuple):
     gain: float
     p_value: float
     power: float
+
+
+class _Predicted(NamedTuple):
+    """
+    :param gain: share of the force's variance that is predicted
+    :param agreement: predicted times measured, summed over each unit, shape ``(units,)``
+    """
+
+    gain: float
+    agreement: np.ndarray
 
 
 def missing_force(
@@ -146,14 +158,19 @@ def remainder(
             for k in (1, 2, len(quantities))
             for names in combinations(quantities, k)
         }
-        most, p_value = max(told.values())
-        if most < _LEAST_GAIN or p_value * len(told) >= _LEVEL:
+        p_values = _by_chance(np.stack([one.agreement for one in told.values()]))
+        chance = {
+            name: min(float(p) * len(joints), 1.0) for name, p in zip(told, p_values, strict=True)
+        }
+        best = max(told, key=lambda names: told[names].gain)
+        most = told[best].gain
+        if most < _LEAST_GAIN or chance[best] >= _LEVEL:
             continue
-        enough = min((names for names in told if told[names][0] >= _MOST_OF_IT * most), key=len)
-        power = told[enough][0] * max(float(np.mean(force**2)), 1.0)
+        enough = min((names for names in told if told[names].gain >= _MOST_OF_IT * most), key=len)
+        power = told[enough].gain * max(float(np.mean(force**2)), 1.0)
         if power < least_power:
             continue
-        found.append(Remainder(joint, enough, *told[enough], power))
+        found.append(Remainder(joint, enough, told[enough].gain, chance[enough], power))
     return max(found, key=lambda r: r.gain, default=None)
 
 
@@ -180,16 +197,8 @@ def _scaled(values: np.ndarray) -> np.ndarray:
     return (values - values.mean(0)) / np.where(spread > 1e-9, spread, 1.0)
 
 
-def _predicted(
-    quantities: list[np.ndarray], force: np.ndarray, parts: Split
-) -> tuple[float, float]:
-    """
-    Each half of the units is predicted from the other.
-
-    :return: share of the variance that is predicted, and the chance of that if nothing were there:
-        what was predicted then agrees in sign with what was measured in as many units as not, so
-        the signs of whole units are flipped
-    """
+def _predicted(quantities: list[np.ndarray], force: np.ndarray, parts: Split) -> _Predicted:
+    """Each half of the units is predicted from the other."""
     features = _scaled(np.concatenate(quantities, 1))
     guess = np.zeros_like(force)
     for learn, check in ((~parts.confirm, parts.confirm), (parts.confirm, ~parts.confirm)):
@@ -201,9 +210,29 @@ def _predicted(
     agreement = np.array(
         [np.sum(force[own] * guess[own]) for own in map(parts.unit.__eq__, np.unique(parts.unit))]
     )
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], (_N_FLIPS, len(agreement)))
-    by_chance = np.sum(signs @ agreement >= agreement.sum())
-    return float(gain), float((1 + by_chance) / (1 + _N_FLIPS))
+    return _Predicted(float(gain), agreement)
+
+
+def _by_chance(agreement: Float[np.ndarray, "sets units"]) -> Float[np.ndarray, " sets"]:
+    """
+    Chance that some set of quantities predicts so well where there is nothing to predict: then what
+    was predicted agrees in sign with what was measured in as many units as not, whichever the set,
+    so the signs of whole units are flipped for all sets together.
+
+    Source: Westfall and Young, *Resampling-based multiple testing*, Wiley 1993 (the largest
+    statistic of a family).
+
+    :return: for each set, shape ``(sets,)``
+    """
+    n = agreement.shape[1]
+    if n <= _ALL_SIGNS_OF:
+        signs = np.array(list(product((1.0, -1.0), repeat=n)))
+    else:
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (_N_FLIPS, n))
+        signs[0] = 1.0
+    largest = np.max(signs @ agreement.T, axis=1)
+    # The first pattern is that of the data themselves.
+    return np.mean(largest[:, None] >= agreement.sum(1) - 1e-9 * np.abs(agreement).sum(1), axis=0)
 
 
 def _ridge(features: np.ndarray, force: np.ndarray, there: np.ndarray) -> np.ndarray:
