@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tomllib
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
 
 import gymnasium
@@ -232,6 +233,21 @@ def test_arrows_of_the_picture_point_down():
 
     pairs = [(name, below) for name, layer in layers.items() for below in layer.layers]
     assert [pair for pair in pairs if order[pair[0]] <= order[pair[1]]] == []
+
+
+def test_boxes_of_the_picture_lie_side_by_side():
+    drawn = import_picture.as_svg(import_picture.read())
+    wide, high = map(float, re.search(r'viewBox="0 0 (\d+) (\d+)"', drawn).groups())
+    pattern = r'<rect x="(\S+)" y="(\S+)" width="(\S+)" height="(\S+)"'
+    boxes = sorted(tuple(map(float, box)) for box in re.findall(pattern, drawn))
+    lines = [float(y) for y in re.findall(r'<text x="\S+" y="(\S+)"', drawn)]
+
+    assert all(x >= 0 and x + w <= wide and y + h <= high for x, y, w, h in boxes)
+    for y in {box[1] for box in boxes}:
+        row = [box for box in boxes if box[1] == y]
+        assert all(one[0] + one[2] < following[0] for one, following in pairwise(row))
+    tops = sorted({box[1] for box in boxes})
+    assert all(any(top < line < top + boxes[0][3] - 4 for top in tops) for line in lines)
 
 
 def test_results_are_shown_with_the_command_that_made_them(tmp_path):

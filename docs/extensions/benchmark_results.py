@@ -41,10 +41,19 @@ def _first_line(path: Path) -> str:
     return words.partition("\n\n")[0]
 
 
+def _short(cell: str) -> str:
+    """Four digits of a number tell enough."""
+    try:
+        return f"{float(cell):.4g}" if "." in cell and abs(float(cell)) < 1e4 else cell
+    except ValueError:
+        return cell
+
+
 def _as_section(path: Path) -> str:
     with path.open(newline="") as file:
         columns, *rows = csv.reader(file)
     title, name = path.stem.replace("_", " "), f"`{path.parent.name}/{path.name}`"
+    rows = [[_short(cell) for cell in row] for row in rows]
     shown = table(columns, rows) if len(rows) <= _MOST_ROWS else f"{len(rows)} rows.\n\n"
     picture = path.with_suffix(".png")
     if picture.exists():

@@ -15,9 +15,9 @@ ROOT = Path(__file__).parent.parent.parent
 Imports = Mapping[str, frozenset[str]]
 
 # Of the drawing, in its own units.
-_WIDTH, _BOX, _HEIGHT, _PITCH, _MARGIN = 720, 210, 66, 112, 8
+_WIDTH, _BOX, _HEIGHT, _PITCH, _MARGIN = 720, 168, 80, 124, 8
 _CORNER = 24  # from the corner of a box to the outermost end of an arrow
-_LETTERS = 36  # that fit into a line of a box
+_LETTERS = 29  # that fit into a line of a box
 
 
 class Layer(NamedTuple):
