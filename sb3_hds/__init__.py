@@ -6,7 +6,6 @@ our environments with Gymnasium.
 """
 
 import importlib
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from sb3_hds.envs.registration import register_environments
@@ -16,6 +15,8 @@ if TYPE_CHECKING:
     from sb3_hds.algos import HDS, PODS
     from sb3_hds.data import Trajectories, audit
     from sb3_hds.sysid import calibrate, diagnose
+
+    __version__: str
 
 __all__ = [
     "HDS",
@@ -42,11 +43,6 @@ _CLASSES = {
     "diagnose": "sysid",
 }
 
-try:
-    __version__ = version("sb3-hds")
-except PackageNotFoundError:  # a checkout that is on the path without being installed
-    __version__ = "0+unknown"
-
 register_environments()
 
 
@@ -55,7 +51,18 @@ def __getattr__(name: str) -> Any:
         return getattr(importlib.import_module(f"sb3_hds.{_CLASSES[name]}"), name)
     if name in __all__:
         return importlib.import_module(f"sb3_hds.{name}")
+    if name == "__version__":
+        return _version()
     raise AttributeError(f"module 'sb3_hds' has no attribute '{name}'")
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("sb3-hds")
+    except PackageNotFoundError:  # a checkout that is on the path without being installed
+        return "0+unknown"
 
 
 def __dir__() -> list[str]:
