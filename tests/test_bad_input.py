@@ -113,6 +113,13 @@ def test_an_observation_of_another_shape_is_refused(name, obs):
 
 
 @every_algorithm
+@pytest.mark.parametrize("value", [np.nan, -np.inf])
+def test_an_observation_that_is_not_finite_gets_no_action(name, value):
+    with pytest.raises(ValueError, match="not finite"):
+        small(name).predict(np.array([1.0, 0.0, value], np.float32))
+
+
+@every_algorithm
 def test_the_pair_that_reset_returns_is_no_observation(name):
     model, env = small(name), gymnasium.make("Pendulum-v1")
 

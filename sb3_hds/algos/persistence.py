@@ -131,13 +131,20 @@ class TensorPolicy(BaseJaxPolicy):
         """
         :param observation: one, or a batch with one row for each copy of the environment
         :return: action of the same number of rows, in the units of the action space; ``state``
-        :raises ValueError: if the observation has another shape than the observation space
+        :raises ValueError: if the observation has another shape than the observation space, or is
+            not finite
         """
         if isinstance(observation, tuple) and len(observation) == 2:
             raise ValueError(
                 "predict() got a tuple instead of an observation. Gymnasium's reset() returns "
                 "(obs, info) where a VecEnv's returns obs, mixing Gym API with SB3 VecEnv API: use "
                 "`obs, info = env.reset()`, or `obs = vec_env.reset()`."
+            )
+        parts = observation.values() if isinstance(observation, dict) else [observation]
+        if not all(np.isfinite(part).all() for part in parts):
+            raise ValueError(
+                f"predict() got an observation that is not finite: {observation}. No "
+                "action follows from it: repeat the last one, or stop the robot safely."
             )
         return super().predict(observation, state, episode_start, deterministic)
 

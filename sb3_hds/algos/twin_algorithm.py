@@ -54,6 +54,7 @@ from sb3_hds.algos.selection import (
 )
 from sb3_hds.algos.twin_policy import TwinPolicy, all_finite
 from sb3_hds.core import Params, Twin
+from sb3_hds.effects import NeuralForce
 from sb3_hds.envs.mirror import check_mirrors, twin_of
 
 # Decay of what counts as recent in the pretraining, per epoch, and the fewest epochs to judge by.
@@ -232,11 +233,32 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """One planning epoch with ``gradient_steps`` regression steps, between real steps."""
+        self._n_updates += gradient_steps
         self.run_epoch(gradient_steps)
 
-    def _store_transition(self, *args: Any, **kwargs: Any) -> None:
-        super()._store_transition(*args, **kwargs)
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray,  # type: ignore[override]
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        :raises ValueError: for a measurement that is not finite; the steps before it are kept, and
+            the next call of ``learn`` resets the environment
+        """
         self.unstored_step = None
+        ends = [info["terminal_observation"] for info in infos if "terminal_observation" in info]
+        if not all(np.isfinite(measured).all() for measured in (new_obs, reward, *ends)):
+            self._last_obs = None
+            raise ValueError(
+                f"Step {self.num_timesteps} of the environment is not finite: observation "
+                f"{new_obs}, reward {reward}. The model and the steps before are as they were: "
+                "mend the sensor, then learn(..., reset_num_timesteps=False)."
+            )
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self.real_timesteps += self.n_envs
 
     def run_epoch(self, gradient_steps: int) -> Report:
@@ -264,7 +286,6 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
             )
         self.policy.networks, self.policy.progress = learner.networks, learner.progress
         self._workspace = learner.workspace
-        self._n_updates += gradient_steps
         self._epochs_done += 1
         self.twin_timesteps += twin_steps_per_epoch(settings)
         if returns is not None:
@@ -464,7 +485,16 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         return super()._init_callback([Pretraining(progress_bar), *given], progress_bar)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "policy.optimizer", "learned_force"], []
+        names = ["policy", "policy.optimizer"]
+        return [*names, "learned_force"] if self._learned_a_force else names, []
+
+    @property
+    def _learned_a_force(self) -> bool:
+        if self.twin is not None:
+            return bool(self.twin.tensors)
+        return any(
+            e["effect"] == NeuralForce.name for e in (self.twin_spec or {}).get("effects", [])
+        )
 
     def _excluded_save_params(self) -> list[str]:
         ours = [
