@@ -17,7 +17,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_hds import HDS, PODS, effects, twins
 from sb3_hds.algos.arguments import knobs_of
-from sb3_hds.algos.correction import Wishes, correct
+from sb3_hds.algos.correction import Correction, Wishes, correct
 from sb3_hds.algos.epoch import plan_ahead
 from sb3_hds.core import Trajectories
 from sb3_hds.effects import force_of
@@ -424,6 +424,20 @@ def test_data_count_since_the_change_though_learn_starts_counting_again():
     inertia = (twin.values["mass"] / 3.0 + twin.values["payload"]) * twin.values["length"] ** 2
     assert inertia == pytest.approx(1.0 / 3.0 + 0.5, rel=0.02)
     assert model.measured.trajectories(model.real_timesteps - model._changed_at).n_steps == 480
+
+
+def test_planning_anew_is_no_block_of_its_own(monkeypatch):
+    asked = []
+
+    def always_changed(twin, data, *rest, **options):
+        asked.append(data.n_steps)
+        return Correction(twin, 0.0, changed=True)
+
+    monkeypatch.setattr("sb3_hds.algos.hds.correct", always_changed)
+    model = small("hds", train_freq=10, replan_epochs=2, gradient_steps=3).learn(30)
+
+    assert asked == [10, 20, 30]
+    assert model._n_updates == 3 * (2 + 1) * 3
 
 
 def test_the_data_sheet_is_that_of_the_environment_that_came_last(tmp_path):

@@ -254,7 +254,7 @@ def test_a_dead_sensor_is_an_error_and_nothing_before_it_is_lost(name, value, tm
     env = Dead(gymnasium.make("Pendulum-v1"), value)
     model = small(name, env, twin="Pendulum")
 
-    with pytest.raises(ValueError, match="Step 9 of the environment is not finite.*mend"):
+    with pytest.raises(ValueError, match=r"Step 9 of the environment is not finite.*mend"):
         model.learn(100)
 
     assert finite(model) and model.replay_buffer.pos == 8

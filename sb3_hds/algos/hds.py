@@ -326,7 +326,7 @@ class HDS(TwinAlgorithm):
         if found.changed and gradient_steps:
             for left in range(self.replan_epochs, 0, -1):
                 self._replanning = left
-                self.train(gradient_steps, self.batch_size)
+                super().train(gradient_steps, self.batch_size)
             self._replanning = 0
         return found
 
