@@ -66,6 +66,7 @@ def test_a_servos_friction_depends_on_its_load():
     assert after <= 0.7 * error_over(before.twin, unseen, 1.0)
 
 
+@pytest.mark.xfail(strict=True, reason="not confirmed, see docs/guide/measured_rigs.md")
 def test_a_double_pendulum_has_dry_friction_at_both_joints():
     found = asked(measured_rigs.dfki())
 
