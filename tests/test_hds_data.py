@@ -397,6 +397,15 @@ def test_a_learned_force_travels_as_tensors(tmp_path):
         np.testing.assert_array_equal(one, other)
 
 
+def test_a_model_without_learned_force_is_no_model_with_one(tmp_path):
+    model = small("pods", REAL)
+    assert all(model.get_parameters().values())
+    model.save(tmp_path / "model")
+
+    with pytest.raises(ValueError, match=r"does not fit this model.*learned_force"):
+        PODS.load(tmp_path / "model", twin=twins.make("PendulumReal").extend(effects.NeuralForce()))
+
+
 def test_pods_keeps_the_weights_of_a_learned_force_too(tmp_path):
     twin = twins.make("PendulumReal")
     force = effects.NeuralForce(share=1.0).fitted_to(twin)

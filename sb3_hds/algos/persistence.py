@@ -67,10 +67,15 @@ def damage_reported(path: Any) -> Iterator[None]:
     """
     A file that was cut off may still look like a zip file, because the weights in it are one each.
 
-    :raises ValueError: where SB3 only asserts that the file has all its parts
+    :raises ValueError: where SB3 only asserts that the file has all its parts, or takes one that
+        misses some for an old one of its own
     """
     try:
         yield
+    except KeyError as error:
+        if not isinstance(error.__context__, ValueError):
+            raise
+        raise ValueError(f"'{path}' does not fit this model: {error.__context__}") from error
     except AssertionError as error:
         if not re.match("No (data|params) found", str(error)):
             raise

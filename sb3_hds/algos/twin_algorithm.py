@@ -21,6 +21,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 
 from sb3_hds import twins
@@ -54,7 +55,6 @@ from sb3_hds.algos.selection import (
 )
 from sb3_hds.algos.twin_policy import TwinPolicy, all_finite
 from sb3_hds.core import Params, Twin
-from sb3_hds.effects import NeuralForce
 from sb3_hds.envs.mirror import check_mirrors, twin_of
 
 # Decay of what counts as recent in the pretraining, per epoch, and the fewest epochs to judge by.
@@ -347,6 +347,32 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         with damage_reported(path):
             return super().load(path, env, device_or_cpu(device), *args, **kwargs)
 
+    def get_parameters(self) -> dict[str, dict]:
+        """:return: by the object's name its tensors by theirs; objects that have some"""
+        return {name: tensors for name, tensors in super().get_parameters().items() if tensors}
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | dict[str, Any],
+        exact_match: bool = True,
+        device: Any = "auto",
+    ) -> None:
+        """
+        SB3's ``set_parameters``.
+
+        :param load_path_or_dict: of a file, or what ``get_parameters`` returned
+        :param exact_match: whether nothing may be missing
+        :param device: where to
+        :raises ValueError: for names of objects that this model does not have, or has and misses
+        :raises RuntimeError: for tensors that do not fit
+        """
+        given = load_path_or_dict
+        if not isinstance(given, dict):
+            _, given, _ = load_from_zip_file(given, device=device, load_data=False)
+        own, (names, _) = self.get_parameters(), self._get_torch_save_params()
+        empty: dict[str, Any] = {name: {} for name in names if name not in own}
+        super().set_parameters(empty | given, exact_match, device)
+
     def _setup_model(self) -> None:
         check_origin(type(self), self.saved_by)
         check_arguments(self)
@@ -485,16 +511,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         return super()._init_callback([Pretraining(progress_bar), *given], progress_bar)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        names = ["policy", "policy.optimizer"]
-        return [*names, "learned_force"] if self._learned_a_force else names, []
-
-    @property
-    def _learned_a_force(self) -> bool:
-        if self.twin is not None:
-            return bool(self.twin.tensors)
-        return any(
-            e["effect"] == NeuralForce.name for e in (self.twin_spec or {}).get("effects", [])
-        )
+        return ["policy", "policy.optimizer", "learned_force"], []
 
     def _excluded_save_params(self) -> list[str]:
         ours = [
