@@ -141,7 +141,7 @@ def ahead(group: pd.DataFrame) -> float:
 
 
 def closed(table: pd.DataFrame) -> pd.DataFrame:
-    """The share of each cell's gap that a method closes, over the seeds that all have."""
+    """The share of each cell's gap that a method closes, over the seeds that it was run with."""
     rows = []
     for cell, group in table.groupby("cell", sort=False):
         by_seed = group.pivot_table("return", "seed", ["method", "episodes"])
@@ -151,7 +151,9 @@ def closed(table: pd.DataFrame) -> pd.DataFrame:
         stderr = gaps.std(ddof=1) / np.sqrt(len(gaps)) if len(gaps) > 1 else np.nan
         for method, episodes in by_seed.columns:
             values = by_seed[method, episodes].dropna()
-            share = (values - by_seed["wrong_twin", 0]).mean() / gaps.mean()
+            paired = values.index.intersection(gaps.index)
+            gained = (values - by_seed["wrong_twin", 0])[paired]
+            share = gained.mean() / gaps[paired].mean()
             rows.append(
                 {
                     "cell": cell,
