@@ -426,6 +426,21 @@ def test_values_and_effects_survive_a_spec_through_wrappers():
     assert repr(back) == repr(twin)
 
 
+def test_an_effect_is_taken_away_again_and_the_rest_keeps_its_values():
+    base = Slider().with_parameters(mass=2.0)
+    one = base.extend(effects.ViscousFriction(b=0.3))
+    both = one.extend(Gain(k=0.5))
+
+    assert both.without("gain.push").to_spec() == one.to_spec()
+    assert both.without("gain.push", "viscous_friction.rail").to_spec() == base.to_spec()
+    seen = TransformedTwin(both, action=RescaleAction(-1.0, 1.0))
+    assert seen.without("gain.push").base.to_spec() == one.to_spec()
+    with pytest.raises(EffectError, match=r"no effect gain\.push attached"):
+        one.without("gain.push")
+    with pytest.raises(EffectError, match=r"no effect gain\.push attached"):
+        base.without("gain.push")
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -111,6 +111,23 @@ def test_suspected_effects_are_attached_once_the_twin_proves_inexact():
     assert found.error_calibrated < 0.6 * found.error_twin
 
 
+def test_what_was_suspected_and_explains_nothing_is_let_go(heavier):
+    twin = twins.make("PendulumReal")
+    suspected = ("coulomb_friction", "action_delay")
+
+    found = corrected(twin, heavier, suspected=suspected)
+
+    assert "action_delay.torque.delay" in [estimate.name for estimate in found.fit.estimates]
+    assert not found.attached and found.twin.structure() == twin.structure()
+    assert found.error_calibrated < 0.5 * found.error_twin
+
+    late = measured(twin.extend(effects.ActionDelay(0, delay=0.1)), noise=0.01)
+    found = corrected(twin, late, suspected=suspected)
+
+    assert found.attached == {"action_delay.torque.delay": 0.0}
+    assert found.twin.values["action_delay.torque.delay"] == pytest.approx(0.1, rel=0.1)
+
+
 def test_what_is_suspected_is_estimated_with_the_rest_and_travels(tmp_path):
     rubbing = twins.make("PendulumReal").extend(effects.CoulombFriction(0, tau_c=0.3))
     data = measured(rubbing, noise=0.01)

@@ -50,6 +50,8 @@ _SOLVER_STEPS = 20
 _NOTICEABLE = 0.1
 # A calibrated twin needs less proof than a learned force: it has few parameters, and a prior.
 _LEAST_OF_CALIBRATION = 0.02
+# A suspected effect stays where the error would be higher without it by this share.
+_LEAST_OF_SUSPECT = 0.01
 # Where held-out windows are of the same few recordings, values that the prior holds for so
 # improbable are not believed: a system that dry friction holds fast looks like a heavier one.
 _IMPROBABLE = 1e-3
@@ -68,7 +70,8 @@ class Wishes:
     :param residual_kwargs: further arguments of ``sysid.fit_residual``
     :param beta: share of rollouts in the learned model, or ``"auto"``
     :param seed: of whatever is drawn
-    :param suspected: effects that are attached, and estimated, once the twin proves inexact
+    :param suspected: effects that are estimated with the rest once the twin proves inexact, and
+        stay attached where they explain something
     """
 
     names: tuple[str, ...]
@@ -157,6 +160,7 @@ def correct(
 
     fit = _calibrated(nominal, twin, learned, origin, spread, wishes)
     calibrated, errors = _best(nominal, twin, fit, bare, now, shots, origin, spread, held)
+    calibrated, errors, added = _cleared(calibrated, errors, added, shots, spread, held)
     found = Correction(
         calibrated,
         0.0,
@@ -191,6 +195,31 @@ def _with_suspects(
         wishes, names=(*wishes.names, *added), nominal={**wishes.nominal, **added}
     )
     return nominal, twin, wishes, added
+
+
+def _cleared(
+    twin: Twin,
+    errors: np.ndarray,
+    added: Mapping[str, float],
+    shots: Shots,
+    spread: np.ndarray,
+    held: np.ndarray,
+) -> tuple[Twin, np.ndarray, dict[str, float]]:
+    """
+    What was suspected and explains nothing is let go, since simulating it costs time; it is
+    suspected again next time.
+
+    :return: the twin without those effects, its errors, and ``added`` without their parameters
+    """
+    left = dict(added)
+    for key in dict.fromkeys(name.rpartition(".")[0] for name in added):
+        own = {name: null for name, null in added.items() if name.startswith(f"{key}.")}
+        cleared = twin.with_parameters(**own)
+        without = window_errors(cleared, _without_force(cleared), shots, spread)
+        if gain(errors[held], without[held]) < _LEAST_OF_SUSPECT:
+            twin, errors = cleared.without(key), without
+            left = {name: null for name, null in left.items() if name not in own}
+    return twin, errors, left
 
 
 def _calibrated(

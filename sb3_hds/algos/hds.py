@@ -112,10 +112,10 @@ class HDS(TwinAlgorithm):
         ``"all"``, names, or None
     :param effects: attached to the twin, so that data can inform them: names from ``effects.ALL``
         (then at every joint or actuator), or effects
-    :param suspected: names of effects that are attached, at every joint or actuator, once data show
-        that the twin is not exact; only with ``calibrated="all"``. Dry friction is nowhere absent,
-        rarely in a simulation, and neither another parameter nor a learned force stands for it
-        well, see the documentation.
+    :param suspected: names of effects that are estimated, at every joint or actuator, once data
+        show that the twin is not exact, and stay where they explain something; only with
+        ``calibrated="all"``. Dry friction and late commands are rarely in a simulation, and neither
+        another parameter nor a learned force stands for them well, see the documentation.
     :param residual: whether a force is learned for what remains
     :param residual_kwargs: ``n_members``, ``net_arch``, ``caution``, see ``sysid.fit_residual``
     :param beta: share of rollouts in the model with the learned force, where that predicts held-out
@@ -186,7 +186,7 @@ class HDS(TwinAlgorithm):
         randomisation: float = 0.0,
         calibrated: str | Sequence[str] | None = "all",
         effects: Sequence[str | Effect] = (),
-        suspected: Sequence[str] = ("coulomb_friction",),
+        suspected: Sequence[str] = ("coulomb_friction", "action_delay"),
         residual: bool = True,
         residual_kwargs: dict[str, Any] | None = None,
         beta: float | str = "auto",

@@ -71,6 +71,18 @@ class ExtendedTwin(Twin):
             (a, a.effect) for a in self._simulated if isinstance(a.effect, SensorEffect)
         )
 
+    def without(self, *keys: str) -> Twin:
+        mine = {a.key: effect for a, effect in zip(self.attached, self.effects_with_values())}  # noqa: B905
+        unknown = [key for key in keys if key not in mine]
+        if unknown:
+            raise EffectError(
+                f"{self.name} has no effect {', '.join(unknown)} attached. "
+                f"It has: {', '.join(mine)}."
+            )
+        left = [effect for key, effect in mine.items() if key not in keys]
+        base = self._base_with_values()
+        return ExtendedTwin(base, *left) if left else base
+
     def at_interval(self, dt: float, substeps: int) -> "ExtendedTwin":
         base = self._base_with_values().at_interval(dt, substeps)
         return ExtendedTwin(base, *self.effects_with_values())

@@ -50,6 +50,10 @@ class TransformedTwin(Twin):
         base = self._base_with_values().extend(*effects)
         return TransformedTwin(base, observation=self.observation, action=self.action)
 
+    def without(self, *keys: str) -> "TransformedTwin":
+        base = self._base_with_values().without(*keys)
+        return TransformedTwin(base, observation=self.observation, action=self.action)
+
     def at_interval(self, dt: float, substeps: int) -> "TransformedTwin":
         base = self._base_with_values().at_interval(dt, substeps)
         return TransformedTwin(base, observation=self.observation, action=self.action)

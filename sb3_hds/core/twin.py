@@ -25,7 +25,7 @@ from sb3_hds.core.types import (
     Tangent,
     Velocity,
 )
-from sb3_hds.errors import ParameterError
+from sb3_hds.errors import EffectError, ParameterError
 
 if TYPE_CHECKING:
     from sb3_hds.core.effect import Effect
@@ -153,6 +153,16 @@ class Twin(abc.ABC):
         from sb3_hds.core.extended import ExtendedTwin
 
         return ExtendedTwin(self, *effects)
+
+    def without(self, *keys: str) -> "Twin":
+        """
+        :param keys: of attached effects, for example ``"viscous_friction.hinge"``
+        :return: this twin without them
+        :raises EffectError: if one is not attached
+        """
+        if keys:
+            raise EffectError(f"{self.name} has no effect {', '.join(keys)} attached.")
+        return self
 
     @classmethod
     def from_env(cls: type[_Twin], env: Any) -> _Twin:
