@@ -62,13 +62,25 @@ def _parameters(function: Any) -> dict[str, inspect.Parameter]:
     return dict(inspect.signature(function).parameters)
 
 
+def parameters_of(algorithm: Any) -> dict[str, inspect.Parameter]:
+    """:return: of its constructor, and of those to which that passes on what it does not know"""
+    found: dict[str, inspect.Parameter] = {}
+    for base in algorithm.__mro__:
+        if "__init__" not in vars(base):
+            continue
+        own = _parameters(base.__init__)
+        found = {**own, **found}
+        if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in own.values()):
+            break
+    passed_on = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+    return {name: p for name, p in found.items() if p.kind not in passed_on}
+
+
 def _refuse_unknown(algorithm: Any, hyperparams: dict[str, Any], also: Iterable[str] = ()) -> None:
-    parameters = _parameters(algorithm.__init__)
-    unknown = sorted(set(hyperparams) - set(parameters) - set(also))
-    takes_any = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values())
-    if takes_any or not unknown:
+    known = [name for name in parameters_of(algorithm) if name != "self"]
+    unknown = sorted(set(hyperparams) - set(known) - set(also))
+    if not unknown:
         return
-    known = [name for name in parameters if name != "self"]
     close = difflib.get_close_matches(unknown[0], known, n=1)
     hint = f" Did you mean '{close[0]}'?" if close else ""
     raise TypeError(

@@ -53,11 +53,87 @@ def convert_planner_params(sampled_params: Params) -> Params:
     }
 
 
+def sample_model_free_params(
+    trial: Any, n_actions: int, n_envs: int, additional_args: Params
+) -> Params:
+    """
+    Sampler of what all model-free algorithms share.
+
+    :param trial: an Optuna trial
+    :param n_actions: unused, as are the next two: the zoo calls every sampler with them
+    :return: hyperparameters
+    """
+    trial.suggest_float("one_minus_gamma", 1e-3, 0.1, log=True)
+    trial.suggest_float("learning_rate", 1e-5, 2e-3, log=True)
+    trial.suggest_int("batch_size_pow", 5, 9)
+    trial.suggest_int("learning_starts", 100, 10_000, log=True)
+    trial.suggest_int("gradient_steps_pow", 0, 4)
+    trial.suggest_categorical("policy_delay", [1, 2, 3, 10, 20])
+    trial.suggest_categorical("net_arch", list(_NET_ARCHS))
+    return convert_model_free_params(trial.params)
+
+
+def convert_model_free_params(sampled_params: Params) -> Params:
+    """
+    :param sampled_params: ``trial.params`` of a trial of :func:`sample_model_free_params`
+    :return: hyperparameters
+    """
+    params = dict(sampled_params)
+    return {
+        "gamma": 1 - params.pop("one_minus_gamma"),
+        "batch_size": 2 ** params.pop("batch_size_pow"),
+        "gradient_steps": 2 ** params.pop("gradient_steps_pow"),
+        "policy_kwargs": {"net_arch": list(_NET_ARCHS[params.pop("net_arch")])},
+        **params,
+    }
+
+
+def sample_soft_params(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+    """Sampler of the SAC family: also how fast target networks follow."""
+    trial.suggest_float("tau", 1e-3, 0.08, log=True)
+    return sample_model_free_params(trial, n_actions, n_envs, additional_args)
+
+
+def sample_gsde_params(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+    """Sampler of gSDE-SAC: also when the noise matrix is drawn, and where its size starts."""
+    trial.suggest_categorical("train_freq", [4, 8, 16, 64])
+    trial.suggest_float("log_std_init", -4.0, 0.0)
+    trial.suggest_float("tau", 1e-3, 0.08, log=True)
+    trial.suggest_float("one_minus_gamma", 1e-3, 0.1, log=True)
+    trial.suggest_float("learning_rate", 1e-5, 2e-3, log=True)
+    trial.suggest_int("batch_size_pow", 5, 9)
+    trial.suggest_int("learning_starts", 100, 10_000, log=True)
+    trial.suggest_int("gradient_steps_pow", 0, 6)
+    trial.suggest_categorical("net_arch", list(_NET_ARCHS))
+    return convert_gsde_params(trial.params)
+
+
+def convert_gsde_params(sampled_params: Params) -> Params:
+    """
+    :param sampled_params: ``trial.params`` of a trial of :func:`sample_gsde_params`
+    :return: hyperparameters
+    """
+    others = {name: value for name, value in sampled_params.items() if name != "log_std_init"}
+    params = convert_model_free_params(others)
+    params["policy_kwargs"]["log_std_init"] = sampled_params["log_std_init"]
+    return params
+
+
+_SOFT = ("droq", "tqc_jax", "simba", "bro")
+
 SAMPLERS: dict[str, Callable[[Any, int, int, Params], Params]] = {
     "pods": sample_planner_params,
     "hds": sample_planner_params,
+    "gsde_sac": sample_gsde_params,
+    "crossq_jax": sample_model_free_params,
+    "td7": sample_model_free_params,
+    **dict.fromkeys(_SOFT, sample_soft_params),
 }
 CONVERTERS: dict[str, Callable[[Params], Params]] = {
     "pods": convert_planner_params,
     "hds": convert_planner_params,
+    "gsde_sac": convert_gsde_params,
+    "crossq_jax": convert_model_free_params,
+    "td7": convert_model_free_params,
+    **dict.fromkeys(_SOFT, convert_model_free_params),
 }

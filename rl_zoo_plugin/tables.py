@@ -9,7 +9,17 @@ from typing import Any
 
 from rl_zoo_plugin.lazy import LazyAlgorithm
 
-ALGORITHMS = {"pods": "PODS", "hds": "HDS"}
+ALGORITHMS = {
+    "pods": "PODS",
+    "hds": "HDS",
+    "gsde_sac": "GSDESAC",
+    "droq": "DroQ",
+    "crossq_jax": "CrossQ",
+    "tqc_jax": "TQC",
+    "simba": "SimbaSAC",
+    "td7": "TD7",
+    "bro": "BRO",
+}
 """Id in the zoo (lower case, as it names a folder) to public name in ``sb3_hds``."""
 
 

@@ -12,15 +12,22 @@ from sb3_hds.envs.registration import register_environments
 
 if TYPE_CHECKING:
     from sb3_hds import data, effects, envs, planning, sysid, twins, wrappers
-    from sb3_hds.algos import HDS, PODS
+    from sb3_hds.algos import BRO, GSDESAC, HDS, PODS, TD7, TQC, CrossQ, DroQ, SimbaSAC
     from sb3_hds.data import Trajectories, audit
     from sb3_hds.sysid import calibrate, diagnose
 
     __version__: str
 
 __all__ = [
+    "BRO",
+    "GSDESAC",
     "HDS",
     "PODS",
+    "TD7",
+    "TQC",
+    "CrossQ",
+    "DroQ",
+    "SimbaSAC",
     "Trajectories",
     "audit",
     "calibrate",
@@ -35,8 +42,15 @@ __all__ = [
 ]
 
 _CLASSES = {
+    "BRO": "algos",
+    "CrossQ": "algos",
+    "DroQ": "algos",
+    "GSDESAC": "algos",
     "HDS": "algos",
     "PODS": "algos",
+    "SimbaSAC": "algos",
+    "TD7": "algos",
+    "TQC": "algos",
     "Trajectories": "data",
     "audit": "data",
     "calibrate": "sysid",

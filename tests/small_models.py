@@ -4,6 +4,7 @@ import io
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import KVWriter, Logger
@@ -27,15 +28,36 @@ _PLANNING = {
     "buffer_size": 500,
     "policy_kwargs": {"net_arch": [8]},
 }
+_MODEL_FREE = {
+    "learning_starts": 10,
+    "train_freq": 5,
+    "gradient_steps": 2,
+    "batch_size": 16,
+    "buffer_size": 500,
+    "policy_kwargs": {"net_arch": [8]},
+}
 #: an algorithm is tested as soon as it has an entry here, under its id in ``algos.ALL``
 SMALL: dict[str, dict[str, Any]] = {
     "pods": _PLANNING,
     "hds": _PLANNING | {"residual_kwargs": {"n_members": 2, "net_arch": [4]}},
+    "gsde_sac": _MODEL_FREE,
+    "droq": _MODEL_FREE,
+    "crossq_jax": _MODEL_FREE,
+    "tqc_jax": _MODEL_FREE | {"policy_kwargs": {"net_arch": [8], "n_quantiles": 5}},
+    "simba": _MODEL_FREE,
+    "td7": _MODEL_FREE
+    | {"use_checkpoints": False, "policy_kwargs": {"net_arch": [8], "embedding_size": 8}},
+    "bro": _MODEL_FREE | {"policy_kwargs": {"net_arch": [8], "n_quantiles": 5}},
 }
 
 NAMES = list(algos.ALL)
 #: the algorithms that plan in a twin
 PLANNERS = [name for name in NAMES if issubclass(algos.ALL[name], TwinAlgorithm)]
+#: all, those of one family but for one only among the expensive tests
+QUICK_NAMES = [
+    name if name in (*PLANNERS, "droq") else pytest.param(name, marks=pytest.mark.expensive)
+    for name in NAMES
+]
 
 
 def small(name: str, env: Any = "Pendulum-v1", **changes: Any) -> BaseAlgorithm:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch as th
 from point_mass import linear_controller, point_mass_env, returns_of
-from small_models import NAMES, SMALL, logged, small, steps_of
+from small_models import NAMES, PLANNERS, QUICK_NAMES, SMALL, logged, small, steps_of
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -26,6 +26,8 @@ from sb3_hds import algos
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 every_algorithm = pytest.mark.parametrize("name", NAMES)
+quick_algorithms = pytest.mark.parametrize("name", QUICK_NAMES)
+every_planner = pytest.mark.parametrize("name", PLANNERS)
 
 #: what it takes to learn PointMass in seconds
 LEARNING = {
@@ -38,8 +40,31 @@ LEARNING = {
         "learning_rate": 5e-3,
         "policy_kwargs": {"net_arch": [16]},
     }
-    for name in ("pods", "hds")
+    for name in PLANNERS
+} | {
+    name: {
+        "learning_rate": 3e-3,
+        "gradient_steps": 5,
+        "train_freq": 5,
+        "learning_starts": 100,
+        "gamma": 0.95,
+        "batch_size": 64,
+        "policy_kwargs": {"net_arch": [32, 32]},
+    }
+    for name in NAMES
+    if name not in PLANNERS
 }
+LEARNING["td7"] |= {
+    "use_checkpoints": False,
+    "target_update_interval": 25,
+    "policy_kwargs": {"net_arch": [32, 32], "embedding_size": 32},
+}
+LEARNING["tqc_jax"]["policy_kwargs"]["n_quantiles"] = 10
+LEARNING["bro"]["policy_kwargs"]["n_quantiles"] = 10
+# What SimBa has seen so far changes what it sees, so it starts later and takes longer.
+LEARNING["simba"] |= {"learning_rate": 1e-3, "learning_starts": 500, "gradient_steps": 10}
+#: real steps that it takes; planners need none
+LEARNING_STEPS = {name: 0 if name in PLANNERS else 1_500 for name in NAMES} | {"simba": 2_500}
 
 
 class Watching(BaseCallback):
@@ -97,17 +122,19 @@ def test_the_environment_may_be_given_alone_or_in_stable_baselines_order(name, f
     assert model.observation_space.shape == (3,)
 
 
-@every_algorithm
+@quick_algorithms
 def test_it_learns_a_task_that_a_linear_controller_solves(name):
     idle = returns_of(lambda obs: np.zeros(1, np.float32)).mean()
     best = returns_of(linear_controller()).mean()
     model = small(name, point_mass_env(), **LEARNING[name])
 
-    model.learn(0)
+    model.learn(LEARNING_STEPS[name])
 
     learned = returns_of(lambda obs: model.predict(obs, deterministic=True)[0]).mean()
-    # Seen over three seeds: 98 to 99.7 % of the way from doing nothing to the optimum.
-    assert learned > best - 0.1 * (best - idle)
+    # Seen over three seeds of the planners: 98 to 99.7 % of the way from doing nothing to the
+    # optimum; of the others, which need real steps for it, 78 to 98 % with one or two seeds.
+    missed = 0.1 if name in PLANNERS else 0.5
+    assert learned > best - missed * (best - idle)
 
 
 @every_algorithm
@@ -156,11 +183,15 @@ def test_one_observation_gives_one_action_and_a_batch_gives_a_batch(name):
 
 @every_algorithm
 def test_actions_stay_within_asymmetric_bounds_of_double_precision(name):
-    model = small(name, point_mass_env(np.float64))
+    # gSDE would keep the mean of its actions within this.
+    unclipped = {"clip_mean": 0.0} if name == "gsde_sac" else {}
+    kwargs = {"policy_kwargs": SMALL[name]["policy_kwargs"] | unclipped}
+    model = small(name, point_mass_env(np.float64), **kwargs)
     parameters = model.get_parameters()
-    # Large weights drive the policy to its bounds, both of them over many observations.
+    # Large weights drive the policy to its bounds, both of them over many observations, as long as
+    # no large bias decides alone.
     parameters["policy"] = {
-        key: t if "inside" in key else 50.0 * th.randn_like(t)
+        key: 50.0 * th.randn_like(t) if key.endswith("kernel") else t
         for key, t in parameters["policy"].items()
     }
     model.set_parameters(parameters)
@@ -278,7 +309,7 @@ def test_environments_in_other_processes_are_stepped_together():
     assert model.num_timesteps == 50
 
 
-@every_algorithm
+@every_planner
 @pytest.mark.parametrize("options", [{}, {"norm_obs": False}, {"norm_reward": False}])
 def test_a_policy_learns_and_acts_in_a_normalised_environment(name, options):
     idle = returns_of(lambda obs: np.zeros(1, np.float32)).mean()

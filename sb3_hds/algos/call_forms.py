@@ -3,7 +3,7 @@
 import math
 import numbers
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -60,30 +60,36 @@ _CHOICES = {
 }
 
 
-def policy_and_env(policy: Any, env: Any, aliases: Mapping[str, Any]) -> tuple[Any, Any]:
+def policy_and_env(
+    policy: Any,
+    env: Any,
+    aliases: Mapping[str, Any],
+    check: Callable[[spaces.Space], None],
+) -> tuple[Any, Any]:
     """
     A lone environment, or a lone string that names no policy, is the environment:
     ``HDS("Pendulum-v1")`` means ``HDS("MlpPolicy", "Pendulum-v1")``.
 
+    :param check: raises for observations that the algorithm cannot use
     :return: policy and environment in SB3's order; the environment made, if it was a string
-    :raises EnvironmentMismatchError: for observations that no twin has
+    :raises EnvironmentMismatchError: for observations that the algorithm cannot use
     """
     if env is None and (
         isinstance(policy, gym.Env | VecEnv) or (isinstance(policy, str) and policy not in aliases)
     ):
-        policy, env = "MlpPolicy", policy
+        policy, env = None, policy
     if env is None:
         return policy, None
     env = maybe_make_env(env, 0)
-    check_observations(env)
-    return policy, env
+    check(env.observation_space)
+    of_several = isinstance(env.observation_space, spaces.Dict)
+    return policy or ("MultiInputPolicy" if of_several else "MlpPolicy"), env
 
 
-def check_observations(env: gym.Env | VecEnv) -> None:
+def check_twin_observes(space: spaces.Space) -> None:
     """
     :raises EnvironmentMismatchError: for dictionaries, images and whatever else no twin has
     """
-    space = env.observation_space
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise EnvironmentMismatchError(
             f"A twin observes a Box with one axis, and this environment observes {space}. Use one "
@@ -129,24 +135,24 @@ def check_arguments(model: "TwinAlgorithm") -> None:
 
 def _broken_rules(model: "TwinAlgorithm") -> Iterator[tuple[str, str]]:
     for name, least in _AT_LEAST.items():
-        if hasattr(model, name) and not _is_count(
+        if hasattr(model, name) and not is_count(
             getattr(model, name), least, may_be_none=name in _DERIVED
         ):
             yield name, f"a whole number of at least {least}" + " or None" * (name in _DERIVED)
     for name in _SHARES:
-        if not _between(getattr(model, name), 0.0, 1.0):
+        if not between(getattr(model, name), 0.0, 1.0):
             yield name, "a number from 0 to 1"
     for name in ("temperature", "exploration_noise", "least_gain", "randomisation"):
-        if not _between(getattr(model, name), 0.0, math.inf):
+        if not between(getattr(model, name), 0.0, math.inf):
             yield name, "a finite number of at least 0"
-    if not (_between(model.gamma, 0.0, 1.0) and model.gamma > 0.0):
+    if not (between(model.gamma, 0.0, 1.0) and model.gamma > 0.0):
         yield "gamma", "a number above 0 and at most 1"
     for name in ("learning_rate", "value_learning_rate"):
         rate = getattr(model, name)
-        if isinstance(rate, numbers.Real) and not _between(rate, 0.0, math.inf):
+        if isinstance(rate, numbers.Real) and not between(rate, 0.0, math.inf):
             yield name, "a finite number of at least 0, or a schedule"
     beta, kwargs = getattr(model, "beta", "auto"), getattr(model, "residual_kwargs", None)
-    if beta != "auto" and not _between(beta, 0.0, 1.0):
+    if beta != "auto" and not between(beta, 0.0, 1.0):
         yield "beta", "'auto' or a number from 0 to 1"
     if not set(kwargs or ()) <= set(_OF_RESIDUAL):
         yield "residual_kwargs", f"a dictionary with some of {', '.join(_OF_RESIDUAL)}"
@@ -155,13 +161,15 @@ def _broken_rules(model: "TwinAlgorithm") -> Iterator[tuple[str, str]]:
             yield name, f"one of {', '.join(map(repr, choices))}"
 
 
-def _is_count(value: Any, least: int, may_be_none: bool) -> bool:
+def is_count(value: Any, least: int, may_be_none: bool = False) -> bool:
+    """:return: whether it is a whole number of at least ``least``"""
     if value is None:
         return may_be_none
     return isinstance(value, int | np.integer) and int(value) >= least
 
 
-def _between(value: Any, low: float, high: float) -> bool:
+def between(value: Any, low: float, high: float) -> bool:
+    """:return: whether it is a finite number from ``low`` to ``high``"""
     if not isinstance(value, numbers.Real):
         return False
     return low <= float(value) <= high and math.isfinite(value)

@@ -6,31 +6,25 @@ SB3 collects real steps and calls ``train``; a call of ``train`` is one planning
 in, nothing else; simulated steps are counted apart.
 """
 
-import io
 import math
-import pathlib
-from collections.abc import Iterable
 from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
-from sbx.common.off_policy_algorithm import OffPolicyAlgorithmJax
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 
 from sb3_hds import twins
 from sb3_hds.algos.arguments import knobs_of, settings_of
 from sb3_hds.algos.call_forms import (
     check_arguments,
-    check_origin,
     check_policy,
-    device_or_cpu,
+    check_twin_observes,
     jax_device,
     policy_and_env,
 )
@@ -46,13 +40,14 @@ from sb3_hds.algos.learner import (
 from sb3_hds.algos.log import record_epoch
 from sb3_hds.algos.model import check_reward, required, twin_from_spec
 from sb3_hds.algos.normalisation import prepare_statistics, view_of
-from sb3_hds.algos.persistence import Tensors, damage_reported, write_whole
+from sb3_hds.algos.persistence import Tensors
 from sb3_hds.algos.pretraining import Pretraining
 from sb3_hds.algos.selection import (
     choose_policy,
     compile_together,
     twin_steps_per_comparison,
 )
+from sb3_hds.algos.tensor_algorithm import TensorAlgorithm
 from sb3_hds.algos.twin_policy import TwinPolicy, all_finite
 from sb3_hds.core import Params, Twin
 from sb3_hds.envs.mirror import check_mirrors, twin_of
@@ -62,13 +57,12 @@ _RECENT = 0.9
 _FEWEST_EPOCHS = 20
 
 
-class TwinAlgorithm(OffPolicyAlgorithmJax):
+class TwinAlgorithm(TensorAlgorithm):
     """
     Abstract: what PODS and HDS share. Arguments are documented there.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": TwinPolicy}
-    default_timesteps: ClassVar[int] = 1_000
     policy: TwinPolicy
 
     def __init__(
@@ -125,7 +119,9 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         monitor_wrapper: bool,
         _init_setup_model: bool,
     ) -> None:
-        policy_class, made_env = policy_and_env(policy, env, self.policy_aliases)
+        policy_class, made_env = policy_and_env(
+            policy, env, self.policy_aliases, check_twin_observes
+        )
         check_policy(type(self), policy_class)
         super().__init__(
             policy=policy_class,
@@ -220,15 +216,8 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         :param reset_num_timesteps: False goes on counting
         :param progress_bar: show one for planning and one for acting
         """
-        if total_timesteps is None:
-            total_timesteps = self.default_timesteps
         return super().learn(
-            total_timesteps,
-            callback,
-            log_interval,  # type: ignore[arg-type]
-            tb_log_name or type(self).__name__,
-            reset_num_timesteps,
-            progress_bar,
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
         )
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
@@ -245,19 +234,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """
-        :raises ValueError: for a measurement that is not finite; the steps before it are kept, and
-            the next call of ``learn`` resets the environment
-        """
         self.unstored_step = None
-        ends = [info["terminal_observation"] for info in infos if "terminal_observation" in info]
-        if not all(np.isfinite(measured).all() for measured in (new_obs, reward, *ends)):
-            self._last_obs = None
-            raise ValueError(
-                f"Step {self.num_timesteps} of the environment is not finite: observation "
-                f"{new_obs}, reward {reward}. The model and the steps before are as they were: "
-                "mend the sensor, then learn(..., reset_num_timesteps=False)."
-            )
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self.real_timesteps += self.n_envs
 
@@ -307,75 +284,7 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
             self.env, self.n_envs, self._vec_normalize_env, self._last_obs = before
             raise
 
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
-        """
-        Write a zip file as SB3 does, whole or not at all.
-
-        :param path: of the file; ``.zip`` is appended where it has no suffix
-        :param exclude: attributes to leave out besides the usual ones
-        :param include: attributes to write although they are usually left out
-        :raises OSError: if the file cannot be written; an older one is then left as it was
-        """
-        write = super().save
-        write_whole(path, "zip", lambda file: write(file, exclude, include))
-
-    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
-        write_whole(path, "pkl", super().save_replay_buffer)
-
-    @classmethod
-    def load(
-        cls,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
-        device: Any = "auto",
-        *args: Any,
-        **kwargs: Any,
-    ) -> Self:
-        """
-        SB3's ``load``.
-
-        :param path: of a file that this class saved
-        :param env: to go on training in; none is needed to predict
-        :param device: where to; ``"cuda"`` means the CPU where there is none, with a warning
-        :raises ValueError: for a damaged file, or one that another algorithm saved
-        """
-        with damage_reported(path):
-            return super().load(path, env, device_or_cpu(device), *args, **kwargs)
-
-    def get_parameters(self) -> dict[str, dict]:
-        """:return: by the object's name its tensors by theirs; objects that have some"""
-        return {name: tensors for name, tensors in super().get_parameters().items() if tensors}
-
-    def set_parameters(
-        self,
-        load_path_or_dict: str | dict[str, Any],
-        exact_match: bool = True,
-        device: Any = "auto",
-    ) -> None:
-        """
-        SB3's ``set_parameters``.
-
-        :param load_path_or_dict: of a file, or what ``get_parameters`` returned
-        :param exact_match: whether nothing may be missing
-        :param device: where to
-        :raises ValueError: for names of objects that this model does not have, or has and misses
-        :raises RuntimeError: for tensors that do not fit
-        """
-        given = load_path_or_dict
-        if not isinstance(given, dict):
-            _, given, _ = load_from_zip_file(given, device=device, load_data=False)
-        own, (names, _) = self.get_parameters(), self._get_torch_save_params()
-        empty: dict[str, Any] = {name: {} for name in names if name not in own}
-        super().set_parameters(empty | given, exact_match, device)
-
     def _setup_model(self) -> None:
-        check_origin(type(self), self.saved_by)
-        check_arguments(self)
         super()._setup_model()
         device = jax_device(self._device_name)
         self.policy = self.policy_class(  # type: ignore[assignment]
@@ -385,6 +294,9 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         self.policy.build(jax.random.key(seed, impl=GENERATOR), device)
         self._workspace = None
         self._setup_twin()
+
+    def check_arguments(self) -> None:
+        check_arguments(self)
 
     def _setup_twin(self) -> None:
         """The twin that was passed, or saved because it had been, or the environment's own."""
@@ -511,15 +423,13 @@ class TwinAlgorithm(OffPolicyAlgorithmJax):
         return super()._init_callback([Pretraining(progress_bar), *given], progress_bar)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "policy.optimizer", "learned_force"], []
+        names, variables = super()._get_torch_save_params()
+        return [*names, "learned_force"], variables
 
     def _excluded_save_params(self) -> list[str]:
         ours = [
-            "policy",
             "twin",
-            "key",
             "_workspace",
-            "_device_name",
             "unstored_step",
             "learned_force",
         ]

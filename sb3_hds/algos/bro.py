@@ -1,0 +1,244 @@
+"""BRO: large regularised critics, and an optimistic actor that explores."""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, ClassVar, cast
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_hds.algos.bodies import BroBody
+from sb3_hds.algos.gaussian_policy import GaussianPolicy
+from sb3_hds.algos.off_policy import (
+    Batch,
+    Knobs,
+    Learner,
+    Optimizer,
+    Recipe,
+    Trained,
+    Weights,
+    act,
+    average,
+    judge,
+    mean,
+    quantile_huber,
+)
+from sb3_hds.algos.soft_actor_critic import SoftActorCritic
+
+# Steps of the environment at which the authors' networks start afresh: with the full replay ratio,
+# and with the fast one of 2.
+_RESETS = (15_000, 50_000, 250_000, 500_000, 750_000, 1_000_000, 1_500_000, 2_000_000)
+_FAST, _FAST_RESETS = 2, _RESETS[:1]
+_INITIAL_OPTIMISM, _INITIAL_REGULARIZER = 1.0, 0.25
+_MULTIPLIER_RATE = 3e-5
+_LOG_LIMITS = (-10.0, 7.5)
+
+
+class BroPolicy(GaussianPolicy):
+    """
+    BroNets of the paper's widths. Where it explores, it acts by the optimistic actor, where it does
+    not, by the other one.
+    """
+
+    defaults = {
+        "net_arch": {"pi": (256,), "qf": (512, 512)},
+        "optimizer_class": "adamw",
+        "optimizer_kwargs": {"weight_decay": 1e-4},
+        "normalize_observations": False,
+    }
+
+    def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
+        return BroBody(net_arch, self.activation_fn)
+
+    def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
+        return BroBody(net_arch, self.activation_fn)
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
+        if deterministic or self.use_sde:
+            return super()._predict(observation, deterministic)
+        obs, learner = self.flatten(observation), self.learner
+        noise = self._noise.standard_normal((len(obs), self.n_act), np.float32)
+        weights = learner.actor.weights, learner.extra["actor"].weights
+        optimist = cast(Optimist, self.recipe.extra)
+        return np.asarray(_explored(self.actor_network, optimist, *weights, obs, noise))
+
+
+class BRO(SoftActorCritic):
+    """
+    Bigger, regularised, optimistic: BroNet critics with 100 quantiles, whose **mean** is what both
+    targets and actor go by, a second actor that explores where the critics disagree, and networks
+    that start afresh.
+
+    Source: Nauman et al., *Bigger, Regularized, Optimistic: scaling for compute and
+    sample-efficient continuous control*, NeurIPS 2024: replay ratio 10 (``gradient_steps=2`` is
+    their fast variant), batches of 128, AdamW with 3e-4, target entropy of minus half the number of
+    controls. The spread of actions is a clipped exponential, as in SB3; the authors squash it.
+
+    :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
+    :param env: likewise
+    :param gradient_steps: updates per call of ``train``
+    :param batch_size: transitions per update
+    :param kl_target: divergence of the optimistic actor from the other one, per control
+    :param std_multiplier: its standard deviation, in units of the other one's
+    :param param_resets: steps at which all networks start afresh; None: the paper's, of which only
+        the first with ``gradient_steps`` of at most 2; ``[]``: never
+    :param policy_kwargs: ``n_quantiles`` is 100 unless given
+    :param arguments: those of ``SoftActorCritic``
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": BroPolicy,
+        "MultiInputPolicy": BroPolicy,
+    }
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
+        env: GymEnv | str | None = None,
+        *,
+        gradient_steps: int = 10,
+        batch_size: int = 128,
+        kl_target: float = 0.05,
+        std_multiplier: float = 0.75,
+        param_resets: list[int] | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        **arguments: Any,
+    ) -> None:
+        self.kl_target, self.std_multiplier = kl_target, std_multiplier
+        if param_resets is None:
+            param_resets = list(_FAST_RESETS if 0 <= gradient_steps <= _FAST else _RESETS)
+        super().__init__(
+            policy,
+            env,
+            gradient_steps=gradient_steps,
+            batch_size=batch_size,
+            param_resets=param_resets,
+            policy_kwargs={"n_quantiles": 100, **(policy_kwargs or {})},
+            **arguments,
+        )
+
+    def auto_target_entropy(self) -> float:
+        return -0.5 * self.policy.n_act
+
+    def recipe(self) -> Recipe:
+        policy = self.policy
+        actor = cast(Any, policy.actor_network)
+        widths = actor.body.net_arch
+        optimist = Optimist(
+            network=Shift(BroBody(widths, policy.activation_fn), policy.n_act),
+            optimizer=policy.optimizers[0],
+            kl_target=self.kl_target,
+            std_multiplier=self.std_multiplier,
+        )
+        return dataclasses.replace(
+            super().recipe(),
+            target_of=average,
+            error=quantile_huber,
+            worth=mean,
+            extra=optimist,
+        )
+
+
+class Shift(nn.Module):
+    """
+    How far the optimistic actor's mean is from the other one's.
+
+    :param body: see ``bodies.py``
+    :param n_act: number of controls
+    """
+
+    body: nn.Module
+    n_act: int
+
+    @nn.compact
+    def __call__(
+        self, obs: Float[Array, "*batch obs"], mean: Float[Array, "*batch act"]
+    ) -> Float[Array, "*batch act"]:
+        latent = self.body(jnp.concatenate([obs, mean], -1), False)
+        small = nn.initializers.orthogonal(0.01)
+        return nn.Dense(self.n_act, use_bias=False, kernel_init=small)(latent)
+
+
+@dataclasses.dataclass(frozen=True)
+class Optimist:
+    r"""
+    The actor that explores: it climbs :math:`Q_\mu + \beta\, Q_\sigma`, mean and half difference of
+    the critics, and pays :math:`\tau` for its divergence from the other actor. Both multipliers
+    follow the divergence that is aimed at (section 3 of the paper).
+
+    :param network: a ``Shift``
+    :param optimizer: of the shift
+    :param kl_target: divergence, per control
+    :param std_multiplier: its standard deviation, in units of the other one's
+    """
+
+    network: nn.Module
+    optimizer: Optimizer
+    kl_target: float
+    std_multiplier: float
+
+    def init(self, actor: Weights, obs: Array, key: PRNGKeyArray) -> Any:
+        n_act = cast(Any, self.network).n_act
+        weights = self.network.init(key, obs, jnp.zeros((1, n_act)))
+        multipliers = {"optimism": _INITIAL_OPTIMISM, "regularizer": _INITIAL_REGULARIZER}
+        fresh = {name: {"params": jnp.log(start)} for name, start in multipliers.items()}
+        return {"actor": Trained(weights, self.optimizer.init(weights["params"]))} | {
+            name: Trained(log, _MULTIPLIER.init(log["params"])) for name, log in fresh.items()
+        }
+
+    def update(
+        self, recipe: Recipe, learner: Learner, batch: Batch, knobs: Knobs, key: PRNGKeyArray
+    ) -> Any:
+        act_key, judge_key = jax.random.split(key)
+        state = learner.extra
+        gaussian, _ = act(recipe.actor, learner.actor.weights, batch.obs)
+        values = {n: jnp.exp(state[n].weights["params"]) for n in ("optimism", "regularizer")}
+        noise = jax.random.normal(act_key, gaussian.mean.shape)
+
+        def loss(params: Any) -> tuple[Array, Array]:
+            shift = cast(Array, self.network.apply({"params": params}, batch.obs, gaussian.mean))
+            std = self.std_multiplier * gaussian.std
+            action = jnp.tanh(gaussian.mean + shift + std * noise)
+            worth, _ = judge(recipe, learner.critic.weights, batch.obs, action, judge_key)
+            apart = 0.5 * (worth.max(0) - worth.min(0))
+            upper = worth.mean(0) + values["optimism"] * apart
+            divergence = jnp.mean(jnp.sum(shift**2 / (2.0 * gaussian.std**2), -1))
+            return values["regularizer"] * divergence - upper.mean(), divergence
+
+        gradient = jax.value_and_grad(loss, has_aux=True)
+        (_, divergence), slope = gradient(state["actor"].weights["params"])
+        excess = divergence / gaussian.mean.shape[-1] - self.kl_target
+        return {
+            "actor": self.optimizer.apply(slope, state["actor"], knobs.learning_rate),
+            "optimism": _limited(state["optimism"], values["optimism"] * excess),
+            "regularizer": _limited(state["regularizer"], -values["regularizer"] * excess),
+        }
+
+
+def _limited(multiplier: Trained, slope: Array) -> Trained:
+    moved = _MULTIPLIER.apply(slope, multiplier, _MULTIPLIER_RATE)
+    return moved._replace(weights={"params": jnp.clip(moved.weights["params"], *_LOG_LIMITS)})
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _explored(
+    actor: nn.Module,
+    optimist: Optimist,
+    weights: Weights,
+    shift_weights: Weights,
+    obs: Any,
+    noise: Any,
+) -> jax.Array:
+    gaussian, _ = act(actor, weights, obs)
+    shift = cast(Array, optimist.network.apply(shift_weights, obs, gaussian.mean))
+    return jnp.tanh(gaussian.mean + shift + optimist.std_multiplier * gaussian.std * noise)
+
+
+_MULTIPLIER = Optimizer(optax.adam, (("b1", 0.5),))

@@ -1,0 +1,47 @@
+"""CrossQ: batch normalisation in the place of target networks."""
+
+from typing import Any, ClassVar
+
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from sb3_hds.algos.gaussian_policy import CrossQPolicy
+from sb3_hds.algos.soft_actor_critic import SoftActorCritic
+
+
+class CrossQ(SoftActorCritic):
+    """
+    Batch normalisation in deep reinforcement learning: one pass of the critics over current and
+    next pairs of state and action, and no target networks.
+
+    Source: Bhatt et al., *CrossQ: Batch Normalization in Deep Reinforcement Learning for Greater
+    Sample Efficiency and Simplicity*, ICLR 2024: critics of width 2048, Adam with b1 = 0.5,
+    learning rate 1e-3, three updates of the critics for each of the actor, 5,000 random steps.
+    Batch normalisation becomes batch renormalisation after 100,000 updates, as in the authors' code
+    (``policy_kwargs={"renorm_after": ...}``). SBX's default width is 1024, and its
+    learning rate never changes; here, schedules act.
+
+    :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
+    :param env: likewise
+    :param learning_rate: of actor, entropy coefficient and critics
+    :param policy_delay: updates of the critics for each of the actor
+    :param arguments: those of ``SoftActorCritic``; ``tau`` has no meaning here
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": CrossQPolicy,
+        "MultiInputPolicy": CrossQPolicy,
+    }
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
+        env: GymEnv | str | None = None,
+        *,
+        learning_rate: float | str | Schedule = 1e-3,
+        policy_delay: int = 3,
+        **arguments: Any,
+    ) -> None:
+        super().__init__(
+            policy, env, learning_rate=learning_rate, policy_delay=policy_delay, **arguments
+        )

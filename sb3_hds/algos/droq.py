@@ -1,0 +1,50 @@
+"""DroQ: dropout and layer norm in the critics, and many updates per step."""
+
+import dataclasses
+from typing import Any
+
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_hds.algos.off_policy import Recipe, mean
+from sb3_hds.algos.soft_actor_critic import SoftActorCritic
+
+
+class DroQ(SoftActorCritic):
+    """
+    Dropout Q-functions: a replay ratio of 20 that critics survive by dropout and layer norm.
+
+    Source: Hiraoka et al., *Dropout Q-Functions for Doubly Efficient Reinforcement Learning*, ICLR
+    2022. As there, and unlike SBX's setting of SAC, the actor climbs the **mean** of the critics
+    (algorithm 2), not the least of them. The paper's target entropies are -1 for Hopper, -2 for
+    Humanoid, -3 for Walker2d and -4 for Ant.
+
+    :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
+    :param env: likewise
+    :param gradient_steps: updates of the critics per call of ``train``
+    :param policy_delay: updates of the critics for each of the actor
+    :param policy_kwargs: ``dropout_rate`` is 0.01 and ``layer_norm`` True unless they are given
+    :param arguments: those of ``SoftActorCritic``
+    """
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
+        env: GymEnv | str | None = None,
+        *,
+        gradient_steps: int = 20,
+        policy_delay: int = 20,
+        policy_kwargs: dict[str, Any] | None = None,
+        **arguments: Any,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            gradient_steps=gradient_steps,
+            policy_delay=policy_delay,
+            policy_kwargs={"dropout_rate": 0.01, "layer_norm": True, **(policy_kwargs or {})},
+            **arguments,
+        )
+
+    def recipe(self) -> Recipe:
+        return dataclasses.replace(super().recipe(), worth=mean)

@@ -1,0 +1,415 @@
+"""The policies of the SAC family, as SB3 sees them: a Gaussian actor and an ensemble of critics."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, ClassVar
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from gymnasium import spaces
+from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_hds.algos.bodies import Mlp, SimbaBody
+from sb3_hds.algos.heads import Critic, ExploringActor, GaussianActor, noise_std
+from sb3_hds.algos.learner import GENERATOR
+from sb3_hds.algos.networks import Activation, activation
+from sb3_hds.algos.observations import Seen, flattener, seen, size_of
+from sb3_hds.algos.off_policy import (
+    Learner,
+    Optimizer,
+    Recipe,
+    Weights,
+    act,
+    begin,
+    least,
+    pessimistic,
+    squared,
+)
+from sb3_hds.algos.persistence import TensorPolicy, TrainingTensors
+
+_OPTIMIZERS = {
+    "adam": optax.adam,
+    "adamw": optax.adamw,
+    "sgd": optax.sgd,
+    "rmsprop": optax.rmsprop,
+    "nadam": optax.nadam,
+    "radam": optax.radam,
+    "adabelief": optax.adabelief,
+    "lion": optax.lion,
+}
+
+
+class GaussianPolicy(TensorPolicy):
+    """
+    ``"MlpPolicy"`` and ``"MultiInputPolicy"``: dense layers; without target entropy or rules of its
+    own, so that every algorithm of the family can use it.
+
+    :param observation_space: Box, Discrete, MultiDiscrete, MultiBinary, or a Dict of these, which
+        are flattened, choices one-hot
+    :param action_space: a bounded Box of any shape
+    :param lr_schedule: learning rate by remaining progress
+    :param net_arch: hidden widths of both, or ``{"pi": [...], "qf": [...]}``
+    :param activation_fn: name, JAX function or torch module class
+    :param n_critics: members of the ensemble
+    :param n_quantiles: values of each of them
+    :param dropout_rate: of the critics
+    :param layer_norm: in the critics
+    :param renorm_after: batch normalisation in actor and critics, which becomes batch
+        renormalisation after so many updates; None: neither
+    :param renorm_momentum: of its running statistics
+    :param use_sde: generalised state-dependent exploration (Raffin et al., CoRL 2021)
+    :param log_std_init: gSDE: where the logarithm of the noise matrix's deviation starts
+    :param full_std: gSDE: one deviation for each feature and control, or for each feature
+    :param use_expln: gSDE: slower growth than the exponential above 0
+    :param clip_mean: gSDE: the mean is clipped to this before tanh; 0: not
+    :param normalize_observations: by running mean and variance, inside the policy
+    :param optimizer_class: name, optax function or torch class
+    :param optimizer_kwargs: besides the learning rate; torch's ``betas`` are understood
+    :param qf_optimizer_kwargs: of the critics, where they differ
+    """
+
+    defaults: ClassVar[Mapping[str, Any]] = {
+        "net_arch": (256, 256),
+        "optimizer_class": "adam",
+        "normalize_observations": False,
+        "renorm_after": None,
+    }
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: Sequence[int] | Mapping[str, Sequence[int]] | None = None,
+        activation_fn: str | Activation | type = "relu",
+        n_critics: int = 2,
+        n_quantiles: int = 1,
+        dropout_rate: float = 0.0,
+        layer_norm: bool = False,
+        renorm_after: int | None = None,
+        renorm_momentum: float = 0.99,
+        use_sde: bool = False,
+        log_std_init: float = -3.0,
+        full_std: bool = True,
+        use_expln: bool = False,
+        clip_mean: float = 2.0,
+        normalize_observations: bool | None = None,
+        optimizer_class: str | Callable[..., Any] | None = None,
+        optimizer_kwargs: Mapping[str, Any] | None = None,
+        qf_optimizer_kwargs: Mapping[str, Any] | None = None,
+    ) -> None:
+        self._arguments = {
+            name: value
+            for name, value in locals().items()
+            if name not in ("self", "observation_space", "action_space", "__class__")
+        }
+        super().__init__(observation_space, action_space, squash_output=True)
+        chosen = {
+            name: self.defaults.get(name) if value is None else value
+            for name, value in self._arguments.items()
+        }
+        net: Any = chosen["net_arch"]
+        pi, qf = widths(net, "qf")
+        self.activation_fn = activation(activation_fn)
+        self.dropout_rate, self.layer_norm = _rate(dropout_rate), layer_norm
+        self.renorm_after, self.renorm_momentum = chosen["renorm_after"], renorm_momentum
+        self.normalize_observations = bool(chosen["normalize_observations"])
+        self.n_critics, self.use_sde = n_critics, use_sde
+        n_act = int(np.prod(action_space.shape))
+        self.actor_network: nn.Module = GaussianActor(self.actor_body(pi), n_act)
+        if use_sde:
+            gsde = (log_std_init, full_std, use_expln, clip_mean)
+            self.actor_network = ExploringActor(self.actor_body(pi), n_act, *gsde)
+        self.critic_network = Critic(self.critic_body(qf), n_quantiles)
+        own = dict(optimizer_kwargs or {})
+        make: Any = chosen["optimizer_class"]
+        usual = self.defaults.get("optimizer_kwargs", {}) if optimizer_class is None else {}
+        self.optimizers = (
+            optimizer_of(make, {**usual, **own}),
+            optimizer_of(make, {**usual, **own, **dict(qf_optimizer_kwargs or {})}),
+        )
+        self.n_obs, self.n_act = size_of(observation_space), n_act
+        self.flatten = flattener(observation_space)
+        self._learner: Learner | None = None
+        self.matrices: np.ndarray | None = None
+        self._noise = np.random.default_rng(0)
+        self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
+
+    def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
+        return Mlp(
+            net_arch,
+            self.activation_fn,
+            renorm_after=self.renorm_after,
+            momentum=self.renorm_momentum,
+        )
+
+    def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
+        return Mlp(
+            net_arch,
+            self.activation_fn,
+            self.dropout_rate,
+            self.layer_norm,
+            self.renorm_after,
+            self.renorm_momentum,
+        )
+
+    @property
+    def learner(self) -> Learner:
+        """What updates change. A policy that no algorithm has built yet is that of plain SAC."""
+        if self._learner is None:
+            self.build(self.plain_recipe(), 1.0, 0, jax.devices()[0])
+        assert self._learner is not None
+        return self._learner
+
+    @learner.setter
+    def learner(self, learner: Learner) -> None:
+        self._learner = learner
+
+    def plain_recipe(self) -> Recipe:
+        """:return: that of SAC with these networks; with batch normalisation, that of CrossQ"""
+        return Recipe(
+            actor=self.actor_network,
+            critic=self.critic_network,
+            n_critics=self.n_critics,
+            target_of=least,
+            error=squared,
+            worth=pessimistic,
+            optimizer=self.optimizers[0],
+            qf_optimizer=self.optimizers[1],
+            joint_pass=self.renorm_after is not None,
+            normalize=self.normalize_observations,
+        )
+
+    def build(self, recipe: Recipe, ent_coef: float, seed: int, device: Any) -> None:
+        """
+        Draw fresh networks.
+
+        :param recipe: of the algorithm
+        :param ent_coef: where the entropy coefficient starts
+        """
+        self.recipe = recipe
+        key = jax.random.key(seed, impl=GENERATOR)
+        self.learner = jax.device_put(begin(recipe, self.n_obs, self.n_act, ent_coef, key), device)
+        self._noise = np.random.default_rng(seed)
+        self.matrices = None
+
+    def observed(self, obs: np.ndarray | dict[str, np.ndarray]) -> None:
+        """Count observations, of one step of every environment, among those seen."""
+        if self.normalize_observations:
+            scales = self.learner.seen.with_more(self.flatten(obs))
+            self.learner = self.learner._replace(seen=scales)
+
+    def reset_noise(self, batch_size: int = 1) -> None:
+        """
+        Draw a new noise matrix for each environment, where the policy explores by gSDE.
+
+        :param batch_size: number of environments
+        """
+        if self.use_sde:
+            std = np.asarray(noise_std(self.actor_network, self.learner.actor.weights))  # type: ignore[arg-type]
+            drawn = self._noise.standard_normal((batch_size, *std.shape), np.float32)
+            self.matrices = drawn * std
+
+    def get_std(self) -> np.ndarray:
+        """:return: standard deviation of the noise matrix's entries; 0 without gSDE"""
+        if not self.use_sde:
+            return np.zeros(1)
+        return np.asarray(noise_std(self.actor_network, self.learner.actor.weights))  # type: ignore[arg-type]
+
+    def forward(self, obs: Any, deterministic: bool = False) -> np.ndarray:
+        return self._predict(obs, deterministic)
+
+    def prepare_obs(self, observation: Any) -> tuple[Any, bool]:
+        space = self.observation_space
+        if not isinstance(space, spaces.Dict):
+            return super().prepare_obs(observation)
+        from stable_baselines3.common.utils import is_vectorized_observation
+
+        if not isinstance(observation, dict) or observation.keys() != space.spaces.keys():
+            raise ValueError(
+                f"predict() got {type(observation).__name__} instead of a dictionary with "
+                f"{', '.join(space.spaces)}."
+            )
+        parts = {name: np.asarray(part) for name, part in observation.items()}
+        vectorized = any(is_vectorized_observation(parts[name], space[name]) for name in parts)
+        rows = {name: part.reshape(-1, *space[name].shape) for name, part in parts.items()}  # type: ignore[misc]
+        return rows, vectorized
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
+        obs, actor = self.flatten(observation), self.learner.actor.weights
+        if deterministic:
+            return np.asarray(_mean(self.actor_network, actor, self.learner.seen, obs))
+        if not self.use_sde:
+            noise = self._noise.standard_normal((len(obs), self.n_act), np.float32)
+            return np.asarray(_scattered(self.actor_network, actor, self.learner.seen, obs, noise))
+        if self.matrices is None:
+            self.reset_noise()
+        matrices = self.matrices if len(self.matrices) == len(obs) else self.matrices[:1]  # type: ignore[arg-type, index]
+        return np.asarray(_explored(self.actor_network, actor, self.learner.seen, obs, matrices))
+
+    @property
+    def weights(self) -> Any:
+        learner = self.learner
+        return {
+            "actor": learner.actor.weights,
+            "critic": learner.critic.weights,
+            "target": learner.target,
+            "log_ent_coef": learner.log_ent_coef.weights["params"],
+            "seen": learner.seen,
+        }
+
+    @weights.setter
+    def weights(self, tree: Any) -> None:
+        learner = self.learner
+        self.learner = learner._replace(
+            actor=learner.actor._replace(weights=tree["actor"]),
+            critic=learner.critic._replace(weights=tree["critic"]),
+            target=tree["target"],
+            log_ent_coef=learner.log_ent_coef._replace(weights={"params": tree["log_ent_coef"]}),
+            seen=tree["seen"],
+        )
+
+    @property
+    def training_state(self) -> Any:
+        """Random keys are stored as 64-bit integers, which torch can hold."""
+        learner = self.learner
+        return {
+            "actor": learner.actor.optimizer,
+            "critic": learner.critic.optimizer,
+            "log_ent_coef": learner.log_ent_coef.optimizer,
+            "extra": learner.extra,
+            "key": np.asarray(jax.random.key_data(learner.key), np.int64),
+            "n_updates": learner.n_updates,
+        }
+
+    @training_state.setter
+    def training_state(self, tree: Any) -> None:
+        learner = self.learner
+        key = jnp.asarray(np.asarray(tree["key"]).astype(np.uint32))
+        self.learner = learner._replace(
+            actor=learner.actor._replace(optimizer=tree["actor"]),
+            critic=learner.critic._replace(optimizer=tree["critic"]),
+            log_ent_coef=learner.log_ent_coef._replace(optimizer=tree["log_ent_coef"]),
+            extra=tree["extra"],
+            key=jax.random.wrap_key_data(key, impl=GENERATOR),
+            n_updates=tree["n_updates"],
+        )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        """What ``save`` keeps of the policy besides its weights, and ``load`` makes it from."""
+        spaces_and_more = super()._get_constructor_parameters()
+        spaces_and_more.pop("normalize_images")
+        return spaces_and_more | self._arguments
+
+
+class SimbaPolicy(GaussianPolicy):
+    """
+    ``"SimbaPolicy"``: residual networks on observations normalised by running statistics (Lee et
+    al., ICLR 2025), with the widths and the weight decay of the paper.
+    """
+
+    defaults = {
+        "net_arch": {"pi": (128,), "qf": (512, 512)},
+        "optimizer_class": "adamw",
+        "optimizer_kwargs": {"weight_decay": 1e-2},
+        "normalize_observations": True,
+    }
+
+    def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
+        return SimbaBody(net_arch, self.activation_fn)
+
+    def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
+        return SimbaBody(net_arch, self.activation_fn, self.dropout_rate)
+
+
+class CrossQPolicy(GaussianPolicy):
+    """
+    Batch normalisation in actor and critics, and Adam's ``b1`` of 0.5 (Bhatt et al., ICLR 2024).
+    """
+
+    defaults = {
+        "net_arch": {"pi": (256, 256), "qf": (2048, 2048)},
+        "optimizer_class": "adam",
+        "optimizer_kwargs": {"b1": 0.5},
+        "normalize_observations": False,
+        "renorm_after": 100_000,
+    }
+
+
+def widths(
+    net_arch: Sequence[int] | Mapping[str, Sequence[int]], critic: str
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """
+    :param critic: the key of the critics' widths, where those of the actor differ
+    :return: hidden widths of the actor and of the critics
+    :raises ValueError: for other keys than ``pi`` and that one, or widths that are no counts
+    """
+    given = net_arch if isinstance(net_arch, Mapping) else {"pi": net_arch, critic: net_arch}
+    fits = given.keys() == {"pi", critic} and all(
+        isinstance(some, Sequence) and some and all(isinstance(w, int) and w > 0 for w in some)
+        for some in given.values()
+    )
+    if not fits:
+        raise ValueError(
+            f"net_arch must be a list of widths such as [256, 256], or {{'pi': [256], '{critic}': "
+            f"[256, 256]}}, got {net_arch!r}."
+        )
+    return tuple(given["pi"]), tuple(given[critic])
+
+
+def optimizer_of(make: str | Callable[..., Any], arguments: Mapping[str, Any]) -> Optimizer:
+    """
+    :param make: name, optax function, or torch class of the same name
+    :param arguments: of optax's function, or torch's ``betas``
+    :raises ValueError: for one that is not known here
+    """
+    arguments = dict(arguments)
+    if "betas" in arguments:
+        arguments["b1"], arguments["b2"] = arguments.pop("betas")
+    name = make if isinstance(make, str) else getattr(make, "__name__", "")
+    found = _OPTIMIZERS.get(name.lower())
+    if found is None and (isinstance(make, str | type) or not callable(make)):
+        raise ValueError(
+            f"optimizer_class must be one of {', '.join(_OPTIMIZERS)}, an optax function or a "
+            f"torch class of one of these names, got {make!r}."
+        )
+    optimizer = Optimizer(found or make, tuple(sorted(arguments.items())))  # type: ignore[arg-type]
+    try:
+        optimizer.init({"w": jnp.zeros(1)})
+    except TypeError as error:
+        raise ValueError(f"optimizer_kwargs {arguments!r} do not fit {name}: {error}.") from None
+    return optimizer
+
+
+def _rate(dropout_rate: float) -> float:
+    if not 0.0 <= dropout_rate < 1.0:
+        raise ValueError(f"dropout_rate must be at least 0 and below 1, got {dropout_rate!r}.")
+    return float(dropout_rate)
+
+
+@partial(jax.jit, static_argnums=0)
+def _mean(actor: nn.Module, weights: Weights, scales: Seen, obs: Any) -> jax.Array:
+    return jnp.tanh(act(actor, weights, seen(scales, obs))[0].mean)
+
+
+@partial(jax.jit, static_argnums=0)
+def _scattered(actor: nn.Module, weights: Weights, scales: Seen, obs: Any, noise: Any) -> jax.Array:
+    gaussian, _ = act(actor, weights, seen(scales, obs))
+    return jnp.tanh(gaussian.mean + gaussian.std * noise)
+
+
+@partial(jax.jit, static_argnums=0)
+def _explored(
+    actor: nn.Module, weights: Weights, scales: Seen, obs: Any, matrices: Any
+) -> jax.Array:
+    """Every environment has its matrix; with one matrix, it is everybody's."""
+    gaussian, _ = act(actor, weights, seen(scales, obs))
+    noise = jnp.einsum(
+        "bl,bla->ba",
+        gaussian.latent,
+        jnp.broadcast_to(matrices, (obs.shape[0], *matrices.shape[1:])),
+    )
+    return jnp.tanh(gaussian.mean + noise)

@@ -1,0 +1,52 @@
+"""SAC with generalised state-dependent exploration."""
+
+from typing import Any
+
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_hds.algos.soft_actor_critic import SoftActorCritic
+
+
+class GSDESAC(SoftActorCritic):
+    r"""
+    SAC that explores by :math:`a = \mu(s) + \theta^T z(s)` with a noise matrix :math:`\theta` that
+    is drawn every ``sde_sample_freq`` steps: smooth motion that depends on the state, which motors
+    stand.
+
+    Source: Raffin, Kober and Stulp, *Smooth Exploration for Robotic Reinforcement Learning*, CoRL
+    2021; on Haarnoja et al., *Soft Actor-Critic Algorithms and Applications*, 2018. SBX draws
+    noise that does not depend on the state and reports a deviation of 0; here, the features of the
+    actor, the learned deviations (``log_std_init``, ``full_std``, ``use_expln``), ``clip_mean``,
+    the marginal variance in the log-probability and ``use_sde_at_warmup`` are those of SB3. Unlike
+    SB3, updates draw the noise of each state independently: its distribution is the same, its
+    gradient varies less. Use it with ``train_freq`` above 1: each collection begins with new noise.
+
+    :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
+    :param env: likewise
+    :param use_sde: False makes it plain SAC
+    :param train_freq: steps between two calls of ``train``
+    :param gradient_steps: updates in each of them
+    :param policy_kwargs: ``log_std_init``, ``full_std``, ``use_expln``, ``clip_mean`` and those of
+        every policy
+    :param arguments: those of ``SoftActorCritic``
+    """
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
+        env: GymEnv | str | None = None,
+        *,
+        use_sde: bool = True,
+        train_freq: int | tuple[int, str] = 8,
+        gradient_steps: int = 8,
+        **arguments: Any,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            use_sde=use_sde,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            **arguments,
+        )

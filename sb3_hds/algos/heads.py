@@ -1,0 +1,94 @@
+"""Actors and critics of the SAC family: a body, and what is read off at its end."""
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sb3_hds.algos.squashed import Gaussian, exploration_std, marginal_std
+
+_LOG_STD_MIN, _LOG_STD_MAX = -20.0, 2.0
+
+
+class GaussianActor(nn.Module):
+    """
+    Observation to a Gaussian whose spread is a layer of its own.
+
+    :param body: see ``bodies.py``
+    :param n_act: number of controls
+    """
+
+    body: nn.Module
+    n_act: int
+
+    @nn.compact
+    def __call__(self, obs: Float[Array, "*batch obs"], train: bool = False) -> Gaussian:
+        latent = self.body(obs, train)
+        mean = nn.Dense(self.n_act)(latent)
+        log_std = jnp.clip(nn.Dense(self.n_act)(latent), _LOG_STD_MIN, _LOG_STD_MAX)
+        return Gaussian(mean, jnp.exp(log_std), latent)
+
+
+class ExploringActor(nn.Module):
+    r"""
+    Observation to a Gaussian whose spread is that of :math:`\theta^T z` over noise matrices
+    :math:`\theta` (generalised state-dependent exploration).
+
+    :param body: its output is :math:`z`
+    :param n_act: number of controls
+    :param log_std_init: where the logarithm of the matrix's standard deviation starts
+    :param full_std: whether each pair of feature and control has its own, or each feature
+    :param use_expln: see :func:`sb3_hds.algos.squashed.exploration_std`
+    :param clip_mean: the mean is clipped to this, which helps where :math:`\tanh` saturates; 0: not
+    """
+
+    body: nn.Module
+    n_act: int
+    log_std_init: float
+    full_std: bool
+    use_expln: bool
+    clip_mean: float
+
+    @nn.compact
+    def __call__(self, obs: Float[Array, "*batch obs"], train: bool = False) -> Gaussian:
+        latent = self.body(obs, train)
+        mean = nn.Dense(self.n_act)(latent)
+        if self.clip_mean > 0.0:
+            mean = jnp.clip(mean, -self.clip_mean, self.clip_mean)
+        shape = (latent.shape[-1], self.n_act if self.full_std else 1)
+        log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), shape)
+        std = exploration_std(log_std, self.use_expln)
+        return Gaussian(
+            mean, marginal_std(latent, jnp.broadcast_to(std, (shape[0], self.n_act))), latent
+        )
+
+
+class Critic(nn.Module):
+    """
+    Observation and action to values.
+
+    :param body: see ``bodies.py``
+    :param n_values: 1, or the number of quantiles
+    """
+
+    body: nn.Module
+    n_values: int = 1
+
+    @nn.compact
+    def __call__(
+        self,
+        obs: Float[Array, "*batch obs"],
+        action: Float[Array, "*batch act"],
+        train: bool = False,
+    ) -> Float[Array, "*batch values"]:
+        latent = self.body(jnp.concatenate([obs, action], -1), train)
+        return nn.Dense(self.n_values)(latent)
+
+
+def noise_std(actor: ExploringActor, weights: dict) -> Float[Array, "latent act"]:
+    """
+    :param weights: of the actor
+    :return: standard deviation of the entries of its noise matrix
+    """
+    log_std = weights["params"]["log_std"]
+    wide = jnp.broadcast_to(log_std, (log_std.shape[0], actor.n_act))
+    return exploration_std(wide, actor.use_expln)

@@ -1,0 +1,253 @@
+"""What model-free algorithms share: SB3 collects steps and calls ``train``, which updates."""
+
+import math
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from sb3_hds.algos.call_forms import between, check_policy, is_count, policy_and_env, schedule_of
+from sb3_hds.algos.observations import check_observations
+from sb3_hds.algos.tensor_algorithm import TensorAlgorithm
+
+
+class ModelFreeAlgorithm(TensorAlgorithm):
+    """
+    Abstract: off-policy learning from transitions.
+
+    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` for Dict observations, ``"SimbaPolicy"``,
+        a policy class, or the environment itself
+    :param env: an environment, its id, or a vectorised environment
+    :param learning_rate: of the actor and the entropy coefficient; number, schedule or
+        ``"lin_3e-4"``
+    :param qf_learning_rate: of the critics, likewise; None: as ``learning_rate``
+    :param buffer_size: transitions that are kept
+    :param learning_starts: steps with random actions before learning starts
+    :param batch_size: transitions per update
+    :param tau: how far the target networks follow in each update
+    :param gamma: discount per step
+    :param train_freq: steps between two calls of ``train``, or ``(n, "episode")``
+    :param gradient_steps: updates in each of them; -1: as many as steps were made
+    :param policy_delay: updates of the critics for each of the actor
+    :param action_noise: added to the actions
+    :param replay_buffer_class: as in SB3
+    :param replay_buffer_kwargs: as in SB3
+    :param optimize_memory_usage: as in SB3
+    :param n_steps: of the returns that critics are regressed on
+    :param use_sde: explore by gSDE instead of independent noise at each step
+    :param sde_sample_freq: steps after which its noise matrix is drawn again; -1: at the start of
+        each collection (``train_freq``)
+    :param use_sde_at_warmup: whether it also acts before ``learning_starts``
+    :param stats_window_size: episodes in the averages that are logged
+    :param tensorboard_log: folder for TensorBoard
+    :param policy_kwargs: see :class:`~sb3_hds.algos.gaussian_policy.GaussianPolicy`
+    :param param_resets: steps of the environment at which networks and their optimisers start
+        afresh
+    :param verbose: 0 nothing, 1 information, 2 debugging
+    :param seed: of all random numbers
+    :param device: ``"auto"``, ``"cpu"`` or ``"cuda"``, as JAX has it
+    :param monitor_wrapper: as in SB3
+    :param _init_setup_model: as in SB3
+    """
+
+    default_timesteps: ClassVar[int] = 20_000
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
+        env: GymEnv | str | None = None,
+        *,
+        learning_rate: float | str | Schedule = 3e-4,
+        qf_learning_rate: float | str | Schedule | None = None,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        policy_delay: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        use_sde_at_warmup: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        param_resets: list[int] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: str = "auto",
+        monitor_wrapper: bool = True,
+        _init_setup_model: bool = True,
+    ) -> None:
+        policy_class, made_env = policy_and_env(
+            policy, env, self.policy_aliases, check_observations
+        )
+        check_policy(type(self), policy_class)
+        super().__init__(
+            policy=policy_class,
+            env=made_env,
+            learning_rate=schedule_of(learning_rate)
+            if isinstance(learning_rate, str)
+            else learning_rate,
+            qf_learning_rate=None,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            # SB3 writes into it: two models that were given the same one are still two.
+            policy_kwargs=dict(policy_kwargs or {}),
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            seed=seed,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            use_sde_at_warmup=use_sde_at_warmup,
+            param_resets=param_resets,
+            monitor_wrapper=monitor_wrapper,
+            supported_action_spaces=(spaces.Box,),
+            support_multi_env=True,
+        )
+        self.critic_learning_rate = qf_learning_rate
+        self.policy_delay = policy_delay
+        self.saved_by = type(self).__name__
+        self._device_name = str(device)
+        if _init_setup_model:
+            if self.env is None:
+                raise ValueError(
+                    f"{type(self).__name__} needs an environment, for example "
+                    f"{type(self).__name__}('Pendulum-v1')."
+                )
+            self._setup_model()
+
+    @abstractmethod
+    def _build(self, seed: int) -> None:
+        """Draw fresh networks."""
+
+    @abstractmethod
+    def _restart(self, seed: int) -> None:
+        """Draw fresh networks, and keep what is no network."""
+
+    @abstractmethod
+    def _updates(self, n: int, batch_size: int) -> dict[str, float]:
+        """
+        :param n: of the critics
+        :return: of the last one, by name, what is logged
+        """
+
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        """
+        Updates on what the replay buffer holds.
+
+        :param gradient_steps: how many
+        :param batch_size: transitions in each
+        :raises FloatingPointError: if one of them diverged; the model keeps its last good state
+        """
+        self._maybe_reset_params()
+        rate, qf_rate = self.learning_rates()
+        report = self._updates(gradient_steps, batch_size)
+        self._n_updates += gradient_steps
+        self.logger.record("train/learning_rate", rate)
+        if self.critic_learning_rate is not None:
+            self.logger.record("train/qf_learning_rate", qf_rate)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, value in report.items():
+            self.logger.record(f"train/{name}", value)
+
+    def learning_rates(self) -> tuple[float, float]:
+        """:return: of the actor and of the critics, at this point of the training"""
+        remaining = self._current_progress_remaining
+        rate = float(self.lr_schedule(remaining))
+        if self.critic_learning_rate is None:
+            return rate, rate
+        return rate, float(schedule_of(self.critic_learning_rate)(remaining))
+
+    def check_arguments(self) -> None:
+        counts = {
+            "buffer_size": 1,
+            "learning_starts": 0,
+            "batch_size": 1,
+            "policy_delay": 1,
+            "gradient_steps": -1,
+            "n_steps": 1,
+        }
+        for name, fewest in counts.items():
+            fine = is_count(getattr(self, name), fewest)
+            self.refuse_unless(fine, name, f"a whole number of at least {fewest}")
+        for name in ("tau", "gamma"):
+            self.refuse_unless(between(getattr(self, name), 0.0, 1.0), name, "from 0 to 1")
+        rates = {"learning_rate": self.learning_rate, "qf_learning_rate": self.critic_learning_rate}
+        for name, rate in rates.items():
+            fine = not isinstance(rate, int | float) or between(rate, 0.0, math.inf)
+            self.refuse_unless(fine, name, "a number of at least 0, or a schedule", rate)
+        if self.critic_learning_rate is not None:
+            schedule_of(self.critic_learning_rate)
+        if self.n_steps > 1 and isinstance(self.observation_space, spaces.Dict):
+            raise ValueError(
+                "n_steps > 1 needs SB3's NStepReplayBuffer, which has no Dict observations: use "
+                "n_steps=1, or gymnasium.wrappers.FlattenObservation."
+            )
+
+    def refuse_unless(self, fine: bool, name: str, allowed: str, value: Any = None) -> None:
+        """
+        :param value: of the argument, where the attribute is not called like it
+        :raises ValueError: unless it is fine
+        """
+        if not fine:
+            got = getattr(self, name) if value is None else value
+            raise ValueError(f"{type(self).__name__}({name}={got!r}): {name} must be {allowed}.")
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.policy = self.policy_class(  # type: ignore[assignment]
+            self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
+        )
+        self._build(self._network_seed)
+        # SB3 draws gSDE's noise and reads its deviation here.
+        self.actor: Any = self.policy
+
+    @property
+    def _network_seed(self) -> int:
+        """After a reset of the networks, another one."""
+        return int(np.asarray(self.key)[-1]) + self.reset_idx
+
+    def _maybe_reset_params(self) -> None:
+        resets = self.param_resets or []
+        if self.reset_idx < len(resets) and self.num_timesteps >= resets[self.reset_idx]:
+            self.reset_idx += 1
+            self._restart(self._network_seed)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "actor"]
+
+
+def finite(report: dict[str, float]) -> dict[str, float]:
+    """
+    :return: the same
+    :raises FloatingPointError: if a number of it is not finite
+    """
+    if all(map(math.isfinite, report.values())):
+        return report
+    raise FloatingPointError(
+        f"The update diverged ({report}); the model keeps the state before it. Lower the learning "
+        "rate, or scale rewards and observations (VecNormalize)."
+    )

@@ -1,0 +1,104 @@
+"""Observations as the networks see them: flat, numeric, and of running scale where asked for."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from jaxtyping import Array, Float
+from stable_baselines3.common.preprocessing import is_image_space
+
+from sb3_hds.errors import EnvironmentMismatchError
+
+_EPSILON = 1e-8
+
+
+class Seen(NamedTuple):
+    """
+    Running mean and variance of the observations of the environment.
+
+    :param count: how many there were; shape ``()``
+    """
+
+    mean: Float[Array, " obs"]
+    variance: Float[Array, " obs"]
+    count: Float[Array, ""]
+
+    @classmethod
+    def nothing(cls, n_obs: int) -> "Seen":
+        return cls(jnp.zeros(n_obs), jnp.ones(n_obs), jnp.zeros(()))
+
+    def with_more(self, obs: np.ndarray) -> "Seen":
+        """
+        :param obs: shape ``(n, obs)``
+        :return: as if they had been there from the start (Chan et al. 1983), on the host
+        """
+        n, n_more = float(self.count), len(obs)
+        mean, variance = np.asarray(self.mean, np.float64), np.asarray(self.variance, np.float64)
+        more, total = obs.mean(0, np.float64), n + n_more
+        away = more - mean
+        squares = n * variance + obs.var(0, np.float64) * n_more + away**2 * n * n_more / total
+        parts = (mean + away * n_more / total, squares / total, np.asarray(total))
+        return Seen(*(part.astype(np.float32) for part in parts))  # type: ignore[arg-type]
+
+
+def seen(scales: Seen, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch obs"]:
+    """:return: observations in units of what was seen so far; before anything was, as they are"""
+    known = scales.count > 1.0
+    std = jnp.sqrt(jnp.where(known, scales.variance, 1.0) + _EPSILON)
+    return (obs - jnp.where(known, scales.mean, 0.0)) / std
+
+
+def check_observations(space: spaces.Space) -> None:
+    """
+    :raises EnvironmentMismatchError: for images, and whatever else is not made of numbers and
+        choices
+    """
+    parts = space.spaces.items() if isinstance(space, spaces.Dict) else [("", space)]
+    for name, part in parts:
+        what = f"Observation '{name}'" if name else "The observation"
+        if isinstance(part, spaces.Box) and (is_image_space(part) or len(part.shape) > 2):
+            raise EnvironmentMismatchError(
+                f"{what} is an image ({part}), and the networks here have no convolutions. Use "
+                "SBX's or SB3's CnnPolicy, or observe features of it."
+            )
+        if not isinstance(
+            part, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
+        ):
+            raise EnvironmentMismatchError(
+                f"{what} is a {type(part).__name__}. The networks here take Box, Discrete, "
+                "MultiDiscrete, MultiBinary, and Dict of these: "
+                "gymnasium.wrappers.FlattenObservation makes one of most others."
+            )
+
+
+def size_of(space: spaces.Space) -> int:
+    """:return: numbers in a flat observation"""
+    return spaces.flatdim(space)
+
+
+def flattener(space: spaces.Space) -> Callable[[Any], np.ndarray]:
+    """
+    :return: observations with a leading axis, as environments and replay buffers give them, to
+        ``float32`` of shape ``(n, size_of(space))``; choices become one-hot
+    """
+    if isinstance(space, spaces.Dict):
+        parts = {name: flattener(part) for name, part in space.spaces.items()}
+        return lambda obs: np.concatenate([flat(obs[name]) for name, flat in parts.items()], 1)  # type: ignore[call-overload]
+    if isinstance(space, spaces.Discrete):
+        return lambda obs: _one_hot(
+            np.asarray(obs).reshape(-1, 1), np.array([space.n]), space.start
+        )
+    if isinstance(space, spaces.MultiDiscrete):
+        n = space.nvec.ravel()
+        return lambda obs: _one_hot(np.asarray(obs).reshape(-1, len(n)), n, space.start.ravel())
+    return lambda obs: np.asarray(obs, np.float32).reshape(len(obs), -1)
+
+
+def _one_hot(obs: np.ndarray, n: np.ndarray, start: np.ndarray) -> np.ndarray:
+    choices = np.asarray(obs).reshape(-1, len(n)).astype(np.int64) - start
+    flat = np.zeros((len(choices), int(n.sum())), np.float32)
+    first = np.concatenate([[0], np.cumsum(n)[:-1]])
+    flat[np.arange(len(choices))[:, None], choices + first] = 1.0
+    return flat

@@ -1,0 +1,406 @@
+"""
+One update for the whole SAC family, pure and compiled once.
+
+What differs between two algorithms is a :class:`Recipe`: how the critics' next values become a
+target, how far predictions are from it, what the critics are worth to the actor, and which networks
+and optimisers there are.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple, Protocol, cast
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from sb3_hds.algos.observations import Seen, seen
+from sb3_hds.algos.squashed import Gaussian, log_probability
+
+Weights = Mapping[str, Any]
+Values = Float[Array, "critics batch values"]
+Targets = Float[Array, "batch targets"]
+Loss = Float[Array, ""]
+
+
+class Batch(NamedTuple):
+    """
+    Transitions. ``discount`` is that of the next value: :math:`\\gamma^n` for n-step returns.
+    """
+
+    obs: Float[Array, "*batch obs"]
+    action: Float[Array, "*batch act"]
+    next_obs: Float[Array, "*batch obs"]
+    reward: Float[Array, "*batch"]
+    terminated: Float[Array, "*batch"]
+    discount: Float[Array, "*batch"]
+
+
+class Trained(NamedTuple):
+    """
+    :param weights: flax variables, ``"params"`` and, where there are some, ``"statistics"``
+    :param optimizer: state of the optimiser of the params
+    """
+
+    weights: Weights
+    optimizer: Any
+
+
+class Learner(NamedTuple):
+    """
+    Everything that an update changes.
+
+    :param target: weights of the target critics; empty where there are none
+    :param log_ent_coef: logarithm of the entropy coefficient, shape ``()``
+    :param seen: what observations were like so far
+    :param extra: what only one algorithm has
+    """
+
+    actor: Trained
+    critic: Trained
+    target: Weights
+    log_ent_coef: Trained
+    seen: Seen
+    extra: Any
+    key: PRNGKeyArray
+    n_updates: Int[Array, ""]
+
+
+class Knobs(NamedTuple):
+    """What may change from call to call without compiling again."""
+
+    learning_rate: float
+    qf_learning_rate: float
+    tau: float
+    target_entropy: float
+
+
+class Report(NamedTuple):
+    """Of the last update; the actor's of the last one in which it was updated."""
+
+    critic_loss: Loss
+    actor_loss: Loss
+    ent_coef: Loss
+    ent_coef_loss: Loss
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """
+    What an algorithm of the SAC family is made of. Static: equal recipes share compiled programs.
+
+    :param actor: observation to ``Gaussian``
+    :param critic: observation and action to values; an ensemble shares this one's structure
+    :param n_critics: members of the ensemble
+    :param target_of: next values of all critics to the values that become targets
+    :param error: loss of all critics' values against targets
+    :param worth: values of all critics to what the actor climbs, shape ``(batch,)``
+    :param optimizer: of the actor
+    :param qf_optimizer: of the critics
+    :param policy_delay: updates of the critics for each of the actor
+    :param learns_ent_coef: whether the entropy coefficient follows the target entropy
+    :param joint_pass: whether current and next values come from one pass of the critics, without
+        target networks (CrossQ)
+    :param normalize: whether observations are normalised by running statistics (SimBa)
+    :param extra: what else is updated after the actor; None: nothing
+    """
+
+    actor: nn.Module
+    critic: nn.Module
+    n_critics: int
+    target_of: Callable[[Values], Targets]
+    error: Callable[[Values, Targets], Loss]
+    worth: Callable[[Values], Float[Array, " batch"]]
+    optimizer: "Optimizer"
+    qf_optimizer: "Optimizer"
+    policy_delay: int = 1
+    learns_ent_coef: bool = True
+    joint_pass: bool = False
+    normalize: bool = False
+    extra: "Extra | None" = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Optimizer:
+    """
+    An optax optimiser, without its learning rate, so that schedules act without compiling again.
+
+    :param make: ``optax.adam`` or one that is called like it
+    :param arguments: besides the learning rate
+    """
+
+    make: Callable[..., optax.GradientTransformation]
+    arguments: tuple[tuple[str, Any], ...] = ()
+
+    def init(self, params: Any) -> Any:
+        return self._transformation.init(params)
+
+    def apply(self, gradient: Any, trained: Trained, rate: Any) -> Trained:
+        params = trained.weights["params"]
+        step, state = self._transformation.update(gradient, trained.optimizer, params)
+        step = jax.tree.map(lambda s: rate * s, step)
+        weights = {**trained.weights, "params": optax.apply_updates(params, step)}
+        return Trained(weights, state)
+
+    @property
+    def _transformation(self) -> optax.GradientTransformation:
+        return self.make(learning_rate=1.0, **dict(self.arguments))
+
+
+class Extra(Protocol):
+    """Something more that learns (BRO's optimistic actor)."""
+
+    def init(self, actor: Weights, obs: Array, key: PRNGKeyArray) -> Any:
+        """:return: its state, for fresh networks"""
+        ...
+
+    def update(
+        self, recipe: Recipe, learner: Learner, batch: Batch, knobs: Knobs, key: PRNGKeyArray
+    ) -> Any:
+        """:return: its state after an update of the actor"""
+        ...
+
+
+# --- how an ensemble's next values become a target, how far off it is, what it is worth
+
+
+def least(values: Values) -> Targets:
+    """Clipped double Q-learning (Fujimoto et al. 2018)."""
+    return jnp.min(values, 0)
+
+
+def average(values: Values) -> Targets:
+    """Of the critics, value by value (BRO)."""
+    return jnp.mean(values, 0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Truncated:
+    """
+    The quantiles of all critics together, but the ``n_dropped`` largest of each (TQC).
+
+    :param n_dropped: for each critic
+    """
+
+    n_dropped: int
+
+    def __call__(self, values: Values) -> Targets:
+        together = jnp.sort(jnp.concatenate(list(values), -1), -1)
+        return together[:, : together.shape[-1] - self.n_dropped * values.shape[0]]
+
+
+def squared(values: Values, targets: Targets) -> Loss:
+    """Half the mean squared error, summed over critics."""
+    return 0.5 * jnp.sum(jnp.mean((values - targets[None]) ** 2, (1, 2)))
+
+
+def quantile_huber(values: Values, targets: Targets) -> Loss:
+    """Mean over quantiles, targets and batch, summed over critics (Dabney et al. 2018)."""
+    n = values.shape[-1]
+    level = (jnp.arange(n) + 0.5) / n
+    delta = targets[None, :, None, :] - values[..., None]
+    size = jnp.abs(delta)
+    huber = jnp.where(size > 1.0, size - 0.5, 0.5 * delta**2)
+    weight = jnp.abs(level[:, None] - (delta < 0.0))
+    return jnp.sum(jnp.mean(weight * huber, (1, 2, 3)))
+
+
+def pessimistic(values: Values) -> Float[Array, " batch"]:
+    """The least of the critics (SAC)."""
+    return jnp.min(jnp.mean(values, -1), 0)
+
+
+def mean(values: Values) -> Float[Array, " batch"]:
+    """Of critics and quantiles (DroQ, TQC, BRO)."""
+    return jnp.mean(values, (0, 2))
+
+
+# --- the update
+
+
+def act(
+    actor: nn.Module, weights: Weights, obs: Array, train: bool = False
+) -> tuple[Gaussian, Weights]:
+    """:return: the actor's Gaussian, and its weights with the statistics of this pass"""
+    if not train or "statistics" not in weights:
+        return cast(Gaussian, actor.apply(weights, obs, train)), weights
+    gaussian, changed = actor.apply(weights, obs, train, mutable=["statistics"])
+    return cast(Gaussian, gaussian), {**weights, **changed}
+
+
+def judge(
+    recipe: Recipe,
+    weights: Weights,
+    obs: Array,
+    action: Array,
+    key: PRNGKeyArray,
+    train: bool = False,
+) -> tuple[Values, Weights]:
+    """
+    :param key: of the dropout masks, which differ between critics
+    :return: values of all critics, and their weights with the statistics of this pass
+    """
+
+    def one(weights: Weights, key: PRNGKeyArray) -> tuple[Array, Weights]:
+        rngs = {"dropout": key}
+        if not train or "statistics" not in weights:
+            return cast(Array, recipe.critic.apply(weights, obs, action, train, rngs=rngs)), weights
+        values, changed = recipe.critic.apply(
+            weights, obs, action, train, rngs=rngs, mutable=["statistics"]
+        )
+        return cast(Array, values), {**weights, **changed}
+
+    return jax.vmap(one)(weights, jax.random.split(key, recipe.n_critics))
+
+
+def sample(gaussian: Gaussian, key: PRNGKeyArray) -> tuple[Array, Array]:
+    """:return: actions drawn from it, and their log-density"""
+    before = gaussian.mean + gaussian.std * jax.random.normal(key, gaussian.mean.shape)
+    return jnp.tanh(before), log_probability(gaussian, before)
+
+
+def begin(recipe: Recipe, n_obs: int, n_act: int, ent_coef: float, key: PRNGKeyArray) -> Learner:
+    """:return: fresh networks and optimisers"""
+    key, actor_key, critic_key, extra_key = jax.random.split(key, 4)
+    obs, action = jnp.zeros((1, n_obs)), jnp.zeros((1, n_act))
+    actor = recipe.actor.init(actor_key, obs)
+    init = lambda key: recipe.critic.init({"params": key, "dropout": key}, obs, action)  # noqa: E731
+    critic = jax.vmap(init)(jax.random.split(critic_key, recipe.n_critics))
+    log_ent_coef = {"params": jnp.log(jnp.asarray(ent_coef, jnp.float32))}
+    return Learner(
+        actor=Trained(actor, recipe.optimizer.init(actor["params"])),
+        critic=Trained(critic, recipe.qf_optimizer.init(critic["params"])),
+        target={} if recipe.joint_pass else critic,
+        log_ent_coef=Trained(log_ent_coef, _ADAM.init(log_ent_coef["params"])),
+        seen=Seen.nothing(n_obs),
+        extra=recipe.extra.init(actor, obs, extra_key) if recipe.extra else {},
+        key=key,
+        n_updates=jnp.zeros((), jnp.int32),
+    )
+
+
+@partial(jax.jit, static_argnums=0)
+def update(
+    recipe: Recipe, learner: Learner, batches: Batch, n: int | Array, knobs: Knobs
+) -> tuple[Learner, Report]:
+    """
+    :param batches: with a leading axis of at least ``n`` batches; the rest is not looked at, so
+        that different ``n`` share a compiled program
+    :param n: how many updates
+    """
+
+    def one(i: Array, carry: tuple[Learner, Report]) -> tuple[Learner, Report]:
+        learner, report = carry
+        return update_once(recipe, learner, jax.tree.map(lambda x: x[i], batches), knobs, report)
+
+    zero = jnp.zeros(())
+    return jax.lax.fori_loop(0, n, one, (learner, Report(zero, zero, zero, zero)))
+
+
+def update_once(
+    recipe: Recipe, learner: Learner, batch: Batch, knobs: Knobs, report: Report
+) -> tuple[Learner, Report]:
+    """The critics on one batch; every ``policy_delay`` updates the actor on the same one."""
+    if recipe.normalize:
+        batch = batch._replace(
+            obs=seen(learner.seen, batch.obs), next_obs=seen(learner.seen, batch.next_obs)
+        )
+    key, critic_key, actor_key = jax.random.split(learner.key, 3)
+    learner = learner._replace(key=key, n_updates=learner.n_updates + 1)
+    learner, report = update_critics(recipe, learner, batch, knobs, report, critic_key)
+    improve = lambda: update_actor(recipe, learner, batch, knobs, report, actor_key)  # noqa: E731
+    if recipe.policy_delay == 1:
+        return improve()
+    due = learner.n_updates % recipe.policy_delay == 0
+    return jax.lax.cond(due, improve, lambda: (learner, report))
+
+
+def update_critics(
+    recipe: Recipe,
+    learner: Learner,
+    batch: Batch,
+    knobs: Knobs,
+    report: Report,
+    key: PRNGKeyArray,
+) -> tuple[Learner, Report]:
+    """Regress the critics on soft targets; the target networks follow."""
+    act_key, key, next_key = jax.random.split(key, 3)
+    gaussian, _ = act(recipe.actor, learner.actor.weights, batch.next_obs)
+    next_action, log_prob = sample(gaussian, act_key)
+    bonus = -jnp.exp(learner.log_ent_coef.weights["params"]) * log_prob
+    reward, discount = batch.reward, batch.discount * (1.0 - batch.terminated)
+
+    def soft_targets(next_values: Values) -> Targets:
+        chosen = recipe.target_of(next_values) + bonus[:, None]
+        return jax.lax.stop_gradient(reward[:, None] + discount[:, None] * chosen)
+
+    def apart(params: Any) -> tuple[Loss, Weights]:
+        next_values, _ = judge(recipe, learner.target, batch.next_obs, next_action, next_key)
+        weights = {**learner.critic.weights, "params": params}
+        values, weights = judge(recipe, weights, batch.obs, batch.action, key, train=True)
+        return recipe.error(values, soft_targets(next_values)), weights
+
+    def jointly(params: Any) -> tuple[Loss, Weights]:
+        weights = {**learner.critic.weights, "params": params}
+        obs = jnp.concatenate([batch.obs, batch.next_obs])
+        action = jnp.concatenate([batch.action, next_action])
+        both, weights = judge(recipe, weights, obs, action, key, train=True)
+        values, next_values = jnp.split(both, 2, axis=1)
+        return recipe.error(values, soft_targets(next_values)), weights
+
+    loss = jointly if recipe.joint_pass else apart
+    gradient = jax.value_and_grad(loss, has_aux=True)
+    (value, weights), slope = gradient(learner.critic.weights["params"])
+    critic = recipe.qf_optimizer.apply(
+        slope, Trained(weights, learner.critic.optimizer), knobs.qf_learning_rate
+    )
+    target = learner.target
+    if not recipe.joint_pass:
+        follow = lambda old, new: old + knobs.tau * (new - old)  # noqa: E731
+        target = jax.tree.map(follow, learner.target, critic.weights)
+    return learner._replace(critic=critic, target=target), report._replace(critic_loss=value)
+
+
+def update_actor(
+    recipe: Recipe,
+    learner: Learner,
+    batch: Batch,
+    knobs: Knobs,
+    report: Report,
+    key: PRNGKeyArray,
+) -> tuple[Learner, Report]:
+    """Climb what the critics think of the actor's own actions, and follow the target entropy."""
+    act_key, judge_key, extra_key = jax.random.split(key, 3)
+    ent_coef = jnp.exp(learner.log_ent_coef.weights["params"])
+
+    def loss(params: Any) -> tuple[Loss, tuple[Array, Weights]]:
+        weights = {**learner.actor.weights, "params": params}
+        gaussian, weights = act(recipe.actor, weights, batch.obs, train=True)
+        action, log_prob = sample(gaussian, act_key)
+        values, _ = judge(recipe, learner.critic.weights, batch.obs, action, judge_key)
+        return jnp.mean(ent_coef * log_prob - recipe.worth(values)), (-log_prob.mean(), weights)
+
+    gradient = jax.value_and_grad(loss, has_aux=True)
+    (value, (entropy, weights)), slope = gradient(learner.actor.weights["params"])
+    actor = recipe.optimizer.apply(
+        slope, Trained(weights, learner.actor.optimizer), knobs.learning_rate
+    )
+    log_ent_coef, excess = learner.log_ent_coef, entropy - knobs.target_entropy
+    report = report._replace(
+        actor_loss=value,
+        ent_coef=ent_coef,
+        ent_coef_loss=log_ent_coef.weights["params"] * excess,
+    )
+    if recipe.learns_ent_coef:
+        log_ent_coef = _ADAM.apply(excess, log_ent_coef, knobs.learning_rate)
+    learner = learner._replace(actor=actor, log_ent_coef=log_ent_coef)
+    if recipe.extra is not None:
+        extra = recipe.extra.update(recipe, learner, batch, knobs, extra_key)
+        learner = learner._replace(extra=extra)
+    return learner, report
+
+
+_ADAM = Optimizer(optax.adam)

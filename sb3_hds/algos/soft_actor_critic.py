@@ -1,0 +1,140 @@
+"""The shell of the SAC family."""
+
+import dataclasses
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_hds.algos.call_forms import between, jax_device
+from sb3_hds.algos.gaussian_policy import GaussianPolicy, SimbaPolicy
+from sb3_hds.algos.model_free import ModelFreeAlgorithm, finite
+from sb3_hds.algos.off_policy import Knobs, Recipe, Report, update
+from sb3_hds.algos.sampling import batches_of
+
+# Updates of one compiled call; more are made in several.
+_MOST_UPDATES = 64
+
+
+class SoftActorCritic(ModelFreeAlgorithm):
+    """
+    Abstract: soft actor-critic (Haarnoja et al. 2018), on which the algorithms of this family
+    differ by their :class:`~sb3_hds.algos.off_policy.Recipe`.
+
+    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` for Dict observations, ``"SimbaPolicy"``,
+        a policy class, or the environment itself
+    :param env: an environment, its id, or a vectorised environment
+    :param ent_coef: a number, ``"auto"``, or ``"auto_0.1"`` to start there
+    :param target_entropy: a number, or ``"auto"``: minus the number of controls
+    :param arguments: those of :class:`~sb3_hds.algos.model_free.ModelFreeAlgorithm`
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": GaussianPolicy,
+        "MultiInputPolicy": GaussianPolicy,
+        "SimbaPolicy": SimbaPolicy,
+    }
+    policy: GaussianPolicy
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
+        env: GymEnv | str | None = None,
+        *,
+        ent_coef: float | str = "auto",
+        target_entropy: float | str = "auto",
+        **arguments: Any,
+    ) -> None:
+        self.ent_coef, self.target_entropy = ent_coef, target_entropy
+        super().__init__(policy, env, **arguments)
+
+    def recipe(self) -> Recipe:
+        """:return: what an update is made of"""
+        return dataclasses.replace(
+            self.policy.plain_recipe(),
+            policy_delay=self.policy_delay,
+            learns_ent_coef=isinstance(self.ent_coef, str),
+        )
+
+    def auto_target_entropy(self) -> float:
+        """:return: what ``target_entropy="auto"`` means here"""
+        return -float(self.policy.n_act)
+
+    def check_arguments(self) -> None:
+        super().check_arguments()
+        entropy = self.target_entropy
+        fine = entropy == "auto" or between(entropy, -math.inf, math.inf)
+        self.refuse_unless(fine, "target_entropy", "'auto' or a number")
+        _initial_ent_coef(self.ent_coef)
+
+    def _build(self, seed: int) -> None:
+        start, device = _initial_ent_coef(self.ent_coef), jax_device(self._device_name)
+        self.policy.build(self.recipe(), start, seed, device)
+
+    def _restart(self, seed: int) -> None:
+        """The entropy coefficient stays, as in SBX."""
+        before = self.policy.learner
+        self._build(seed)
+        self.policy.learner = self.policy.learner._replace(
+            log_ent_coef=before.log_ent_coef, seen=before.seen, n_updates=before.n_updates
+        )
+
+    def _updates(self, n: int, batch_size: int) -> dict[str, float]:
+        policy, knobs, report = self.policy, self._knobs(), {}
+        for done in range(0, n, _MOST_UPDATES):
+            now = min(_MOST_UPDATES, n - done)
+            batches = batches_of(self, now, batch_size, _capacity(now))
+            learner, found = update(policy.recipe, policy.learner, batches, now, knobs)
+            report = finite(_plain(found))
+            policy.learner = learner
+        return report
+
+    def _knobs(self) -> Knobs:
+        rate, qf_rate = self.learning_rates()
+        entropy = self.target_entropy
+        wanted = self.auto_target_entropy() if entropy == "auto" else float(entropy)
+        return Knobs(rate, qf_rate, self.tau, wanted)
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self.policy.observed(new_obs)
+
+
+def _initial_ent_coef(ent_coef: float | str) -> float:
+    """
+    :raises ValueError: for anything but a positive number, ``"auto"`` or ``"auto_NUMBER"``
+    """
+    start: Any = ent_coef
+    if isinstance(ent_coef, str):
+        kind, _, start = ent_coef.partition("_")
+        start = start or "1.0" if kind == "auto" else "nan"
+    try:
+        value = float(start)
+    except (TypeError, ValueError):
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise ValueError(
+            f"ent_coef must be a number above 0, 'auto', or 'auto_0.1' to start there, got "
+            f"{ent_coef!r}."
+        )
+    return value
+
+
+def _capacity(n: int) -> int:
+    """:return: the power of 2 from ``n`` on: few sizes are few compiled programs"""
+    return 1 << (n - 1).bit_length()
+
+
+def _plain(report: Report) -> dict[str, float]:
+    return {name: float(value) for name, value in zip(report._fields, report, strict=True)}

@@ -1,0 +1,383 @@
+"""TD7: learned embeddings, prioritised replay, and policies that are kept once they proved good."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from sb3_hds.algos.call_forms import between, is_count, jax_device
+from sb3_hds.algos.gaussian_policy import optimizer_of, widths
+from sb3_hds.algos.lap import LapReplayBuffer
+from sb3_hds.algos.learner import GENERATOR
+from sb3_hds.algos.model_free import ModelFreeAlgorithm, finite
+from sb3_hds.algos.networks import Activation, activation
+from sb3_hds.algos.observations import flattener, size_of
+from sb3_hds.algos.off_policy import Batch
+from sb3_hds.algos.persistence import TensorPolicy, TrainingTensors
+from sb3_hds.algos.sampling import transitions
+from sb3_hds.algos.td7_update import (
+    Actor,
+    Critic,
+    Encoder,
+    Learner,
+    Recipe,
+    Report,
+    act,
+    begin,
+    update,
+)
+
+
+class TD7Policy(TensorPolicy):
+    """
+    ``"MlpPolicy"`` of TD7: encoder, actor and two critics. Where nothing is explored, the policy
+    of the last checkpoint acts.
+
+    :param observation_space: a Box, or choices, which become one-hot
+    :param action_space: a bounded Box of any shape
+    :param lr_schedule: learning rate by remaining progress
+    :param net_arch: hidden widths of all, or ``{"pi": [...], "qf": [...]}``
+    :param embedding_size: of states, and of pairs of state and action
+    :param activation_fn: of the actor: name, JAX function or torch module class
+    :param qf_activation_fn: of encoder and critics
+    :param n_critics: members of the ensemble
+    :param optimizer_class: name, optax function or torch class
+    :param optimizer_kwargs: besides the learning rate
+    :param use_sde: accepted for SB3's sake; the policy is deterministic
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: Sequence[int] | Mapping[str, Sequence[int]] = (256, 256),
+        embedding_size: int = 256,
+        activation_fn: str | Activation | type = "relu",
+        qf_activation_fn: str | Activation | type = "elu",
+        n_critics: int = 2,
+        optimizer_class: str | Callable[..., Any] = "adam",
+        optimizer_kwargs: Mapping[str, Any] | None = None,
+        use_sde: bool = False,
+    ) -> None:
+        self._arguments = {
+            name: value
+            for name, value in locals().items()
+            if name not in ("self", "observation_space", "action_space", "__class__", "use_sde")
+        }
+        super().__init__(observation_space, action_space, squash_output=True)
+        pi, qf = widths(net_arch, "qf")
+        of_values = activation(qf_activation_fn)
+        self.n_obs = size_of(observation_space)
+        self.n_act = int(np.prod(action_space.shape))
+        optimizer = optimizer_of(optimizer_class, optimizer_kwargs or {})
+        self.parts: dict[str, Any] = {
+            "encoder": Encoder(embedding_size, qf, of_values),
+            "actor": Actor(self.n_act, pi, activation(activation_fn)),
+            "critic": Critic(qf, of_values),
+            "n_critics": n_critics,
+            "optimizer": optimizer,
+            "qf_optimizer": optimizer,
+        }
+        self.flatten = flattener(observation_space)
+        self.learner: Learner
+        self.uses_checkpoints = False
+        self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
+
+    def build(self, recipe: Recipe, seed: int, device: Any) -> None:
+        """
+        Draw fresh networks.
+
+        :param recipe: of the algorithm
+        """
+        self.recipe = recipe
+        key = jax.random.key(seed, impl=GENERATOR)
+        self.learner = jax.device_put(begin(recipe, self.n_obs, self.n_act, key), device)
+
+    def keep_checkpoint(self) -> None:
+        """The policy as it is acts where nothing is explored."""
+        learner = self.learner
+        checkpoint = learner.copies.encoder, learner.actor.weights
+        self.learner = learner._replace(checkpoint=checkpoint)
+
+    def forward(self, obs: Any, deterministic: bool = False) -> np.ndarray:
+        return self._predict(obs, deterministic)
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
+        learner = self.learner
+        weights = learner.copies.encoder, learner.actor.weights
+        if deterministic and self.uses_checkpoints:
+            weights = learner.checkpoint
+        return np.asarray(_act(self.recipe, *weights, self.flatten(observation)))
+
+    def reset_noise(self, batch_size: int = 1) -> None:
+        """Nothing to reset: noise is added to the actions (``action_noise``)."""
+
+    @property
+    def weights(self) -> Any:
+        learner = self.learner
+        encoder, actor = learner.checkpoint
+        return {
+            "actor": learner.actor.weights,
+            "encoder": learner.encoder.weights,
+            "critic": learner.critic.weights,
+            "copies": learner.copies,
+            "checkpoint": {"encoder": encoder, "actor": actor},
+        }
+
+    @weights.setter
+    def weights(self, tree: Any) -> None:
+        learner = self.learner
+        self.learner = learner._replace(
+            actor=learner.actor._replace(weights=tree["actor"]),
+            encoder=learner.encoder._replace(weights=tree["encoder"]),
+            critic=learner.critic._replace(weights=tree["critic"]),
+            copies=tree["copies"],
+            checkpoint=(tree["checkpoint"]["encoder"], tree["checkpoint"]["actor"]),
+        )
+
+    @property
+    def training_state(self) -> Any:
+        """Random keys are stored as 64-bit integers, which torch can hold."""
+        learner = self.learner
+        return {
+            "actor": learner.actor.optimizer,
+            "encoder": learner.encoder.optimizer,
+            "critic": learner.critic.optimizer,
+            "clip": learner.clip,
+            "range": learner.range,
+            "key": np.asarray(jax.random.key_data(learner.key), np.int64),
+            "n_updates": learner.n_updates,
+        }
+
+    @training_state.setter
+    def training_state(self, tree: Any) -> None:
+        learner = self.learner
+        key = jnp.asarray(np.asarray(tree["key"]).astype(np.uint32))
+        self.learner = learner._replace(
+            actor=learner.actor._replace(optimizer=tree["actor"]),
+            encoder=learner.encoder._replace(optimizer=tree["encoder"]),
+            critic=learner.critic._replace(optimizer=tree["critic"]),
+            clip=tree["clip"],
+            range=tree["range"],
+            key=jax.random.wrap_key_data(key, impl=GENERATOR),
+            n_updates=tree["n_updates"],
+        )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        """What ``save`` keeps of the policy besides its weights, and ``load`` makes it from."""
+        spaces_and_more = super()._get_constructor_parameters()
+        spaces_and_more.pop("normalize_images")
+        return spaces_and_more | self._arguments
+
+
+class TD7(ModelFreeAlgorithm):
+    """
+    TD3 with state-action embeddings, prioritised replay, value clipping and checkpoints of the
+    policy.
+
+    Source: Fujimoto et al., *For SALE: State-Action Representation Learning for Deep Reinforcement
+    Learning*, NeurIPS 2023, with its constants (appendix): target networks are copied every 250
+    updates, noise of 0.1 explores, 25,000 steps are random, priorities are errors to the power of
+    0.4, and 20 episodes assess a policy from 750,000 updates on, one before.
+
+    With checkpoints, as in the paper, a policy acts for whole episodes and is assessed by the worst
+    of them; only then it is updated, once for each step that it made. That needs one environment,
+    and ``gradient_steps`` is not looked at.
+
+    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` for Dict observations, a policy class, or
+        the environment itself
+    :param env: an environment, its id, or a vectorised environment
+    :param learning_starts: steps with random actions before learning starts
+    :param policy_delay: updates of the critics for each of the actor
+    :param target_update_interval: updates between two copies into the target networks
+    :param target_policy_noise: standard deviation of the noise on the target policy's actions,
+        which lie in [-1, 1]
+    :param target_noise_clip: its limit
+    :param exploration_noise: standard deviation of the noise on actions, unless ``action_noise`` is
+        passed
+    :param priority_exponent: how much priorities depend on errors; 0: not at all
+    :param use_checkpoints: whether policies are assessed; None: where there is one environment
+    :param max_episodes_per_checkpoint: episodes that assess a policy, from
+        ``updates_before_checkpointing`` on
+    :param updates_before_checkpointing: until then, one episode does
+    :param reset_weight: factor on the best assessment at that moment
+    :param arguments: those of :class:`~sb3_hds.algos.model_free.ModelFreeAlgorithm`
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": TD7Policy,
+        "MultiInputPolicy": TD7Policy,
+    }
+    policy: TD7Policy
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
+        env: GymEnv | str | None = None,
+        *,
+        learning_starts: int = 25_000,
+        train_freq: int | tuple[int, str] | None = None,
+        policy_delay: int = 2,
+        target_update_interval: int = 250,
+        target_policy_noise: float = 0.2,
+        target_noise_clip: float = 0.5,
+        exploration_noise: float = 0.1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        priority_exponent: float = 0.4,
+        use_checkpoints: bool | None = None,
+        max_episodes_per_checkpoint: int = 20,
+        updates_before_checkpointing: int = 750_000,
+        reset_weight: float = 0.9,
+        **arguments: Any,
+    ) -> None:
+        self.target_update_interval = target_update_interval
+        self.target_policy_noise = target_policy_noise
+        self.target_noise_clip = target_noise_clip
+        self.exploration_noise = exploration_noise
+        self.priority_exponent = priority_exponent
+        self.use_checkpoints = use_checkpoints
+        self.max_episodes_per_checkpoint = max_episodes_per_checkpoint
+        self.updates_before_checkpointing = updates_before_checkpointing
+        self.reset_weight = reset_weight
+        self.assessed_episodes, self.assessed_steps = 0, 0
+        self.worst_return, self.best_worst_return = np.inf, -np.inf
+        self._episode_return, self._episode_length = 0.0, 0
+        self._finished: list[tuple[float, int]] = []
+        self._chosen_freq = train_freq
+        super().__init__(
+            policy,
+            env,
+            learning_starts=learning_starts,
+            train_freq=1 if train_freq is None else train_freq,
+            policy_delay=policy_delay,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class or LapReplayBuffer,
+            **arguments,
+        )
+
+    def recipe(self) -> Recipe:
+        """:return: what an update is made of"""
+        return Recipe(
+            **self.policy.parts,
+            target_every=self.target_update_interval,
+            policy_delay=self.policy_delay,
+            target_noise=self.target_policy_noise,
+            noise_clip=self.target_noise_clip,
+            alpha=self.priority_exponent,
+        )
+
+    def check_arguments(self) -> None:
+        super().check_arguments()
+        for name in ("target_update_interval", "max_episodes_per_checkpoint"):
+            self.refuse_unless(
+                is_count(getattr(self, name), 1), name, "a whole number of at least 1"
+            )
+        for name in ("target_policy_noise", "target_noise_clip", "exploration_noise"):
+            fine = between(getattr(self, name), 0.0, np.inf)
+            self.refuse_unless(fine, name, "a number of at least 0")
+        for name in ("priority_exponent", "reset_weight"):
+            self.refuse_unless(between(getattr(self, name), 0.0, 1.0), name, "from 0 to 1")
+        several = self.n_envs > 1 and self.use_checkpoints
+        self.refuse_unless(not several, "use_checkpoints", "False with several environments")
+        fits = isinstance(self.replay_buffer_class, type) and issubclass(
+            self.replay_buffer_class, LapReplayBuffer
+        )
+        self.refuse_unless(fits, "replay_buffer_class", "LapReplayBuffer, or extend it")
+
+    def _setup_model(self) -> None:
+        if self.use_checkpoints is None:
+            self.use_checkpoints = self.n_envs == 1
+        if self._chosen_freq is None and self.use_checkpoints:
+            self.train_freq = (1, "episode")  # type: ignore[assignment]
+        super()._setup_model()
+        self.policy.uses_checkpoints = self.use_checkpoints
+        if self.action_noise is None and self.exploration_noise:
+            size = np.full(self.policy.n_act, self.exploration_noise, np.float32)
+            self.action_noise = NormalActionNoise(np.zeros_like(size), size)
+
+    def _build(self, seed: int) -> None:
+        self.policy.build(self.recipe(), seed, jax_device(self._device_name))
+
+    def _restart(self, seed: int) -> None:
+        before = self.policy.learner
+        self._build(seed)
+        self.policy.learner = self.policy.learner._replace(n_updates=before.n_updates)
+
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        if self.use_checkpoints:
+            gradient_steps = self._assessed()
+        if gradient_steps > 0:
+            super().train(gradient_steps, batch_size)
+
+    def _assessed(self) -> int:
+        """
+        Judge the policy by the episodes that it has made since it was updated last.
+
+        :return: how many updates are due: none while it is still to be seen how good it is
+        """
+        for reward, length in self._finished:
+            self.assessed_episodes += 1
+            self.assessed_steps += length
+            self.worst_return = min(self.worst_return, reward)
+        self._finished = []
+        late = self._n_updates >= self.updates_before_checkpointing
+        enough = self.max_episodes_per_checkpoint if late else 1
+        good = self.worst_return >= self.best_worst_return
+        if good and self.assessed_episodes < enough:
+            return 0
+        if good:
+            self.best_worst_return = self.worst_return
+            self.policy.keep_checkpoint()
+        due = self.assessed_steps
+        if not late and self._n_updates + due >= self.updates_before_checkpointing:
+            self.best_worst_return *= self.reset_weight
+        self.assessed_episodes, self.assessed_steps, self.worst_return = 0, 0, np.inf
+        return due
+
+    def _updates(self, n: int, batch_size: int) -> dict[str, float]:
+        """One after the other: what is drawn depends on the errors of the update before."""
+        buffer: Any = self.replay_buffer
+        rates, policy = self.learning_rates(), self.policy
+        zero = jnp.zeros(())
+        report, found = {}, Report(zero, zero, zero)
+        for i in range(n):
+            steps, copies = buffer.draw(batch_size)
+            batch = Batch(**transitions(self, buffer, steps, copies))  # type: ignore[arg-type]
+            learner, found, priorities = update(policy.recipe, policy.learner, batch, *rates, found)
+            report = finite({name: float(value) for name, value in found._asdict().items()})
+            policy.learner = learner
+            buffer.set_priorities(steps, copies, np.asarray(priorities))
+            if (self._n_updates + i + 1) % self.target_update_interval == 0:
+                buffer.forget_highest()
+        return report
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self._episode_return += float(reward[0])
+        self._episode_length += 1
+        if dones[0]:
+            self._finished.append((self._episode_return, self._episode_length))
+            self._episode_return, self._episode_length = 0.0, 0
+
+
+@partial(jax.jit, static_argnums=0)
+def _act(recipe: Recipe, encoder: Any, actor: Any, obs: Any) -> jax.Array:
+    return act(recipe, encoder, actor, obs)

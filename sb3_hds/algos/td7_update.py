@@ -1,0 +1,306 @@
+"""
+The update of TD7, pure: embeddings of states and actions, critics on top of them, targets that are
+copied whole.
+
+Source: Fujimoto et al., *For SALE: State-Action Representation Learning for Deep Reinforcement
+Learning*, NeurIPS 2023.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple, cast
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from sb3_hds.algos.networks import Activation
+from sb3_hds.algos.off_policy import Batch, Optimizer, Trained, Weights
+
+_EPSILON = 1e-8
+
+
+def average_l1_norm(x: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    """:return: of mean absolute value 1 (section 4.1 of the paper)"""
+    return x / jnp.maximum(jnp.mean(jnp.abs(x), -1, keepdims=True), _EPSILON)
+
+
+class Encoder(nn.Module):
+    """
+    State to embedding, and embedding and action to what the next state's embedding will be.
+
+    :param n: size of the embeddings
+    :param net_arch: hidden widths
+    :param activation_fn: between the layers
+    """
+
+    n: int
+    net_arch: Sequence[int]
+    activation_fn: Activation
+
+    def setup(self) -> None:
+        self.of_state = _Dense((*self.net_arch, self.n), self.activation_fn)
+        self.of_both = _Dense((*self.net_arch, self.n), self.activation_fn)
+
+    def __call__(self, obs: Array, action: Array) -> tuple[Array, Array]:
+        state = average_l1_norm(self.of_state(obs))
+        return state, self.of_both(jnp.concatenate([state, action], -1))
+
+
+class Actor(nn.Module):
+    """
+    Observation and its embedding to controls.
+
+    :param n_act: number of controls
+    :param net_arch: hidden widths; the observation passes the first, then its embedding joins
+    :param activation_fn: between the layers
+    """
+
+    n_act: int
+    net_arch: Sequence[int]
+    activation_fn: Activation
+
+    @nn.compact
+    def __call__(
+        self, obs: Float[Array, "*batch obs"], state: Float[Array, "*batch z"]
+    ) -> Float[Array, "*batch act"]:
+        own = average_l1_norm(nn.Dense(self.net_arch[0])(obs))
+        hidden = _Dense((*self.net_arch, self.n_act), self.activation_fn)
+        return jnp.tanh(hidden(jnp.concatenate([own, state], -1)))
+
+
+class Critic(nn.Module):
+    """
+    Observation, action and both embeddings to a value.
+
+    :param net_arch: hidden widths; observation and action pass the first, then embeddings join
+    :param activation_fn: between the layers
+    """
+
+    net_arch: Sequence[int]
+    activation_fn: Activation
+
+    @nn.compact
+    def __call__(
+        self,
+        obs: Float[Array, "*batch obs"],
+        action: Float[Array, "*batch act"],
+        both: Float[Array, "*batch z"],
+        state: Float[Array, "*batch z"],
+    ) -> Float[Array, "*batch"]:
+        own = nn.Dense(self.net_arch[0])(jnp.concatenate([obs, action], -1))
+        hidden = _Dense((*self.net_arch, 1), self.activation_fn)
+        return hidden(jnp.concatenate([average_l1_norm(own), both, state], -1))[..., 0]
+
+
+class _Dense(nn.Module):
+    """Layers of these widths, the last one linear."""
+
+    sizes: Sequence[int]
+    activation_fn: Activation
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        for size in self.sizes[:-1]:
+            x = self.activation_fn(nn.Dense(size)(x))
+        return nn.Dense(self.sizes[-1])(x)
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """
+    What an update is made of.
+
+    :param target_every: updates between two copies into the target networks
+    :param policy_delay: updates of the critics for each of the actor
+    :param target_noise: standard deviation of the noise on the target policy's actions
+    :param noise_clip: its limit
+    :param alpha: how much priorities depend on errors
+    """
+
+    encoder: nn.Module
+    actor: nn.Module
+    critic: nn.Module
+    n_critics: int
+    optimizer: Optimizer
+    qf_optimizer: Optimizer
+    target_every: int
+    policy_delay: int
+    target_noise: float
+    noise_clip: float
+    alpha: float
+
+
+class Range(NamedTuple):
+    """Of the values that targets had."""
+
+    low: Float[Array, ""]
+    high: Float[Array, ""]
+
+
+class Copies(NamedTuple):
+    """
+    Weights that do not move with every update.
+
+    :param encoder: that actor and critics go by
+    :param target_encoder: that target actor and critics go by
+    """
+
+    encoder: Weights
+    actor: Weights
+    critic: Weights
+    target_encoder: Weights
+
+
+class Learner(NamedTuple):
+    """
+    Everything that an update changes.
+
+    :param clip: range of values to which next values are clipped
+    :param range: of targets since the last copy
+    :param checkpoint: encoder and actor that act where nothing is explored
+    """
+
+    encoder: Trained
+    actor: Trained
+    critic: Trained
+    copies: Copies
+    checkpoint: tuple[Weights, Weights]
+    clip: Range
+    range: Range
+    key: PRNGKeyArray
+    n_updates: Int[Array, ""]
+
+
+class Report(NamedTuple):
+    """Of the last update; the actor's of the last one in which it was updated."""
+
+    critic_loss: Float[Array, ""]
+    actor_loss: Float[Array, ""]
+    encoder_loss: Float[Array, ""]
+
+
+def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
+    """:return: fresh networks and optimisers"""
+    key, encoder_key, actor_key, critic_key = jax.random.split(key, 4)
+    obs, action = jnp.zeros((1, n_obs)), jnp.zeros((1, n_act))
+    encoder = recipe.encoder.init(encoder_key, obs, action)
+    state, both = cast(tuple[Array, Array], recipe.encoder.apply(encoder, obs, action))
+    actor = recipe.actor.init(actor_key, obs, state)
+    init = lambda key: recipe.critic.init(key, obs, action, both, state)  # noqa: E731
+    critic = jax.vmap(init)(jax.random.split(critic_key, recipe.n_critics))
+    zero, infinite = jnp.zeros(()), jnp.full((), jnp.inf)
+    return Learner(
+        encoder=Trained(encoder, recipe.qf_optimizer.init(encoder["params"])),
+        actor=Trained(actor, recipe.optimizer.init(actor["params"])),
+        critic=Trained(critic, recipe.qf_optimizer.init(critic["params"])),
+        copies=Copies(encoder, actor, critic, encoder),
+        checkpoint=(encoder, actor),
+        clip=Range(zero, zero),
+        range=Range(infinite, -infinite),
+        key=key,
+        n_updates=jnp.zeros((), jnp.int32),
+    )
+
+
+def act(recipe: Recipe, encoder: Weights, actor: Weights, obs: Array) -> Array:
+    """:return: controls, by these weights"""
+    nothing = jnp.zeros((*obs.shape[:-1], cast(Any, recipe.actor).n_act))
+    state, _ = cast(tuple[Array, Array], recipe.encoder.apply(encoder, obs, nothing))
+    return cast(Array, recipe.actor.apply(actor, obs, state))
+
+
+def _embedded(recipe: Recipe, weights: Weights, obs: Array, action: Array) -> tuple[Array, Array]:
+    return cast(tuple[Array, Array], recipe.encoder.apply(weights, obs, action))
+
+
+def _judged(
+    recipe: Recipe, weights: Weights, obs: Array, action: Array, state: Array, both: Array
+) -> Array:
+    one = lambda w: recipe.critic.apply(w, obs, action, both, state)  # noqa: E731
+    return cast(Array, jax.vmap(one)(weights))
+
+
+@partial(jax.jit, static_argnums=0)
+def update(
+    recipe: Recipe,
+    learner: Learner,
+    batch: Batch,
+    learning_rate: float,
+    qf_learning_rate: float,
+    report: Report,
+) -> tuple[Learner, Report, Float[Array, " batch"]]:
+    """
+    :param batch: of one update
+    :return: the learner, what happened, and the transitions' priorities
+    """
+    key, noise_key = jax.random.split(learner.key)
+    copies = learner.copies
+    learner = learner._replace(key=key, n_updates=learner.n_updates + 1)
+    encoder, encoder_loss = _update_encoder(recipe, learner.encoder, batch, qf_learning_rate)
+
+    noise = recipe.target_noise * jax.random.normal(noise_key, batch.action.shape)
+    noise = jnp.clip(noise, -recipe.noise_clip, recipe.noise_clip)
+    next_action = act(recipe, copies.target_encoder, copies.actor, batch.next_obs)
+    next_action = jnp.clip(next_action + noise, -1.0, 1.0)
+    embedded = _embedded(recipe, copies.target_encoder, batch.next_obs, next_action)
+    next_value = _judged(recipe, copies.critic, batch.next_obs, next_action, *embedded).min(0)
+    next_value = jnp.clip(next_value, learner.clip.low, learner.clip.high)
+    target = batch.reward + (1.0 - batch.terminated) * batch.discount * next_value
+    seen = Range(
+        jnp.minimum(learner.range.low, target.min()), jnp.maximum(learner.range.high, target.max())
+    )
+    state, both = _embedded(recipe, copies.encoder, batch.obs, batch.action)
+
+    def critic_loss(params: Any) -> tuple[Array, Array]:
+        value = _judged(recipe, {"params": params}, batch.obs, batch.action, state, both)
+        error = jnp.abs(value - target)
+        return jnp.sum(jnp.mean(jnp.where(error < 1.0, 0.5 * error**2, error), 1)), error
+
+    gradient = jax.value_and_grad(critic_loss, has_aux=True)
+    (loss, error), slope = gradient(learner.critic.weights["params"])
+    critic = recipe.qf_optimizer.apply(slope, learner.critic, qf_learning_rate)
+    priority = jnp.maximum(error.max(0), 1.0) ** recipe.alpha
+    learner = learner._replace(encoder=encoder, critic=critic, range=seen)
+    report = report._replace(critic_loss=loss, encoder_loss=encoder_loss)
+
+    improve = lambda: _update_actor(recipe, learner, batch, state, learning_rate)  # noqa: E731
+    due = learner.n_updates % recipe.policy_delay == 0
+    actor, loss = jax.lax.cond(due, improve, lambda: (learner.actor, report.actor_loss))
+    learner = learner._replace(actor=actor)
+    copied = learner._replace(
+        copies=Copies(encoder.weights, actor.weights, critic.weights, copies.encoder),
+        clip=seen,
+    )
+    due = learner.n_updates % recipe.target_every == 0
+    learner = jax.lax.cond(due, lambda: copied, lambda: learner)
+    return learner, report._replace(actor_loss=loss), priority
+
+
+def _update_encoder(
+    recipe: Recipe, encoder: Trained, batch: Batch, rate: float
+) -> tuple[Trained, Array]:
+    """The embedding of state and action shall be that of the next state."""
+    wanted, _ = _embedded(recipe, encoder.weights, batch.next_obs, batch.action)
+
+    def loss(params: Any) -> Array:
+        _, both = _embedded(recipe, {"params": params}, batch.obs, batch.action)
+        return jnp.mean((both - jax.lax.stop_gradient(wanted)) ** 2)
+
+    value, slope = jax.value_and_grad(loss)(encoder.weights["params"])
+    return recipe.qf_optimizer.apply(slope, encoder, rate), value
+
+
+def _update_actor(
+    recipe: Recipe, learner: Learner, batch: Batch, state: Array, rate: float
+) -> tuple[Trained, Array]:
+    def loss(params: Any) -> Array:
+        action = cast(Array, recipe.actor.apply({"params": params}, batch.obs, state))
+        _, both = _embedded(recipe, learner.copies.encoder, batch.obs, action)
+        value = _judged(recipe, learner.critic.weights, batch.obs, action, state, both)
+        return -jnp.mean(value)
+
+    value, slope = jax.value_and_grad(loss)(learner.actor.weights["params"])
+    return recipe.optimizer.apply(slope, learner.actor, rate), value

@@ -1,0 +1,59 @@
+"""TQC: quantile critics, of which the largest quantiles are left out."""
+
+import dataclasses
+from typing import Any
+
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_hds.algos.off_policy import Recipe, Truncated, mean, quantile_huber
+from sb3_hds.algos.soft_actor_critic import SoftActorCritic
+
+
+class TQC(SoftActorCritic):
+    """
+    Truncated quantile critics.
+
+    Source: Kuznetsov et al., *Controlling Overestimation Bias with Truncated Mixture of Continuous
+    Distributional Quantile Critics*, ICML 2020: 25 quantiles, five networks of three layers of 512
+    (``policy_kwargs={"n_critics": 5, "net_arch": {"pi": [256, 256], "qf": [512, 512, 512]}}``), of
+    which 2 quantiles are dropped for each network, none on HalfCheetah, 5 on Hopper. SB3-contrib
+    and SBX use two networks; so does the default here.
+
+    :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
+    :param env: likewise
+    :param top_quantiles_to_drop_per_net: of each critic's next values
+    :param policy_kwargs: ``n_quantiles`` is 25 unless given
+    :param arguments: those of ``SoftActorCritic``
+    """
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
+        env: GymEnv | str | None = None,
+        *,
+        top_quantiles_to_drop_per_net: int = 2,
+        policy_kwargs: dict[str, Any] | None = None,
+        **arguments: Any,
+    ) -> None:
+        self.top_quantiles_to_drop_per_net = top_quantiles_to_drop_per_net
+        super().__init__(
+            policy, env, policy_kwargs={"n_quantiles": 25, **(policy_kwargs or {})}, **arguments
+        )
+
+    def recipe(self) -> Recipe:
+        return dataclasses.replace(
+            super().recipe(),
+            target_of=Truncated(self.top_quantiles_to_drop_per_net),
+            error=quantile_huber,
+            worth=mean,
+        )
+
+    def check_arguments(self) -> None:
+        super().check_arguments()
+        n, n_quantiles = self.top_quantiles_to_drop_per_net, self.policy_kwargs["n_quantiles"]
+        if not 0 <= n < n_quantiles:
+            raise ValueError(
+                f"top_quantiles_to_drop_per_net must be at least 0 and below the {n_quantiles} "
+                f"quantiles of a critic (policy_kwargs={{'n_quantiles': ...}}), got {n!r}."
+            )

@@ -1,0 +1,385 @@
+"""What model-free algorithms are made of, beside references, and what only they can do."""
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from small_models import NAMES, PLANNERS, SMALL, small
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.distributions import StateDependentNoiseDistribution
+from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_hds import GSDESAC, TD7, CrossQ, DroQ, SimbaSAC
+from sb3_hds.algos.bodies import BatchRenorm, Dropout
+from sb3_hds.algos.heads import ExploringActor
+from sb3_hds.algos.lap import SumTree
+from sb3_hds.algos.observations import Seen, flattener, seen
+from sb3_hds.algos.off_policy import Truncated, average, least, mean, pessimistic, quantile_huber
+from sb3_hds.algos.sampling import batches_of
+from sb3_hds.algos.squashed import Gaussian, exploration_std, log_probability, marginal_std
+from sb3_hds.errors import EnvironmentMismatchError
+
+MODEL_FREE = [name for name in NAMES if name not in PLANNERS]
+SOFT = [name for name in MODEL_FREE if name != "td7"]
+every_algorithm = pytest.mark.parametrize("name", MODEL_FREE)
+every_soft = pytest.mark.parametrize("name", SOFT)
+
+
+# --- gSDE beside SB3's
+
+
+@pytest.mark.parametrize("use_expln", [False, True])
+@pytest.mark.parametrize("full_std", [False, True])
+def test_state_dependent_noise_is_that_of_stable_baselines(full_std, use_expln):
+    rng = np.random.default_rng(0)
+    latent, means = rng.normal(size=(7, 5)).astype("f"), rng.normal(size=(7, 2)).astype("f")
+    log_std = rng.normal(size=(5, 2 if full_std else 1)).astype("f") - 1.0
+    theirs = StateDependentNoiseDistribution(
+        2, full_std, use_expln=use_expln, squash_output=True, learn_features=True
+    )
+    theirs.latent_sde_dim = 5
+    theirs.sample_weights(th.as_tensor(log_std), 7)
+    theirs.proba_distribution(*map(th.as_tensor, (means, log_std, latent)))
+    before = rng.normal(size=(7, 2)).astype("f")
+
+    std = exploration_std(jnp.broadcast_to(log_std, (5, 2)), use_expln)
+    gaussian = Gaussian(jnp.asarray(means), marginal_std(jnp.asarray(latent), std), latent)
+
+    np.testing.assert_allclose(gaussian.std, theirs.distribution.stddev, rtol=1e-5)
+    np.testing.assert_allclose(jnp.tanh(gaussian.mean), theirs.mode(), rtol=1e-5)
+    expected = theirs.log_prob(th.tanh(th.as_tensor(before)))
+    np.testing.assert_allclose(log_probability(gaussian, before), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_noise_depends_on_the_state_and_stays_until_it_is_drawn_again():
+    model = small("gsde_sac", policy_kwargs={"net_arch": [8], "log_std_init": 0.0})
+    obs = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 2.0]], np.float32)
+
+    model.policy.reset_noise()
+    deviations = [
+        np.arctanh(np.clip(model.predict(obs)[0] / 2.0, -0.999, 0.999))
+        - np.arctanh(np.clip(model.predict(obs, deterministic=True)[0] / 2.0, -0.999, 0.999))
+        for _ in range(2)
+    ]
+    model.policy.reset_noise()
+
+    np.testing.assert_array_equal(*deviations)
+    assert abs(deviations[0][0] - deviations[0][1]) > 1e-3
+    assert (model.predict(obs)[0] != np.tanh(deviations[0])).all()
+    assert model.policy.get_std().shape == (8, 1)
+    assert model.policy.get_std().mean() == pytest.approx(1.0)
+
+
+def test_each_environment_has_its_noise_matrix_and_the_deviation_is_logged():
+    env = DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")] * 3)
+    model = small("gsde_sac", env, train_freq=5).learn(60)
+
+    assert model.policy.matrices.shape == (3, 8, 1)
+    model.dump_logs()
+    assert isinstance(model.policy.actor_network, ExploringActor)
+
+
+@pytest.mark.parametrize("name", ["tqc_jax", "crossq_jax"])
+def test_other_algorithms_explore_by_the_same_noise(name):
+    model = small(name, use_sde=True, sde_sample_freq=2).learn(30)
+
+    assert model.policy.matrices is not None and model.policy.get_std().mean() > 0.0
+
+
+# --- the parts
+
+
+def test_how_critics_become_targets_and_what_they_are_worth():
+    values = jnp.array([[[4.0, 1.0]], [[2.0, 3.0]]])  # two critics, one state, two quantiles
+
+    np.testing.assert_array_equal(least(values), [[2.0, 1.0]])
+    np.testing.assert_array_equal(average(values), [[3.0, 2.0]])
+    np.testing.assert_array_equal(Truncated(1)(values), [[1.0, 2.0]])
+    assert mean(values) == pytest.approx(2.5)
+    assert pessimistic(values) == pytest.approx(2.5)
+
+
+def test_the_quantile_loss_is_least_at_the_quantiles():
+    targets = jnp.linspace(-1.0, 1.0, 2001)[None]
+    best = (jnp.arange(4) + 0.5) / 2.0 - 1.0
+    loss = lambda shift: quantile_huber((best + shift)[None, None], targets)  # noqa: E731
+
+    # The Huber part smooths within 1: the slopes at the quantiles are those of an expectile.
+    assert loss(0.0) < min(loss(0.5), loss(-0.5))
+
+    def by_hand(level, y, q):
+        size = abs(y - q)
+        return abs(level - (y < q)) * (0.5 * size**2 if size <= 1.0 else size - 0.5)
+
+    expected = np.mean(
+        [
+            by_hand((i + 0.5) / 4.0, y, q)
+            for i, q in enumerate(np.asarray(best))
+            for y in np.asarray(targets[0])
+        ]
+    )
+    assert float(loss(0.0)) == pytest.approx(expected, rel=1e-4)
+
+
+def test_dropout_zeroes_its_share_independently_and_keeps_the_mean():
+    x = jnp.ones((400, 500))
+    masks = [
+        np.asarray(Dropout(0.1).apply({}, x, rngs={"dropout": jax.random.key(seed)})) == 0.0
+        for seed in (0, 1)
+    ]
+
+    for mask in masks:
+        # Six standard deviations of a share of 200,000.
+        assert mask.mean() == pytest.approx(0.1, abs=6 * np.sqrt(0.09 / mask.size))
+        assert mask.mean(0).std() == pytest.approx(np.sqrt(0.09 / 400), rel=0.2)
+    together = (masks[0] & masks[1]).mean()
+    assert together == pytest.approx(0.01, abs=6 * np.sqrt(0.01 / x.size))
+    assert (masks[0][:, 1:] & masks[0][:, :-1]).mean() == pytest.approx(0.01, abs=0.002)
+
+
+def test_batch_renormalisation_normalises_by_the_batch_and_remembers():
+    x = jnp.asarray(np.random.default_rng(0).normal(3.0, 2.0, (64, 4)), jnp.float32)
+    layer = BatchRenorm(warmup=10, momentum=0.9)
+    weights = layer.init(jax.random.key(0), x, True)
+
+    for _ in range(100):
+        y, changed = layer.apply(weights, x, True, mutable=["statistics"])
+        weights = {**weights, **changed}
+
+    np.testing.assert_allclose(y.mean(0), 0.0, atol=1e-3)
+    np.testing.assert_allclose(y.std(0), 1.0, atol=1e-2)
+    np.testing.assert_allclose(weights["statistics"]["mean"], x.mean(0), rtol=1e-3)
+    np.testing.assert_allclose(layer.apply(weights, x, False), y, atol=1e-2)
+
+
+def test_running_statistics_are_those_of_all_observations():
+    rows = np.random.default_rng(0).normal(5.0, 3.0, (50, 2)).astype("f")
+    scales = Seen.nothing(2)
+    for part in np.split(rows, 10):
+        scales = scales.with_more(part)
+
+    np.testing.assert_allclose(scales.mean, rows.mean(0), rtol=1e-5)
+    np.testing.assert_allclose(scales.variance, rows.var(0), rtol=1e-4)
+    np.testing.assert_allclose(seen(scales, rows).std(0), 1.0, rtol=1e-3)
+    np.testing.assert_array_equal(seen(Seen.nothing(2), rows), rows)
+
+
+def test_entries_are_drawn_in_proportion_to_their_size():
+    tree, sizes = SumTree(7), np.array([0.0, 1.0, 5.0, 0.0, 2.0, 0.0, 2.0])
+    tree.set(np.arange(7), sizes)
+
+    at = np.linspace(0.0, tree.total, 10_001)
+    drawn = np.bincount(tree.draw(at), minlength=7) / len(at)
+
+    assert tree.total == 10.0 and tree.largest() == 5.0
+    np.testing.assert_allclose(drawn, sizes / 10.0, atol=1e-3)
+
+
+def test_choices_become_one_hot_and_dictionaries_one_row():
+    space = spaces.Dict(
+        {
+            "box": spaces.Box(-1, 1, (2, 2)),
+            "choice": spaces.Discrete(3, start=5),
+            "choices": spaces.MultiDiscrete([2, 3]),
+            "flags": spaces.MultiBinary(2),
+        }
+    )
+    sample = {name: value[None] for name, value in space.sample().items()}
+    sample |= {"choice": np.array([6]), "choices": np.array([[1, 2]])}
+
+    [flat] = flattener(space)(sample)
+
+    assert flat.shape == (spaces.flatdim(space),)
+    np.testing.assert_array_equal(flat[4:7], [0, 1, 0])
+    np.testing.assert_array_equal(flat[7:12], [0, 1, 0, 0, 1])
+
+
+# --- what an algorithm takes
+
+
+class Constant(gymnasium.Env):
+    """An environment with any spaces, of ten steps."""
+
+    def __init__(self, observation_space, action_space) -> None:
+        self.observation_space, self.action_space = observation_space, action_space
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        self._left = 10
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        self._left -= 1
+        return self.observation_space.sample(), 1.0, False, self._left == 0, {}
+
+
+SPACES = {
+    "box of two axes": spaces.Box(-1, 1, (2, 3)),
+    "discrete": spaces.Discrete(4),
+    "multi-discrete": spaces.MultiDiscrete([2, 3]),
+    "multi-binary": spaces.MultiBinary(3),
+    "dict": spaces.Dict({"a": spaces.Box(-1, 1, (2,)), "b": spaces.Discrete(3)}),
+}
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_observations_of_numbers_and_choices_are_learned_from(space):
+    env = Constant(SPACES[space], spaces.Box(-2.0, 3.0, (2, 2)))
+    policy = "MultiInputPolicy" if space == "dict" else "MlpPolicy"
+
+    model = DroQ(policy, env, seed=0, **SMALL["droq"]).learn(30)
+
+    action, _ = model.predict(env.reset()[0])
+    assert env.action_space.contains(action)
+
+
+def test_models_that_were_given_the_same_dictionary_do_not_share_it():
+    kwargs = {"net_arch": [8]}
+    exploring = GSDESAC("Pendulum-v1", policy_kwargs=kwargs)
+    DroQ("Pendulum-v1", policy_kwargs=kwargs)
+
+    assert kwargs == {"net_arch": [8]} and exploring.policy_kwargs["use_sde"]
+
+
+def test_images_are_refused():
+    env = Constant(spaces.Box(0, 255, (3, 36, 36), np.uint8), spaces.Box(-1, 1, (1,)))
+
+    with pytest.raises(EnvironmentMismatchError, match="is an image"):
+        DroQ("MlpPolicy", env)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"tau": 2.0}, "tau must be from 0 to 1"),
+        ({"policy_delay": 0}, "policy_delay must be a whole number of at least 1"),
+        ({"ent_coef": "automatic"}, "ent_coef must be a number above 0, 'auto'"),
+        ({"target_entropy": "low"}, "target_entropy must be 'auto' or a number"),
+        ({"policy_kwargs": {"net_arch": {"pi": [8]}}}, "net_arch must be a list of widths"),
+        ({"policy_kwargs": {"activation_fn": "swoosh"}}, "activation_fn must be one of"),
+        ({"policy_kwargs": {"optimizer_class": "magic"}}, "optimizer_class must be one of"),
+        ({"policy_kwargs": {"optimizer_kwargs": {"speed": 1}}}, "optimizer_kwargs"),
+        ({"policy_kwargs": {"dropout_rate": 1.0}}, "dropout_rate must be at least 0"),
+    ],
+)
+def test_what_cannot_work_is_refused_at_the_door(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        DroQ("Pendulum-v1", **arguments)
+
+
+def test_torch_classes_are_understood():
+    kwargs = {
+        "activation_fn": th.nn.ELU,
+        "optimizer_class": th.optim.AdamW,
+        "optimizer_kwargs": {"betas": (0.8, 0.99), "weight_decay": 1e-3},
+    }
+    model = small("droq", policy_kwargs=SMALL["droq"]["policy_kwargs"] | kwargs).learn(20)
+
+    assert dict(model.policy.optimizers[0].arguments)["b1"] == 0.8
+
+
+@every_soft
+def test_returns_of_several_steps_and_compressed_buffers_are_learned_from(name):
+    small(name, n_steps=3).learn(30)
+    buffer = {"handle_timeout_termination": False}
+    small(name, optimize_memory_usage=True, replay_buffer_kwargs=buffer).learn(30)
+
+
+def test_hindsight_replay_is_learned_from():
+    env = BitFlippingEnv(n_bits=3, continuous=True, max_steps=3)
+    model = DroQ(
+        "MultiInputPolicy",
+        env,
+        replay_buffer_class=HerReplayBuffer,
+        seed=0,
+        **SMALL["droq"],
+    )
+
+    assert model.learn(40)._n_updates > 0
+
+
+def test_batches_are_normalised_as_the_environment_is_and_time_limits_are_no_end():
+    env = VecNormalize(DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")]))
+    model = small("droq", env, gradient_steps=0).learn(450)
+
+    batch = batches_of(model, 3, 100, 4)
+
+    assert batch.obs.shape == (4, 100, 3) and (batch.obs[3] == 0.0).all()
+    assert np.abs(batch.obs[:3].reshape(-1, 3).mean(0)).max() < 0.5
+    assert model.replay_buffer.dones.sum() == 2.0 and not batch.terminated.any()
+
+
+@every_algorithm
+def test_networks_start_afresh_when_told_to(name):
+    model = small(name, param_resets=[20]).learn(15)
+    before = model.get_parameters()["policy"]
+    model.learn(15, reset_num_timesteps=False)
+
+    assert model.reset_idx == 1
+    changed = [
+        np.abs(tensor.numpy() - before[key].numpy()).max()
+        for key, tensor in model.get_parameters()["policy"].items()
+        if key.endswith("kernel")
+    ]
+    # A few small steps of Adam would not lead so far.
+    assert min(changed) > 0.05
+
+
+def test_an_update_that_diverges_is_an_error_and_leaves_the_last_good_weights():
+    model = small("droq").learn(20)
+    before = model.get_parameters()["policy"]
+    model.replay_buffer.rewards[:] = 1e38
+
+    with pytest.raises(FloatingPointError, match="diverged"):
+        for _ in range(20):
+            model.train(gradient_steps=4, batch_size=16)
+
+    after = model.get_parameters()["policy"]
+    assert all(np.isfinite(tensor.numpy()).all() for tensor in after.values())
+    assert before.keys() == after.keys()
+
+
+@pytest.mark.parametrize("algorithm", [GSDESAC, CrossQ, TD7])
+def test_schedules_of_both_learning_rates_act(algorithm):
+    name = {GSDESAC: "gsde_sac", CrossQ: "crossq_jax", TD7: "td7"}[algorithm]
+    model = small(name, learning_rate=lambda left: 1e-3 * left, qf_learning_rate="lin_2e-3")
+    model.learn(40)
+    model._current_progress_remaining = 0.0
+    before = model.get_parameters()["policy"]
+
+    model.train(4, 16)
+
+    for key, tensor in model.get_parameters()["policy"].items():
+        if key.startswith(("actor", "critic")) and "statistics" not in key:
+            np.testing.assert_array_equal(tensor, before[key], err_msg=key)
+
+
+def test_simba_sees_observations_in_units_of_what_it_saw():
+    model = small("simba").learn(60)
+    assert isinstance(model, SimbaSAC)
+    scales = model.policy.learner.seen
+
+    assert float(scales.count) == 60.0
+    speeds = model.replay_buffer.next_observations[:60, 0, 2]
+    assert float(scales.mean[2]) == pytest.approx(speeds.mean(), rel=1e-3)
+
+
+def test_a_policy_of_td7_is_kept_only_if_it_did_no_worse():
+    model = small("td7", use_checkpoints=True, train_freq=None)
+    model._finished, model.best_worst_return = [(-500.0, 200)], -300.0
+    before = model.policy.learner.checkpoint
+    assert model._assessed() == 200
+    assert model.policy.learner.checkpoint is before
+
+    model._finished = [(-100.0, 200)]
+    assert model._assessed() == 200
+    assert model.best_worst_return == -100.0
+    assert model.policy.learner.checkpoint is not before
+
+    model._n_updates, model._finished = model.updates_before_checkpointing, [(-50.0, 200)]
+    assert model._assessed() == 0 and model.assessed_episodes == 1
