@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from small_models import NAMES, PLANNERS, SMALL, small
+from small_models import NAMES, PLANNERS, SMALL, logged, small
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.envs import BitFlippingEnv
@@ -60,26 +60,27 @@ def test_noise_depends_on_the_state_and_stays_until_it_is_drawn_again():
     obs = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 2.0]], np.float32)
 
     model.policy.reset_noise()
-    deviations = [
-        np.arctanh(np.clip(model.predict(obs)[0] / 2.0, -0.999, 0.999))
-        - np.arctanh(np.clip(model.predict(obs, deterministic=True)[0] / 2.0, -0.999, 0.999))
-        for _ in range(2)
-    ]
+    before = lambda **how: np.arctanh(np.clip(model.predict(obs, **how)[0] / 2.0, -0.999, 0.999))  # noqa: E731
+    deviations = [before() - before(deterministic=True) for _ in range(2)]
     model.policy.reset_noise()
 
     np.testing.assert_array_equal(*deviations)
     assert abs(deviations[0][0] - deviations[0][1]) > 1e-3
-    assert (model.predict(obs)[0] != np.tanh(deviations[0])).all()
+    assert np.abs(before() - before(deterministic=True) - deviations[0]).min() > 1e-3
     assert model.policy.get_std().shape == (8, 1)
     assert model.policy.get_std().mean() == pytest.approx(1.0)
 
 
 def test_each_environment_has_its_noise_matrix_and_the_deviation_is_logged():
     env = DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")] * 3)
-    model = small("gsde_sac", env, train_freq=5).learn(60)
+    model = small("gsde_sac", env, train_freq=5)
+    lines = logged(model)
+
+    model.learn(700, log_interval=1)
 
     assert model.policy.matrices.shape == (3, 8, 1)
-    model.dump_logs()
+    stds = lines.column("train/std")
+    assert stds and stds[-1] == pytest.approx(np.exp(-3.0), rel=0.5)
     assert isinstance(model.policy.actor_network, ExploringActor)
 
 
@@ -285,9 +286,15 @@ def test_torch_classes_are_understood():
 
 @every_soft
 def test_returns_of_several_steps_and_compressed_buffers_are_learned_from(name):
-    small(name, n_steps=3).learn(30)
+    longer = small(name, n_steps=3, gamma=0.9).learn(30)
     buffer = {"handle_timeout_termination": False}
-    small(name, optimize_memory_usage=True, replay_buffer_kwargs=buffer).learn(30)
+    compressed = small(name, optimize_memory_usage=True, replay_buffer_kwargs=buffer).learn(30)
+
+    assert longer._n_updates > 0 and compressed._n_updates > 0
+    discounts = batches_of(longer, 4, 16, 4).discount
+    assert discounts.min() == pytest.approx(0.9**3)
+    batch = batches_of(compressed, 1, 16, 1)
+    assert (batch.obs != batch.next_obs).any()
 
 
 def test_hindsight_replay_is_learned_from():
@@ -367,6 +374,25 @@ def test_simba_sees_observations_in_units_of_what_it_saw():
     assert float(scales.count) == 60.0
     speeds = model.replay_buffer.next_observations[:60, 0, 2]
     assert float(scales.mean[2]) == pytest.approx(speeds.mean(), rel=1e-3)
+
+
+def test_td7_does_not_judge_a_policy_by_random_actions():
+    model = small("td7", use_checkpoints=True, train_freq=None, learning_starts=250)
+    judged = []
+    model._assessed = lambda: judged.extend(model._finished) or 0
+    model.learn(600)
+
+    # Episodes of 200 steps: the first is random, the second begins so.
+    assert judged and {length for _, length in judged} == {200}
+    assert len(model._finished) == 1
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"n_steps": 2}, {"use_sde": True}, {"optimize_memory_usage": True}]
+)
+def test_what_the_replay_buffer_of_td7_cannot_do_is_refused(arguments):
+    with pytest.raises(ValueError, match=next(iter(arguments))):
+        TD7("Pendulum-v1", **arguments)
 
 
 def test_a_policy_of_td7_is_kept_only_if_it_did_no_worse():

@@ -193,8 +193,7 @@ class TD7(ModelFreeAlgorithm):
     of them; only then it is updated, once for each step that it made. That needs one environment,
     and ``gradient_steps`` is not looked at.
 
-    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` for Dict observations, a policy class, or
-        the environment itself
+    :param policy: ``"MlpPolicy"``, a policy class, or the environment itself
     :param env: an environment, its id, or a vectorised environment
     :param learning_starts: steps with random actions before learning starts
     :param policy_delay: updates of the critics for each of the actor
@@ -215,7 +214,7 @@ class TD7(ModelFreeAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": TD7Policy,
-        "MultiInputPolicy": TD7Policy,
+        "MultiInputPolicy": TD7Policy,  # so that Dict observations reach the message that says why
     }
     policy: TD7Policy
 
@@ -293,6 +292,15 @@ class TD7(ModelFreeAlgorithm):
             self.replay_buffer_class, LapReplayBuffer
         )
         self.refuse_unless(fits, "replay_buffer_class", "LapReplayBuffer, or extend it")
+        self.refuse_unless(self.n_steps == 1, "n_steps", "1 with this replay buffer")
+        self.refuse_unless(not self.use_sde, "use_sde", "False: noise is added to the actions")
+        compressed = self.optimize_memory_usage
+        self.refuse_unless(not compressed, "optimize_memory_usage", "False with this replay buffer")
+        if isinstance(self.observation_space, spaces.Dict):
+            raise ValueError(
+                "TD7's replay buffer has no Dict observations: "
+                "use gymnasium.wrappers.FlattenObservation."
+            )
 
     def _setup_model(self) -> None:
         if self.use_checkpoints is None:
@@ -374,7 +382,9 @@ class TD7(ModelFreeAlgorithm):
         self._episode_return += float(reward[0])
         self._episode_length += 1
         if dones[0]:
-            self._finished.append((self._episode_return, self._episode_length))
+            # What random actions earned says nothing of a policy.
+            if self.num_timesteps - self._episode_length >= self.learning_starts:
+                self._finished.append((self._episode_return, self._episode_length))
             self._episode_return, self._episode_length = 0.0, 0
 
 
