@@ -12,7 +12,18 @@ from sb3_hds.envs.registration import register_environments
 
 if TYPE_CHECKING:
     from sb3_hds import data, effects, envs, planning, sysid, twins, wrappers
-    from sb3_hds.algos import BRO, GSDESAC, HDS, PODS, TD7, TQC, CrossQ, DroQ, SimbaSAC
+    from sb3_hds.algos import (
+        BRO,
+        GSDESAC,
+        HDS,
+        PODS,
+        TD7,
+        TQC,
+        CrossQ,
+        DroQ,
+        SimbaSAC,
+        load_policy,
+    )
     from sb3_hds.data import Trajectories, audit
     from sb3_hds.sysid import calibrate, diagnose
 
@@ -35,6 +46,7 @@ __all__ = [
     "diagnose",
     "effects",
     "envs",
+    "load_policy",
     "planning",
     "sysid",
     "twins",
@@ -55,6 +67,7 @@ _CLASSES = {
     "audit": "data",
     "calibrate": "sysid",
     "diagnose": "sysid",
+    "load_policy": "algos",
 }
 
 register_environments()

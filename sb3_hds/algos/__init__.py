@@ -7,6 +7,7 @@ from sb3_hds.algos.gaussian_policy import GaussianPolicy
 from sb3_hds.algos.gsde_sac import GSDESAC
 from sb3_hds.algos.hds import HDS
 from sb3_hds.algos.pods import PODS
+from sb3_hds.algos.policy_file import load_policy
 from sb3_hds.algos.simba import SimbaSAC
 from sb3_hds.algos.td7 import TD7
 from sb3_hds.algos.tqc import TQC
@@ -38,4 +39,5 @@ __all__ = [
     "GaussianPolicy",
     "SimbaSAC",
     "TwinPolicy",
+    "load_policy",
 ]

@@ -61,9 +61,9 @@ class BroPolicy(GaussianPolicy):
         return BroBody(net_arch, self.activation_fn)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
-        if deterministic or self.use_sde:
-            return super()._predict(observation, deterministic)
         obs, learner = self.flatten(observation), self.learner
+        if deterministic or self.use_sde or self.recipe.extra is None:
+            return super()._predict(observation, deterministic)
         noise = self._noise.standard_normal((len(obs), self.n_act), np.float32)
         weights = learner.actor.weights, learner.extra["actor"].weights
         optimist = cast(Optimist, self.recipe.extra)

@@ -101,7 +101,7 @@ class GaussianPolicy(TensorPolicy):
         optimizer_kwargs: Mapping[str, Any] | None = None,
         qf_optimizer_kwargs: Mapping[str, Any] | None = None,
     ) -> None:
-        self._arguments = {
+        self.arguments = {
             name: value
             for name, value in locals().items()
             if name not in ("self", "observation_space", "action_space", "__class__")
@@ -109,7 +109,7 @@ class GaussianPolicy(TensorPolicy):
         super().__init__(observation_space, action_space, squash_output=True)
         chosen = {
             name: self.defaults.get(name) if value is None else value
-            for name, value in self._arguments.items()
+            for name, value in self.arguments.items()
         }
         net: Any = chosen["net_arch"]
         pi, qf = widths(net, "qf")
@@ -297,12 +297,6 @@ class GaussianPolicy(TensorPolicy):
             key=jax.random.wrap_key_data(key, impl=GENERATOR),
             n_updates=tree["n_updates"],
         )
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        """What ``save`` keeps of the policy besides its weights, and ``load`` makes it from."""
-        spaces_and_more = super()._get_constructor_parameters()
-        spaces_and_more.pop("normalize_images")
-        return spaces_and_more | self._arguments
 
 
 class SimbaPolicy(GaussianPolicy):

@@ -14,8 +14,9 @@ import io
 import os
 import re
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -123,8 +124,14 @@ class TensorPolicy(BaseJaxPolicy):
     """
     A policy whose networks are pytrees, saved as tensors.
 
-    Subclasses implement ``weights`` and ``training_state``, each with a setter.
+    Subclasses implement ``weights`` and ``training_state``, each with a setter, and keep what they
+    were made with in ``arguments``.
     """
+
+    #: of the constructor, but for the spaces
+    arguments: dict[str, Any]
+    #: what prediction needs besides arguments and weights, as plain data
+    plain_state: Mapping[str, Any] = MappingProxyType({})
 
     def predict(  # type: ignore[override]
         self,
@@ -175,6 +182,12 @@ class TensorPolicy(BaseJaxPolicy):
     @training_state.setter
     def training_state(self, tree: Any) -> None:
         raise AttributeError("training_state")
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        """What ``save`` keeps of the policy besides its weights, and ``load`` makes it from."""
+        spaces_and_more = super()._get_constructor_parameters()
+        spaces_and_more.pop("normalize_images")
+        return spaces_and_more | self.arguments
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, th.Tensor]:
         return to_state_dict(self.weights)

@@ -68,7 +68,7 @@ class TD7Policy(TensorPolicy):
         optimizer_kwargs: Mapping[str, Any] | None = None,
         use_sde: bool = False,
     ) -> None:
-        self._arguments = {
+        self.arguments = {
             name: value
             for name, value in locals().items()
             if name not in ("self", "observation_space", "action_space", "__class__", "use_sde")
@@ -88,9 +88,21 @@ class TD7Policy(TensorPolicy):
             "qf_optimizer": optimizer,
         }
         self.flatten = flattener(observation_space)
-        self.learner: Learner
+        self._learner: Learner | None = None
         self.uses_checkpoints = False
         self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
+
+    @property
+    def learner(self) -> Learner:
+        """What updates change. A policy that no algorithm has built yet is that of the paper."""
+        if self._learner is None:
+            self.build(Recipe(**self.parts), 0, jax.devices()[0])
+        assert self._learner is not None
+        return self._learner
+
+    @learner.setter
+    def learner(self, learner: Learner) -> None:
+        self._learner = learner
 
     def build(self, recipe: Recipe, seed: int, device: Any) -> None:
         """
@@ -101,6 +113,14 @@ class TD7Policy(TensorPolicy):
         self.recipe = recipe
         key = jax.random.key(seed, impl=GENERATOR)
         self.learner = jax.device_put(begin(recipe, self.n_obs, self.n_act, key), device)
+
+    @property
+    def plain_state(self) -> dict[str, bool]:  # type: ignore[override]
+        return {"uses_checkpoints": self.uses_checkpoints}
+
+    @plain_state.setter
+    def plain_state(self, state: Mapping[str, bool]) -> None:
+        self.uses_checkpoints = bool(state["uses_checkpoints"])
 
     def keep_checkpoint(self) -> None:
         """The policy as it is acts where nothing is explored."""
@@ -171,12 +191,6 @@ class TD7Policy(TensorPolicy):
             key=jax.random.wrap_key_data(key, impl=GENERATOR),
             n_updates=tree["n_updates"],
         )
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        """What ``save`` keeps of the policy besides its weights, and ``load`` makes it from."""
-        spaces_and_more = super()._get_constructor_parameters()
-        spaces_and_more.pop("normalize_images")
-        return spaces_and_more | self._arguments
 
 
 class TD7(ModelFreeAlgorithm):

@@ -126,11 +126,11 @@ class Recipe:
     n_critics: int
     optimizer: Optimizer
     qf_optimizer: Optimizer
-    target_every: int
-    policy_delay: int
-    target_noise: float
-    noise_clip: float
-    alpha: float
+    target_every: int = 250
+    policy_delay: int = 2
+    target_noise: float = 0.2
+    noise_clip: float = 0.5
+    alpha: float = 0.4
 
 
 class Range(NamedTuple):

@@ -14,6 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_hds.algos.call_forms import check_origin, device_or_cpu
 from sb3_hds.algos.persistence import TensorPolicy, damage_reported, write_whole
+from sb3_hds.algos.policy_description import described
 
 
 class TensorAlgorithm(OffPolicyAlgorithmJax):
@@ -22,6 +23,7 @@ class TensorAlgorithm(OffPolicyAlgorithmJax):
     default_timesteps: ClassVar[int] = 1_000
     policy: TensorPolicy
     saved_by: str
+    policy_description: dict[str, Any] | None
 
     def learn(  # type: ignore[override]
         self,
@@ -90,6 +92,7 @@ class TensorAlgorithm(OffPolicyAlgorithmJax):
         :param include: attributes to write although they are usually left out
         :raises OSError: if the file cannot be written; an older one is then left as it was
         """
+        self.policy_description = described(self.policy)
         write = super().save
         write_whole(path, "zip", lambda file: write(file, exclude, include))
 

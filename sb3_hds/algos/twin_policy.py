@@ -49,7 +49,7 @@ class TwinPolicy(TensorPolicy):
         function = activation(activation_fn)
         if not max_grad_norm > 0.0:
             raise ValueError(f"max_grad_norm must be above 0, got {max_grad_norm!r}.")
-        self._arguments = {
+        self.arguments = {
             "lr_schedule": lr_schedule,
             "net_arch": net_arch,
             "activation_fn": activation_fn,
@@ -100,12 +100,6 @@ class TwinPolicy(TensorPolicy):
     def _predict(self, observation: np.ndarray, deterministic: bool = True) -> np.ndarray:  # type: ignore[override]
         flat = observation.reshape(observation.shape[0], -1)
         return np.asarray(_act(self.actor_network, self.networks, flat))
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        """What ``save`` keeps of the policy besides its weights, and ``load`` makes it from."""
-        spaces_and_more = super()._get_constructor_parameters()
-        spaces_and_more.pop("normalize_images")
-        return spaces_and_more | self._arguments
 
     def reset_noise(self, batch_size: int = 1) -> None:
         """Nothing to reset: the policy is deterministic."""

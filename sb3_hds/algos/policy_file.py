@@ -1,0 +1,86 @@
+"""
+A policy from a file that a stranger sent: nothing in it is unpickled.
+
+SB3 pickles whatever of a model is not JSON, its spaces among it, so that loading a model runs code
+of whoever saved it. Beside that, our models describe their policy in plain JSON; the weights are
+tensors, which ``torch.load(weights_only=True)`` reads.
+"""
+
+import io
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch as th
+
+from sb3_hds.algos.bro import BroPolicy
+from sb3_hds.algos.gaussian_policy import CrossQPolicy, GaussianPolicy, SimbaPolicy
+from sb3_hds.algos.persistence import TensorPolicy
+from sb3_hds.algos.policy_description import space_from_plain
+from sb3_hds.algos.td7 import TD7Policy
+from sb3_hds.algos.twin_policy import TwinPolicy
+
+_CLASSES: dict[str, type[TensorPolicy]] = {
+    policy.__name__: policy
+    for policy in (TwinPolicy, GaussianPolicy, SimbaPolicy, CrossQPolicy, BroPolicy, TD7Policy)
+}
+
+
+def load_policy(path: str | os.PathLike[str] | io.BufferedIOBase) -> TensorPolicy:
+    """
+    The policy of a saved model, on the CPU, to act with: ``policy.predict(obs,
+    deterministic=True)``.
+
+    Nothing is unpickled: the file may come from anywhere. It has no environment, no
+    ``VecNormalize`` (whose statistics are a file of their own) and cannot go on learning.
+
+    :param path: of a zip file that one of our algorithms saved; ``.zip`` may be left out
+    :raises FileNotFoundError: if there is none
+    :raises ValueError: for a file that is damaged, that another library saved, or whose policy only
+        Python code describes: a class or an activation function of your own
+    """
+    try:
+        with zipfile.ZipFile(_existing(path)) as file:
+            description = json.loads(file.read("data")).get("policy_description")
+            tensors = io.BytesIO(file.read("policy.pth"))
+    except (zipfile.BadZipFile, KeyError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"'{path}' is damaged, or is no saved model: {error}.") from error
+    if description is None:
+        raise ValueError(
+            f"'{path}' does not describe its policy in plain data: another library saved it, an "
+            "older version of this one, or its policy has a class or function of your own. If you "
+            "trust whoever saved it, load it with its algorithm, for example HDS.load(path)."
+        )
+    return _built(description, th.load(tensors, map_location="cpu", weights_only=True))
+
+
+def _built(description: Mapping[str, Any], tensors: dict[str, th.Tensor]) -> TensorPolicy:
+    try:
+        make = _CLASSES[description["class"]]
+        observation_space = space_from_plain(description["observation_space"])
+        action_space: Any = space_from_plain(description["action_space"])
+        policy = make(  # type: ignore[call-arg]
+            observation_space, action_space, lr_schedule=_no_rate, **description["arguments"]
+        )
+        policy.plain_state = description["state"]
+    except (KeyError, TypeError) as error:
+        raise ValueError(
+            f"This file describes its policy in a way that this version does not know ({error}): "
+            "was it saved by a newer one?"
+        ) from error
+    policy.load_state_dict(tensors)
+    return policy
+
+
+def _existing(path: Any) -> Any:
+    if not isinstance(path, str | os.PathLike):
+        return path
+    named = Path(path)
+    return named if named.exists() else named.with_name(f"{named.name}.zip")
+
+
+def _no_rate(_: float) -> float:
+    return 0.0

@@ -1,0 +1,145 @@
+"""``sb3_hds.load_policy``: a policy from a file of which nothing is unpickled."""
+
+import pickle
+import zipfile
+
+import cloudpickle
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from small_models import NAMES, saved, small
+from stable_baselines3 import SAC
+
+import sb3_hds
+from sb3_hds.algos.policy_description import space_from_plain, space_to_plain
+
+
+@pytest.fixture
+def no_pickle(monkeypatch):
+    """Whatever is unpickled from now on fails, but for the tensors that torch vouches for."""
+
+    def refuse(*_, **__):
+        raise AssertionError("something was unpickled")
+
+    for module in (pickle, cloudpickle):
+        for name in ("load", "loads"):
+            monkeypatch.setattr(module, name, refuse)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_policy_alone_acts_as_its_model_and_nothing_is_unpickled(name, tmp_path, no_pickle):
+    model = small(name, seed=3)
+    obs = np.array([[1.0, 0.0, 0.5], [-0.6, 0.8, -7.0]], np.float32)
+    if name == "simba":
+        model.policy.observed(obs)
+    model.save(tmp_path / "model")
+
+    policy = sb3_hds.load_policy(tmp_path / "model")
+
+    expected, _ = model.predict(obs, deterministic=True)
+    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], expected)
+    explored, _ = policy.predict(obs)
+    assert explored.shape == expected.shape and np.abs(explored).max() <= 2.0
+    assert policy.observation_space == model.observation_space
+    assert policy.action_space == model.action_space
+
+
+def test_checkpoints_of_td7_act_in_the_policy_alone(no_pickle):
+    model = small("td7", use_checkpoints=True, train_freq=None)
+    learner = model.policy.learner
+    other = jax.tree.map(lambda weight: weight + 0.1, learner.checkpoint)
+    model.policy.learner = learner._replace(checkpoint=other)
+    obs = model.observation_space.sample()
+
+    policy = sb3_hds.load_policy(saved(model))
+
+    expected, _ = model.predict(obs, deterministic=True)
+    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], expected)
+    model.policy.uses_checkpoints = False
+    assert (model.predict(obs, deterministic=True)[0] != expected).any()
+
+
+class Choices(gymnasium.Env):
+    """Observations that are numbers and choices, in an order that is not the alphabet's."""
+
+    observation_space = spaces.Dict(
+        [("speed", spaces.Box(-np.inf, np.inf, (2,))), ("gear", spaces.Discrete(3, start=1))]
+    )
+    action_space = spaces.Box(-1.0, 1.0, (2, 2))
+
+    def reset(self, **settings):
+        super().reset(**settings)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), float(action.sum()), False, False, {}
+
+
+def test_observations_of_several_parts_keep_their_order(no_pickle):
+    model = small("droq", Choices(), policy="MultiInputPolicy", seed=3)
+    obs = {"speed": np.array([0.3, -2.0], np.float32), "gear": 2}
+
+    policy = sb3_hds.load_policy(saved(model))
+
+    expected, _ = model.predict(obs, deterministic=True)
+    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], expected)
+    assert expected.shape == (2, 2)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Box(np.array([-np.inf, -1.0]), np.array([np.inf, 2.5]), dtype=np.float64),
+        spaces.Box(0, 255, (2, 3), np.uint8),
+        spaces.Discrete(4, start=-1),
+        spaces.MultiDiscrete([2, 3], start=[0, 1]),
+        spaces.MultiBinary([2, 2]),
+        spaces.Dict([("z", spaces.Discrete(2)), ("a", spaces.Box(-1.0, 1.0, (1,)))]),
+    ],
+)
+def test_spaces_come_back_from_plain_data(space):
+    assert space_from_plain(space_to_plain(space)) == space
+
+
+def test_names_and_torch_classes_of_activations_are_plain(no_pickle):
+    kwargs = {"net_arch": [8], "activation_fn": th.nn.Tanh}
+    file = saved(small("gsde_sac", policy_kwargs=kwargs))
+
+    assert sb3_hds.load_policy(file).arguments["activation_fn"] == "tanh"
+
+
+def test_a_function_of_ones_own_is_no_plain_data():
+    kwargs = {"net_arch": [8], "activation_fn": lambda x: jnp.sin(x)}
+    file = saved(small("gsde_sac", policy_kwargs=kwargs))
+
+    with pytest.raises(ValueError, match=r"class or function of your own.*HDS\.load"):
+        sb3_hds.load_policy(file)
+
+
+def test_a_missing_file_and_files_of_others_are_reported(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        sb3_hds.load_policy(tmp_path / "nowhere")
+    (tmp_path / "text.zip").write_text("no zip file")
+    with pytest.raises(ValueError, match="damaged, or is no saved model"):
+        sb3_hds.load_policy(tmp_path / "text.zip")
+    SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [8]}).save(tmp_path / "sac")
+    with pytest.raises(ValueError, match="another library saved it"):
+        sb3_hds.load_policy(tmp_path / "sac.zip")
+
+
+def test_a_description_of_a_newer_version_is_reported(tmp_path):
+    model = small("droq")
+    model.save(tmp_path / "old.zip")
+    with zipfile.ZipFile(tmp_path / "old.zip") as old:
+        parts = {name: old.read(name) for name in old.namelist()}
+    parts["data"] = parts["data"].replace(b'"GaussianPolicy"', b'"TransformerPolicy"')
+    with zipfile.ZipFile(tmp_path / "new.zip", "w") as new:
+        for name, content in parts.items():
+            new.writestr(name, content)
+
+    with pytest.raises(ValueError, match=r"TransformerPolicy.*newer"):
+        sb3_hds.load_policy(tmp_path / "new.zip")
