@@ -1,6 +1,7 @@
 """Learning algorithms behind Stable-Baselines3's API, one file each."""
 
 from sb3_hds.algos.bro import BRO
+from sb3_hds.algos.compiled import Episodes, learn_compiled
 from sb3_hds.algos.crossq import CrossQ
 from sb3_hds.algos.droq import DroQ
 from sb3_hds.algos.gaussian_policy import GaussianPolicy
@@ -36,8 +37,10 @@ __all__ = [
     "TQC",
     "CrossQ",
     "DroQ",
+    "Episodes",
     "GaussianPolicy",
     "SimbaSAC",
     "TwinPolicy",
+    "learn_compiled",
     "load_policy",
 ]

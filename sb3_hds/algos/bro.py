@@ -2,13 +2,11 @@
 
 import dataclasses
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, ClassVar, cast
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 from stable_baselines3.common.policies import BasePolicy
@@ -31,6 +29,7 @@ from sb3_hds.algos.off_policy import (
     quantile_huber,
 )
 from sb3_hds.algos.soft_actor_critic import SoftActorCritic
+from sb3_hds.algos.squashed import Gaussian
 
 # Steps of the environment at which the authors' networks start afresh: with the full replay ratio,
 # and with the fast one of 2.
@@ -59,15 +58,6 @@ class BroPolicy(GaussianPolicy):
 
     def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
         return BroBody(net_arch, self.activation_fn)
-
-    def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
-        obs, learner = self.flatten(observation), self.learner
-        if deterministic or self.use_sde or self.recipe.extra is None:
-            return super()._predict(observation, deterministic)
-        noise = self._noise.standard_normal((len(obs), self.n_act), np.float32)
-        weights = learner.actor.weights, learner.extra["actor"].weights
-        optimist = cast(Optimist, self.recipe.extra)
-        return np.asarray(_explored(self.actor_network, optimist, *weights, obs, noise))
 
 
 class BRO(SoftActorCritic):
@@ -221,24 +211,14 @@ class Optimist:
             "regularizer": _limited(state["regularizer"], -values["regularizer"] * excess),
         }
 
+    def explore(self, state: Any, obs: Array, gaussian: Gaussian, noise: Array) -> Array:
+        shift = cast(Array, self.network.apply(state["actor"].weights, obs, gaussian.mean))
+        return jnp.tanh(gaussian.mean + shift + self.std_multiplier * gaussian.std * noise)
+
 
 def _limited(multiplier: Trained, slope: Array) -> Trained:
     moved = _MULTIPLIER.apply(slope, multiplier, _MULTIPLIER_RATE)
     return moved._replace(weights={"params": jnp.clip(moved.weights["params"], *_LOG_LIMITS)})
-
-
-@partial(jax.jit, static_argnums=(0, 1))
-def _explored(
-    actor: nn.Module,
-    optimist: Optimist,
-    weights: Weights,
-    shift_weights: Weights,
-    obs: Any,
-    noise: Any,
-) -> jax.Array:
-    gaussian, _ = act(actor, weights, obs)
-    shift = cast(Array, optimist.network.apply(shift_weights, obs, gaussian.mean))
-    return jnp.tanh(gaussian.mean + shift + optimist.std_multiplier * gaussian.std * noise)
 
 
 _MULTIPLIER = Optimizer(optax.adam, (("b1", 0.5),))

@@ -24,6 +24,7 @@ from sb3_hds.algos.off_policy import (
     Weights,
     act,
     begin,
+    explored,
     least,
     pessimistic,
     squared,
@@ -244,7 +245,8 @@ class GaussianPolicy(TensorPolicy):
             return np.asarray(_mean(self.actor_network, actor, self.learner.seen, obs))
         if not self.use_sde:
             noise = self._noise.standard_normal((len(obs), self.n_act), np.float32)
-            return np.asarray(_scattered(self.actor_network, actor, self.learner.seen, obs, noise))
+            scales, extra = self.learner.seen, self.learner.extra
+            return np.asarray(_scattered(self.recipe, actor, extra, scales, obs, noise))
         if self.matrices is None:
             self.reset_noise()
         matrices = self.matrices if len(self.matrices) == len(obs) else self.matrices[:1]  # type: ignore[arg-type, index]
@@ -390,9 +392,10 @@ def _mean(actor: nn.Module, weights: Weights, scales: Seen, obs: Any) -> jax.Arr
 
 
 @partial(jax.jit, static_argnums=0)
-def _scattered(actor: nn.Module, weights: Weights, scales: Seen, obs: Any, noise: Any) -> jax.Array:
-    gaussian, _ = act(actor, weights, seen(scales, obs))
-    return jnp.tanh(gaussian.mean + gaussian.std * noise)
+def _scattered(
+    recipe: Recipe, weights: Weights, extra: Any, scales: Seen, obs: Any, noise: Any
+) -> jax.Array:
+    return explored(recipe, weights, extra, seen(scales, obs), noise)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -163,6 +163,14 @@ class Extra(Protocol):
         """:return: its state after an update of the actor"""
         ...
 
+    def explore(self, state: Any, obs: Array, gaussian: Gaussian, noise: Array) -> Array:
+        """
+        :param gaussian: of the actor
+        :param noise: standard normal, as many numbers as controls
+        :return: actions to explore by
+        """
+        ...
+
 
 # --- how an ensemble's next values become a target, how far off it is, what it is worth
 
@@ -260,6 +268,20 @@ def sample(gaussian: Gaussian, key: PRNGKeyArray) -> tuple[Array, Array]:
     """:return: actions drawn from it, and their log-density"""
     before = gaussian.mean + gaussian.std * jax.random.normal(key, gaussian.mean.shape)
     return jnp.tanh(before), log_probability(gaussian, before)
+
+
+def explored(recipe: Recipe, weights: Weights, extra: Any, obs: Array, noise: Array) -> Array:
+    """
+    :param weights: of the actor
+    :param extra: what only one algorithm has
+    :param obs: as the networks see them
+    :param noise: standard normal, as many numbers as controls
+    :return: actions by which the algorithm explores, without gSDE
+    """
+    gaussian, _ = act(recipe.actor, weights, obs)
+    if recipe.extra is not None:
+        return recipe.extra.explore(extra, obs, gaussian, noise)
+    return jnp.tanh(gaussian.mean + gaussian.std * noise)
 
 
 def begin(recipe: Recipe, n_obs: int, n_act: int, ent_coef: float, key: PRNGKeyArray) -> Learner:

@@ -83,7 +83,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
         )
 
     def _updates(self, n: int, batch_size: int) -> dict[str, float]:
-        policy, knobs, report = self.policy, self._knobs(), {}
+        policy, knobs, report = self.policy, self.knobs(), {}
         for done in range(0, n, _MOST_UPDATES):
             now = min(_MOST_UPDATES, n - done)
             batches = batches_of(self, now, batch_size, _capacity(now))
@@ -92,7 +92,8 @@ class SoftActorCritic(ModelFreeAlgorithm):
             policy.learner = learner
         return report
 
-    def _knobs(self) -> Knobs:
+    def knobs(self) -> Knobs:
+        """:return: what schedules make of the arguments, at this point of the training"""
         rate, qf_rate = self.learning_rates()
         entropy = self.target_entropy
         wanted = self.auto_target_entropy() if entropy == "auto" else float(entropy)

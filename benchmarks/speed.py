@@ -1,0 +1,192 @@
+"""
+Steps and updates per second of the model-free family, beside SBX, SB3 and SB3-contrib.
+
+    python benchmarks/speed.py                     # all rows; resumable
+    python benchmarks/speed.py --rows "droq, 20" --start-up
+    python benchmarks/speed.py --table
+
+Pendulum-v1, equal networks, batches and replay ratios. The two that are compared learn by turns in
+one process, in short blocks, so that a slow moment of the machine meets both; the ratio is that of
+their median times, with the first and the third quartile of the ratios of neighbouring blocks. The
+start-up is that of a fresh process each, from the interpreter to the first update, with no compiled
+program kept.
+
+Beside them, `learn_compiled`: environment and updates in one program, several seeds side by side.
+"""
+
+import argparse
+import json
+import sys
+import time
+
+import numpy as np
+import pandas as pd
+from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+
+ENV, BATCH, STARTS = "Pendulum-v1", 256, 100
+WIDE = {"pi": [256, 256], "qf": [1024, 1024]}
+#: ours, its peer, and what both are made with
+PAIRS = {
+    "sac": ("GSDESAC", {"use_sde": False}, "SAC", {}),
+    "gsde_sac": ("GSDESAC", {"policy_kwargs": {"log_std_init": -3.0}}, "SAC", {"use_sde": True}),
+    "droq": (
+        "DroQ",
+        {},
+        "SAC",
+        {"policy_kwargs": {"dropout_rate": 0.01, "layer_norm": True}},
+    ),
+    "tqc": ("TQC", {"policy_kwargs": {"n_critics": 2}}, "TQC", {}),
+    "crossq": (
+        "CrossQ",
+        {"policy_kwargs": {"net_arch": WIDE}},
+        "CrossQ",
+        {"policy_kwargs": {"net_arch": WIDE}},
+    ),
+    "simba": (
+        "SimbaSAC",
+        {"policy": "SimbaPolicy", "policy_kwargs": {"net_arch": {"pi": [128], "qf": [256, 256]}}},
+        "SAC",
+        {"policy": "SimbaPolicy", "policy_kwargs": {"net_arch": {"pi": [128], "qf": [256, 256]}}},
+    ),
+}
+#: what SB3 and SB3-contrib have of these
+IN_SB3 = ("sac", "gsde_sac", "tqc", "crossq")
+#: without a peer: their own speed
+ALONE = {"td7": ("TD7", {"use_checkpoints": False, "train_freq": 1}), "bro": ("BRO", {})}
+RATIOS = (1, 20)
+N_BLOCKS = 9
+SEEDS = (1, 2, 4, 8)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument("--rows", nargs="*", help='such as "droq, 20, sbx"; default: all')
+    parser.add_argument("--table", action="store_true")
+    parser.add_argument("--worker", nargs=3, metavar=("NAME", "RATIO", "PEER"))
+    arguments = parser.parse_args()
+    if arguments.worker:
+        name, ratio, peer = arguments.worker
+        print(json.dumps(worker(name, int(ratio), peer)))
+        return
+    if not arguments.table:
+        wanted = [run for run in rows() if chosen(run, arguments.rows)]
+        in_process = lambda *run: fresh_process(__file__, *run, cache=cache_of(run))["rows"]  # noqa: E731
+        resume("speed", ("name", "ratio", "peer"), wanted, in_process, jobs=1)
+    report()
+
+
+def rows() -> list[tuple[str, int, str]]:
+    pairs = [(name, ratio, "sbx") for name in PAIRS for ratio in RATIOS]
+    pairs += [(name, ratio, "sb3") for name in IN_SB3 for ratio in RATIOS]
+    pairs += [(name, ratio, "none") for name in ALONE for ratio in RATIOS]
+    compiled = [("sac", n_seeds, "compiled") for n_seeds in SEEDS]
+    starts = [(name, 1, f"start-up of {who}") for name in PAIRS for who in ("ours", "sbx")]
+    return pairs + compiled + starts
+
+
+def chosen(run: tuple[str, int, str], words: list[str] | None) -> bool:
+    label = ", ".join(map(str, run))
+    return words is None or any(label.startswith(word) for word in words)
+
+
+def cache_of(run: tuple[str, int, str]):
+    """A start-up compiles everything."""
+    return None if "start-up" in run[2] else CACHE
+
+
+def worker(name: str, ratio: int, peer: str) -> dict:
+    if peer.startswith("start-up"):
+        return {"rows": [{"start_up_s": start_up(name, peer.split()[-1])}]}
+    if peer == "compiled":
+        return {"rows": [compiled(name, ratio)]}
+    models = [ours(name, ratio)] + ([] if peer == "none" else [other(name, ratio, peer)])
+    for model in models:
+        model.learn(STARTS + 20)
+    steps = block_length(models, ratio)
+    seconds = np.array([turn(models, steps, backwards=bool(i % 2)) for i in range(N_BLOCKS)])
+    middle = np.median(seconds, 0)
+    row = {"steps_per_s": steps / middle[0], "updates_per_s": steps * ratio / middle[0]}
+    if peer != "none":
+        faster = seconds[:, 1] / seconds[:, 0]
+        row |= {"peer_steps_per_s": steps / middle[1], "speed_up": middle[1] / middle[0]}
+        row |= {"low": np.quantile(faster, 0.25), "high": np.quantile(faster, 0.75)}
+    return {"rows": [row]}
+
+
+def block_length(models: list, ratio: int) -> int:
+    """:return: steps that take the slower of them about three seconds"""
+    slowest = max(turn(models, 10, backwards=False)) / 10
+    return int(np.clip(3.0 / slowest, 5, 500))
+
+
+def turn(models: list, steps: int, backwards: bool) -> list[float]:
+    """:return: seconds that each of them takes, one after the other"""
+    seconds = [0.0] * len(models)
+    order = range(len(models))
+    for i in reversed(order) if backwards else order:
+        begin = time.perf_counter()
+        models[i].learn(steps, reset_num_timesteps=False)
+        seconds[i] = time.perf_counter() - begin
+    return seconds
+
+
+def ours(name: str, ratio: int):
+    import sb3_hds
+
+    algorithm, arguments, *_ = PAIRS[name] if name in PAIRS else ALONE[name]
+    return getattr(sb3_hds, algorithm)(**common(name, ratio), **arguments)
+
+
+def other(name: str, ratio: int, library: str):
+    """:param library: ``"sbx"``, or ``"sb3"`` for SB3 and SB3-contrib"""
+    _, _, algorithm, arguments = PAIRS[name]
+    settings = common(name, ratio) | {"policy": "MlpPolicy"} | arguments
+    if library == "sbx":
+        import sbx
+
+        return getattr(sbx, algorithm)(**settings)
+    import sb3_contrib
+    import stable_baselines3
+    import torch
+
+    torch.set_num_threads(2)
+    found = getattr(stable_baselines3, algorithm, None) or getattr(sb3_contrib, algorithm)
+    return found(**settings, device="cpu")
+
+
+def common(name: str, ratio: int) -> dict:
+    """Equal for all; DroQ updates its actor once for each call of ``train``."""
+    settings = {"env": ENV, "batch_size": BATCH, "learning_starts": STARTS, "seed": 0}
+    settings |= {"train_freq": 1, "gradient_steps": ratio}
+    return settings | ({"policy_delay": ratio} if name == "droq" else {})
+
+
+def start_up(name: str, who: str) -> float:
+    """:return: seconds from the start of the interpreter to the end of the first update"""
+    model = ours(name, 1) if who == "ours" else other(name, 1, "sbx")
+    model.learn(STARTS + 2)
+    return seconds_since_start()
+
+
+def compiled(name: str, n_seeds: int) -> dict:
+    """Steps of all seeds together in a second, compiled before."""
+    from sb3_hds.algos import learn_compiled
+
+    model, steps = ours(name, 1), 2_000
+    learn_compiled(model, steps, range(n_seeds))
+    begin = time.perf_counter()
+    learn_compiled(model, steps, range(n_seeds))
+    speed = n_seeds * steps / (time.perf_counter() - begin)
+    return {"steps_per_s": speed, "updates_per_s": speed}
+
+
+def report() -> None:
+    path = RESULTS / "speed.csv"
+    if not path.exists():
+        print("Nothing has been measured yet.", file=sys.stderr)
+        return
+    print(pd.read_csv(path).to_string(index=False, float_format="%.3g"))
+
+
+if __name__ == "__main__":
+    main()

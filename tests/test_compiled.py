@@ -1,0 +1,148 @@
+"""Seeds side by side in one program: the same task, the same updates, none knows of the others."""
+
+from functools import partial
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from point_mass import N_STEPS, linear_controller, point_mass_env, returns_of
+from small_models import SMALL, saved, small
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_hds import TD7, algos
+from sb3_hds.algos import learn_compiled
+from sb3_hds.envs import twin_of
+
+SOFT = ["gsde_sac", "droq", "crossq_jax", "tqc_jax", "simba", "bro"]
+
+
+def weights_of(model) -> list[np.ndarray]:
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(model.policy.weights)]
+
+
+def test_what_is_remembered_are_steps_of_the_environment():
+    (model,), (episodes,) = learn_compiled(small("tqc_jax", buffer_size=450), 420)
+
+    buffer, env = model.replay_buffer, gymnasium.make("Pendulum-v1").unwrapped
+    assert buffer.size() == 420 and model.num_timesteps == 420
+    for i in (0, 1, 57, 198, 300):
+        x, y, speed = buffer.observations[i, 0]
+        env.reset()
+        env.state = np.array([np.arctan2(y, x), speed], np.float64)
+        obs, reward, *_ = env.step(2.0 * buffer.actions[i, 0])
+        np.testing.assert_allclose(buffer.next_observations[i, 0], obs, atol=2e-5)
+        np.testing.assert_allclose(buffer.rewards[i, 0], reward, rtol=1e-4, atol=1e-5)
+    follows = np.abs(buffer.next_observations[:419, 0] - buffer.observations[1:420, 0]).max(1)
+    np.testing.assert_array_equal(np.flatnonzero(follows > 0.0), [199, 399])
+    assert not buffer.dones.any()
+    assert episodes.timesteps.tolist() == [200, 400]
+    np.testing.assert_allclose(episodes.returns[0], buffer.rewards[:200].sum(), rtol=1e-5)
+
+
+def test_actions_are_random_until_learning_starts():
+    (model,), _ = learn_compiled(small("gsde_sac", learning_starts=400), 500)
+
+    actions = model.replay_buffer.actions[:500, 0, 0]
+    uniform = np.sort(actions[:400])
+    # Kolmogorov-Smirnov: 1.95 / sqrt(n) is exceeded once in a thousand times.
+    assert np.abs(uniform - np.linspace(-1.0, 1.0, 400)).max() / 2.0 < 1.95 / np.sqrt(400)
+    assert np.abs(np.diff(actions[410:])).mean() < 0.2 * np.abs(np.diff(actions[:400])).mean()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name == "gsde_sac" else pytest.param(name, marks=pytest.mark.expensive)
+        for name in SOFT
+    ],
+)
+def test_a_seed_does_not_know_which_others_run_beside_it(name):
+    model = small(name)
+    together, _ = learn_compiled(model, 40, seeds=[3, 5])
+    (alone,), _ = learn_compiled(model, 40, seeds=[5])
+
+    for one, other in zip(weights_of(together[1]), weights_of(alone), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4)
+    assert any((a != b).any() for a, b in zip(*map(weights_of, together), strict=True))
+    assert together[0]._n_updates == 12
+
+
+def test_models_act_are_saved_and_go_on_learning():
+    (model,), _ = learn_compiled(small("tqc_jax"), 60)
+    obs = np.array([[1.0, 0.0, 0.5]], np.float32)
+
+    copy = algos.TQC.load(saved(model))
+    np.testing.assert_array_equal(
+        *(each.predict(obs, deterministic=True)[0] for each in (model, copy))
+    )
+    before = weights_of(model)
+    model.learn(20, reset_num_timesteps=False)
+    assert model.num_timesteps == 80 and model.replay_buffer.size() == 80
+    assert any((a != b).any() for a, b in zip(before, weights_of(model), strict=True))
+
+
+def test_the_template_stays_as_it_is():
+    model = small("tqc_jax")
+    before = weights_of(model)
+    learn_compiled(model, 40)
+
+    assert model.num_timesteps == 0 and model.replay_buffer.size() == 0
+    for one, other in zip(before, weights_of(model), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.expensive
+def test_the_point_mass_is_solved():
+    """As ``test_an_algorithm_learns`` asks of learning step by step."""
+    settings = SMALL["tqc_jax"] | {"policy_kwargs": {"net_arch": [32, 32]}, "gradient_steps": 5}
+    model = algos.TQC(env=point_mass_env(), gamma=0.9, learning_rate=3e-3, **settings)
+    models, episodes = learn_compiled(model, 1_500, seeds=range(2))
+
+    best, idle = returns_of(linear_controller()).mean(), returns_of(lambda _: np.zeros(1)).mean()
+    for learned, own in zip(models, episodes, strict=True):
+        act = partial(learned.predict, deterministic=True)
+        assert (returns_of(lambda obs, act=act: act(obs)[0]).mean() - idle) / (best - idle) > 0.8
+        assert np.diff(own.timesteps).tolist() == [N_STEPS] * (1_500 // N_STEPS - 1)
+
+
+def test_a_time_limit_is_the_environments_own():
+    env = gymnasium.make("Pendulum-v1", max_episode_steps=30)
+    assert twin_of(env).max_episode_steps == 200
+    _, (episodes,) = learn_compiled(small("tqc_jax", env), 95)
+
+    assert episodes.timesteps.tolist() == [30, 60, 90]
+
+
+@pytest.mark.parametrize(
+    ("words", "env", "arguments"),
+    [
+        ("n_envs", lambda: DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")] * 2), {}),
+        (
+            "VecNormalize",
+            lambda: VecNormalize(DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")])),
+            {},
+        ),
+        ("n_steps", lambda: "Pendulum-v1", {"n_steps": 3}),
+        (
+            "action_noise",
+            lambda: "Pendulum-v1",
+            {"action_noise": NormalActionNoise(np.zeros(1), np.ones(1))},
+        ),
+        ("param_resets", lambda: "Pendulum-v1", {"param_resets": [50]}),
+        ("episodes", lambda: "Pendulum-v1", {"train_freq": (1, "episode")}),
+    ],
+)
+def test_what_needs_python_is_refused(words, env, arguments):
+    model = small("tqc_jax", env(), **arguments)
+
+    with pytest.raises(ValueError, match=words):
+        learn_compiled(model, 100)
+
+
+def test_other_families_and_no_seeds_are_refused():
+    with pytest.raises(ValueError, match=r"SAC family, not TD7"):
+        learn_compiled(TD7("Pendulum-v1"), 100)
+    with pytest.raises(ValueError, match="at least one step and one seed"):
+        learn_compiled(small("tqc_jax"), 100, seeds=[])
