@@ -53,11 +53,19 @@ SMALL: dict[str, dict[str, Any]] = {
 NAMES = list(algos.ALL)
 #: the algorithms that plan in a twin
 PLANNERS = [name for name in NAMES if issubclass(algos.ALL[name], TwinAlgorithm)]
-#: all, those of one family but for one only among the expensive tests
-QUICK_NAMES = [
-    name if name in (*PLANNERS, "droq") else pytest.param(name, marks=pytest.mark.expensive)
-    for name in NAMES
-]
+
+
+def _mostly_expensive(representatives: tuple[str, ...]) -> list[Any]:
+    quick = {*PLANNERS, *representatives}
+    mark = pytest.mark.expensive
+    return [name if name in quick else pytest.param(name, marks=mark) for name in NAMES]
+
+
+#: all; of the model-free ones, those that share every line with one that is here are among the
+#: expensive tests
+EVERY_NAME = _mostly_expensive(("droq", "td7"))
+#: all, for tests that take long
+QUICK_NAMES = _mostly_expensive(("droq",))
 
 
 def small(name: str, env: Any = "Pendulum-v1", **changes: Any) -> BaseAlgorithm:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch as th
 from point_mass import linear_controller, point_mass_env, returns_of
-from small_models import NAMES, PLANNERS, QUICK_NAMES, SMALL, logged, small, steps_of
+from small_models import EVERY_NAME, NAMES, PLANNERS, QUICK_NAMES, SMALL, logged, small, steps_of
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 from sb3_hds import algos
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
-every_algorithm = pytest.mark.parametrize("name", NAMES)
+every_algorithm = pytest.mark.parametrize("name", EVERY_NAME)
 quick_algorithms = pytest.mark.parametrize("name", QUICK_NAMES)
 every_planner = pytest.mark.parametrize("name", PLANNERS)
 

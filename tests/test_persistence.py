@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch as th
-from small_models import NAMES, PLANNERS, same, saved, small
+from small_models import EVERY_NAME, NAMES, PLANNERS, same, saved, small
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -23,7 +23,7 @@ from sb3_hds.algos import TwinPolicy, persistence
 from sb3_hds.errors import NoTwinError
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
-every_algorithm = pytest.mark.parametrize("name", NAMES)
+every_algorithm = pytest.mark.parametrize("name", EVERY_NAME)
 every_planner = pytest.mark.parametrize("name", PLANNERS)
 
 PREDICT = """
