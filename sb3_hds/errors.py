@@ -29,5 +29,9 @@ class RewardError(SB3HDSError, ValueError):
     """A reward gives planning nothing to climb."""
 
 
-class EnvironmentMismatchError(SB3HDSError, ValueError):
-    """An environment, as wrapped, is not what its twin simulates."""
+class EnvironmentMismatchError(SB3HDSError, ValueError, AssertionError):
+    """
+    An environment, as wrapped, is not what its twin simulates, or what an algorithm takes.
+
+    It is an ``AssertionError``, too, because that is what SB3 raises for spaces that do not fit.
+    """

@@ -57,7 +57,8 @@ class SimbaBody(nn.Module):
     Source: Lee et al., *SimBa: Simplicity Bias for Scaling Up Parameters in Deep Reinforcement
     Learning*, ICLR 2025, section 4.
 
-    :param net_arch: width of each block; all the same
+    :param net_arch: width of each block; where it changes, a dense layer leads to the next; none:
+        the input itself
     :param activation_fn: inside a block
     :param dropout_rate: after each block, as in SBX
     """
@@ -68,12 +69,13 @@ class SimbaBody(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch n"], train: bool) -> Float[Array, "*batch m"]:
-        x = nn.Dense(self.net_arch[0], kernel_init=nn.initializers.orthogonal(1.0))(x)
-        for width in self.net_arch:
+        for i, width in enumerate(self.net_arch):
+            if i == 0 or x.shape[-1] != width:
+                x = nn.Dense(width, kernel_init=nn.initializers.orthogonal(1.0))(x)
             inside = nn.Dense(4 * width, kernel_init=_HE)(nn.LayerNorm()(x))
             x = x + nn.Dense(width, kernel_init=_HE)(self.activation_fn(inside))
             x = Dropout(self.dropout_rate)(x)
-        return nn.LayerNorm()(x)
+        return nn.LayerNorm()(x) if self.net_arch else x
 
 
 class BroBody(nn.Module):
@@ -83,7 +85,8 @@ class BroBody(nn.Module):
     Source: Nauman et al., *Bigger, Regularized, Optimistic: scaling for compute and
     sample-efficient continuous control*, NeurIPS 2024, section 3 (BroNet).
 
-    :param net_arch: width of each block; all the same
+    :param net_arch: width of each block; where it changes, a dense layer leads to the next; none:
+        the input itself
     :param activation_fn: between the layers
     """
 
@@ -93,8 +96,9 @@ class BroBody(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "*batch n"], train: bool) -> Float[Array, "*batch m"]:
         dense = lambda width: nn.Dense(width, kernel_init=nn.initializers.orthogonal(math.sqrt(2)))  # noqa: E731
-        x = self.activation_fn(nn.LayerNorm()(dense(self.net_arch[0])(x)))
-        for width in self.net_arch:
+        for i, width in enumerate(self.net_arch):
+            if i == 0 or x.shape[-1] != width:
+                x = self.activation_fn(nn.LayerNorm()(dense(width)(x)))
             inside = self.activation_fn(nn.LayerNorm()(dense(width)(x)))
             x = x + nn.LayerNorm()(dense(width)(inside))
         return x
@@ -145,7 +149,7 @@ class BatchRenorm(nn.Module):
         n = x.shape[-1]
         mean = self.variable("statistics", "mean", jnp.zeros, n)
         variance = self.variable("statistics", "var", jnp.ones, n)
-        steps = self.variable("statistics", "steps", jnp.zeros, (), jnp.int32)
+        steps = self.variable("statistics", "steps", jnp.zeros, ())
         scale = self.param("scale", nn.initializers.ones, (n,))
         bias = self.param("bias", nn.initializers.zeros, (n,))
         running = jnp.sqrt(variance.value + _RENORM_EPSILON)

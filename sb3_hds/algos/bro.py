@@ -69,7 +69,10 @@ class BRO(SoftActorCritic):
     Source: Nauman et al., *Bigger, Regularized, Optimistic: scaling for compute and
     sample-efficient continuous control*, NeurIPS 2024: replay ratio 10 (``gradient_steps=2`` is
     their fast variant), batches of 128, AdamW with 3e-4, target entropy of minus half the number of
-    controls. The spread of actions is a clipped exponential, as in SB3; the authors squash it.
+    controls, Adam with b1 = 0.5 for the temperature and the multipliers. Fresh starts include the
+    temperature, the multipliers and all optimisers, as in the authors' code. Where that squashes
+    the spread of actions and the multipliers, here they are clipped; its quantile loss is a sum
+    over quantiles where this is their mean, a factor that Adam takes out again.
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
@@ -85,8 +88,10 @@ class BRO(SoftActorCritic):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": BroPolicy,
+        "CnnPolicy": BroPolicy,
         "MultiInputPolicy": BroPolicy,
     }
+    kept_by_restarts = ("seen", "n_updates")
 
     def __init__(
         self,
@@ -119,10 +124,8 @@ class BRO(SoftActorCritic):
 
     def recipe(self) -> Recipe:
         policy = self.policy
-        actor = cast(Any, policy.actor_network)
-        widths = actor.body.net_arch
         optimist = Optimist(
-            network=Shift(BroBody(widths, policy.activation_fn), policy.n_act),
+            network=Shift(policy.looking(policy.actor_body(policy.widths[0])), policy.n_act),
             optimizer=policy.optimizers[0],
             kl_target=self.kl_target,
             std_multiplier=self.std_multiplier,
@@ -132,6 +135,7 @@ class BRO(SoftActorCritic):
             target_of=average,
             error=quantile_huber,
             worth=mean,
+            ent_coef_optimizer=_MULTIPLIER,
             extra=optimist,
         )
 

@@ -30,6 +30,7 @@ class CrossQ(SoftActorCritic):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": CrossQPolicy,
+        "CnnPolicy": CrossQPolicy,
         "MultiInputPolicy": CrossQPolicy,
     }
 

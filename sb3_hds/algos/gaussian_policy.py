@@ -10,11 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from gymnasium import spaces
+from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import is_vectorized_observation
 
 from sb3_hds.algos.bodies import Mlp, SimbaBody
+from sb3_hds.algos.features import is_image, looking, n_features, parts_of
 from sb3_hds.algos.heads import Critic, ExploringActor, GaussianActor, noise_std
 from sb3_hds.algos.learner import GENERATOR
+from sb3_hds.algos.learning_policy import LearningPolicy
 from sb3_hds.algos.networks import Activation, activation
 from sb3_hds.algos.observations import Seen, flattener, seen, size_of
 from sb3_hds.algos.off_policy import (
@@ -25,11 +29,11 @@ from sb3_hds.algos.off_policy import (
     act,
     begin,
     explored,
+    judge,
     least,
     pessimistic,
     squared,
 )
-from sb3_hds.algos.persistence import TensorPolicy, TrainingTensors
 
 _OPTIMIZERS = {
     "adam": optax.adam,
@@ -43,13 +47,14 @@ _OPTIMIZERS = {
 }
 
 
-class GaussianPolicy(TensorPolicy):
+class GaussianPolicy(LearningPolicy):
     """
-    ``"MlpPolicy"`` and ``"MultiInputPolicy"``: dense layers; without target entropy or rules of its
-    own, so that every algorithm of the family can use it.
+    ``"MlpPolicy"``, ``"CnnPolicy"`` and ``"MultiInputPolicy"``: dense layers, after convolutions of
+    images, of which the actor and each critic have their own; without target entropy or rules of
+    its own, so that every algorithm of the family can use it.
 
     :param observation_space: Box, Discrete, MultiDiscrete, MultiBinary, or a Dict of these, which
-        are flattened, choices one-hot
+        are flattened, choices one-hot; images are seen by convolutions
     :param action_space: a bounded Box of any shape
     :param lr_schedule: learning rate by remaining progress
     :param net_arch: hidden widths of both, or ``{"pi": [...], "qf": [...]}``
@@ -67,11 +72,17 @@ class GaussianPolicy(TensorPolicy):
     :param use_expln: gSDE: slower growth than the exponential above 0
     :param clip_mean: gSDE: the mean is clipped to this before tanh; 0: not
     :param normalize_observations: by running mean and variance, inside the policy
+    :param normalize_images: whether images of bytes are divided by 255; False: every Box of three
+        axes is an image, and nothing is divided
+    :param features_extractor_kwargs: ``features_dim`` of an image alone, 512 unless given;
+        ``cnn_output_dim`` of each image of a Dict, 256 unless given
     :param optimizer_class: name, optax function or torch class
     :param optimizer_kwargs: besides the learning rate; torch's ``betas`` are understood
     :param qf_optimizer_kwargs: of the critics, where they differ
     """
 
+    held = ("target", "seen")
+    learner: Learner
     defaults: ClassVar[Mapping[str, Any]] = {
         "net_arch": (256, 256),
         "optimizer_class": "adam",
@@ -98,6 +109,8 @@ class GaussianPolicy(TensorPolicy):
         use_expln: bool = False,
         clip_mean: float = 2.0,
         normalize_observations: bool | None = None,
+        normalize_images: bool = True,
+        features_extractor_kwargs: dict[str, Any] | None = None,
         optimizer_class: str | Callable[..., Any] | None = None,
         optimizer_kwargs: Mapping[str, Any] | None = None,
         qf_optimizer_kwargs: Mapping[str, Any] | None = None,
@@ -107,24 +120,33 @@ class GaussianPolicy(TensorPolicy):
             for name, value in locals().items()
             if name not in ("self", "observation_space", "action_space", "__class__")
         }
-        super().__init__(observation_space, action_space, squash_output=True)
+        super().__init__(
+            observation_space,
+            action_space,
+            normalize_images=normalize_images,
+            squash_output=True,
+        )
         chosen = {
             name: self.defaults.get(name) if value is None else value
             for name, value in self.arguments.items()
         }
         net: Any = chosen["net_arch"]
-        pi, qf = widths(net, "qf")
+        self.widths = widths(net, "qf")
+        self.parts = parts_of(observation_space, normalize_images)
+        self.n_features = n_features(self.parts, features_extractor_kwargs)
         self.activation_fn = activation(activation_fn)
         self.dropout_rate, self.layer_norm = _rate(dropout_rate), layer_norm
         self.renorm_after, self.renorm_momentum = chosen["renorm_after"], renorm_momentum
         self.normalize_observations = bool(chosen["normalize_observations"])
         self.n_critics, self.use_sde = n_critics, use_sde
         n_act = int(np.prod(action_space.shape))
-        self.actor_network: nn.Module = GaussianActor(self.actor_body(pi), n_act)
+        pi, qf = self.widths
+        body = self.looking(self.actor_body(pi))
+        self.actor_network: nn.Module = GaussianActor(body, n_act)
         if use_sde:
             gsde = (log_std_init, full_std, use_expln, clip_mean)
-            self.actor_network = ExploringActor(self.actor_body(pi), n_act, *gsde)
-        self.critic_network = Critic(self.critic_body(qf), n_quantiles)
+            self.actor_network = ExploringActor(body, n_act, *gsde)
+        self.critic_network = Critic(self.looking(self.critic_body(qf)), n_quantiles)
         own = dict(optimizer_kwargs or {})
         make: Any = chosen["optimizer_class"]
         usual = self.defaults.get("optimizer_kwargs", {}) if optimizer_class is None else {}
@@ -133,11 +155,13 @@ class GaussianPolicy(TensorPolicy):
             optimizer_of(make, {**usual, **own, **dict(qf_optimizer_kwargs or {})}),
         )
         self.n_obs, self.n_act = size_of(observation_space), n_act
-        self.flatten = flattener(observation_space)
-        self._learner: Learner | None = None
+        self.flatten = flattener(observation_space, normalize_images)
         self.matrices: np.ndarray | None = None
         self._noise = np.random.default_rng(0)
-        self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
+
+    def looking(self, body: nn.Module) -> nn.Module:
+        """:return: the body; of observations with images, one that sees their features"""
+        return looking(self.parts, self.n_features, body)
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
         return Mlp(
@@ -157,17 +181,9 @@ class GaussianPolicy(TensorPolicy):
             self.renorm_momentum,
         )
 
-    @property
-    def learner(self) -> Learner:
-        """What updates change. A policy that no algorithm has built yet is that of plain SAC."""
-        if self._learner is None:
-            self.build(self.plain_recipe(), 1.0, 0, jax.devices()[0])
-        assert self._learner is not None
-        return self._learner
-
-    @learner.setter
-    def learner(self, learner: Learner) -> None:
-        self._learner = learner
+    def build_plain(self) -> None:
+        """That of SAC; with batch normalisation, that of CrossQ."""
+        self.build(self.plain_recipe(), 1.0, 0, jax.devices()[0])
 
     def plain_recipe(self) -> Recipe:
         """:return: that of SAC with these networks; with batch normalisation, that of CrossQ"""
@@ -203,6 +219,12 @@ class GaussianPolicy(TensorPolicy):
             scales = self.learner.seen.with_more(self.flatten(obs))
             self.learner = self.learner._replace(seen=scales)
 
+    def critic(self, obs: Any, actions: Any) -> tuple[np.ndarray, ...]:
+        learner, flat = self.learner, self.flatten(obs)
+        taken = np.asarray(actions, np.float32).reshape(len(flat), -1)
+        values = _judged(self.recipe, learner.critic.weights, learner.seen, flat, taken)
+        return tuple(np.asarray(values))
+
     def reset_noise(self, batch_size: int = 1) -> None:
         """
         Draw a new noise matrix for each environment, where the policy explores by gSDE.
@@ -220,21 +242,19 @@ class GaussianPolicy(TensorPolicy):
             return np.zeros(1)
         return np.asarray(noise_std(self.actor_network, self.learner.actor.weights))  # type: ignore[arg-type]
 
-    def forward(self, obs: Any, deterministic: bool = False) -> np.ndarray:
-        return self._predict(obs, deterministic)
-
     def prepare_obs(self, observation: Any) -> tuple[Any, bool]:
         space = self.observation_space
         if not isinstance(space, spaces.Dict):
             return super().prepare_obs(observation)
-        from stable_baselines3.common.utils import is_vectorized_observation
-
         if not isinstance(observation, dict) or observation.keys() != space.spaces.keys():
             raise ValueError(
                 f"predict() got {type(observation).__name__} instead of a dictionary with "
                 f"{', '.join(space.spaces)}."
             )
-        parts = {name: np.asarray(part) for name, part in observation.items()}
+        parts = {
+            name: np.asarray(maybe_transpose(part, space[name]) if is_image(space[name]) else part)
+            for name, part in observation.items()
+        }
         vectorized = any(is_vectorized_observation(parts[name], space[name]) for name in parts)
         rows = {name: part.reshape(-1, *space[name].shape) for name, part in parts.items()}  # type: ignore[misc]
         return rows, vectorized
@@ -251,54 +271,6 @@ class GaussianPolicy(TensorPolicy):
             self.reset_noise()
         matrices = self.matrices if len(self.matrices) == len(obs) else self.matrices[:1]  # type: ignore[arg-type, index]
         return np.asarray(_explored(self.actor_network, actor, self.learner.seen, obs, matrices))
-
-    @property
-    def weights(self) -> Any:
-        learner = self.learner
-        return {
-            "actor": learner.actor.weights,
-            "critic": learner.critic.weights,
-            "target": learner.target,
-            "log_ent_coef": learner.log_ent_coef.weights["params"],
-            "seen": learner.seen,
-        }
-
-    @weights.setter
-    def weights(self, tree: Any) -> None:
-        learner = self.learner
-        self.learner = learner._replace(
-            actor=learner.actor._replace(weights=tree["actor"]),
-            critic=learner.critic._replace(weights=tree["critic"]),
-            target=tree["target"],
-            log_ent_coef=learner.log_ent_coef._replace(weights={"params": tree["log_ent_coef"]}),
-            seen=tree["seen"],
-        )
-
-    @property
-    def training_state(self) -> Any:
-        """Random keys are stored as 64-bit integers, which torch can hold."""
-        learner = self.learner
-        return {
-            "actor": learner.actor.optimizer,
-            "critic": learner.critic.optimizer,
-            "log_ent_coef": learner.log_ent_coef.optimizer,
-            "extra": learner.extra,
-            "key": np.asarray(jax.random.key_data(learner.key), np.int64),
-            "n_updates": learner.n_updates,
-        }
-
-    @training_state.setter
-    def training_state(self, tree: Any) -> None:
-        learner = self.learner
-        key = jnp.asarray(np.asarray(tree["key"]).astype(np.uint32))
-        self.learner = learner._replace(
-            actor=learner.actor._replace(optimizer=tree["actor"]),
-            critic=learner.critic._replace(optimizer=tree["critic"]),
-            log_ent_coef=learner.log_ent_coef._replace(optimizer=tree["log_ent_coef"]),
-            extra=tree["extra"],
-            key=jax.random.wrap_key_data(key, impl=GENERATOR),
-            n_updates=tree["n_updates"],
-        )
 
 
 class SimbaPolicy(GaussianPolicy):
@@ -345,7 +317,7 @@ def widths(
     """
     given = net_arch if isinstance(net_arch, Mapping) else {"pi": net_arch, critic: net_arch}
     fits = given.keys() == {"pi", critic} and all(
-        isinstance(some, Sequence) and some and all(isinstance(w, int) and w > 0 for w in some)
+        isinstance(some, Sequence) and all(isinstance(w, int) and w > 0 for w in some)
         for some in given.values()
     )
     if not fits:
@@ -384,6 +356,14 @@ def _rate(dropout_rate: float) -> float:
     if not 0.0 <= dropout_rate < 1.0:
         raise ValueError(f"dropout_rate must be at least 0 and below 1, got {dropout_rate!r}.")
     return float(dropout_rate)
+
+
+@partial(jax.jit, static_argnums=0)
+def _judged(recipe: Recipe, weights: Weights, scales: Seen, obs: Any, actions: Any) -> jax.Array:
+    """Dropout, where there is some, is the same in each call."""
+    inside = seen(scales, obs) if recipe.normalize else obs
+    values, _ = judge(recipe, weights, inside, actions, jax.random.key(0))
+    return jnp.mean(values, -1, keepdims=True)
 
 
 @partial(jax.jit, static_argnums=0)

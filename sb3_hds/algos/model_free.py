@@ -1,10 +1,10 @@
 """What model-free algorithms share: SB3 collects steps and calls ``train``, which updates."""
 
 import math
+import warnings
 from abc import abstractmethod
 from typing import Any, ClassVar
 
-import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
@@ -14,6 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from sb3_hds.algos.call_forms import between, check_policy, is_count, policy_and_env, schedule_of
 from sb3_hds.algos.observations import check_observations
 from sb3_hds.algos.tensor_algorithm import TensorAlgorithm
+from sb3_hds.errors import EnvironmentMismatchError
 
 
 class ModelFreeAlgorithm(TensorAlgorithm):
@@ -127,17 +128,15 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             supported_action_spaces=(spaces.Box,),
             support_multi_env=True,
         )
+        if n_steps > 1 and replay_buffer_class is not None:
+            warnings.warn(
+                f"n_steps={n_steps} is ignored with replay_buffer_class="
+                f"{replay_buffer_class.__name__}: use SB3's NStepReplayBuffer with "
+                f"replay_buffer_kwargs={{'n_steps': {n_steps}, 'gamma': {gamma}}}."
+            )
         self.critic_learning_rate = qf_learning_rate
         self.policy_delay = policy_delay
-        self.saved_by = type(self).__name__
-        self._device_name = str(device)
-        if _init_setup_model:
-            if self.env is None:
-                raise ValueError(
-                    f"{type(self).__name__} needs an environment, for example "
-                    f"{type(self).__name__}('Pendulum-v1')."
-                )
-            self._setup_model()
+        self._constructed(device, _init_setup_model)
 
     @abstractmethod
     def _build(self, seed: int) -> None:
@@ -201,10 +200,11 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             self.refuse_unless(fine, name, "a number of at least 0, or a schedule", rate)
         if self.critic_learning_rate is not None:
             schedule_of(self.critic_learning_rate)
-        if self.n_steps > 1 and isinstance(self.observation_space, spaces.Dict):
-            raise ValueError(
-                "n_steps > 1 needs SB3's NStepReplayBuffer, which has no Dict observations: use "
-                "n_steps=1, or gymnasium.wrappers.FlattenObservation."
+        usual_buffer = self.replay_buffer_class is None
+        if usual_buffer and self.n_steps > 1 and isinstance(self.observation_space, spaces.Dict):
+            raise EnvironmentMismatchError(
+                "n_steps > 1 needs SB3's NStepReplayBuffer, which has no Dict observation spaces: "
+                "use n_steps=1, or gymnasium.wrappers.FlattenObservation."
             )
 
     def refuse_unless(self, fine: bool, name: str, allowed: str, value: Any = None) -> None:
@@ -221,23 +221,18 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
         )
-        self._build(self._network_seed)
-        # SB3 draws gSDE's noise and reads its deviation here.
-        self.actor: Any = self.policy
-
-    @property
-    def _network_seed(self) -> int:
-        """After a reset of the networks, another one."""
-        return int(np.asarray(self.key)[-1]) + self.reset_idx
+        self._build(self.network_seed)
+        # SB3 draws gSDE's noise and reads its deviation from the actor.
+        self.actor, self.critic = self.policy.actor, self.policy.critic
 
     def _maybe_reset_params(self) -> None:
         resets = self.param_resets or []
         if self.reset_idx < len(resets) and self.num_timesteps >= resets[self.reset_idx]:
             self.reset_idx += 1
-            self._restart(self._network_seed)
+            self._restart(self.network_seed)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor"]
+        return [*super()._excluded_save_params(), "actor", "critic"]
 
 
 def finite(report: dict[str, float]) -> dict[str, float]:

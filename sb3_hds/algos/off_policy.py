@@ -100,6 +100,7 @@ class Recipe:
     :param worth: values of all critics to what the actor climbs, shape ``(batch,)``
     :param optimizer: of the actor
     :param qf_optimizer: of the critics
+    :param ent_coef_optimizer: of the logarithm of the entropy coefficient; None: Adam
     :param policy_delay: updates of the critics for each of the actor
     :param learns_ent_coef: whether the entropy coefficient follows the target entropy
     :param joint_pass: whether current and next values come from one pass of the critics, without
@@ -116,6 +117,7 @@ class Recipe:
     worth: Callable[[Values], Float[Array, " batch"]]
     optimizer: "Optimizer"
     qf_optimizer: "Optimizer"
+    ent_coef_optimizer: "Optimizer | None" = None
     policy_delay: int = 1
     learns_ent_coef: bool = True
     joint_pass: bool = False
@@ -292,11 +294,12 @@ def begin(recipe: Recipe, n_obs: int, n_act: int, ent_coef: float, key: PRNGKeyA
     init = lambda key: recipe.critic.init({"params": key, "dropout": key}, obs, action)  # noqa: E731
     critic = jax.vmap(init)(jax.random.split(critic_key, recipe.n_critics))
     log_ent_coef = {"params": jnp.log(jnp.asarray(ent_coef, jnp.float32))}
+    of_ent_coef = recipe.ent_coef_optimizer or _ADAM
     return Learner(
         actor=Trained(actor, recipe.optimizer.init(actor["params"])),
         critic=Trained(critic, recipe.qf_optimizer.init(critic["params"])),
         target={} if recipe.joint_pass else critic,
-        log_ent_coef=Trained(log_ent_coef, _ADAM.init(log_ent_coef["params"])),
+        log_ent_coef=Trained(log_ent_coef, of_ent_coef.init(log_ent_coef["params"])),
         seen=Seen.nothing(n_obs),
         extra=recipe.extra.init(actor, obs, extra_key) if recipe.extra else {},
         key=key,
@@ -394,7 +397,13 @@ def update_actor(
     report: Report,
     key: PRNGKeyArray,
 ) -> tuple[Learner, Report]:
-    """Climb what the critics think of the actor's own actions, and follow the target entropy."""
+    r"""
+    Climb what the critics think of the actor's own actions, and follow the target entropy.
+
+    The loss of the entropy coefficient is :math:`\log\alpha\,(H - \bar{H})`, as in SB3 and SBX;
+    the papers have :math:`\alpha` in the place of its logarithm, a factor on the slope that Adam
+    takes out again.
+    """
     act_key, judge_key, extra_key = jax.random.split(key, 3)
     ent_coef = jnp.exp(learner.log_ent_coef.weights["params"])
 
@@ -417,7 +426,8 @@ def update_actor(
         ent_coef_loss=log_ent_coef.weights["params"] * excess,
     )
     if recipe.learns_ent_coef:
-        log_ent_coef = _ADAM.apply(excess, log_ent_coef, knobs.learning_rate)
+        of_ent_coef = recipe.ent_coef_optimizer or _ADAM
+        log_ent_coef = of_ent_coef.apply(excess, log_ent_coef, knobs.learning_rate)
     learner = learner._replace(actor=actor, log_ent_coef=log_ent_coef)
     if recipe.extra is not None:
         extra = recipe.extra.update(recipe, learner, batch, knobs, extra_key)

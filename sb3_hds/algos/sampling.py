@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_hds.algos.off_policy import Batch
@@ -63,6 +64,7 @@ def transitions(
 
 
 def _over_torch(model: "SoftActorCritic", buffer: Any, n: int) -> dict[str, np.ndarray]:
+    buffer.device = th.device("cpu")  # what is drawn goes to JAX by NumPy
     data, flatten = buffer.sample(n, env=model.get_vec_normalize_env()), model.policy.flatten
 
     def plain(rows: Any) -> Any:

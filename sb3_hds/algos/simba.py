@@ -35,6 +35,7 @@ class SimbaSAC(SoftActorCritic):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": SimbaPolicy,
+        "CnnPolicy": SimbaPolicy,
         "MultiInputPolicy": SimbaPolicy,
         "SimbaPolicy": SimbaPolicy,
     }

@@ -34,9 +34,12 @@ class SoftActorCritic(ModelFreeAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": GaussianPolicy,
+        "CnnPolicy": GaussianPolicy,
         "MultiInputPolicy": GaussianPolicy,
         "SimbaPolicy": SimbaPolicy,
     }
+    #: fields of the learner that ``param_resets`` leaves as they are
+    kept_by_restarts: ClassVar[tuple[str, ...]] = ("log_ent_coef", "seen", "n_updates")
     policy: GaussianPolicy
 
     def __init__(
@@ -75,12 +78,11 @@ class SoftActorCritic(ModelFreeAlgorithm):
         self.policy.build(self.recipe(), start, seed, device)
 
     def _restart(self, seed: int) -> None:
-        """The entropy coefficient stays, as in SBX."""
+        """The entropy coefficient stays with its optimiser, as in SBX, but for BRO."""
         before = self.policy.learner
         self._build(seed)
-        self.policy.learner = self.policy.learner._replace(
-            log_ent_coef=before.log_ent_coef, seen=before.seen, n_updates=before.n_updates
-        )
+        kept = {name: getattr(before, name) for name in self.kept_by_restarts}
+        self.policy.learner = self.policy.learner._replace(**kept)
 
     def _updates(self, n: int, batch_size: int) -> dict[str, float]:
         policy, knobs, report = self.policy, self.knobs(), {}

@@ -40,7 +40,7 @@ def log_probability(
     """
     scaled = (before - gaussian.mean) / gaussian.std
     density = -0.5 * scaled**2 - jnp.log(gaussian.std) - _LOG_SQRT_TAU
-    return jnp.sum(density - jnp.log(1.0 - jnp.tanh(before) ** 2 + _EPSILON), -1)
+    return jnp.sum(density - jnp.log(_tanh_slope(before) + _EPSILON), -1)
 
 
 def exploration_std(
@@ -50,14 +50,14 @@ def exploration_std(
     Standard deviation of the entries of gSDE's noise matrix.
 
     :param log_std: learned; with one column, it holds for all actions
-    :param use_expln: :math:`e^x` for :math:`x \leq 0` and :math:`\log(1 + x) + 1` above, which
-        grows slower than the exponential
+    :param use_expln: :math:`e^x` for :math:`x \leq 0` and :math:`\log(1 + x + 10^{-6}) + 1` above,
+        which grows slower than the exponential
 
     Source: Rueckstiess et al., *State-dependent exploration for policy gradient methods*, 2008.
     """
     if not use_expln:
         return jnp.exp(log_std)
-    above = jnp.where(log_std > 0.0, log_std, 0.0)
+    above = jnp.where(log_std > 0.0, log_std, 0.0) + _EPSILON
     return jnp.where(log_std > 0.0, jnp.log1p(above) + 1.0, jnp.exp(jnp.minimum(log_std, 0.0)))
 
 
@@ -72,3 +72,9 @@ def marginal_std(
     2021, equation 6.
     """
     return jnp.sqrt(latent**2 @ std**2 + _EPSILON)
+
+
+def _tanh_slope(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    r""":math:`1 - \tanh^2 x`, whose digits cancel where :math:`\tanh` is near 1, without that."""
+    t = jnp.exp(-2.0 * jnp.abs(x))
+    return 4.0 * t / (1.0 + t) ** 2

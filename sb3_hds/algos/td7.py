@@ -14,17 +14,19 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_hds.algos.call_forms import between, is_count, jax_device
+from sb3_hds.algos.features import is_image
 from sb3_hds.algos.gaussian_policy import optimizer_of, widths
 from sb3_hds.algos.lap import LapReplayBuffer
 from sb3_hds.algos.learner import GENERATOR
+from sb3_hds.algos.learning_policy import LearningPolicy
 from sb3_hds.algos.model_free import ModelFreeAlgorithm, finite
 from sb3_hds.algos.networks import Activation, activation
 from sb3_hds.algos.observations import flattener, size_of
 from sb3_hds.algos.off_policy import Batch
-from sb3_hds.algos.persistence import TensorPolicy, TrainingTensors
 from sb3_hds.algos.sampling import transitions
 from sb3_hds.algos.td7_update import (
     Actor,
+    Checkpoint,
     Critic,
     Encoder,
     Learner,
@@ -32,11 +34,14 @@ from sb3_hds.algos.td7_update import (
     Report,
     act,
     begin,
+    embed,
+    judge,
     update,
 )
+from sb3_hds.errors import EnvironmentMismatchError
 
 
-class TD7Policy(TensorPolicy):
+class TD7Policy(LearningPolicy):
     """
     ``"MlpPolicy"`` of TD7: encoder, actor and two critics. Where nothing is explored, the policy
     of the last checkpoint acts.
@@ -53,6 +58,9 @@ class TD7Policy(TensorPolicy):
     :param optimizer_kwargs: besides the learning rate
     :param use_sde: accepted for SB3's sake; the policy is deterministic
     """
+
+    held = ("copies", "checkpoint")
+    learner: Learner
 
     def __init__(
         self,
@@ -88,21 +96,11 @@ class TD7Policy(TensorPolicy):
             "qf_optimizer": optimizer,
         }
         self.flatten = flattener(observation_space)
-        self._learner: Learner | None = None
         self.uses_checkpoints = False
-        self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
 
-    @property
-    def learner(self) -> Learner:
-        """What updates change. A policy that no algorithm has built yet is that of the paper."""
-        if self._learner is None:
-            self.build(Recipe(**self.parts), 0, jax.devices()[0])
-        assert self._learner is not None
-        return self._learner
-
-    @learner.setter
-    def learner(self, learner: Learner) -> None:
-        self._learner = learner
+    def build_plain(self) -> None:
+        """That of the paper."""
+        self.build(Recipe(**self.parts), 0, jax.devices()[0])
 
     def build(self, recipe: Recipe, seed: int, device: Any) -> None:
         """
@@ -125,11 +123,8 @@ class TD7Policy(TensorPolicy):
     def keep_checkpoint(self) -> None:
         """The policy as it is acts where nothing is explored."""
         learner = self.learner
-        checkpoint = learner.copies.encoder, learner.actor.weights
+        checkpoint = Checkpoint(learner.copies.encoder, learner.actor.weights)
         self.learner = learner._replace(checkpoint=checkpoint)
-
-    def forward(self, obs: Any, deterministic: bool = False) -> np.ndarray:
-        return self._predict(obs, deterministic)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
         learner = self.learner
@@ -138,59 +133,14 @@ class TD7Policy(TensorPolicy):
             weights = learner.checkpoint
         return np.asarray(_act(self.recipe, *weights, self.flatten(observation)))
 
+    def critic(self, obs: Any, actions: Any) -> tuple[np.ndarray, ...]:
+        learner, flat = self.learner, self.flatten(obs)
+        taken = np.asarray(actions, np.float32).reshape(len(flat), -1)
+        values = _judged(self.recipe, learner.copies.encoder, learner.critic.weights, flat, taken)
+        return tuple(np.asarray(values)[..., None])
+
     def reset_noise(self, batch_size: int = 1) -> None:
         """Nothing to reset: noise is added to the actions (``action_noise``)."""
-
-    @property
-    def weights(self) -> Any:
-        learner = self.learner
-        encoder, actor = learner.checkpoint
-        return {
-            "actor": learner.actor.weights,
-            "encoder": learner.encoder.weights,
-            "critic": learner.critic.weights,
-            "copies": learner.copies,
-            "checkpoint": {"encoder": encoder, "actor": actor},
-        }
-
-    @weights.setter
-    def weights(self, tree: Any) -> None:
-        learner = self.learner
-        self.learner = learner._replace(
-            actor=learner.actor._replace(weights=tree["actor"]),
-            encoder=learner.encoder._replace(weights=tree["encoder"]),
-            critic=learner.critic._replace(weights=tree["critic"]),
-            copies=tree["copies"],
-            checkpoint=(tree["checkpoint"]["encoder"], tree["checkpoint"]["actor"]),
-        )
-
-    @property
-    def training_state(self) -> Any:
-        """Random keys are stored as 64-bit integers, which torch can hold."""
-        learner = self.learner
-        return {
-            "actor": learner.actor.optimizer,
-            "encoder": learner.encoder.optimizer,
-            "critic": learner.critic.optimizer,
-            "clip": learner.clip,
-            "range": learner.range,
-            "key": np.asarray(jax.random.key_data(learner.key), np.int64),
-            "n_updates": learner.n_updates,
-        }
-
-    @training_state.setter
-    def training_state(self, tree: Any) -> None:
-        learner = self.learner
-        key = jnp.asarray(np.asarray(tree["key"]).astype(np.uint32))
-        self.learner = learner._replace(
-            actor=learner.actor._replace(optimizer=tree["actor"]),
-            encoder=learner.encoder._replace(optimizer=tree["encoder"]),
-            critic=learner.critic._replace(optimizer=tree["critic"]),
-            clip=tree["clip"],
-            range=tree["range"],
-            key=jax.random.wrap_key_data(key, impl=GENERATOR),
-            n_updates=tree["n_updates"],
-        )
 
 
 class TD7(ModelFreeAlgorithm):
@@ -228,7 +178,9 @@ class TD7(ModelFreeAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": TD7Policy,
-        "MultiInputPolicy": TD7Policy,  # so that Dict observations reach the message that says why
+        # So that these observations reach the message that says why not.
+        "CnnPolicy": TD7Policy,
+        "MultiInputPolicy": TD7Policy,
     }
     policy: TD7Policy
 
@@ -315,6 +267,11 @@ class TD7(ModelFreeAlgorithm):
                 "TD7's replay buffer has no Dict observations: "
                 "use gymnasium.wrappers.FlattenObservation."
             )
+        if is_image(self.observation_space):
+            raise EnvironmentMismatchError(
+                f"The observation is an image ({self.observation_space}), and TD7's networks have "
+                "no convolutions: use another algorithm, or observe features of it."
+            )
 
     def _setup_model(self) -> None:
         if self.use_checkpoints is None:
@@ -400,6 +357,11 @@ class TD7(ModelFreeAlgorithm):
             if self.num_timesteps - self._episode_length >= self.learning_starts:
                 self._finished.append((self._episode_return, self._episode_length))
             self._episode_return, self._episode_length = 0.0, 0
+
+
+@partial(jax.jit, static_argnums=0)
+def _judged(recipe: Recipe, encoder: Any, critic: Any, obs: Any, actions: Any) -> jax.Array:
+    return judge(recipe, critic, obs, actions, *embed(recipe, encoder, obs, actions))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -7,7 +7,7 @@ Learning*, NeurIPS 2023.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple, cast
 
@@ -66,7 +66,7 @@ class Actor(nn.Module):
     def __call__(
         self, obs: Float[Array, "*batch obs"], state: Float[Array, "*batch z"]
     ) -> Float[Array, "*batch act"]:
-        own = average_l1_norm(nn.Dense(self.net_arch[0])(obs))
+        own = average_l1_norm(_first(self.net_arch)(obs))
         hidden = _Dense((*self.net_arch, self.n_act), self.activation_fn)
         return jnp.tanh(hidden(jnp.concatenate([own, state], -1)))
 
@@ -90,9 +90,14 @@ class Critic(nn.Module):
         both: Float[Array, "*batch z"],
         state: Float[Array, "*batch z"],
     ) -> Float[Array, "*batch"]:
-        own = nn.Dense(self.net_arch[0])(jnp.concatenate([obs, action], -1))
+        own = _first(self.net_arch)(jnp.concatenate([obs, action], -1))
         hidden = _Dense((*self.net_arch, 1), self.activation_fn)
         return hidden(jnp.concatenate([average_l1_norm(own), both, state], -1))[..., 0]
+
+
+def _first(net_arch: Sequence[int]) -> Callable[[Array], Array]:
+    """A layer of the first width; without hidden layers, what comes in."""
+    return nn.Dense(net_arch[0]) if net_arch else lambda x: x
 
 
 class _Dense(nn.Module):
@@ -154,20 +159,26 @@ class Copies(NamedTuple):
     target_encoder: Weights
 
 
+class Checkpoint(NamedTuple):
+    """What acts where nothing is explored."""
+
+    encoder: Weights
+    actor: Weights
+
+
 class Learner(NamedTuple):
     """
     Everything that an update changes.
 
     :param clip: range of values to which next values are clipped
     :param range: of targets since the last copy
-    :param checkpoint: encoder and actor that act where nothing is explored
     """
 
     encoder: Trained
     actor: Trained
     critic: Trained
     copies: Copies
-    checkpoint: tuple[Weights, Weights]
+    checkpoint: Checkpoint
     clip: Range
     range: Range
     key: PRNGKeyArray
@@ -197,7 +208,7 @@ def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
         actor=Trained(actor, recipe.optimizer.init(actor["params"])),
         critic=Trained(critic, recipe.qf_optimizer.init(critic["params"])),
         copies=Copies(encoder, actor, critic, encoder),
-        checkpoint=(encoder, actor),
+        checkpoint=Checkpoint(encoder, actor),
         clip=Range(zero, zero),
         range=Range(infinite, -infinite),
         key=key,
@@ -212,13 +223,15 @@ def act(recipe: Recipe, encoder: Weights, actor: Weights, obs: Array) -> Array:
     return cast(Array, recipe.actor.apply(actor, obs, state))
 
 
-def _embedded(recipe: Recipe, weights: Weights, obs: Array, action: Array) -> tuple[Array, Array]:
+def embed(recipe: Recipe, weights: Weights, obs: Array, action: Array) -> tuple[Array, Array]:
+    """:return: embeddings of states, and of pairs of state and action"""
     return cast(tuple[Array, Array], recipe.encoder.apply(weights, obs, action))
 
 
-def _judged(
+def judge(
     recipe: Recipe, weights: Weights, obs: Array, action: Array, state: Array, both: Array
 ) -> Array:
+    """:return: values of all critics, shape ``(critics, batch)``"""
     one = lambda w: recipe.critic.apply(w, obs, action, both, state)  # noqa: E731
     return cast(Array, jax.vmap(one)(weights))
 
@@ -245,17 +258,17 @@ def update(
     noise = jnp.clip(noise, -recipe.noise_clip, recipe.noise_clip)
     next_action = act(recipe, copies.target_encoder, copies.actor, batch.next_obs)
     next_action = jnp.clip(next_action + noise, -1.0, 1.0)
-    embedded = _embedded(recipe, copies.target_encoder, batch.next_obs, next_action)
-    next_value = _judged(recipe, copies.critic, batch.next_obs, next_action, *embedded).min(0)
+    embedded = embed(recipe, copies.target_encoder, batch.next_obs, next_action)
+    next_value = judge(recipe, copies.critic, batch.next_obs, next_action, *embedded).min(0)
     next_value = jnp.clip(next_value, learner.clip.low, learner.clip.high)
     target = batch.reward + (1.0 - batch.terminated) * batch.discount * next_value
     seen = Range(
         jnp.minimum(learner.range.low, target.min()), jnp.maximum(learner.range.high, target.max())
     )
-    state, both = _embedded(recipe, copies.encoder, batch.obs, batch.action)
+    state, both = embed(recipe, copies.encoder, batch.obs, batch.action)
 
     def critic_loss(params: Any) -> tuple[Array, Array]:
-        value = _judged(recipe, {"params": params}, batch.obs, batch.action, state, both)
+        value = judge(recipe, {"params": params}, batch.obs, batch.action, state, both)
         error = jnp.abs(value - target)
         return jnp.sum(jnp.mean(jnp.where(error < 1.0, 0.5 * error**2, error), 1)), error
 
@@ -283,10 +296,10 @@ def _update_encoder(
     recipe: Recipe, encoder: Trained, batch: Batch, rate: float
 ) -> tuple[Trained, Array]:
     """The embedding of state and action shall be that of the next state."""
-    wanted, _ = _embedded(recipe, encoder.weights, batch.next_obs, batch.action)
+    wanted, _ = embed(recipe, encoder.weights, batch.next_obs, batch.action)
 
     def loss(params: Any) -> Array:
-        _, both = _embedded(recipe, {"params": params}, batch.obs, batch.action)
+        _, both = embed(recipe, {"params": params}, batch.obs, batch.action)
         return jnp.mean((both - jax.lax.stop_gradient(wanted)) ** 2)
 
     value, slope = jax.value_and_grad(loss)(encoder.weights["params"])
@@ -298,8 +311,8 @@ def _update_actor(
 ) -> tuple[Trained, Array]:
     def loss(params: Any) -> Array:
         action = cast(Array, recipe.actor.apply({"params": params}, batch.obs, state))
-        _, both = _embedded(recipe, learner.copies.encoder, batch.obs, action)
-        value = _judged(recipe, learner.critic.weights, batch.obs, action, state, both)
+        _, both = embed(recipe, learner.copies.encoder, batch.obs, action)
+        value = judge(recipe, learner.critic.weights, batch.obs, action, state, both)
         return -jnp.mean(value)
 
     value, slope = jax.value_and_grad(loss)(learner.actor.weights["params"])

@@ -25,6 +25,29 @@ class TensorAlgorithm(OffPolicyAlgorithmJax):
     saved_by: str
     policy_description: dict[str, Any] | None
 
+    def _constructed(self, device: Any, set_up: bool) -> None:
+        """
+        The end of every constructor.
+
+        :param device: as it was passed
+        :param set_up: whether networks are made now; ``load`` has them made later
+        :raises ValueError: if there is no environment to make them for
+        """
+        self.saved_by, self._device_name = type(self).__name__, str(device)
+        if not set_up:
+            return
+        if self.env is None:
+            raise ValueError(
+                f"{type(self).__name__} needs an environment, for example "
+                f"{type(self).__name__}('Pendulum-v1')."
+            )
+        self._setup_model()
+
+    @property
+    def network_seed(self) -> int:
+        """After a reset of the networks, another one."""
+        return int(np.asarray(self.key)[-1]) + self.reset_idx
+
     def learn(  # type: ignore[override]
         self,
         total_timesteps: int | None = None,
@@ -98,6 +121,15 @@ class TensorAlgorithm(OffPolicyAlgorithmJax):
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         write_whole(path, "pkl", super().save_replay_buffer)
+
+    def load_replay_buffer(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        truncate_last_traj: bool = True,
+    ) -> None:
+        # SBX marks the buffer as the CPU's, where SB3 has the model's device.
+        super().load_replay_buffer(path, truncate_last_traj)
+        self.replay_buffer.device = self.device  # type: ignore[union-attr]
 
     @classmethod
     def load(

@@ -181,20 +181,12 @@ class TwinAlgorithm(TensorAlgorithm):
         self.unstored_step: dict[str, Any] | None = None
         self.real_timesteps = 0
         self.learned_force = Tensors(self)
-        self.saved_by = type(self).__name__
         self.n_pretrained = 0
         self.twin_timesteps = 0
         self._n_updates = 0
         self._epochs_planned, self._epochs_done = 0, 0
-        self._device_name = str(device)
         self._workspace: Workspace | None = None
-        if _init_setup_model:
-            if self.env is None:
-                raise ValueError(
-                    f"{type(self).__name__} needs an environment, for example "
-                    f"{type(self).__name__}('Pendulum-v1')."
-                )
-            self._setup_model()
+        self._constructed(device, _init_setup_model)
 
     def learn(  # type: ignore[override]
         self,
@@ -290,8 +282,7 @@ class TwinAlgorithm(TensorAlgorithm):
         self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
         )
-        seed = int(np.asarray(self.key)[-1])
-        self.policy.build(jax.random.key(seed, impl=GENERATOR), device)
+        self.policy.build(jax.random.key(self.network_seed, impl=GENERATOR), device)
         self._workspace = None
         self._setup_twin()
 

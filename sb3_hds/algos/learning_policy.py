@@ -1,0 +1,96 @@
+"""What the policies of model-free algorithms share: they hold all that updates change."""
+
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sb3_hds.algos.learner import GENERATOR
+from sb3_hds.algos.off_policy import Trained
+from sb3_hds.algos.persistence import TensorPolicy, TrainingTensors
+
+
+class LearningPolicy(TensorPolicy):
+    """
+    Abstract: a policy that holds a learner, a named tuple of networks with their optimisers
+    (:class:`~sb3_hds.algos.off_policy.Trained`), a random ``key``, and more.
+    """
+
+    #: fields of the learner that are saved with the networks, not with their optimisers
+    held: ClassVar[tuple[str, ...]]
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._learner: Any = None
+        self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
+
+    @abstractmethod
+    def build_plain(self) -> None:
+        """Draw networks for a policy that no algorithm has built."""
+
+    @abstractmethod
+    def critic(self, obs: Any, actions: Any) -> tuple[np.ndarray, ...]:
+        """
+        As ``model.critic`` of SB3, to look at values.
+
+        :param obs: with a leading axis, as the environment gives them
+        :param actions: within [-1, 1], shape ``(n, act)``
+        :return: of each critic, shape ``(n, 1)``; the mean, where it has quantiles
+        """
+
+    @property
+    def actor(self) -> "LearningPolicy":
+        """Where SB3 has the actor apart: here, it is the policy."""
+        return self
+
+    @property
+    def learner(self) -> Any:
+        """What updates change."""
+        if self._learner is None:
+            self.build_plain()
+        return self._learner
+
+    @learner.setter
+    def learner(self, learner: Any) -> None:
+        self._learner = learner
+
+    def forward(self, obs: Any, deterministic: bool = False) -> np.ndarray:
+        return self._predict(obs, deterministic)  # type: ignore[return-value]
+
+    @property
+    def weights(self) -> Any:
+        fields = self.learner._asdict()
+        networks = {n: part.weights for n, part in fields.items() if isinstance(part, Trained)}
+        return networks | {name: fields[name] for name in self.held}
+
+    @weights.setter
+    def weights(self, tree: Any) -> None:
+        self._take("weights", tree)
+
+    @property
+    def training_state(self) -> Any:
+        """Random keys are stored as 64-bit integers, which torch can hold."""
+        fields = self.learner._asdict()
+        state = {
+            name: part.optimizer if isinstance(part, Trained) else part
+            for name, part in fields.items()
+            if name not in self.held
+        }
+        return state | {"key": np.asarray(jax.random.key_data(fields["key"]), np.int64)}
+
+    @training_state.setter
+    def training_state(self, tree: Any) -> None:
+        key = jnp.asarray(np.asarray(tree["key"]).astype(np.uint32))
+        self._take("optimizer", tree | {"key": jax.random.wrap_key_data(key, impl=GENERATOR)})
+
+    def _take(self, of_networks: str, tree: Any) -> None:
+        before = self.learner._asdict()
+        after = {
+            name: before[name]._replace(**{of_networks: part})
+            if isinstance(before[name], Trained)
+            else part
+            for name, part in tree.items()
+        }
+        self.learner = self.learner._replace(**after)

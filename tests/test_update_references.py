@@ -1,0 +1,528 @@
+"""Two updates of every model-free algorithm beside plain NumPy, weight by weight."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from gymnasium import spaces
+from numpy_networks import (
+    Adam,
+    Weights,
+    average_l1,
+    bro,
+    dense,
+    descend,
+    elu,
+    gaussian,
+    member,
+    mlp,
+    quantile_huber,
+    relu,
+    simba,
+    squashed,
+)
+
+from sb3_hds import algos
+from sb3_hds.algos import td7_update
+from sb3_hds.algos.observations import Seen
+from sb3_hds.algos.off_policy import Batch, Knobs, Optimizer, Trained, update
+
+pytestmark = pytest.mark.usefixtures("x64", "quick_compilation")
+
+N_OBS, N_ACT, N_BATCH, N_UPDATES = 3, 2, 6, 2
+KNOBS = Knobs(learning_rate=0.03, qf_learning_rate=0.05, tau=0.1, target_entropy=-1.3)
+# Double precision, and slopes whose error is that of a central difference.
+CLOSE: dict[str, Any] = {"rtol": 1e-6, "atol": 1e-8}
+
+
+class Spaces(gymnasium.Env):
+    """An environment that only says what it observes and takes."""
+
+    observation_space = spaces.Box(-1.0, 1.0, (N_OBS,))
+    action_space = spaces.Box(-1.0, 1.0, (N_ACT,))
+
+
+def begun(name: str, policy_kwargs: dict[str, Any] | None = None, **arguments: Any) -> Any:
+    """
+    :return: recipe and learner of a model whose networks are trained by plain gradient descent, in
+        double precision; no bias is zero, and no two networks are equal
+    """
+    kwargs = {"net_arch": [4], "optimizer_class": "sgd"} | (policy_kwargs or {})
+    model = algos.ALL[name](env=Spaces(), seed=0, buffer_size=10, policy_kwargs=kwargs, **arguments)
+    rng = np.random.default_rng(1)
+
+    def doubled(path: Any, leaf: Any) -> Any:
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            return leaf
+        weight = any(getattr(step, "key", None) == "params" for step in path) and leaf.ndim > 0
+        moved = 0.2 * rng.normal(size=leaf.shape) if weight else 0.0
+        return jnp.asarray(np.asarray(leaf, np.float64) + moved)
+
+    return model.policy.recipe, jax.tree_util.tree_map_with_path(doubled, model.policy.learner)
+
+
+def plain(tree: Any) -> Any:
+    """:return: writable arrays of NumPy"""
+    return jax.tree.map(lambda leaf: np.array(leaf, np.float64), tree)
+
+
+def batches(n_updates: int = N_UPDATES) -> Batch:
+    rng = np.random.default_rng(0)
+    draw = lambda *shape: rng.normal(size=(n_updates, N_BATCH, *shape))  # noqa: E731
+    return Batch(
+        obs=draw(N_OBS),
+        action=np.tanh(draw(N_ACT)),
+        next_obs=draw(N_OBS),
+        reward=3.0 * draw(),
+        terminated=(draw() > 0.7).astype(float),
+        discount=np.full((n_updates, N_BATCH), 0.9),
+    )
+
+
+def assert_same(found: Any, expected: Any) -> None:
+    leaves, structure = jax.tree_util.tree_flatten_with_path(expected)
+    assert jax.tree.structure(found) == structure
+    for (path, leaf), other in zip(leaves, jax.tree.leaves(found), strict=True):
+        np.testing.assert_allclose(other, leaf, err_msg=str(path), **CLOSE)
+
+
+def keys_of(learner: Any) -> Iterator[tuple[Any, ...]]:
+    """:return: of each update, the keys of the next action, the action and what else there is"""
+    key = learner.key
+    while True:
+        key, critic_key, actor_key = jax.random.split(key, 3)
+        yield jax.random.split(critic_key, 3)[0], *jax.random.split(actor_key, 3)[::2]
+
+
+def normal(key: Any) -> np.ndarray:
+    return np.asarray(jax.random.normal(key, (N_BATCH, N_ACT)))
+
+
+class Soft:
+    """
+    Soft actor-critic (Haarnoja et al. 2018): equations 5 to 9 and 18 of arXiv 1812.05905.
+
+    :param body: what lies before the last layers
+    :param target_of: next values of all critics, shape ``(critics, batch, values)``, to what
+        becomes a target, shape ``(batch, targets)``
+    :param error: of the values of one critic, given targets
+    :param worth: values of all critics to what the actor climbs, shape ``(batch,)``
+    :param b1: Adam's, of the entropy coefficient
+    """
+
+    def __init__(self, learner, body, target_of, error, worth, b1=0.9) -> None:
+        self.body, self.target_of, self.error, self.worth = body, target_of, error, worth
+        self.actor = plain(learner.actor.weights["params"])
+        self.critic = plain(learner.critic.weights["params"])
+        self.target = plain(learner.target["params"])
+        self.log_ent_coef = float(learner.log_ent_coef.weights["params"])
+        self.adam = Adam(KNOBS.learning_rate, b1)
+        self.keys = keys_of(learner)
+
+    def values(self, critic: Weights, obs: np.ndarray, action: np.ndarray) -> np.ndarray:
+        both = np.concatenate([obs, action], -1)
+        each = [member(critic, i) for i in range(2)]
+        return np.stack([dense(w["Dense_0"], self.body(w["body"], both)) for w in each])
+
+    def acts(self, actor: Weights, obs: np.ndarray, noise: np.ndarray) -> Any:
+        return squashed(*gaussian(actor, self.body(actor["body"], obs)), noise)
+
+    def update(self, batch: Batch) -> dict[str, float]:
+        next_key, key, extra_key = next(self.keys)
+        ent_coef, noise = np.exp(self.log_ent_coef), normal(key)
+        next_action, log_prob = self.acts(self.actor, batch.next_obs, normal(next_key))
+        chosen = self.target_of(self.values(self.target, batch.next_obs, next_action))
+        alive = (batch.discount * (1.0 - batch.terminated))[:, None]
+        y = batch.reward[:, None] + alive * (chosen - ent_coef * log_prob[:, None])
+
+        def critic_loss(critic: Weights) -> float:
+            return sum(self.error(v, y) for v in self.values(critic, batch.obs, batch.action))
+
+        def actor_loss(actor: Weights) -> float:
+            action, log_prob = self.acts(actor, batch.obs, noise)
+            worth = self.worth(self.values(self.critic, batch.obs, action))
+            return np.mean(ent_coef * log_prob - worth)
+
+        report = {"critic_loss": critic_loss(self.critic)}
+        self.critic = descend(critic_loss, self.critic, KNOBS.qf_learning_rate)
+        follow = lambda old, new: (1.0 - KNOBS.tau) * old + KNOBS.tau * new  # noqa: E731
+        self.target = jax.tree.map(follow, self.target, self.critic)
+        report |= {"actor_loss": actor_loss(self.actor), "ent_coef": ent_coef}
+        excess = -self.acts(self.actor, batch.obs, noise)[1].mean() - KNOBS.target_entropy
+        report["ent_coef_loss"] = self.log_ent_coef * excess
+        self.actor = descend(actor_loss, self.actor, KNOBS.learning_rate)
+        self.log_ent_coef = self.adam.step(self.log_ent_coef, excess)
+        self.explore(batch, extra_key)
+        return report
+
+    def explore(self, batch: Batch, key: Any) -> None:
+        """What follows the actor."""
+
+
+def check(recipe: Any, learner: Any, expected: Any, seen: Any = lambda obs: obs) -> Any:
+    """:return: the learner after as many updates as the reference makes, which agree with it"""
+    given = batches()
+    learner, report = update(recipe, learner, given, N_UPDATES, KNOBS)
+    for i in range(N_UPDATES):
+        batch = jax.tree.map(lambda x, i=i: np.array(x[i]), given)
+        said = expected.update(batch._replace(obs=seen(batch.obs), next_obs=seen(batch.next_obs)))
+    assert_same(report._asdict(), said)
+    assert_same(learner.critic.weights["params"], expected.critic)
+    assert_same(learner.actor.weights["params"], expected.actor)
+    assert_same(learner.log_ent_coef.weights["params"], expected.log_ent_coef)
+    if not recipe.joint_pass:
+        assert_same(learner.target["params"], expected.target)
+    return learner
+
+
+def half_square(values: np.ndarray, y: np.ndarray) -> float:
+    return 0.5 * np.mean((values - y) ** 2)
+
+
+def least(values: np.ndarray) -> np.ndarray:
+    return values.min(0)
+
+
+def least_worth(values: np.ndarray) -> np.ndarray:
+    return values.min(0)[:, 0]
+
+
+def mean_worth(values: np.ndarray) -> np.ndarray:
+    return values.mean((0, 2))
+
+
+@pytest.mark.parametrize("full_std", [True, pytest.param(False, marks=pytest.mark.expensive)])
+def test_soft_actor_critic_with_state_dependent_noise(full_std):
+    kwargs = {"full_std": full_std, "log_std_init": -1.0}
+    recipe, learner = begun("gsde_sac", kwargs)
+
+    check(recipe, learner, Soft(learner, mlp, least, half_square, least_worth))
+
+
+def test_droq_climbs_the_mean_and_regresses_on_the_least():
+    recipe, learner = begun("droq", {"dropout_rate": 0.0}, policy_delay=1)
+
+    check(recipe, learner, Soft(learner, mlp, least, half_square, mean_worth))
+
+
+def test_tqc_drops_the_largest_of_all_quantiles():
+    recipe, learner = begun("tqc_jax", {"n_quantiles": 5}, top_quantiles_to_drop_per_net=2)
+
+    def kept(values: np.ndarray) -> np.ndarray:
+        return np.array([sorted([*one, *other])[:6] for one, other in zip(*values, strict=True)])
+
+    check(recipe, learner, Soft(learner, mlp, kept, quantile_huber, mean_worth))
+
+
+@pytest.mark.parametrize("clipped", [True, pytest.param(False, marks=pytest.mark.expensive)])
+def test_simba_normalises_by_all_it_saw(clipped):
+    recipe, learner = begun("simba", clipped_double_q=clipped)
+    rows = np.random.default_rng(2).normal([3.0, -1.0, 0.0], [2.0, 0.1, 5.0], (40, N_OBS))
+    learner = learner._replace(seen=Seen.nothing(N_OBS).with_more(rows[:7]).with_more(rows[7:]))
+    learner = learner._replace(seen=jax.tree.map(lambda x: jnp.asarray(x, float), learner.seen))
+    # Statistics are kept in single precision.
+    np.testing.assert_allclose(learner.seen.variance, rows.var(0), rtol=1e-6)
+    mean, variance = plain(learner.seen.mean), plain(learner.seen.variance)
+    target_of, worth = (least, least_worth) if clipped else (lambda v: v.mean(0), mean_worth)
+
+    check(
+        recipe,
+        learner,
+        Soft(learner, simba, target_of, half_square, worth),
+        lambda obs: (obs - mean) / np.sqrt(variance + 1e-8),
+    )
+
+
+class Optimistic(Soft):
+    """Nauman et al., NeurIPS 2024, section 3: the actor that explores, and its two multipliers."""
+
+    def __init__(self, learner) -> None:
+        target_of = lambda values: values.mean(0)  # noqa: E731
+        super().__init__(learner, bro, target_of, quantile_huber, mean_worth, b1=0.5)
+        self.shift = plain(learner.extra["actor"].weights["params"])
+        self.log_optimism, self.log_regularizer = np.log(1.0), np.log(0.25)
+        self.adams = Adam(3e-5, 0.5), Adam(3e-5, 0.5)
+
+    def explore(self, batch: Batch, key: Any) -> None:
+        noise = normal(jax.random.split(key)[0])
+        mean, std = gaussian(self.actor, self.body(self.actor["body"], batch.obs))
+        optimism, regularizer = np.exp(self.log_optimism), np.exp(self.log_regularizer)
+
+        def moved(w: Weights) -> np.ndarray:
+            inside = np.concatenate([batch.obs, mean], -1)
+            return dense(w["Dense_0"], self.body(w["body"], inside))
+
+        def divergence(w: Weights) -> float:
+            """Kullback-Leibler, of Gaussians of equal deviation."""
+            return np.mean(np.sum(moved(w) ** 2 / (2.0 * std**2), -1))
+
+        def loss(w: Weights) -> float:
+            action = np.tanh(mean + moved(w) + 0.75 * std * noise)
+            one, other = self.values(self.critic, batch.obs, action)
+            upper = (one + other) / 2.0 + optimism * np.abs(one - other) / 2.0
+            return regularizer * divergence(w) - upper.mean()
+
+        excess = divergence(self.shift) / N_ACT - 0.05
+        self.shift = descend(loss, self.shift, KNOBS.learning_rate)
+        of_optimism, of_regularizer = self.adams
+        self.log_optimism = of_optimism.step(self.log_optimism, optimism * excess)
+        self.log_regularizer = of_regularizer.step(self.log_regularizer, -regularizer * excess)
+
+
+def test_bro_regresses_and_climbs_means_and_explores_by_another_actor():
+    recipe, learner = begun("bro", {"n_quantiles": 5})
+    expected = Optimistic(learner)
+
+    learner = check(recipe, learner, expected)
+
+    assert_same(learner.extra["actor"].weights["params"], expected.shift)
+    assert_same(learner.extra["optimism"].weights["params"], expected.log_optimism)
+    assert_same(learner.extra["regularizer"].weights["params"], expected.log_regularizer)
+
+
+class Renormed:
+    """
+    A hidden layer between two batch renormalisations (Ioffe 2017, algorithm 1).
+
+    :param statistics: running means and variances; changed by :meth:`remember`
+    :param warm: whether the batch is corrected towards them
+    """
+
+    def __init__(self, statistics: Weights) -> None:
+        self.statistics, self.warm = statistics, False
+        self.corrections: dict[str, Any] = {}
+        self.of_batch: dict[str, Any] = {}
+
+    def running(self, w: Weights, x: np.ndarray) -> np.ndarray:
+        return self._layers(w, x, self._by_statistics)
+
+    def training(self, w: Weights, x: np.ndarray) -> np.ndarray:
+        """Corrections are those of the first call since :meth:`remember`: they have no slope."""
+        return self._layers(w, x, self._by_batch)
+
+    def remember(self, momentum: float) -> None:
+        """What the first pass saw goes into the running statistics."""
+        for name, found in self.of_batch.items():
+            for key, value in found.items():
+                old = self.statistics[name][key]
+                self.statistics[name][key] = momentum * old + (1.0 - momentum) * value
+        self.corrections, self.of_batch, self.warm = {}, {}, True
+
+    def _layers(self, w: Weights, x: np.ndarray, normalise: Any) -> np.ndarray:
+        x = normalise("BatchRenorm_0", w, x)
+        return normalise("BatchRenorm_1", w, relu(dense(w["Dense_0"], x)))
+
+    def _by_statistics(self, name: str, w: Weights, x: np.ndarray) -> np.ndarray:
+        held = self.statistics[name]
+        x = (x - held["mean"]) / np.sqrt(held["var"] + 1e-3)
+        return x * w[name]["scale"] + w[name]["bias"]
+
+    def _by_batch(self, name: str, w: Weights, x: np.ndarray) -> np.ndarray:
+        mean, var, held = x.mean(0), x.var(0), self.statistics[name]
+        now, running = np.sqrt(var + 1e-3), np.sqrt(held["var"] + 1e-3)
+        if name not in self.of_batch:
+            r = np.clip(now / running, 1.0 / 3.0, 3.0)
+            d = np.clip((mean - held["mean"]) / running, -5.0, 5.0)
+            self.corrections[name] = (r, d) if self.warm else (1.0, 0.0)
+            self.of_batch[name] = {"mean": mean, "var": var}
+        r, d = self.corrections[name]
+        return ((x - mean) / now * r + d) * w[name]["scale"] + w[name]["bias"]
+
+
+class Joint(Soft):
+    """Bhatt et al., ICLR 2024, section 3: no target networks, one pass over both pairs."""
+
+    momentum = 0.9
+
+    def __init__(self, learner) -> None:
+        super().__init__(
+            learner._replace(target={"params": {}}), None, least, half_square, least_worth
+        )
+        statistics = plain(learner.critic.weights["statistics"]["body"])
+        self.of_critics = [Renormed(member(statistics, i)) for i in range(2)]
+        self.of_actor = Renormed(plain(learner.actor.weights["statistics"]["body"]))
+
+    def judged(self, critic: Weights, obs: Any, action: Any, how: str) -> np.ndarray:
+        both, values = np.concatenate([obs, action], -1), []
+        for i, layer in enumerate(self.of_critics):
+            w = member(critic, i)
+            values.append(dense(w["Dense_0"], getattr(layer, how)(w["body"], both)))
+        return np.stack(values)
+
+    def acted(self, actor: Weights, obs: Any, noise: Any, how: str) -> Any:
+        return squashed(*gaussian(actor, getattr(self.of_actor, how)(actor["body"], obs)), noise)
+
+    def update(self, batch: Batch) -> dict[str, float]:
+        next_key, key, _ = next(self.keys)
+        ent_coef, noise = np.exp(self.log_ent_coef), normal(key)
+        next_action, log_prob = self.acted(self.actor, batch.next_obs, normal(next_key), "running")
+        obs = np.concatenate([batch.obs, batch.next_obs])
+        action = np.concatenate([batch.action, next_action])
+        both = self.judged(self.critic, obs, action, "training")
+        alive = (batch.discount * (1.0 - batch.terminated))[:, None]
+        y = batch.reward[:, None] + alive * (
+            both[:, N_BATCH:].min(0) - ent_coef * log_prob[:, None]
+        )
+
+        def critic_loss(critic: Weights) -> float:
+            values = self.judged(critic, obs, action, "training")[:, :N_BATCH]
+            return sum(half_square(v, y) for v in values)
+
+        def actor_loss(actor: Weights) -> float:
+            action, log_prob = self.acted(actor, batch.obs, noise, "training")
+            worth = self.judged(self.critic, batch.obs, action, "running").min(0)[:, 0]
+            return np.mean(ent_coef * log_prob - worth)
+
+        report = {"critic_loss": critic_loss(self.critic)}
+        self.critic = descend(critic_loss, self.critic, KNOBS.qf_learning_rate)
+        for layer in self.of_critics:
+            layer.remember(self.momentum)
+        report |= {"actor_loss": actor_loss(self.actor), "ent_coef": ent_coef}
+        entropy = -self.acted(self.actor, batch.obs, noise, "training")[1].mean()
+        report["ent_coef_loss"] = self.log_ent_coef * (entropy - KNOBS.target_entropy)
+        self.actor = descend(actor_loss, self.actor, KNOBS.learning_rate)
+        self.of_actor.remember(self.momentum)
+        self.log_ent_coef = self.adam.step(self.log_ent_coef, entropy - KNOBS.target_entropy)
+        return report
+
+
+def test_crossq_normalises_both_pairs_together_and_has_no_target_networks():
+    kwargs = {"renorm_after": 1, "renorm_momentum": Joint.momentum}
+    recipe, learner = begun("crossq_jax", kwargs, policy_delay=1)
+    assert recipe.joint_pass and learner.target == {}
+    expected = Joint(learner)
+
+    learner = check(recipe, learner, expected)
+
+    for i, layer in enumerate(expected.of_critics):
+        found = member(learner.critic.weights["statistics"]["body"], i)
+        for name, held in layer.statistics.items():
+            assert_same(found[name], held | {"steps": float(N_UPDATES)})
+    assert float(learner.actor.weights["statistics"]["body"]["BatchRenorm_0"]["steps"]) == N_UPDATES
+
+
+class Sale:
+    """Fujimoto et al., NeurIPS 2023, section 4 and appendix; LAP's loss is equation 10 of its own
+    paper (NeurIPS 2020)."""
+
+    def __init__(self, recipe, learner) -> None:
+        self.recipe, self.key = recipe, learner.key
+        parts = {n: plain(getattr(learner, n).weights["params"]) for n in ("encoder", "actor")}
+        self.encoder, self.actor = parts["encoder"], parts["actor"]
+        self.critic = plain(learner.critic.weights["params"])
+        self.fixed = self.target_encoder = self.encoder
+        self.target_actor, self.target_critic = self.actor, self.critic
+        self.clip, self.range, self.n = (0.0, 0.0), [np.inf, -np.inf], 0
+
+    def embed(self, w: Weights, obs: np.ndarray, action: np.ndarray) -> tuple[Any, Any]:
+        state = average_l1(self._two(w["of_state"], obs, elu))
+        return state, self._two(w["of_both"], np.concatenate([state, action], -1), elu)
+
+    def act(self, w: Weights, obs: np.ndarray, state: np.ndarray) -> np.ndarray:
+        own = average_l1(dense(w["Dense_0"], obs))
+        return np.tanh(self._two(w["_Dense_0"], np.concatenate([own, state], -1), relu))
+
+    def judge(self, critic: Weights, obs: Any, action: Any, state: Any, both: Any) -> np.ndarray:
+        values = []
+        for i in range(2):
+            w = member(critic, i)
+            own = average_l1(dense(w["Dense_0"], np.concatenate([obs, action], -1)))
+            inside = np.concatenate([own, both, state], -1)
+            values.append(self._two(w["_Dense_0"], inside, elu)[:, 0])
+        return np.stack(values)
+
+    @staticmethod
+    def _two(w: Weights, x: np.ndarray, activation: Any) -> np.ndarray:
+        return dense(w["Dense_1"], activation(dense(w["Dense_0"], x)))
+
+    def update(self, batch: Batch) -> tuple[dict[str, float], np.ndarray]:
+        self.n += 1
+        self.key, noise_key = jax.random.split(self.key)
+        wanted, _ = self.embed(self.encoder, batch.next_obs, batch.action)
+
+        def encoder_loss(w: Weights) -> float:
+            return np.mean((self.embed(w, batch.obs, batch.action)[1] - wanted) ** 2)
+
+        noise = np.clip(self.recipe.target_noise * normal(noise_key), -0.5, 0.5)
+        state, _ = self.embed(self.target_encoder, batch.next_obs, batch.action)
+        action = np.clip(self.act(self.target_actor, batch.next_obs, state) + noise, -1.0, 1.0)
+        embedded = self.embed(self.target_encoder, batch.next_obs, action)
+        value = self.judge(self.target_critic, batch.next_obs, action, *embedded).min(0)
+        alive = batch.discount * (1.0 - batch.terminated)
+        y = batch.reward + alive * np.clip(value, *self.clip)
+        self.range = [min(self.range[0], y.min()), max(self.range[1], y.max())]
+        embedded = self.embed(self.fixed, batch.obs, batch.action)
+
+        def errors(w: Weights) -> np.ndarray:
+            return np.abs(self.judge(w, batch.obs, batch.action, *embedded) - y)
+
+        def critic_loss(w: Weights) -> float:
+            e = errors(w)
+            return np.where(e < 1.0, 0.5 * e**2, e).mean(1).sum()
+
+        def actor_loss(w: Weights) -> float:
+            action = self.act(w, batch.obs, embedded[0])
+            both = self.embed(self.fixed, batch.obs, action)[1]
+            return -self.judge(self.critic, batch.obs, action, embedded[0], both).mean()
+
+        report = {
+            "critic_loss": critic_loss(self.critic),
+            "encoder_loss": encoder_loss(self.encoder),
+        }
+        priorities = np.maximum(errors(self.critic).max(0), 1.0) ** 0.4
+        self.encoder = descend(encoder_loss, self.encoder, KNOBS.qf_learning_rate)
+        self.critic = descend(critic_loss, self.critic, KNOBS.qf_learning_rate)
+        if self.n % self.recipe.policy_delay == 0:
+            report["actor_loss"] = actor_loss(self.actor)
+            self.actor = descend(actor_loss, self.actor, KNOBS.learning_rate)
+        if self.n % self.recipe.target_every == 0:
+            self.target_actor, self.target_critic = self.actor, self.critic
+            self.target_encoder, self.fixed = self.fixed, self.encoder
+            self.clip = tuple(self.range)
+        return report, priorities
+
+
+def test_td7_learns_embeddings_clips_targets_and_copies_them_late():
+    recipe, learner = begun("td7", {"embedding_size": 5}, target_update_interval=2)
+    fixed = td7_update.Copies(
+        *(getattr(learner, n).weights for n in ("encoder", "actor", "critic", "encoder"))
+    )
+    learner = learner._replace(copies=fixed)
+    expected, zero = Sale(recipe, learner), jnp.zeros(())
+    report, given = td7_update.Report(zero, zero, zero), batches(4)
+    rates = KNOBS.learning_rate, KNOBS.qf_learning_rate
+
+    # The third update is the first one by copied networks, within the range of targets.
+    for i in range(3):
+        batch = jax.tree.map(lambda x, i=i: jnp.asarray(x[i]), given)
+        learner, report, priorities = td7_update.update(recipe, learner, batch, *rates, report)
+        said, wanted = expected.update(jax.tree.map(np.array, batch))
+        assert_same({name: report._asdict()[name] for name in said}, said)
+        assert_same(priorities, wanted)
+
+    for name in ("encoder", "actor", "critic"):
+        assert_same(getattr(learner, name).weights["params"], getattr(expected, name))
+    assert_same(learner.copies.encoder["params"], expected.fixed)
+    assert_same(learner.copies.target_encoder["params"], expected.target_encoder)
+    assert_same(tuple(learner.clip), expected.clip)
+    assert tuple(learner.clip) != (0.0, 0.0)
+
+
+@pytest.mark.parametrize("make, decay", [(optax.adam, None), (optax.adamw, 0.01)])
+def test_the_learning_rate_scales_the_whole_step_of_an_optimiser(make, decay):
+    arguments = () if decay is None else (("weight_decay", decay),)
+    optimizer, expected = Optimizer(make, (("b1", 0.5), *arguments)), Adam(0.03, 0.5, decay or 0.0)
+    rng = np.random.default_rng(0)
+    w = rng.normal(size=(3, 2))
+    trained = Trained({"params": jnp.asarray(w)}, optimizer.init(jnp.asarray(w)))
+
+    for _ in range(3):
+        g = rng.normal(size=(3, 2))
+        trained, w = optimizer.apply(jnp.asarray(g), trained, 0.03), expected.step(w, g)
+
+    np.testing.assert_allclose(trained.weights["params"], w, rtol=1e-12)
