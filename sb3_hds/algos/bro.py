@@ -88,7 +88,6 @@ class BRO(SoftActorCritic):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": BroPolicy,
-        "CnnPolicy": BroPolicy,
         "MultiInputPolicy": BroPolicy,
     }
     kept_by_restarts = ("seen", "n_updates")
@@ -125,7 +124,7 @@ class BRO(SoftActorCritic):
     def recipe(self) -> Recipe:
         policy = self.policy
         optimist = Optimist(
-            network=Shift(policy.looking(policy.actor_body(policy.widths[0])), policy.n_act),
+            network=Shift(policy.actor_body(policy.widths[0]), policy.n_act),
             optimizer=policy.optimizers[0],
             kl_target=self.kl_target,
             std_multiplier=self.std_multiplier,

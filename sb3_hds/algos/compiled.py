@@ -118,7 +118,7 @@ def _copy_of(model: Algorithm, seed: int) -> Algorithm:
     model.save(file)
     file.seek(0)
     copy = type(model).load(file, env=model.get_env(), seed=seed, device=model._device_name)
-    copy._build(copy._network_seed)
+    copy._build(copy.network_seed)
     copy.num_timesteps = copy._n_updates = 0
     return copy
 

@@ -30,7 +30,6 @@ class CrossQ(SoftActorCritic):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": CrossQPolicy,
-        "CnnPolicy": CrossQPolicy,
         "MultiInputPolicy": CrossQPolicy,
     }
 

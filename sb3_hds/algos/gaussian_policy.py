@@ -10,12 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import is_vectorized_observation
 
 from sb3_hds.algos.bodies import Mlp, SimbaBody
-from sb3_hds.algos.features import is_image, looking, n_features, parts_of
 from sb3_hds.algos.heads import Critic, ExploringActor, GaussianActor, noise_std
 from sb3_hds.algos.learner import GENERATOR
 from sb3_hds.algos.learning_policy import LearningPolicy
@@ -49,12 +47,11 @@ _OPTIMIZERS = {
 
 class GaussianPolicy(LearningPolicy):
     """
-    ``"MlpPolicy"``, ``"CnnPolicy"`` and ``"MultiInputPolicy"``: dense layers, after convolutions of
-    images, of which the actor and each critic have their own; without target entropy or rules of
-    its own, so that every algorithm of the family can use it.
+    ``"MlpPolicy"`` and ``"MultiInputPolicy"``: dense layers; without target entropy or rules of its
+    own, so that every algorithm of the family can use it.
 
     :param observation_space: Box, Discrete, MultiDiscrete, MultiBinary, or a Dict of these, which
-        are flattened, choices one-hot; images are seen by convolutions
+        are flattened, choices one-hot
     :param action_space: a bounded Box of any shape
     :param lr_schedule: learning rate by remaining progress
     :param net_arch: hidden widths of both, or ``{"pi": [...], "qf": [...]}``
@@ -72,10 +69,6 @@ class GaussianPolicy(LearningPolicy):
     :param use_expln: gSDE: slower growth than the exponential above 0
     :param clip_mean: gSDE: the mean is clipped to this before tanh; 0: not
     :param normalize_observations: by running mean and variance, inside the policy
-    :param normalize_images: whether images of bytes are divided by 255; False: every Box of three
-        axes is an image, and nothing is divided
-    :param features_extractor_kwargs: ``features_dim`` of an image alone, 512 unless given;
-        ``cnn_output_dim`` of each image of a Dict, 256 unless given
     :param optimizer_class: name, optax function or torch class
     :param optimizer_kwargs: besides the learning rate; torch's ``betas`` are understood
     :param qf_optimizer_kwargs: of the critics, where they differ
@@ -109,8 +102,6 @@ class GaussianPolicy(LearningPolicy):
         use_expln: bool = False,
         clip_mean: float = 2.0,
         normalize_observations: bool | None = None,
-        normalize_images: bool = True,
-        features_extractor_kwargs: dict[str, Any] | None = None,
         optimizer_class: str | Callable[..., Any] | None = None,
         optimizer_kwargs: Mapping[str, Any] | None = None,
         qf_optimizer_kwargs: Mapping[str, Any] | None = None,
@@ -120,20 +111,13 @@ class GaussianPolicy(LearningPolicy):
             for name, value in locals().items()
             if name not in ("self", "observation_space", "action_space", "__class__")
         }
-        super().__init__(
-            observation_space,
-            action_space,
-            normalize_images=normalize_images,
-            squash_output=True,
-        )
+        super().__init__(observation_space, action_space, squash_output=True)
         chosen = {
             name: self.defaults.get(name) if value is None else value
             for name, value in self.arguments.items()
         }
         net: Any = chosen["net_arch"]
         self.widths = widths(net, "qf")
-        self.parts = parts_of(observation_space, normalize_images)
-        self.n_features = n_features(self.parts, features_extractor_kwargs)
         self.activation_fn = activation(activation_fn)
         self.dropout_rate, self.layer_norm = _rate(dropout_rate), layer_norm
         self.renorm_after, self.renorm_momentum = chosen["renorm_after"], renorm_momentum
@@ -141,12 +125,12 @@ class GaussianPolicy(LearningPolicy):
         self.n_critics, self.use_sde = n_critics, use_sde
         n_act = int(np.prod(action_space.shape))
         pi, qf = self.widths
-        body = self.looking(self.actor_body(pi))
+        body = self.actor_body(pi)
         self.actor_network: nn.Module = GaussianActor(body, n_act)
         if use_sde:
             gsde = (log_std_init, full_std, use_expln, clip_mean)
             self.actor_network = ExploringActor(body, n_act, *gsde)
-        self.critic_network = Critic(self.looking(self.critic_body(qf)), n_quantiles)
+        self.critic_network = Critic(self.critic_body(qf), n_quantiles)
         own = dict(optimizer_kwargs or {})
         make: Any = chosen["optimizer_class"]
         usual = self.defaults.get("optimizer_kwargs", {}) if optimizer_class is None else {}
@@ -155,13 +139,9 @@ class GaussianPolicy(LearningPolicy):
             optimizer_of(make, {**usual, **own, **dict(qf_optimizer_kwargs or {})}),
         )
         self.n_obs, self.n_act = size_of(observation_space), n_act
-        self.flatten = flattener(observation_space, normalize_images)
+        self.flatten = flattener(observation_space)
         self.matrices: np.ndarray | None = None
         self._noise = np.random.default_rng(0)
-
-    def looking(self, body: nn.Module) -> nn.Module:
-        """:return: the body; of observations with images, one that sees their features"""
-        return looking(self.parts, self.n_features, body)
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
         return Mlp(
@@ -251,10 +231,7 @@ class GaussianPolicy(LearningPolicy):
                 f"predict() got {type(observation).__name__} instead of a dictionary with "
                 f"{', '.join(space.spaces)}."
             )
-        parts = {
-            name: np.asarray(maybe_transpose(part, space[name]) if is_image(space[name]) else part)
-            for name, part in observation.items()
-        }
+        parts = {name: np.asarray(part) for name, part in observation.items()}
         vectorized = any(is_vectorized_observation(parts[name], space[name]) for name in parts)
         rows = {name: part.reshape(-1, *space[name].shape) for name, part in parts.items()}  # type: ignore[misc]
         return rows, vectorized

@@ -223,7 +223,8 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         )
         self._build(self.network_seed)
         # SB3 draws gSDE's noise and reads its deviation from the actor.
-        self.actor, self.critic = self.policy.actor, self.policy.critic
+        self.actor: Any = self.policy.actor
+        self.critic: Any = self.policy.critic
 
     def _maybe_reset_params(self) -> None:
         resets = self.param_resets or []

@@ -52,11 +52,17 @@ def seen(scales: Seen, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch 
 
 def check_observations(space: spaces.Space) -> None:
     """
-    :raises EnvironmentMismatchError: for what is not made of numbers and choices
+    :raises EnvironmentMismatchError: for images, and whatever else is not made of numbers and
+        choices
     """
     parts = space.spaces.items() if isinstance(space, spaces.Dict) else [("", space)]
     for name, part in parts:
         what = f"Observation '{name}'" if name else "The observation"
+        if isinstance(part, spaces.Box) and (is_image_space(part) or len(part.shape) > 2):
+            raise EnvironmentMismatchError(
+                f"{what} is an image ({part}), and the networks here have no convolutions. Use "
+                "SBX's or SB3's CnnPolicy, or observe features of it."
+            )
         if not isinstance(
             part, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
         ):
@@ -72,14 +78,13 @@ def size_of(space: spaces.Space) -> int:
     return spaces.flatdim(space)
 
 
-def flattener(space: spaces.Space, normalize_images: bool = True) -> Callable[[Any], np.ndarray]:
+def flattener(space: spaces.Space) -> Callable[[Any], np.ndarray]:
     """
-    :param normalize_images: whether images of bytes are divided by 255
     :return: observations with a leading axis, as environments and replay buffers give them, to
         ``float32`` of shape ``(n, size_of(space))``; choices become one-hot
     """
     if isinstance(space, spaces.Dict):
-        parts = {name: flattener(part, normalize_images) for name, part in space.spaces.items()}
+        parts = {name: flattener(part) for name, part in space.spaces.items()}
         return lambda obs: np.concatenate([flat(obs[name]) for name, flat in parts.items()], 1)  # type: ignore[call-overload]
     if isinstance(space, spaces.Discrete):
         return lambda obs: _one_hot(
@@ -88,8 +93,7 @@ def flattener(space: spaces.Space, normalize_images: bool = True) -> Callable[[A
     if isinstance(space, spaces.MultiDiscrete):
         n = space.nvec.ravel()
         return lambda obs: _one_hot(np.asarray(obs).reshape(-1, len(n)), n, space.start.ravel())
-    unit = np.float32(255.0 if normalize_images and is_image_space(space) else 1.0)
-    return lambda obs: np.asarray(obs, np.float32).reshape(len(obs), -1) / unit
+    return lambda obs: np.asarray(obs, np.float32).reshape(len(obs), -1)
 
 
 def _one_hot(obs: np.ndarray, n: np.ndarray, start: np.ndarray) -> np.ndarray:

@@ -35,7 +35,6 @@ class SimbaSAC(SoftActorCritic):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": SimbaPolicy,
-        "CnnPolicy": SimbaPolicy,
         "MultiInputPolicy": SimbaPolicy,
         "SimbaPolicy": SimbaPolicy,
     }

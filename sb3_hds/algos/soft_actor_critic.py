@@ -34,7 +34,6 @@ class SoftActorCritic(ModelFreeAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": GaussianPolicy,
-        "CnnPolicy": GaussianPolicy,
         "MultiInputPolicy": GaussianPolicy,
         "SimbaPolicy": SimbaPolicy,
     }

@@ -14,7 +14,6 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_hds.algos.call_forms import between, is_count, jax_device
-from sb3_hds.algos.features import is_image
 from sb3_hds.algos.gaussian_policy import optimizer_of, widths
 from sb3_hds.algos.lap import LapReplayBuffer
 from sb3_hds.algos.learner import GENERATOR
@@ -38,7 +37,6 @@ from sb3_hds.algos.td7_update import (
     judge,
     update,
 )
-from sb3_hds.errors import EnvironmentMismatchError
 
 
 class TD7Policy(LearningPolicy):
@@ -179,7 +177,6 @@ class TD7(ModelFreeAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": TD7Policy,
         # So that these observations reach the message that says why not.
-        "CnnPolicy": TD7Policy,
         "MultiInputPolicy": TD7Policy,
     }
     policy: TD7Policy
@@ -266,11 +263,6 @@ class TD7(ModelFreeAlgorithm):
             raise ValueError(
                 "TD7's replay buffer has no Dict observations: "
                 "use gymnasium.wrappers.FlattenObservation."
-            )
-        if is_image(self.observation_space):
-            raise EnvironmentMismatchError(
-                f"The observation is an image ({self.observation_space}), and TD7's networks have "
-                "no convolutions: use another algorithm, or observe features of it."
             )
 
     def _setup_model(self) -> None:
