@@ -12,7 +12,7 @@ from sb3_hds.envs.registration import register_environments
 
 if TYPE_CHECKING:
     from sb3_hds import data, effects, envs, planning, sysid, twins, wrappers
-    from sb3_hds.algos import BRO, GSDESAC, HDS, PODS, TD7, TQC, CrossQ, DroQ, SimbaSAC
+    from sb3_hds.algos import BRO, GSDESAC, HDS, PODS, TD7, TQC, CrossQ, DroQ, OpenLoop, SimbaSAC
     from sb3_hds.data import Trajectories, audit
     from sb3_hds.sysid import calibrate, diagnose
 
@@ -27,6 +27,7 @@ __all__ = [
     "TQC",
     "CrossQ",
     "DroQ",
+    "OpenLoop",
     "SimbaSAC",
     "Trajectories",
     "audit",
@@ -47,6 +48,7 @@ _CLASSES = {
     "DroQ": "algos",
     "GSDESAC": "algos",
     "HDS": "algos",
+    "OpenLoop": "algos",
     "PODS": "algos",
     "SimbaSAC": "algos",
     "TD7": "algos",

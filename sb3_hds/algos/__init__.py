@@ -6,6 +6,8 @@ from sb3_hds.algos.droq import DroQ
 from sb3_hds.algos.gaussian_policy import GaussianPolicy
 from sb3_hds.algos.gsde_sac import GSDESAC
 from sb3_hds.algos.hds import HDS
+from sb3_hds.algos.open_loop import OpenLoop
+from sb3_hds.algos.oscillator_policy import OscillatorPolicy
 from sb3_hds.algos.pods import PODS
 from sb3_hds.algos.simba import SimbaSAC
 from sb3_hds.algos.td7 import TD7
@@ -23,6 +25,7 @@ ALL = {
     "simba": SimbaSAC,
     "td7": TD7,
     "bro": BRO,
+    "openloop": OpenLoop,
 }
 
 __all__ = [
@@ -36,6 +39,8 @@ __all__ = [
     "CrossQ",
     "DroQ",
     "GaussianPolicy",
+    "OpenLoop",
+    "OscillatorPolicy",
     "SimbaSAC",
     "TwinPolicy",
 ]
