@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_hds import algos
 from sb3_hds.algos.twin_algorithm import TwinAlgorithm
@@ -48,14 +49,23 @@ SMALL: dict[str, dict[str, Any]] = {
     "td7": _MODEL_FREE
     | {"use_checkpoints": False, "policy_kwargs": {"net_arch": [8], "embedding_size": 8}},
     "bro": _MODEL_FREE | {"policy_kwargs": {"net_arch": [8], "n_quantiles": 5}},
+    "openloop": {"population_size": 3, "horizon": 4, "n_elites": 2, "ranking_share": 0.0},
 }
+
+#: what it takes to run whole episodes
+WHOLE_EPISODES = {"openloop": {"horizon": None}}
 
 NAMES = list(algos.ALL)
 #: the algorithms that plan in a twin
 PLANNERS = [name for name in NAMES if issubclass(algos.ALL[name], TwinAlgorithm)]
+#: the algorithms that learn from a replay buffer, by gradients
+OFF_POLICY = [name for name in NAMES if issubclass(algos.ALL[name], OffPolicyAlgorithm)]
+_QUICK = (*PLANNERS, "droq", "openloop")
 #: all, those of one family but for one only among the expensive tests
 QUICK_NAMES = [
-    name if name in (*PLANNERS, "droq") else pytest.param(name, marks=pytest.mark.expensive)
+    name
+    if name in (*PLANNERS, "droq", "openloop")
+    else pytest.param(name, marks=pytest.mark.expensive)
     for name in NAMES
 ]
 

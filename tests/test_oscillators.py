@@ -1,4 +1,4 @@
-"""Oscillators: exact where there is a formula, close to a fine reference elsewhere, differentiable."""
+"""Oscillators: exact where there is a formula, else close to a fine reference; differentiable."""
 
 import math
 
@@ -205,7 +205,7 @@ def test_commanded_amplitudes_have_the_derivatives_that_finite_differences_give(
     begun = AmplitudeState(jnp.array([0.2]), jnp.array([3.0]), jnp.array([0.0]))
 
     def end(mu):
-        after = oscillators.advance_amplitude(begun, jnp.array([1.0]) * mu, jnp.asarray(9.0), 0.02)
+        after = oscillators.advance_amplitude(begun, jnp.array([1.0]) * mu, 9.0, 0.02)
         return after.radius * jnp.sin(after.phase)
 
     np.testing.assert_allclose(jax.jacfwd(end)(1.3), central_difference(end, 1.3), rtol=1e-6)

@@ -1,4 +1,4 @@
-"""What an open-loop policy knows of the system that it moves: how long a step is, where joints are."""
+"""What an open-loop policy knows of the system that it moves: its time step and its joints."""
 
 import dataclasses
 from typing import Any
@@ -156,18 +156,20 @@ def space_of(
 
 
 def state_vectors(env: VecEnv) -> Float[np.ndarray, "n_envs state"]:
+    """:return: ``qpos`` and ``qvel`` of each copy of a MuJoCo environment"""
+    return np.stack(env.env_method("state_vector"))
+
+
+def refuse_without_state(env: VecEnv) -> None:
     """
-    :return: ``qpos`` and ``qvel`` of each copy of a MuJoCo environment
-    :raises EnvironmentMismatchError: if it has none
+    :raises EnvironmentMismatchError: if the environment does not show its state
     """
-    try:
-        return np.stack(env.env_method("state_vector"))
-    except (AttributeError, NotImplementedError):
+    if not env.has_attr("state_vector"):
         raise EnvironmentMismatchError(
             "Joints can be read from Gymnasium's MuJoCo environments, which have a method "
             "state_vector(); this environment has none. Let the oscillators be the commands: "
             "control='direct'."
-        ) from None
+        )
 
 
 def _interval(env: VecEnv) -> float:
@@ -202,10 +204,8 @@ def _driven(env: VecEnv, control: str) -> ActuatedJoints | None:
 
 
 def _attribute(env: VecEnv, name: str) -> Any:
-    try:
-        return env.get_attr(name, indices=[0])[0]
-    except (AttributeError, NotImplementedError, TypeError):
-        return None
+    # In another process, asking for an attribute that is not there ends it.
+    return env.get_attr(name, indices=[0])[0] if env.has_attr(name) else None
 
 
 def _commands(env: VecEnv) -> tuple[np.ndarray, np.ndarray]:
@@ -228,9 +228,9 @@ def _in_observation(
     ]
     columns = []
     for truth in there:
-        off = np.abs(observed[:, :, None] - truth[:, None, :]).max(axis=0)
-        matches = off < _EQUAL
-        if not (matches.sum(axis=0) == 1).all():
+        matches = np.abs(observed[:, :, None] - truth[:, None, :]).max(axis=0) < _EQUAL
+        # A joint that every reset puts at the same place cannot be told from other constants.
+        if not (matches.any(axis=0) & (np.ptp(truth, axis=0) > _EQUAL)).all():
             return None
         columns.append(tuple(np.argmax(matches, axis=0).tolist()))
     return columns[0], columns[1]

@@ -20,8 +20,8 @@ class SearchState(NamedTuple):
     :param sigma: step size
     :param path_sigma: evolution path of the step size
     :param path_covariance: evolution path of the covariance
-    :param returns: of this generation: one row per candidate, one column per reset, NaN where it
-        is not known yet
+    :param returns: of this generation: one row per candidate, one column per reset, -inf where
+        it is not known yet
     :param elites: best candidates so far, best first
     :param elite_returns: their means over resets, -inf for places that are free
     :param ranked: whether the acting candidate has been compared on fresh resets
@@ -66,7 +66,7 @@ def begin(
         sigma=np.asarray(sigma, float),
         path_sigma=np.zeros(dim),
         path_covariance=np.zeros(dim),
-        returns=np.full((population, n_resets), np.nan),
+        returns=np.full((population, n_resets), -np.inf),
         elites=np.tile(np.asarray(start, float), (n_elites, 1)),
         elite_returns=np.full(n_elites, -np.inf),
         ranked=np.asarray(False),
@@ -114,7 +114,7 @@ def tell(state: SearchState) -> SearchState:
         sigma=np.asarray(learned["_sigma"], float),
         path_sigma=np.array(learned["_p_sigma"]),
         path_covariance=np.array(learned["_pc"]),
-        returns=np.full_like(state.returns, np.nan),
+        returns=np.full_like(state.returns, -np.inf),
         elites=pool[best],
         elite_returns=pool_values[best],
     )

@@ -4,7 +4,6 @@ import dataclasses
 import math
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -123,11 +122,11 @@ class GaitSpace:
 def _from_first(gait: Constants) -> PerJoint:
     """Phases of all joints but the first, when that of the first is 0."""
     phase = np.mod(gait.phase + math.pi * (gait.amplitude < 0.0), _TURN)
-    swing, stance = gait.omega_swing, gait.omega_stance
+    swing, stance = float(gait.omega_swing), float(gait.omega_stance)
     half = math.pi / swing
     gone = phase[0] / swing if phase[0] < math.pi else half + (phase[0] - math.pi) / stance
-    left = half + math.pi / stance - gone
-    return np.asarray(advance_phase(jnp.asarray(phase), left, swing, stance), float)[1:]
+    left = float(half + math.pi / stance - gone)
+    return advance_phase(phase, left, swing, stance)[1:]
 
 
 def _squashed(x: np.ndarray) -> np.ndarray:

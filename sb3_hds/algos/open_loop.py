@@ -17,7 +17,7 @@ from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_hds.algos import gait_search
-from sb3_hds.algos.body import Body, body_of, space_of, state_vectors
+from sb3_hds.algos.body import Body, body_of, refuse_without_state, space_of, state_vectors
 from sb3_hds.algos.call_forms import (
     between,
     check_origin,
@@ -301,7 +301,7 @@ class OpenLoop(SavesTensors):
         :raises EnvironmentMismatchError: if it is none of MuJoCo
         """
         if env is not None:
-            state_vectors(env)
+            refuse_without_state(env)
         self.policy.read_states = None if env is None else partial(state_vectors, env)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -366,7 +366,7 @@ class OpenLoop(SavesTensors):
         search, space = self.policy.search, self.gait_space
         gaits = _stacked([space.decode(point) for point in gait_search.candidates(search)])
         seeds = gait_search.reset_seeds(search)
-        due = np.argwhere(np.isnan(search.returns))
+        due = np.argwhere(~np.isfinite(search.returns))
 
         def keep(trial: Trial, value: float) -> None:
             known = self.policy.search.returns.copy()

@@ -10,7 +10,7 @@ swing and stance, and are right on both sides.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -45,18 +45,20 @@ class Gait(NamedTuple):
     omega_stance: Scalar
 
 
-def period(omega_swing: Scalar, omega_stance: Scalar) -> Scalar:
+def period(omega_swing: Any, omega_stance: Any) -> Any:
     """:return: of one cycle [s]"""
     return math.pi / omega_swing + math.pi / omega_stance
 
 
 def advance_phase(
-    phase: Float[Array, "*shape"],
-    duration: Float[Array, "*#shape"] | float,
-    omega_swing: Float[Array, "*#shape"] | Scalar,
-    omega_stance: Float[Array, "*#shape"] | Scalar,
-) -> Float[Array, "*shape"]:
+    phase: Float[Any, "*shape"],
+    duration: Float[Any, "*#shape"] | float,
+    omega_swing: Float[Any, "*#shape"] | float,
+    omega_stance: Float[Any, "*#shape"] | float,
+) -> Float[Any, "*shape"]:
     """
+    Takes arrays of NumPy and JAX alike.
+
     Where a phase is after some time, exactly: the cycle is two straight lines in time, so nothing
     is integrated. An Euler step of length h is late by up to ``h`` at each change-over, and the
     delays add up: ``h (omega_swing - omega_stance)`` rad per change-over at most.
@@ -67,12 +69,13 @@ def advance_phase(
     :param omega_stance: [rad/s]
     :return: within one turn, from 0 to 2 pi [rad]
     """
-    angle = jnp.mod(phase, 2.0 * math.pi)
+    xp = phase.__array_namespace__()
+    angle = xp.remainder(phase, 2.0 * math.pi)
     swing = math.pi / omega_swing
-    gone = jnp.where(angle < math.pi, angle / omega_swing, swing + (angle - math.pi) / omega_stance)
-    gone = jnp.mod(gone + duration, period(omega_swing, omega_stance))
+    gone = xp.where(angle < math.pi, angle / omega_swing, swing + (angle - math.pi) / omega_stance)
+    gone = xp.remainder(gone + duration, period(omega_swing, omega_stance))
     in_swing, in_stance = gone * omega_swing, math.pi + (gone - swing) * omega_stance
-    return jnp.where(gone < swing, in_swing, in_stance)
+    return xp.where(gone < swing, in_swing, in_stance)
 
 
 def phase_at(gait: Gait, time: Scalar | float) -> PerJoint:
@@ -180,20 +183,22 @@ def advance_hopf(state: HopfState, hopf: Hopf, dt: float, substeps: int) -> Hopf
 
 class AmplitudeState(NamedTuple):
     """
+    Arrays of NumPy or JAX.
+
     :param radius: amplitude of each oscillator
     :param speed: its time derivative [1/s]
     :param phase: of each [rad], within one turn
     """
 
-    radius: Float[Array, " n"]
-    speed: Float[Array, " n"]
-    phase: Float[Array, " n"]
+    radius: Float[Any, " n"]
+    speed: Float[Any, " n"]
+    phase: Float[Any, " n"]
 
 
 def advance_amplitude(
     state: AmplitudeState,
-    mu: Float[Array, " n"],
-    omega: Float[Array, " n"] | Scalar,
+    mu: Float[Any, " n"],
+    omega: Float[Any, " #n"] | float,
     dt: float,
     gain: float = 150.0,
 ) -> AmplitudeState:
@@ -221,7 +226,7 @@ def advance_amplitude(
     decay = math.exp(-k * dt)
     radius = mu + (error + slope * dt) * decay
     speed = (slope - k * (error + slope * dt)) * decay
-    return AmplitudeState(radius, speed, jnp.mod(state.phase + omega * dt, 2.0 * math.pi))
+    return AmplitudeState(radius, speed, (state.phase + omega * dt) % (2.0 * math.pi))
 
 
 def _moved(state: HopfState, rate: HopfState, h: float) -> HopfState:
