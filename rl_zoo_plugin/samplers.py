@@ -119,6 +119,46 @@ def convert_gsde_params(sampled_params: Params) -> Params:
     return params
 
 
+def sample_open_loop_params(
+    trial: Any, n_actions: int, n_envs: int, additional_args: Params
+) -> Params:
+    """
+    Sampler of OpenLoop: its ranges, gains, and how candidates are judged.
+
+    :param trial: an Optuna trial
+    :param n_actions: unused, as are the next two: the zoo calls every sampler with them
+    :return: hyperparameters
+    """
+    trial.suggest_categorical("horizon", [100, 200, 400, 0])
+    trial.suggest_int("n_resets", 1, 4)
+    trial.suggest_int("population_pow", 3, 5)
+    trial.suggest_float("initial_sigma", 0.3, 2.0, log=True)
+    trial.suggest_float("kp", 0.5, 20.0, log=True)
+    trial.suggest_float("kd_share", 0.01, 0.2, log=True)
+    trial.suggest_categorical("gain_factor", [1.0, 4.5])
+    trial.suggest_float("amplitude", 0.3, 2.0, log=True)
+    trial.suggest_float("offset", 0.1, 1.0)
+    trial.suggest_float("lowest_frequency", 0.1, 1.0, log=True)
+    trial.suggest_float("frequency_ratio", 3.0, 20.0, log=True)
+    return convert_open_loop_params(trial.params)
+
+
+def convert_open_loop_params(sampled_params: Params) -> Params:
+    """
+    :param sampled_params: ``trial.params`` of a trial of :func:`sample_open_loop_params`
+    :return: hyperparameters
+    """
+    params = dict(sampled_params)
+    lowest = params.pop("lowest_frequency")
+    return {
+        "horizon": params.pop("horizon") or None,
+        "population_size": 2 ** params.pop("population_pow"),
+        "kd": params["kp"] * params.pop("kd_share"),
+        "frequency": [lowest, lowest * params.pop("frequency_ratio")],
+        **params,
+    }
+
+
 _SOFT = ("droq", "tqc_jax", "simba", "bro")
 
 SAMPLERS: dict[str, Callable[[Any, int, int, Params], Params]] = {
@@ -127,6 +167,7 @@ SAMPLERS: dict[str, Callable[[Any, int, int, Params], Params]] = {
     "gsde_sac": sample_gsde_params,
     "crossq_jax": sample_model_free_params,
     "td7": sample_model_free_params,
+    "openloop": sample_open_loop_params,
     **dict.fromkeys(_SOFT, sample_soft_params),
 }
 CONVERTERS: dict[str, Callable[[Params], Params]] = {
@@ -135,5 +176,6 @@ CONVERTERS: dict[str, Callable[[Params], Params]] = {
     "gsde_sac": convert_gsde_params,
     "crossq_jax": convert_model_free_params,
     "td7": convert_model_free_params,
+    "openloop": convert_open_loop_params,
     **dict.fromkeys(_SOFT, convert_model_free_params),
 }

@@ -19,6 +19,7 @@ ALGORITHMS = {
     "simba": "SimbaSAC",
     "td7": "TD7",
     "bro": "BRO",
+    "openloop": "OpenLoop",
 }
 """Id in the zoo (lower case, as it names a folder) to public name in ``sb3_hds``."""
 

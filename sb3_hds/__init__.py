@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         TQC,
         CrossQ,
         DroQ,
+        OpenLoop,
         SimbaSAC,
         load_policy,
     )
@@ -38,6 +39,7 @@ __all__ = [
     "TQC",
     "CrossQ",
     "DroQ",
+    "OpenLoop",
     "SimbaSAC",
     "Trajectories",
     "audit",
@@ -59,6 +61,7 @@ _CLASSES = {
     "DroQ": "algos",
     "GSDESAC": "algos",
     "HDS": "algos",
+    "OpenLoop": "algos",
     "PODS": "algos",
     "SimbaSAC": "algos",
     "TD7": "algos",

@@ -1,16 +1,21 @@
 """
-``sb3-hds``: what is wrong with a simulation, from the command line.
+``sb3-hds``: what is wrong with a simulation, and how robust a policy is, from the command line.
 
     sb3-hds diagnose --twin PendulumReal --data 'logs/*.csv' --columns map.yml --report out.html
+    sb3-hds robustness --algo openloop --model model.zip --env Swimmer-v5
     sb3-hds effects
     sb3-hds twins
 """
 
 import argparse
+import io
 import json
 import sys
 from collections.abc import Sequence
 from typing import Any
+
+# Of Stable-Baselines3, for continuous actions.
+_THEIRS = ("a2c", "ddpg", "ppo", "sac", "td3")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -22,7 +27,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from sb3_hds.errors import SB3HDSError
 
     try:
-        {"diagnose": _diagnose, "effects": _effects, "twins": _twins}[given.command](given)
+        {
+            "diagnose": _diagnose,
+            "robustness": _robustness,
+            "effects": _effects,
+            "twins": _twins,
+        }[given.command](given)
     except BrokenPipeError:
         return 0
     except (SB3HDSError, OSError, ImportError) as error:
@@ -37,7 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def parser() -> argparse.ArgumentParser:
     """:return: what the command understands"""
     every = argparse.ArgumentParser(
-        prog="sb3-hds", description="Find out what a simulation gets wrong."
+        prog="sb3-hds",
+        description="What a simulation gets wrong, and what a policy endures.",
     )
     commands = every.add_subparsers(dest="command", required=True)
     ask = commands.add_parser("diagnose", help="name the cause, from measured data")
@@ -51,6 +62,15 @@ def parser() -> argparse.ArgumentParser:
     ask.add_argument("--seed", type=int, default=0)
     ask.add_argument("--report", help="HTML page to write")
     ask.add_argument("--json", help="JSON file to write")
+    shake = commands.add_parser("robustness", help="return under noise, failed sensors, pushes")
+    shake.add_argument("--algo", required=True, help="id in the zoo, ours or Stable-Baselines3's")
+    shake.add_argument("--model", required=True, help="file that the algorithm saved")
+    shake.add_argument("--env", required=True, help="environment id")
+    shake.add_argument("--episodes", type=int, default=20, help="for each perturbation")
+    shake.add_argument("--encoders", choices=("own", "observation"), default="own")
+    shake.add_argument("--vecnormalize", help="vecnormalize.pkl of the training")
+    shake.add_argument("--push", type=float, default=5.0, help="force on the torso [N]")
+    shake.add_argument("--csv", help="table to write")
     commands.add_parser("effects", help="list the candidates, with units and explanations")
     commands.add_parser("twins", help="list the simulations, with their parameters")
     return every
@@ -89,6 +109,45 @@ def _diagnose(given: argparse.Namespace) -> None:
         write_bytes(given.json, text.encode())
     if given.report:
         print(f"The report is {found.to_html(given.report)}.")
+
+
+def _robustness(given: argparse.Namespace) -> None:
+    import csv
+
+    from sb3_hds.core.storage import write_bytes
+    from sb3_hds.experiments import PERTURBATIONS, measure_robustness
+
+    changed = {name: dict(settings) for name, settings in PERTURBATIONS.items()}
+    changed["push"]["push"] = given.push
+    found = measure_robustness(
+        _algorithm(given.algo).load(given.model),
+        given.env,
+        perturbations=changed,
+        n_episodes=given.episodes,
+        encoders=given.encoders,
+        normalize=given.vecnormalize,
+        progress=sys.stderr.isatty(),
+    )
+    print(found)
+    if given.csv:
+        lines, rows = io.StringIO(), found.to_rows()
+        table = csv.DictWriter(lines, list(rows[0]), lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+        write_bytes(given.csv, lines.getvalue().encode())
+
+
+def _algorithm(name: str) -> Any:
+    import stable_baselines3
+
+    from sb3_hds.algos import ALL
+    from sb3_hds.errors import ParameterError
+
+    theirs = {id_: getattr(stable_baselines3, id_.upper()) for id_ in _THEIRS}
+    if name not in ALL | theirs:
+        known = ", ".join(ALL | theirs)
+        raise ParameterError(f"There is no algorithm '{name}'. There are: {known}.")
+    return (ALL | theirs)[name]
 
 
 def _setting(text: str) -> tuple[str, float]:

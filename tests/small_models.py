@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_hds import algos
 from sb3_hds.algos.twin_algorithm import TwinAlgorithm
@@ -48,11 +49,17 @@ SMALL: dict[str, dict[str, Any]] = {
     "td7": _MODEL_FREE
     | {"use_checkpoints": False, "policy_kwargs": {"net_arch": [8], "embedding_size": 8}},
     "bro": _MODEL_FREE | {"policy_kwargs": {"net_arch": [8], "n_quantiles": 5}},
+    "openloop": {"population_size": 3, "horizon": 4, "n_elites": 2, "ranking_share": 0.0},
 }
+
+#: what it takes to run whole episodes
+WHOLE_EPISODES = {"openloop": {"horizon": None}}
 
 NAMES = list(algos.ALL)
 #: the algorithms that plan in a twin
 PLANNERS = [name for name in NAMES if issubclass(algos.ALL[name], TwinAlgorithm)]
+#: the algorithms that learn from a replay buffer, by gradients
+OFF_POLICY = [name for name in NAMES if issubclass(algos.ALL[name], OffPolicyAlgorithm)]
 
 
 def _mostly_expensive(representatives: tuple[str, ...]) -> list[Any]:
@@ -61,11 +68,16 @@ def _mostly_expensive(representatives: tuple[str, ...]) -> list[Any]:
     return [name if name in quick else pytest.param(name, marks=mark) for name in NAMES]
 
 
+def _id_of(name: Any) -> str:
+    return name if isinstance(name, str) else name.values[0]
+
+
 #: all; of the model-free ones, those that share every line with one that is here are among the
 #: expensive tests
-EVERY_NAME = _mostly_expensive(("droq", "td7"))
+EVERY_NAME = _mostly_expensive(("droq", "td7", "openloop"))
+EVERY_OFF_POLICY = [name for name in EVERY_NAME if _id_of(name) in OFF_POLICY]
 #: all, for tests that take long
-QUICK_NAMES = _mostly_expensive(("droq",))
+QUICK_NAMES = _mostly_expensive(("droq", "openloop"))
 
 
 def small(name: str, env: Any = "Pendulum-v1", **changes: Any) -> BaseAlgorithm:

@@ -5,7 +5,17 @@ import numpy as np
 import pytest
 import torch as th
 from point_mass import linear_controller, point_mass_env, returns_of
-from small_models import EVERY_NAME, NAMES, PLANNERS, QUICK_NAMES, SMALL, logged, small, steps_of
+from small_models import (
+    EVERY_NAME,
+    EVERY_OFF_POLICY,
+    PLANNERS,
+    QUICK_NAMES,
+    SMALL,
+    WHOLE_EPISODES,
+    logged,
+    small,
+    steps_of,
+)
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -26,7 +36,9 @@ from sb3_hds import algos
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 every_algorithm = pytest.mark.parametrize("name", EVERY_NAME)
-quick_algorithms = pytest.mark.parametrize("name", QUICK_NAMES)
+quick_algorithms = pytest.mark.parametrize("name", [n for n in QUICK_NAMES if n != "openloop"])
+# What learns from a replay buffer, by gradients, from observations.
+every_off_policy = pytest.mark.parametrize("name", EVERY_OFF_POLICY)
 every_planner = pytest.mark.parametrize("name", PLANNERS)
 
 #: what it takes to learn PointMass in seconds
@@ -51,7 +63,7 @@ LEARNING = {
         "batch_size": 64,
         "policy_kwargs": {"net_arch": [32, 32]},
     }
-    for name in NAMES
+    for name in OFF_POLICY
     if name not in PLANNERS
 }
 LEARNING["td7"] |= {
@@ -64,7 +76,7 @@ LEARNING["bro"]["policy_kwargs"]["n_quantiles"] = 10
 # What SimBa has seen so far changes what it sees, so it starts later and takes longer.
 LEARNING["simba"] |= {"learning_rate": 1e-3, "learning_starts": 500, "gradient_steps": 10}
 #: real steps that it takes; planners need none
-LEARNING_STEPS = {name: 0 if name in PLANNERS else 1_500 for name in NAMES} | {"simba": 2_500}
+LEARNING_STEPS = {name: 0 if name in PLANNERS else 1_500 for name in OFF_POLICY} | {"simba": 2_500}
 
 
 class Watching(BaseCallback):
@@ -101,7 +113,7 @@ def pendulums(n: int, **kwargs) -> DummyVecEnv:
 
 @pytest.mark.parametrize("name", list(algos.ALL))
 def test_every_algorithm_has_an_entry_in_the_table_of_small_settings(name):
-    assert name in SMALL and name in LEARNING
+    assert name in SMALL and (name in LEARNING or name not in OFF_POLICY)
 
 
 @every_algorithm
@@ -155,7 +167,7 @@ def test_two_runs_with_one_seed_end_with_the_same_weights(name):
     assert any((weight != weights(other)[key]).any() for key, weight in weights(first).items())
 
 
-@every_algorithm
+@every_off_policy
 def test_exploration_noise_of_stable_baselines_is_applied_and_is_deterministic(name):
     def rewards(sigma):
         noise = NormalActionNoise(np.zeros(1), sigma * np.ones(1))
@@ -175,13 +187,15 @@ def test_one_observation_gives_one_action_and_a_batch_gives_a_batch(name):
     actions, state = model.predict(batch, deterministic=True)
     singles = np.stack([model.predict(obs, deterministic=True)[0] for obs in batch])
 
-    assert actions.shape == (5, 1) and actions.dtype == space.dtype and state is None
+    assert actions.shape == (5, 1) and actions.dtype == space.dtype
+    # An open-loop gait has no eyes: what it remembers is the time.
+    assert (state is None) == (name in OFF_POLICY)
     assert all(space.contains(action) for action in actions)
     # One program for each batch size: they may round differently.
     np.testing.assert_allclose(singles, actions, rtol=1e-5, atol=1e-7)
 
 
-@every_algorithm
+@every_off_policy
 def test_actions_stay_within_asymmetric_bounds_of_double_precision(name):
     # gSDE would keep the mean of its actions within this.
     unclipped = {"clip_mean": 0.0} if name == "gsde_sac" else {}
@@ -248,7 +262,8 @@ def test_stable_baselines_own_callbacks_work(name, tmp_path):
     on_event = EveryNTimesteps(100, CheckpointCallback(1, str(tmp_path), name_prefix="event"))
     episodes = StopTrainingOnMaxEpisodes(max_episodes=1)
 
-    model = small(name).learn(1_000, callback=CallbackList([best, checkpoints, on_event, episodes]))
+    model = small(name, **WHOLE_EPISODES.get(name, {}))
+    model.learn(1_000, callback=CallbackList([best, checkpoints, on_event, episodes]))
 
     # Pendulum-v1 ends an episode after 200 steps, and 0 is more than any return.
     assert model.num_timesteps == 200
@@ -256,11 +271,12 @@ def test_stable_baselines_own_callbacks_work(name, tmp_path):
     assert (tmp_path / "best" / "best_model.zip").is_file()
     written = sorted(map(steps_of, tmp_path.glob("rl_model_*_steps.zip")))
     assert written == [50, 100, 150, 200]
-    assert len(list(tmp_path.glob("rl_model_replay_buffer_*.pkl"))) == 4
+    n_buffers = 4 if name in OFF_POLICY else 0
+    assert len(list(tmp_path.glob("rl_model_replay_buffer_*.pkl"))) == n_buffers
     assert list(tmp_path.glob("event_*.zip"))
 
 
-@every_algorithm
+@every_off_policy
 def test_the_usual_keys_are_logged_at_the_number_of_environment_steps(name):
     model = small(name)
     lines = logged(model)
@@ -289,7 +305,7 @@ def test_another_environment_may_be_set(name):
         model.set_env(pendulums(2))
 
 
-@every_algorithm
+@every_off_policy
 def test_several_copies_of_the_environment_are_stepped_together(name):
     model = small(name, pendulums(4), train_freq=5).learn(60)
 
@@ -299,10 +315,11 @@ def test_several_copies_of_the_environment_are_stepped_together(name):
     assert actions.shape == (4, 1)
 
 
-def test_environments_in_other_processes_are_stepped_together():
+@pytest.mark.parametrize("name", ["bro", "openloop"])
+def test_environments_in_other_processes_are_stepped_together(name):
     env = make_vec_env("Pendulum-v1", n_envs=2, vec_env_cls=SubprocVecEnv)
     try:
-        model = small(NAMES[-1], env).learn(50)
+        model = small(name, env).learn(50)
     finally:
         env.close()
 
@@ -331,7 +348,7 @@ def test_a_policy_learns_and_acts_in_a_normalised_environment(name, options):
         assert (env.obs_rms.var > 0.1**2).all() and (env.obs_rms.var < 15.0**2).all()
 
 
-@every_algorithm
+@every_off_policy
 @pytest.mark.parametrize(
     "rate", [1e-3, lambda left: 1e-3 * left, LinearSchedule(1e-3, 0.0, 1.0)], ids=type
 )

@@ -24,7 +24,7 @@ ALL = set().union(*ORDER)
 ARRAYS = {"jax", "numpy", "jaxtyping"}
 SOLVERS = ARRAYS | {"flax", "optax", "optimistix"}
 STEPPING = ARRAYS | {"gymnasium", "stable_baselines3.common.vec_env"}
-LEARNING = SOLVERS | {"gymnasium", "stable_baselines3", "sbx", "torch", "rich", "tqdm"}
+LEARNING = SOLVERS | {"gymnasium", "stable_baselines3", "sbx", "cmaes", "torch", "rich", "tqdm"}
 TABLES = {"pandas", "rich", "yaml"}
 
 LIBRARIES = {

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from small_models import NAMES, PLANNERS, SMALL, logged, small
+from small_models import OFF_POLICY, PLANNERS, SMALL, logged, small
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.envs import BitFlippingEnv
@@ -23,7 +23,7 @@ from sb3_hds.algos.sampling import batches_of
 from sb3_hds.algos.squashed import Gaussian, exploration_std, log_probability, marginal_std
 from sb3_hds.errors import EnvironmentMismatchError
 
-MODEL_FREE = [name for name in NAMES if name not in PLANNERS]
+MODEL_FREE = [name for name in OFF_POLICY if name not in PLANNERS]
 SOFT = [name for name in MODEL_FREE if name != "td7"]
 every_algorithm = pytest.mark.parametrize("name", MODEL_FREE)
 every_soft = pytest.mark.parametrize("name", SOFT)

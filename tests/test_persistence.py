@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch as th
-from small_models import EVERY_NAME, NAMES, PLANNERS, same, saved, small
+from small_models import EVERY_OFF_POLICY, NAMES, PLANNERS, same, saved, small
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -24,6 +24,7 @@ from sb3_hds.errors import NoTwinError
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 every_algorithm = pytest.mark.parametrize("name", EVERY_NAME)
+every_off_policy = pytest.mark.parametrize("name", EVERY_OFF_POLICY)
 every_planner = pytest.mark.parametrize("name", PLANNERS)
 
 PREDICT = """
@@ -64,7 +65,8 @@ def test_a_loaded_model_predicts_and_holds_the_same(name, tmp_path):
     actions = model.predict(obs, deterministic=True)[0]
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], actions)
     assert same(model.get_parameters(), loaded.get_parameters())
-    for kept in ("num_timesteps", "_n_updates", "seed", "policy_kwargs", "train_freq"):
+    of_buffer = ("train_freq",) if name in OFF_POLICY else ()
+    for kept in ("num_timesteps", "_n_updates", "seed", "policy_kwargs", *of_buffer):
         assert getattr(loaded, kept) == getattr(model, kept), kept
 
 
@@ -133,7 +135,7 @@ def test_a_file_of_one_twin_algorithm_is_not_loaded_as_another():
     assert isinstance(Mine.load(file), Mine)
 
 
-@every_algorithm
+@every_off_policy
 def test_arguments_may_be_changed_while_loading(name):
     loaded = algos.ALL[name].load(
         saved(small(name)), env=gymnasium.make("Pendulum-v1"), batch_size=8, learning_rate=1e-5
@@ -157,7 +159,8 @@ def test_parameters_make_a_round_trip_and_misfits_are_refused(name):
     lacking["policy"].popitem()
     with pytest.raises(RuntimeError, match="missing"):
         one.set_parameters(lacking)
-    wider = small(name, policy_kwargs={"net_arch": [9]})
+    other_size = {"policy_kwargs": {"net_arch": [9]}} if name in OFF_POLICY else {"n_elites": 9}
+    wider = small(name, **other_size)
     with pytest.raises(RuntimeError, match="policy_kwargs"):
         wider.set_parameters(one.get_parameters())
 
@@ -175,7 +178,7 @@ def test_parameters_that_are_not_given_keep_their_values(name):
     assert all(th.equal(after[other], before["policy"][other]) for other in others)
 
 
-@every_algorithm
+@every_off_policy
 def test_a_replay_buffer_is_saved_and_read_again(name, tmp_path):
     model = small(name).learn(50)
     loaded = algos.ALL[name].load(saved(model), env=gymnasium.make("Pendulum-v1"))

@@ -7,6 +7,8 @@ from sb3_hds.algos.droq import DroQ
 from sb3_hds.algos.gaussian_policy import GaussianPolicy
 from sb3_hds.algos.gsde_sac import GSDESAC
 from sb3_hds.algos.hds import HDS
+from sb3_hds.algos.open_loop import OpenLoop
+from sb3_hds.algos.oscillator_policy import OscillatorPolicy
 from sb3_hds.algos.pods import PODS
 from sb3_hds.algos.policy_file import load_policy
 from sb3_hds.algos.simba import SimbaSAC
@@ -25,6 +27,7 @@ ALL = {
     "simba": SimbaSAC,
     "td7": TD7,
     "bro": BRO,
+    "openloop": OpenLoop,
 }
 
 __all__ = [
@@ -39,6 +42,8 @@ __all__ = [
     "DroQ",
     "Episodes",
     "GaussianPolicy",
+    "OpenLoop",
+    "OscillatorPolicy",
     "SimbaSAC",
     "TwinPolicy",
     "learn_compiled",

@@ -120,6 +120,25 @@ def from_state_dict(tree: Any, tensors: dict[str, th.Tensor], strict: bool = Tru
     return jax.tree_util.tree_unflatten(structure, values)
 
 
+def refuse_odd(observation: Any) -> None:
+    """
+    :raises ValueError: for what ``reset`` returns beside an observation, and for one that is not
+        finite
+    """
+    if isinstance(observation, tuple) and len(observation) == 2:
+        raise ValueError(
+            "predict() got a tuple instead of an observation. Gymnasium's reset() returns "
+            "(obs, info) where a VecEnv's returns obs, mixing Gym API with SB3 VecEnv API: use "
+            "`obs, info = env.reset()`, or `obs = vec_env.reset()`."
+        )
+    parts = observation.values() if isinstance(observation, dict) else [observation]
+    if not all(np.isfinite(part).all() for part in parts):
+        raise ValueError(
+            f"predict() got an observation that is not finite: {observation}. No "
+            "action follows from it: repeat the last one, or stop the robot safely."
+        )
+
+
 class TensorPolicy(BaseJaxPolicy):
     """
     A policy whose networks are pytrees, saved as tensors.
@@ -146,18 +165,7 @@ class TensorPolicy(BaseJaxPolicy):
         :raises ValueError: if the observation has another shape than the observation space, or is
             not finite
         """
-        if isinstance(observation, tuple) and len(observation) == 2:
-            raise ValueError(
-                "predict() got a tuple instead of an observation. Gymnasium's reset() returns "
-                "(obs, info) where a VecEnv's returns obs, mixing Gym API with SB3 VecEnv API: use "
-                "`obs, info = env.reset()`, or `obs = vec_env.reset()`."
-            )
-        parts = observation.values() if isinstance(observation, dict) else [observation]
-        if not all(np.isfinite(part).all() for part in parts):
-            raise ValueError(
-                f"predict() got an observation that is not finite: {observation}. No "
-                "action follows from it: repeat the last one, or stop the robot safely."
-            )
+        refuse_odd(observation)
         return super().predict(observation, state, episode_start, deterministic)
 
     def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ import torch as th
 
 from sb3_hds.algos.bro import BroPolicy
 from sb3_hds.algos.gaussian_policy import CrossQPolicy, GaussianPolicy, SimbaPolicy
+from sb3_hds.algos.oscillator_policy import OscillatorPolicy
 from sb3_hds.algos.persistence import TensorPolicy
 from sb3_hds.algos.policy_description import space_from_plain
 from sb3_hds.algos.td7 import TD7Policy
@@ -25,7 +26,15 @@ from sb3_hds.algos.twin_policy import TwinPolicy
 
 _CLASSES: dict[str, type[TensorPolicy]] = {
     policy.__name__: policy
-    for policy in (TwinPolicy, GaussianPolicy, SimbaPolicy, CrossQPolicy, BroPolicy, TD7Policy)
+    for policy in (
+        TwinPolicy,
+        GaussianPolicy,
+        SimbaPolicy,
+        CrossQPolicy,
+        BroPolicy,
+        TD7Policy,
+        OscillatorPolicy,
+    )
 }
 
 

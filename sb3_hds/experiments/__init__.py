@@ -2,5 +2,13 @@
 
 from sb3_hds.experiments.policy_gain import PolicyGain, measure_policy_gain
 from sb3_hds.experiments.returns import returns_of
+from sb3_hds.experiments.robustness import PERTURBATIONS, Robustness, measure_robustness
 
-__all__ = ["PolicyGain", "measure_policy_gain", "returns_of"]
+__all__ = [
+    "PERTURBATIONS",
+    "PolicyGain",
+    "Robustness",
+    "measure_policy_gain",
+    "measure_robustness",
+    "returns_of",
+]

@@ -24,9 +24,11 @@ def returns_of(
     totals = np.zeros(n_episodes)
     for episode in range(n_episodes):
         obs, _ = env.reset(seed=FIRST_START + episode)
-        done = False
+        state, done = None, False
+        start = np.ones(1, bool)
         while not done:
-            action, _ = model.predict(obs, deterministic=True)
+            action, state = model.predict(obs, state, start, deterministic=True)
+            start = np.zeros(1, bool)
             obs, reward, terminated, truncated, _ = env.step(action)
             totals[episode] += float(reward)
             done = terminated or truncated

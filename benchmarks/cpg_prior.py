@@ -1,0 +1,143 @@
+"""
+SAC and gSDE-SAC with and without a rhythm under the policy: Swimmer-v5 and HalfCheetah-v5.
+
+    python benchmarks/cpg_prior.py                 # 50,000 steps, three seeds
+    python benchmarks/cpg_prior.py --figure        # draw the figure again from the table
+
+The rhythm is a plain one, not the result of a search: joints one after another on a wave, at a
+frequency within the range of the search. ``residual`` and ``offset`` are the modes of ``CPGPrior``.
+Each run is a process of its own; what acts at the end is evaluated on 20 episodes, the same resets
+for every run. Runs that are in the table are not done again.
+"""
+
+import argparse
+import json
+
+import numpy as np
+import pandas as pd
+from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+
+TAU = 2.0 * np.pi
+#: a travelling wave for each environment: arguments of ``CPGPrior``
+RHYTHMS = {
+    "Swimmer-v5": {
+        "omega_swing": TAU * 0.6,
+        "amplitude": 1.0,
+        "phase": [0.0, 0.75 * TAU],
+        "kp": 10.0,
+        "kd": 0.5,
+    },
+    "HalfCheetah-v5": {
+        "omega_swing": TAU * 3.0,
+        "amplitude": 0.7,
+        "phase": [0.0, 0.25 * TAU, 0.5 * TAU, 0.5 * TAU, 0.75 * TAU, 0.0],
+        "kp": 1.0,
+        "kd": 0.05,
+    },
+}
+#: how far an action of 1 goes: commands, rad
+RANGES = {"residual": 0.5, "offset": 0.5}
+PRIORS = ("none", "residual", "offset", "parameters")
+LEARNERS = ("sac", "gsde_sac")
+N_EPISODES = 20
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument("--envs", nargs="*", default=list(RHYTHMS))
+    parser.add_argument("--learners", nargs="*", default=list(LEARNERS))
+    parser.add_argument("--priors", nargs="*", default=list(PRIORS))
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--steps", type=int, default=50_000)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--figure", action="store_true")
+    parser.add_argument("--worker", nargs=5, metavar=("ENV", "LEARNER", "PRIOR", "SEED", "STEPS"))
+    arguments = parser.parse_args()
+    if arguments.worker:
+        env_id, learner, prior, seed, steps = arguments.worker
+        print(json.dumps(worker(env_id, learner, prior, int(seed), int(steps))))
+        return
+    if not arguments.figure:
+        wanted = [
+            (env_id, learner, prior, seed, arguments.steps)
+            for seed in range(arguments.seeds)
+            for env_id in arguments.envs
+            for learner in arguments.learners
+            for prior in arguments.priors
+        ]
+        keys = ("env", "learner", "prior", "seed", "steps")
+        resume("cpg_prior", keys, wanted, _run, arguments.jobs)
+    report()
+
+
+def _run(*run) -> list[dict]:
+    return [fresh_process(__file__, *run, cache=CACHE / "programs")]
+
+
+def worker(env_id: str, learner: str, prior: str, seed: int, steps: int) -> dict:
+    """Learn once, then evaluate what was learned."""
+    from sb3_hds.experiments import returns_of
+
+    model = algorithm(learner)("MlpPolicy", make(env_id, prior), seed=seed, **settings(learner))
+    model.learn(steps)
+    seconds = seconds_since_start()
+    returns = returns_of(model, make(env_id, prior), N_EPISODES)
+    return {"return": returns.mean(), "std": returns.std(), "seconds": seconds}
+
+
+def make(env_id: str, prior: str):
+    """:return: the environment, with the rhythm under it unless ``prior`` is "none" """
+    import gymnasium
+
+    from sb3_hds.wrappers import CPGPrior
+
+    env = gymnasium.make(env_id)
+    if prior == "none":
+        return env
+    changes = {"action_range": RANGES[prior]} if prior in RANGES else {}
+    return CPGPrior(env, mode=prior, **RHYTHMS[env_id], **changes)
+
+
+def algorithm(learner: str):
+    """:return: SBX's SAC, or ours with gSDE"""
+    from sbx import SAC
+
+    from sb3_hds import GSDESAC
+
+    return {"sac": SAC, "gsde_sac": GSDESAC}[learner]
+
+
+def settings(learner: str) -> dict:
+    """:return: what differs from the defaults: gSDE keeps its noise for eight steps"""
+    return {"train_freq": 8, "gradient_steps": 8} if learner == "gsde_sac" else {}
+
+
+def report() -> None:
+    """Print and draw means over seeds."""
+    table = pd.read_csv(RESULTS / "cpg_prior.csv")
+    by = table.groupby(["env", "learner", "prior", "steps"])["return"]
+    print(by.agg(["count", "mean", "min", "max"]).to_string(float_format="%.1f"))
+    draw(table[table.steps == table.steps.max()])
+
+
+def draw(table: pd.DataFrame) -> None:
+    """One picture for each environment: every seed, by learner and prior."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 3.5), layout="constrained")
+    shown = [env_id for env_id in RHYTHMS if (table.env == env_id).any()]
+    for axes, env_id in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
+        for shift, learner in zip((-0.12, 0.12), LEARNERS, strict=True):
+            rows = table[(table.env == env_id) & (table.learner == learner)]
+            places = [PRIORS.index(prior) + shift for prior in rows.prior]
+            axes.plot(places, rows["return"], "o", alpha=0.7, label=learner)
+        axes.set_xticks(range(len(PRIORS)), PRIORS)
+        axes.set_title(env_id)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.axes[0].set_ylabel(f"return after {table.steps.max():,} steps")
+    figure.axes[0].legend(frameon=False)
+    figure.savefig(RESULTS / "cpg_prior.png", dpi=150)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,129 @@
+"""
+Open-loop gaits from scratch: return and wall time in five environments of MuJoCo.
+
+    python benchmarks/open_loop.py                      # 200,000 steps, five seeds
+    python benchmarks/open_loop.py --steps 1000000
+    python benchmarks/open_loop.py --figure             # draw the figure again from the table
+
+Each run is a process of its own with the hyperparameters of ``hyperparams/openloop.yml``; the time
+counts from the start of its interpreter. What acts at the end of the search is evaluated on 20
+episodes, the same resets for every seed. Runs that are in the table are not done again.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import pandas as pd
+from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+
+#: environment to the median return that 200,000 steps should reach
+TARGETS = {
+    "Swimmer-v5": 290.0,
+    "HalfCheetah-v5": 1000.0,
+    "Hopper-v5": 1000.0,
+    "Walker2d-v5": 500.0,
+    "Ant-v5": 700.0,
+}
+N_EPISODES = 20
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument("--envs", nargs="*", default=list(TARGETS))
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=200_000)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--figure", action="store_true")
+    parser.add_argument("--worker", nargs=3, metavar=("ENV", "SEED", "STEPS"))
+    arguments = parser.parse_args()
+    if arguments.worker:
+        env_id, seed, steps = arguments.worker
+        print(json.dumps(worker(env_id, int(seed), int(steps))))
+        return
+    if not arguments.figure:
+        wanted = [(e, s, arguments.steps) for s in range(arguments.seeds) for e in arguments.envs]
+        resume("open_loop", ("env", "seed", "steps"), wanted, _run, arguments.jobs)
+    report()
+
+
+def _run(env_id: str, seed: int, steps: int) -> list[dict]:
+    return [fresh_process(__file__, env_id, seed, steps, cache=CACHE / "programs")]
+
+
+def worker(env_id: str, seed: int, steps: int) -> dict:
+    """Search once, then evaluate what was found."""
+    import gymnasium
+
+    from sb3_hds import OpenLoop
+    from sb3_hds.experiments import returns_of
+
+    model = OpenLoop("MlpPolicy", env_id, seed=seed, **hyperparameters(env_id)).learn(steps)
+    seconds = seconds_since_start()
+    returns = returns_of(model, gymnasium.make(env_id), N_EPISODES)
+    space = model.gait_space
+    return {
+        "return": returns.mean(),
+        "std": returns.std(),
+        "worst": returns.min(),
+        "target": TARGETS.get(env_id) if steps == 200_000 else None,
+        "searched": space.dim,
+        "generations": int(model.policy.search.generation),
+        "seconds": seconds,
+        "gait": json.dumps(
+            {name: _rounded(value) for name, value in model.constants.items()},
+            separators=(",", ":"),
+        ),
+    }
+
+
+def _rounded(value: float | list[float]) -> float | list[float]:
+    return [round(v, 3) for v in value] if isinstance(value, list) else round(value, 3)
+
+
+def hyperparameters(env_id: str) -> dict:
+    """:return: of the zoo's file, without what the zoo itself consumes"""
+    import yaml
+
+    path = Path(__file__).parent.parent / "hyperparams" / "openloop.yml"
+    entries = yaml.safe_load(path.read_text())
+    entry = entries.get(env_id, entries["default"])
+    return {key: value for key, value in entry.items() if key not in ("n_timesteps", "policy")}
+
+
+def report() -> None:
+    """Print medians over seeds, and draw them with every seed."""
+    table = pd.read_csv(RESULTS / "open_loop.csv")
+    by = table.groupby(["env", "steps"])
+    summary = by.agg(
+        seeds=("seed", "count"),
+        median=("return", "median"),
+        lowest=("return", "min"),
+        highest=("return", "max"),
+        target=("target", "first"),
+        minutes=("seconds", lambda s: s.median() / 60.0),
+    )
+    print(summary.to_string(float_format="%.1f"))
+    draw(table[table.steps == 200_000])
+
+
+def draw(table: pd.DataFrame) -> None:
+    """One picture for each environment: every seed, the median, and the target."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 3.0), layout="constrained")
+    shown = [env_id for env_id in TARGETS if (table.env == env_id).any()]
+    for axes, env_id in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
+        runs = table[table.env == env_id]["return"]
+        axes.plot([0.0] * len(runs), runs, "o", color="#27496d", alpha=0.6)
+        axes.plot([-0.3, 0.3], [runs.median()] * 2, color="#27496d", lw=2)
+        axes.axhline(TARGETS[env_id], color="#d1495b", lw=1, ls="--")
+        axes.set(xlim=(-1.0, 1.0), xticks=[], title=env_id)
+        axes.set_ylim(bottom=min(0.0, float(runs.min())))
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.axes[0].set_ylabel("return after 200,000 steps")
+    figure.savefig(RESULTS / "open_loop.png", dpi=150)
+
+
+if __name__ == "__main__":
+    main()

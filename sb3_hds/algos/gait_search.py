@@ -1,0 +1,145 @@
+"""Black-box search by CMA-ES, generation by generation, whose state is a pytree of arrays."""
+
+from typing import NamedTuple
+
+import numpy as np
+from cmaes import CMA
+from jaxtyping import Float, Int
+
+# Where generations and rounds of a ranking get their random numbers.
+_SAMPLES, _RESETS, _ROUNDS = 0, 1, 2
+_LARGEST = 2**31 - 1
+
+
+class SearchState(NamedTuple):
+    """
+    :param seed: of all random numbers
+    :param generation: how many are complete
+    :param mean: of the distribution
+    :param covariance: up to ``sigma`` squared
+    :param sigma: step size
+    :param path_sigma: evolution path of the step size
+    :param path_covariance: evolution path of the covariance
+    :param returns: of this generation: one row per candidate, one column per reset, -inf where
+        it is not known yet
+    :param elites: best candidates so far, best first
+    :param elite_returns: their means over resets, -inf for places that are free
+    :param ranked: whether the acting candidate has been compared on fresh resets
+    :param n_rounds: rounds of rankings so far
+    """
+
+    seed: np.ndarray
+    generation: np.ndarray
+    mean: Float[np.ndarray, " dim"]
+    covariance: Float[np.ndarray, "dim dim"]
+    sigma: np.ndarray
+    path_sigma: Float[np.ndarray, " dim"]
+    path_covariance: Float[np.ndarray, " dim"]
+    returns: Float[np.ndarray, "population resets"]
+    elites: Float[np.ndarray, "elites dim"]
+    elite_returns: Float[np.ndarray, " elites"]
+    ranked: np.ndarray
+    n_rounds: np.ndarray
+
+
+def begin(
+    start: Float[np.ndarray, " dim"],
+    sigma: float,
+    seed: int,
+    population: int,
+    n_resets: int,
+    n_elites: int,
+) -> SearchState:
+    """
+    :param start: mean of the first generation
+    :param sigma: its standard deviation
+    :param population: candidates in a generation
+    :param n_resets: episodes of each of them
+    :return: a search that has seen nothing
+    """
+    dim = len(start)
+    return SearchState(
+        seed=np.asarray(seed, np.int64),
+        generation=np.asarray(0, np.int64),
+        mean=np.array(start, float),
+        covariance=np.eye(dim),
+        sigma=np.asarray(sigma, float),
+        path_sigma=np.zeros(dim),
+        path_covariance=np.zeros(dim),
+        returns=np.full((population, n_resets), -np.inf),
+        elites=np.tile(np.asarray(start, float), (n_elites, 1)),
+        elite_returns=np.full(n_elites, -np.inf),
+        ranked=np.asarray(False),
+        n_rounds=np.asarray(0, np.int64),
+    )
+
+
+def default_population(dim: int) -> int:
+    """:return: candidates in a generation, as in Hansen's tutorial (2016), equation 48"""
+    return 4 + int(3.0 * np.log(dim))
+
+
+def candidates(state: SearchState) -> Float[np.ndarray, "population dim"]:
+    """:return: of this generation, always the same ones"""
+    return _asked(_restored(state), len(state.returns))
+
+
+def reset_seeds(state: SearchState) -> Int[np.ndarray, " resets"]:
+    """:return: with which every candidate of this generation is reset"""
+    return _seeds(state, _RESETS, int(state.generation), state.returns.shape[1])
+
+
+def round_seed(state: SearchState) -> int:
+    """:return: with which all finalists are reset in the next round of a ranking"""
+    return int(_seeds(state, _ROUNDS, int(state.n_rounds), 1)[0])
+
+
+def tell(state: SearchState) -> SearchState:
+    """
+    :param state: with all returns of its generation
+    :return: at the start of the next generation
+    """
+    search = _restored(state)
+    points = _asked(search, len(state.returns))
+    values = state.returns.mean(axis=1)
+    search.tell([(x, -value) for x, value in zip(points, values, strict=True)])
+    learned = vars(search)
+    pool = np.concatenate([state.elites, points])
+    pool_values = np.concatenate([state.elite_returns, values])
+    best = np.argsort(-pool_values, kind="stable")[: len(state.elites)]
+    return state._replace(
+        generation=np.asarray(search.generation, np.int64),
+        mean=np.array(search.mean),
+        covariance=np.array(learned["_C"]),
+        sigma=np.asarray(learned["_sigma"], float),
+        path_sigma=np.array(learned["_p_sigma"]),
+        path_covariance=np.array(learned["_pc"]),
+        returns=np.full_like(state.returns, -np.inf),
+        elites=pool[best],
+        elite_returns=pool_values[best],
+    )
+
+
+def _restored(state: SearchState) -> CMA:
+    """``cmaes`` has no public way to go on with a search, so its attributes are set."""
+    search = CMA(
+        mean=np.array(state.mean),
+        sigma=float(state.sigma),
+        cov=np.array(state.covariance),
+        population_size=len(state.returns),
+    )
+    search.__dict__.update(
+        _p_sigma=np.array(state.path_sigma),
+        _pc=np.array(state.path_covariance),
+        _g=int(state.generation),
+    )
+    search.reseed_rng(int(_seeds(state, _SAMPLES, int(state.generation), 1)[0]))
+    return search
+
+
+def _asked(search: CMA, n: int) -> Float[np.ndarray, "population dim"]:
+    return np.stack([search.ask() for _ in range(n)])
+
+
+def _seeds(state: SearchState, purpose: int, index: int, n: int) -> Int[np.ndarray, " n"]:
+    return np.random.default_rng([int(state.seed), purpose, index]).integers(_LARGEST, size=n)

@@ -1,0 +1,90 @@
+"""Saving and loading of every algorithm: tensors, in files that are whole or not there."""
+
+import io
+import pathlib
+from collections.abc import Iterable
+from typing import Any, Self
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_hds.algos.call_forms import device_or_cpu
+from sb3_hds.algos.persistence import damage_reported, write_whole
+from sb3_hds.algos.policy_description import described
+
+
+class SavesTensors(BaseAlgorithm):
+    """Abstract: an algorithm whose policy is a :class:`~sb3_hds.algos.persistence.TensorPolicy`."""
+
+    policy_description: dict[str, Any] | None
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Write a zip file as SB3 does, whole or not at all.
+
+        :param path: of the file; ``.zip`` is appended where it has no suffix
+        :param exclude: attributes to leave out besides the usual ones
+        :param include: attributes to write although they are usually left out
+        :raises OSError: if the file cannot be written; an older one is then left as it was
+        """
+        self.policy_description = described(self.policy)  # type: ignore[arg-type]
+        write = super().save
+        write_whole(path, "zip", lambda file: write(file, exclude, include))
+
+    @classmethod
+    def load(
+        cls,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: Any = "auto",
+        *args: Any,
+        **kwargs: Any,
+    ) -> Self:
+        """
+        SB3's ``load``.
+
+        :param path: of a file that this class saved
+        :param env: to go on training in; none is needed to predict
+        :param device: where to; ``"cuda"`` means the CPU where there is none, with a warning
+        :raises ValueError: for a damaged file, or one that another algorithm saved
+        """
+        with damage_reported(path):
+            return super().load(path, env, device_or_cpu(device), *args, **kwargs)
+
+    def get_parameters(self) -> dict[str, dict]:
+        """:return: by the object's name its tensors by theirs; objects that have some"""
+        return {name: tensors for name, tensors in super().get_parameters().items() if tensors}
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | dict[str, Any],
+        exact_match: bool = True,
+        device: Any = "auto",
+    ) -> None:
+        """
+        SB3's ``set_parameters``.
+
+        :param load_path_or_dict: of a file, or what ``get_parameters`` returned
+        :param exact_match: whether nothing may be missing
+        :param device: where to
+        :raises ValueError: for names of objects that this model does not have, or has and misses
+        :raises RuntimeError: for tensors that do not fit
+        """
+        given = load_path_or_dict
+        if not isinstance(given, dict):
+            _, given, _ = load_from_zip_file(given, device=device, load_data=False)
+        own, (names, _) = self.get_parameters(), self._get_torch_save_params()
+        empty: dict[str, Any] = {name: {} for name in names if name not in own}
+        super().set_parameters(empty | given, exact_match, device)
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer"], []
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "policy", "key", "_device_name"]

@@ -1,0 +1,151 @@
+"""What is left of a return when sensors are noisy or fail, or something pushes."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+from jaxtyping import Float
+from rich.progress import track
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+
+from sb3_hds.algos import OpenLoop
+from sb3_hds.errors import TrajectoryError
+from sb3_hds.experiments.returns import FIRST_START
+from sb3_hds.wrappers import Perturb
+
+#: arguments of :class:`~sb3_hds.wrappers.Perturb` by the name that a table shows
+PERTURBATIONS: dict[str, dict[str, Any]] = {
+    "none": {},
+    "noise 0.25": {"noise": 0.25},
+    "noise 0.5": {"noise": 0.5},
+    "sensor zero": {"failing": "zero"},
+    "sensor constant": {"failing": "constant"},
+    "push": {"push": 5.0},
+}
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Robustness:
+    """
+    Returns of one policy under perturbations. Prints itself.
+
+    :param returns: by perturbation, one for each episode; all start alike
+    """
+
+    returns: Mapping[str, Float[np.ndarray, " episodes"]]
+
+    def share(self, perturbation: str) -> float:
+        """:return: mean return as a share of the unperturbed one, nan unless that is positive"""
+        whole = float(np.mean(self.returns["none"]))
+        return float(np.mean(self.returns[perturbation])) / whole if whole > 0.0 else float("nan")
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """:return: plain data, one row for each perturbation"""
+        return [
+            {
+                "perturbation": name,
+                "return": float(np.mean(values)),
+                "std": float(np.std(values)),
+                "worst": float(np.min(values)),
+                "share": self.share(name),
+            }
+            for name, values in self.returns.items()
+        ]
+
+    def __str__(self) -> str:
+        n = len(self.returns["none"])
+        lines = [
+            f"Return over {n} episodes from the same starts:",
+            f"  {'perturbation':<16}{'return':>10}{'std':>9}{'worst':>10}{'share':>8}",
+        ]
+        for row in self.to_rows():
+            numbers = f"{row['return']:>10.1f}{row['std']:>9.1f}{row['worst']:>10.1f}"
+            lines.append(f"  {row['perturbation']:<16}{numbers}{row['share']:>8.2f}")
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+def measure_robustness(
+    model: BaseAlgorithm,
+    env: str | Callable[[], gymnasium.Env],
+    *,
+    perturbations: Mapping[str, Mapping[str, Any]] = PERTURBATIONS,
+    n_episodes: int = 20,
+    encoders: str = "own",
+    normalize: str | None = None,
+    progress: bool = True,
+) -> Robustness:
+    """
+    Run the deterministic policy under each perturbation, from the same starts.
+
+    Noise and failures are in what the policy observes. The motors of an open-loop gait have
+    encoders of their own, as on a robot, so that neither reaches them; ``encoders="observation"``
+    lets the loop that tracks joints see what the policy sees. A push reaches everybody.
+
+    Source: after Raffin et al., *An Open-Loop Baseline*, RLJ 2024, table 2; how it defined units,
+    sensors and pushes is not published, see :class:`~sb3_hds.wrappers.Perturb` for what is done
+    here.
+
+    :param model: any saved model of Stable-Baselines3, SBX or this package
+    :param env: its id, or a function that makes it
+    :param perturbations: arguments of ``Perturb`` by name, ``"none"`` among them
+    :param n_episodes: of each
+    :param encoders: ``"own"`` or ``"observation"``
+    :param normalize: file of the statistics of ``VecNormalize`` that the model was trained with
+    :param progress: whether a bar shows how far it is
+    :raises TrajectoryError: for fewer than one episode, or without the perturbation ``"none"``
+    """
+    if n_episodes < 1 or "none" not in perturbations or encoders not in ("own", "observation"):
+        raise TrajectoryError(
+            f"measure_robustness takes n_episodes of at least 1 (got {n_episodes}), a perturbation "
+            f"'none' among others (got {', '.join(perturbations)}), and encoders 'own' or "
+            f"'observation' (got {encoders!r})."
+        )
+    returns = {}
+    shown = track(perturbations.items(), "perturbing", transient=True, disable=not progress)
+    for name, settings in shown:
+        venv: VecEnv = DummyVecEnv([lambda settings=settings: _perturbed(env, settings)])
+        try:
+            seen = VecNormalize.load(normalize, venv) if normalize else venv
+            if isinstance(seen, VecNormalize):
+                seen.training, seen.norm_reward = False, False
+            returns[name] = _returns(model, seen, n_episodes, encoders)
+        finally:
+            venv.close()
+    return Robustness(returns)
+
+
+def _perturbed(env: str | Callable[[], gymnasium.Env], settings: Mapping[str, Any]):
+    made = gymnasium.make(env) if isinstance(env, str) else env()
+    return Perturb(made, **settings)
+
+
+def _returns(
+    model: BaseAlgorithm, env: VecEnv, n_episodes: int, encoders: str
+) -> Float[np.ndarray, " episodes"]:
+    tracks = isinstance(model, OpenLoop) and (model.body or {}).get("control") == "track"
+    own = tracks and encoders == "own"
+    before = model.policy.read_states if isinstance(model, OpenLoop) else None
+    try:
+        if own and isinstance(model, OpenLoop):
+            model.read_joints_from(env)
+        return np.array([_episode(model, env, FIRST_START + i) for i in range(n_episodes)])
+    finally:
+        if own and isinstance(model, OpenLoop):
+            model.policy.read_states = before
+
+
+def _episode(model: BaseAlgorithm, env: VecEnv, seed: int) -> float:
+    env.seed(seed)
+    obs: Any = env.reset()
+    state, start, total = None, np.ones(1, bool), 0.0
+    while True:
+        action, state = model.predict(obs, state, start, deterministic=True)
+        obs, reward, start, _ = env.step(action)
+        total += float(reward[0])
+        if start[0]:
+            return total

@@ -1,0 +1,96 @@
+"""What goes wrong with sensors, and what pushes a robot."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
+
+from sb3_hds.errors import EnvironmentMismatchError, ParameterError
+
+_FAILURES = (None, "zero", "constant")
+# Of MuJoCo's bodies, 0 is the world and 1 the torso.
+_TORSO = 1
+
+
+class Perturb(gymnasium.Wrapper, RecordConstructorArgs):
+    """
+    Noise on observations, a sensor that fails, a force that pushes. Rewards and the environment's
+    own state are what they are; random numbers are those of the environment, seeded with it.
+
+    :param env: whose observations are a Box with one axis
+    :param noise: standard deviation of what is added to each entry, drawn afresh at every step, in
+        the unit of the entry
+    :param failing: one entry of the observation shows ``"zero"`` throughout, or a ``"constant"``;
+        None: none fails
+    :param sensor: which entry; None: another one in each episode
+    :param constant: what a sensor shows that fails so
+    :param push: force on the torso [N], in a random direction of space
+    :param push_probability: of a push in a step
+    :raises ParameterError: for arguments out of range
+    :raises EnvironmentMismatchError: for other observations, or a push without MuJoCo
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        *,
+        noise: float = 0.0,
+        failing: str | None = None,
+        sensor: int | None = None,
+        constant: float = 5.0,
+        push: float = 0.0,
+        push_probability: float = 0.05,
+    ) -> None:
+        given = {k: v for k, v in locals().items() if k not in ("self", "env", "__class__")}
+        RecordConstructorArgs.__init__(self, **given)
+        gymnasium.Wrapper.__init__(self, env)
+        space = env.observation_space
+        if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+            raise EnvironmentMismatchError(f"Perturb takes a Box with one axis, got {space}.")
+        if failing not in _FAILURES or noise < 0.0 or not 0.0 <= push_probability <= 1.0:
+            raise ParameterError(
+                f"Perturb(noise={noise}, failing={failing!r}, push_probability={push_probability}):"
+                " noise must be at least 0, failing None, 'zero' or 'constant', and the probability"
+                " from 0 to 1."
+            )
+        if sensor is not None and not 0 <= sensor < space.shape[0]:
+            raise ParameterError(f"Sensor {sensor} is none of the {space.shape[0]} that there are.")
+        if push and not hasattr(getattr(env.unwrapped, "data", None), "xfrc_applied"):
+            raise EnvironmentMismatchError(f"A push needs an environment of MuJoCo, got {env}.")
+        # Limits would be crossed by noise; a policy that was trained sees the same shape and type.
+        self.noise, self.failing, self.sensor, self.constant = noise, failing, sensor, constant
+        self.push, self.push_probability = push, push_probability
+        self._failed = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        obs, info = self.env.reset(seed=seed, options=options)
+        self._failed = self.sensor
+        if self.sensor is None and self.failing:
+            self._failed = int(self.np_random.integers(len(obs)))
+        return self._seen(obs), info
+
+    def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
+        if self.push:
+            self._push()
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        return self._seen(obs), reward, terminated, truncated, info
+
+    def _push(self) -> None:
+        inner: Any = self.env.unwrapped
+        force = np.zeros(3)
+        if self.np_random.random() < self.push_probability:
+            direction = self.np_random.normal(size=3)
+            force = self.push * direction / np.linalg.norm(direction)
+        inner.data.xfrc_applied[_TORSO, :3] = force
+
+    def _seen(self, obs: np.ndarray) -> np.ndarray:
+        seen = np.array(obs)
+        if self.noise:
+            seen = seen + self.noise * self.np_random.normal(size=seen.shape)
+        if self.failing:
+            seen[self._failed] = 0.0 if self.failing == "zero" else self.constant
+        return seen.astype(obs.dtype)

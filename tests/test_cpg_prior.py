@@ -1,0 +1,276 @@
+"""CPGPrior: a rhythm under a policy, in every mode; and the other wrappers around joints."""
+
+import pickle
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env as gymnasium_check
+from small_models import small
+from stable_baselines3.common.env_checker import check_env as sb3_check
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_hds.core.cpg import Rhythm
+from sb3_hds.core.oscillators import advance_phase
+from sb3_hds.errors import EnvironmentMismatchError, ParameterError
+from sb3_hds.wrappers import CPGPrior, Perturb, ShowJoints
+
+TAU = 2.0 * np.pi
+SETTINGS = {
+    "omega_swing": TAU * 0.6,
+    "omega_stance": TAU * 0.9,
+    "amplitude": [0.8, 1.2],
+    "phase": [0.3, 4.0],
+    "offset": [0.1, -0.1],
+    "kp": 10.0,
+    "kd": 0.5,
+}
+every_mode = pytest.mark.parametrize("mode", Rhythm.modes)
+quickly = pytest.mark.usefixtures("quick_compilation")
+
+
+def swimmer(mode: str = "offset", **changes) -> CPGPrior:
+    return CPGPrior(gymnasium.make("Swimmer-v5"), mode=mode, **(SETTINGS | changes))
+
+
+def pendulum(mode: str = "offset", **changes) -> CPGPrior:
+    settings = {"omega_swing": 4.0, "omega_stance": 6.0, "amplitude": 1.5, "phase": 0.4} | changes
+    return CPGPrior(gymnasium.make("Pendulum-v1"), mode=mode, **settings)
+
+
+def wave(time: float, joint: int) -> float:
+    """Where a joint aims at, from the definition."""
+    phase = np.array([SETTINGS["phase"][joint]])
+    moved = advance_phase(phase, time, SETTINGS["omega_swing"], SETTINGS["omega_stance"])
+    return SETTINGS["amplitude"][joint] * np.sin(moved[0]) + SETTINGS["offset"][joint]
+
+
+@every_mode
+@pytest.mark.parametrize("make", [swimmer, pendulum])
+def test_the_checkers_of_gymnasium_and_stable_baselines_accept_it(mode, make):
+    gymnasium_check(make(mode), skip_render_check=True)
+    sb3_check(make(mode))
+
+
+@pytest.mark.parametrize("mode", ["offset", "residual"])
+def test_without_an_action_joints_aim_at_the_middle_of_each_step(mode):
+    env = swimmer(mode)
+    env.reset(seed=0)
+
+    for k in range(200):
+        *_, info = env.step(np.zeros(2))
+        expected = [wave((k + 0.5) * 0.04, joint) for joint in range(2)]
+        np.testing.assert_allclose(info["target"], expected, atol=1e-9)
+
+
+def test_an_offset_moves_the_target_and_a_residual_the_command():
+    for mode, name in (("offset", "target"), ("residual", "command")):
+        plain, moved = (swimmer(mode, action_range=0.2, kp=0.1, kd=0.0) for _ in range(2))
+        plain.reset(seed=0)
+        moved.reset(seed=0)
+
+        *_, before = plain.step(np.zeros(2))
+        *_, after = moved.step(np.array([1.0, -0.5]))
+
+        change = after[name] - before[name]
+        np.testing.assert_allclose(change, [0.2, -0.1], atol=1e-6)
+
+
+def test_commands_track_the_joints_that_the_model_names():
+    env = swimmer(kp=0.3, kd=0.02)
+    env.reset(seed=0)
+    data = env.unwrapped.data
+    position, velocity = data.qpos[3:5].copy(), data.qvel[3:5].copy()
+
+    *_, info = env.step(np.zeros(2))
+
+    expected = 0.3 * (info["target"] - position) - 0.02 * velocity
+    np.testing.assert_allclose(info["command"], expected, atol=1e-6)
+
+
+def test_in_the_third_mode_actions_are_amplitudes_and_the_frequency():
+    env = swimmer("parameters", amplitude_factor=(0.0, 2.0), frequency_factor=(0.5, 1.5))
+    env.reset(seed=0)
+    faster = np.array([0.5, -1.0, 1.0])
+
+    for _ in range(100):
+        obs, *_, info = env.step(faster)
+
+    # Long settled: 1.5 times the first amplitude, none of the second.
+    np.testing.assert_allclose(obs[-4:-2], [1.5, 0.0], atol=1e-3)
+    np.testing.assert_allclose(obs[-2:], 0.0, atol=1e-3)
+    cycle = np.pi / SETTINGS["omega_swing"] + np.pi / SETTINGS["omega_stance"]
+    turned = TAU * (1.5 * 100 * 0.04 / cycle)
+    np.testing.assert_allclose(obs[-6:-4], [np.sin(turned), np.cos(turned)], atol=1e-6)
+    assert info["target"][1] == pytest.approx(SETTINGS["offset"][1], abs=1e-3)
+
+
+@every_mode
+def test_what_happens_next_depends_on_the_observation_and_the_action_alone(mode):
+    """Two ways to the same observation below and the same memory lead to the same targets."""
+    rhythm = swimmer(mode).rhythm
+    cycle = np.pi / SETTINGS["omega_swing"] + np.pi / SETTINGS["omega_stance"]
+    rest = np.zeros(rhythm.n_actions)
+    dt = cycle / 50
+
+    once = rhythm.start()
+    targets = []
+    for _ in range(100):
+        target, once = rhythm.target(rest, once, dt)
+        targets.append(target)
+
+    # After a whole cycle, the memory is that of the start, and all repeats itself. Amplitudes that
+    # start in the middle of their range are where they are told to be.
+    np.testing.assert_allclose(targets[50:], targets[:50], atol=1e-6)
+    np.testing.assert_allclose(once[:2], [0.0, 1.0], atol=1e-9)
+
+
+@every_mode
+def test_targets_and_commands_are_differentiable_in_jax_and_the_same_in_numpy(mode):
+    rhythm = swimmer(mode).rhythm
+    action = np.linspace(-0.4, 0.6, rhythm.n_actions)
+    # A while after the start: where the clock turns over, the phase has a corner.
+    _, memory = rhythm.target(action, rhythm.start(), 0.13)
+
+    def aim(a):
+        return rhythm.target(a, jnp.asarray(memory), 0.04)[0]
+
+    expected, _ = rhythm.target(action, memory, 0.04)
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(aim(jnp.asarray(action)), expected, atol=1e-12)
+        slope = jax.jacfwd(aim)(jnp.asarray(action))
+    h, columns = 1e-6, []
+    for i in range(rhythm.n_actions):
+        step = h * np.eye(rhythm.n_actions)[i]
+        ends = (rhythm.target(action + sign * step, memory, 0.04)[0] for sign in (1.0, -1.0))
+        columns.append(np.subtract(*ends) / (2.0 * h))
+    np.testing.assert_allclose(slope, np.transpose(columns), atol=1e-6)
+    assert (np.abs(slope).max() > 0.0) == (mode != "residual")
+
+
+@every_mode
+def test_it_survives_pickling_and_says_how_it_was_made(mode):
+    env = swimmer(mode)
+    env.reset(seed=3)
+    copy = pickle.loads(pickle.dumps(env))
+
+    copy.reset(seed=3)
+    env.reset(seed=3)
+    for _ in range(5):
+        action = np.full(env.action_space.shape, 0.3, np.float32)
+        np.testing.assert_array_equal(env.step(action)[0], copy.step(action)[0])
+    assert env.spec is not None and env.spec.additional_wrappers[-1].name == "CPGPrior"
+    assert gymnasium.make(env.spec).rhythm == env.rhythm
+
+
+@quickly
+@pytest.mark.parametrize("name", ["droq", "openloop"])
+def test_learners_use_it_in_several_copies(name):
+    env = make_vec_env(
+        "Pendulum-v1", n_envs=2, wrapper_class=CPGPrior, wrapper_kwargs={"omega_swing": 4.0}
+    )
+
+    model = small(name, env).learn(40)
+
+    assert model.observation_space.shape == (5,) and model.num_timesteps == 40
+
+
+def test_the_zoo_makes_it_from_keywords_alone():
+    zoo = pytest.importorskip("rl_zoo3.utils")
+    entry = {
+        "env_wrapper": [{"sb3_hds.wrappers.CPGPrior": {"omega_swing": 4.0, "mode": "residual"}}]
+    }
+
+    env = zoo.get_wrapper_class(entry)(gymnasium.make("Pendulum-v1"))
+
+    assert isinstance(env, CPGPrior) and env.rhythm.mode == "residual"
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"mode": "offsets"}, "mode must be one of 'offset'"),
+        ({"omega_swing": 0.0}, "omega_swing must be above 0"),
+        ({"amplitude": [1.0, 2.0, 3.0]}, "3 values of amplitude, and there are 2 actuators"),
+        ({"kp": float("nan")}, "kp must be finite"),
+        ({"frequency_factor": (0.0, 1.0)}, "needs 0 <= lowest < highest"),
+    ],
+)
+def test_arguments_that_make_no_sense_are_named(changes, reason):
+    with pytest.raises(ParameterError, match=reason):
+        swimmer(**changes)
+
+
+def test_an_environment_that_it_cannot_be_put_around_is_refused():
+    with pytest.raises(EnvironmentMismatchError, match="boxes of one axis"):
+        CPGPrior(gymnasium.make("CartPole-v1"), omega_swing=1.0)
+    with pytest.raises(EnvironmentMismatchError, match="needs an environment of MuJoCo"):
+        pendulum(control="track")
+
+
+def test_show_joints_appends_what_the_actuators_drive():
+    env = ShowJoints(gymnasium.make("Ant-v5"))
+    obs, _ = env.reset(seed=0)
+    inner = env.unwrapped
+
+    joints = [
+        inner.model.joint(f"{part}_{leg}") for leg in (4, 1, 2, 3) for part in ("hip", "ankle")
+    ]
+    np.testing.assert_array_equal(obs[-16:-8], [inner.data.qpos[j.qposadr[0]] for j in joints])
+    np.testing.assert_array_equal(obs[-8:], [inner.data.qvel[j.dofadr[0]] for j in joints])
+    gymnasium_check(ShowJoints(gymnasium.make("Reacher-v5")), skip_render_check=True)
+
+
+def perturbed(**settings) -> gymnasium.Env:
+    return Perturb(gymnasium.make("Swimmer-v5", max_episode_steps=400), **settings)
+
+
+def observations(env: gymnasium.Env, n: int = 400) -> np.ndarray:
+    seen = [env.reset(seed=1)[0]]
+    return np.stack(seen + [env.step(np.zeros(2))[0] for _ in range(n)])
+
+
+def test_noise_has_the_deviation_that_was_asked_for_and_rewards_have_none():
+    noisy = observations(perturbed(noise=0.25))
+    seen = noisy - observations(perturbed())
+
+    # 400 samples of each of eight entries: the deviation is known to 1.3 %.
+    assert seen.std() == pytest.approx(0.25, rel=0.05) and abs(seen.mean()) < 0.02
+    np.testing.assert_array_equal(observations(perturbed(noise=0.25)), noisy)
+
+
+@pytest.mark.parametrize(("failing", "shown"), [("zero", 0.0), ("constant", 5.0)])
+def test_a_failed_sensor_shows_one_value_and_the_others_what_they_measure(failing, shown):
+    seen, true = observations(perturbed(failing=failing, sensor=3)), observations(perturbed())
+
+    assert (seen[:, 3] == shown).all()
+    np.testing.assert_array_equal(np.delete(seen, 3, axis=1), np.delete(true, 3, axis=1))
+    drawn = {int(np.argmax((s == shown).all(0))) for s in _episodes(failing)}
+    assert len(drawn) > 2
+
+
+def _episodes(failing: str):
+    env = perturbed(failing=failing)
+    for seed in range(12):
+        yield np.stack([env.reset(seed=seed)[0]] + [env.step(np.zeros(2))[0] for _ in range(3)])
+
+
+def test_a_push_is_a_force_on_the_torso_in_some_steps_only():
+    env = perturbed(push=5.0, push_probability=0.25)
+    env.reset(seed=0)
+    forces = []
+    for _ in range(400):
+        env.step(np.zeros(2))
+        forces.append(np.linalg.norm(env.unwrapped.data.xfrc_applied[1, :3]))
+
+    pushed = np.array(forces) > 0.0
+    np.testing.assert_allclose(np.array(forces)[pushed], 5.0)
+    # Three standard deviations of 400 draws.
+    assert abs(pushed.mean() - 0.25) < 3.0 * np.sqrt(0.25 * 0.75 / 400)
+
+
+@pytest.mark.parametrize("settings", [{"noise": 0.1}, {"failing": "zero"}, {"push": 5.0}], ids=str)
+def test_the_checkers_accept_perturbed_environments(settings):
+    gymnasium_check(perturbed(**settings), skip_render_check=True)

@@ -1,0 +1,435 @@
+"""OpenLoop: published gaits walk, a search finds some, and joints are those that are driven."""
+
+import json
+
+import gymnasium
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium import spaces
+from small_models import logged, same, saved, small
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
+
+from sb3_hds import OpenLoop, twins
+from sb3_hds.algos import gait_search
+from sb3_hds.algos.gait_space import Constants, GaitSpace
+from sb3_hds.core.oscillators import Gait, target_at
+from sb3_hds.envs import TwinVecEnv
+from sb3_hds.errors import EnvironmentMismatchError, ParameterError
+from sb3_hds.wrappers import ShowJoints
+from sb3_hds.wrappers.actuated_joints import actuated_joints
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+TAU = 2.0 * np.pi
+
+# Gaits that the authors of the open-loop paper published: kp, kd in commands per rad and rad/s.
+SWIMMER = {
+    "amplitude": 1.0,
+    "phase": [0.0, TAU * 0.95],
+    "omega_swing": TAU * 0.62,
+    "omega_stance": TAU * 0.62,
+    "kp": 10.0,
+    "kd": 0.5,
+}
+HALF_CHEETAH = {
+    "amplitude": [1.123, -1.910, -1.204, 1.173, 1.196, -0.085],
+    "offset": [-0.114, 0.075, 0.002, -0.493, -0.501, -0.227],
+    "phase": [TAU * turns for turns in (0.0, 0.789, 0.316, 0.294, 0.629, 0.921)],
+    "omega_swing": TAU * 3.865,
+    "omega_stance": TAU * 4.622,
+    "kp": 1.0,
+    "kd": 0.05,
+}
+
+
+class Tune(gymnasium.Env):
+    """Rewards a command that is a given sine of time. Episodes have 40 steps of 50 ms."""
+
+    dt = 0.05
+    metadata = {"render_modes": []}
+
+    def __init__(self, noise: float = 0.0) -> None:
+        self.observation_space = spaces.Box(-1.0, 1.0, (1,))
+        self.action_space = spaces.Box(-1.0, 1.0, (1,))
+        self.noise = noise
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.k, self.luck = 0, self.noise * float(self.np_random.normal())
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        wanted = 0.5 * np.sin(TAU * 1.0 * (self.k + 0.5) * self.dt) + 0.2
+        self.k += 1
+        reward = -float((action[0] - wanted) ** 2) + self.luck
+        return np.zeros(1, np.float32), reward, False, self.k == 40, {}
+
+
+class HiddenJoints(gymnasium.ObservationWrapper):
+    """Shows nothing of the joints."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = spaces.Box(-1.0, 1.0, (1,))
+
+    def observation(self, observation):
+        return np.zeros(1, np.float32)
+
+
+def returns(model: OpenLoop, env_id: str) -> list[float]:
+    """:return: of one episode from each of the resets with the seeds 0 to 4"""
+    envs = [make_vec_env(env_id, seed=seed) for seed in range(5)]
+    return [float(evaluate_policy(model, env, 1, warn=False)[0]) for env in envs]
+
+
+def test_the_published_gait_swims_as_far_as_published():
+    model = OpenLoop("MlpPolicy", "Swimmer-v5", seed=0).set_constants(**SWIMMER)
+
+    assert 345.0 < np.mean(returns(model, "Swimmer-v5")) < 358.0
+
+
+def test_the_published_gait_runs_as_fast_as_published():
+    model = OpenLoop("MlpPolicy", "HalfCheetah-v5", seed=0).set_constants(**HALF_CHEETAH)
+
+    assert 3_500.0 < np.mean(returns(model, "HalfCheetah-v5")) < 4_200.0
+
+
+def test_joints_of_the_ant_are_those_that_its_actuators_are_named_after():
+    model = gymnasium.make("Ant-v5").unwrapped.model
+
+    joints = actuated_joints(model)
+
+    assert joints.names == tuple(
+        f"{part}_{leg}" for leg in (4, 1, 2, 3) for part in ("hip", "ankle")
+    )
+    # The trap: in the state, they come in another order, after the seven numbers of the torso.
+    in_state = [f"{part}_{leg}" for leg in (1, 2, 3, 4) for part in ("hip", "ankle")]
+    assert joints.position.tolist() == [7 + in_state.index(name) for name in joints.names]
+
+
+@pytest.mark.parametrize(
+    "env_id", ["Swimmer-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5"]
+)
+def test_joints_are_found_in_the_observation(env_id):
+    env = make_vec_env(env_id, seed=3)
+    model = OpenLoop("MlpPolicy", env, seed=3)
+    inner = env.envs[0].unwrapped
+
+    env.seed(11)
+    obs = env.reset()
+
+    position, velocity = model.policy.body.in_observations(obs)
+    for i, (joint, _) in enumerate(inner.model.actuator_trnid):
+        assert position[0, i] == inner.data.qpos[inner.model.jnt_qposadr[joint]]
+        assert velocity[0, i] == inner.data.qvel[inner.model.jnt_dofadr[joint]]
+
+
+def hidden():
+    return HiddenJoints(gymnasium.make("Swimmer-v5", max_episode_steps=50))
+
+
+@pytest.mark.parametrize(
+    "kind", [DummyVecEnv, pytest.param(SubprocVecEnv, marks=pytest.mark.expensive)]
+)
+def test_joints_that_are_not_observed_are_read_from_the_environment(kind):
+    shown = make_vec_env("Swimmer-v5", env_kwargs={"max_episode_steps": 50}, seed=5)
+    expected = OpenLoop("MlpPolicy", shown, seed=5).set_constants(**SWIMMER)
+    env = make_vec_env(hidden, n_envs=2, vec_env_cls=kind, seed=5)
+    try:
+        model = OpenLoop("MlpPolicy", env, seed=5).set_constants(**SWIMMER)
+        shown.seed(5)
+        env.seed(5)
+        wanted, _ = evaluate_policy(expected, shown, 1, return_episode_rewards=True)
+        found, _ = evaluate_policy(model, env, 2, return_episode_rewards=True)
+    finally:
+        env.close()
+    assert found[0] == pytest.approx(wanted[0], abs=1e-9)
+
+
+def test_a_model_that_has_no_joints_to_read_says_where_it_could_get_them():
+    model = OpenLoop("MlpPolicy", hidden())
+    alone = OpenLoop.load(saved(model))
+    with pytest.raises(EnvironmentMismatchError, match=r"read_joints_from.*ShowJoints"):
+        alone.predict(np.zeros(1, np.float32))
+    with pytest.raises(EnvironmentMismatchError, match="do not show position and velocity"):
+        OpenLoop("MlpPolicy", hidden(), joints="observation")
+    shown = OpenLoop("MlpPolicy", ShowJoints(hidden()), joints="observation")
+    assert shown.policy.body.seen_position == (1, 2) and shown.policy.body.seen_velocity == (3, 4)
+
+
+def test_the_state_that_predict_returns_carries_the_phase():
+    model = OpenLoop("MlpPolicy", "Pendulum-v1", seed=0)
+    model.set_constants(amplitude=1.5, phase=0.7, omega_swing=3.0, omega_stance=5.0)
+    gait = Gait(*map(jnp.asarray, ([1.5], [0.0], [0.7], 3.0, 5.0)))
+    obs, state, start = np.zeros((2, 3), np.float32), None, np.ones(2, bool)
+
+    for k in range(60):
+        actions, state = model.predict(obs, state, start)
+        # The second copy starts another episode at step 40.
+        times = np.array([k, k if k < 40 else k - 40]) + 0.5
+        expected = [target_at(gait, 0.05 * time)[0] for time in times]
+        np.testing.assert_allclose(actions[:, 0], expected, atol=1e-4)
+        start = np.array([False, k == 39])
+
+
+def test_predicting_twice_without_the_state_is_warned_of():
+    model, obs = small("openloop"), np.zeros(3, np.float32)
+    model.predict(obs)
+
+    with pytest.warns(UserWarning, match="without the state that it returned"):
+        model.predict(obs)
+
+
+def test_a_search_finds_the_gait_that_is_rewarded():
+    model = OpenLoop("MlpPolicy", Tune(), seed=0, frequency=(0.5, 2.0), n_resets=1)
+
+    model.learn(40 * 600)
+
+    # Doing nothing costs 40 (0.5^2 / 2 + 0.2^2) = 6.6.
+    assert evaluate_policy(model, model.get_env(), 1)[0] > -0.5
+    found = model.constants
+    assert found["omega_swing"] == pytest.approx(TAU, rel=0.1)
+    assert abs(found["amplitude"][0]) == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_search_is_the_same_however_many_copies_there_are():
+    def searched(n_envs):
+        env = make_vec_env(Tune, n_envs=n_envs, env_kwargs={"noise": 1.0})
+        model = OpenLoop("MlpPolicy", env, seed=4, population_size=6, horizon=10, ranking_share=0.0)
+        model.learn(10 * 6 * 2 * 3)
+        return model.policy.search
+
+    one, three = searched(1), searched(3)
+
+    assert int(one.generation) == int(three.generation) == 3
+    np.testing.assert_array_equal(one.mean, three.mean)
+
+
+def test_all_candidates_of_a_generation_start_from_the_same_resets():
+    seen = []
+
+    class Watched(Tune):
+        def reset(self, *, seed=None, options=None):
+            if seed is not None:
+                seen.append(seed)
+            return super().reset(seed=seed, options=options)
+
+    model = OpenLoop(
+        "MlpPolicy", Watched(), seed=0, population_size=4, n_resets=2, horizon=5, ranking_share=0.0
+    )
+    seen.clear()
+
+    model.learn(5 * 4 * 2 * 2)
+
+    _of_the_model, *of_trials = seen
+    first, second = np.array(of_trials[:16]).reshape(2, 4, 2)
+    assert (first == first[0]).all() and (second == second[0]).all()
+    assert len({*first[0], *second[0]}) == 4
+
+
+class StopAt(BaseCallback):
+    def __init__(self, n: int) -> None:
+        super().__init__()
+        self.n = n
+
+    def _on_step(self) -> bool:
+        return self.num_timesteps < self.n
+
+
+def test_an_interrupted_search_goes_on_after_loading_as_if_nothing_had_happened():
+    settings = {"population_size": 4, "n_resets": 2, "horizon": 5, "ranking_share": 0.0}
+    whole = OpenLoop("MlpPolicy", Tune(noise=1.0), seed=2, **settings).learn(5 * 8 * 4)
+    # In the second generation, in the middle of its fourth episode.
+    part = OpenLoop("MlpPolicy", Tune(noise=1.0), seed=2, **settings)
+    part.learn(5 * 8 * 4, callback=StopAt(5 * 11 + 3))
+
+    rest = OpenLoop.load(saved(part), env=Tune(noise=1.0))
+    known = np.isfinite(rest.policy.search.returns).sum()
+    rest.learn(5 * 8 * 4 - 5 * 11, reset_num_timesteps=False)
+
+    # The steps of the episode that was cut off are made again.
+    assert known == 3 and rest.num_timesteps == whole.num_timesteps + 3
+    assert same(whole.get_parameters(), rest.get_parameters())
+
+
+def test_a_restored_search_asks_for_what_cmaes_itself_would_ask_for():
+    """A sphere, with the library keeping its own state."""
+    from cmaes import CMA
+
+    state = gait_search.begin(np.array([2.0, -1.0, 0.5]), 0.7, 0, 6, 1, 2)
+    own = CMA(mean=state.mean.copy(), sigma=0.7, population_size=6)
+
+    for _ in range(20):
+        points = gait_search.candidates(state)
+        values = -(points**2).sum(axis=1)
+        own.tell([(point, -value) for point, value in zip(points, values, strict=True)])
+        state = gait_search.tell(state._replace(returns=values[:, None]))
+
+        np.testing.assert_allclose(state.mean, own.mean, rtol=1e-9)
+        np.testing.assert_allclose(state.sigma, own._sigma, rtol=1e-9)
+    assert np.linalg.norm(state.mean) < 0.5
+
+
+def test_the_ranking_prefers_what_is_good_on_fresh_resets_to_what_was_lucky():
+    model = OpenLoop("MlpPolicy", Tune(noise=0.2), seed=0, n_resets=1, population_size=4)
+    space = model.gait_space
+    good = Constants(
+        np.array([0.5]),
+        np.array([0.2]),
+        np.zeros(1),
+        np.array(TAU),
+        np.array(TAU),
+        *[np.zeros(1)] * 2,
+    )
+    lucky, honest = np.full(space.dim, 2.0), space.encode(good)
+    found = model.policy.search._replace(
+        mean=lucky,
+        elites=np.stack([lucky, honest, lucky, lucky, lucky]),
+        elite_returns=np.array([100.0, 1.0, -np.inf, -np.inf, -np.inf]),
+    )
+    model.policy.search, model.ranking_share = found, 1.0
+
+    model.learn(40 * 12)
+
+    np.testing.assert_allclose(model.constants["amplitude"], [0.5], atol=1e-6)
+
+
+def test_steps_of_all_copies_count_and_nothing_runs_beyond_the_budget():
+    model = small("openloop", make_vec_env("Pendulum-v1", n_envs=4)).learn(60)
+
+    assert model.num_timesteps == 60
+
+
+def test_a_log_line_has_the_usual_keys_and_those_of_the_search():
+    model = OpenLoop("MlpPolicy", Tune(), seed=0, population_size=2, n_resets=1, ranking_share=0.6)
+    lines = logged(model)
+
+    model.learn(400)
+
+    # Generations of two episodes, then rounds of four finalists.
+    assert lines.column("time/total_timesteps")[:2] == [80, 160]
+    assert lines.column("train/n_updates")[:2] == [1, 2]
+    assert set(lines.column("rollout/ep_len_mean")) == {40.0}
+    for key in ("rollout/ep_rew_mean", "search/mean_return", "search/best_return", "search/sigma"):
+        assert np.isfinite(lines.column(key)).all() and lines.column(key)
+    assert lines.column("search/best_whole_episodes")
+
+
+def test_constants_make_a_round_trip_as_plain_data():
+    model = OpenLoop("MlpPolicy", "Swimmer-v5", seed=0).learn(50)
+
+    other = OpenLoop("MlpPolicy", "Swimmer-v5", seed=1)
+    other.set_constants(**json.loads(json.dumps(model.constants)))
+
+    assert other.constants == model.constants
+
+
+def test_a_search_starts_from_the_constants_that_were_set_and_keeps_them_until_it_ranked():
+    model = OpenLoop("MlpPolicy", "Swimmer-v5", seed=0, frequency=(0.2, 3.0), gain_factor=1.0)
+    model.set_constants(**SWIMMER)
+    at_start = model.gait_space.decode(model.policy.search.mean)
+
+    model.learn(100)
+
+    assert float(at_start.omega_swing) == pytest.approx(TAU * 0.62)
+    assert model.constants["phase"] == SWIMMER["phase"]
+
+
+def test_points_and_gaits_are_two_names_of_the_same():
+    space = GaitSpace(
+        amplitude=np.array([1.0, 2.0]),
+        offset=np.array([[-0.5, 0.5], [0.0, 1.0]]),
+        frequency=(0.5, 4.0),
+        kp=3.0,
+        kd=0.2,
+        gain_factor=4.0,
+    )
+    point = np.random.default_rng(0).normal(size=space.dim)
+    point[4] = 0.3  # turns, from 0 to 1
+
+    np.testing.assert_allclose(space.encode(space.decode(point)), point, atol=1e-5)
+    assert space.dim == 2 + 2 + 1 + 2 + 2
+
+
+def test_the_ablations_of_the_paper_search_fewer_numbers():
+    model = OpenLoop("MlpPolicy", "HalfCheetah-v5", gain_factor=1.0)
+    fewer = OpenLoop(
+        "MlpPolicy", "HalfCheetah-v5", gain_factor=1.0, same_frequency=True, phases=False
+    )
+
+    assert (model.gait_space.dim, fewer.gait_space.dim) == (19, 13)
+    found = fewer.gait_space.decode(np.ones(13))
+    assert found.omega_swing == found.omega_stance and (found.phase == 0.0).all()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"horizon": None}, {"population_size": 1}, {"n_resets": 0}, {"frequency": [2.0, 1.0]},
+     {"gain_factor": 0.5}, {"control": "maybe"}, {"kp": -1.0}, {"dt": 0.0}, {"amplitude": 0.0}],
+    ids=str,
+)  # fmt: skip
+def test_an_argument_out_of_range_is_named_with_its_range(settings):
+    [(name, value)] = settings.items()
+    if value is None:
+        assert small("openloop", **settings).horizon is None
+        return
+    with pytest.raises(ValueError, match=rf"OpenLoop\({name}=.*: {name} must be"):
+        small("openloop", **settings)
+
+
+def test_constants_of_another_body_are_refused():
+    model = OpenLoop("MlpPolicy", "Swimmer-v5")
+
+    with pytest.raises(ParameterError, match="amplitude must be one number, or one for each of"):
+        model.set_constants(amplitude=[1.0, 2.0, 3.0], omega_swing=1.0, omega_stance=1.0)
+    with pytest.raises(ParameterError, match="omega_swing must be finite and above 0"):
+        model.set_constants(omega_swing=0.0, omega_stance=1.0)
+
+
+def test_observations_that_are_normalised_do_not_show_joints_and_are_refused():
+    env = make_vec_env("Swimmer-v5")
+
+    with pytest.raises(ValueError, match="norm_obs=False"):
+        OpenLoop("MlpPolicy", VecNormalize(env))
+    assert OpenLoop("MlpPolicy", VecNormalize(env, norm_obs=False), horizon=5).learn(20)
+
+
+def test_returns_are_judged_in_the_rewards_of_the_environment():
+    env = VecNormalize(make_vec_env(Tune), norm_obs=False)
+    settings = {"seed": 0, "population_size": 4, "n_resets": 1, "ranking_share": 0.0}
+
+    scaled = OpenLoop("MlpPolicy", env, **settings).learn(40 * 8)
+    raw = OpenLoop("MlpPolicy", Tune(), **settings).learn(40 * 8)
+
+    np.testing.assert_allclose(
+        scaled.policy.search.elite_returns, raw.policy.search.elite_returns, rtol=1e-5
+    )
+
+
+@pytest.mark.parametrize("kind", ["frames", "twin"])
+def test_where_single_copies_cannot_be_reset_whole_episodes_are_run(kind):
+    frames = VecFrameStack(make_vec_env(Tune, n_envs=2), 2)
+    env = frames if kind == "frames" else TwinVecEnv(twins.make("Pendulum-v1"), n_envs=2)
+    steps = 40 if kind == "frames" else 200
+    model = OpenLoop("MlpPolicy", env, seed=0, population_size=2, n_resets=1, horizon=3)
+
+    model.learn(2 * steps + 2)
+
+    assert int(model.policy.search.generation) == 1
+    assert model.num_timesteps == 2 * steps + 2
+
+
+def test_a_reward_that_is_not_finite_is_an_error_and_no_result():
+    class Broken(Tune):
+        def step(self, action):
+            obs, reward, *rest = super().step(action)
+            return obs, float("nan") if self.k == 7 else reward, *rest
+
+    model = OpenLoop("MlpPolicy", Broken(), seed=0)
+
+    with pytest.raises(ValueError, match="not finite"):
+        model.learn(100)
+    assert not np.isfinite(model.policy.search.returns).any()
