@@ -31,3 +31,7 @@ class RewardError(SB3HDSError, ValueError):
 
 class EnvironmentMismatchError(SB3HDSError, ValueError):
     """An environment, as wrapped, is not what its twin simulates."""
+
+
+class SafetyError(SB3HDSError, RuntimeError):
+    """A safety layer cannot keep what it promises: what it assumes does not hold."""

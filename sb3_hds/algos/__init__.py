@@ -3,6 +3,7 @@
 from sb3_hds.algos.bro import BRO
 from sb3_hds.algos.crossq import CrossQ
 from sb3_hds.algos.droq import DroQ
+from sb3_hds.algos.executed_actions import ExecutedDictReplayBuffer, ExecutedReplayBuffer
 from sb3_hds.algos.gaussian_policy import GaussianPolicy
 from sb3_hds.algos.gsde_sac import GSDESAC
 from sb3_hds.algos.hds import HDS
@@ -35,6 +36,8 @@ __all__ = [
     "TQC",
     "CrossQ",
     "DroQ",
+    "ExecutedDictReplayBuffer",
+    "ExecutedReplayBuffer",
     "GaussianPolicy",
     "SimbaSAC",
     "TwinPolicy",

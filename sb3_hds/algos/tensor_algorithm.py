@@ -13,6 +13,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_hds.algos.call_forms import check_origin, device_or_cpu
+from sb3_hds.algos.executed_actions import executed
 from sb3_hds.algos.persistence import TensorPolicy, damage_reported, write_whole
 
 
@@ -20,6 +21,8 @@ class TensorAlgorithm(OffPolicyAlgorithmJax):
     """Abstract: an off-policy algorithm whose policy is a :class:`TensorPolicy`."""
 
     default_timesteps: ClassVar[int] = 1_000
+    #: whether a layer around the environment may decide that executed actions are stored
+    stores_executed: ClassVar[bool] = True
     policy: TensorPolicy
     saved_by: str
 
@@ -74,6 +77,8 @@ class TensorAlgorithm(OffPolicyAlgorithmJax):
                 f"{new_obs}, reward {reward}. The model and the steps before are as they were: "
                 "mend the sensor, then learn(..., reset_num_timesteps=False)."
             )
+        if self.stores_executed:
+            buffer_action = executed(self.action_space, buffer_action, infos)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
 
     def save(
