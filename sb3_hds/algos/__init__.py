@@ -11,6 +11,7 @@ from sb3_hds.algos.pods import PODS
 from sb3_hds.algos.simba import SimbaSAC
 from sb3_hds.algos.td7 import TD7
 from sb3_hds.algos.tqc import TQC
+from sb3_hds.algos.train_beside import TrainBeside
 from sb3_hds.algos.twin_policy import TwinPolicy
 
 #: every algorithm by its id in the zoo: listed here, it is tested, registered and documented
@@ -40,5 +41,6 @@ __all__ = [
     "ExecutedReplayBuffer",
     "GaussianPolicy",
     "SimbaSAC",
+    "TrainBeside",
     "TwinPolicy",
 ]

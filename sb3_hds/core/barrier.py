@@ -100,20 +100,20 @@ class Barrier(StatefulTransform):
         q, step = self.positions(obs), self.gain * self.dt
         slowest = (self.share * (_like(q, self.low) - q) + self.tolerance) / step
         fastest = (self.share * (_like(q, self.high) - q) - self.tolerance) / step
-        wanted = clipped(action, below)
-        safe = list(wanted)
-        for place, i in enumerate(self.action):
-            safe[i] = wanted[i].clip(slowest[place], fastest[place])
-        return clipped(namespace(action).stack(safe), below), memory
+        # Which joint is behind each command; the last entry stands for none.
+        joints = [self.action.index(i) if i in self.action else -1 for i in range(len(action))]
+        free = _like(q, [math.inf])
+        concatenate, order = namespace(q).concatenate, np.array(joints)
+        lower, upper = concatenate([slowest, -free])[order], concatenate([fastest, free])[order]
+        return clipped(clipped(action, below).clip(lower, upper), below), memory
 
     def positions(self, obs: Float[Any, " obs"]) -> Float[Any, " joints"]:
         """:return: the positions of the guarded joints [rad] or [m]"""
+        first, last = np.array([(_indices(p)[0], _indices(p)[-1]) for p in self.position]).T
+        if np.all(first == last):
+            return obs[first]
         xp = namespace(obs)
-        found = [
-            obs[place[0]] if len(place) == 1 else xp.arctan2(obs[place[1]], obs[place[0]])
-            for place in map(_indices, self.position)
-        ]
-        return xp.stack(found)
+        return xp.where(first == last, obs[first], xp.arctan2(obs[last], obs[first]))
 
     def violation(self, obs: Float[Any, " obs"]) -> Any:
         """:return: by how much the guarded joints are beyond their limits, summed"""

@@ -7,6 +7,7 @@ from sb3_hds.wrappers.history import HistoryObservation
 from sb3_hds.wrappers.low_pass import LowPassAction
 from sb3_hds.wrappers.manual_reset import ManualReset
 from sb3_hds.wrappers.rate_limit import ActionRateLimit
+from sb3_hds.wrappers.real_time import RealTime, Timing
 from sb3_hds.wrappers.record import Record
 from sb3_hds.wrappers.scale import ActionScale
 from sb3_hds.wrappers.shared_control import Phase, SharedControlTemplate
@@ -23,6 +24,8 @@ __all__ = [
     "LowPassAction",
     "ManualReset",
     "Phase",
+    "RealTime",
     "Record",
     "SharedControlTemplate",
+    "Timing",
 ]

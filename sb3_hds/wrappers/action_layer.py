@@ -25,8 +25,10 @@ class ActionLayer(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs, abc.
     - ``safe_action``: what the environment was told, after the innermost layer
     - ``correction``: the sum of what each layer changed, in command units
     - ``constraint_cost``: the sum of what each layer found violated, 0 where nothing is
-    - ``stored_action``: what a learner should store instead of what it chose, in the units of the
-      outermost layer's action space; only where that layer has ``store="executed"``
+    - ``executed_action``: the action that would have been executed unchanged, in the units of the
+      outermost layer's action space; what the policy chose, where a layer has no such action
+    - ``stored_action``: the same, where the outermost layer has ``store="executed"``: what a
+      learner should store instead of what it chose
 
     :param env: its actions are a bounded Box with one axis
     :param store: ``"raw"``, or ``"executed"``
@@ -136,9 +138,13 @@ class ActionLayer(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs, abc.
             "correction": correction,
             "constraint_cost": self.cost() + below.get("constraint_cost", 0.0),
         }
-        stored = info.pop("stored_action", command)
+        info.pop("stored_action", None)
+        executed = raw
+        if "executed" in self.stores:
+            executed = self.meant_by(below.get("executed_action", command))
+        info["executed_action"] = executed.astype(self.action_space.dtype)
         if self.store == "executed":
-            info["stored_action"] = self.meant_by(stored).astype(self.action_space.dtype)
+            info["stored_action"] = info["executed_action"]
         return info | self.told()
 
 

@@ -87,7 +87,7 @@ class JointLimitBarrier(TransformLayer):
             low=lows.tolist(),
             high=highs.tolist(),
             position=position,
-            action=range(n) if action is None else action,
+            action=list(range(n)) if action is None else action,
             gain=float(gain),
             share=float(share),
             tolerance=float(tolerance),
