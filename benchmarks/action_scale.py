@@ -22,7 +22,7 @@ from runs import CACHE, RESULTS, fresh_process, resume
 SCALES = (0.4, 0.7, 1.0, "schedule")
 #: from 0.4 of the range to the whole over two thirds of the steps
 SCHEDULE_SHARE = 2.0 / 3.0
-N_EVALUATIONS = 10
+N_EVALUATIONS = 6
 
 _DT = 0.1  # [s]
 _STEPS = 200
@@ -124,7 +124,7 @@ def learn(scale: str, seed: int, steps: int) -> list[dict]:
         wrapped(),
         learning_starts=500,
         train_freq=50,
-        gradient_steps=50,
+        gradient_steps=25,
         batch_size=128,
         policy_delay=3,
         policy_kwargs={"net_arch": {"pi": [64, 64], "qf": [128, 128]}},
