@@ -35,3 +35,7 @@ class EnvironmentMismatchError(SB3HDSError, ValueError, AssertionError):
 
     It is an ``AssertionError``, too, because that is what SB3 raises for spaces that do not fit.
     """
+
+
+class SafetyError(SB3HDSError, RuntimeError):
+    """A safety layer cannot keep what it promises: what it assumes does not hold."""

@@ -3,6 +3,7 @@
 import ast
 import csv
 import inspect
+import pydoc
 import re
 import shlex
 import subprocess
@@ -119,7 +120,11 @@ def test_the_commands_of_a_page_exist_and_have_the_options_shown(page):
 def test_the_hyperparameters_of_a_page_are_arguments_of_the_algorithms(page):
     for block in blocks(page, "yaml"):
         for entry in yaml.safe_load(block).values():
-            own = {"n_timesteps", "n_envs", "normalize"}  # of the zoo itself
+            own = {"n_timesteps", "n_envs", "normalize", "env_wrapper"}  # of the zoo itself
+            for wrapper in entry.get("env_wrapper", ()):
+                [(path, arguments)] = wrapper.items()
+                made = pydoc.locate(path)
+                assert set(arguments) <= set(inspect.signature(made).parameters)
             assert set(entry) - own <= set(inspect.signature(HDS).parameters)
 
 

@@ -38,6 +38,8 @@ LIBRARIES = {
     "sysid": SOLVERS | TABLES | {"scipy", "jinja2"},
     "envs": STEPPING | {"mujoco"},
     "wrappers": STEPPING,
+    "wrappers/low_pass.py": {"scipy"},
+    "wrappers/projection.py": {"daqp"},
     "algos": LEARNING,
     "deploy": LEARNING | {"onnx", "onnxruntime"},
     "experiments": LEARNING | TABLES | {"scipy"},

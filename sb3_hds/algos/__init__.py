@@ -4,6 +4,7 @@ from sb3_hds.algos.bro import BRO
 from sb3_hds.algos.compiled import Episodes, learn_compiled
 from sb3_hds.algos.crossq import CrossQ
 from sb3_hds.algos.droq import DroQ
+from sb3_hds.algos.executed_actions import ExecutedDictReplayBuffer, ExecutedReplayBuffer
 from sb3_hds.algos.gaussian_policy import GaussianPolicy
 from sb3_hds.algos.gsde_sac import GSDESAC
 from sb3_hds.algos.hds import HDS
@@ -14,6 +15,7 @@ from sb3_hds.algos.policy_file import load_policy
 from sb3_hds.algos.simba import SimbaSAC
 from sb3_hds.algos.td7 import TD7
 from sb3_hds.algos.tqc import TQC
+from sb3_hds.algos.train_beside import TrainBeside
 from sb3_hds.algos.twin_policy import TwinPolicy
 
 #: every algorithm by its id in the zoo: listed here, it is tested, registered and documented
@@ -41,10 +43,13 @@ __all__ = [
     "CrossQ",
     "DroQ",
     "Episodes",
+    "ExecutedDictReplayBuffer",
+    "ExecutedReplayBuffer",
     "GaussianPolicy",
     "OpenLoop",
     "OscillatorPolicy",
     "SimbaSAC",
+    "TrainBeside",
     "TwinPolicy",
     "learn_compiled",
     "load_policy",

@@ -11,6 +11,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_hds.algos.call_forms import check_origin
+from sb3_hds.algos.executed_actions import executed
 from sb3_hds.algos.persistence import TensorPolicy, write_whole
 from sb3_hds.algos.saving import SavesTensors
 
@@ -19,6 +20,8 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
     """Abstract: an off-policy algorithm whose policy is a :class:`TensorPolicy`."""
 
     default_timesteps: ClassVar[int] = 1_000
+    #: whether a layer around the environment may decide that executed actions are stored
+    stores_executed: ClassVar[bool] = True
     policy: TensorPolicy
     saved_by: str
 
@@ -96,6 +99,8 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
                 f"{new_obs}, reward {reward}. The model and the steps before are as they were: "
                 "mend the sensor, then learn(..., reset_num_timesteps=False)."
             )
+        if self.stores_executed:
+            buffer_action = executed(self.action_space, buffer_action, infos)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:

@@ -64,6 +64,8 @@ class TwinAlgorithm(TensorAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": TwinPolicy}
     policy: TwinPolicy
+    #: the twin contains the layers: it has to be told what they were told
+    stores_executed: ClassVar[bool] = False
 
     def __init__(
         self,

@@ -1,6 +1,8 @@
 """The pure JAX core: parameters, effects, twins and data."""
 
 from sb3_hds.core.analytic import AnalyticTwin
+from sb3_hds.core.barrier import Barrier
+from sb3_hds.core.continuity import Continuity
 from sb3_hds.core.effect import (
     NO_EFFECTS,
     ActionEffect,
@@ -13,11 +15,14 @@ from sb3_hds.core.effect import (
     SensorEffect,
 )
 from sb3_hds.core.extended import ExtendedTwin
+from sb3_hds.core.filters import Delay, LowPass, RateLimit, Scale
+from sb3_hds.core.history import History
 from sb3_hds.core.integrators import explicit_euler, rk4, semi_implicit_euler
 from sb3_hds.core.linear import solve_spd
 from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.rollout import Rollout, rollout, rollout_policy
 from sb3_hds.core.signals import Actuator, Channel, Joint
+from sb3_hds.core.stateful import Signals, StatefulTransform
 from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.core.transform import (
     TRANSFORMS,
@@ -52,16 +57,21 @@ __all__ = [
     "ActionTransform",
     "Actuator",
     "AnalyticTwin",
+    "Barrier",
     "Channel",
+    "Continuity",
+    "Delay",
     "Effect",
     "EffectChain",
     "ExtendedTwin",
     "Flag",
     "Force",
     "ForceEffect",
+    "History",
     "Joint",
     "JointEffect",
     "JointMoment",
+    "LowPass",
     "MassMatrix",
     "Memory",
     "Moment",
@@ -70,12 +80,16 @@ __all__ = [
     "Parameter",
     "Params",
     "Position",
+    "RateLimit",
     "RescaleAction",
     "RescaleObservation",
     "Rollout",
     "Scalar",
+    "Scale",
     "SensorEffect",
+    "Signals",
     "State",
+    "StatefulTransform",
     "Tangent",
     "Trajectories",
     "TransformedTwin",

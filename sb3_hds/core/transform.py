@@ -10,7 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sb3_hds.core.barrier import Barrier
+from sb3_hds.core.continuity import Continuity
+from sb3_hds.core.filters import Delay, LowPass, RateLimit, Scale
+from sb3_hds.core.history import History
 from sb3_hds.core.signals import Actuator, Channel
+from sb3_hds.core.stateful import StatefulTransform
 from sb3_hds.errors import ParameterError
 
 
@@ -142,10 +147,20 @@ class RescaleObservation(ObservationTransform):
         return _affine(obs, low, high, *_limits(below))
 
 
-Transform = ObservationTransform | ActionTransform
+Transform = ObservationTransform | ActionTransform | StatefulTransform
 
 #: The transforms that can be rebuilt from saved data without naming their classes.
-TRANSFORMS: tuple[type[Transform], ...] = (RescaleAction, RescaleObservation)
+TRANSFORMS: tuple[type[Transform], ...] = (
+    RescaleAction,
+    RescaleObservation,
+    RateLimit,
+    LowPass,
+    Delay,
+    Scale,
+    History,
+    Barrier,
+    Continuity,
+)
 
 
 def transform_to_spec(transform: Transform) -> dict[str, Any]:
@@ -172,7 +187,7 @@ def transform_from_spec(
     return by_name[spec["transform"]](**fields)
 
 
-def _store_bounds(transform: Transform, low: Any, high: Any) -> None:
+def _store_bounds(transform: RescaleAction | RescaleObservation, low: Any, high: Any) -> None:
     """Keep bounds as hashable plain data: a float, or a tuple of floats."""
     low, high = np.asarray(low, float), np.asarray(high, float)
     for name, value in (("low", low), ("high", high)):

@@ -3,9 +3,11 @@
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.core.effect import NO_EFFECTS, Effect, EffectChain
+from sb3_hds.core.stateful import Signals, StatefulTransform
 from sb3_hds.core.transform import (
     TRANSFORMS,
     ActionTransform,
@@ -15,13 +17,14 @@ from sb3_hds.core.transform import (
     transform_to_spec,
 )
 from sb3_hds.core.twin import State, Twin
-from sb3_hds.core.types import Action, Flag, Obs, Params, Scalar, Tangent
+from sb3_hds.core.types import Action, Flag, Memory, Obs, Params, Scalar, Tangent
+from sb3_hds.errors import ParameterError
 
 
 class TransformedTwin(Twin):
     """
-    A twin whose observations or actions pass through a wrapper. States, parameters and rewards are
-    those of the twin below.
+    A twin whose observations or actions pass through a wrapper. Parameters, states and rewards are
+    those of the twin below, but for what a stateful wrapper remembers and charges.
 
     Effects belong to the plant: :meth:`extend` attaches them to the twin below the wrapper, where
     commands and measurements have their physical units.
@@ -29,7 +32,9 @@ class TransformedTwin(Twin):
     :param base: the twin below
     :param observation: what happens to observations; None leaves them
     :param action: what happens to actions; None leaves them
-    :raises ParameterError: if a transform does not fit the twin below
+    :param stateful: what happens to both, with a memory or with an eye on the observation; instead
+        of the other two
+    :raises ParameterError: if a transform does not fit the twin below, or comes with another
     """
 
     def __init__(
@@ -38,36 +43,55 @@ class TransformedTwin(Twin):
         *,
         observation: ObservationTransform | None = None,
         action: ActionTransform | None = None,
+        stateful: StatefulTransform | None = None,
     ) -> None:
+        if stateful is not None and (observation is not None or action is not None):
+            raise ParameterError(
+                f"{type(stateful).__name__} is a wrapper of its own: put one TransformedTwin into "
+                "another instead of passing several transforms."
+            )
         self.base, self.observation, self.action = base, observation, action
+        self.stateful = stateful
         self._mirror(base)
+        if stateful is not None:
+            self._below = Signals(base.actuators, base.channels)
+            self._key = f"{stateful.name} at {_depth(base)}"
+            self.channels = stateful.channels(self._below)
+            self.actuators = stateful.actuators(self._below)
         if observation is not None:
             self.channels = observation.channels(base.channels)
         if action is not None:
             self.actuators = action.actuators(base.actuators)
 
     def extend(self, *effects: Effect) -> "TransformedTwin":
-        base = self._base_with_values().extend(*effects)
-        return TransformedTwin(base, observation=self.observation, action=self.action)
+        return self._around(self._base_with_values().extend(*effects))
 
     def without(self, *keys: str) -> "TransformedTwin":
-        base = self._base_with_values().without(*keys)
-        return TransformedTwin(base, observation=self.observation, action=self.action)
+        return self._around(self._base_with_values().without(*keys))
 
     def at_interval(self, dt: float, substeps: int) -> "TransformedTwin":
-        base = self._base_with_values().at_interval(dt, substeps)
-        return TransformedTwin(base, observation=self.observation, action=self.action)
+        return self._around(self._base_with_values().at_interval(dt, substeps))
 
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
-        return self.base.initial(key, params)
+        state = self.base.initial(key, params)
+        if self.stateful is None:
+            return state
+        obs = self.base.observe(state, params)
+        drawn = self.stateful.draw(jax.random.fold_in(key, 1), obs, self._below)
+        return self._remembering(state, drawn)
 
     def infer(self, obs: Obs, params: Params) -> State:
+        if self.stateful is not None:
+            inside, memory = self.stateful.infer(obs, self._below)
+            return self._remembering(self.base.infer(inside, params), memory)
         if self.observation is not None:
             obs = self.observation.invert(obs, self.base.channels)
         return self.base.infer(obs, params)
 
     def observe(self, state: State, params: Params) -> Obs:
         obs = self.base.observe(state, params)
+        if self.stateful is not None:
+            return self.stateful.observe(obs, state.memory[self._key])
         if self.observation is not None:
             obs = self.observation.observe(obs, self.base.channels)
         return obs
@@ -75,15 +99,24 @@ class TransformedTwin(Twin):
     def step(
         self, state: State, action: Action, params: Params, effects: EffectChain = NO_EFFECTS
     ) -> State:
-        return self.base.step(state, self.command(action), params, effects)
+        command, memory = self._act(state, action, params)
+        if self.stateful is None:
+            return self.base.step(state, command, params, effects)
+        inside = {key: own for key, own in state.memory.items() if key != self._key}
+        after = self.base.step(state._replace(memory=inside), command, params, effects)
+        return self._remembering(after, memory)
 
     def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        return self.base.reward(state, self.command(action), next_state, params)
+        command = self.command(state, action, params)
+        reward = self.base.reward(state, command, next_state, params)
+        return reward - self._cost(state, action, params)
 
     def planning_reward(
         self, state: State, action: Action, next_state: State, params: Params
     ) -> Scalar:
-        return self.base.planning_reward(state, self.command(action), next_state, params)
+        command = self.command(state, action, params)
+        reward = self.base.planning_reward(state, command, next_state, params)
+        return reward - self._cost(state, action, params)
 
     def terminated(self, state: State, params: Params) -> Flag:
         return self.base.terminated(state, params)
@@ -99,21 +132,45 @@ class TransformedTwin(Twin):
 
     def to_spec(self) -> dict[str, Any]:
         spec = self._base_with_values().to_spec()
-        parts = (part for part in (self.observation, self.action) if part is not None)
-        layer = [transform_to_spec(part) for part in parts]
+        layer = [transform_to_spec(part) for part in self._parts()]
         return spec | {"transforms": [*spec.get("transforms", ()), layer]}
 
     def structure(self) -> tuple[Any, ...]:
-        return (type(self), self.base, self.observation, self.action)
+        return (type(self), self.base, self.observation, self.action, self.stateful)
 
     def __repr__(self) -> str:
-        parts = (self._base_with_values(), self.observation, self.action)
-        inside = ", ".join(repr(part) for part in parts if part is not None)
+        inside = ", ".join(map(repr, (self._base_with_values(), *self._parts())))
         return f"{type(self).__name__}({inside})"
 
-    def command(self, action: Action) -> Action:
+    def command(self, state: State, action: Action, params: Params) -> Action:
         """:return: what the twin below is told"""
-        return action if self.action is None else self.action.apply(action, self.base.actuators)
+        return self._act(state, action, params)[0]
+
+    def _act(self, state: State, action: Action, params: Params) -> tuple[Action, Memory]:
+        if self.stateful is not None:
+            obs = self.base.observe(state, params)
+            return self.stateful.act(action, obs, state.memory[self._key], self._below)
+        if self.action is not None:
+            action = self.action.apply(action, self.base.actuators)
+        return action, ()
+
+    def _cost(self, state: State, action: Action, params: Params) -> Scalar | float:
+        if self.stateful is None:
+            return 0.0
+        obs = self.base.observe(state, params)
+        return self.stateful.cost(action, obs, state.memory[self._key], self._below)
+
+    def _remembering(self, state: State, memory: Memory) -> State:
+        return state._replace(memory=state.memory | {self._key: memory})
+
+    def _parts(self) -> list[Transform]:
+        parts = (self.observation, self.action, self.stateful)
+        return [part for part in parts if part is not None]
+
+    def _around(self, base: Twin) -> "TransformedTwin":
+        return TransformedTwin(
+            base, observation=self.observation, action=self.action, stateful=self.stateful
+        )
 
     def _base_with_values(self) -> Twin:
         return self.base.with_parameters(**self.values).with_tensors(self.tensors)
@@ -133,11 +190,19 @@ def seen_through(
     :raises ParameterError: if a transform is not among them, or does not fit the twin below
     """
     for layer in layers:
-        observation, action = None, None
-        for transform in (transform_from_spec(part, known) for part in layer):
-            if isinstance(transform, ObservationTransform):
-                observation = transform
-            else:
-                action = transform
-        base = TransformedTwin(base, observation=observation, action=action)
+        parts = (transform_from_spec(part, known) for part in layer)
+        placed: dict[str, Any] = {_place_of(part): part for part in parts}
+        base = TransformedTwin(base, **placed)
     return base
+
+
+def _place_of(transform: Transform) -> str:
+    """The argument that a transform is passed as."""
+    if isinstance(transform, StatefulTransform):
+        return "stateful"
+    return "observation" if isinstance(transform, ObservationTransform) else "action"
+
+
+def _depth(base: Twin) -> int:
+    """Wrappers around the plant so far, which tells memories of one kind apart."""
+    return 1 + _depth(base.base) if isinstance(base, TransformedTwin) else 0

@@ -1,13 +1,15 @@
 """
 Which twin mirrors an environment, however that is vectorised and wrapped.
 
-Wrappers known to leave observations, actions and rewards alone are looked through. All others are
-refused by name: planning in a twin of what lies below them would be silently wrong.
+Wrappers known to leave observations, actions and rewards alone are looked through. Those that tell
+what they do, by a ``twin_transform``, are put around the twin. All others are refused by name:
+planning in a twin of what lies below them would be silently wrong.
 """
 
+import contextlib
 import dataclasses
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import gymnasium
 import numpy as np
@@ -23,7 +25,7 @@ from stable_baselines3.common.vec_env import (
     VecVideoRecorder,
 )
 
-from sb3_hds.core import Twin
+from sb3_hds.core import StatefulTransform, TransformedTwin, Twin
 from sb3_hds.envs.twin_env import TwinEnv
 from sb3_hds.envs.twin_vec_env import TwinVecEnv
 from sb3_hds.errors import EnvironmentMismatchError, NoTwinError
@@ -129,48 +131,92 @@ def _without_vec_wrappers(env: VecEnv) -> VecEnv:
 
 
 def _twin_of_one(env: gymnasium.Env) -> Twin:
-    layer = env
+    layer, transforms = env, []
     while isinstance(layer, gymnasium.Wrapper):
-        _refuse_unless_neutral(type(layer).__name__, type(layer).__module__)
+        transform = getattr(layer, "twin_transform", None)
+        if isinstance(transform, StatefulTransform):
+            transforms.append(transform)
+        else:
+            _refuse_unless_neutral(type(layer).__name__, type(layer).__module__)
         layer = layer.env
     _action_limits(env.action_space)
-    return layer.twin if isinstance(layer, TwinEnv) else registry.from_env(layer)
+    twin = layer.twin if isinstance(layer, TwinEnv) else registry.from_env(layer)
+    return _behind(twin, transforms)
+
+
+def _behind(twin: Twin, transforms: Iterable[StatefulTransform]) -> Twin:
+    """:return: the twin as seen through wrappers, the outermost first"""
+    for transform in reversed(list(transforms)):
+        twin = TransformedTwin(twin, stateful=transform)
+    return twin
 
 
 def _twins_of_copies(env: VecEnv) -> list[Twin]:
     """The twin of each copy in this process (``DummyVecEnv``) or another (``SubprocVecEnv``)."""
     if isinstance(env, DummyVecEnv):
         return [_twin_of_one(copy) for copy in env.envs]
-    specs = _specs_of(env)
+    layers = _layers_of(env)
+    specs = _specs_of(env, {name for copy in layers for name, _ in copy})
     _action_limits(env.action_space)
     own = env.get_attr("twin") if env.has_attr("twin") else []
-    if own and all(isinstance(twin, Twin) for twin in own):
-        return own
-    return [_twin_of_spec(spec) for spec in specs]
+    bare = own if own and all(isinstance(t, Twin) for t in own) else map(_twin_of_spec, specs)
+    return [
+        _behind(twin, (transform for _, transform in copy))
+        for twin, copy in zip(bare, layers, strict=True)
+    ]
 
 
-def _specs_of(env: VecEnv) -> list[EnvSpec | None]:
+def _layers_of(env: VecEnv) -> list[list[tuple[str, StatefulTransform]]]:
     """
-    How the copies in other processes were made.
+    The wrappers of each copy in another process that tell what they do, the outermost first.
 
-    :raises EnvironmentMismatchError: for a wrapper not known to be neutral
+    :raises EnvironmentMismatchError: for a wrapper neither neutral nor among them
+    :raises NoTwinError: if the copies do not tell how they are wrapped
+    """
+    with _telling(env):
+        named = [_wrappers_in(text) for text in env.env_method("__str__")]
+        if not env.has_attr("twin_transforms"):
+            told: list[list[tuple[str, StatefulTransform]]] = [[] for _ in named]
+        else:
+            told = env.get_attr("twin_transforms")
+    for names, layers in zip(named, told, strict=True):
+        left = iter([name for name, _ in layers] + [None])
+        following = next(left)
+        for name in names:
+            if name == following:
+                following = next(left)
+            else:
+                _refuse_unless_neutral(name)
+    return told
+
+
+def _specs_of(env: VecEnv, told: set[str]) -> list[EnvSpec | None]:
+    """
+    How the copies in other processes were made. Ask for :func:`_layers_of` before: a spec holds the
+    arguments of wrappers, and sending a lambda kills the process.
+
+    :param told: names of wrappers that tell what they do
+    :raises EnvironmentMismatchError: for another wrapper that is not neutral
     :raises NoTwinError: if they do not tell
     """
-    try:
-        for text in env.env_method("__str__"):
-            for name in _wrappers_in(text):
-                _refuse_unless_neutral(name)
-        # Only now: a spec holds the arguments of wrappers, and sending a lambda kills the process.
+    with _telling(env):
         specs = env.get_attr("spec")
+    for spec in specs:
+        for wrapper in spec.additional_wrappers if spec is not None else ():
+            if wrapper.name not in told:
+                _refuse_unless_neutral(wrapper.name, wrapper.entry_point)
+    return specs
+
+
+@contextlib.contextmanager
+def _telling(env: VecEnv) -> Iterator[None]:
+    try:
+        yield
     except (AttributeError, NotImplementedError, EOFError, ConnectionError) as error:
         raise NoTwinError(
             f"{type(env).__name__} does not tell how its environments were made ({error!r}). "
             "Pass twin=."
         ) from error
-    for spec in specs:
-        for wrapper in spec.additional_wrappers if spec is not None else ():
-            _refuse_unless_neutral(wrapper.name, wrapper.entry_point)
-    return specs
 
 
 def _wrappers_in(text: str) -> list[str]:

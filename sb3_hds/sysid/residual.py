@@ -191,10 +191,11 @@ def _with_force(
     return twin, found[0]
 
 
-def _command(twin: Twin, action: Array) -> Array:
+def _command(twin: Twin, state: State, action: Array, params: dict[str, Any]) -> Array:
     """What the plant is told, below the wrappers."""
     while hasattr(twin, "base"):
-        action = twin.command(action) if isinstance(twin, TransformedTwin) else action
+        if isinstance(twin, TransformedTwin):
+            action = twin.command(state, action, params)
         twin = twin.base  # type: ignore[attr-defined]
     return action
 
@@ -218,7 +219,7 @@ def _seen(twin: Twin, shots: Shots) -> tuple[Array, Array, Array]:
 
     def one(obs: Array, action: Array) -> tuple[Array, Array, Array]:
         state: State = twin.infer(obs, params)
-        return state.q, state.v, plant.actuate(state, _command(twin, action), params)
+        return state.q, state.v, plant.actuate(state, _command(twin, state, action, params), params)
 
     obs = jnp.asarray(shots.obs[:, :-1], jnp.float32)
     return jax.vmap(jax.vmap(one))(obs, jnp.asarray(shots.actions, jnp.float32))

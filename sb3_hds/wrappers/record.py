@@ -1,6 +1,5 @@
 """Recording whatever an environment does, a robot's included."""
 
-import numbers
 import os
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -11,6 +10,7 @@ from gymnasium import spaces
 
 from sb3_hds.data.recording import Recorder
 from sb3_hds.errors import TrajectoryError
+from sb3_hds.wrappers.interval import interval_of
 
 
 class Record(gymnasium.Wrapper):
@@ -49,7 +49,7 @@ class Record(gymnasium.Wrapper):
         super().__init__(env)
         self.recorder = Recorder(
             path,
-            _interval(env) if dt is None else dt,
+            interval_of(env, TrajectoryError) if dt is None else dt,
             obs=_names("obs", env.observation_space, obs_names),
             actions=_names("action", env.action_space, action_names),
             condition=condition,
@@ -72,17 +72,6 @@ class Record(gymnasium.Wrapper):
     def close(self) -> None:
         self.recorder.close()
         super().close()
-
-
-def _interval(env: gymnasium.Env) -> float:
-    inner = env.unwrapped
-    for owner in (inner, getattr(inner, "twin", None)):
-        for name in ("dt", "tau"):
-            if isinstance(value := getattr(owner, name, None), numbers.Real):
-                return float(value)
-    raise TrajectoryError(
-        f"{inner} does not say how long a step is: it has no attribute dt. Pass dt=SECONDS."
-    )
 
 
 def _names(kind: str, space: spaces.Space, names: Sequence[str] | None) -> Sequence[str]:

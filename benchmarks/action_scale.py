@@ -1,0 +1,187 @@
+"""
+A small range of actions learns faster, a large one ends better: a car on an oval.
+
+    python benchmarks/action_scale.py [--seeds 5] [--steps 6000] [--figure]
+
+Raffin reports it for the steering range of a racing car (*Learning to race in an hour*, 2022).
+Here, ``ActionScale`` shrinks the range of steering and target speed of a car that understeers,
+around straight ahead at 7 m/s. An episode ends after 20 s or off the track; its return is the
+distance covered [m]. The learner is CrossQ with the same settings for all; the policy's mean is
+evaluated for three episodes.
+"""
+
+import argparse
+import json
+import math
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from runs import CACHE, RESULTS, fresh_process, resume
+
+SCALES = (0.4, 0.7, 1.0, "schedule")
+#: from 0.4 of the range to the whole over two thirds of the steps
+SCHEDULE_SHARE = 2.0 / 3.0
+N_EVALUATIONS = 6
+
+_DT = 0.1  # [s]
+_STEPS = 200
+_STRAIGHT, _RADIUS, _HALF_WIDTH = 30.0, 8.0, 2.0  # [m]
+_WHEELBASE = 1.0  # [m]
+_UNDERSTEER = 0.01  # [s2/m2]
+_STEERING = 0.5  # [rad]
+_SPEEDS = 2.0, 12.0  # [m/s]
+_ACCELERATION = 6.0  # [m/s2]
+_SIGHT = (0.0, 3.0, 6.0, 12.0)  # [m]
+
+
+class Oval(gymnasium.Env):
+    """
+    A car in the coordinates of the middle line of an oval: place along it, distance to its left,
+    heading against it. Kinematic, with a yaw rate that understeer takes away at speed:
+
+    ``yaw rate = v tan(steering) / (L (1 + K v^2))``
+    """
+
+    dt = _DT
+
+    def __init__(self) -> None:
+        self.observation_space = spaces.Box(-5.0, 5.0, (3 + len(_SIGHT),))
+        self.action_space = spaces.Box(-1.0, 1.0, (2,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        place = self.np_random.uniform(0.0, _length())
+        offset, heading = self.np_random.uniform(-0.5, 0.5), self.np_random.uniform(-0.1, 0.1)
+        self.state, self.n_steps = (place, offset, heading, float(np.mean(_SPEEDS))), 0
+        return self._observe(), {}
+
+    def step(self, action):
+        steering, throttle = np.clip(action, -1.0, 1.0) * (_STEERING, 1.0)
+        place, offset, heading, speed = self.state
+        wanted = np.mean(_SPEEDS) + throttle * 0.5 * (_SPEEDS[1] - _SPEEDS[0])
+        most = _ACCELERATION * _DT
+        speed += np.clip(wanted - speed, -most, most)
+        turn = speed * math.tan(steering) / (_WHEELBASE * (1.0 + _UNDERSTEER * speed**2))
+        bend = curvature(place)
+        progress = speed * math.cos(heading) / (1.0 - offset * bend)
+        offset += speed * math.sin(heading) * _DT
+        heading += (turn - bend * progress) * _DT
+        self.state = ((place + progress * _DT) % _length(), offset, heading, float(speed))
+        self.n_steps += 1
+        off = abs(offset) > _HALF_WIDTH or abs(heading) > 0.5 * math.pi
+        return self._observe(), progress * _DT, bool(off), self.n_steps >= _STEPS, {}
+
+    def _observe(self):
+        place, offset, heading, speed = self.state
+        ahead = [curvature(place + d) * _RADIUS for d in _SIGHT]
+        seen = [offset / _HALF_WIDTH, heading, (speed - 7.0) / 5.0, *ahead]
+        return np.clip(seen, -5.0, 5.0).astype(np.float32)
+
+
+def curvature(place: float) -> float:
+    """:return: of the middle line, a bend to the left [1/m]"""
+    along = place % (0.5 * _length())
+    return 0.0 if along < _STRAIGHT else 1.0 / _RADIUS
+
+
+def _length() -> float:
+    return 2.0 * _STRAIGHT + 2.0 * math.pi * _RADIUS
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=6_000)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--figure", action="store_true")
+    parser.add_argument("--worker", nargs=2, metavar=("SEED", "STEPS"))
+    arguments = parser.parse_args()
+    if arguments.worker:
+        seed, steps = map(int, arguments.worker)
+        rows = [row for scale in SCALES for row in learn(str(scale), seed, steps)]
+        print(json.dumps({"rows": rows}))
+        return
+    if not arguments.figure:
+        wanted = [(seed, arguments.steps) for seed in range(arguments.seeds)]
+        work = lambda *run: fresh_process(__file__, *run, cache=CACHE)["rows"]  # noqa: E731
+        resume("action_scale", ["seed", "steps"], wanted, work, arguments.jobs)
+    report()
+
+
+def learn(scale: str, seed: int, steps: int) -> list[dict]:
+    """:return: one row for each evaluation"""
+    from sb3_hds import CrossQ
+    from sb3_hds.wrappers import ActionScale
+
+    def wrapped():
+        if scale != "schedule":
+            return ActionScale(Oval(), float(scale))
+        return ActionScale(Oval(), schedule=[[0, 0.4], [SCHEDULE_SHARE * steps, 1.0]])
+
+    model = CrossQ(
+        "MlpPolicy",
+        wrapped(),
+        learning_starts=500,
+        train_freq=50,
+        gradient_steps=25,
+        batch_size=128,
+        policy_delay=3,
+        policy_kwargs={"net_arch": {"pi": [64, 64], "qf": [128, 128]}},
+        gamma=0.97,
+        seed=seed,
+    )
+    rows, env = [], wrapped()
+    for block in range(1, N_EVALUATIONS + 1):
+        model.learn(steps // N_EVALUATIONS, reset_num_timesteps=block == 1)
+        env.set_progress(model.num_timesteps / (SCHEDULE_SHARE * steps))
+        distance, finished = evaluate(model, env, 1000 + seed)
+        point = {"timestep": model.num_timesteps, "distance": distance, "finished": finished}
+        rows.append({"scale": scale} | point)
+    return rows
+
+
+def evaluate(model, env, seed: int, n_episodes: int = 3) -> tuple[float, float]:
+    """:return: mean distance of episodes [m], and the share of them that stayed on the track"""
+    covered, finished = 0.0, 0
+    for episode in range(n_episodes):
+        obs, _ = env.reset(seed=seed + episode)
+        done = False
+        while not done:
+            action, _ = model.predict(obs, deterministic=True)
+            obs, reward, terminated, truncated, _ = env.step(action)
+            covered, done = covered + reward, terminated or truncated
+        finished += truncated and not terminated
+    return covered / n_episodes, finished / n_episodes
+
+
+def report() -> None:
+    import pandas as pd
+
+    table = pd.read_csv(RESULTS / "action_scale.csv", dtype={"scale": str})
+    grouped = table.groupby(["scale", "timestep"]).distance.agg(["mean", "std", "count"])
+    print(grouped.round(1).to_string())
+    draw(table)
+
+
+def draw(table) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.0, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for scale, color in zip(map(str, SCALES), ("#4c956c", "#27496d", "#b8422e", "#888888")):  # noqa: B905
+        runs = table[table.scale == scale].pivot(index="timestep", columns="seed")["distance"]
+        if runs.empty:
+            continue
+        mean, error = runs.mean(1), runs.std(1) / np.sqrt(runs.count(1))
+        axes.plot(mean.index, mean, color=color, label=scale)
+        axes.fill_between(mean.index, mean - error, mean + error, color=color, alpha=0.2, lw=0.0)
+    axes.set_xlabel("steps of the environment")
+    axes.set_ylabel("distance in 20 s [m]")
+    axes.set_title(f"Share of the action range, {table.seed.nunique()} seeds, mean and its error")
+    axes.legend(frameon=False, title="ActionScale")
+    figure.savefig(RESULTS / "action_scale.png", dpi=150)
+
+
+if __name__ == "__main__":
+    main()

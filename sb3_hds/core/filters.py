@@ -1,0 +1,257 @@
+"""What makes commands smooth, late or small, between a policy and what it commands."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from sb3_hds.core.signals import Channel
+from sb3_hds.core.stateful import Signals, StatefulTransform, namespace, per_place, refuse_unless
+
+# A bound of an observation must hold in single precision, too.
+_ROUNDING = 1e-5
+# The impulse response of a filter is summed until it is below this share of its sum.
+_NEGLIGIBLE = 1e-12
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RateLimit(StatefulTransform):
+    r"""
+    Commands change by at most :math:`\Delta` from one step to the next:
+
+    .. math:: u_k = \min(\max(a_k, u_{k-1} - \Delta), u_{k-1} + \Delta)
+
+    Remembers :math:`u_{k-1}`; before an episode, the command nearest to zero. Where the limit is
+    active, the derivative with respect to the action is zero.
+
+    :param max_change: :math:`\Delta` [command unit], one number or one per actuator
+    :raises ParameterError: unless it is positive
+    """
+
+    name: ClassVar[str] = "rate_limit"
+
+    max_change: float | Sequence[float]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        refuse_unless(self, "max_change", bool(np.all(np.array(self.max_change) > 0.0)), "positive")
+
+    def remembers(self, below: Signals) -> tuple[Channel, ...]:
+        per_place(self, "max_change", len(below.actuators), "actuators")
+        return tuple(Channel(f"last {a.name}", *a[1:]) for a in below.actuators)
+
+    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+        return namespace(obs).asarray(below.rest(), dtype=obs.dtype)
+
+    def act(
+        self,
+        action: Float[Any, " outer"],
+        obs: Float[Any, " obs"],
+        memory: Float[Any, " memory"],
+        below: Signals,
+    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        most = _like(action, per_place(self, "max_change", len(below.actuators), "actuators"))
+        wanted = clipped(action, below)
+        command = wanted.clip(memory - most, memory + most)
+        return command, command
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LowPass(StatefulTransform):
+    r"""
+    A digital filter of each command, in transposed direct form II:
+
+    .. math:: y = b_0 a + z_1, \quad z_i \leftarrow b_i a - c_i y + z_{i+1}
+
+    The command is :math:`y`, clipped to the limits of the actuator: from second order on, a
+    low-pass overshoots. Remembers :math:`z`; before an episode, the one at rest at the command
+    nearest to zero. Gain at zero frequency must be one.
+
+    Source: Oppenheim and Schafer, *Discrete-Time Signal Processing*, 3rd ed., section 6.3.
+
+    :param b: numerator :math:`b_0 \dots b_n`
+    :param a: denominator :math:`1, c_1 \dots c_n`
+    :raises ParameterError: unless both have one length, and the filter is stable with gain one
+    """
+
+    name: ClassVar[str] = "low_pass"
+
+    b: Sequence[float]
+    a: Sequence[float]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        refuse_unless(self, "a", self.a[0] == 1.0, "a denominator that begins with 1")
+        refuse_unless(self, "b", len(self.b) == len(self.a) >= 2, f"{len(self.a)} coefficients")
+        stable = bool(np.all(np.abs(np.roots(self.a)) < 1.0))
+        refuse_unless(self, "a", stable, "the denominator of a stable filter")
+        gain = sum(self.b) / sum(self.a)
+        refuse_unless(self, "b", math.isclose(gain, 1.0, rel_tol=1e-6), "of gain 1 at frequency 0")
+
+    @property
+    def order(self) -> int:
+        """Numbers that the filter of one command remembers."""
+        return len(self.a) - 1
+
+    def remembers(self, below: Signals) -> tuple[Channel, ...]:
+        low, high = below.limits()
+        still, swing = self._at_rest(), self._largest()
+        half = 0.5 * (high - low) + _ROUNDING * np.maximum(np.abs(low), np.abs(high))
+        return tuple(
+            Channel(f"filter {i + 1} of {a.name}", a.unit, still[i] * m - w, still[i] * m + w)
+            for i in range(self.order)
+            for a, m, w in zip(below.actuators, 0.5 * (low + high), swing[i] * half, strict=True)
+        )
+
+    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+        return _like(obs, np.outer(self._at_rest(), below.rest()).ravel())
+
+    def act(
+        self,
+        action: Float[Any, " outer"],
+        obs: Float[Any, " obs"],
+        memory: Float[Any, " memory"],
+        below: Signals,
+    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        n, wanted = len(below.actuators), clipped(action, below)
+        z = [memory[i * n : (i + 1) * n] for i in range(self.order)]
+        y = self.b[0] * wanted + z[0]
+        after = [
+            self.b[i] * wanted - self.a[i] * y + (z[i] if i < self.order else 0.0)
+            for i in range(1, self.order + 1)
+        ]
+        return clipped(y, below), namespace(action).concatenate(after)
+
+    def _at_rest(self) -> np.ndarray:
+        """What it remembers of a command of one that never changed, shape ``(order,)``."""
+        differences = np.array(self.b[1:]) - np.array(self.a[1:])
+        return np.cumsum(differences[::-1])[::-1]
+
+    def _largest(self) -> np.ndarray:
+        """The most that it remembers of commands within [-1, 1], shape ``(order,)``."""
+        z, total, given = np.zeros(self.order), np.zeros(self.order), 1.0
+        while given or np.any(np.abs(z) > _NEGLIGIBLE * total):
+            y = self.b[0] * given + z[0]
+            z = np.array(self.b[1:]) * given - np.array(self.a[1:]) * y + np.append(z[1:], 0.0)
+            total, given = total + np.abs(z), 0.0
+        return total
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Delay(StatefulTransform):
+    """
+    Commands arrive a whole number of steps late; until the first arrives, the one nearest to zero.
+
+    Remembers the commands on their way, the oldest first. A delay that is no multiple of the step,
+    or is to be estimated, is :class:`sb3_hds.effects.ActionDelay`.
+
+    :param steps: how late [control intervals]
+    :raises ParameterError: unless it is a positive whole number
+    """
+
+    name: ClassVar[str] = "delay"
+
+    steps: int
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        whole = isinstance(self.steps, int) and self.steps >= 1
+        refuse_unless(self, "steps", whole, "a whole number of at least 1")
+
+    def remembers(self, below: Signals) -> tuple[Channel, ...]:
+        return tuple(
+            Channel(f"{a.name} in {i}", *a[1:]) for i in range(self.steps) for a in below.actuators
+        )
+
+    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+        return _like(obs, np.tile(below.rest(), self.steps))
+
+    def act(
+        self,
+        action: Float[Any, " outer"],
+        obs: Float[Any, " obs"],
+        memory: Float[Any, " memory"],
+        below: Signals,
+    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        n, queue = len(below.actuators), [memory, clipped(action, below)]
+        return memory[:n], namespace(action).concatenate(queue)[n:]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Scale(StatefulTransform):
+    r"""
+    Commands reach only a share :math:`s` of the range around its middle :math:`m`:
+
+    .. math:: u = m + s\,(a - m)
+
+    The share follows a schedule, linear between its points and constant outside. Where it changes,
+    it remembers how much of the schedule has passed, from 0 to 1, over all episodes; an episode of
+    a twin begins anywhere in it. Without ``observed``, a twin infers the beginning of the schedule.
+
+    :param schedule: ``((steps, share), ...)``, steps growing from 0, shares above 0 and at most 1
+    :raises ParameterError: for any other schedule
+    """
+
+    name: ClassVar[str] = "scale"
+    persists: ClassVar[bool] = True
+
+    schedule: Sequence[Sequence[float]]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        points = np.asarray(self.schedule, float)
+        fine = points.ndim == 2 and points.shape[1] == 2 and points[0, 0] == 0.0
+        fine = fine and bool(np.all(np.diff(points[:, 0]) > 0.0))
+        fine = fine and bool(np.all((points[:, 1] > 0.0) & (points[:, 1] <= 1.0)))
+        wanted = "pairs of steps, growing from 0, and a share above 0 and at most 1"
+        refuse_unless(self, "schedule", bool(fine), wanted)
+
+    @property
+    def length(self) -> float:
+        """Steps until the last point; 0 where nothing changes."""
+        return float(self.schedule[-1][0])
+
+    def remembers(self, below: Signals) -> tuple[Channel, ...]:
+        return (Channel("progress of the scale", "1", 0.0, 1.0),) if self.length else ()
+
+    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+        return _like(obs, np.zeros(1 if self.length else 0))
+
+    def draw(
+        self, key: PRNGKeyArray, obs: Float[Array, " obs"], below: Signals
+    ) -> Float[Array, " memory"]:
+        return jax.random.uniform(key, (1 if self.length else 0,), obs.dtype)
+
+    def act(
+        self,
+        action: Float[Any, " outer"],
+        obs: Float[Any, " obs"],
+        memory: Float[Any, " memory"],
+        below: Signals,
+    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        middle = _like(action, 0.5 * np.sum(below.limits(), 0))
+        command = middle + self.share(memory) * (clipped(action, below) - middle)
+        return command, (memory + 1.0 / self.length).clip(0.0, 1.0) if self.length else memory
+
+    def share(self, memory: Float[Any, " memory"]) -> Any:
+        """:return: the share of the range that commands reach now"""
+        if not self.length:
+            return self.schedule[0][1]
+        steps, shares = np.array(self.schedule).T
+        at = _like(memory, steps), _like(memory, shares)
+        return namespace(memory).interp(memory * self.length, *at)
+
+
+def clipped(command: Float[Any, " act"], below: Signals) -> Float[Any, " act"]:
+    """:return: the command within the limits of the actuators below"""
+    low, high = below.limits()
+    return command.clip(_like(command, low), _like(command, high))
+
+
+def _like(array: Any, values: np.ndarray) -> Any:
+    """The values where the array lives, in its precision."""
+    return namespace(array).asarray(values, dtype=array.dtype)

@@ -1,0 +1,272 @@
+"""What all layers between a policy and the commands of an environment have in common."""
+
+import abc
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from sb3_hds.core import Actuator, Channel, Signals
+from sb3_hds.core.stateful import StatefulTransform
+from sb3_hds.errors import ParameterError
+
+_STORES = ("raw", "executed")
+
+
+class ActionLayer(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs, abc.ABC):
+    """
+    Abstract: turns the action that a policy chooses into the command that the environment gets.
+
+    ``step`` adds to ``info``, where several layers are nested:
+
+    - ``raw_action``: what the policy chose, before the outermost layer
+    - ``safe_action``: what the environment was told, after the innermost layer
+    - ``correction``: the sum of what each layer changed, in command units
+    - ``constraint_cost``: the sum of what each layer found violated, 0 where nothing is
+    - ``executed_action``: the action that would have been executed unchanged, in the units of the
+      outermost layer's action space; what the policy chose, where a layer has no such action
+    - ``stored_action``: the same, where the outermost layer has ``store="executed"``: what a
+      learner should store instead of what it chose
+
+    :param env: its actions are a bounded Box with one axis
+    :param store: ``"raw"``, or ``"executed"``
+    :param arguments: of the constructor, so that ``env.spec`` can tell how to wrap again
+    :raises ParameterError: for other actions, or another ``store``
+    """
+
+    #: whether commands may differ from actions
+    alters_commands: ClassVar[bool] = True
+    #: what ``store`` may be
+    stores: ClassVar[tuple[str, ...]] = _STORES
+
+    def __init__(self, env: gymnasium.Env, store: str, arguments: Mapping[str, Any]) -> None:
+        gymnasium.utils.RecordConstructorArgs.__init__(self, **arguments)
+        gymnasium.Wrapper.__init__(self, env)
+        check_bounded(type(self), env.action_space)
+        if store not in self.stores:
+            raise ParameterError(
+                f"{type(self).__name__}(store={store!r}): store must be one of {self.stores}."
+            )
+        self.store = store
+        self._obs = np.zeros(0)
+
+    @property
+    def commands(self) -> spaces.Box:
+        """What the environment below takes."""
+        assert isinstance(self.env.action_space, spaces.Box)
+        return self.env.action_space
+
+    @abc.abstractmethod
+    def decide(self, action: np.ndarray) -> np.ndarray:
+        """
+        :param action: finite, of the shape of the action space
+        :return: the command, in double precision
+        """
+
+    def nominal(self, action: np.ndarray) -> np.ndarray:
+        """:return: the command that would count as uncorrected"""
+        return np.clip(action, self.commands.low, self.commands.high)
+
+    def meant_by(self, command: np.ndarray) -> np.ndarray:
+        """:return: the action that stands for a command: the inverse of :meth:`nominal`"""
+        return command
+
+    def begin(self, obs: Any) -> None:
+        """An episode begins with ``obs``."""
+        self._obs = vector(self.env.observation_space, obs)
+
+    def arrive(self, obs: Any, command: np.ndarray) -> None:
+        """``command`` led to ``obs``."""
+        self._obs = vector(self.env.observation_space, obs)
+
+    def seen(self, obs: Any) -> Any:
+        """:return: what the policy sees"""
+        return obs
+
+    def cost(self) -> float:
+        """:return: by how much the latest observation violates what the layer guards"""
+        return 0.0
+
+    def charged(self) -> float:
+        """:return: what the latest command costs; the reward is that much smaller"""
+        return 0.0
+
+    def told(self) -> dict[str, Any]:
+        """:return: further entries of ``info``"""
+        return {}
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        obs, info = self.env.reset(seed=seed, options=options)
+        self.begin(obs)
+        return self.seen(obs), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """
+        :return: as the environment, with the entries of ``info`` above
+        :raises ValueError: for an action of another shape or not finite
+        """
+        raw = check_action(self, action)
+        command = self._rounded(self.decide(raw))
+        correction = command - self.nominal(raw)
+        obs, reward, terminated, truncated, info = self.env.step(command)
+        self.arrive(obs, command)
+        info = self._informed(raw, command, correction, info)
+        return self.seen(obs), float(reward) - self.charged(), terminated, truncated, info
+
+    def _rounded(self, command: np.ndarray) -> np.ndarray:
+        """The command as the environment takes it; rounding must not leave its limits."""
+        space = self.commands
+        return np.clip(command.astype(space.dtype), space.low, space.high)
+
+    def _informed(
+        self,
+        raw: np.ndarray,
+        command: np.ndarray,
+        correction: np.ndarray,
+        below: dict[str, Any],
+    ) -> dict[str, Any]:
+        inner = below.get("correction")
+        if inner is not None and np.shape(inner) == correction.shape:
+            correction = correction + inner
+        info = below | {
+            "raw_action": raw.astype(self.action_space.dtype),
+            "safe_action": below.get("safe_action", command),
+            "correction": correction,
+            "constraint_cost": self.cost() + below.get("constraint_cost", 0.0),
+        }
+        info.pop("stored_action", None)
+        executed = raw
+        if "executed" in self.stores:
+            executed = self.meant_by(below.get("executed_action", command))
+        info["executed_action"] = executed.astype(self.action_space.dtype)
+        if self.store == "executed":
+            info["stored_action"] = info["executed_action"]
+        return info | self.told()
+
+
+class TransformLayer(ActionLayer):
+    """
+    Abstract: a layer that is a :class:`~sb3_hds.core.StatefulTransform`, so that a twin can be seen
+    through it.
+
+    :param transform: what it does
+    :raises ParameterError: if it does not fit the environment
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        transform: StatefulTransform,
+        store: str,
+        arguments: Mapping[str, Any],
+    ) -> None:
+        super().__init__(env, store, arguments)
+        self.twin_transform = transform
+        self._below = signals_of(env)
+        remembered = transform.remembers(self._below)
+        self._memory = transform.start(np.zeros(len(self._below.channels)), self._below)
+        if transform.observed and remembered:
+            self.observation_space = with_channels(self, env.observation_space, remembered)
+        self._appends = bool(transform.observed and remembered)
+        self._charged = 0.0
+
+    @property
+    def twin_transforms(self) -> list[tuple[str, StatefulTransform]]:
+        """The layers from here to the environment that a twin can be seen through, by class."""
+        layers, env = [], self
+        while isinstance(env, gymnasium.Wrapper):
+            if isinstance(env, TransformLayer):
+                layers.append((type(env).__name__, env.twin_transform))
+            env = env.env
+        return layers
+
+    def decide(self, action: np.ndarray) -> np.ndarray:
+        given = action, self._obs, self._memory, self._below
+        self._charged = float(self.twin_transform.cost(*given))
+        command, self._memory = self.twin_transform.act(*given)
+        return command
+
+    def charged(self) -> float:
+        return self._charged
+
+    def begin(self, obs: Any) -> None:
+        super().begin(obs)
+        if not self.twin_transform.persists:
+            self._memory = self.twin_transform.start(self._obs, self._below)
+
+    def seen(self, obs: Any) -> Any:
+        if not self._appends:
+            return obs
+        assert self.observation_space.dtype is not None
+        return np.concatenate([obs, self._memory]).astype(self.observation_space.dtype)
+
+
+def check_bounded(layer: type, space: spaces.Space) -> None:
+    """:raises ParameterError: unless actions are a bounded Box with one axis"""
+    fine = isinstance(space, spaces.Box) and len(space.shape) == 1 and space.is_bounded()
+    if not fine:
+        raise ParameterError(
+            f"{layer.__name__} takes environments whose actions are a bounded Box with one axis, "
+            f"got {space}. Flatten them, or give them limits, below this wrapper."
+        )
+
+
+def check_action(env: gymnasium.Env, action: Any) -> np.ndarray:
+    """
+    :return: the action in double precision
+    :raises ValueError: for another shape, or numbers that are not finite
+    """
+    found = np.asarray(action, np.float64)
+    if found.shape != env.action_space.shape:
+        raise ValueError(f"{env} takes actions of shape {env.action_space.shape}, got {found!r}.")
+    if not np.isfinite(found).all():
+        raise ValueError(f"{env} takes finite actions, got {found.tolist()}.")
+    return found
+
+
+def vector(space: spaces.Space, obs: Any) -> np.ndarray:
+    """:return: the observation in double precision; of no entries where it is no vector"""
+    return np.asarray(obs, np.float64) if is_vector(space) else np.zeros(0)
+
+
+def signals_of(env: gymnasium.Env) -> Signals:
+    """:return: the limits of an environment's actions and, where they are a vector, observations"""
+    space, seen = env.action_space, env.observation_space
+    assert isinstance(space, spaces.Box)
+    actuators = tuple(Actuator(f"action[{i}]", "1", *e) for i, e in enumerate(_ends(space)))
+    ends = _ends(seen) if isinstance(seen, spaces.Box) and is_vector(seen) else []
+    channels = tuple(Channel(f"obs[{i}]", "1", *e) for i, e in enumerate(ends))
+    return Signals(actuators, channels)
+
+
+def with_channels(
+    env: gymnasium.Env, space: spaces.Space, added: tuple[Channel, ...]
+) -> spaces.Box:
+    """
+    :return: the observation space with ``added`` behind it
+    :raises ParameterError: unless observations are a Box with one axis
+    """
+    if not isinstance(space, spaces.Box) or not is_vector(space):
+        raise ParameterError(
+            f"{type(env).__name__} adds to observations that are a Box with one axis, got {space}. "
+            "Flatten them below (gymnasium.wrappers.FlattenObservation), or pass "
+            "observe_state=False: then the task is no longer Markov."
+        )
+    dtype = np.result_type(space.dtype, np.float32) if space.dtype.kind == "f" else np.float32
+    low = np.concatenate([space.low, [c.low for c in added]]).astype(dtype)
+    high = np.concatenate([space.high, [c.high for c in added]]).astype(dtype)
+    return spaces.Box(low, high, dtype=dtype)
+
+
+def is_vector(space: spaces.Space) -> bool:
+    """:return: whether it is a Box with one axis"""
+    return isinstance(space, spaces.Box) and len(space.shape) == 1
+
+
+def _ends(space: spaces.Box) -> list[tuple[float, float]]:
+    low, high = space.low.astype(float).tolist(), space.high.astype(float).tolist()
+    return list(zip(low, high, strict=True))

@@ -1,0 +1,160 @@
+"""Joints that stay within their limits, whatever a policy asks for."""
+
+import math
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from sb3_hds.core import Barrier
+from sb3_hds.errors import ParameterError, SafetyError
+from sb3_hds.wrappers.action_layer import ActionLayer, TransformLayer
+from sb3_hds.wrappers.interval import interval_of
+
+# What single precision takes away from two positions and a speed, as a share of the largest limit.
+_ROUNDING = 1e-6
+_ON_BREACH = ("raise", "warn", "ignore")
+
+
+class JointLimitBarrier(TransformLayer):
+    r"""
+    The speed towards a joint's limit is bounded by the distance to it, as in
+    :class:`~sb3_hds.core.Barrier`:
+
+    .. math:: u \le \frac{\gamma\,(q_\text{max} - q) - \varepsilon}{\Delta t}
+
+    Assumes joints that are commanded by their speed and miss no step by more than ``tolerance``,
+    that speed limits allow standing still, and an episode that begins within the limits. What can
+    be checked at construction is checked there; the rest is checked at every reset and step. It has
+    to be next to the environment: any layer below would change what it decided.
+
+    ``info["constraint_cost"]`` is how far joints are beyond their limits, and
+    ``info["tracking_error"]`` by how much they missed what they were told.
+
+    :param env: observes the positions in a Box with one axis
+    :param low: lower limit [rad] or [m], one number or one per guarded joint
+    :param high: upper limit
+    :param position: where the observation has each joint's position: an index, or for an angle the
+        two indices of its cosine and sine
+    :param action: index of the command that is each joint's speed; default: 0, 1, ...
+    :param gain: speed per unit of the command [rad/s] or [m/s]
+    :param share: :math:`\gamma`, above 0 and at most 1: how much of the distance one step may take
+    :param tolerance: :math:`\varepsilon`, by how much a step may miss [rad] or [m]; default: what
+        single precision needs
+    :param dt: control interval [s]; default: the environment's own ``dt`` or ``tau``
+    :param on_breach: what to do where an assumption does not hold: ``"raise"``, ``"warn"`` or
+        ``"ignore"``
+    :param store: ``"executed"``: learners store the bounded command
+    :raises ParameterError: for numbers out of range, or another layer below
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        low: float | Sequence[float],
+        high: float | Sequence[float],
+        position: Sequence[int | Sequence[int]] = (0,),
+        action: Sequence[int] | None = None,
+        *,
+        gain: float = 1.0,
+        share: float = 0.5,
+        tolerance: float | None = None,
+        dt: float | None = None,
+        on_breach: str = "raise",
+        store: str = "raw",
+    ) -> None:
+        arguments = {
+            "low": low,
+            "high": high,
+            "position": position,
+            "action": action,
+            "gain": gain,
+            "share": share,
+            "tolerance": tolerance,
+            "dt": dt,
+            "on_breach": on_breach,
+            "store": store,
+        }
+        refuse_layers_below(type(self), env)
+        self._on_breach = check_on_breach(type(self), on_breach)
+        n = len(position)
+        lows, highs = (np.broadcast_to(np.asarray(x, float), (n,)) for x in (low, high))
+        if tolerance is None:
+            tolerance = _ROUNDING * float(np.max(np.abs([lows, highs])))
+        self._barrier = Barrier(
+            low=lows.tolist(),
+            high=highs.tolist(),
+            position=position,
+            action=list(range(n)) if action is None else action,
+            gain=float(gain),
+            share=float(share),
+            tolerance=float(tolerance),
+            dt=interval_of(env, ParameterError) if dt is None else float(dt),
+        )
+        super().__init__(env, self._barrier, store, arguments)
+        self._turns = np.array([not isinstance(place, int) for place in self._barrier.position])
+        self._missed = 0.0
+
+    def begin(self, obs: Any) -> None:
+        super().begin(obs)
+        self._missed = 0.0
+        if self.cost() > self._barrier.tolerance:
+            self._breach(
+                f"An episode begins {self.cost():.3g} beyond the joint limits, at "
+                f"{self._barrier.positions(self._obs)}. Start within them."
+            )
+
+    def arrive(self, obs: Any, command: np.ndarray) -> None:
+        barrier, before = self._barrier, self._barrier.positions(self._obs)
+        super().arrive(obs, command)
+        speed = barrier.gain * command[list(barrier.action)].astype(float)
+        error = barrier.positions(self._obs) - before - speed * barrier.dt
+        turned = (error + math.pi) % (2.0 * math.pi) - math.pi
+        self._missed = float(np.max(np.abs(np.where(self._turns, turned, error))))
+        if not self._missed <= barrier.tolerance:
+            self._breach(
+                f"A joint missed what its speed command asks for by {self._missed:.3g}, and the "
+                f"barrier counts on at most {barrier.tolerance:.3g}. It protects joints that are "
+                "commanded by their speed: check gain, dt, position and action, or pass the "
+                "tolerance of the drive."
+            )
+
+    def cost(self) -> float:
+        return float(self._barrier.violation(self._obs))
+
+    def told(self) -> dict[str, Any]:
+        return {"tracking_error": self._missed}
+
+    def _breach(self, message: str) -> None:
+        report_breach(self._on_breach, message)
+
+
+def report_breach(on_breach: str, message: str) -> None:
+    """:raises SafetyError: with the message, if it is to be raised"""
+    if on_breach == "raise":
+        raise SafetyError(message)
+    if on_breach == "warn":
+        warnings.warn(message)
+
+
+def check_on_breach(layer: type, on_breach: str) -> str:
+    """:raises ParameterError: for anything but ``"raise"``, ``"warn"`` and ``"ignore"``"""
+    if on_breach not in _ON_BREACH:
+        raise ParameterError(
+            f"{layer.__name__}(on_breach={on_breach!r}): on_breach must be one of {_ON_BREACH}."
+        )
+    return on_breach
+
+
+def refuse_layers_below(layer: type, env: gymnasium.Env) -> None:
+    """:raises ParameterError: if a layer below would change what a safety layer decides"""
+    below = env
+    while isinstance(below, gymnasium.Wrapper):
+        if isinstance(below, ActionLayer) and below.alters_commands:
+            raise ParameterError(
+                f"{layer.__name__} must have the last word, but {type(below).__name__} below it "
+                "changes commands. Wrap the other way round: the safety layer first."
+            )
+        below = below.env

@@ -1,0 +1,68 @@
+"""Commands without high frequencies."""
+
+from typing import Any
+
+import gymnasium
+from scipy import signal
+
+from sb3_hds.core import LowPass
+from sb3_hds.errors import ParameterError
+from sb3_hds.wrappers.action_layer import TransformLayer
+from sb3_hds.wrappers.interval import interval_of
+
+# Beyond it, coefficients of one fraction lose their meaning in single precision.
+_HIGHEST_ORDER = 4
+
+
+class LowPassAction(TransformLayer):
+    """
+    A Butterworth low-pass in front of each command. The filter's state is appended to observations.
+
+    From second order on, the filter overshoots a step (4 % at second order); commands are clipped
+    to their limits. Put limits of joints below it: a filter delays what they ask for.
+
+    Source: Butterworth, *On the theory of filter amplifiers*, Experimental Wireless 7, 1930;
+    bilinear transform as in ``scipy.signal.butter``.
+
+    :param env: its actions are a bounded Box with one axis
+    :param cutoff: frequency at which half of the power passes [Hz], below half the control rate
+    :param order: 1 to 4
+    :param dt: control interval [s]; default: the environment's own ``dt`` or ``tau``
+    :param observe_state: whether the state is appended, ``order`` numbers per action; without it,
+        the task is not Markov
+    :param store: ``"executed"``: learners store the filtered command
+    :raises ParameterError: for a cut-off or an order out of range, or an unknown interval
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        cutoff: float,
+        order: int = 2,
+        *,
+        dt: float | None = None,
+        observe_state: bool = True,
+        store: str = "raw",
+    ) -> None:
+        interval = interval_of(env, ParameterError) if dt is None else dt
+        if not 0.0 < cutoff < 0.5 / interval:
+            raise ParameterError(
+                f"LowPassAction(cutoff={cutoff!r}): with a step of {interval:g} s, cutoff must be "
+                f"above 0 and below {0.5 / interval:g} Hz, half the control rate."
+            )
+        if order not in range(1, _HIGHEST_ORDER + 1):
+            raise ParameterError(
+                f"LowPassAction(order={order!r}): order must be a whole number from 1 to "
+                f"{_HIGHEST_ORDER}."
+            )
+        filtered: Any = signal.butter(order, cutoff, fs=1.0 / interval)
+        b, a = filtered
+        arguments = {
+            "cutoff": cutoff,
+            "order": order,
+            "dt": dt,
+            "observe_state": observe_state,
+            "store": store,
+        }
+        transform = LowPass(b=b.tolist(), a=a.tolist(), observed=observe_state)
+        super().__init__(env, transform, store, arguments)

@@ -1,0 +1,233 @@
+"""A control period against a clock, and a watchdog for learners that are late."""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+
+from sb3_hds.errors import ParameterError
+
+# The histogram of latencies has this many bins per period, over this many periods.
+_BINS, _PERIODS = 20, 2
+
+
+class Timing(NamedTuple):
+    """
+    What happened since the environment was wrapped.
+
+    :param steps: commands of the learner that were executed
+    :param overruns: of them, those that came after their deadline
+    :param safe_actions: commands of the watchdog
+    :param slow_steps: steps of the environment, of either kind, that took longer than a period
+    :param dropped: commands that came after the episode had ended under the watchdog
+    """
+
+    steps: int = 0
+    overruns: int = 0
+    safe_actions: int = 0
+    slow_steps: int = 0
+    dropped: int = 0
+
+
+class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
+    r"""
+    One command per period :math:`T`, at the ticks of a monotonic clock. ``step`` waits for the next
+    tick, executes the command and returns what is then observed; the learner has until the
+    following tick to answer.
+
+    A command that comes after its tick is an overrun: it is executed at once. With a
+    ``safe_action``, a watchdog executes that one if no command has come ``grace`` after a tick, and
+    again at each tick until one comes. Then the reward of ``step`` includes what was missed, and
+    ``info["missed_steps"]`` is how many safe actions were executed since the last observation that
+    the learner saw. An episode that ends meanwhile is reported by the next ``step``, whose command
+    is dropped (``info["command_dropped"]``).
+
+    Between the end of an episode and the next reset no tick passes: train there
+    (``train_freq=(1, "episode")``), or beside the loop with
+    :class:`sb3_hds.algos.TrainBeside`. A general-purpose operating system wakes a process a little
+    late, on a busy machine by milliseconds: this is no hard real time, and no substitute for a
+    watchdog in the drive.
+
+    ``info`` gets ``latency`` (from observation to command [s]), ``overrun`` and ``missed_steps``.
+
+    :param env: of any kind; simulated ones wait for the clock, real ones must return promptly
+    :param period: :math:`T` [s]
+    :param safe_action: what the watchdog executes; None: there is no watchdog
+    :param grace: how late a command may be before the watchdog acts, as a share of the period
+    :param threaded: whether the watchdog has a thread of its own; without, call :meth:`watch`
+    :param clock: monotonic [s]
+    :param sleep: waits for so many seconds
+    :raises ParameterError: for a period or a grace out of range, or an action out of the space
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        period: float,
+        safe_action: Sequence[float] | np.ndarray | None = None,
+        *,
+        grace: float = 0.5,
+        threaded: bool = True,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        gymnasium.utils.RecordConstructorArgs.__init__(
+            self, period=period, safe_action=safe_action, grace=grace, threaded=threaded
+        )
+        gymnasium.Wrapper.__init__(self, env)
+        if not 0.0 < period < math.inf:
+            raise ParameterError(f"RealTime(period={period!r}): period must be above 0 s.")
+        if not 0.0 <= grace <= 1.0:
+            raise ParameterError(f"RealTime(grace={grace!r}): grace must be from 0 to 1.")
+        self.period, self.grace = float(period), float(grace)
+        self._safe = None if safe_action is None else _in_space(env, safe_action)
+        self._threaded = threaded and self._safe is not None
+        self._clock, self._sleep = clock, sleep
+        self.timing = Timing()
+        self._counts = np.zeros(_BINS * _PERIODS + 1, int)
+        self._deadline, self._answered = 0.0, 0.0
+        self._running, self._claimed = False, False
+        self._missed: list[tuple[Any, Any, bool, bool, dict[str, Any]]] = []
+        self._begin_watching()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        with self._lock:
+            self._running = False
+            self._missed.clear()
+            obs, info = self.env.reset(seed=seed, options=options)
+            self._answered = self._clock()
+            self._deadline = self._answered + self.period
+            self._running, self._claimed = True, False
+        self._watch_on()
+        return obs, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """:return: as the environment; see above for rewards and ``info``"""
+        came = self._clock()
+        latency = came - self._answered
+        self._note(latency)
+        self.watch()
+        with self._lock:
+            missed, self._missed = self._missed, []
+            if missed and (missed[-1][2] or missed[-1][3]):
+                self.timing = self.timing._replace(dropped=self.timing.dropped + 1)
+                return self._merged(missed, latency, True, True)
+            self._claimed = True
+        late = bool(missed) or came > self._deadline
+        if (wait := self._deadline - self._clock()) > 0.0:
+            self._sleep(wait)
+        with self._lock:
+            missed.append(self._execute(action))
+            self._claimed = False
+            self._answered = self._clock()
+            timing = self.timing
+            self.timing = timing._replace(
+                steps=timing.steps + 1, overruns=timing.overruns + int(late)
+            )
+        return self._merged(missed, latency, late, False)
+
+    def watch(self) -> bool:
+        """
+        Execute the safe action if it is due: what the watchdog's thread does at each tick.
+
+        :return: whether it was
+        """
+        with self._lock:
+            due = self._deadline + self.grace * self.period
+            if self._safe is None or not self._running or self._claimed or self._clock() < due:
+                return False
+            self._missed.append(self._execute(self._safe))
+            self.timing = self.timing._replace(safe_actions=self.timing.safe_actions + 1)
+            return True
+
+    def latencies(self) -> tuple[np.ndarray, np.ndarray]:
+        """
+        The histogram of times from observation to command.
+
+        :return: counts, shape ``(n,)``, and edges [s], shape ``(n + 1,)``; the last bin is open
+        """
+        edges = np.linspace(0.0, _PERIODS * self.period, _BINS * _PERIODS + 1)
+        return self._counts.copy(), np.append(edges, math.inf)
+
+    def close(self) -> None:
+        self._stopped.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        super().close()
+
+    def _execute(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the environment, and set the next deadline on the grid of ticks."""
+        begin = self._clock()
+        result = self.env.step(action)
+        end = self._clock()
+        if end - begin > self.period:
+            self.timing = self.timing._replace(slow_steps=self.timing.slow_steps + 1)
+        if self._safe is None:  # nobody kept the ticks: begin a grid anew where one was missed
+            self._deadline = max(self._deadline, begin)
+        passed = math.floor((end - self._deadline) / self.period + 1e-9)
+        self._deadline += self.period * (1 + max(0, passed))
+        self._running = not (result[2] or result[3])
+        return result
+
+    def _merged(
+        self,
+        results: list[tuple[Any, Any, bool, bool, dict[str, Any]]],
+        latency: float,
+        late: bool,
+        dropped: bool,
+    ) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        obs, _, terminated, truncated, info = results[-1]
+        info = info | {
+            "latency": latency,
+            "overrun": late,
+            "missed_steps": len(results) - (not dropped),
+            "command_dropped": dropped,
+        }
+        return obs, sum(float(result[1]) for result in results), terminated, truncated, info
+
+    def _note(self, latency: float) -> None:
+        place = int(latency / self.period * _BINS)
+        self._counts[min(max(place, 0), len(self._counts) - 1)] += 1
+
+    def _begin_watching(self) -> None:
+        self._lock, self._stopped = threading.RLock(), threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def _watch_on(self) -> None:
+        if self._threaded and self._thread is None:
+            self._stopped.clear()
+            self._thread = threading.Thread(target=self._keep_watching, daemon=True)
+            self._thread.start()
+
+    def _keep_watching(self) -> None:
+        while not self._stopped.is_set():
+            due = self._deadline + self.grace * self.period - self._clock()
+            idle = not self._running or self._claimed
+            if idle or due > 0.0:
+                self._stopped.wait(self.grace * self.period if idle else due)
+            else:
+                self.watch()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_lock": None, "_stopped": None, "_thread": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._begin_watching()
+        self._running = False
+
+
+def _in_space(env: gymnasium.Env, action: Sequence[float] | np.ndarray) -> np.ndarray:
+    found = np.asarray(action, env.action_space.dtype)
+    if not env.action_space.contains(found):
+        raise ParameterError(
+            f"RealTime(safe_action={action!r}): the safe action must be in {env.action_space}."
+        )
+    return found

@@ -1,0 +1,88 @@
+"""Commands that are small, at first or always."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from sb3_hds.core import Scale
+from sb3_hds.errors import ParameterError
+from sb3_hds.wrappers.action_layer import TransformLayer
+
+
+class ActionScale(TransformLayer):
+    """
+    Actions reach a share of the range of commands, around its middle: always the same share, or one
+    that follows a schedule over the steps of this copy of the environment.
+
+    The action space stays as it is. With a schedule, its progress from 0 to 1 is appended to
+    observations, and goes on over resets; a reset with a seed begins anew. An environment for
+    evaluation has a progress of its own: see :meth:`set_progress`.
+
+    :param env: its actions are a bounded Box with one axis
+    :param scale: the share, above 0 and at most 1
+    :param schedule: ``[[0, 0.3], [10_000, 1.0]]``: shares at step 0 and from step 10,000 on, linear
+        between; instead of ``scale``
+    :param observe_state: whether the progress is appended
+    :param store: ``"executed"``: learners store the action that stands for what was executed below
+    :raises ParameterError: for a share or a schedule out of range, or both
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        scale: float | None = None,
+        schedule: Sequence[Sequence[float]] | None = None,
+        *,
+        observe_state: bool = True,
+        store: str = "raw",
+    ) -> None:
+        if (scale is None) == (schedule is None):
+            raise ParameterError(
+                f"ActionScale takes either a scale or a schedule, got scale={scale} and "
+                f"schedule={schedule}."
+            )
+        arguments = {
+            "scale": scale,
+            "schedule": schedule,
+            "observe_state": observe_state,
+            "store": store,
+        }
+        points = np.asarray([[0.0, scale]] if schedule is None else schedule, float)
+        self._scale = Scale(schedule=points.tolist(), observed=observe_state)
+        super().__init__(env, self._scale, store, arguments)
+        self._begin_at = self._memory
+        self._share = float(np.squeeze(self._scale.share(self._memory)))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        if seed is not None:
+            self._memory = self._begin_at
+        return super().reset(seed=seed, options=options)
+
+    def set_progress(self, progress: float) -> None:
+        """
+        Go to another place of the schedule, for example to where training is, also at later resets
+        with a seed; reachable through ``VecEnv.env_method``. Without a schedule, nothing happens.
+
+        :param progress: from 0 to 1
+        """
+        if self._scale.length:
+            self._memory = self._begin_at = np.array([np.clip(progress, 0.0, 1.0)])
+
+    def decide(self, action: np.ndarray) -> np.ndarray:
+        self._share = float(np.squeeze(self._scale.share(self._memory)))
+        return super().decide(action)
+
+    def nominal(self, action: np.ndarray) -> np.ndarray:
+        return self._middle + self._share * (super().nominal(action) - self._middle)
+
+    def meant_by(self, command: np.ndarray) -> np.ndarray:
+        wanted = self._middle + (command - self._middle) / self._share
+        return np.clip(wanted, self.commands.low, self.commands.high)
+
+    @property
+    def _middle(self) -> np.ndarray:
+        return 0.5 * (self.commands.low.astype(float) + self.commands.high)

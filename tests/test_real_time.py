@@ -1,0 +1,267 @@
+"""Control periods, overruns and the watchdog: against a clock of our own, and once a real one."""
+
+import pickle
+import time
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from small_models import small
+
+from sb3_hds.algos import TrainBeside
+from sb3_hds.errors import ParameterError
+from sb3_hds.wrappers import RealTime, Timing
+
+
+class Time:
+    """A clock that only sleeping moves, and whoever holds it."""
+
+    def __init__(self):
+        self.now, self.slept = 100.0, []
+
+    def clock(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.slept.append(seconds)
+        self.now += seconds
+
+
+class Plant(gymnasium.Env):
+    """Notes when it is told what; a step takes as long as it is said to. Each step is worth one."""
+
+    def __init__(self, time=None, takes=0.0, length=1000):
+        self.observation_space = spaces.Box(-np.inf, np.inf, (1,))
+        self.action_space = spaces.Box(-1.0, 1.0, (1,))
+        self.time, self.takes, self.length, self.told = time, takes, length, []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.n = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.told.append((self.time.clock() if self.time else time.monotonic(), float(action[0])))
+        self.time.sleep(self.takes) if self.time else time.sleep(self.takes)
+        self.n += 1
+        return np.full(1, self.n, np.float32), 1.0, False, self.n >= self.length, {}
+
+
+def controlled(takes=0.0, length=1000, safe=None, **settings):
+    """A period of 0.1 s, begun at 100 s."""
+    ours = Time()
+    env = RealTime(
+        Plant(ours, takes, length),
+        0.1,
+        safe,
+        threaded=False,
+        clock=ours.clock,
+        sleep=ours.sleep,
+        **settings,
+    )
+    env.reset(seed=0)
+    return env, ours
+
+
+GO = np.array([1.0], np.float32)
+
+
+def times(env):
+    return [at for at, _ in env.unwrapped.told]
+
+
+def test_commands_act_at_the_ticks_however_fast_the_learner_is():
+    env, ours = controlled(takes=0.02)
+
+    for thinking in (0.0, 0.05, 0.03):
+        ours.now += thinking
+        *_, info = env.step(GO)
+
+    assert times(env) == pytest.approx([100.1, 100.2, 100.3])
+    assert info["latency"] == pytest.approx(0.03) and not info["overrun"]
+    assert env.timing == Timing(steps=3)
+
+
+def test_a_late_command_is_counted_and_acts_at_once():
+    env, ours = controlled()
+
+    ours.now += 0.17
+    *_, info = env.step(GO)
+    env.step(GO)
+
+    # Nobody kept the ticks meanwhile: the next period counts from the late command.
+    assert times(env) == pytest.approx([100.17, 100.27])
+    assert info["overrun"] and info["missed_steps"] == 0
+    assert env.timing == Timing(steps=2, overruns=1)
+
+
+def test_a_command_within_the_grace_keeps_the_ticks_where_they_are():
+    env, ours = controlled(safe=[-1.0])
+
+    ours.now += 0.12
+    assert not env.watch()
+    env.step(GO)
+    env.step(GO)
+
+    assert times(env) == pytest.approx([100.12, 100.2])
+    assert env.timing == Timing(steps=2, overruns=1)
+
+
+def test_the_watchdog_sends_the_safe_action_at_each_tick_without_a_command():
+    env, ours = controlled(safe=[-1.0])
+    sent = []
+
+    for _ in range(14):  # looks every 25 ms, as a thread would, for 350 ms
+        ours.now += 0.025
+        sent.append(env.watch())
+    obs, reward, _, _, info = env.step(GO)
+
+    # Ticks at 0.1, 0.2 and 0.3 s, each with 0.05 s of grace; the command acts at the next one.
+    assert [command for _, command in env.unwrapped.told] == [-1.0, -1.0, -1.0, 1.0]
+    assert times(env) == pytest.approx([100.15, 100.25, 100.35, 100.4])
+    assert (obs[0], reward, info["missed_steps"]) == (4.0, 4.0, 3)
+    assert env.timing == Timing(steps=1, overruns=1, safe_actions=3)
+
+
+def test_a_watchdog_that_was_held_up_does_not_make_up_for_ticks_in_a_burst():
+    env, ours = controlled(safe=[-1.0])
+
+    ours.now += 0.57
+    *_, info = env.step(GO)
+
+    assert [command for _, command in env.unwrapped.told] == [-1.0, 1.0]
+    assert times(env) == pytest.approx([100.57, 100.6])
+    assert info["missed_steps"] == 1
+
+
+def test_an_episode_that_ends_under_the_watchdog_is_reported_and_the_command_dropped():
+    env, ours = controlled(safe=[-1.0], length=2)
+
+    for _ in range(30):
+        ours.now += 0.025
+        env.watch()
+    obs, reward, terminated, truncated, info = env.step(GO)
+
+    assert (obs[0], reward, terminated, truncated) == (2.0, 2.0, False, True)
+    assert info["command_dropped"] and info["missed_steps"] == 2
+    assert env.timing == Timing(safe_actions=2, dropped=1)
+
+
+def test_no_tick_passes_between_episodes():
+    env, ours = controlled(safe=[-1.0], length=1)
+    env.step(GO)
+
+    ours.now += 60.0  # training
+    assert not env.watch()
+    env.reset()
+    ours.now += 0.05
+    *_, info = env.step(GO)
+
+    assert not info["overrun"] and env.timing == Timing(steps=2)
+    assert times(env) == pytest.approx([100.1, 160.2])
+
+
+def test_a_step_longer_than_the_period_is_counted_and_skips_to_the_next_tick():
+    env, _ = controlled(takes=0.25)
+
+    env.step(GO)
+    env.step(GO)
+
+    # From 0.1 to 0.35 s, so the next tick is at 0.4 s.
+    assert times(env) == pytest.approx([100.1, 100.4])
+    assert env.timing == Timing(steps=2, slow_steps=2)
+
+
+def test_latencies_fill_a_histogram_with_an_open_end():
+    env, ours = controlled()
+
+    for thinking in (0.0025, 0.0525, 0.0525, 5.0):
+        ours.now += thinking
+        env.step(GO)
+
+    counts, edges = env.latencies()
+    # Bins of 5 ms up to 0.2 s.
+    assert counts.sum() == 4 and counts[-1] == 1 and edges[-1] == np.inf
+    assert counts[0] == 1 and counts[10] == 2 and edges[10] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"period": 0.0}, "period must be above 0"),
+        ({"period": 0.1, "grace": 1.5}, "grace must be from 0 to 1"),
+        ({"period": 0.1, "safe_action": [3.0]}, "must be in Box"),
+    ],
+)
+def test_arguments_out_of_range_are_refused(arguments, says):
+    with pytest.raises(ParameterError, match=says):
+        RealTime(Plant(), **arguments)
+
+
+def test_real_time_passes_actions_and_observations_on_and_pickles():
+    env = RealTime(Plant(), 0.001, [0.0])
+    env.reset()
+    env.step(GO)
+
+    copy = pickle.loads(pickle.dumps(env))
+    env.close()
+    copy.reset()
+    obs, *_ = copy.step(GO)
+    copy.close()
+
+    assert obs.shape == (1,) and copy.action_space == env.action_space
+
+
+def test_in_real_time_a_learner_that_hangs_is_replaced_by_the_watchdog():
+    env = RealTime(Plant(takes=0.002), 0.02, [-1.0])
+    env.reset()
+    begin = time.monotonic()
+    try:
+        for _ in range(5):
+            env.step(GO)
+        time.sleep(0.3)  # the learner hangs for 15 periods
+        *_, info = env.step(GO)
+    finally:
+        env.close()
+    elapsed = time.monotonic() - begin
+
+    commands = [command for _, command in env.unwrapped.told]
+    # Never faster than the clock, and how much slower depends on the machine.
+    assert elapsed >= 5 * 0.02 + 0.3
+    assert 1 <= info["missed_steps"] <= 16
+    assert commands[-1] == 1.0 and commands[-2] == -1.0
+    assert env.timing.steps == 6 and env.timing.safe_actions >= info["missed_steps"]
+    assert info["overrun"] and env.latencies()[0].sum() == 6
+
+
+def test_training_beside_the_loop_improves_the_policy_while_the_environment_runs():
+    env = gymnasium.wrappers.TimeLimit(Plant(takes=0.002), 20)
+    model = small("droq", env, gradient_steps=0, learning_starts=20)
+    beside = TrainBeside(gradient_steps=2, most=3.0)
+    before = model.get_parameters()["policy"]
+    before = {name: tensor.clone() for name, tensor in before.items()}
+
+    model.learn(120, callback=beside)
+
+    done, after = beside.n_done, model.get_parameters()["policy"]
+    assert 0 < done <= 3.0 * 120 + 2
+    assert any(not np.array_equal(before[name], after[name]) for name in before)
+    time.sleep(0.05)
+    assert beside.n_done == done  # nothing runs on
+
+
+def test_a_learner_that_trains_in_the_loop_is_refused_beside_it():
+    with pytest.raises(ValueError, match="gradient_steps=0"):
+        small("droq", Plant()).learn(5, callback=TrainBeside())
+
+
+def test_what_fails_beside_the_loop_fails_in_it():
+    model = small("droq", Plant(takes=0.002), gradient_steps=0)
+
+    def broken(**settings):
+        raise RuntimeError("the network caught fire")
+
+    model.train = broken
+    with pytest.raises(RuntimeError, match="caught fire"):
+        model.learn(500, callback=TrainBeside())

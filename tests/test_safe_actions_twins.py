@@ -1,0 +1,296 @@
+"""Layers around an environment have twins, planners plan through them, learners store as asked."""
+
+import json
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import stable_baselines3 as sb3
+from small_models import small
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+from sb3_hds import PODS, twins
+from sb3_hds.algos import ExecutedReplayBuffer
+from sb3_hds.core import LowPass, RateLimit, RescaleAction, Signals, TransformedTwin
+from sb3_hds.effects import ViscousFriction
+from sb3_hds.envs import TwinEnv, twin_of
+from sb3_hds.errors import EnvironmentMismatchError, ParameterError
+from sb3_hds.twins import Pendulum
+from sb3_hds.wrappers import (
+    ActionDelay,
+    ActionRateLimit,
+    ActionScale,
+    ActionShield,
+    ContinuityCost,
+    HistoryObservation,
+    JointLimitBarrier,
+    LowPassAction,
+)
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+
+def nested(env):
+    env = LowPassAction(ActionDelay(env, 2), cutoff=4.0)
+    env = ActionScale(ActionRateLimit(env, max_rate=10.0), schedule=[[0, 0.3], [150, 1.0]])
+    return HistoryObservation(ContinuityCost(env, 0.3), n_observations=1, n_actions=2)
+
+
+LAYERS = {
+    "rate_limit": lambda env: ActionRateLimit(env, max_rate=10.0),
+    "low_pass": lambda env: LowPassAction(env, cutoff=4.0, order=3),
+    "delay": lambda env: ActionDelay(env, steps=3),
+    "scale": lambda env: ActionScale(env, schedule=[[0, 0.3], [150, 1.0]]),
+    "history": lambda env: HistoryObservation(env, n_observations=2, n_actions=2),
+    "continuity": lambda env: ContinuityCost(env, weight=0.3),
+    # No speed is commanded here: what the twin does beyond its assumptions has to agree, too.
+    "barrier": lambda env: JointLimitBarrier(
+        env, -2.0, 2.0, position=[[0, 1]], gain=0.5, on_breach="ignore"
+    ),
+    "two_of_a_kind": lambda env: ActionRateLimit(ActionRateLimit(env, 30.0), 10.0),
+    "nested": nested,
+}
+ALL = pytest.mark.parametrize("layer", LAYERS)
+
+
+@ALL
+def test_a_wrapped_pendulum_and_its_twin_agree_step_for_step(layer, x64):
+    env = LAYERS[layer](gymnasium.make("Pendulum-v1"))
+    twin = twin_of(env)
+    step, reward, infer = map(jax.jit, (twin.step, twin.reward, twin.infer))
+    obs, _ = env.reset(seed=1)
+    env.action_space.seed(1)
+    alone = infer(jnp.asarray(obs, jnp.float64), twin.params)
+
+    for _ in range(200):
+        action = env.action_space.sample()
+        state, command = infer(jnp.asarray(obs, jnp.float64), twin.params), jnp.float64(action)
+        obs, given, *_ = env.step(action)
+        after, alone = (step(s, command, twin.params) for s in (state, alone))
+        # From an observation in single precision: 6e-8 of a speed of 8 rad/s and of each filter;
+        # the reward squares an angle of up to pi and a speed of up to 8 rad/s.
+        np.testing.assert_allclose(twin.observe(after, twin.params), obs, atol=5e-6)
+        assert float(reward(state, command, after, twin.params)) == pytest.approx(given, abs=5e-5)
+        # A twin that never saw the environment again: the pendulum magnifies what was rounded.
+        np.testing.assert_allclose(twin.observe(alone, twin.params), obs, atol=5e-3)
+    assert env.unwrapped.state[1] != 0.0
+
+
+@ALL
+def test_what_is_seen_tells_the_state_of_the_twin(layer, x64):
+    twin = twin_of(LAYERS[layer](gymnasium.make("Pendulum-v1")))
+    state = twin.initial(jax.random.key(0), twin.params)
+    for k in range(5):
+        state = twin.step(state, jnp.full(1, 1.5 - k), twin.params)
+
+    back = twin.infer(twin.observe(state, twin.params), twin.params)
+
+    for ours, theirs in zip(jax.tree.leaves(state), jax.tree.leaves(back), strict=True):
+        np.testing.assert_allclose(jnp.sin(ours), jnp.sin(theirs), atol=1e-9)  # angles turn
+
+
+@ALL
+def test_the_twin_survives_a_spec_effects_and_another_interval(layer):
+    twin = twin_of(LAYERS[layer](gymnasium.make("Pendulum-v1", g=9.0)))
+
+    back = twins.from_spec(json.loads(json.dumps(twin.to_spec())))
+
+    assert back == twin and back.params == twin.params and hash(back) == hash(twin)
+    extended = twin.extend(ViscousFriction(b=0.1))
+    assert "viscous_friction.hinge.b" in extended.parameters
+    assert extended.without("viscous_friction.hinge") == twin
+    assert twin.at_interval(0.1, 2).channels == twin.channels
+
+
+def test_copies_in_other_processes_have_the_same_twin():
+    def make():
+        return nested(gymnasium.make("Pendulum-v1", g=9.0))
+
+    expected, env = twin_of(make()), SubprocVecEnv([make])
+    try:
+        found = twin_of(env)
+    finally:
+        env.close()
+
+    assert found == expected and found.values["gravity"] == 9.0
+    assert twin_of(DummyVecEnv([make, make])) == expected
+
+
+def test_an_environment_made_of_a_twin_behind_a_layer_agrees_with_the_wrapped_one():
+    layer = ActionDelay(gymnasium.make("Pendulum-v1"), 2)
+    made = TwinEnv(twin_of(layer))
+    start = made.reset(seed=0)[0]
+    layer.reset(seed=0)
+    layer.unwrapped.state = np.array([np.arctan2(start[1], start[0]), start[2]])
+
+    for action in ([2.0], [-1.0], [0.5], [2.0]):
+        ours, theirs = (env.step(np.array(action, np.float32))[0] for env in (made, layer))
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+
+def test_layers_without_a_twin_are_refused_by_name():
+    env = ActionShield(gymnasium.make("Pendulum-v1"), ([[1.0]], [1.0]))
+
+    with pytest.raises(EnvironmentMismatchError, match="wrapper ActionShield may"):
+        twin_of(LowPassAction(env, 4.0))
+
+
+def test_a_stateful_transform_comes_alone():
+    limit = RateLimit(max_change=1.0)
+
+    with pytest.raises(ParameterError, match="one TransformedTwin into another"):
+        TransformedTwin(Pendulum(), stateful=limit, action=RescaleAction())
+
+
+def test_derivatives_of_a_filter_pass_through_the_twin(x64):
+    twin = TransformedTwin(Pendulum(), stateful=LowPass(b=(0.4, 0.4), a=(1.0, -0.2)))
+    state = twin.infer(jnp.array([1.0, 0.0, 0.0, 0.1]), twin.params)
+
+    slope = jax.jacfwd(lambda u: twin.step(state, u, twin.params).v[0])(jnp.zeros(1))
+
+    # The command is 0.4 u + z; 1 N m during 0.05 s speeds m l^2 / 3 up by 0.15.
+    assert float(slope[0]) == pytest.approx(0.4 * 0.15, rel=1e-9)
+
+
+def test_limits_of_the_filters_memory_are_those_of_the_twin_and_the_wrapper():
+    env = LowPassAction(gymnasium.make("Pendulum-v1"), 4.0)
+    twin = twin_of(env)
+
+    np.testing.assert_allclose([c.low for c in twin.channels], env.observation_space.low)
+    np.testing.assert_allclose([c.high for c in twin.channels], env.observation_space.high)
+    assert Signals(twin.actuators, twin.channels).rest() == pytest.approx(0.0)
+
+
+# --- learners ------------------------------------------------------------------------------------
+
+
+def test_pods_plans_through_layers():
+    env = nested(gymnasium.make("Pendulum-v1"))
+    model = small("pods", env)
+    before = jax.tree.leaves(model.policy.networks.actor)
+
+    model.learn(25)
+
+    assert isinstance(model.twin, TransformedTwin)
+    after = jax.tree.leaves(model.policy.networks.actor)
+    assert any(not np.array_equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+def jumping():
+    """Actions of ±2 that a rate limit turns into changes of 0.5."""
+    return ActionRateLimit(gymnasium.make("Pendulum-v1"), max_rate=10.0, store="executed")
+
+
+@pytest.mark.parametrize("name", ["droq", "gsde_sac", "td7"])
+def test_our_learners_store_what_was_executed(name):
+    model = small(name, jumping(), learning_starts=40)
+
+    model.learn(30)
+
+    stored = 2.0 * model.replay_buffer.actions[:30, 0, 0]  # from [-1, 1] to N m
+    assert np.max(np.abs(np.diff(stored, prepend=0.0))) <= 0.5 + 1e-5
+    # The observation that follows holds the same command.
+    np.testing.assert_allclose(stored, model.replay_buffer.next_observations[:30, 0, 3], atol=1e-5)
+
+
+def test_learners_of_sb3_store_what_was_executed_with_our_buffer():
+    stock, ours = (
+        sb3.SAC(
+            "MlpPolicy", jumping(), learning_starts=50, buffer_size=100, seed=0, **arguments
+        ).learn(30)
+        for arguments in ({}, {"replay_buffer_class": ExecutedReplayBuffer})
+    )
+
+    chosen, executed = (2.0 * model.replay_buffer.actions[:30, 0, 0] for model in (stock, ours))
+    told = ours.replay_buffer.next_observations[:30, 0, 3]
+    np.testing.assert_allclose(executed, told, atol=1e-5)
+    assert np.max(np.abs(chosen - told)) > 1.0
+
+
+def test_planners_keep_what_was_chosen_because_their_twin_has_the_layer():
+    noise = NormalActionNoise(np.zeros(1), np.ones(1))
+    model = small("pods", jumping(), action_noise=noise)
+
+    model.learn(25)
+
+    buffer = model.replay_buffer
+    told = buffer.next_observations[:25, 0, 3]
+    assert np.max(np.abs(2.0 * buffer.actions[:25, 0, 0] - told)) > 0.1
+
+
+def test_an_action_to_store_in_other_units_is_an_error():
+    env = gymnasium.wrappers.RescaleAction(jumping(), np.float32(-0.1), np.float32(0.1))
+    model = small("droq", env, learning_starts=40)
+
+    with pytest.raises(ValueError, match="outside that layer rescales actions"):
+        model.learn(30)
+
+
+# --- returns where a layer does not bind ---------------------------------------------------------
+
+
+class Reacher(gymnasium.Env):
+    """A joint commanded by its speed that has to go to 0.3 rad; the limits of 1.5 are far away."""
+
+    dt = 0.05
+
+    def __init__(self):
+        self.observation_space = gymnasium.spaces.Box(-5.0, 5.0, (1,))
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.q, self.n = self.np_random.uniform(-1.0, 1.0), 0
+        return np.array([self.q], np.float32), {}
+
+    def step(self, action):
+        self.q, self.n = self.q + float(action[0]) * self.dt, self.n + 1
+        reward = 1.0 - abs(self.q - 0.3)
+        return np.array([self.q], np.float32), reward, False, self.n >= 50, {}
+
+
+@pytest.mark.expensive
+@pytest.mark.parametrize(
+    "guard",
+    [
+        lambda env: JointLimitBarrier(env, -1.5, 1.5),
+        lambda env: ActionShield(env, ([[1.0], [-1.0]], [1.1, 1.1])),
+    ],
+    ids=["barrier", "shield"],
+)
+def test_a_policy_trained_behind_a_layer_that_does_not_bind_is_as_good_as_without(guard):
+    def trained(wrap):
+        model = small("droq", wrap(Reacher()), seed=1, learning_starts=200, batch_size=64)
+        model.learn(2_000)
+        env, total = wrap(Reacher()), 0.0
+        for episode in range(20):
+            obs, _ = env.reset(seed=episode)
+            for _ in range(50):
+                obs, reward, *_ = env.step(model.predict(obs, deterministic=True)[0])
+                total += reward
+        return total / 20
+
+    free, guarded = trained(lambda env: env), trained(guard)
+
+    assert free > 35.0  # a policy that stays where it begins gets 50 (1 - 0.55) = 22
+    assert guarded > free - 0.05 * abs(free)
+
+
+@pytest.mark.expensive
+def test_pods_swings_up_through_a_low_pass():
+    env = LowPassAction(gymnasium.make("Pendulum-v1"), cutoff=4.0)
+    model = PODS("MlpPolicy", env, seed=0)
+
+    model.learn(200)
+
+    total = 0.0
+    for episode in range(20):
+        obs, _ = env.reset(seed=100 + episode)
+        done = False
+        while not done:
+            obs, reward, _, done, _ = env.step(model.predict(obs, deterministic=True)[0])
+            total += reward
+    assert total / 20 > -250.0  # model-free learners reach about -150 without a filter
