@@ -40,6 +40,7 @@ LIBRARIES = {
     "wrappers": STEPPING,
     "wrappers/low_pass.py": {"scipy"},
     "wrappers/projection.py": {"daqp"},
+    "wrappers/gymnasium_vec_env.py": {"stable_baselines3.common.monitor"},
     "algos": LEARNING,
     "deploy": LEARNING | {"onnx", "onnxruntime"},
     "experiments": LEARNING | TABLES | {"scipy"},

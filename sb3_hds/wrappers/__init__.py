@@ -4,6 +4,8 @@ from sb3_hds.wrappers.barrier import JointLimitBarrier
 from sb3_hds.wrappers.continuity import ContinuityCost
 from sb3_hds.wrappers.cpg_prior import CPGPrior
 from sb3_hds.wrappers.delay import ActionDelay
+from sb3_hds.wrappers.ends import InfiniteHorizon, TerminateToTruncate, TruncateToTerminate
+from sb3_hds.wrappers.gymnasium_vec_env import GymnasiumVecEnv
 from sb3_hds.wrappers.history import HistoryObservation
 from sb3_hds.wrappers.low_pass import LowPassAction
 from sb3_hds.wrappers.manual_reset import ManualReset
@@ -15,6 +17,7 @@ from sb3_hds.wrappers.scale import ActionScale
 from sb3_hds.wrappers.shared_control import Phase, SharedControlTemplate
 from sb3_hds.wrappers.shield import ActionShield
 from sb3_hds.wrappers.show_joints import ShowJoints
+from sb3_hds.wrappers.time_aware import TimeAware
 
 __all__ = [
     "ActionDelay",
@@ -23,7 +26,9 @@ __all__ = [
     "ActionShield",
     "CPGPrior",
     "ContinuityCost",
+    "GymnasiumVecEnv",
     "HistoryObservation",
+    "InfiniteHorizon",
     "JointLimitBarrier",
     "LowPassAction",
     "ManualReset",
@@ -33,5 +38,8 @@ __all__ = [
     "Record",
     "SharedControlTemplate",
     "ShowJoints",
+    "TerminateToTruncate",
+    "TimeAware",
     "Timing",
+    "TruncateToTerminate",
 ]
