@@ -127,6 +127,7 @@ def test_what_happens_next_depends_on_the_observation_and_the_action_alone(mode)
     np.testing.assert_allclose(once[:2], [0.0, 1.0], atol=1e-9)
 
 
+@quickly
 @every_mode
 def test_targets_and_commands_are_differentiable_in_jax_and_the_same_in_numpy(mode):
     rhythm = swimmer(mode).rhythm
@@ -166,7 +167,7 @@ def test_it_survives_pickling_and_says_how_it_was_made(mode):
 
 
 @quickly
-@pytest.mark.parametrize("name", ["droq", "openloop"])
+@pytest.mark.parametrize("name", [pytest.param("droq", marks=pytest.mark.expensive), "openloop"])
 def test_learners_use_it_in_several_copies(name):
     env = make_vec_env(
         "Pendulum-v1", n_envs=2, wrapper_class=CPGPrior, wrapper_kwargs={"omega_swing": 4.0}

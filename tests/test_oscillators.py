@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from sb3_hds.core import oscillators
 from sb3_hds.core.oscillators import AmplitudeState, Gait, Hopf, HopfState
 
-pytestmark = pytest.mark.usefixtures("x64")
+pytestmark = pytest.mark.usefixtures("x64", "quick_compilation")
 TAU = 2.0 * math.pi
 
 

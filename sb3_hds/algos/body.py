@@ -188,7 +188,7 @@ def _driven(env: VecEnv, control: str) -> ActuatedJoints | None:
     if control == "direct":
         return None
     model = _attribute(env, "model")
-    if hasattr(model, "actuator_trnid") and model.nu == int(np.prod(env.action_space.shape)):
+    if hasattr(model, "actuator_trnid") and model.nu == _commands(env)[0].size:
         try:
             return actuated_joints(model)
         except EnvironmentMismatchError:

@@ -37,14 +37,15 @@ class Timetable:
     """
 
     def __init__(self, gaits: Constants, dt: float) -> None:
-        self._gait = Gait(*(np.asarray(part, float) for part in gaits[:5]))
+        # Double precision: the phase is kept over a thousand turns and more.
+        with jax.enable_x64(True):
+            self._gait = Gait(*(jnp.asarray(part, float) for part in gaits[:5]))
         self._dt = dt
         self._targets = np.zeros((len(gaits.amplitude), 0, gaits.amplitude.shape[1]))
 
     def at(self, rows: Int[np.ndarray, " n"], steps: Int[np.ndarray, " n"]) -> Targets:
         """:return: what each of the gaits ``rows`` aims at in its step of ``steps``"""
         while steps.size and self._targets.shape[1] <= int(steps.max()):
-            # Double precision: the phase is kept over a thousand turns and more.
             with jax.enable_x64(True):
                 more = _targets(self._gait, float(self._targets.shape[1]), self._dt)
             self._targets = np.concatenate([self._targets, np.asarray(more)], axis=1)
