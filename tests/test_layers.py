@@ -38,6 +38,7 @@ LIBRARIES = {
     "sysid": SOLVERS | TABLES | {"scipy", "jinja2"},
     "envs": STEPPING | {"mujoco"},
     "wrappers": STEPPING,
+    "wrappers/gymnasium_vec_env.py": {"stable_baselines3.common.monitor"},
     "wrappers/low_pass.py": {"scipy"},
     "wrappers/projection.py": {"daqp"},
     "algos": LEARNING,

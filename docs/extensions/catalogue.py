@@ -7,7 +7,7 @@ from tables import table
 
 from sb3_hds import effects, twins
 from sb3_hds.core import Actuator, Channel, Parameter, Twin
-from sb3_hds.envs.registration import HARDWARE, STEP_LIMITS
+from sb3_hds.envs.registration import EXAMPLES, HARDWARE, STEP_LIMITS
 
 
 def twins_as_markdown() -> str:
@@ -64,6 +64,9 @@ def environments_as_markdown() -> str:
         [f"`{env_id}`", f"none: MuJoCo's engine; [its twin](twins.md#{name.lower()})", str(steps)]
         for env_id, (_, steps) in HARDWARE.items()
         for name in [twins.get(env_id).name]
+    ]
+    rows += [
+        [f"`{env_id}`", "none: an example", str(steps)] for env_id, (_, steps) in EXAMPLES.items()
     ]
     return table(["id", "made of the twin", "steps of an episode"], rows)
 

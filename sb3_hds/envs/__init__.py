@@ -8,6 +8,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sb3_hds.envs.constant_reward import ConstantReward
     from sb3_hds.envs.inverted_pendulum_friction import InvertedPendulumFriction
     from sb3_hds.envs.mirror import check_mirrors, twin_of
     from sb3_hds.envs.pendulum_real import PendulumReal
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from sb3_hds.envs.twin_vec_env import TwinVecEnv
 
 __all__ = [
+    "ConstantReward",
     "InvertedPendulumFriction",
     "PendulumReal",
     "TwinEnv",
@@ -30,6 +32,7 @@ __all__ = [
 ]
 
 _MODULES = {
+    "ConstantReward": "constant_reward",
     "InvertedPendulumFriction": "inverted_pendulum_friction",
     "PendulumReal": "pendulum_real",
     "TwinEnv": "twin_env",

@@ -35,6 +35,7 @@ from sb3_hds.twins import registry
 _NEUTRAL = {
     "Autoreset": "gymnasium",
     "HumanRendering": "gymnasium",
+    "InfiniteHorizon": "sb3_hds",
     "ManualReset": "sb3_hds",
     "Monitor": "stable_baselines3",
     "OrderEnforcing": "gymnasium",

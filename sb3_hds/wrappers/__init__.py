@@ -3,6 +3,8 @@
 from sb3_hds.wrappers.barrier import JointLimitBarrier
 from sb3_hds.wrappers.continuity import ContinuityCost
 from sb3_hds.wrappers.delay import ActionDelay
+from sb3_hds.wrappers.ends import InfiniteHorizon, TerminateToTruncate, TruncateToTerminate
+from sb3_hds.wrappers.gymnasium_vec_env import GymnasiumVecEnv
 from sb3_hds.wrappers.history import HistoryObservation
 from sb3_hds.wrappers.low_pass import LowPassAction
 from sb3_hds.wrappers.manual_reset import ManualReset
@@ -12,6 +14,7 @@ from sb3_hds.wrappers.record import Record
 from sb3_hds.wrappers.scale import ActionScale
 from sb3_hds.wrappers.shared_control import Phase, SharedControlTemplate
 from sb3_hds.wrappers.shield import ActionShield
+from sb3_hds.wrappers.time_aware import TimeAware
 
 __all__ = [
     "ActionDelay",
@@ -19,7 +22,9 @@ __all__ = [
     "ActionScale",
     "ActionShield",
     "ContinuityCost",
+    "GymnasiumVecEnv",
     "HistoryObservation",
+    "InfiniteHorizon",
     "JointLimitBarrier",
     "LowPassAction",
     "ManualReset",
@@ -27,5 +32,8 @@ __all__ = [
     "RealTime",
     "Record",
     "SharedControlTemplate",
+    "TerminateToTruncate",
+    "TimeAware",
     "Timing",
+    "TruncateToTerminate",
 ]

@@ -28,9 +28,11 @@ class ManualReset(gymnasium.Wrapper):
         """End the episode with the step that is running, or the next one. Any thread may call."""
         self._requested.set()
 
-    def reset(self, **settings: Any) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         self._requested.clear()
-        return self.env.reset(**settings)
+        return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """:return: as the environment, with ``info["manual_reset"]`` where it was asked to end"""

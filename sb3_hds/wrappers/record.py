@@ -57,8 +57,10 @@ class Record(gymnasium.Wrapper):
             append=append,
         )
 
-    def reset(self, **settings: Any) -> tuple[Any, dict[str, Any]]:
-        obs, info = self.env.reset(**settings)
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        obs, info = self.env.reset(seed=seed, options=options)
         self.recorder.start(obs)
         return obs, info
 
