@@ -47,15 +47,43 @@ class Case(NamedTuple):
 
 
 CASES = {
+    "ActionDelay": Case(wrappers.ActionDelay, {"steps": 2}),
+    "ActionRateLimit": Case(wrappers.ActionRateLimit, {"max_rate": 10.0}),
+    "ActionScale": Case(wrappers.ActionScale, {"scale": 0.5}),
+    "ActionScale, schedule": Case(wrappers.ActionScale, {"schedule": [[0, 0.2], [20, 1.0]]}),
+    "ActionShield": Case(wrappers.ActionShield, {"constraints": [[[1.0]], [1.5]]}),
+    "ContinuityCost": Case(wrappers.ContinuityCost, {"weight": 0.1}),
+    "HistoryObservation": Case(wrappers.HistoryObservation, {"n_observations": 2}),
     "InfiniteHorizon": Case(wrappers.InfiniteHorizon, {"max_episode_steps": 20}),
+    # Pendulum-v1 is commanded by its torque, which the barrier would object to.
+    "JointLimitBarrier": Case(
+        wrappers.JointLimitBarrier,
+        {"low": -2.0, "high": 2.0, "position": [[0, 1]], "on_breach": "ignore"},
+    ),
+    "LowPassAction": Case(wrappers.LowPassAction, {"cutoff": 4.0}),
     # May hold a function, which no spec should carry to another process.
     "ManualReset": Case(wrappers.ManualReset, remade=False),
+    # Without a watchdog, which would act where the machine is busy.
+    "RealTime": Case(wrappers.RealTime, {"period": 1e-4}),
     # An open file, which is never overwritten.
     "Record": Case(
         wrappers.Record,
         lambda folder: {"path": str(folder / "run.jsonl")},
         pickles=False,
         remade=False,
+    ),
+    "SharedControlTemplate": Case(
+        wrappers.SharedControlTemplate,
+        {
+            "phases": [
+                {
+                    "name": "down",
+                    "mapping": [[2.0]],
+                    "transitions": [{"to": "up", "when": {"channel": 0, "above": 0.0}}],
+                },
+                {"name": "up", "mapping": [[1.0]], "constraints": [[[1.0]], [0.5]]},
+            ]
+        },
     ),
     "TerminateToTruncate": Case(wrappers.TerminateToTruncate, env_id="MountainCarContinuous-v0"),
     "TimeAware": Case(wrappers.TimeAware),

@@ -52,7 +52,9 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     late, on a busy machine by milliseconds: this is no hard real time, and no substitute for a
     watchdog in the drive.
 
-    ``info`` gets ``latency`` (from observation to command [s]), ``overrun`` and ``missed_steps``.
+    Times are no part of ``info``, which is a function of seed and actions: they are attributes,
+    ``timing``, ``latency`` (of the latest command, from observation to command [s]), ``overrun``
+    (whether that came late) and :meth:`latencies`.
 
     :param env: of any kind; simulated ones wait for the clock, real ones must return promptly
     :param period: :math:`T` [s]
@@ -87,7 +89,7 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         self._safe = None if safe_action is None else _in_space(env, safe_action)
         self._threaded = threaded and self._safe is not None
         self._clock, self._sleep = clock, sleep
-        self.timing = Timing()
+        self.timing, self.latency, self.overrun = Timing(), 0.0, False
         self._counts = np.zeros(_BINS * _PERIODS + 1, int)
         self._deadline, self._answered = 0.0, 0.0
         self._running, self._claimed = False, False
@@ -110,16 +112,16 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """:return: as the environment; see above for rewards and ``info``"""
         came = self._clock()
-        latency = came - self._answered
-        self._note(latency)
+        self.latency, self.overrun = came - self._answered, True
+        self._note(self.latency)
         self.watch()
         with self._lock:
             missed, self._missed = self._missed, []
             if missed and (missed[-1][2] or missed[-1][3]):
                 self.timing = self.timing._replace(dropped=self.timing.dropped + 1)
-                return self._merged(missed, latency, True, True)
+                return self._merged(missed, dropped=True)
             self._claimed = True
-        late = bool(missed) or came > self._deadline
+        self.overrun = bool(missed) or came > self._deadline
         if (wait := self._deadline - self._clock()) > 0.0:
             self._sleep(wait)
         with self._lock:
@@ -128,9 +130,9 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
             self._answered = self._clock()
             timing = self.timing
             self.timing = timing._replace(
-                steps=timing.steps + 1, overruns=timing.overruns + int(late)
+                steps=timing.steps + 1, overruns=timing.overruns + int(self.overrun)
             )
-        return self._merged(missed, latency, late, False)
+        return self._merged(missed, dropped=False)
 
     def watch(self) -> bool:
         """
@@ -179,14 +181,10 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     def _merged(
         self,
         results: list[tuple[Any, Any, bool, bool, dict[str, Any]]],
-        latency: float,
-        late: bool,
         dropped: bool,
     ) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         obs, _, terminated, truncated, info = results[-1]
         info = info | {
-            "latency": latency,
-            "overrun": late,
             "missed_steps": len(results) - (not dropped),
             "command_dropped": dropped,
         }
