@@ -52,6 +52,8 @@ CASES = {
     "ActionScale": Case(wrappers.ActionScale, {"scale": 0.5}),
     "ActionScale, schedule": Case(wrappers.ActionScale, {"schedule": [[0, 0.2], [20, 1.0]]}),
     "ActionShield": Case(wrappers.ActionShield, {"constraints": [[[1.0]], [1.5]]}),
+    "CPGPrior": Case(wrappers.CPGPrior, {"omega_swing": 6.0}),
+    "CPGPrior, own parameters": Case(wrappers.CPGPrior, {"mode": "parameters", "omega_swing": 6.0}),
     "ContinuityCost": Case(wrappers.ContinuityCost, {"weight": 0.1}),
     "HistoryObservation": Case(wrappers.HistoryObservation, {"n_observations": 2}),
     "InfiniteHorizon": Case(wrappers.InfiniteHorizon, {"max_episode_steps": 20}),
@@ -63,6 +65,7 @@ CASES = {
     "LowPassAction": Case(wrappers.LowPassAction, {"cutoff": 4.0}),
     # May hold a function, which no spec should carry to another process.
     "ManualReset": Case(wrappers.ManualReset, remade=False),
+    "Perturb": Case(wrappers.Perturb, {"noise": 0.1}),
     # Without a watchdog, which would act where the machine is busy.
     "RealTime": Case(wrappers.RealTime, {"period": 1e-4}),
     # An open file, which is never overwritten.
@@ -85,6 +88,8 @@ CASES = {
             ]
         },
     ),
+    # Environments of MuJoCo begin anew where they are unpickled.
+    "ShowJoints": Case(wrappers.ShowJoints, env_id="Swimmer-v5", pickles=False),
     "TerminateToTruncate": Case(wrappers.TerminateToTruncate, env_id="MountainCarContinuous-v0"),
     "TimeAware": Case(wrappers.TimeAware),
     "TimeAware, own limit": Case(wrappers.TimeAware, {"max_episode_steps": 50}),

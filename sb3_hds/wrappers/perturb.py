@@ -59,7 +59,6 @@ class Perturb(gymnasium.Wrapper, RecordConstructorArgs):
             raise ParameterError(f"Sensor {sensor} is none of the {space.shape[0]} that there are.")
         if push and not hasattr(getattr(env.unwrapped, "data", None), "xfrc_applied"):
             raise EnvironmentMismatchError(f"A push needs an environment of MuJoCo, got {env}.")
-        # Limits would be crossed by noise; a policy that was trained sees the same shape and type.
         self.noise, self.failing, self.sensor, self.constant = noise, failing, sensor, constant
         self.push, self.push_probability = push, push_probability
         self._failed = 0
@@ -93,4 +92,6 @@ class Perturb(gymnasium.Wrapper, RecordConstructorArgs):
             seen = seen + self.noise * self.np_random.normal(size=seen.shape)
         if self.failing:
             seen[self._failed] = 0.0 if self.failing == "zero" else self.constant
-        return seen.astype(obs.dtype)
+        box: Any = self.observation_space
+        # A sensor reports nothing beyond its range, and a policy that was trained expects none.
+        return np.clip(seen, box.low, box.high).astype(obs.dtype)
