@@ -111,6 +111,7 @@ def test_what_the_data_cannot_tell_apart_is_said():
     assert any("torque_gain" in name for name in (finding.effect, *finding.alternatives))
 
 
+@pytest.mark.expensive
 def test_what_is_refitted_as_a_nuisance_is_no_finding():
     data = on_engine(mass=1.1)
 
@@ -128,6 +129,7 @@ def test_what_no_candidate_explains_is_unknown_and_where_it_lives_is_said():
     assert "hinge" in found.unexplained and "position" in found.unexplained
 
 
+@pytest.mark.expensive
 def test_two_causes_are_found_one_after_the_other():
     found = asked(on_engine(friction=0.1, delay=0.05))
 
@@ -157,6 +159,7 @@ def test_a_joint_whose_direction_is_wrong_is_found_as_a_whole():
     }
 
 
+@pytest.mark.expensive
 def test_what_looks_alike_is_said_and_how_sure_predictions_are_is_drawn():
     """Two dry frictions, one for each direction, can be one; they have more freedom."""
     kinds = [effects.CoulombFriction, effects.DirectionalCoulombFriction, effects.MotorLag]

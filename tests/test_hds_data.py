@@ -128,6 +128,7 @@ def test_what_was_suspected_and_explains_nothing_is_let_go(heavier):
     assert found.twin.values["action_delay.torque.delay"] == pytest.approx(0.1, rel=0.1)
 
 
+@pytest.mark.expensive
 def test_what_is_suspected_is_estimated_with_the_rest_and_travels(tmp_path):
     rubbing = twins.make("PendulumReal").extend(effects.CoulombFriction(0, tau_c=0.3))
     data = measured(rubbing, noise=0.01)
@@ -249,6 +250,7 @@ def return_of(model, env, n=20):
     return total / n
 
 
+@pytest.mark.expensive
 def test_what_the_data_say_is_logged():
     model = small("hds", gymnasium.make(REAL, mass=1.4), twin="PendulumReal", train_freq=100)
     lines = logged(model)
@@ -385,6 +387,7 @@ def columns(model):
     }
 
 
+@pytest.mark.expensive
 def test_data_and_corrections_travel_with_the_model(tmp_path, heavier):
     model = small("hds", REAL, twin="PendulumReal", pretrain_data=heavier, residual=False)
     model.learn(125).save(tmp_path / "model")
@@ -554,6 +557,7 @@ small("hds", env, twin="PendulumReal", residual=False, replan_epochs=1).learn(
 """
 
 
+@pytest.mark.expensive
 def test_a_killed_run_resumes_with_its_data_and_its_corrected_twin(tmp_path):
     environ = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     killed = subprocess.run([sys.executable, "-c", SCRIPT, str(tmp_path)], env=environ)

@@ -149,6 +149,7 @@ def test_a_timestep_is_a_step_of_the_environment_and_nothing_else(trained):
     assert evaluations["results"].shape == (3, 2)
 
 
+@pytest.mark.expensive
 def test_training_continues_from_a_saved_agent(continued):
     assert (continued / "Pendulum-v1.zip").is_file()
     assert np.load(continued / "evaluations.npz")["timesteps"][-1] == N_STEPS
@@ -194,6 +195,7 @@ def test_optuna_trials_are_stored_and_one_of_them_can_be_trained(zoo):
     assert saved_hyperparameters(run)["policy_kwargs"].keys() == {"net_arch", "activation_fn"}
 
 
+@pytest.mark.expensive
 def test_results_of_several_runs_are_drawn(zoo, collected):
     # LaTeX is a program of its own, which matplotlib calls.
     latex = ("-latex",) if shutil.which("latex") else ()
