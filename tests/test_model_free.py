@@ -1,5 +1,7 @@
 """What model-free algorithms are made of, beside references, and what only they can do."""
 
+from typing import Any
+
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -8,17 +10,26 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from small_models import OFF_POLICY, PLANNERS, SMALL, logged, small
-from stable_baselines3 import HerReplayBuffer
+from stable_baselines3 import SAC, HerReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_hds import GSDESAC, TD7, CrossQ, DroQ, SimbaSAC
-from sb3_hds.algos.bodies import BatchRenorm, Dropout
+from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp
 from sb3_hds.algos.heads import ExploringActor
 from sb3_hds.algos.lap import SumTree
 from sb3_hds.algos.observations import Seen, flattener, seen
-from sb3_hds.algos.off_policy import Truncated, average, least, mean, pessimistic, quantile_huber
+from sb3_hds.algos.off_policy import (
+    Truncated,
+    average,
+    judge,
+    least,
+    mean,
+    pessimistic,
+    quantile_huber,
+)
 from sb3_hds.algos.sampling import batches_of
 from sb3_hds.algos.squashed import Gaussian, exploration_std, log_probability, marginal_std
 from sb3_hds.errors import EnvironmentMismatchError
@@ -32,27 +43,75 @@ every_soft = pytest.mark.parametrize("name", SOFT)
 # --- gSDE beside SB3's
 
 
-@pytest.mark.parametrize("use_expln", [False, True])
-@pytest.mark.parametrize("full_std", [False, True])
-def test_state_dependent_noise_is_that_of_stable_baselines(full_std, use_expln):
+def both_noises(full_std: bool, use_expln: bool) -> tuple[Gaussian, np.ndarray, Any]:
+    """:return: our Gaussian, actions before tanh, and SB3's distribution in double precision"""
     rng = np.random.default_rng(0)
-    latent, means = rng.normal(size=(7, 5)).astype("f"), rng.normal(size=(7, 2)).astype("f")
-    log_std = rng.normal(size=(5, 2 if full_std else 1)).astype("f") - 1.0
+    latent, means, before = rng.normal(size=(3, 7, 5))
+    means, before = means[:, :2], 2.0 * before[:, :2]
+    before[0, 0] = 5.0  # where the action is 1 but for 1e-4
+    log_std = rng.normal(size=(5, 2 if full_std else 1)) - 1.0
     theirs = StateDependentNoiseDistribution(
         2, full_std, use_expln=use_expln, squash_output=True, learn_features=True
     )
     theirs.latent_sde_dim = 5
     theirs.sample_weights(th.as_tensor(log_std), 7)
-    theirs.proba_distribution(*map(th.as_tensor, (means, log_std, latent)))
-    before = rng.normal(size=(7, 2)).astype("f")
+    # SB3 expands a single column by ones of single precision; these are of double.
+    wide = th.as_tensor(np.broadcast_to(log_std, (5, 2)).copy())
+    theirs.full_std = True
+    theirs.proba_distribution(th.as_tensor(means), wide, th.as_tensor(latent))
+    std = exploration_std(jnp.broadcast_to(jnp.asarray(log_std), (5, 2)), use_expln)
+    return (
+        Gaussian(jnp.asarray(means), marginal_std(jnp.asarray(latent), std), latent),
+        before,
+        theirs,
+    )
 
-    std = exploration_std(jnp.broadcast_to(log_std, (5, 2)), use_expln)
-    gaussian = Gaussian(jnp.asarray(means), marginal_std(jnp.asarray(latent), std), latent)
 
-    np.testing.assert_allclose(gaussian.std, theirs.distribution.stddev, rtol=1e-5)
-    np.testing.assert_allclose(jnp.tanh(gaussian.mean), theirs.mode(), rtol=1e-5)
+@pytest.mark.parametrize("use_expln", [False, True])
+@pytest.mark.parametrize("full_std", [False, True])
+def test_state_dependent_noise_is_that_of_stable_baselines(full_std, use_expln, x64):
+    gaussian, before, theirs = both_noises(full_std, use_expln)
+    actions = th.tanh(th.as_tensor(before))
+
+    # SB3 has to find these from rounded actions again, which costs digits where they are near 1.
+    np.testing.assert_allclose(gaussian.std, theirs.distribution.stddev, rtol=1e-12)
+    np.testing.assert_allclose(jnp.tanh(gaussian.mean), theirs.mode(), rtol=1e-12)
+    np.testing.assert_allclose(
+        log_probability(gaussian, before), theirs.log_prob(actions), rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize("use_expln", [False, True])
+def test_single_precision_does_not_cost_log_probabilities_their_digits(use_expln):
+    gaussian, before, theirs = both_noises(True, use_expln)
     expected = theirs.log_prob(th.tanh(th.as_tensor(before)))
-    np.testing.assert_allclose(log_probability(gaussian, before), expected, rtol=1e-4, atol=1e-4)
+
+    found = log_probability(gaussian, jnp.asarray(before))
+
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_an_exploring_actor_is_that_of_stable_baselines_with_its_weights(x64):
+    theirs = SAC("MlpPolicy", "Pendulum-v1", use_sde=True, buffer_size=10, seed=0).actor.double()
+    ours = ExploringActor(Mlp((256, 256), jax.nn.relu), 1, -3.0, True, False, 2.0)
+    obs = np.random.default_rng(0).normal(size=(20, 3))
+    before = np.random.default_rng(1).normal(size=(20, 1))
+    layer = lambda given: {"kernel": given.weight.T.numpy(), "bias": given.bias.numpy()}  # noqa: E731
+
+    with th.no_grad():
+        theirs.log_std += 0.3 * th.randn_like(theirs.log_std)
+        latent = theirs.latent_pi(th.as_tensor(obs))
+        noise = theirs.action_dist.proba_distribution(theirs.mu(latent), theirs.log_std, latent)
+        expected = noise.log_prob(th.tanh(th.as_tensor(before)))
+        hidden, last = (theirs.latent_pi[0], theirs.latent_pi[2]), theirs.mu[0]
+        body = {f"Dense_{i}": layer(each) for i, each in enumerate(hidden)}
+        params = {"body": body, "Dense_0": layer(last), "log_std": theirs.log_std.numpy()}
+        gaussian = ours.apply({"params": params}, jnp.asarray(obs))
+
+    np.testing.assert_allclose(gaussian.mean, noise.distribution.mean, rtol=1e-9)
+    np.testing.assert_allclose(gaussian.std, noise.distribution.stddev, rtol=1e-9)
+    np.testing.assert_allclose(log_probability(gaussian, before), expected, rtol=1e-9, atol=1e-5)
 
 
 def test_noise_depends_on_the_state_and_stays_until_it_is_drawn_again():
@@ -254,6 +313,60 @@ def test_images_are_refused():
         DroQ("MlpPolicy", env)
 
 
+# --- what SB3's own tests ask for
+
+
+@every_algorithm
+@pytest.mark.parametrize("net_arch", [[], {"pi": [8, 4], "qf": [6]}])
+def test_networks_may_have_no_hidden_layer_or_layers_of_several_widths(name, net_arch):
+    kwargs = SMALL[name]["policy_kwargs"] | {"net_arch": net_arch}
+
+    assert np.isfinite(small(name, policy_kwargs=kwargs).predict(np.zeros(3, np.float32))[0]).all()
+
+
+@every_algorithm
+def test_values_of_the_critics_can_be_looked_at(name):
+    model = small(name)
+    obs = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, -2.0]], np.float32)
+
+    actions = model.actor(th.as_tensor(obs), deterministic=True)
+    values = model.critic(th.as_tensor(obs), th.as_tensor(actions))
+
+    assert len(values) == 2 and {value.shape for value in values} == {(2, 1)}
+    np.testing.assert_allclose(2.0 * actions, model.predict(obs, deterministic=True)[0], rtol=1e-6)
+    assert not np.array_equal(values[0], model.critic(obs, -np.ones((2, 1)))[0])
+
+
+def test_critics_agree_with_the_values_that_targets_are_made_of():
+    model = small("tqc_jax")
+    obs, action = np.ones((1, 3), np.float32), np.full((1, 1), 0.3, np.float32)
+    weights = model.policy.learner.critic.weights
+
+    [[one], [other]] = model.critic(obs, action)
+
+    values, _ = judge(model.policy.recipe, weights, obs, action, jax.random.key(1))
+    np.testing.assert_allclose([one[0], other[0]], values.mean(-1)[:, 0], rtol=1e-6)
+
+
+def test_a_replay_buffer_that_is_read_belongs_to_the_models_device(tmp_path):
+    model = small("droq", n_steps=2).learn(30)
+    model.save_replay_buffer(tmp_path / "buffer")
+    model.device = th.device("cuda")
+
+    model.load_replay_buffer(tmp_path / "buffer")
+
+    assert model.replay_buffer.device.type == "cuda"
+    assert batches_of(model, 1, 4, 1).obs.shape == (1, 4, 3)
+
+
+def test_returns_of_several_steps_need_a_buffer_that_has_them():
+    env = Constant(SPACES["dict"], spaces.Box(-1, 1, (1,)))
+    with pytest.raises(EnvironmentMismatchError, match="no Dict observation spaces"):
+        DroQ("MultiInputPolicy", env, n_steps=3)
+    with pytest.warns(UserWarning, match="n_steps=3 is ignored with replay_buffer_class=Replay"):
+        DroQ("Pendulum-v1", n_steps=3, replay_buffer_class=ReplayBuffer)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -335,6 +448,20 @@ def test_networks_start_afresh_when_told_to(name):
     ]
     # A few small steps of Adam would not lead so far.
     assert min(changed) > 0.05
+
+
+def test_bro_starts_afresh_with_its_temperature_and_others_keep_theirs():
+    for name, afresh in (("bro", True), ("droq", False)):
+        model = small(name, param_resets=[25]).learn(24)
+        before = model.policy.learner.log_ent_coef
+        assert float(before.weights["params"]) != 0.0
+
+        model._restart(seed=1)
+
+        after = model.policy.learner.log_ent_coef
+        assert (float(after.weights["params"]) == 0.0) == afresh, name
+        counts = [int(part[0].count) for part in (before.optimizer, after.optimizer)]
+        assert counts[0] > 0 and counts[1] == (0 if afresh else counts[0]), name
 
 
 def test_an_update_that_diverges_is_an_error_and_leaves_the_last_good_weights():

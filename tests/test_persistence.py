@@ -11,6 +11,7 @@ from base64 import b64decode
 from pathlib import Path
 
 import gymnasium
+import jax
 import numpy as np
 import pytest
 import torch as th
@@ -19,7 +20,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_hds import algos, effects, twins
-from sb3_hds.algos import TwinPolicy, persistence
+from sb3_hds.algos import persistence
 from sb3_hds.errors import NoTwinError
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -296,15 +297,31 @@ def test_a_model_of_an_accelerator_loads_where_there_is_none(name):
         algos.ALL[name].load(file, device="cuda").predict(observations())
 
 
-@every_planner
+@every_algorithm
 def test_a_policy_can_be_saved_alone(name, tmp_path):
-    model = small(name, policy_kwargs={"net_arch": [8], "activation_fn": "relu"}).learn(25)
+    model = small(name).learn(25)
 
     model.policy.save(tmp_path / "policy.pth")
-    policy = TwinPolicy.load(tmp_path / "policy.pth")
+    policy = type(model.policy).load(tmp_path / "policy.pth")
+
+    obs, expected = observations(), model.policy
+    actions = expected.predict(obs, deterministic=True)[0]
+    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], actions)
+    assert same({"": policy.state_dict()}, {"": expected.state_dict()})
+
+
+def test_a_policy_of_td7_alone_acts_by_its_checkpoint(tmp_path):
+    model = small("td7", use_checkpoints=True, train_freq=None)
+    moved = jax.tree.map(lambda weight: weight + 0.1, model.policy.learner.checkpoint)
+    model.policy.learner = model.policy.learner._replace(checkpoint=moved)
+
+    model.policy.save(tmp_path / "policy.pth")
+    policy = type(model.policy).load(tmp_path / "policy.pth")
 
     obs = observations()
-    np.testing.assert_array_equal(policy.predict(obs)[0], model.policy.predict(obs)[0])
+    expected = model.predict(obs, deterministic=True)[0]
+    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], expected)
+    assert not np.array_equal(policy.predict(obs)[0], expected)
 
 
 def test_loading_and_saving_raise_no_warning(tmp_path):

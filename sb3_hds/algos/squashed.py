@@ -7,13 +7,14 @@ log-probabilities agree with its ``SquashedDiagGaussianDistribution`` and
 ``StateDependentNoiseDistribution``.
 """
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 _EPSILON = 1e-6
-_LOG_SQRT_TAU = 0.5 * jnp.log(2.0 * jnp.pi).item()
+_LOG_SQRT_TAU = 0.5 * math.log(2.0 * math.pi)
 
 
 class Gaussian(NamedTuple):

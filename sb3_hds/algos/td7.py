@@ -38,6 +38,16 @@ from sb3_hds.algos.td7_update import (
     update,
 )
 
+# Of the policy's constructor: what is no argument, or is kept as state.
+_NO_ARGUMENTS = (
+    "self",
+    "observation_space",
+    "action_space",
+    "__class__",
+    "use_sde",
+    "uses_checkpoints",
+)
+
 
 class TD7Policy(LearningPolicy):
     """
@@ -55,6 +65,7 @@ class TD7Policy(LearningPolicy):
     :param optimizer_class: name, optax function or torch class
     :param optimizer_kwargs: besides the learning rate
     :param use_sde: accepted for SB3's sake; the policy is deterministic
+    :param uses_checkpoints: whether that of the last checkpoint acts; its algorithm says so
     """
 
     held = ("copies", "checkpoint")
@@ -73,11 +84,10 @@ class TD7Policy(LearningPolicy):
         optimizer_class: str | Callable[..., Any] = "adam",
         optimizer_kwargs: Mapping[str, Any] | None = None,
         use_sde: bool = False,
+        uses_checkpoints: bool = False,
     ) -> None:
         self.arguments = {
-            name: value
-            for name, value in locals().items()
-            if name not in ("self", "observation_space", "action_space", "__class__", "use_sde")
+            name: value for name, value in locals().items() if name not in _NO_ARGUMENTS
         }
         super().__init__(observation_space, action_space, squash_output=True)
         pi, qf = widths(net_arch, "qf")
@@ -94,7 +104,7 @@ class TD7Policy(LearningPolicy):
             "qf_optimizer": optimizer,
         }
         self.flatten = flattener(observation_space)
-        self.uses_checkpoints = False
+        self.uses_checkpoints = uses_checkpoints
 
     def build_plain(self) -> None:
         """That of the paper."""
@@ -117,6 +127,9 @@ class TD7Policy(LearningPolicy):
     @plain_state.setter
     def plain_state(self, state: Mapping[str, bool]) -> None:
         self.uses_checkpoints = bool(state["uses_checkpoints"])
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | self.plain_state
 
     def keep_checkpoint(self) -> None:
         """The policy as it is acts where nothing is explored."""
