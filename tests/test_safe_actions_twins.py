@@ -167,24 +167,12 @@ def test_limits_of_the_filters_memory_are_those_of_the_twin_and_the_wrapper():
 # --- learners ------------------------------------------------------------------------------------
 
 
-def test_pods_plans_through_layers():
-    env = nested(gymnasium.make("Pendulum-v1"))
-    model = small("pods", env)
-    before = jax.tree.leaves(model.policy.networks.actor)
-
-    model.learn(25)
-
-    assert isinstance(model.twin, TransformedTwin)
-    after = jax.tree.leaves(model.policy.networks.actor)
-    assert any(not np.array_equal(a, b) for a, b in zip(before, after, strict=True))
-
-
 def jumping():
     """Actions of ±2 that a rate limit turns into changes of 0.5."""
     return ActionRateLimit(gymnasium.make("Pendulum-v1"), max_rate=10.0, store="executed")
 
 
-@pytest.mark.parametrize("name", ["droq", "gsde_sac", "td7"])
+@pytest.mark.parametrize("name", ["droq", pytest.param("td7", marks=pytest.mark.expensive)])
 def test_our_learners_store_what_was_executed(name):
     model = small(name, jumping(), learning_starts=40)
 
@@ -210,12 +198,19 @@ def test_learners_of_sb3_store_what_was_executed_with_our_buffer():
     assert np.max(np.abs(chosen - told)) > 1.0
 
 
-def test_planners_keep_what_was_chosen_because_their_twin_has_the_layer():
+@pytest.mark.parametrize(
+    "wrap", [lambda env: env, pytest.param(nested, marks=pytest.mark.expensive)]
+)
+def test_planners_plan_through_layers_and_so_keep_what_was_chosen(wrap):
     noise = NormalActionNoise(np.zeros(1), np.ones(1))
-    model = small("pods", jumping(), action_noise=noise)
+    model = small("pods", wrap(jumping()), action_noise=noise)
+    before = jax.tree.leaves(model.policy.networks.actor)
 
     model.learn(25)
 
+    assert model.twin == twin_of(model.env) and isinstance(model.twin, TransformedTwin)
+    after = jax.tree.leaves(model.policy.networks.actor)
+    assert any(not np.array_equal(a, b) for a, b in zip(before, after, strict=True))
     buffer = model.replay_buffer
     told = buffer.next_observations[:25, 0, 3]
     assert np.max(np.abs(2.0 * buffer.actions[:25, 0, 0] - told)) > 0.1

@@ -13,7 +13,9 @@ def check_reward(twin: Twin) -> None:
     """
     :raises RewardError: if planning has nothing to climb in this twin
     """
-    base = getattr(twin, "base", twin)
+    base = twin
+    while hasattr(base, "base"):
+        base = base.base  # type: ignore[attr-defined]
     surrogate = type(base).planning_reward is not Twin.planning_reward
     if not surrogate and type(base).reward is Twin.reward:
         raise RewardError(
