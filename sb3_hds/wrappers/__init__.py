@@ -1,5 +1,7 @@
-"""Gymnasium wrappers for what robots need, one file per concern."""
+"""Gymnasium wrappers for what robots need, one file per concern, and checks of tasks."""
 
+from sb3_hds.wrappers.check_task import TaskReport, check_task
+from sb3_hds.wrappers.check_truncation import TruncationReport, check_truncation
 from sb3_hds.wrappers.ends import InfiniteHorizon, TerminateToTruncate, TruncateToTerminate
 from sb3_hds.wrappers.gymnasium_vec_env import GymnasiumVecEnv
 from sb3_hds.wrappers.manual_reset import ManualReset
@@ -11,7 +13,11 @@ __all__ = [
     "InfiniteHorizon",
     "ManualReset",
     "Record",
+    "TaskReport",
     "TerminateToTruncate",
     "TimeAware",
     "TruncateToTerminate",
+    "TruncationReport",
+    "check_task",
+    "check_truncation",
 ]

@@ -19,7 +19,7 @@ def infos_of(infos: Mapping[str, Any] | Sequence[Mapping[str, Any]], n: int) -> 
     for name, value in infos.items():
         if name.startswith("_") and name[1:] in infos:
             continue
-        parts = infos_of(value, n) if isinstance(value, Mapping) else _one_each(value, n)
+        parts: Any = infos_of(value, n) if isinstance(value, Mapping) else _one_each(value, n)
         has_it = infos.get(f"_{name}", np.ones(n, bool))
         for i in np.flatnonzero(has_it):
             rows[i][name] = parts[i]
@@ -47,7 +47,7 @@ def same_rows(first: Any, second: Any, rows: np.ndarray) -> bool:
     return np.array_equal(np.asarray(first)[rows], np.asarray(second)[rows], equal_nan=True)
 
 
-def _one_each(value: Any, n: int) -> Sequence[Any]:
+def _one_each(value: Any, n: int) -> Any:
     """Entries that do not come one for each copy belong to all of them."""
     each = isinstance(value, np.ndarray | Sequence) and not isinstance(value, str)
     return value if each and len(value) == n else [value] * n
