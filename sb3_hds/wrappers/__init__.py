@@ -1,6 +1,8 @@
 """Gymnasium wrappers for what robots need, one file per concern."""
 
 from sb3_hds.wrappers.barrier import JointLimitBarrier
+from sb3_hds.wrappers.check_task import TaskReport, check_task
+from sb3_hds.wrappers.check_truncation import TruncationReport, check_truncation
 from sb3_hds.wrappers.continuity import ContinuityCost
 from sb3_hds.wrappers.cpg_prior import CPGPrior
 from sb3_hds.wrappers.delay import ActionDelay
@@ -38,8 +40,12 @@ __all__ = [
     "Record",
     "SharedControlTemplate",
     "ShowJoints",
+    "TaskReport",
     "TerminateToTruncate",
     "TimeAware",
     "Timing",
     "TruncateToTerminate",
+    "TruncationReport",
+    "check_task",
+    "check_truncation",
 ]

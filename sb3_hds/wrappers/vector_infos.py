@@ -19,7 +19,7 @@ def infos_of(infos: Mapping[str, Any] | Sequence[Mapping[str, Any]], n: int) -> 
     for name, value in infos.items():
         if name.startswith("_") and name[1:] in infos:
             continue
-        parts = infos_of(value, n) if isinstance(value, Mapping) else _one_each(value, n)
+        parts: Any = infos_of(value, n) if isinstance(value, Mapping) else _one_each(value, n)
         has_it = infos.get(f"_{name}", np.ones(n, bool))
         for i in np.flatnonzero(has_it).tolist():
             rows[i][name] = parts[i]

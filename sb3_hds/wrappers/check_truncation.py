@@ -1,0 +1,231 @@
+"""Does a time-out reach the learner as what it is?"""
+
+from collections import Counter
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
+
+from sb3_hds.errors import ParameterError
+from sb3_hds.wrappers.ends_seen import End, Seen, ends_of_env, ends_of_vec_env, is_same
+from sb3_hds.wrappers.gymnasium_vec_env import GymnasiumVecEnv
+from sb3_hds.wrappers.report import Report, counted, name_of
+from sb3_hds.wrappers.step_limit import step_limit_of
+
+# Steps that are made where no limit is known.
+_USUAL = 2_000
+# Ends after equally many steps that are no coincidence, if they are half of all ends.
+_FEWEST = 3
+
+
+class TruncationReport(Report):
+    """What :func:`check_truncation` found."""
+
+
+def check_truncation(
+    env: gymnasium.Env | VecEnv | VectorEnv, *, n_steps: int | None = None, seed: int = 0
+) -> TruncationReport:
+    r"""
+    Find out whether a time-out reaches the learner as a truncation.
+
+    A learner bootstraps the value of the last observation at a truncation, and takes 0 at a
+    termination. A time limit that arrives as a termination makes values wrong, silently: those of a
+    constant reward of 1 by a factor of :math:`1 / (1 - \gamma^n)` for a limit of ``n`` steps.
+
+    Episodes are made with random actions. What an end *means* cannot be seen from outside; but
+    ends that come after the same number of steps time and again are a limit, unless observations
+    tell the time. The environment is reset and stepped, and not closed.
+
+    :param env: an environment, an SB3 ``VecEnv`` of anybody's, or a Gymnasium ``VectorEnv`` in any
+        autoreset mode, wrapped as the learner gets it
+    :param n_steps: at most so many; None: four episodes of the time limit in each copy, or 2,000
+    :param seed: of starts and actions
+    :raises ParameterError: for anything else, or no steps
+    """
+    if n_steps is not None and n_steps < 1:
+        raise ParameterError(f"check_truncation(n_steps={n_steps}): at least one step is needed.")
+    if isinstance(env, VectorEnv):
+        return _of_vector_env(env, n_steps, seed)
+    if isinstance(env, VecEnv):
+        problems, notes, seen = _of_vec_env(env, n_steps, seed)
+    elif isinstance(env, gymnasium.Env):
+        problems, notes, seen = _of_env(env, n_steps, seed)
+    else:
+        raise ParameterError(
+            "check_truncation takes a gymnasium.Env, an SB3 VecEnv or a gymnasium.vector.VectorEnv,"
+            f" got {type(env).__name__}."
+        )
+    return TruncationReport(_subject(env, seen), problems, notes)
+
+
+def _of_env(env: gymnasium.Env, n_steps: int | None, seed: int) -> tuple[list, list, Seen]:
+    limit = step_limit_of(env)
+    try:
+        seen = ends_of_env(env, n_steps or 4 * (limit or _USUAL // 4), seed)
+    except ValueError as error:
+        if "values to unpack" not in str(error):
+            raise
+        old = (
+            f"{env}.step() or reset() does not return what Gymnasium's do ({error}). With a single "
+            "'done', a time-out cannot be told from a failure. Return (obs, reward, terminated, "
+            "truncated, info), and (obs, info) from reset()."
+        )
+        return [old], [], Seen([], 0, False)
+    problems = _only_in_info(seen) + _looks_like_a_limit(seen, limit)
+    problems += _nothing_ended(seen)
+    return problems, [] if problems else _unseen(seen, limit), seen
+
+
+def _of_vec_env(env: VecEnv, n_steps: int | None, seed: int) -> tuple[list, list, Seen]:
+    limit = _limit_of_copies(env)
+    seen = ends_of_vec_env(env, n_steps or env.num_envs * 4 * (limit or _USUAL // 4), seed)
+    problems = _missing_keys(seen) + _lost_observations(env, seen)
+    if all("TimeLimit.truncated" in end.told for end in seen.ends):
+        problems += _looks_like_a_limit(seen, limit)
+    problems += _nothing_ended(seen)
+    return problems, [] if problems else _unseen(seen, limit), seen
+
+
+def _of_vector_env(env: VectorEnv, n_steps: int | None, seed: int) -> TruncationReport:
+    seen = Seen([], 0, False)
+    try:
+        adapted = GymnasiumVecEnv(env)
+        problems, notes, seen = _of_vec_env(adapted, n_steps, seed)
+    except (ParameterError, RuntimeError) as error:
+        return TruncationReport(_subject(env, seen), [str(error)], [])
+    if adapted.autoreset_mode is AutoresetMode.NEXT_STEP:
+        notes.append(
+            "In NEXT_STEP mode the step after an end ignores the action and is no transition. "
+            "GymnasiumVecEnv(env) leaves it out; a learner of your own must, too."
+        )
+    return TruncationReport(_subject(env, seen), problems, notes)
+
+
+def _only_in_info(seen: Seen) -> list[str]:
+    n = sum(end.terminated and bool(end.told.get("TimeLimit.truncated")) for end in seen.ends)
+    if not n:
+        return []
+    return [
+        f"{counted(n, 'time-out')} of {counted(len(seen.ends), 'end')} stood only in "
+        "info['TimeLimit.truncated'], and step() returned terminated=True. SB3 writes this entry "
+        "itself, from what step() returns, so the time-out is taken for a failure. Return "
+        "truncated=True and terminated=False."
+    ]
+
+
+def _looks_like_a_limit(seen: Seen, limit: int | None) -> list[str]:
+    """Ends that are terminations and come after the same number of steps."""
+    lengths = Counter(end.length for end in seen.ends)
+    longest = max(lengths, default=0)
+    n, at_end = lengths[longest], [end for end in seen.ends if end.length == longest]
+    often = n >= _FEWEST and 2 * n >= len(seen.ends)
+    # An episode of one step has no time to run out.
+    if longest < 2 or not (often or (longest == limit and n > 1)) or seen.clock:
+        return []
+    if not all(end.terminated for end in at_end):
+        return []
+    return [
+        f"{n} of {counted(len(seen.ends), 'episode')} ended as terminations after exactly "
+        f"{longest} steps. That looks like a time limit: the learner will take states that are "
+        "worth something for worth nothing. Return truncated=True, terminated=False there, or use "
+        f"sb3_hds.wrappers.InfiniteHorizon(env, max_episode_steps={longest}). If the task really "
+        "is over then, let observations tell the time: sb3_hds.wrappers.TimeAware."
+    ]
+
+
+def _missing_keys(seen: Seen) -> list[str]:
+    problems = []
+    n = sum("TimeLimit.truncated" not in end.told for end in seen.ends)
+    if n:
+        problems.append(
+            f"In {n} of {counted(len(seen.ends), 'end')}, infos[i] had no 'TimeLimit.truncated'. "
+            "SB3 takes such an end for a termination, time-outs included. The VecEnv must set it "
+            "in every step to `truncated and not terminated`."
+        )
+    n = sum(end.last_obs is None for end in seen.ends)
+    if n:
+        problems.append(
+            f"In {n} of {counted(len(seen.ends), 'end')}, infos[i] had no 'terminal_observation'. "
+            "SB3 then stores the first observation of the next episode as where the step led. The "
+            "VecEnv must put the last observation there when it resets a copy by itself."
+        )
+    return problems
+
+
+def _lost_observations(env: VecEnv, seen: Seen) -> list[str]:
+    """Last observations that cannot be what they should be."""
+    told = [end for end in seen.ends if end.last_obs is not None]
+    strange = [end for end in told if not _fits(env, end.last_obs)]
+    if strange:
+        return [
+            f"In {len(strange)} of {counted(len(told), 'end')}, infos[i]['terminal_observation'] "
+            f"was {_shape(strange[0].last_obs)} instead of one observation of "
+            f"{env.observation_space}. Put the row of that copy there."
+        ]
+    # Where all episodes begin alike, an episode may as well end where it began.
+    starts_differ = any(not is_same(end.first_obs, told[0].first_obs) for end in told)
+    n = sum(is_same(end.last_obs, end.first_obs) for end in told)
+    if not starts_differ or n < len(told):
+        return []
+    return [
+        f"In {n} of {counted(len(told), 'end')}, infos[i]['terminal_observation'] was what step() "
+        "returned as well: it is either the first observation of the next episode, whose value "
+        "has nothing to do with the step before, or the copy was not reset. Keep the last "
+        "observation before resetting, and return the first one of the next episode."
+    ]
+
+
+def _nothing_ended(seen: Seen) -> list[str]:
+    if seen.ends:
+        return []
+    return [
+        f"No episode ended in {seen.n_steps} steps, so it is not known how a time-out arrives. "
+        "Pass more n_steps=; or, if nothing ever ends it, cut episodes: "
+        "gymnasium.wrappers.TimeLimit(env, max_episode_steps=...)."
+    ]
+
+
+def _unseen(seen: Seen, limit: int | None) -> list[str]:
+    if not all(end.terminated for end in seen.ends):
+        return []
+    before = f" before the limit of {limit} steps" if limit else ""
+    return [
+        f"No time-out was seen: all {counted(len(seen.ends), 'episode')} terminated{before}. How "
+        "one arrives has not been checked."
+    ]
+
+
+def _limit_of_copies(env: VecEnv) -> int | None:
+    """What the copies in this process, or the whole, say; others are not asked."""
+    bare: Any = env
+    while isinstance(bare, VecEnvWrapper):
+        bare = bare.venv
+    if isinstance(bare, DummyVecEnv):
+        return step_limit_of(bare.envs[0])
+    if isinstance(bare, GymnasiumVecEnv):
+        copies = getattr(bare.env.unwrapped, "envs", None)
+        return step_limit_of(copies[0]) if copies else None
+    limit = getattr(bare, "max_episode_steps", None)
+    return limit if isinstance(limit, int) and 0 < limit < np.iinfo(np.int32).max else None
+
+
+def _fits(env: VecEnv, obs: Any) -> bool:
+    space = env.observation_space
+    if isinstance(space, gymnasium.spaces.Dict):
+        return isinstance(obs, dict) and obs.keys() == space.spaces.keys()
+    return np.shape(obs) == (space.shape or ())
+
+
+def _shape(obs: Any) -> str:
+    return type(obs).__name__ if isinstance(obs, dict) else f"of shape {np.shape(obs)}"
+
+
+def _subject(env: Any, seen: Seen) -> str:
+    ends: list[End] = seen.ends
+    n_cut = sum(not end.terminated for end in ends)
+    return (
+        f"Truncation of {name_of(env)}: in {counted(seen.n_steps, 'step')}, {n_cut} truncated and "
+        f"{counted(len(ends) - n_cut, 'terminated episode')}"
+    )

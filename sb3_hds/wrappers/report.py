@@ -1,0 +1,55 @@
+"""Reports of checks: they say what was looked at, and print themselves in 80 columns."""
+
+import dataclasses
+import textwrap
+from typing import Any
+
+_WIDTH = 80
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Report:
+    """
+    What a check found.
+
+    :param subject: what was checked, and how much of it was seen
+    :param problems: one paragraph each: what was measured, why it matters, what to do
+    :param notes: what could not be seen, or is right and still worth knowing
+    """
+
+    subject: str
+    problems: list[str]
+    notes: list[str]
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is no problem."""
+        return not self.problems
+
+    def __str__(self) -> str:
+        n = len(self.problems)
+        verdict = "no problem found" if self.ok else f"{n} problem{'s' if n > 1 else ''}"
+        paragraphs = [textwrap.fill(f"{self.subject}: {verdict}.", _WIDTH)]
+        paragraphs += [_item(f"{i}. ", text) for i, text in enumerate(self.problems, 1)]
+        paragraphs += [_item("Note: ", text) for text in self.notes]
+        return "\n\n".join(paragraphs)
+
+    __repr__ = __str__
+
+
+def counted(n: int, what: str) -> str:
+    """:return: ``"1 episode"``, ``"2 episodes"``"""
+    return f"{n} {what}" if n == 1 else f"{n} {what}s"
+
+
+def name_of(env: Any) -> str:
+    """:return: the id of an environment, or else what it is made of"""
+    spec = getattr(env, "spec", None)
+    if spec is not None:
+        return spec.id
+    bare = getattr(env, "unwrapped", env)
+    return type(bare).__name__
+
+
+def _item(mark: str, text: str) -> str:
+    return textwrap.fill(text, _WIDTH, initial_indent=mark, subsequent_indent=" " * len(mark))
