@@ -73,7 +73,7 @@ def ends_of_vec_env(env: VecEnv, n_steps: int, seed: int) -> Seen:
         actions = np.stack([space.sample() for _ in range(env.num_envs)])
         obs, _, dones, infos = env.step(actions)
         lengths += 1
-        for i in np.flatnonzero(dones):
+        for i in np.flatnonzero(dones).tolist():
             told = dict(infos[i])
             cut, last = bool(told.get("TimeLimit.truncated")), told.get("terminal_observation")
             ends.append(End(int(lengths[i]), not cut, told, last, _row(obs, i)))

@@ -30,7 +30,7 @@ def observation_scale(sample: Sample) -> list[str]:
     """Networks are made for inputs of order 1."""
     if not np.isfinite(sample.obs).all():
         return [
-            f"Observation: {_listed(sample.names, ~np.isfinite(sample.obs).all(0))} was not "
+            f"Observation: {_listed(sample.names, np.atleast_1d(~np.isfinite(sample.obs).all(0)))} was not "
             "finite. One such number makes all weights of a network so. Bound it, or end the "
             "episode before."
         ]
