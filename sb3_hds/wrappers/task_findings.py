@@ -29,9 +29,10 @@ _FEWEST_ENDS = 3
 def observation_scale(sample: Sample) -> list[str]:
     """Networks are made for inputs of order 1."""
     if not np.isfinite(sample.obs).all():
+        odd = np.atleast_1d(~np.isfinite(sample.obs).all(0))
         return [
-            f"Observation: {_listed(sample.names, np.atleast_1d(~np.isfinite(sample.obs).all(0)))} was not "
-            "finite. One such number makes all weights of a network so. Bound it, or end the "
+            f"Observation: {_listed(sample.names, odd)} was not finite. One such number "
+            "makes all weights of a network so. Bound it, or end the "
             "episode before."
         ]
     mean, std = np.abs(sample.obs.mean(0)), sample.obs.std(0)
