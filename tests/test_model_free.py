@@ -452,7 +452,7 @@ def test_networks_start_afresh_when_told_to(name):
 
 def test_bro_starts_afresh_with_its_temperature_and_others_keep_theirs():
     for name, afresh in (("bro", True), ("droq", False)):
-        model = small(name, param_resets=[25]).learn(24)
+        model = small(name, policy_delay=1).learn(20)
         before = model.policy.learner.log_ent_coef
         assert float(before.weights["params"]) != 0.0
 
