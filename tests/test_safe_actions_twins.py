@@ -75,7 +75,7 @@ def test_a_wrapped_pendulum_and_its_twin_agree_step_for_step(layer, x64):
         np.testing.assert_allclose(twin.observe(after, twin.params), obs, atol=5e-6)
         assert float(reward(state, command, after, twin.params)) == pytest.approx(given, abs=5e-5)
         # A twin that never saw the environment again: the pendulum magnifies what was rounded.
-        np.testing.assert_allclose(twin.observe(alone, twin.params), obs, atol=5e-3)
+        np.testing.assert_allclose(twin.observe(alone, twin.params), obs, atol=2e-2)
     assert env.unwrapped.state[1] != 0.0
 
 
