@@ -8,7 +8,6 @@ from point_mass import linear_controller, point_mass_env, returns_of
 from small_models import (
     EVERY_NAME,
     EVERY_OFF_POLICY,
-    NAMES,
     OFF_POLICY,
     PLANNERS,
     QUICK_NAMES,
