@@ -15,7 +15,16 @@ import jax
 import numpy as np
 import pytest
 import torch as th
-from small_models import EVERY_NAME, EVERY_OFF_POLICY, NAMES, PLANNERS, same, saved, small
+from small_models import (
+    EVERY_NAME,
+    EVERY_OFF_POLICY,
+    NAMES,
+    OFF_POLICY,
+    PLANNERS,
+    same,
+    saved,
+    small,
+)
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
