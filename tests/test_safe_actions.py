@@ -460,7 +460,7 @@ def test_no_attack_gets_a_joint_past_a_barrier_in_1000_episodes(share, angles, u
 
     smallest = worst_of(env, lambda q: np.minimum(q + 1.0, 1.2 - q))
 
-    assert 0.0 <= smallest < 0.02  # and attacks do come close
+    assert 0.0 <= smallest < 0.05  # and attacks do come close
 
 
 def test_a_barrier_counts_with_a_drive_that_misses_by_its_tolerance(unchecked):
