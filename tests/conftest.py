@@ -3,6 +3,7 @@
 import gc
 import itertools
 import os
+import pickle
 import tempfile
 from pathlib import Path
 
@@ -17,6 +18,7 @@ os.environ.setdefault(
     "--xla_llvm_disable_expensive_passes=true",
 )
 
+import cloudpickle  # noqa: E402
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
@@ -34,6 +36,18 @@ def quick_compilation():
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture
+def no_pickle(monkeypatch):
+    """Whatever is unpickled from now on fails, but for the tensors that torch vouches for."""
+
+    def refuse(*_, **__):
+        raise AssertionError("something was unpickled")
+
+    for module in (pickle, cloudpickle):
+        for name in ("load", "loads"):
+            monkeypatch.setattr(module, name, refuse)
 
 
 _MAPS = Path("/proc/self/maps")

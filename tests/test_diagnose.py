@@ -374,6 +374,7 @@ def test_friction_that_changes_with_place_or_time_is_left_over(where, seed):
         time=time,
         origin=np.repeat(np.arange(10), 20),
         numbers=10,
+        noise=np.ones(1),
     )
     data = Trajectories.from_arrays([np.zeros((21, 1))] * 10, [np.zeros((20, 1))] * 10, dt=0.1)
 

@@ -21,7 +21,7 @@ from rl_zoo_plugin.lazy import parameters_of
 from rl_zoo_plugin.tables import ALGORITHMS
 from sb3_hds import HDS, PODS, algos, cli, effects, twins
 from sb3_hds.algos.log import record_epoch
-from sb3_hds.envs.registration import EXAMPLES, HARDWARE, STEP_LIMITS
+from sb3_hds.envs.registration import HARDWARE, STEP_LIMITS, TASKS
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -187,7 +187,7 @@ def test_every_twin_effect_and_environment_is_listed_with_its_parameters():
             assert f"`{name}` [{parameter.unit}]" in shown and effect.explanation in shown
 
     listed = catalogue.environments_as_markdown()
-    assert [i for i in STEP_LIMITS | HARDWARE | EXAMPLES if f"`{i}`" not in listed] == []
+    assert [i for i in STEP_LIMITS | HARDWARE | TASKS if f"`{i}`" not in listed] == []
 
 
 def test_a_surrogate_is_announced_where_planning_maximises_something_else():

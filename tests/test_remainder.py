@@ -8,25 +8,38 @@ from sb3_hds.sysid.remainder import _by_chance
 N_SETS, N_UNITS = 11, 8
 
 
-def agreements(rng, n_units=N_UNITS):
-    """Of sets of quantities that share most of what they predict."""
-    shared = rng.standard_normal((1, n_units))
-    return 0.8 * shared + 0.6 * rng.standard_normal((N_SETS, n_units))
+def agreements(rng, n_units=N_UNITS, n_windows=1):
+    """Of sets of quantities that share most of what they predict; windows share some, too."""
+    shape = (n_units, n_windows)
+    shared, own = rng.standard_normal((1, *shape)), rng.standard_normal((N_SETS, *shape))
+    common = rng.standard_normal((1, n_units, 1))
+    found = 0.4 * common + np.sqrt(1.0 - 0.4**2) * (0.8 * shared + 0.6 * own)
+    return found.reshape(N_SETS, -1), np.repeat(np.arange(n_units), n_windows)
 
 
+@pytest.mark.parametrize("n_windows", [1, 16])
 @pytest.mark.parametrize("n_units", [N_UNITS, 20])
-def test_chance_is_that_of_the_best_among_all_sets(n_units):
+def test_chance_is_that_of_the_best_among_all_sets(n_units, n_windows):
     rng = np.random.default_rng(0)
-    best = [_by_chance(agreements(rng, n_units)).min() for _ in range(400)]
-    # 400 draws at a level of 5 %: 20 are expected, more than 33 come once in 500.
-    assert np.sum(np.array(best) < 0.05) <= 33
+    best = [_by_chance(*agreements(rng, n_units, n_windows)).min() for _ in range(200)]
+    # 200 draws at a level of 5 %: 10 are expected, more than 20 come once in 1000.
+    assert np.sum(np.array(best) < 0.05) <= 20
 
 
 def test_eight_recordings_are_enough_for_what_agrees_in_all_of_them():
-    found = 0.1 * agreements(np.random.default_rng(1))
-    found[3] = 1.0 + 0.1 * found[3]
+    found, unit = agreements(np.random.default_rng(1))
+    found *= 0.1
+    found[3] = 1.0 + found[3]
 
-    chance = _by_chance(found)
+    chance = _by_chance(found, unit)
 
     assert chance[3] == pytest.approx(2.0**-N_UNITS)
     assert np.delete(chance, 3).min() > 0.05
+
+
+def test_what_is_met_in_few_recordings_is_seen_in_their_windows():
+    rng = np.random.default_rng(2)
+    found, unit = rng.standard_normal((N_SETS, 8 * 20)), np.repeat(np.arange(8), 20)
+    found[5, :60] += 3.0
+
+    assert _by_chance(found, unit)[5] < 0.01

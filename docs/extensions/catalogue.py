@@ -7,7 +7,7 @@ from tables import table
 
 from sb3_hds import effects, twins
 from sb3_hds.core import Actuator, Channel, Parameter, Twin
-from sb3_hds.envs.registration import EXAMPLES, HARDWARE, STEP_LIMITS
+from sb3_hds.envs.registration import HARDWARE, STEP_LIMITS, TASKS
 
 
 def twins_as_markdown() -> str:
@@ -65,9 +65,7 @@ def environments_as_markdown() -> str:
         for env_id, (_, steps) in HARDWARE.items()
         for name in [twins.get(env_id).name]
     ]
-    rows += [
-        [f"`{env_id}`", "none: an example", str(steps)] for env_id, (_, steps) in EXAMPLES.items()
-    ]
+    rows += [[f"`{env_id}`", "none", str(steps)] for env_id, (_, steps) in TASKS.items()]
     return table(["id", "made of the twin", "steps of an episode"], rows)
 
 

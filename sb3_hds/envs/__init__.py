@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sb3_hds.envs.constant_reward import ConstantReward
+    from sb3_hds.envs.elastic_quadruped import ElasticQuadruped
     from sb3_hds.envs.inverted_pendulum_friction import InvertedPendulumFriction
     from sb3_hds.envs.mirror import check_mirrors, twin_of
     from sb3_hds.envs.pendulum_real import PendulumReal
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ConstantReward",
+    "ElasticQuadruped",
     "InvertedPendulumFriction",
     "PendulumReal",
     "TwinEnv",
@@ -33,6 +35,7 @@ __all__ = [
 
 _MODULES = {
     "ConstantReward": "constant_reward",
+    "ElasticQuadruped": "elastic_quadruped",
     "InvertedPendulumFriction": "inverted_pendulum_friction",
     "PendulumReal": "pendulum_real",
     "TwinEnv": "twin_env",

@@ -18,9 +18,10 @@ HARDWARE = {
     "sb3_hds/PendulumReal-v1": ("sb3_hds.envs.pendulum_real:PendulumReal", 200),
 }
 
-#: Tasks whose values are known in closed form: id -> class and step limit.
-EXAMPLES = {
+#: Tasks without a twin: id -> class and step limit.
+TASKS = {
     "sb3_hds/ConstantReward-v0": ("sb3_hds.envs.constant_reward:ConstantReward", 4),
+    "sb3_hds/ElasticQuadruped-v0": ("sb3_hds.envs.elastic_quadruped:ElasticQuadruped", 500),
 }
 
 _ENTRY_POINT = "sb3_hds.envs.twin_env:TwinEnv"
@@ -31,9 +32,10 @@ def register_environments() -> None:
     Make our ids known to ``gymnasium.make``. Calling it again changes nothing.
 
     Keyword arguments of ``gymnasium.make`` are settings of the twin: values of parameters by name,
-    its options, ``dt`` [s], ``substeps``; those of the stand-ins for hardware and of the examples
-    are documented in their classes. Where another process makes the environment by its id, as with
-    SB3's ``SubprocVecEnv``, name the package too: ``"sb3_hds:sb3_hds/CartPoleSwingUp-v0"``.
+    its options, ``dt`` [s], ``substeps``; those of the stand-ins for hardware and of the tasks
+    without a twin are documented in their classes. Where another process makes the environment by
+    its id, as with SB3's ``SubprocVecEnv``, name the package too:
+    ``"sb3_hds:sb3_hds/CartPoleSwingUp-v0"``.
     """
     for env_id, max_episode_steps in STEP_LIMITS.items():
         if env_id not in gymnasium.registry:
@@ -43,6 +45,6 @@ def register_environments() -> None:
                 max_episode_steps=max_episode_steps,
                 kwargs={"twin": env_id},
             )
-    for env_id, (entry_point, max_episode_steps) in (HARDWARE | EXAMPLES).items():
+    for env_id, (entry_point, max_episode_steps) in (HARDWARE | TASKS).items():
         if env_id not in gymnasium.registry:
             gymnasium.register(env_id, entry_point=entry_point, max_episode_steps=max_episode_steps)

@@ -36,6 +36,8 @@ class Finding:
     :param parameters: estimates with intervals and units, by short name
     :param alternatives: what the data cannot tell from it, by name and place
     :param p_value: that held-out recordings would gain as much by chance
+    :param family_p_value: that the best of all candidates would gain as much on the recordings that
+        proposed it if nothing were wrong
     :param gain: share by which it lowers the mean square error of held-out recordings
     :param explanation: one sentence for people
     """
@@ -45,6 +47,7 @@ class Finding:
     parameters: Mapping[str, Estimate]
     alternatives: tuple[str, ...]
     p_value: float
+    family_p_value: float
     gain: float
     explanation: str
 

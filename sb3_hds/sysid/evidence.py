@@ -1,9 +1,11 @@
 """How well hypotheses explain windows of data: one compiled program for all of them."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +31,10 @@ _RIDGE = 1e-9
 # Most windows that are simulated at a time, and of what their number is a multiple.
 _PORTION, _ROUND = 64, 8
 # Steps of all windows beyond which a second program, for start states alone, is worth compiling.
-_MANY_STEPS = 2_500
+_MANY_STEPS = 10_000
+
+_Given = TypeVar("_Given")
+_Told = TypeVar("_Told")
 
 
 def portion_for(n: int) -> int:
@@ -193,10 +198,12 @@ class Evidence:
 
     def _blocks(self, theta: np.ndarray, index: np.ndarray, offsets: np.ndarray) -> _Blocks:
         """Normal equations at a point, of the parameters named by ``index``."""
-        found = [
-            self._portion(shots, theta, index, offsets[rows], rows.stop - rows.start)
-            for shots, rows in self._portions
-        ]
+
+        def of(portion: tuple[Shots, slice]) -> _Blocks:
+            shots, rows = portion
+            return self._portion(shots, theta, index, offsets[rows], rows.stop - rows.start)
+
+        found = in_threads(of, self._portions)
         return _Blocks(*map(np.concatenate, zip(*found, strict=True)))
 
     def _portion(
@@ -213,6 +220,17 @@ class Evidence:
             slopes.append(by_theta)
         by_theta = np.concatenate(slopes, -1)[..., : len(index)]
         return _normal(raw, by_start, by_theta, self.noise, self._counted)
+
+
+def in_threads(work: Callable[[_Given], _Told], given: Sequence[_Given]) -> Iterator[_Told]:
+    """
+    As ``map``. Compiled programs leave the interpreter free, so threads share the cores.
+    """
+    if len(given) == 1:
+        yield work(given[0])
+        return
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        yield from pool.map(work, given)
 
 
 def _in_groups(index: np.ndarray, width: int, nothing: int) -> Iterator[np.ndarray]:

@@ -21,7 +21,9 @@ from sb3_hds.sysid.calibrate import spread_of
 from sb3_hds.sysid.comparison import Comparison, split
 from sb3_hds.sysid.diagnosis import Diagnosis, Finding, Rejected
 from sb3_hds.sysid.evidence import Evidence, Point, portion_for
+from sb3_hds.sysid.family import chance_of_the_best
 from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
+from sb3_hds.sysid.profile import profiled
 from sb3_hds.sysid.remainder import MissingForce, Remainder, missing_force, remainder, weighed
 from sb3_hds.sysid.results import Estimate
 from sb3_hds.sysid.search import LEAST_GAIN, LEVEL, Base, Effort, Half, Search, Tried
@@ -34,28 +36,39 @@ from sb3_hds.sysid.timing import in_step
 _WINDOW, _SHORTEST, _LONGEST = 1.0, 8, 200
 # A cause that explains less than this share of what can be explained is not the cause.
 _LEAST_SHARE = 0.9
+# A later cause that takes away a smaller share of the error than this, of what the ones before took
+# away, may be no more than what their model is off by.
+_LEAST_OF_EARLIER = 0.01
 # Causes that are looked for, and candidates that are fitted to the end to settle the noise.
 _MOST, _FOR_NOISE = 3, 3
 # How long to search.
-EFFORTS = {"full": Effort(16, 8, 256, 4), "quick": Effort(8, 4, 64, 2)}
+EFFORTS = {"full": Effort(16, 8, 256, 4, True), "quick": Effort(8, 4, 64, 2, False)}
 # Errors that nobody minds, in shares of a channel's spread: no simulation is exact, and a finding
 # must matter.
 _IRRELEVANT = 5e-3
 # A force that moves a short window by a smaller share of that is no remainder.
-_OF_IRRELEVANT = 0.25
+_OF_IRRELEVANT = 0.18
 # Noise before it is known, in the same units.
 _FIRST_NOISE = 0.05
 # Parameters that a cause has at most, and fewer units of evidence than these cannot say anything.
 _WIDEST, _FEWEST_UNITS = 3, 4
 _CONFIDENCE = 0.9
+# Family-wise level of what selection proposes.
+_FAMILY_LEVEL = 0.05
 
 
 class _Accepted(NamedTuple):
-    """A cause that was confirmed, and what the data cannot tell from it."""
+    """
+    A cause that was confirmed.
+
+    :param alternatives: what the data cannot tell from it
+    :param chance: that the best of all candidates would gain as much if nothing were wrong
+    """
 
     tried: Tried
     verdict: Comparison
     alternatives: tuple[str, ...]
+    chance: float
 
 
 class _Left(NamedTuple):
@@ -101,6 +114,8 @@ class Inquiry:
         self.parts = split(self.data, origin, seed)
         self.effort, self.progress = EFFORTS[budget], progress
         self.undetermined: set[str] = set()
+        self.by_chance: set[str] = set()
+        self.leftover: set[str] = set()
 
     def poor(self) -> str:
         """:return: why these data cannot support a verdict; empty if they may"""
@@ -149,8 +164,15 @@ class Inquiry:
             best = self.search.best(sure, base, len(found))
             if best is None:
                 break
+            if self._is_leftover(best, base, start):
+                self.leftover.add(best.candidate.key)
+                break
+            if (chance := self._chance(best, base, found)) >= _FAMILY_LEVEL / (1 + len(found)):
+                self.by_chance.add(best.candidate.key)
+                break
             others = self.search.alternatives(best, tried, base)
-            found.append(_Accepted(best, self.search.confirmed(best.kept, base.kept), others))
+            verdict = self.search.confirmed(best.kept, base.kept)
+            found.append(_Accepted(best, verdict, others, chance))
             own = self.hypotheses.indices(best.candidate)
             base = Base(best.point, best.kept, (*base.free, *own))
         found, base = self._pruned(found, base)
@@ -174,6 +196,20 @@ class Inquiry:
         if not (sure := bool((moved > _margin(len(np.unique(half.unit)), stderr)).any())):
             self.undetermined.add(tried.candidate.key)
         return sure
+
+    def _is_leftover(self, best: Tried, base: Base, start: Base) -> bool:
+        """Whether an imperfect model of the causes before explains as much as this one."""
+        first, now, then = map(self.search.confirm.total, (start.kept, base.kept, best.kept))
+        return now - then < _LEAST_OF_EARLIER * (first - now)
+
+    def _chance(self, best: Tried, base: Base, found: Sequence[_Accepted]) -> float:
+        """:return: family-wise p-value on the half that selects"""
+        left = [c for c in self.hypotheses.candidates if c.key not in _keys(found)]
+        slopes = self.search.select.evidence.slopes(best.point)
+        own = [self.hypotheses.indices(c) for c in left]
+        fitted = (*base.free, *self.hypotheses.indices(best.candidate))
+        gain = base.point.cost - best.point.cost
+        return chance_of_the_best(slopes, own, base.free, fitted, gain, self.seed)
 
     def refused(self, reason: str) -> Diagnosis:
         return Diagnosis(
@@ -212,7 +248,7 @@ class Inquiry:
         missing = missing_force(self.search.select.evidence, base.point.theta, self.data)
         joints = tuple(joint.name for joint in self.hypotheses.twin.joints)
         power = float(np.mean(np.sum(weighed(missing) ** 2, 1)))
-        mind = float(np.mean((_IRRELEVANT * self.spread / self.search.noise) ** 2))
+        mind = float(np.mean((_IRRELEVANT * self.spread / missing.noise) ** 2))
         least = _OF_IRRELEVANT**2 * mind * missing.numbers
         return _Left(remainder(missing, self.data, joints, self.seed, least), power, missing)
 
@@ -242,8 +278,7 @@ class Inquiry:
         left: _Left,
     ) -> Diagnosis:
         select, confirm, theta = self.search.select, self.search.confirm, base.point.theta
-        stderr = standard_errors(select.evidence, select.unit, base.point, base.free)
-        findings = tuple(_finding(self.hypotheses, one, theta, stderr) for one in found)
+        findings = self._findings(found, base)
         verdict = "none"
         if findings:
             verdict = "ambiguous" if findings[0].alternatives else "named"
@@ -276,38 +311,55 @@ class Inquiry:
             ),
         )
 
+    def _findings(self, found: Sequence[_Accepted], base: Base) -> tuple[Finding, ...]:
+        h, half, theta = self.hypotheses, self.search.select, base.point.theta
+        stderr = standard_errors(half.evidence, half.unit, base.point, base.free)
+        findings = []
+        for one in found:
+            candidate, parameters = one.tried.candidate, {}
+            for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
+                low, high = self._interval(i, base, float(_margin(one.verdict.n_units, stderr[i])))
+                parameters[name.rpartition(".")[2]] = Estimate(
+                    name=name,
+                    estimate=float(theta[i]),
+                    stderr=float(stderr[i]),
+                    low=low,
+                    high=high,
+                    unit=h.twin.parameters[name].unit,
+                    before=float(h.null[i]),
+                    at_bound=bool(theta[i] <= h.lower[i] or theta[i] >= h.upper[i]),
+                )
+            findings.append(
+                Finding(
+                    candidate.name,
+                    h.place_of(candidate),
+                    parameters,
+                    one.alternatives,
+                    one.verdict.p_value,
+                    one.chance,
+                    one.verdict.gain,
+                    candidate.explanation,
+                )
+            )
+        return tuple(findings)
+
+    def _interval(self, index: int, base: Base, half: float) -> tuple[float, float]:
+        """:param half: half the width of the symmetric interval"""
+        h, best = self.hypotheses, float(base.point.theta[index])
+        if self.effort.profiles:
+            return profiled(self.search.select.evidence, base.point, base.free, index, half)
+        return max(best - half, float(h.lower[index])), min(best + half, float(h.upper[index]))
+
     def _why(self, candidate: Candidate, verdict: Comparison) -> str:
         if verdict.gain < LEAST_GAIN:
             return "gains too little"
         if candidate.key in self.undetermined:
             return "has no certain size"
+        if candidate.key in self.leftover:
+            return "is small beside the others"
+        if candidate.key in self.by_chance:
+            return "may be chance"
         return "may be chance" if verdict.p_value >= LEVEL else "others gain more"
-
-
-def _finding(h: Hypotheses, accepted: _Accepted, theta: np.ndarray, stderr: np.ndarray) -> Finding:
-    candidate, verdict = accepted.tried.candidate, accepted.verdict
-    parameters = {}
-    for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
-        half = _margin(verdict.n_units, stderr[i])
-        parameters[name.rpartition(".")[2]] = Estimate(
-            name=name,
-            estimate=float(theta[i]),
-            stderr=float(stderr[i]),
-            low=float(max(theta[i] - half, h.lower[i])),
-            high=float(min(theta[i] + half, h.upper[i])),
-            unit=h.twin.parameters[name].unit,
-            before=float(h.null[i]),
-            at_bound=bool(theta[i] <= h.lower[i] or theta[i] >= h.upper[i]),
-        )
-    return Finding(
-        candidate.name,
-        h.place_of(candidate),
-        parameters,
-        accepted.alternatives,
-        verdict.p_value,
-        verdict.gain,
-        candidate.explanation,
-    )
 
 
 def _margin(n_units: int, stderr: np.ndarray) -> np.ndarray:

@@ -4,16 +4,18 @@ from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from sb3_hds.core import Trajectories
 from sb3_hds.sysid.comparison import Split, split
-from sb3_hds.sysid.evidence import Evidence
+from sb3_hds.sysid.evidence import Evidence, Point, Slopes
 from sb3_hds.sysid.motion import motion_of
 from sb3_hds.sysid.shooting import Shots, shots_of
 
 # Length of a window over which the missing force counts as constant [s], and in steps.
 _WINDOW, _SHORTEST, _LONGEST = 0.25, 4, 25
+# Steps of the fit of their start states.
+_STEPS = 5
 # Windows that a smooth function is learned from; more cost memory in its square.
 _MOST_WINDOWS = 1500
 # Candidates of its regularisation, relative to the variance of the force.
@@ -22,6 +24,8 @@ _RIDGES = (0.1, 1.0, 10.0, 100.0)
 _LEAST_GAIN, _LEVEL = 0.05, 0.01
 # Patterns of signs: all of so many units, or so many drawn.
 _ALL_SIGNS_OF, _N_FLIPS = 12, 4096
+# By which factor the level of the test on windows is stricter than that on units.
+_STRICTER = 25.0
 # A smaller set of quantities that explains this share of what all explain tells where it lives.
 _MOST_OF_IT = 0.8
 _MOST_RATIO = 4.0
@@ -32,13 +36,14 @@ class MissingForce(NamedTuple):
     The force that each window asks for, beyond what the twin has.
 
     :param force: shape ``(n, dof)`` [N m] or [N]
-    :param stderr: of each, from the noise, shape ``(n, dof)``
+    :param stderr: of each, from what a force leaves of so short windows, shape ``(n, dof)``
     :param position: mean over the window, shape ``(n, dof)``
     :param velocity: mean over the window, shape ``(n, dof)``
     :param command: mean over the window, shape ``(n, n_act)``
     :param time: since the recording began [s], shape ``(n,)``
     :param origin: recording, shape ``(n,)``
     :param numbers: measurements in a window
+    :param noise: of each channel, in so short windows, shape ``(n_obs,)``
     """
 
     force: np.ndarray
@@ -49,6 +54,7 @@ class MissingForce(NamedTuple):
     time: np.ndarray
     origin: np.ndarray
     numbers: int
+    noise: np.ndarray
 
 
 class Remainder(NamedTuple):
@@ -70,7 +76,7 @@ class Remainder(NamedTuple):
 class _Predicted(NamedTuple):
     """
     :param gain: share of the force's variance that is predicted
-    :param agreement: predicted times measured, summed over each unit, shape ``(units,)``
+    :param agreement: predicted times measured, of each window, shape ``(n,)``
     """
 
     gain: float
@@ -91,10 +97,13 @@ def missing_force(
     shots, origin = shots_of(data, steps, h.twin)
     counted = (np.arange(longest + 1) <= steps).astype(float)
     short = evidence.on(_lengthened(shots, longest), counted)
-    point = short.fit(theta, ())
+    point = short.fit(theta, (), n_steps=_STEPS)
     scale = h.scale[list(h.pushes)]
     slopes = short.slopes(point, h.pushes)
     informed = np.maximum(np.einsum("njj->nj", slopes.curvature), 1e-12)
+    numbers = (steps + 1) * data.n_obs
+    rest = _left_by_forces(point, slopes, evidence.noise, counted)
+    calmer = np.sqrt(np.median(rest) / max(numbers - point.offsets.shape[1] - len(scale), 1))
     q, v = motion_of(h.believed, shots.obs, data.dt)
     counter = {recording: 0 for recording in origin}
     time = np.zeros(len(origin))
@@ -103,14 +112,28 @@ def missing_force(
         counter[recording] += 1
     return MissingForce(
         force=-scale * slopes.scores / informed,
-        stderr=scale / np.sqrt(informed),
+        stderr=calmer * scale / np.sqrt(informed),
         position=np.unwrap(q, axis=1).mean(1),
         velocity=v.mean(1),
         command=shots.actions.mean(1),
         time=time,
         origin=origin,
-        numbers=(steps + 1) * data.n_obs,
+        numbers=numbers,
+        noise=calmer * evidence.noise,
     )
+
+
+def _left_by_forces(
+    point: Point, slopes: Slopes, noise: np.ndarray, counted: np.ndarray
+) -> Float[np.ndarray, " n"]:
+    """
+    What a constant force leaves of each window, sum of squares in units of the noise. That noise
+    was measured over long windows, where what is missing has had time to grow.
+    """
+    whole = np.sum((np.nan_to_num(point.raw, nan=0.0) / noise) ** 2 * counted[:, None], (1, 2))
+    inverse = np.linalg.pinv(slopes.curvature, hermitian=True)
+    gained = np.einsum("ni,nij,nj->n", slopes.scores, inverse, slopes.scores)
+    return np.maximum(whole - gained, 0.0)
 
 
 def _lengthened(shots: Shots, steps: int) -> Shots:
@@ -158,7 +181,7 @@ def remainder(
             for k in (1, 2, len(quantities))
             for names in combinations(quantities, k)
         }
-        p_values = _by_chance(np.stack([one.agreement for one in told.values()]))
+        p_values = _by_chance(np.stack([one.agreement for one in told.values()]), parts.unit)
         chance = {
             name: min(float(p) * len(joints), 1.0) for name, p in zip(told, p_values, strict=True)
         }
@@ -207,23 +230,29 @@ def _predicted(quantities: list[np.ndarray], force: np.ndarray, parts: Split) ->
     # Forces are in units of their errors: below one, there is nothing to predict.
     total = max(float(np.sum(force**2)), len(force))
     gain = (np.sum(force**2) - np.sum((force - guess) ** 2)) / total
-    agreement = np.array(
-        [np.sum(force[own] * guess[own]) for own in map(parts.unit.__eq__, np.unique(parts.unit))]
-    )
-    return _Predicted(float(gain), agreement)
+    return _Predicted(float(gain), force * guess)
 
 
-def _by_chance(agreement: Float[np.ndarray, "sets units"]) -> Float[np.ndarray, " sets"]:
+def _by_chance(
+    agreement: Float[np.ndarray, "sets n"], unit: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, " sets"]:
     """
     Chance that some set of quantities predicts so well where there is nothing to predict: then what
-    was predicted agrees in sign with what was measured in as many units as not, whichever the set,
-    so the signs of whole units are flipped for all sets together.
+    was predicted agrees in sign with what was measured as often as not, whichever the set, so signs
+    are flipped for all sets together. Those of whole units are, as windows of one recording are not
+    independent; but what is met in a few recordings only, such as a wall, is seen there again and
+    again, so those of windows count too, at a much stricter level.
 
     Source: Westfall and Young, *Resampling-based multiple testing*, Wiley 1993 (the largest
     statistic of a family).
 
     :return: for each set, shape ``(sets,)``
     """
+    by_unit = np.stack([agreement[:, unit == label].sum(1) for label in np.unique(unit)], 1)
+    return np.minimum(_by_flips(by_unit), _STRICTER * _by_flips(agreement))
+
+
+def _by_flips(agreement: Float[np.ndarray, "sets n"]) -> Float[np.ndarray, " sets"]:
     n = agreement.shape[1]
     if n <= _ALL_SIGNS_OF:
         signs = np.array(list(product((1.0, -1.0), repeat=n)))

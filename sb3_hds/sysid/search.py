@@ -1,8 +1,6 @@
 """Which candidate explains what is left: proposed on some windows, confirmed on others."""
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -10,7 +8,7 @@ from jaxtyping import Float, Int
 from rich.progress import track
 
 from sb3_hds.sysid.comparison import Comparison, compare, confirm, effective_size
-from sb3_hds.sysid.evidence import Evidence, Point
+from sb3_hds.sysid.evidence import Evidence, Point, in_threads
 from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
 
 # What confirms a candidate: by which share the mean square error of held-out recordings falls, at
@@ -106,12 +104,14 @@ class Effort(NamedTuple):
     :param finalists: candidates that are fitted to the end
     :param windows: most windows on which the others are compared
     :param steps: of the fits that choose the finalists
+    :param profiles: whether intervals follow the likelihood, or are symmetric
     """
 
     guessed: int
     finalists: int
     windows: int
     steps: int
+    profiles: bool
 
 
 class Search:
@@ -297,11 +297,9 @@ class Search:
     def _each(
         self, work: Callable[[_Given], _Told], given: Sequence[_Given], what: str
     ) -> list[_Told]:
-        """Compiled programs leave the interpreter free, so threads share the cores."""
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            done = pool.map(work, given)
-            shown = track(done, what, total=len(given), transient=True, disable=not self.progress)
-            return list(shown)
+        done = in_threads(work, given)
+        shown = track(done, what, total=len(given), transient=True, disable=not self.progress)
+        return list(shown)
 
 
 def _newton(

@@ -1,0 +1,158 @@
+"""
+A quadruped with springs: RL alone, an optimised rhythm, and both, in which order.
+
+    python benchmarks/elastic_quadruped.py              # 100,000 steps, three seeds
+    python benchmarks/elastic_quadruped.py --figure     # draw the figure again from the table
+
+`sb3_hds/ElasticQuadruped-v0`, the same number of real steps for all:
+
+- ``rl, position`` and ``rl, force``: gSDE-SAC alone, an action being the angles of the motors, or
+  the torques that springs shall pass on
+- ``rhythm``: the gait that ``OpenLoop`` finds
+- ``rhythm, then rl``: half the steps for the search, the rest for gSDE-SAC, which adds offsets to
+  the targets of the gait that was found
+- ``rl over a plain rhythm``: the same offsets, over a trot that nobody optimised
+- ``rl sets the rhythm``: gSDE-SAC sets amplitudes and frequency of that trot while it walks
+
+Each run is a process of its own; what acts at the end is evaluated on 20 episodes, the same resets
+for every run. Runs that are in the table are not done again.
+"""
+
+import argparse
+import json
+import math
+
+import numpy as np
+import pandas as pd
+from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+
+METHODS = (
+    "rl, position",
+    "rl, force",
+    "rhythm",
+    "rhythm, then rl",
+    "rl over a plain rhythm",
+    "rl sets the rhythm",
+)
+# The drive's own loop, in its commands.
+GAINS = {"kp": 6.0, "kd": 0.14}
+#: a trot at 2 Hz: hips swing, knees a quarter of a turn ahead
+PLAIN = {
+    "omega_swing": 4.0 * math.pi,
+    "amplitude": [0.4, 0.4] * 4,
+    "phase": [0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi, math.pi, 1.5 * math.pi, 0, 0.5 * math.pi],
+    **GAINS,
+}
+N_EPISODES = 20
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument("--methods", nargs="*", default=list(METHODS), choices=METHODS)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--steps", type=int, default=100_000)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--figure", action="store_true")
+    parser.add_argument("--worker", nargs=3, metavar=("METHOD", "SEED", "STEPS"))
+    arguments = parser.parse_args()
+    if arguments.worker:
+        method, seed, steps = arguments.worker
+        print(json.dumps(worker(method, int(seed), int(steps))))
+        return
+    if not arguments.figure:
+        wanted = [
+            (method, seed, arguments.steps)
+            for seed in range(arguments.seeds)
+            for method in arguments.methods
+        ]
+        resume("elastic_quadruped", ("method", "seed", "steps"), wanted, _run, arguments.jobs)
+    report()
+
+
+def _run(*run) -> list[dict]:
+    return [fresh_process(__file__, *run, cache=CACHE / "programs")]
+
+
+def worker(method: str, seed: int, steps: int) -> dict:
+    """Learn once, then evaluate what was learned."""
+    from sb3_hds.experiments import returns_of
+
+    model, env = learned(method, seed, steps)
+    seconds = seconds_since_start()
+    returns = returns_of(model, env, N_EPISODES)
+    return {"return": returns.mean(), "std": returns.std(), "seconds": seconds}
+
+
+def learned(method: str, seed: int, steps: int):
+    """:return: model, and environment that it acts in"""
+    if method == "rhythm":
+        return searched(seed, steps), make("torque")
+    if method == "rhythm, then rl":
+        gait = searched(seed, steps // 2).constants
+        env = over(gait, "offset", action_range=0.3)
+        return with_rl(env, seed, steps - steps // 2), env
+    env = {
+        "rl, position": lambda: make("position"),
+        "rl, force": lambda: make("force"),
+        "rl over a plain rhythm": lambda: over(PLAIN, "offset", action_range=0.3),
+        "rl sets the rhythm": lambda: over(PLAIN, "parameters"),
+    }[method]()
+    return with_rl(env, seed, steps), env
+
+
+def make(control: str):
+    import gymnasium
+
+    import sb3_hds  # noqa: F401
+
+    return gymnasium.make("sb3_hds/ElasticQuadruped-v0", control=control)
+
+
+def over(gait: dict, mode: str, **settings):
+    """:return: the environment with a rhythm under the policy"""
+    from sb3_hds.wrappers import CPGPrior
+
+    return CPGPrior(make("torque"), mode=mode, **gait, **settings)
+
+
+def searched(seed: int, steps: int):
+    from sb3_hds import OpenLoop
+
+    settings = {"horizon": 100, "amplitude": 0.6, "offset": 0.3, "frequency": (0.5, 6.0)}
+    return OpenLoop("MlpPolicy", make("torque"), seed=seed, **settings, **GAINS).learn(steps)
+
+
+def with_rl(env, seed: int, steps: int):
+    from sb3_hds import GSDESAC
+
+    settings = {"train_freq": 8, "gradient_steps": 8, "gamma": 0.98}
+    return GSDESAC("MlpPolicy", env, seed=seed, **settings).learn(steps)
+
+
+def report() -> None:
+    """Print and draw all runs."""
+    table = pd.read_csv(RESULTS / "elastic_quadruped.csv")
+    by = table.groupby(["method", "steps"], sort=False)["return"]
+    print(by.agg(["count", "median", "min", "max"]).to_string(float_format="%.1f"))
+    draw(table[table.steps == table.steps.max()])
+
+
+def draw(table: pd.DataFrame) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 3.4), layout="constrained")
+    axes = figure.subplots()
+    shown = [method for method in METHODS if (table.method == method).any()]
+    for place, method in enumerate(shown):
+        returns = table[table.method == method]["return"]
+        axes.plot(np.full(len(returns), place), returns, "o", color="#27496d", alpha=0.6)
+        axes.plot([place - 0.25, place + 0.25], [returns.median()] * 2, color="#27496d", lw=2)
+    axes.set_xticks(range(len(shown)), [method.replace(" rhythm", "\nrhythm") for method in shown])
+    axes.tick_params(axis="x", labelsize=8)
+    axes.set_ylabel(f"return after {table.steps.max():,} steps")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(RESULTS / "elastic_quadruped.png", dpi=150)
+
+
+if __name__ == "__main__":
+    main()

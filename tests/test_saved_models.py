@@ -1,0 +1,80 @@
+"""
+What was saved by this version is loaded by every later one, and acts as it did.
+
+    python tests/test_saved_models.py      # writes tests/saved/VERSION anew: once for each release
+"""
+
+import json
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from small_models import SMALL, small
+
+import sb3_hds
+from sb3_hds import algos
+
+SAVED = Path(__file__).parent / "saved"
+OBSERVATIONS = np.array(
+    [[1.0, 0.0, 0.0], [-1.0, 0.0, 2.0], [0.6, -0.8, -7.5], [0.0, 1.0, 1.0]], np.float32
+)
+#: enough for updates, a real episode, and another network than at the start
+N_STEPS = {"pods": 25, "hds": 50, "openloop": 24}
+FILES = sorted(SAVED.glob("*/*.zip"))
+EACH = pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.stem}")
+
+
+def test_every_algorithm_has_a_file_of_its_first_version():
+    assert {path.stem for path in (SAVED / "0.1.0").glob("*.zip")} == set(algos.ALL)
+
+
+@EACH
+def test_a_model_of_an_earlier_version_acts_as_it_did(path):
+    told = json.loads(path.with_suffix(".json").read_text())
+
+    model = algos.ALL[path.stem].load(path, env=gymnasium.make("Pendulum-v1"))
+
+    assert model.num_timesteps == told["num_timesteps"]
+    assert_acts(model, told["actions"])
+
+
+@EACH
+def test_a_policy_of_an_earlier_version_acts_alone(path, no_pickle):
+    told = json.loads(path.with_suffix(".json").read_text())
+
+    assert_acts(sb3_hds.load_policy(path), told["actions"])
+
+
+@pytest.mark.expensive
+@EACH
+def test_a_model_of_an_earlier_version_learns_on(path):
+    model = algos.ALL[path.stem].load(path, env=gymnasium.make("Pendulum-v1"))
+    before = model.num_timesteps
+
+    model.learn(N_STEPS.get(path.stem, 20), reset_num_timesteps=False)
+
+    assert model.num_timesteps > before
+
+
+def assert_acts(model, expected):
+    actions, _ = model.predict(OBSERVATIONS, deterministic=True)
+    np.testing.assert_allclose(actions, expected, rtol=1e-4, atol=1e-5)
+
+
+def write() -> None:
+    folder = SAVED / sb3_hds.__version__.split("+")[0]
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in SMALL:
+        model = small(name).learn(N_STEPS.get(name, 30))
+        model.save(folder / f"{name}.zip")
+        actions, _ = model.predict(OBSERVATIONS, deterministic=True)
+        told = {
+            "actions": np.asarray(actions, float).round(7).tolist(),
+            "num_timesteps": model.num_timesteps,
+        }
+        (folder / f"{name}.json").write_text(json.dumps(told) + "\n")
+
+
+if __name__ == "__main__":
+    write()
