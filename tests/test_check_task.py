@@ -1,6 +1,8 @@
 """What is wrong with a task is found, and what is not wrong is left alone."""
 
 import copy
+import functools
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -16,7 +18,7 @@ from sb3_hds.wrappers import TaskReport, check_task
 
 def topics(env: gymnasium.Env, **how) -> list[str]:
     """:return: what the problems are about"""
-    return [text.split(":")[0] for text in check_task(env, **how).problems]
+    return [text.split(":")[0] for text in check_task(env, **({"n_steps": 1000} | how)).problems]
 
 
 def test_nothing_is_wrong_with_a_healthy_task():
@@ -24,6 +26,11 @@ def test_nothing_is_wrong_with_a_healthy_task():
 
     assert report.ok and report.problems == []
     assert words(report).endswith("no problem found.")
+
+
+@functools.cache
+def of_toy(settings: tuple[tuple[str, Any], ...], how: tuple[tuple[str, Any], ...]) -> list[str]:
+    return topics(toy(**dict(settings)), **dict(how))
 
 
 def words(report: TaskReport) -> str:
@@ -61,12 +68,7 @@ DEFECTS = {
     ),
     "short episodes": ({"limit": 4}, {"gamma": 0.98}, "Episode length", {}),
     "no end": ({"limit": None}, {}, "Episode length", {}),
-    "a short-sighted discount": (
-        {"limit": 1500},
-        {"gamma": 0.9},
-        "Episode length",
-        {},
-    ),
+    "a short-sighted discount": ({"limit": 900}, {"gamma": 0.8}, "Episode length", {}),
     "late reward": ({"reward": "late"}, {"gamma": 0.9}, "Late reward", {"reward": "late"}),
 }
 
@@ -75,9 +77,10 @@ DEFECTS = {
 def test_a_defect_is_found_and_what_has_it_not_is_left_alone(defect):
     wrong, how, topic, mended = DEFECTS[defect]
 
-    assert topic in topics(toy(**wrong), **how)
+    assert topic in of_toy(tuple(wrong.items()), tuple(how.items()))
     # The late reward is one at a discount of 0.9, and none at 0.99.
-    assert topic not in topics(toy(**mended), **({} if topic == "Late reward" else how))
+    how = {} if topic == "Late reward" else how
+    assert topic not in of_toy(tuple(mended.items()), tuple(how.items()))
 
 
 @pytest.mark.parametrize(
@@ -118,6 +121,43 @@ def test_ends_are_weighed_against_staying():
     assert "Termination pays" in topics(Costly(-99.0))
     assert "Termination pays" not in topics(Costly(-101.0))
     assert "staying therefore 100" in " ".join(check_task(Costly(-99.0)).problems)
+
+
+def test_what_is_said_of_a_limit_is_of_episodes_that_it_cut():
+    class Mixed(gymnasium.Env):
+        """Most episodes fall after a few steps; the others would go on for ever."""
+
+        observation_space = spaces.Box(-1.0, 1.0, (1,))
+        action_space = spaces.Box(-1.0, 1.0, (1,))
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.stays = self.np_random.random() < 0.2
+            return self.observation_space.sample(), {}
+
+        def step(self, action):
+            fell = not self.stays and self.np_random.random() < 0.3
+            return self.observation_space.sample(), float(action[0]), fell, False, {}
+
+    # 1 - 0.99^150 is 78 %, although the mean episode has some 35 steps.
+    assert "Episode length" not in topics(TimeLimit(Mixed(), 150))
+    assert "Episode length" in topics(TimeLimit(Mixed(), 20))
+
+
+def test_a_cost_for_each_step_is_no_constant_reward_where_something_ends_it():
+    class UntilTheGoal(gymnasium.Env):
+        observation_space = spaces.Box(-1.0, 1.0, (1,))
+        action_space = spaces.Box(-1.0, 1.0, (1,))
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return self.observation_space.sample(), {}
+
+        def step(self, action):
+            there = self.np_random.random() < 0.02
+            return self.observation_space.sample(), -1.0, there, False, {"is_success": there}
+
+    assert topics(TimeLimit(UntilTheGoal(), 200)) == []
 
 
 def of_stock(env_id: str, **changes) -> list[str]:

@@ -349,10 +349,13 @@ def test_what_is_confirmed_is_not_given_up_for_something_simpler_that_is_not(p_o
         SimpleNamespace(kept=name, criterion=60.0, candidate=SimpleNamespace(parameters=parameters))
         for name, parameters in (("rich", ("tau_c", "mu")), ("simple", ("gain",)))
     )
-    search = SimpleNamespace(
-        against=lambda new, old: Comparison(0.3, 0.2, -0.1, 0.6, 6),
-        confirmed=lambda new, old: Comparison(0.5, p_values[new], 0.2, 0.7, 6),
-    )
+    p_values["rich", "simple"] = 0.2
+
+    def confirmed(new, old):
+        p_value = p_values[new] if old == "base" else p_values[new, old]
+        return Comparison(0.5, p_value, 0.2, 0.7, 6)
+
+    search = SimpleNamespace(confirmed=confirmed)
 
     best = Search.best(search, [rich, simple], SimpleNamespace(kept="base"))
 

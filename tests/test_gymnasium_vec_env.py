@@ -67,8 +67,16 @@ LEARNERS = {
 }
 
 
-@pytest.mark.parametrize("learner", LEARNERS)
-@every_mode
+@pytest.mark.parametrize(
+    ("mode", "learner"),
+    [
+        (mode, learner)
+        if learner == "SB3's SAC" or mode is AutoresetMode.NEXT_STEP
+        else pytest.param(mode, learner, marks=pytest.mark.expensive)
+        for mode in MODES
+        for learner in LEARNERS
+    ],
+)
 def test_the_replay_buffer_holds_exactly_the_true_transitions(mode, learner):
     model = LEARNERS[learner](GymnasiumVecEnv(sync(mode)))
 
@@ -96,7 +104,14 @@ def test_what_is_bootstrapped_is_what_was_only_cut(mode):
         np.testing.assert_array_equal(next_obs[:3], (copy, episode, step + 1))
 
 
-@every_mode
+@pytest.mark.parametrize(
+    "mode",
+    [
+        AutoresetMode.NEXT_STEP,
+        pytest.param(AutoresetMode.SAME_STEP, marks=pytest.mark.expensive),
+        pytest.param(AutoresetMode.DISABLED, marks=pytest.mark.expensive),
+    ],
+)
 def test_environments_in_other_processes_are_stored_as_truly(mode):
     env = GymnasiumVecEnv(
         AsyncVectorEnv([counting(i) for i in range(2)], autoreset_mode=mode, context="forkserver")

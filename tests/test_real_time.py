@@ -10,7 +10,7 @@ from gymnasium import spaces
 from small_models import small
 
 from sb3_hds.algos import TrainBeside
-from sb3_hds.errors import ParameterError
+from sb3_hds.errors import ParameterError, SafetyError
 from sb3_hds.wrappers import RealTime, Timing
 
 
@@ -234,6 +234,25 @@ def test_in_real_time_a_learner_that_hangs_is_replaced_by_the_watchdog():
     assert commands[-1] == 1.0 and commands[-2] == -1.0
     assert env.timing.steps == 6 and env.timing.safe_actions >= info["missed_steps"]
     assert env.overrun and env.latencies()[0].sum() == 6
+
+
+def test_a_watchdog_whose_safe_action_fails_says_so_and_stays_still():
+    class Broken(Plant):
+        def step(self, action):
+            if float(action[0]) == 0.5:
+                raise OSError("no answer from the drive")
+            return super().step(action)
+
+    env = RealTime(Broken(), 0.2, [0.5])
+    env.reset()
+    env.step(np.zeros(1, np.float32))
+    time.sleep(0.7)
+    with pytest.raises(SafetyError, match="watchdog"):
+        env.step(np.zeros(1, np.float32))
+    assert len(env.unwrapped.told) == 1
+    env.reset()
+    env.step(np.zeros(1, np.float32))
+    env.close()
 
 
 def test_training_beside_the_loop_improves_the_policy_while_the_environment_runs():

@@ -72,9 +72,17 @@ class _Accepted(NamedTuple):
 
 
 class _Left(NamedTuple):
-    """What a twin leaves: what can be predicted of it, its mean square, and all of it."""
+    """
+    What a twin leaves.
+
+    :param remainder: what can be predicted of it
+    :param predicted: mean square of that, in units of the force's error under the search's noise
+    :param power: mean square of all of it, likewise
+    :param missing: all of it
+    """
 
     remainder: Remainder | None
+    predicted: float
     power: float
     missing: MissingForce
 
@@ -250,7 +258,11 @@ class Inquiry:
         power = float(np.mean(np.sum(weighed(missing) ** 2, 1)))
         mind = float(np.mean((_IRRELEVANT * self.spread / missing.noise) ** 2))
         least = _OF_IRRELEVANT**2 * mind * missing.numbers
-        return _Left(remainder(missing, self.data, joints, self.seed, least), power, missing)
+        found = remainder(missing, self.data, joints, self.seed, least)
+        # Errors of forces are known better the less is missing: two twins need one unit.
+        unit = float(np.mean((missing.noise / self.search.noise) ** 2))
+        predicted = 0.0 if found is None else unit * found.power
+        return _Left(found, predicted, unit * power, missing)
 
     def _look_alike(self, found: Sequence[_Accepted], base: Base) -> list[str]:
         """Sentences on candidates that others imitate, though held-out recordings prefer these."""
@@ -370,8 +382,7 @@ def _margin(n_units: int, stderr: np.ndarray) -> np.ndarray:
 def _share(before: _Left, left: _Left) -> float:
     """:return: of the missing force that can be predicted, how much is not missing any more"""
     gone = max(before.power - left.power, 0.0)
-    rest = left.remainder.power if left.remainder is not None else 0.0
-    return gone / (gone + rest) if gone + rest else 1.0
+    return gone / (gone + left.predicted) if gone + left.predicted else 1.0
 
 
 def _keys(found: Sequence[_Accepted]) -> list[str]:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from rich.progress import track
 
-from sb3_hds.sysid.comparison import Comparison, compare, confirm, effective_size
+from sb3_hds.sysid.comparison import Comparison, confirm, effective_size
 from sb3_hds.sysid.evidence import Evidence, Point, in_threads
 from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
 
@@ -216,7 +216,7 @@ class Search:
         first = simplest = tried[0]
         for other in tried[1:]:
             fewer = len(other.candidate.parameters) < len(simplest.candidate.parameters)
-            as_good = self.against(simplest.kept, other.kept).p_value > _LEVEL_OF_SET
+            as_good = self.confirmed(simplest.kept, other.kept).p_value > _LEVEL_OF_SET
             if fewer and other.criterion >= LEAST_BIC and as_good:
                 simplest = other
         for one in (simplest, first):
@@ -243,11 +243,6 @@ class Search:
         theta[list(own)] = self.hypotheses.null[list(own)]
         without = self.base(theta, [i for i in base.free if i not in own])
         return passes(self.confirmed(base.kept, without.kept))
-
-    def against(self, new: Point, old: Point) -> Comparison:
-        """:return: one candidate beside another, both on the half that confirms"""
-        half = self.confirm
-        return compare(half.errors(new), half.errors(old), half.unit)
 
     def confirmed(self, new: Point, old: Point) -> Comparison:
         """:return: whether one is better than another, both on the half that confirms"""

@@ -100,7 +100,7 @@ class JointLimitBarrier(TransformLayer):
     def begin(self, obs: Any) -> None:
         super().begin(obs)
         self._missed = 0.0
-        if self.cost() > self._barrier.tolerance:
+        if not self.cost() <= self._barrier.tolerance:
             self._breach(
                 f"An episode begins {self.cost():.3g} beyond the joint limits, at "
                 f"{self._barrier.positions(self._obs)}. Start within them."

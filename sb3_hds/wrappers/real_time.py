@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 
-from sb3_hds.errors import ParameterError
+from sb3_hds.errors import ParameterError, SafetyError
 
 # The histogram of latencies has this many bins per period, over this many periods.
 _BINS, _PERIODS = 20, 2
@@ -100,7 +100,7 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         with self._lock:
-            self._running = False
+            self._running, self._failure = False, None
             self._missed.clear()
             obs, info = self.env.reset(seed=seed, options=options)
             self._answered = self._clock()
@@ -110,8 +110,16 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         return obs, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """:return: as the environment; see above for rewards and ``info``"""
+        """
+        :return: as the environment; see above for rewards and ``info``
+        :raises SafetyError: if the environment failed under the watchdog since the last step
+        """
         came = self._clock()
+        if self._failure is not None:
+            raise SafetyError(
+                "The watchdog could not execute the safe action; nothing was executed since. Stop "
+                "the robot by hand, then reset."
+            ) from self._failure
         self.latency, self.overrun = came - self._answered, True
         self._note(self.latency)
         self.watch()
@@ -196,6 +204,7 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
 
     def _begin_watching(self) -> None:
         self._lock, self._stopped = threading.RLock(), threading.Event()
+        self._failure: Exception | None = None
         self._thread: threading.Thread | None = None
 
     def _watch_on(self) -> None:
@@ -210,8 +219,11 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
             idle = not self._running or self._claimed
             if idle or due > 0.0:
                 self._stopped.wait(self.grace * self.period if idle else due)
-            else:
+                continue
+            try:
                 self.watch()
+            except Exception as error:
+                self._running, self._failure = False, error
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_lock": None, "_stopped": None, "_thread": None}

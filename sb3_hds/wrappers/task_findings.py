@@ -28,11 +28,11 @@ _FEWEST_ENDS = 3
 
 def observation_scale(sample: Sample) -> list[str]:
     """Networks are made for inputs of order 1."""
-    if not np.isfinite(sample.obs).all():
-        odd = np.atleast_1d(~np.isfinite(sample.obs).all(0))
+    broken = np.any(~np.isfinite(sample.obs), axis=0)
+    if broken.any():
         return [
-            f"Observation: {_listed(sample.names, odd)} was not finite. One such number "
-            "makes all weights of a network so. Bound it, or end the "
+            f"Observation: {_listed(sample.names, np.asarray(broken))} was not "
+            "finite. One such number makes all weights of a network so. Bound it, or end the "
             "episode before."
         ]
     mean, std = np.abs(sample.obs.mean(0)), sample.obs.std(0)
@@ -81,8 +81,8 @@ def reward_variety(sample: Sample) -> list[str]:
         return []
     values, counts = np.unique(inner, return_counts=True)
     usual, others = values[counts.argmax()], len(inner) - counts.max()
-    # A bonus for each step, until the end: the end is what there is to learn.
-    if usual > 0.0 and sample.terminated.any():
+    # Where each step pays or costs the same until the end, the end is what there is to learn.
+    if usual != 0.0 and sample.terminated.any():
         return []
     n = len(sample.rewards)
     if np.ptp(sample.rewards) == 0.0:
@@ -171,9 +171,7 @@ def rewarded_end(sample: Sample, gamma: float) -> list[str]:
 def horizon(sample: Sample, gamma: float) -> list[str]:
     """How far a discount looks, against how long an episode is."""
     ahead = 1.0 / (1.0 - gamma)
-    if not len(sample.lengths):
-        if sample.limit is not None:
-            return []
+    if not len(sample.lengths) and sample.limit is None:
         return [
             f"Episode length: no episode ended in {counted(len(sample.rewards), 'step')}, and no "
             "time limit is known. A policy sees new starts only after an end, and returns are "
@@ -181,12 +179,15 @@ def horizon(sample: Sample, gamma: float) -> list[str]:
             "max_episode_steps=...)."
         ]
     problems = []
-    length = float(sample.lengths.mean())
-    if sample.truncated.any() and 1.0 - gamma**length < _HALF:
+    cut = float(sample.limit or math.inf)
+    length = float(sample.lengths.mean()) if len(sample.lengths) else cut
+    if sample.truncated.any():
+        cut = float((sample.age[sample.truncated] + 1).mean())
+    if 1.0 - gamma**cut < _HALF:
         enough = math.ceil(math.log(_HALF) / math.log(gamma))
         problems.append(
-            f"Episode length: episodes are cut after {length:.0f} steps, in which only "
-            f"{1.0 - gamma**length:.0%} of what gamma={gamma:g} counts is paid; the rest of each "
+            f"Episode length: episodes are cut after {cut:.0f} steps, in which only "
+            f"{1.0 - gamma**cut:.0%} of what gamma={gamma:g} counts is paid; the rest of each "
             "value is bootstrapped, and right only if time-outs arrive as truncations "
             f"(check_truncation). Make episodes of {enough} steps or more, or lower gamma."
         )
