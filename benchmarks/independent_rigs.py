@@ -47,7 +47,8 @@ _FURUTA = (
 <inertial pos="0 0 -0.07" mass="0.05" diaginertia="8e-5 8e-5 1e-12"/></body></body></worldbody>
 <actuator><motor joint="arm"/></actuator></mujoco>"""
 )
-# Motor and load apart, each with half of the inertia; a tendon holds them together.
+# Motor and load apart, each with half of the inertia; a tendon holds them together. Gravity and
+# friction act on the load, as `effects.Transmission` says.
 _TENDON = """<tendon><fixed {hold}><joint joint="rotor" coef="1"/><joint joint="load" coef="-1"/>
 </fixed></tendon><actuator><motor joint="rotor"/></actuator></mujoco>"""
 _PENDULUM_APART = (
@@ -60,9 +61,9 @@ _PENDULUM_APART = (
 )
 _AXIS_APART = (
     _HEAD
-    + """<worldbody><body><joint name="load" type="slide" axis="1 0 0" damping="1.5"/>
+    + """<worldbody><body><joint name="load" type="slide" axis="1 0 0" damping="3"/>
 <inertial pos="0 0 0" mass="1.0" diaginertia="0.01 0.01 0.01"/></body>
-<body><joint name="rotor" type="slide" axis="1 0 0" damping="1.5"/>
+<body><joint name="rotor" type="slide" axis="1 0 0"/>
 <inertial pos="0 0 0" mass="1.0" diaginertia="0.01 0.01 0.01"/></body></worldbody>"""
     + _TENDON
 )

@@ -138,25 +138,58 @@ def test_two_causes_are_found_one_after_the_other():
     assert found.twin.values["action_delay.torque.delay"] == pytest.approx(0.05, rel=0.15)
 
 
-def test_a_joint_whose_direction_is_wrong_is_found_as_a_whole():
-    """Each of its channels alone makes predictions worse."""
+def swinging(*hidden, n_steps=120, strength=0.05):
+    """:return: a driven pendulum without what is hidden, and recordings of it with that"""
     pushed = twins.make("FreePendulum", driven=True, dt=0.02)
-    wander = np.random.default_rng(0).standard_normal((10, 120, 1)).cumsum(1)
-    actions = 0.05 * np.sin(0.7 * wander)
-    data = measured(pushed, n=10, n_steps=120, noise=0.005, commands=actions)
-    obs = [data.episode(i)[0] * [-1.0, -1.0] for i in range(len(data))]
+    wander = np.random.default_rng(0).standard_normal((10, n_steps, 1)).cumsum(1)
+    actions = strength * np.sin(0.7 * wander)
+    data = measured(
+        pushed.extend(*hidden) if hidden else pushed,
+        n=10,
+        n_steps=n_steps,
+        noise=0.005,
+        commands=actions,
+    )
+    return pushed, data
+
+
+@pytest.mark.parametrize(
+    ("signs", "where", "flipped"),
+    [
+        # Each of its channels alone makes predictions worse.
+        ([-1.0, -1.0], "joint", {"hinge_position", "hinge_velocity"}),
+        # The start states that explain the data best are those of another motion.
+        ([-1.0, 1.0], "channel", {"hinge_position"}),
+    ],
+)
+def test_a_wrong_direction_is_found(signs, where, flipped):
+    pushed, data = swinging(strength=0.4)
+    episodes = [data.episode(i) for i in range(len(data))]
     found = asked(
-        Trajectories.from_arrays(obs, list(actions), dt=pushed.dt),
+        Trajectories.from_arrays(
+            [obs * signs for obs, _ in episodes], [a for _, a in episodes], dt=pushed.dt
+        ),
         pushed,
         effects=[effects.SignFlip, effects.ViscousFriction],
     )
 
     (finding,) = found.findings
-    assert (finding.effect, finding.where["slot"]) == ("sign_flip", "joint")
-    assert {a.key for a in found.twin.attached} == {
-        "sign_flip.hinge_position",
-        "sign_flip.hinge_velocity",
-    }
+    assert (finding.effect, finding.where["slot"]) == ("sign_flip", where)
+    assert {a.key for a in found.twin.attached} == {f"sign_flip.{name}" for name in flipped}
+
+
+def test_a_spring_is_found_that_is_far_softer_than_is_usual():
+    """Of what has no slope where nothing is wrong, the search has to know where to begin."""
+    pushed, data = swinging(effects.JointElasticity("hinge", k=0.3, d=0.002), n_steps=150)
+    found = asked(
+        data,
+        pushed,
+        effects=[effects.JointElasticity, effects.ViscousFriction, effects.ActionDelay],
+        budget="quick",
+    )
+
+    assert [finding.effect for finding in found.findings] == ["joint_elasticity"]
+    assert found.findings[0].parameters["k"].estimate == pytest.approx(0.3, rel=0.05)
 
 
 @pytest.mark.expensive

@@ -137,7 +137,7 @@ class Evidence:
         h, moving = self.hypotheses, np.array(free, int)
         low, high, size = h.lower[moving], h.upper[moving], h.scale[moving]
         theta = np.array(theta, float)
-        offsets = self._begin if offsets is None else offsets
+        offsets = self._measured(theta) if offsets is None else offsets
         now, damping = self._blocks(theta, moving, offsets), _DAMPING
         for _ in range(n_steps):
             step = _eliminated(now, damping)
@@ -172,10 +172,22 @@ class Evidence:
         step = _eliminated(self._blocks(point.theta, every, point.offsets), 0.0)
         return Slopes(step.curvature, step.scores)
 
-    @cached_property
-    def _begin(self) -> np.ndarray:
-        twin = self.hypotheses.believed
-        return first_offsets(twin, np.asarray(self.shots.obs), twin.dt)
+    def nearer(
+        self, theta: Float[np.ndarray, " p"], offsets: Float[np.ndarray, "n free"]
+    ) -> Float[np.ndarray, "n free"]:
+        """
+        :param offsets: of the start states under other parameters
+        :return: of each window, what explains it better: that start state, or the measured one
+        """
+        both = offsets, self._measured(theta)
+        here, there = (self._blocks(theta, np.array([], int), each).cost for each in both)
+        return np.where((here <= there)[:, None], *both)
+
+    def _measured(self, theta: np.ndarray) -> np.ndarray:
+        h = self.hypotheses
+        params = h.fixed | dict(zip(h.names, theta, strict=True))
+        with jax.enable_x64(True):
+            return first_offsets(h.twin, np.asarray(self.shots.obs, float), h.twin.dt, params)
 
     @cached_property
     def _counted(self) -> np.ndarray:

@@ -174,9 +174,8 @@ class Search:
             own = list(self.hypotheses.indices(candidate))
             theta = first.theta.copy()
             theta[own] = self._reached[candidate.key][own]
-            free = [*base.free, *own]
-            point = evidence.fit(theta, free, first.offsets, self.effort.steps)
-            return min(first, point, key=lambda p: p.cost)
+            offsets = evidence.nearer(theta, first.offsets)
+            return evidence.fit(theta, [*base.free, *own], offsets, self.effort.steps)
 
         points = self._each(glance, likely, f"comparing {len(likely)} causes")
         ranked = sorted(zip(likely, points, strict=True), key=lambda pair: pair[1].cost)
@@ -185,7 +184,8 @@ class Search:
 
         def finish(candidate: Candidate) -> Tried:
             point = self._continued(candidate, base)
-            kept = self.confirm.evidence.fit(point.theta, (), base.kept.offsets, _KEPT_STEPS)
+            offsets = self.confirm.evidence.nearer(point.theta, base.kept.offsets)
+            kept = self.confirm.evidence.fit(point.theta, (), offsets, _KEPT_STEPS)
             return Tried(candidate, point, kept, self._criterion(candidate, point, base.point))
 
         best = [candidate for candidate, _ in ranked[: most or self.effort.finalists]]
@@ -199,7 +199,8 @@ class Search:
 
         def verdict(candidate: Candidate) -> Comparison:
             theta = self._reached[candidate.key]
-            kept = self.confirm.evidence.fit(theta, (), base.kept.offsets, _ROUGH_STEPS)
+            offsets = self.confirm.evidence.nearer(theta, base.kept.offsets)
+            kept = self.confirm.evidence.fit(theta, (), offsets, _ROUGH_STEPS)
             return self.confirmed(kept, base.kept)
 
         return list(zip(rest, self._each(verdict, rest, "weighing the others"), strict=True))
@@ -275,7 +276,8 @@ class Search:
         own = list(self.hypotheses.indices(candidate))
         reached = self._reached[candidate.key]
         evidence, moving = self.select.evidence, [*base.free, *own]
-        point = evidence.fit(reached, moving, base.point.offsets, _ALL_STEPS)
+        offsets = evidence.nearer(reached, base.point.offsets)
+        point = evidence.fit(reached, moving, offsets, _ALL_STEPS)
         return min(base.point, point, key=lambda p: p.cost)
 
     def _criterion(self, candidate: Candidate, point: Point, base: Point) -> float:

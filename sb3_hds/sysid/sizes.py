@@ -2,10 +2,11 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.core import Trajectories
+from sb3_hds.core import AnalyticTwin, Trajectories, Twin
 from sb3_hds.sysid.evidence import Evidence
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.motion import motion_of
@@ -14,6 +15,8 @@ from sb3_hds.sysid.motion import motion_of
 _SHARE = 0.05
 # Of the largest command, speed and excursion, where a parameter moves nothing at its null.
 _OF_COMMAND, _OF_SPEED, _OF_POSITION = 0.2, 0.1, 0.2
+# A spring between motor and load stretches by this share of the excursion under a typical torque.
+_STRETCH = 0.4
 # Of an admissible range.
 _OF_RANGE = 0.1
 _NOTHING = 1e-15
@@ -36,10 +39,12 @@ def sized(evidence: Evidence, data: Trajectories) -> Hypotheses:
 
 
 def _unseen(h: Hypotheses, data: Trajectories) -> Float[np.ndarray, " p"]:
-    """Scales of what has no slope at its null, by the unit: a limit, a speed, a place."""
+    """Scales of what has no slope at its null, by the unit: a limit, a speed, a place, a spring."""
     scale = h.scale.copy()
     commands = np.abs(data.actions).max((0, 1)) if data.n_act else np.zeros(0)
-    speeds, excursions = _motion(h, data)
+    speeds, excursions, torques = _motion(h, data)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        springs = torques / (_STRETCH * excursions)
     for candidate in h.candidates:
         for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
             unit = h.twin.parameters[name].unit
@@ -52,11 +57,26 @@ def _unseen(h: Hypotheses, data: Trajectories) -> Float[np.ndarray, " p"]:
                     scale[i] = _OF_SPEED * speeds[candidate.index]
                 elif unit == joint.unit and joint.unit == "m" and excursions[candidate.index]:
                     scale[i] = _OF_POSITION * excursions[candidate.index]
+                elif np.isfinite(spring := springs[candidate.index]) and spring > 0.0:
+                    if unit.endswith(f" s/{joint.unit}"):
+                        scale[i] = spring * data.dt
+                    elif unit.endswith(f"/{joint.unit}"):
+                        scale[i] = spring
     return scale
 
 
-def _motion(h: Hypotheses, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
-    """Largest speed and largest excursion of each joint."""
+def _motion(h: Hypotheses, data: Trajectories) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Largest speed, excursion and torque of each joint; no number where inertias are unknown."""
     parts = [motion_of(h.believed, data.episode(i)[0][None], data.dt) for i in range(len(data))]
     q, v = (np.concatenate([part[k][0] for part in parts]) for k in (0, 1))
-    return np.quantile(np.abs(v), 0.98, axis=0), q.max(0) - q.min(0)
+    change = np.concatenate([np.diff(part[1][0], axis=0) for part in parts]) / data.dt
+    speeds, faster = (np.quantile(np.abs(x), 0.98, axis=0) for x in (v, change))
+    return speeds, q.max(0) - q.min(0), faster * _inertias(h.believed, q[0])
+
+
+def _inertias(twin: Twin, q: np.ndarray) -> np.ndarray:
+    while not isinstance(twin, AnalyticTwin):
+        if not hasattr(twin, "base"):
+            return np.full(len(q), np.nan)
+        twin = twin.base  # type: ignore[attr-defined]
+    return np.diag(np.asarray(twin.mass_matrix(jnp.asarray(q), twin.params)))
