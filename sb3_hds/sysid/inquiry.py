@@ -6,29 +6,36 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from sb3_hds.core import Effect, Trajectories, Twin
 from sb3_hds.data import audit
 from sb3_hds.sysid.account import (
     by_horizon,
     detectable,
-    imitators,
     pictures_of,
     standard_errors,
 )
 from sb3_hds.sysid.calibrate import spread_of
 from sb3_hds.sysid.comparison import Comparison, split
-from sb3_hds.sysid.diagnosis import Diagnosis, Finding, Rejected
+from sb3_hds.sysid.diagnosis import Diagnosis, Rejected
 from sb3_hds.sysid.evidence import Evidence, Point, portion_for
 from sb3_hds.sysid.family import chance_of_the_best
 from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
-from sb3_hds.sysid.profile import profiled
 from sb3_hds.sysid.remainder import MissingForce, Remainder, missing_force, remainder, weighed
-from sb3_hds.sysid.results import Estimate
-from sb3_hds.sysid.search import LEAST_GAIN, LEVEL, Base, Effort, Half, Search, Tried
+from sb3_hds.sysid.search import Base, Effort, Half, Search, Tried
 from sb3_hds.sysid.shooting import Shots, shots_of
 from sb3_hds.sysid.sizes import sized
+from sb3_hds.sysid.telling import (
+    CHANCE,
+    SMALL,
+    UNCERTAIN,
+    Accepted,
+    finding,
+    in_words,
+    look_alike,
+    margin,
+    why,
+)
 from sb3_hds.sysid.thinning import thinned
 from sb3_hds.sysid.timing import in_step
 
@@ -52,23 +59,8 @@ _OF_IRRELEVANT = 0.18
 _FIRST_NOISE = 0.05
 # Parameters that a cause has at most, and fewer units of evidence than these cannot say anything.
 _WIDEST, _FEWEST_UNITS = 3, 4
-_CONFIDENCE = 0.9
 # Family-wise level of what selection proposes.
 _FAMILY_LEVEL = 0.05
-
-
-class _Accepted(NamedTuple):
-    """
-    A cause that was confirmed.
-
-    :param alternatives: what the data cannot tell from it
-    :param chance: that the best of all candidates would gain as much if nothing were wrong
-    """
-
-    tried: Tried
-    verdict: Comparison
-    alternatives: tuple[str, ...]
-    chance: float
 
 
 class _Left(NamedTuple):
@@ -121,9 +113,7 @@ class Inquiry:
         self.shots, origin = shots_of(self.data, min(steps, longest), self.hypotheses.twin)
         self.parts = split(self.data, origin, seed)
         self.effort, self.progress = EFFORTS[budget], progress
-        self.undetermined: set[str] = set()
-        self.by_chance: set[str] = set()
-        self.leftover: set[str] = set()
+        self.turned_down: dict[str, str] = {}
 
     def poor(self) -> str:
         """:return: why these data cannot support a verdict; empty if they may"""
@@ -161,7 +151,7 @@ class Inquiry:
         self.prepare()
         self.settle_noise()
         start = base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
-        found: list[_Accepted] = []
+        found: list[Accepted] = []
         rejected: list[tuple[Candidate, Comparison]] = []
         while len(found) < _MOST:
             tried = self.search.finalists(base, _keys(found))
@@ -173,14 +163,14 @@ class Inquiry:
             if best is None:
                 break
             if self._is_leftover(best, base, start):
-                self.leftover.add(best.candidate.key)
+                self.turned_down[best.candidate.key] = SMALL
                 break
             if (chance := self._chance(best, base, found)) >= _FAMILY_LEVEL / (1 + len(found)):
-                self.by_chance.add(best.candidate.key)
+                self.turned_down[best.candidate.key] = CHANCE
                 break
             others = self.search.alternatives(best, tried, base)
             verdict = self.search.confirmed(best.kept, base.kept)
-            found.append(_Accepted(best, verdict, others, chance))
+            found.append(Accepted(best, verdict, others, chance))
             own = self.hypotheses.indices(best.candidate)
             base = Base(best.point, best.kept, (*base.free, *own))
         found, base = self._pruned(found, base)
@@ -201,8 +191,8 @@ class Inquiry:
         free = [*base.free, *own]
         stderr = standard_errors(half.evidence, half.unit, tried.point, free)[own]
         moved = np.abs(tried.point.theta - self.hypotheses.null)[own]
-        if not (sure := bool((moved > _margin(len(np.unique(half.unit)), stderr)).any())):
-            self.undetermined.add(tried.candidate.key)
+        if not (sure := bool((moved > margin(len(np.unique(half.unit)), stderr)).any())):
+            self.turned_down[tried.candidate.key] = UNCERTAIN
         return sure
 
     def _is_leftover(self, best: Tried, base: Base, start: Base) -> bool:
@@ -210,7 +200,7 @@ class Inquiry:
         first, now, then = map(self.search.confirm.total, (start.kept, base.kept, best.kept))
         return now - then < _LEAST_OF_EARLIER * (first - now)
 
-    def _chance(self, best: Tried, base: Base, found: Sequence[_Accepted]) -> float:
+    def _chance(self, best: Tried, base: Base, found: Sequence[Accepted]) -> float:
         """:return: family-wise p-value on the half that selects"""
         left = [c for c in self.hypotheses.candidates if c.key not in _keys(found)]
         slopes = self.search.select.evidence.slopes(best.point)
@@ -240,7 +230,7 @@ class Inquiry:
         noise = np.mean(point.raw**2, (0, 1)) + (_IRRELEVANT * self.spread) ** 2
         self.search.set_noise(np.sqrt(noise))
 
-    def _pruned(self, found: list[_Accepted], base: Base) -> tuple[list[_Accepted], Base]:
+    def _pruned(self, found: list[Accepted], base: Base) -> tuple[list[Accepted], Base]:
         """Without causes that later ones have made superfluous."""
         for one in found[:-1]:
             if not self.search.needed(one.tried.candidate, base):
@@ -264,25 +254,9 @@ class Inquiry:
         predicted = 0.0 if found is None else unit * found.power
         return _Left(found, predicted, unit * power, missing)
 
-    def _look_alike(self, found: Sequence[_Accepted], base: Base) -> list[str]:
-        """Sentences on candidates that others imitate, though held-out recordings prefer these."""
-        sentences = []
-        for one in found:
-            own = self.hypotheses.indices(one.tried.candidate)
-            rest = [i for i in base.free if i not in own]
-            alike = imitators(self.search.select, base.point, one.tried.candidate, rest)
-            alike = [name for name in alike if name not in one.alternatives]
-            if alike:
-                sentences.append(
-                    f"In these data {', '.join(alike)} would do nearly the same as "
-                    f"{one.tried.candidate.key}, which held-out recordings prefer. Recordings that "
-                    "excite other speeds, positions and commands would tell them further apart."
-                )
-        return sentences
-
     def _told(
         self,
-        found: Sequence[_Accepted],
+        found: Sequence[Accepted],
         rejected: Sequence[tuple[Candidate, Comparison]],
         start: Base,
         base: Base,
@@ -290,7 +264,7 @@ class Inquiry:
         left: _Left,
     ) -> Diagnosis:
         select, confirm, theta = self.search.select, self.search.confirm, base.point.theta
-        findings = self._findings(found, base)
+        findings = tuple(finding(one, self.search, base) for one in found)
         verdict = "none"
         if findings:
             verdict = "ambiguous" if findings[0].alternatives else "named"
@@ -300,18 +274,18 @@ class Inquiry:
             verdict=verdict,
             believed=self.believed,
             findings=findings,
-            unexplained="" if left.remainder is None else _in_words(left.remainder),
+            unexplained="" if left.remainder is None else in_words(left.remainder),
             gain=by_horizon(confirm, start.kept, base.kept, self.every),
             explained=_share(before, left) if findings else 0.0,
             detectable=detectable(select, start.point),
             rejected=tuple(
-                Rejected(candidate.key, c.gain, c.p_value, self._why(candidate, c))
-                for candidate, c in sorted(rejected, key=lambda pair: -pair[1].gain)
+                Rejected(one.key, c.gain, c.p_value, why(c, self.turned_down.get(one.key)))
+                for one, c in sorted(rejected, key=lambda pair: -pair[1].gain)
             ),
             caveats=(
                 *(f"{found.sentence} {found.remedy}" for found in self.audit.findings),
                 *self.moved,
-                *self._look_alike(found, base),
+                *look_alike(found, select, base),
             ),
             twin=self.hypotheses.extended_by(_keys(found), theta).at_interval(
                 self.believed.dt, self.believed.substeps
@@ -323,61 +297,6 @@ class Inquiry:
             ),
         )
 
-    def _findings(self, found: Sequence[_Accepted], base: Base) -> tuple[Finding, ...]:
-        h, half, theta = self.hypotheses, self.search.select, base.point.theta
-        stderr = standard_errors(half.evidence, half.unit, base.point, base.free)
-        findings = []
-        for one in found:
-            candidate, parameters = one.tried.candidate, {}
-            for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
-                low, high = self._interval(i, base, float(_margin(one.verdict.n_units, stderr[i])))
-                parameters[name.rpartition(".")[2]] = Estimate(
-                    name=name,
-                    estimate=float(theta[i]),
-                    stderr=float(stderr[i]),
-                    low=low,
-                    high=high,
-                    unit=h.twin.parameters[name].unit,
-                    before=float(h.null[i]),
-                    at_bound=bool(theta[i] <= h.lower[i] or theta[i] >= h.upper[i]),
-                )
-            findings.append(
-                Finding(
-                    candidate.name,
-                    h.place_of(candidate),
-                    parameters,
-                    one.alternatives,
-                    one.verdict.p_value,
-                    one.chance,
-                    one.verdict.gain,
-                    candidate.explanation,
-                )
-            )
-        return tuple(findings)
-
-    def _interval(self, index: int, base: Base, half: float) -> tuple[float, float]:
-        """:param half: half the width of the symmetric interval"""
-        h, best = self.hypotheses, float(base.point.theta[index])
-        if self.effort.profiles:
-            return profiled(self.search.select.evidence, base.point, base.free, index, half)
-        return max(best - half, float(h.lower[index])), min(best + half, float(h.upper[index]))
-
-    def _why(self, candidate: Candidate, verdict: Comparison) -> str:
-        if verdict.gain < LEAST_GAIN:
-            return "gains too little"
-        if candidate.key in self.undetermined:
-            return "has no certain size"
-        if candidate.key in self.leftover:
-            return "is small beside the others"
-        if candidate.key in self.by_chance:
-            return "may be chance"
-        return "may be chance" if verdict.p_value >= LEVEL else "others gain more"
-
-
-def _margin(n_units: int, stderr: np.ndarray) -> np.ndarray:
-    """:return: half the width of an interval"""
-    return stats.t.ppf(0.5 + 0.5 * _CONFIDENCE, max(n_units - 1, 1)) * stderr
-
 
 def _share(before: _Left, left: _Left) -> float:
     """:return: of the missing force that can be predicted, how much is not missing any more"""
@@ -385,16 +304,8 @@ def _share(before: _Left, left: _Left) -> float:
     return gone / (gone + left.predicted) if gone + left.predicted else 1.0
 
 
-def _keys(found: Sequence[_Accepted]) -> list[str]:
+def _keys(found: Sequence[Accepted]) -> list[str]:
     return [one.tried.candidate.key for one in found]
-
-
-def _in_words(left: Remainder) -> str:
-    share = f"{left.gain:.0%}"
-    return (
-        f"a force at {left.joint} goes with {' and '.join(left.goes_with)}; {share} of its "
-        f"variance is predictable on held-out recordings (p = {left.p_value:.2g})."
-    )
 
 
 def _rows_of(shots: Shots, rows: np.ndarray) -> Shots:

@@ -1,0 +1,112 @@
+"""How what was found is told."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from sb3_hds.sysid.account import imitators, standard_errors
+from sb3_hds.sysid.comparison import Comparison
+from sb3_hds.sysid.diagnosis import Finding
+from sb3_hds.sysid.profile import profiled
+from sb3_hds.sysid.remainder import Remainder
+from sb3_hds.sysid.results import Estimate
+from sb3_hds.sysid.search import LEAST_GAIN, LEVEL, Base, Half, Search, Tried
+
+#: why a candidate was turned down that predicts better
+UNCERTAIN, SMALL, CHANCE = "has no certain size", "is small beside the others", "may be chance"
+_CONFIDENCE = 0.9
+
+
+class Accepted(NamedTuple):
+    """
+    A cause that was confirmed.
+
+    :param alternatives: what the data cannot tell from it
+    :param chance: that the best of all candidates would gain as much if nothing were wrong
+    """
+
+    tried: Tried
+    verdict: Comparison
+    alternatives: tuple[str, ...]
+    chance: float
+
+
+def finding(one: Accepted, search: Search, base: Base) -> Finding:
+    """
+    :param base: what is believed in the end, this cause among it
+    """
+    h, half, theta = search.hypotheses, search.select, base.point.theta
+    stderr = standard_errors(half.evidence, half.unit, base.point, base.free)
+    candidate, parameters = one.tried.candidate, {}
+    for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
+        low, high = _interval(search, base, i, float(margin(one.verdict.n_units, stderr[i])))
+        parameters[name.rpartition(".")[2]] = Estimate(
+            name=name,
+            estimate=float(theta[i]),
+            stderr=float(stderr[i]),
+            low=low,
+            high=high,
+            unit=h.twin.parameters[name].unit,
+            before=float(h.null[i]),
+            at_bound=bool(theta[i] <= h.lower[i] or theta[i] >= h.upper[i]),
+        )
+    return Finding(
+        candidate.name,
+        h.place_of(candidate),
+        parameters,
+        one.alternatives,
+        one.verdict.p_value,
+        one.chance,
+        one.verdict.gain,
+        candidate.explanation,
+    )
+
+
+def margin(n_units: int, stderr: np.ndarray) -> np.ndarray:
+    """:return: half the width of a symmetric interval"""
+    return stats.t.ppf(0.5 + 0.5 * _CONFIDENCE, max(n_units - 1, 1)) * stderr
+
+
+def look_alike(found: Sequence[Accepted], half: Half, base: Base) -> list[str]:
+    """:return: sentences on what imitates a cause, though held-out recordings prefer the cause"""
+    sentences = []
+    for one in found:
+        own = half.evidence.hypotheses.indices(one.tried.candidate)
+        rest = [i for i in base.free if i not in own]
+        alike = imitators(half, base.point, one.tried.candidate, rest)
+        alike = [name for name in alike if name not in one.alternatives]
+        if alike:
+            sentences.append(
+                f"In these data {', '.join(alike)} would do nearly the same as "
+                f"{one.tried.candidate.key}, which held-out recordings prefer. Recordings that "
+                "excite other speeds, positions and commands would tell them further apart."
+            )
+    return sentences
+
+
+def why(verdict: Comparison, turned_down: str | None) -> str:
+    """
+    :param verdict: on a candidate that is not named
+    :param turned_down: for which reason, if it was the best for a time
+    """
+    if verdict.gain < LEAST_GAIN:
+        return "gains too little"
+    return turned_down or (CHANCE if verdict.p_value >= LEVEL else "others gain more")
+
+
+def in_words(left: Remainder) -> str:
+    share = f"{left.gain:.0%}"
+    return (
+        f"a force at {left.joint} goes with {' and '.join(left.goes_with)}; {share} of its "
+        f"variance is predictable on held-out recordings (p = {left.p_value:.2g})."
+    )
+
+
+def _interval(search: Search, base: Base, index: int, half: float) -> tuple[float, float]:
+    """:param half: half the width of the symmetric interval"""
+    h, best = search.hypotheses, float(base.point.theta[index])
+    if search.effort.profiles:
+        return profiled(search.select.evidence, base.point, base.free, index, half)
+    return max(best - half, float(h.lower[index])), min(best + half, float(h.upper[index]))
