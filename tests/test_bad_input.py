@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
-from small_models import NAMES, PLANNERS, small
+from small_models import NAMES, PLANNERS, SMALL, small
 
 from sb3_hds import algos
 from sb3_hds.errors import EnvironmentMismatchError, NoTwinError, ParameterError
@@ -209,6 +209,17 @@ def test_an_unknown_argument_is_named(name):
 def test_settings_of_the_networks_are_checked(name, settings, reason):
     with pytest.raises(ValueError, match=reason):
         small(name, policy_kwargs=settings)
+
+
+@every_algorithm
+def test_settings_belong_to_whoever_gave_them(name):
+    """Two models that were given one dictionary are still two."""
+    given = {**SMALL[name].get("policy_kwargs", {})}
+    before = dict(given)
+
+    model = small(name, policy_kwargs=given)
+
+    assert given == before and model.policy_kwargs is not given
 
 
 @every_algorithm

@@ -12,6 +12,7 @@ from typing import Any
 import benchmark_results
 import catalogue
 import import_picture
+import summaries
 
 PARTS: dict[str, Callable[[], str]] = {
     "imports": import_picture.as_markdown,
@@ -20,6 +21,19 @@ PARTS: dict[str, Callable[[], str]] = {
     "effects": catalogue.effects_as_markdown,
     "environments": catalogue.environments_as_markdown,
     "benchmarks": benchmark_results.as_markdown,
+    "sim_to_real_gap": summaries.whole("sim_to_real_gap"),
+    "sim_to_real_median": summaries.whole("sim_to_real_median"),
+    "hds_parts": summaries.over_seeds("hds_parts", "variant", "return"),
+    "hds_weaknesses": summaries.over_seeds("hds_weaknesses", "variant", "return"),
+    "hds_beta": summaries.over_seeds(
+        "hds_beta",
+        "variant",
+        "return",
+        "dropped_samples",
+        "gradient_norm",
+        "derivative_median",
+        "derivative_worst",
+    ),
 }
 
 _LINE = re.compile(r"^<!-- generated: (\w+) -->$", re.MULTILINE)
