@@ -442,6 +442,24 @@ def test_the_better_of_two_policies_acts(name):
     assert of_average < of_best and close(model.policy.networks.acting, good)
 
 
+@pytest.mark.parametrize(
+    ("name", "expected"), [("pods", [False] * 4), ("hds", [False] * 2 + [True] * 2)]
+)
+def test_a_policy_whose_model_changes_is_compared_before_it_acts(name, expected, monkeypatch):
+    compared, choose = [], twin_algorithm.choose_policy
+
+    def chosen(*given):
+        learner, returns = choose(*given)
+        compared.append(returns is not None)
+        return learner, returns
+
+    monkeypatch.setattr(twin_algorithm, "choose_policy", chosen)
+    model = small(name, train_freq=20, pretrain_epochs=2, compare_every=100)
+    model.learn(40)
+
+    assert compared == expected
+
+
 @every_planner
 def test_the_average_acts_until_it_was_first_compared_and_always_where_nothing_is(name):
     for every, n_epochs in ((5, 3), (0, 6)):

@@ -9,7 +9,7 @@ from tables import table
 
 RESULTS = Path(__file__).parent.parent.parent / "benchmarks" / "results"
 
-_NONE = "Not measured in this checkout.\n\n"
+_NONE = "Not measured yet in this checkout.\n\n"
 
 
 def over_seeds(name: str, variant: str, *measured: str) -> Callable[[], str]:

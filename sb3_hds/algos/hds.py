@@ -103,7 +103,7 @@ class HDS(TwinAlgorithm):
         those of the first rollouts
     :param compare_every: epochs after which the average policy and the one that acts go through
         whole episodes of the twin, and the better one acts from then on; 0: the average acts (the
-        paper)
+        paper). Between real steps every epoch counts, but for those that follow a correction.
     :param least_gain: the pretraining ends when plans have gained less than this share of the
         policy's return, on the average of about ten epochs; 0: never
     :param randomisation: domain randomisation: standard deviation of the twin's parameters between
@@ -382,6 +382,11 @@ class HDS(TwinAlgorithm):
     def _since_change(self) -> int | None:
         """:return: real steps that count, where the system changed; None if all do"""
         return None if self._changed_at is None else self.real_timesteps - self._changed_at
+
+    @property
+    def comparison_due(self) -> bool:
+        """What was better in another model need not be so in this one: before it acts, compare."""
+        return self.real_timesteps > 0 and not self._replanning
 
     def varied(self, twin: Twin) -> Params:
         drawn, force = super().varied(twin), force_of(twin)

@@ -32,16 +32,17 @@ _FEWEST, _MOST = 32, 256
 
 
 def choose_policy(
-    settings: Settings, learner: Learner, knobs: Knobs, every: int
+    settings: Settings, learner: Learner, knobs: Knobs, every: int, due: bool
 ) -> tuple[Learner, Float[Array, " 2"] | None]:
     """
     After an epoch: the average acts, until it was first compared; then the better one does.
 
     :param every: epochs from one comparison to the next; 0: never
+    :param due: compare after this epoch in any case, unless never
     :return: the learner, and the returns of a comparison, see :func:`keep_better`
     """
     n_epochs = int(learner.progress.n_epochs)
-    if every and n_epochs % every == 0:
+    if every and (due or n_epochs % every == 0):
         return keep_better(settings, learner, knobs)
     if every and n_epochs > every:
         return learner, None

@@ -245,10 +245,14 @@ class TwinAlgorithm(TensorAlgorithm):
         learner, settings = self._learner(), self._settings
         knobs = knobs_of(self, settings.twin, self._progress_remaining(), gradient_steps)
         if first:
-            compares = 0 < self.compare_every <= self._epochs_planned
+            compares = self.compare_every > 0 and (
+                self.comparison_due or self.compare_every <= self._epochs_planned
+            )
             compile_together(settings, learner, knobs, compares)
         learner, report = epoch(settings, learner, knobs)
-        learner, returns = choose_policy(settings, learner, knobs, self.compare_every)
+        learner, returns = choose_policy(
+            settings, learner, knobs, self.compare_every, self.comparison_due
+        )
         losses = float(report.policy_loss), float(report.value_loss)
         if not (all(map(math.isfinite, losses)) and all_finite(learner.networks)):
             raise FloatingPointError(
@@ -320,6 +324,11 @@ class TwinAlgorithm(TensorAlgorithm):
     def _prepared(self, twin: Twin) -> Twin:
         """:return: what to plan in, given the twin of the environment or the one that was passed"""
         return twin
+
+    @property
+    def comparison_due(self) -> bool:
+        """Whether policies are compared after this epoch, whatever ``compare_every`` says."""
+        return False
 
     def varied(self, twin: Twin) -> Params:
         """
