@@ -36,7 +36,7 @@ PARTS = {
     "noise does not decay": {"exploration_decay": 1.0},
     "best step always": {"temperature": 0.0},
     "no terminal value": {"terminal_value": False},
-    "no relabelling": {"relabel_share": 0.0},
+    "relabelling": {"relabel_share": 0.25},
     "no calibration": {"calibrated": None},
     "no dry friction suspected": {"suspected": ()},
     "no learned force": {"residual": False},

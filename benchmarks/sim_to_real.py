@@ -76,19 +76,18 @@ def planner(method: str, cell: str, seed: int):
 
 
 def learner(method: str, cell: str, seed: int):
-    """The hyperparameters of SAC and TQC are those of RL Zoo for Pendulum-v1."""
+    """
+    SAC and TQC are SBX's, with the hyperparameters of RL Zoo for Pendulum-v1; DroQ is ours, with
+    the same learning rate.
+    """
     if method == "hds":
         return pretrained(cell, seed)
-    from sbx import SAC, TQC
+    import sbx
 
-    given = {"policy": "MlpPolicy", "env": make(cell), "seed": seed, "learning_rate": 1e-3}
-    if method == "sac":
-        return SAC(**given)
-    if method == "tqc":
-        return TQC(**given)
-    # Hiraoka et al. 2022: dropout, layer norm, and 20 gradient steps for each real one.
-    nets = {"dropout_rate": 0.01, "layer_norm": True}
-    return SAC(**given, gradient_steps=20, policy_delay=20, policy_kwargs=nets)
+    import sb3_hds
+
+    algorithm = {"sac": sbx.SAC, "tqc": sbx.TQC, "droq": sb3_hds.DroQ}[method]
+    return algorithm("MlpPolicy", make(cell), seed=seed, learning_rate=1e-3)
 
 
 def evaluated(model, cell: str, episodes: int) -> dict:
@@ -149,13 +148,13 @@ def over_cells(table: pd.DataFrame, cells: list[str], n_draws: int = 2000) -> pd
     :param cells: that count
     """
     rng, rows = np.random.default_rng(0), []
-    by_cell = {
+    returns_of = {
         cell: table[table["cell"] == cell].pivot_table("return", "seed", ["method", "episodes"])
         for cell in cells
     }
     for method, episodes in [("randomised", 0), *(("hds", n) for n in STEPS)]:
         drawn = []
-        for returns in by_cell.values():
+        for returns in returns_of.values():
             wrong, best = returns["wrong_twin", 0], returns["ceiling", 0]
             pairs = pd.concat([returns[method, episodes] - wrong, best - wrong], axis=1).dropna()
             gained, gaps = pairs.to_numpy().T

@@ -144,7 +144,7 @@ def swinging(*hidden, n_steps=120, strength=0.05):
     wander = np.random.default_rng(0).standard_normal((10, n_steps, 1)).cumsum(1)
     actions = strength * np.sin(0.7 * wander)
     data = measured(
-        pushed.extend(*hidden) if hidden else pushed,
+        pushed.extend(*hidden),
         n=10,
         n_steps=n_steps,
         noise=0.005,

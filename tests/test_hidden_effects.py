@@ -8,7 +8,6 @@ import os
 
 import hidden_effects
 import pytest
-from scipy.stats import binom
 
 # Twenty diagnoses take some ten minutes.
 pytestmark = [pytest.mark.expensive, pytest.mark.timeout(3600)]
@@ -36,21 +35,18 @@ def spoken(row):
     return row["verdict"] in ("named", "ambiguous")
 
 
-def allowed(n, rate):
-    """:return: mistakes of ``n`` that a tool with this rate of them exceeds once in 200 runs"""
-    return binom.ppf(0.995, n, rate)
-
-
 def test_nothing_is_named_where_nothing_was_hidden(table):
     nulls = [row for row in table if row["kind"].startswith("null")]
     alarms = [row for row in nulls if spoken(row)]
-    assert len(alarms) <= allowed(len(nulls), 0.025), alarms
+    # At most 2.5 % of nulls: two of seven are seen once in 80 runs.
+    assert len(alarms) <= 1, alarms
 
 
 def test_names_are_right(table):
     named = [row for row in table if row["kind"] == "effect" and spoken(row)]
     wrong = [row for row in named if not hidden_effects.hit(row["truth"], row["set"])]
-    assert len(wrong) <= allowed(len(named), 0.05), wrong
+    # At least 95 % of the sets: three of ten are missed once in 90 runs.
+    assert len(wrong) <= 2, wrong
 
 
 def test_what_shows_is_found(table):
@@ -60,7 +56,7 @@ def test_what_shows_is_found(table):
         if row["kind"] == "effect" and row["factor"] >= 4.0 and not row["disturbed"]
     ]
     missed = [row for row in clear if not hidden_effects.hit(row["truth"], row["set"])]
-    assert len(missed) <= allowed(len(clear), 0.10), missed
+    assert len(missed) <= 1 + len(clear) // 4, missed
 
 
 def test_standing_still_says_nothing(table):

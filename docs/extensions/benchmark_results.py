@@ -1,10 +1,9 @@
 """The measurements that lie in ``benchmarks/results``, with the commands that made them."""
 
 import ast
-import csv
 from pathlib import Path
 
-from tables import table
+from tables import read, rounded, table
 
 BENCHMARKS = Path(__file__).parent.parent.parent / "benchmarks"
 
@@ -41,19 +40,10 @@ def _first_line(path: Path) -> str:
     return words.partition("\n\n")[0]
 
 
-def _short(cell: str) -> str:
-    """Four digits of a number tell enough."""
-    try:
-        return f"{float(cell):.4g}" if "." in cell and abs(float(cell)) < 1e4 else cell
-    except ValueError:
-        return cell
-
-
 def _as_section(path: Path) -> str:
-    with path.open(newline="") as file:
-        columns, *rows = csv.reader(file)
+    columns, rows = read(path)
     title, name = path.stem.replace("_", " "), f"`{path.parent.name}/{path.name}`"
-    rows = [[_short(cell) for cell in row] for row in rows]
+    rows = [[rounded(cell) for cell in row] for row in rows]
     shown = table(columns, rows) if len(rows) <= _MOST_ROWS else f"{len(rows)} rows.\n\n"
     picture = path.with_suffix(".png")
     if picture.exists():

@@ -1,11 +1,10 @@
 """Tables of ``benchmarks/results`` with a row for each variant: mean and range over seeds."""
 
-import csv
 from collections.abc import Callable
 from pathlib import Path
 from statistics import fmean
 
-from tables import table
+from tables import read, rounded, table
 
 RESULTS = Path(__file__).parent.parent.parent / "benchmarks" / "results"
 
@@ -20,48 +19,32 @@ def over_seeds(name: str, variant: str, *measured: str) -> Callable[[], str]:
     :return: what makes the Markdown
     """
 
-    def as_markdown() -> str:
-        path = RESULTS / f"{name}.csv"
-        if not path.exists():
-            return _NONE
-        with path.open(newline="") as file:
-            rows = list(csv.DictReader(file))
+    def condensed(columns: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
+        place, shown = columns.index(variant), [columns.index(column) for column in measured]
         lines = []
-        for one in dict.fromkeys(row[variant] for row in rows):
-            own = [row for row in rows if row[variant] == one]
-            values = [_spread([float(row[column]) for row in own]) for column in measured]
+        for one in dict.fromkeys(row[place] for row in rows):
+            own = [row for row in rows if row[place] == one]
+            values = [_spread([float(row[i]) for row in own]) for i in shown]
             lines.append([one, *values, str(len(own))])
-        titles = [column.replace("_", " ") for column in measured]
-        return table([variant, *titles, "seeds"], lines) + f"From `benchmarks/results/{name}.csv`."
+        return [variant, *measured, "seeds"], lines
 
-    return as_markdown
+    return lambda: _shown(name, condensed)
 
 
 def whole(name: str) -> Callable[[], str]:
     """:return: what makes the Markdown of a table that is shown as it is, numbers rounded"""
+    return lambda: _shown(name, lambda columns, rows: (columns, [[*map(rounded, r)] for r in rows]))
 
-    def as_markdown() -> str:
-        path = RESULTS / f"{name}.csv"
-        if not path.exists():
-            return _NONE
-        with path.open(newline="") as file:
-            columns, *rows = csv.reader(file)
-        titles = [column.replace("_", " ") for column in columns]
-        shown = table(titles, [[_rounded(cell) for cell in row] for row in rows])
-        return shown + f"From `benchmarks/results/{name}.csv`."
 
-    return as_markdown
+def _shown(name: str, change: Callable) -> str:
+    path = RESULTS / f"{name}.csv"
+    if not path.exists():
+        return _NONE
+    columns, rows = change(*read(path))
+    titles = [column.replace("_", " ") for column in columns]
+    return table(titles, rows) + f"From `benchmarks/results/{name}.csv`."
 
 
 def _spread(values: list[float]) -> str:
-    mean, low, high = (_rounded(x) for x in (fmean(values), min(values), max(values)))
+    mean, low, high = (rounded(x) for x in (fmean(values), min(values), max(values)))
     return mean if low == high else f"{mean} ({low} to {high})"
-
-
-def _rounded(cell: float | str) -> str:
-    """Three digits of a number tell enough; words stay."""
-    try:
-        number = float(cell)
-    except ValueError:
-        return str(cell)
-    return f"{number:,.0f}" if abs(number) >= 100 else f"{number:.3g}"

@@ -173,7 +173,7 @@ class HDS(TwinAlgorithm):
         exploration_decay: float = 0.997,
         temperature: float = 0.05,
         temperature_decay: float = 0.9,
-        relabel_share: float = 0.25,
+        relabel_share: float = 0.0,
         plan_memory: int = 8,
         learned_share: float = 0.5,
         loss: str = "smooth_absolute",

@@ -6,6 +6,7 @@ from typing import Any
 
 from sb3_hds import effects, twins
 from sb3_hds.core import Effect, Twin
+from sb3_hds.core.layers import plant_of
 from sb3_hds.errors import EffectError, NoTwinError, RewardError
 
 
@@ -13,9 +14,7 @@ def check_reward(twin: Twin) -> None:
     """
     :raises RewardError: if planning has nothing to climb in this twin
     """
-    base = twin
-    while hasattr(base, "base"):
-        base = base.base  # type: ignore[attr-defined]
+    base = plant_of(twin)
     surrogate = type(base).planning_reward is not Twin.planning_reward
     if not surrogate and type(base).reward is Twin.reward:
         raise RewardError(

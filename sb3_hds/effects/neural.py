@@ -23,6 +23,7 @@ from sb3_hds.core import (
     Scalar,
     Velocity,
 )
+from sb3_hds.core.layers import layers_of
 from sb3_hds.core.storage import read_npz, write_npz
 from sb3_hds.errors import EffectError, TrajectoryError
 
@@ -232,9 +233,8 @@ class _Member(nn.Module):
 
 def force_of(twin: "Twin") -> tuple[str, NeuralForce] | None:
     """:return: full name and effect of the learned force that a twin has; None without one"""
-    while not hasattr(twin, "attached") and hasattr(twin, "base"):
-        twin = twin.base  # type: ignore[attr-defined]
-    for a in getattr(twin, "attached", ()):
-        if isinstance(a.effect, NeuralForce):
-            return a.key, a.effect
+    for layer in layers_of(twin):
+        for a in getattr(layer, "attached", ()):
+            if isinstance(a.effect, NeuralForce):
+                return a.key, a.effect
     return None

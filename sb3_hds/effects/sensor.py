@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sb3_hds.core import Memory, Parameter, Params, Scalar, SensorEffect
+from sb3_hds.core.layers import plant_of
 from sb3_hds.errors import EffectError
 
 if TYPE_CHECKING:
@@ -141,8 +142,7 @@ def reversed_joint(twin: "Twin", joint: int | str) -> tuple[SignFlip, ...]:
     :raises EffectError: for a joint that the twin does not have, or a channel that neither keeps
         its size nor changes its sign alone, which no flip of channels can say
     """
-    while hasattr(twin, "base"):
-        twin = twin.base  # type: ignore[attr-defined]
+    twin = plant_of(twin)
     names = [each.name for each in twin.joints]
     index = names.index(joint) if joint in names else joint
     if not isinstance(index, int) or not 0 <= index < len(names):

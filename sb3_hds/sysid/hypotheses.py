@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.core import Effect, Params, Twin
+from sb3_hds.core import Effect, ExtendedTwin, Params, Twin
+from sb3_hds.core.layers import layers_of, plant_of
 from sb3_hds.effects import ConstantForce, NeuralForce, SignFlip, reversed_joint
 from sb3_hds.errors import CalibrationError, EffectError
 
@@ -224,16 +225,13 @@ def _reversed_joints(twin: Twin) -> list[Candidate]:
 
 
 def _attached_of(twin: Twin) -> tuple:
-    while not hasattr(twin, "attached") and hasattr(twin, "base"):
-        twin = twin.base  # type: ignore[attr-defined]
-    return getattr(twin, "attached", ())
+    extended = [layer for layer in layers_of(twin) if isinstance(layer, ExtendedTwin)]
+    return extended[0].attached if extended else ()
 
 
 def _native_targets(twin: Twin, candidates: Sequence[Candidate]) -> dict[str, str]:
     """Full name of an effect's parameter -> the twin's own parameter that it adds to."""
-    plant = twin
-    while hasattr(plant, "base"):
-        plant = plant.base  # type: ignore[attr-defined]
+    plant = plant_of(twin)
     return {
         f"{c.key}.{name}": target
         for c in candidates

@@ -223,6 +223,7 @@ class Inquiry:
         """What is left under the best explanation, of whatever kind, is the noise."""
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
         self._set_noise(base.point)
+        base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
         tried = self.search.finalists(base, [], most=_FOR_NOISE)
         self._set_noise(min((base.point, *(t.point for t in tried)), key=lambda p: p.cost))
 

@@ -1,11 +1,14 @@
 """How the joints moved, as far as measurements say."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from sb3_hds.core import Params, Twin
+from sb3_hds.core import Params, State, Twin
+from sb3_hds.core.compilation import QUICKEST_COMPILATION
 
 # Samples from which the first velocity is told.
 _FEW = 5
@@ -19,9 +22,7 @@ def motion_of(
     :param params: under which they are read; default: the twin's own
     :return: positions, and velocities; where no velocity is observed, differences of positions
     """
-    values = twin.params if params is None else params
-    seen = jax.vmap(jax.vmap(lambda row: twin.infer(row, values)))(jnp.asarray(obs))
-    q, v = np.asarray(seen.q, float), np.asarray(seen.v, float)
+    q, v = _read(twin, obs, twin.params if params is None else params)
     if q.shape[1] > 1 and not v.any():
         v = np.gradient(q, dt, axis=1)
     return q, v
@@ -37,10 +38,16 @@ def first_offsets(
     :return: offsets from what first measurements say: zero, but for velocities that are not
         observed, which differences of positions tell
     """
-    dof = len(twin.joints)
-    values = twin.params if params is None else params
-    q, v = motion_of(twin, obs[:, :_FEW], dt, values)
-    first = jax.vmap(lambda row: twin.infer(row, values).v)(jnp.asarray(obs[:, 0]))
-    if np.asarray(first).any():
-        return np.zeros((len(obs), 2 * dof))
+    q, v = _read(twin, obs[:, :_FEW], twin.params if params is None else params)
+    v = np.zeros_like(q) if v[:, 0].any() else np.gradient(q, dt, axis=1)
     return np.concatenate([np.zeros_like(q[:, 0]), v.mean(1)], 1)
+
+
+def _read(twin: Twin, obs: np.ndarray, params: Params) -> tuple[np.ndarray, np.ndarray]:
+    seen = _inferred(twin, jnp.asarray(obs), params)
+    return np.asarray(seen.q, float), np.asarray(seen.v, float)
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
+def _inferred(twin: Twin, obs: Float[Array, "n rows obs"], params: Params) -> State:
+    return jax.vmap(jax.vmap(lambda row: twin.infer(row, params)))(obs)

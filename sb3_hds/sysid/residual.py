@@ -12,6 +12,7 @@ import optax
 from jaxtyping import Array, Float
 
 from sb3_hds.core import AnalyticTwin, Params, State, Trajectories, TransformedTwin, Twin
+from sb3_hds.core.layers import layers_of, plant_of
 from sb3_hds.effects import NeuralForce, force_of
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.calibrate import check_fits, default_window, spread_of
@@ -148,7 +149,7 @@ def fit_force(
     :param scale: what an error of one means in each channel
     :raises CalibrationError: for a twin without mass matrix, or too few windows
     """
-    if _plant(twin) is None or twin.differentiability != "reverse":
+    if not isinstance(plant_of(twin), AnalyticTwin) or twin.differentiability != "reverse":
         raise CalibrationError(
             f"A residual force is learned through analytic twins; {twin.name} is none. "
             "Calibrate it, or attach named effects."
@@ -193,17 +194,10 @@ def _with_force(
 
 def _command(twin: Twin, state: State, action: Array, params: dict[str, Any]) -> Array:
     """What the plant is told, below the wrappers."""
-    while hasattr(twin, "base"):
-        if isinstance(twin, TransformedTwin):
-            action = twin.command(state, action, params)
-        twin = twin.base  # type: ignore[attr-defined]
+    for layer in layers_of(twin):
+        if isinstance(layer, TransformedTwin):
+            action = layer.command(state, action, params)
     return action
-
-
-def _plant(twin: Twin) -> AnalyticTwin | None:
-    while not isinstance(twin, AnalyticTwin) and hasattr(twin, "base"):
-        twin = twin.base  # type: ignore[attr-defined]
-    return twin if isinstance(twin, AnalyticTwin) else None
 
 
 def _own(twin: Twin, key: str) -> dict[str, Any]:
@@ -214,8 +208,8 @@ def _own(twin: Twin, key: str) -> dict[str, Any]:
 
 def _seen(twin: Twin, shots: Shots) -> tuple[Array, Array, Array]:
     """Position, velocity and force of the actuators at every measurement that an action follows."""
-    plant, params = _plant(twin), twin.params
-    assert plant is not None
+    plant, params = plant_of(twin), twin.params
+    assert isinstance(plant, AnalyticTwin)
 
     def one(obs: Array, action: Array) -> tuple[Array, Array, Array]:
         state: State = twin.infer(obs, params)
@@ -229,8 +223,8 @@ def _normalised(
     twin: Twin, key: str, shots: Shots, learned: np.ndarray, seed: int
 ) -> dict[str, Any]:
     """Random weights with the scales of the data."""
-    found, plant = force_of(twin), _plant(twin)
-    assert found is not None and plant is not None
+    found, plant = force_of(twin), plant_of(twin)
+    assert found is not None and isinstance(plant, AnalyticTwin)
     rows = Shots(*(leaf[learned] for leaf in shots))
     q, v, actuator = _seen(twin, rows)
     inputs = jax.vmap(jax.vmap(found[1].inputs))(q, v, actuator)

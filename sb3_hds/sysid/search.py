@@ -18,7 +18,7 @@ LEAST_GAIN, LEVEL, LEAST_BIC = 0.05, 0.025, 6.0
 _LEVEL_OF_SET = 0.05
 # Errors that differ by a smaller share are the same, however surely they differ.
 _SAME = 0.01
-# Where fits begin of what has no slope at its null, in units of each parameter's scale from it.
+# Where fits begin for which the slope at the null is no guide, in units of each parameter's scale.
 _AWAY = 3.0
 # A Newton step promises nothing beyond, in the same units.
 _FARTHEST = 10.0
@@ -90,7 +90,8 @@ class _Guess(NamedTuple):
     """
     :param gain: by which the cost would fall
     :param theta: where to begin a fit, shape ``(p,)``
-    :param blind: some parameter has no slope where nothing is wrong
+    :param blind: what the slope says where nothing is wrong is no guide: it is none, or it leads
+        nowhere although things are better farther away
     """
 
     gain: float
@@ -127,6 +128,7 @@ class Search:
     def __init__(self, select: Half, confirm: Half, effort: Effort, progress: bool) -> None:
         self.select, self.confirm, self.effort, self.progress = select, confirm, effort, progress
         self._reached: dict[str, np.ndarray] = {}
+        self._far: set[str] = set()
 
     @property
     def hypotheses(self) -> Hypotheses:
@@ -165,6 +167,8 @@ class Search:
         guesses = self._guessed(left, base.free, first, evidence)
         for candidate, guess in zip(left, guesses, strict=True):
             self._reached.setdefault(candidate.key, guess.theta)
+            if guess.blind:
+                self._far.add(candidate.key)
         blind = [c for c, guess in zip(left, guesses, strict=True) if guess.blind]
         seen = [(guess.gain, c) for c, guess in zip(left, guesses, strict=True) if not guess.blind]
         seen = sorted(seen, key=lambda pair: -pair[0])[: self.effort.guessed]
@@ -174,7 +178,7 @@ class Search:
             own = list(self.hypotheses.indices(candidate))
             theta = first.theta.copy()
             theta[own] = self._reached[candidate.key][own]
-            offsets = evidence.nearer(theta, first.offsets)
+            offsets = self._starts(candidate, theta, first.offsets, evidence)
             return evidence.fit(theta, [*base.free, *own], offsets, self.effort.steps)
 
         points = self._each(glance, likely, f"comparing {len(likely)} causes")
@@ -184,8 +188,9 @@ class Search:
 
         def finish(candidate: Candidate) -> Tried:
             point = self._continued(candidate, base)
-            offsets = self.confirm.evidence.nearer(point.theta, base.kept.offsets)
-            kept = self.confirm.evidence.fit(point.theta, (), offsets, _KEPT_STEPS)
+            half = self.confirm.evidence
+            offsets = self._starts(candidate, point.theta, base.kept.offsets, half)
+            kept = half.fit(point.theta, (), offsets, _KEPT_STEPS)
             return Tried(candidate, point, kept, self._criterion(candidate, point, base.point))
 
         best = [candidate for candidate, _ in ranked[: most or self.effort.finalists]]
@@ -198,9 +203,9 @@ class Search:
         rest = [c for c in self.hypotheses.candidates if c.key not in done]
 
         def verdict(candidate: Candidate) -> Comparison:
-            theta = self._reached[candidate.key]
-            offsets = self.confirm.evidence.nearer(theta, base.kept.offsets)
-            kept = self.confirm.evidence.fit(theta, (), offsets, _ROUGH_STEPS)
+            theta, half = self._reached[candidate.key], self.confirm.evidence
+            offsets = self._starts(candidate, theta, base.kept.offsets, half)
+            kept = half.fit(theta, (), offsets, _ROUGH_STEPS)
             return self.confirmed(kept, base.kept)
 
         return list(zip(rest, self._each(verdict, rest, "weighing the others"), strict=True))
@@ -253,7 +258,7 @@ class Search:
     def _guessed(
         self, candidates: Sequence[Candidate], free: Sequence[int], base: Point, evidence: Evidence
     ) -> list[_Guess]:
-        """What one Newton step promises, and where it leads; elsewhere if there is no slope."""
+        """What one Newton step promises, and where it leads; elsewhere if that is no guide."""
         h, slopes = self.hypotheses, evidence.slopes(base)
         curvature, score = slopes.curvature.sum(0), slopes.scores.sum(0)
         flat = np.diag(curvature) < _FLAT * base.raw.size
@@ -265,20 +270,28 @@ class Search:
         for candidate in candidates:
             own = list(h.indices(candidate))
             step, gain = _newton(curvature, score, [*free, *own], room)
-            theta, blind = base.theta + h.scale * step, bool(flat[own].any())
-            if blind:
-                away = h.null[own] + _AWAY * h.scale[own]
-                theta[own] = np.clip(away, h.lower[own], h.upper[own])
-            found.append(_Guess(gain, theta, blind))
+            theta, away = base.theta + h.scale * step, base.theta.copy()
+            away[own] = np.clip(h.null[own] + _AWAY * h.scale[own], h.lower[own], h.upper[own])
+            blind = bool(flat[own].any())
+            if not blind and np.array_equal(theta[own], h.null[own]):
+                there = evidence.fit(away, free, base.offsets, self.effort.steps)
+                blind = there.cost < base.cost
+            found.append(_Guess(gain, away if blind else theta, blind))
         return found
 
     def _continued(self, candidate: Candidate, base: Base) -> Point:
         own = list(self.hypotheses.indices(candidate))
         reached = self._reached[candidate.key]
         evidence, moving = self.select.evidence, [*base.free, *own]
-        offsets = evidence.nearer(reached, base.point.offsets)
+        offsets = self._starts(candidate, reached, base.point.offsets, evidence)
         point = evidence.fit(reached, moving, offsets, _ALL_STEPS)
         return min(base.point, point, key=lambda p: p.cost)
+
+    def _starts(
+        self, candidate: Candidate, theta: np.ndarray, offsets: np.ndarray, evidence: Evidence
+    ) -> np.ndarray:
+        """Far from what is believed, its start states may be those of another motion."""
+        return evidence.nearer(theta, offsets) if candidate.key in self._far else offsets
 
     def _criterion(self, candidate: Candidate, point: Point, base: Point) -> float:
         n = effective_size(base.raw / self.noise)

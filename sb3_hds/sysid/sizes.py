@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sb3_hds.core import AnalyticTwin, Trajectories, Twin
+from sb3_hds.core.layers import plant_of
 from sb3_hds.sysid.evidence import Evidence
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.motion import motion_of
@@ -75,8 +76,7 @@ def _motion(h: Hypotheses, data: Trajectories) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _inertias(twin: Twin, q: np.ndarray) -> np.ndarray:
-    while not isinstance(twin, AnalyticTwin):
-        if not hasattr(twin, "base"):
-            return np.full(len(q), np.nan)
-        twin = twin.base  # type: ignore[attr-defined]
-    return np.diag(np.asarray(twin.mass_matrix(jnp.asarray(q), twin.params)))
+    plant = plant_of(twin)
+    if not isinstance(plant, AnalyticTwin):
+        return np.full(len(q), np.nan)
+    return np.diag(np.asarray(plant.mass_matrix(jnp.asarray(q), plant.params)))

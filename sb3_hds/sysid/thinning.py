@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_hds.core import Trajectories, Twin, rk4
+from sb3_hds.core.layers import plant_of
 
 # Interval that windows of a second need at most, and sub-steps that Runge-Kutta needs [s].
 _INTERVAL, _SUBSTEP = 0.01, 0.005
@@ -37,7 +38,7 @@ def thinned(twin: Twin, data: Trajectories) -> Thinned:
     if every <= 1:
         return Thinned(twin, data, 1)
     dt, inner = every * data.dt, twin.dt / twin.substeps
-    if getattr(_plant(twin), "integrator", None) is rk4:
+    if getattr(plant_of(twin), "integrator", None) is rk4:
         inner = max(inner, _SUBSTEP)
     pieces = [_every(*data.episode(i), every) for i in range(len(data))]
     obs, actions = (list(leaves) for leaves in zip(*pieces, strict=True))
@@ -50,9 +51,3 @@ def _every(obs: np.ndarray, actions: np.ndarray, every: int) -> tuple[np.ndarray
     n = len(actions) // every
     means = actions[: n * every].reshape(n, every, actions.shape[1]).mean(1)
     return obs[: n * every + 1 : every], means
-
-
-def _plant(twin: Twin) -> Twin:
-    while hasattr(twin, "base"):
-        twin = twin.base  # type: ignore[attr-defined]
-    return twin
