@@ -192,6 +192,20 @@ def test_a_spring_is_found_that_is_far_softer_than_is_usual():
     assert found.findings[0].parameters["k"].estimate == pytest.approx(0.3, rel=0.05)
 
 
+def test_play_is_found_although_the_first_bit_of_it_explains_nothing():
+    """Of some effects the slope where nothing is wrong leads nowhere."""
+    pushed, data = swinging(effects.Backlash("hinge", gap=0.4), n_steps=150)
+    found = asked(
+        data,
+        pushed,
+        effects=[effects.Backlash, effects.ViscousFriction, effects.ActionDelay],
+        budget="quick",
+    )
+
+    assert [finding.effect for finding in found.findings] == ["backlash"]
+    assert found.findings[0].parameters["gap"].estimate == pytest.approx(0.4, rel=0.05)
+
+
 @pytest.mark.expensive
 def test_what_looks_alike_is_said_and_how_sure_predictions_are_is_drawn():
     """Two dry frictions, one for each direction, can be one; they have more freedom."""
