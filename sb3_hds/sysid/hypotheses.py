@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.core import Effect, ExtendedTwin, Params, Twin
+from sb3_hds.core import ActionEffect, Effect, ExtendedTwin, ForceEffect, Params, Twin
 from sb3_hds.core.layers import layers_of, plant_of
 from sb3_hds.effects import ConstantForce, NeuralForce, SignFlip, reversed_joint
 from sb3_hds.errors import CalibrationError, EffectError
@@ -135,6 +135,12 @@ class Hypotheses:
         """All parameters of the extended twin, in double precision."""
         with jax.enable_x64(True):
             return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), self.twin.params)
+
+    def remembers(self, candidate: Candidate) -> bool:
+        """:return: whether it is a force or a command that depends on what was before"""
+        attached = [a.effect for a in _attached_of(self.twin) if a.key == candidate.key]
+        effects = [e for e in attached if isinstance(e, ForceEffect | ActionEffect)]
+        return any(jax.tree.leaves(effect.memory(self.twin)) for effect in effects)
 
     def indices(self, candidate: Candidate) -> tuple[int, ...]:
         return tuple(self.names.index(name) for name in candidate.parameters)

@@ -20,6 +20,8 @@ _LEVEL_OF_SET = 0.05
 _SAME = 0.01
 # Where fits begin for which the slope at the null is no guide, in units of each parameter's scale.
 _AWAY = 3.0
+# Where else it may be better, in the same units.
+_DISTANCES = (0.1, 0.3, 1.0, 3.0)
 # A Newton step promises nothing beyond, in the same units.
 _FARTHEST = 10.0
 # Curvature, per measurement, below which there is no slope; directions below this share of the
@@ -270,14 +272,24 @@ class Search:
         for candidate in candidates:
             own = list(h.indices(candidate))
             step, gain = _newton(curvature, score, [*free, *own], room)
-            theta, away = base.theta + h.scale * step, base.theta.copy()
-            away[own] = np.clip(h.null[own] + _AWAY * h.scale[own], h.lower[own], h.upper[own])
-            blind = bool(flat[own].any())
-            if not blind and np.array_equal(theta[own], h.null[own]):
-                there = evidence.fit(away, free, base.offsets, self.effort.steps)
-                blind = there.cost < base.cost
-            found.append(_Guess(gain, away if blind else theta, blind))
+            theta, blind = base.theta + h.scale * step, bool(flat[own].any())
+            if blind:
+                theta = self._away(candidate, base, _AWAY)
+            elif h.remembers(candidate):
+                # The first bit of a gap says little about a whole one.
+                farther = [self._away(candidate, base, distance) for distance in _DISTANCES]
+                there = [evidence.fit(x, free, base.offsets, self.effort.steps) for x in farther]
+                costs = [point.cost for point in there]
+                if blind := min(costs) < base.cost - gain:
+                    theta = farther[int(np.argmin(costs))]
+            found.append(_Guess(gain, theta, blind))
         return found
+
+    def _away(self, candidate: Candidate, base: Point, distance: float) -> np.ndarray:
+        h, own = self.hypotheses, list(self.hypotheses.indices(candidate))
+        theta = base.theta.copy()
+        theta[own] = np.clip(h.null[own] + distance * h.scale[own], h.lower[own], h.upper[own])
+        return theta
 
     def _continued(self, candidate: Candidate, base: Base) -> Point:
         own = list(self.hypotheses.indices(candidate))
