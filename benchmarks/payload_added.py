@@ -79,15 +79,23 @@ def planner(method: str, seed: int):
 def report() -> None:
     table = pd.read_csv(RESULTS / "payload_added.csv")
     means = table.groupby(["method", "episodes"], sort=False)["return"].mean().unstack("episodes")
-    print(f"mean return over seeds and {N_STARTS} start states, by episodes since the load")
-    print(means.to_string(float_format=lambda x: f"{x:.1f}", na_rep=""))
+    means = means.reindex(list(METHODS)).dropna(how="all")
     best, worst = means.loc["ceiling", 0], means.loc["unaware", 0]
     enough = best - 0.1 * (best - worst)
-    for method in [name for name in METHODS if name not in ("ceiling", "unaware")]:
+    shown = means.rename(columns=lambda n: f"after_{n}").copy()
+    for method in means.index.difference(["ceiling", "unaware"]):
         own = table[table["method"] == method]
         found = [recovered(group, enough) for _, group in own.groupby("seed")]
-        print(f"{method}: recovered (above {enough:.1f}) after {found} episodes, seed by seed")
+        shown.loc[method, "recovered_after"] = ", ".join(map(_or_never, found))
+    print(f"mean return over seeds and {N_STARTS} start states, by episodes since the load;")
+    print(f"recovered: above {enough:.1f} from there on, seed by seed")
+    print(shown.to_string(float_format=lambda x: f"{x:.1f}", na_rep=""))
+    shown.to_csv(RESULTS / "payload_added_recovery.csv", float_format="%.5g")
     figure(table, best, worst)
+
+
+def _or_never(episodes: int | None) -> str:
+    return "never" if episodes is None else str(episodes)
 
 
 def recovered(group: pd.DataFrame, enough: float) -> int | None:

@@ -99,7 +99,7 @@ def write(episodes: list[dict], folder: Path) -> None:
     axes = figure.subplots()
     minutes, returns = (np.array([e[key] for e in episodes]) for key in ("minutes", "return"))
     axes.plot(minutes, returns, "o-", color="#27496d", markersize=3.0)
-    axes.set_xlabel("minutes since the interpreter started, imports and compilation included")
+    axes.set_xlabel("minutes since the start, compilation included")
     axes.set_ylabel("return of an episode")
     axes.set_title("A pendulum at 20 Hz, learning while it runs")
     figure.savefig(folder / "return.png", dpi=150)

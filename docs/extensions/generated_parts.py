@@ -23,6 +23,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "benchmarks": benchmark_results.as_markdown,
     "sim_to_real_gap": summaries.whole("sim_to_real_gap"),
     "sim_to_real_median": summaries.whole("sim_to_real_median"),
+    "payload_added": summaries.whole("payload_added_recovery"),
     "hds_parts": summaries.over_seeds("hds_parts", "variant", "return"),
     "hds_weaknesses": summaries.over_seeds("hds_weaknesses", "variant", "return"),
     "hds_beta": summaries.over_seeds(
