@@ -2,13 +2,13 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from sb3_hds.algos.model import missing_effects, nulls_of
-from sb3_hds.core import Trajectories, Twin
+from sb3_hds.core import Params, Trajectories, Twin
 from sb3_hds.effects import force_of
 from sb3_hds.errors import CalibrationError, TrajectoryError
 from sb3_hds.sysid import Fit
@@ -114,6 +114,32 @@ class Correction:
     error_hybrid: float = np.nan
 
 
+class _Windows(NamedTuple):
+    """
+    What models are compared on.
+
+    :param shots: windows of the data
+    :param origin: of each window, the recording it is from; negative where it does not count
+    :param spread: of the channels
+    :param held: whether each window is held out of what is learned from
+    """
+
+    shots: Shots
+    origin: np.ndarray
+    spread: Float[np.ndarray, " obs"]
+    held: np.ndarray
+
+    @property
+    def learned(self) -> Shots:
+        """Those that are not held out."""
+        return self.shots._replace(weight=self.shots.weight * ~self.held)
+
+    def errors(self, twin: Twin, params: Params | None = None) -> np.ndarray:
+        """:return: of each window, with these parameters; None: the twin's, without its force"""
+        params = _without_force(twin) if params is None else params
+        return window_errors(twin, params, self.shots, self.spread)
+
+
 def correct(
     twin: Twin,
     data: Trajectories,
@@ -156,11 +182,11 @@ def correct(
     nominal, twin, wishes, added = _with_suspects(nominal, twin, wishes)
     shots, origin, forgotten = _since_change(shots, origin, now, latest)
     held = hold_out(origin, _HELD if real.sum() >= _MANY else _HELD_OF_FEW)
-    learned = shots._replace(weight=shots.weight * ~held)
+    windows = _Windows(shots, origin, spread, held)
 
-    fit = _calibrated(nominal, twin, learned, origin, spread, wishes)
-    calibrated, errors = _best(nominal, twin, fit, bare, now, shots, origin, spread, held)
-    calibrated, errors, added = _cleared(calibrated, errors, added, shots, spread, held)
+    fit = _calibrated(nominal, twin, windows, wishes)
+    calibrated, errors = _best(nominal, twin, fit, bare, now, windows)
+    calibrated, errors, added = _cleared(calibrated, errors, added, windows)
     found = Correction(
         calibrated,
         0.0,
@@ -172,8 +198,8 @@ def correct(
         error_calibrated=_mean(errors[held]),
     )
     if beta > 0.0:
-        now = window_errors(twin, twin.params, shots, spread)
-    found, errors = _with_residual(found, shots, held, errors, spread, wishes, learn_force)
+        now = windows.errors(twin, twin.params)
+    found, errors = _with_residual(found, windows, errors, wishes, learn_force)
     return dataclasses.replace(found, changed=gain(errors[held], now[held]) > _NOTICEABLE)
 
 
@@ -201,9 +227,7 @@ def _cleared(
     twin: Twin,
     errors: np.ndarray,
     added: Mapping[str, float],
-    shots: Shots,
-    spread: np.ndarray,
-    held: np.ndarray,
+    windows: _Windows,
 ) -> tuple[Twin, np.ndarray, dict[str, float]]:
     """
     What was suspected and explains nothing is let go, since simulating it costs time; it is
@@ -215,8 +239,8 @@ def _cleared(
     for key in dict.fromkeys(name.rpartition(".")[0] for name in added):
         own = {name: null for name, null in added.items() if name.startswith(f"{key}.")}
         cleared = twin.with_parameters(**own)
-        without = window_errors(cleared, _without_force(cleared), shots, spread)
-        if gain(errors[held], without[held]) < _LEAST_OF_SUSPECT:
+        without = windows.errors(cleared)
+        if gain(errors[windows.held], without[windows.held]) < _LEAST_OF_SUSPECT:
             twin, errors = cleared.without(key), without
             left = {name: null for name, null in left.items() if name not in own}
     return twin, errors, left
@@ -225,9 +249,7 @@ def _cleared(
 def _calibrated(
     nominal: Twin,
     twin: Twin,
-    learned: Shots,
-    origin: np.ndarray,
-    spread: Float[np.ndarray, " obs"],
+    windows: _Windows,
     wishes: Wishes,
 ) -> Fit | None:
     """From the values as they are, with what was believed before any data as prior."""
@@ -239,9 +261,9 @@ def _calibrated(
         return fit_windows(
             start,
             wishes.names,
-            learned,
-            origin,
-            spread,
+            windows.learned,
+            windows.origin,
+            windows.spread,
             prior=1.0,
             believed=believed,
             max_steps=_SOLVER_STEPS,
@@ -256,19 +278,17 @@ def _best(
     fit: Fit | None,
     bare: np.ndarray,
     now: np.ndarray,
-    shots: Shots,
-    origin: np.ndarray,
-    spread: np.ndarray,
-    held: np.ndarray,
+    windows: _Windows,
 ) -> tuple[Twin, np.ndarray]:
     """:return: the calibrated twin if it predicts better, otherwise the twin as it is or was"""
+    held = windows.held
     current = (twin, now) if now[held].mean() < bare[held].mean() else (nominal, bare)
     if fit is None or not all(np.isfinite(e.estimate) for e in fit.estimates):
         return current
-    if not holds_out_recordings(origin) and probability_before(fit, nominal) < _IMPROBABLE:
+    if not holds_out_recordings(windows.origin) and probability_before(fit, nominal) < _IMPROBABLE:
         return current
     new = twin.with_parameters(**{e.name: e.estimate for e in fit.estimates})
-    errors = window_errors(new, _without_force(new), shots, spread)
+    errors = windows.errors(new)
     if (
         gain(errors[held], bare[held]) > _LEAST_OF_CALIBRATION
         and gain(errors[held], now[held]) >= 0.0
@@ -279,22 +299,20 @@ def _best(
 
 def _with_residual(
     found: Correction,
-    shots: Shots,
-    held: np.ndarray,
+    windows: _Windows,
     errors: np.ndarray,
-    spread: np.ndarray,
     wishes: Wishes,
     learn_force: bool,
 ) -> tuple[Correction, np.ndarray]:
     """:return: the correction, and the errors of the model that is planned in"""
-    twin, residual = found.twin, None
+    twin, residual, held = found.twin, None, windows.held
     wanted = wishes.residual and wishes.beta != 0.0 and _mean(errors[held]) > _EXACT
     if wanted and learn_force:
-        scale = 0.05 * spread if found.fit is None else found.fit.noise
-        scale = np.maximum(scale, 1e-3 * spread)
+        scale = 0.05 * windows.spread if found.fit is None else found.fit.noise
+        scale = np.maximum(scale, 1e-3 * windows.spread)
         try:
             residual = fit_force(
-                twin, shots, held, scale, seed=wishes.seed, **wishes.residual_kwargs
+                twin, windows.shots, held, scale, seed=wishes.seed, **wishes.residual_kwargs
             )
         except CalibrationError:
             residual = None
@@ -305,7 +323,7 @@ def _with_residual(
     if key is None:
         hybrid = np.nan if residual is None else _mean(residual.error_after)
         return dataclasses.replace(found, residual=residual, error_hybrid=hybrid), errors
-    whole = window_errors(twin, {**twin.params, key: 1.0}, shots, spread)
+    whole = windows.errors(twin, {**twin.params, key: 1.0})
     helps = is_better(whole[held], errors[held])
     share = 0.0
     if helps:
