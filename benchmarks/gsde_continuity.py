@@ -1,0 +1,144 @@
+"""
+What smooth exploration costs: return against continuity, unstructured noise and gSDE.
+
+    python benchmarks/gsde_continuity.py                 # two environments, three seeds
+    python benchmarks/gsde_continuity.py --figure        # draw the figure again from the table
+
+After figure 2 of Raffin, Kober and Stulp, *Smooth Exploration for Robotic Reinforcement Learning*,
+CoRL 2021. The learner is GSDESAC throughout, updated after each episode as often as it has steps,
+so that only the noise differs: drawn anew at every step without regard to the state, or from
+features of the state by a matrix that stays for 2, 8, 64 steps or a whole episode. The continuity
+cost is theirs, 100 times the mean square of the change between successive actions as a share of
+their range: 0 for a constant action, 100 for one that jumps from end to end. It is taken while
+learning (from the first update on, what motors feel), and of the mean policy that is evaluated.
+Finished runs are kept.
+"""
+
+import argparse
+import json
+
+import gymnasium
+import numpy as np
+import pandas as pd
+from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+
+#: steps of a run, by environment; all their episodes have the same length
+LENGTHS = {"Pendulum-v1": 10_000, "HalfCheetah-v5": 50_000}
+#: of gSDE's noise: how many steps it stays; None: unstructured noise
+NOISES = {"unstructured": None, "gSDE 2": 2, "gSDE 8": 8, "gSDE 64": 64, "gSDE episode": -1}
+SETTINGS = {
+    "Pendulum-v1": {"learning_starts": 500, "learning_rate": 1e-3},
+    "HalfCheetah-v5": {"learning_starts": 5_000},
+}
+N_EPISODES = 20
+KEYS = ("env", "noise", "seed")
+
+
+class Continuity(gymnasium.Wrapper):
+    """Keeps the square of each change of the action, as a share of its range."""
+
+    def __init__(self, env: gymnasium.Env) -> None:
+        super().__init__(env)
+        self.changes: list[float] = []
+        self._last: np.ndarray | None = None
+
+    def reset(self, **arguments):
+        self._last = None
+        return self.env.reset(**arguments)
+
+    def step(self, action):
+        share = action / (self.action_space.high - self.action_space.low)
+        if self._last is not None:
+            self.changes.append(float(np.mean((share - self._last) ** 2)))
+        self._last = share
+        return self.env.step(action)
+
+    def cost(self) -> float:
+        return 100.0 * float(np.mean(self.changes))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument("--envs", nargs="*", default=list(LENGTHS))
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--figure", action="store_true")
+    parser.add_argument("--worker", nargs=3, metavar=("ENV", "NOISE", "SEED"))
+    arguments = parser.parse_args()
+    if arguments.worker:
+        env_id, noise, seed = arguments.worker
+        print(json.dumps({"rows": [worker(env_id, noise, int(seed))]}))
+        return
+    if not arguments.figure:
+        wanted = [
+            (env_id, noise, seed)
+            for env_id in arguments.envs
+            for seed in range(arguments.seeds)
+            for noise in NOISES
+        ]
+        in_process = lambda *run: fresh_process(__file__, *run, cache=CACHE)["rows"]  # noqa: E731
+        resume("gsde_continuity", KEYS, wanted, in_process, arguments.jobs)
+    report()
+
+
+def worker(env_id: str, noise: str, seed: int) -> dict:
+    from sb3_hds import GSDESAC
+    from sb3_hds.experiments import returns_of
+
+    env = Continuity(gymnasium.make(env_id))
+    stays, settings = NOISES[noise], SETTINGS[env_id]
+    model = GSDESAC(
+        "MlpPolicy",
+        env,
+        seed=seed,
+        train_freq=(1, "episode"),
+        gradient_steps=-1,
+        use_sde=stays is not None,
+        sde_sample_freq=stays or -1,
+        **settings,
+    )
+    model.learn(settings["learning_starts"])
+    env.changes.clear()
+    model.learn(LENGTHS[env_id] - model.num_timesteps, reset_num_timesteps=False)
+    seconds = seconds_since_start()
+    judged = Continuity(gymnasium.make(env_id))
+    returns = returns_of(model, judged, N_EPISODES)
+    return {
+        "return": returns.mean(),
+        "continuity": env.cost(),
+        "continuity_of_mean": judged.cost(),
+        "seconds": seconds,
+    }
+
+
+def report() -> None:
+    table = pd.read_csv(RESULTS / "gsde_continuity.csv")
+    measured = ["return", "continuity", "continuity_of_mean"]
+    summary = table.groupby(["env", "noise"], sort=False)[measured].agg(["mean", "min", "max"])
+    print(summary.to_string(float_format="%.2f"))
+    figure(table)
+
+
+def figure(table: pd.DataFrame) -> None:
+    """A panel for each environment: a point for each seed, a cross at their mean."""
+    from matplotlib import colormaps
+    from matplotlib.figure import Figure
+
+    shown = [env_id for env_id in LENGTHS if (table["env"] == env_id).any()]
+    drawing = Figure(figsize=(4.0 * len(shown), 3.4), layout="constrained")
+    for axes, env_id in zip(drawing.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
+        for i, noise in enumerate(NOISES):
+            runs = table[(table["env"] == env_id) & (table["noise"] == noise)]
+            colour = colormaps["viridis"](i / len(NOISES))
+            axes.plot(runs["continuity"], runs["return"], "o", color=colour, alpha=0.4)
+            middle = runs[["continuity", "return"]].mean()
+            axes.plot(*middle, "X", color=colour, markersize=9, label=noise)
+        axes.set(xlabel="continuity cost while learning", title=env_id, xscale="log")
+        axes.spines[["top", "right"]].set_visible(False)
+    drawing.axes[0].set_ylabel("return of the mean policy")
+    drawing.axes[0].legend(frameon=False, fontsize=8)
+    drawing.savefig(RESULTS / "gsde_continuity.png", dpi=150)
+
+
+if __name__ == "__main__":
+    main()
