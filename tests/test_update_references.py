@@ -392,7 +392,7 @@ class Joint(Soft):
 
 
 def test_crossq_normalises_both_pairs_together_and_has_no_target_networks():
-    kwargs = {"renorm_after": 1, "renorm_momentum": Joint.momentum}
+    kwargs = {"renorm_warmup_steps": 1, "batch_norm_momentum": Joint.momentum}
     recipe, learner = begun("crossq_jax", kwargs, policy_delay=1)
     assert recipe.joint_pass and learner.target == {}
     expected = Joint(learner)

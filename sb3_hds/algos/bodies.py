@@ -24,7 +24,7 @@ class Mlp(nn.Module):
     :param activation_fn: after each
     :param dropout_rate: DroQ's; 0: none
     :param layer_norm: DroQ's, after the dropout
-    :param renorm_after: CrossQ's: updates of plain batch normalisation before batch
+    :param renorm_warmup_steps: CrossQ's: updates of plain batch normalisation before batch
         renormalisation; None: neither of them
     :param momentum: of its running statistics
     """
@@ -33,20 +33,20 @@ class Mlp(nn.Module):
     activation_fn: Activation
     dropout_rate: float = 0.0
     layer_norm: bool = False
-    renorm_after: int | None = None
+    renorm_warmup_steps: int | None = None
     momentum: float = 0.99
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch n"], train: bool) -> Float[Array, "*batch m"]:
-        if self.renorm_after is not None:
-            x = BatchRenorm(self.renorm_after, self.momentum)(x, train)
+        if self.renorm_warmup_steps is not None:
+            x = BatchRenorm(self.renorm_warmup_steps, self.momentum)(x, train)
         for width in self.net_arch:
             x = nn.Dense(width)(x)
             x = Dropout(self.dropout_rate)(x)
             x = nn.LayerNorm()(x) if self.layer_norm else x
             x = self.activation_fn(x)
-            if self.renorm_after is not None:
-                x = BatchRenorm(self.renorm_after, self.momentum)(x, train)
+            if self.renorm_warmup_steps is not None:
+                x = BatchRenorm(self.renorm_warmup_steps, self.momentum)(x, train)
         return x
 
 

@@ -18,7 +18,7 @@ class CrossQ(SoftActorCritic):
     Sample Efficiency and Simplicity*, ICLR 2024: critics of width 2048, Adam with b1 = 0.5,
     learning rate 1e-3, three updates of the critics for each of the actor, 5,000 random steps.
     Batch normalisation becomes batch renormalisation after 100,000 updates, as in the authors' code
-    (``policy_kwargs={"renorm_after": ...}``). SBX's default width is 1024, and its
+    (``policy_kwargs={"renorm_warmup_steps": ...}``). SBX's default width is 1024, and its
     learning rate never changes; here, schedules act.
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`

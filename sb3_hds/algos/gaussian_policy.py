@@ -60,9 +60,9 @@ class GaussianPolicy(LearningPolicy):
     :param n_quantiles: values of each of them
     :param dropout_rate: of the critics
     :param layer_norm: in the critics
-    :param renorm_after: batch normalisation in actor and critics, which becomes batch
+    :param renorm_warmup_steps: batch normalisation in actor and critics, which becomes batch
         renormalisation after so many updates; None: neither
-    :param renorm_momentum: of its running statistics
+    :param batch_norm_momentum: the share of its running statistics that stays at an update
     :param use_sde: generalised state-dependent exploration (Raffin et al., CoRL 2021)
     :param log_std_init: gSDE: where the logarithm of the noise matrix's deviation starts
     :param full_std: gSDE: one deviation for each feature and control, or for each feature
@@ -80,7 +80,7 @@ class GaussianPolicy(LearningPolicy):
         "net_arch": (256, 256),
         "optimizer_class": "adam",
         "normalize_observations": False,
-        "renorm_after": None,
+        "renorm_warmup_steps": None,
     }
 
     def __init__(
@@ -94,8 +94,8 @@ class GaussianPolicy(LearningPolicy):
         n_quantiles: int = 1,
         dropout_rate: float = 0.0,
         layer_norm: bool = False,
-        renorm_after: int | None = None,
-        renorm_momentum: float = 0.99,
+        renorm_warmup_steps: int | None = None,
+        batch_norm_momentum: float = 0.99,
         use_sde: bool = False,
         log_std_init: float = -3.0,
         full_std: bool = True,
@@ -120,7 +120,7 @@ class GaussianPolicy(LearningPolicy):
         self.widths = widths(net, "qf")
         self.activation_fn = activation(activation_fn)
         self.dropout_rate, self.layer_norm = _rate(dropout_rate), layer_norm
-        self.renorm_after, self.renorm_momentum = chosen["renorm_after"], renorm_momentum
+        self.renorm_warmup_steps, self.batch_norm_momentum = chosen["renorm_warmup_steps"], batch_norm_momentum
         self.normalize_observations = bool(chosen["normalize_observations"])
         self.n_critics, self.use_sde = n_critics, use_sde
         n_act = int(np.prod(action_space.shape))
@@ -147,8 +147,8 @@ class GaussianPolicy(LearningPolicy):
         return Mlp(
             net_arch,
             self.activation_fn,
-            renorm_after=self.renorm_after,
-            momentum=self.renorm_momentum,
+            renorm_warmup_steps=self.renorm_warmup_steps,
+            momentum=self.batch_norm_momentum,
         )
 
     def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
@@ -157,8 +157,8 @@ class GaussianPolicy(LearningPolicy):
             self.activation_fn,
             self.dropout_rate,
             self.layer_norm,
-            self.renorm_after,
-            self.renorm_momentum,
+            self.renorm_warmup_steps,
+            self.batch_norm_momentum,
         )
 
     def build_plain(self) -> None:
@@ -176,7 +176,7 @@ class GaussianPolicy(LearningPolicy):
             worth=pessimistic,
             optimizer=self.optimizers[0],
             qf_optimizer=self.optimizers[1],
-            joint_pass=self.renorm_after is not None,
+            joint_pass=self.renorm_warmup_steps is not None,
             normalize=self.normalize_observations,
         )
 
@@ -280,7 +280,7 @@ class CrossQPolicy(GaussianPolicy):
         "optimizer_class": "adam",
         "optimizer_kwargs": {"b1": 0.5},
         "normalize_observations": False,
-        "renorm_after": 100_000,
+        "renorm_warmup_steps": 100_000,
     }
 
 
