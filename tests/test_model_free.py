@@ -1,5 +1,7 @@
 """What model-free algorithms are made of, beside references, and what only they can do."""
 
+import dataclasses
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -13,13 +15,15 @@ from small_models import OFF_POLICY, PLANNERS, SMALL, logged, small
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_hds import GSDESAC, TD7, CrossQ, DroQ, SimbaSAC
+from sb3_hds import GSDESAC, TD7, CrossQ, DroQ, SimbaSAC, algos
+from sb3_hds.algos import td7_update
 from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp
 from sb3_hds.algos.heads import ExploringActor
-from sb3_hds.algos.lap import SumTree
+from sb3_hds.algos.lap import LapReplayBuffer, SumTree
 from sb3_hds.algos.observations import Seen, flattener, seen
 from sb3_hds.algos.off_policy import (
     Truncated,
@@ -397,7 +401,7 @@ def test_torch_classes_are_understood():
     assert dict(model.policy.optimizers[0].arguments)["b1"] == 0.8
 
 
-@every_soft
+@every_algorithm
 def test_returns_of_several_steps_and_compressed_buffers_are_learned_from(name):
     longer = small(name, n_steps=3, gamma=0.9).learn(30)
     buffer = {"handle_timeout_termination": False}
@@ -410,14 +414,11 @@ def test_returns_of_several_steps_and_compressed_buffers_are_learned_from(name):
     assert (batch.obs != batch.next_obs).any()
 
 
-def test_hindsight_replay_is_learned_from():
+@pytest.mark.parametrize("name", ["droq", "td7"])
+def test_hindsight_replay_is_learned_from(name):
     env = BitFlippingEnv(n_bits=3, continuous=True, max_steps=3)
-    model = DroQ(
-        "MultiInputPolicy",
-        env,
-        replay_buffer_class=HerReplayBuffer,
-        seed=0,
-        **SMALL["droq"],
+    model = algos.ALL[name](
+        "MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, seed=0, **SMALL[name]
     )
 
     assert model.learn(40)._n_updates > 0
@@ -515,11 +516,40 @@ def test_td7_does_not_judge_a_policy_by_random_actions():
 
 
 @pytest.mark.parametrize(
-    "arguments", [{"n_steps": 2}, {"use_sde": True}, {"optimize_memory_usage": True}]
+    "arguments",
+    [
+        {"use_sde": True},
+        {"n_steps": 2, "replay_buffer_class": LapReplayBuffer},
+        {"optimize_memory_usage": True, "replay_buffer_class": LapReplayBuffer},
+    ],
 )
-def test_what_the_replay_buffer_of_td7_cannot_do_is_refused(arguments):
+@pytest.mark.filterwarnings("ignore:n_steps=2 is ignored")
+def test_what_td7_cannot_do_is_refused(arguments):
     with pytest.raises(ValueError, match=next(iter(arguments))):
         TD7("Pendulum-v1", **arguments)
+
+
+def test_td7_loaded_with_several_environments_assesses_no_policy(tmp_path):
+    model = small("td7", use_checkpoints=None, train_freq=None).learn(10)
+    assert model.assesses and model.train_freq.unit.value == "episode"
+    model.save(tmp_path / "model")
+
+    loaded = TD7.load(tmp_path / "model", env=make_vec_env("Pendulum-v1", 2))
+
+    assert not loaded.assesses and loaded.learn(40)._n_updates > 0
+
+
+def test_uniform_draws_give_td7_the_gradient_of_prioritised_ones():
+    model = small("td7")
+    prioritised = model.recipe()
+    errors = jnp.array([[0.2, 3.0, 5.0, 0.7], [0.9, 1.5, 8.0, 0.1]])
+    share = td7_update.priorities_of(prioritised, errors)
+    uniform = dataclasses.replace(prioritised, uniform=True)
+
+    slope = jax.grad(partial(td7_update.loss_of, uniform))(errors)
+
+    expected = jnp.clip(errors, -1.0, 1.0) * share / share.sum()
+    np.testing.assert_allclose(slope, expected, rtol=1e-6)
 
 
 def test_a_policy_of_td7_is_kept_only_if_it_did_no_worse():

@@ -11,7 +11,6 @@ import numpy as np
 import optax
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import is_vectorized_observation
 
 from sb3_hds.algos.bodies import Mlp, SimbaBody
 from sb3_hds.algos.heads import Critic, ExploringActor, GaussianActor, noise_std
@@ -120,7 +119,10 @@ class GaussianPolicy(LearningPolicy):
         self.widths = widths(net, "qf")
         self.activation_fn = activation(activation_fn)
         self.dropout_rate, self.layer_norm = _rate(dropout_rate), layer_norm
-        self.renorm_warmup_steps, self.batch_norm_momentum = chosen["renorm_warmup_steps"], batch_norm_momentum
+        self.renorm_warmup_steps, self.batch_norm_momentum = (
+            chosen["renorm_warmup_steps"],
+            batch_norm_momentum,
+        )
         self.normalize_observations = bool(chosen["normalize_observations"])
         self.n_critics, self.use_sde = n_critics, use_sde
         n_act = int(np.prod(action_space.shape))
@@ -221,20 +223,6 @@ class GaussianPolicy(LearningPolicy):
         if not self.use_sde:
             return np.zeros(1)
         return np.asarray(noise_std(self.actor_network, self.learner.actor.weights))  # type: ignore[arg-type]
-
-    def prepare_obs(self, observation: Any) -> tuple[Any, bool]:
-        space = self.observation_space
-        if not isinstance(space, spaces.Dict):
-            return super().prepare_obs(observation)
-        if not isinstance(observation, dict) or observation.keys() != space.spaces.keys():
-            raise ValueError(
-                f"predict() got {type(observation).__name__} instead of a dictionary with "
-                f"{', '.join(space.spaces)}."
-            )
-        parts = {name: np.asarray(part) for name, part in observation.items()}
-        vectorized = any(is_vectorized_observation(parts[name], space[name]) for name in parts)
-        rows = {name: part.reshape(-1, *space[name].shape) for name, part in parts.items()}  # type: ignore[misc]
-        return rows, vectorized
 
     def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
         obs, actor = self.flatten(observation), self.learner.actor.weights

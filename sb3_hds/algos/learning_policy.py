@@ -1,11 +1,14 @@
 """What the policies of model-free algorithms share: they hold all that updates change."""
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.utils import is_vectorized_observation
 
 from sb3_hds.algos.learner import GENERATOR
 from sb3_hds.algos.off_policy import Trained
@@ -20,6 +23,8 @@ class LearningPolicy(TensorPolicy):
 
     #: fields of the learner that are saved with the networks, not with their optimisers
     held: ClassVar[tuple[str, ...]]
+    #: observations to rows of numbers
+    flatten: Callable[[Any], np.ndarray]
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -55,6 +60,20 @@ class LearningPolicy(TensorPolicy):
     @learner.setter
     def learner(self, learner: Any) -> None:
         self._learner = learner
+
+    def prepare_obs(self, observation: Any) -> tuple[Any, bool]:
+        space = self.observation_space
+        if not isinstance(space, spaces.Dict):
+            return super().prepare_obs(observation)
+        if not isinstance(observation, dict) or observation.keys() != space.spaces.keys():
+            raise ValueError(
+                f"predict() got {type(observation).__name__} instead of a dictionary with "
+                f"{', '.join(space.spaces)}."
+            )
+        parts = {name: np.asarray(part) for name, part in observation.items()}
+        vectorized = any(is_vectorized_observation(parts[name], space[name]) for name in parts)
+        rows = {name: part.reshape(-1, *space[name].shape) for name, part in parts.items()}  # type: ignore[misc]
+        return rows, vectorized
 
     def forward(self, obs: Any, deterministic: bool = False) -> np.ndarray:
         return self._predict(obs, deterministic)  # type: ignore[return-value]

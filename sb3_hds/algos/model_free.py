@@ -12,6 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_hds.algos.call_forms import between, check_policy, is_count, policy_and_env, schedule_of
+from sb3_hds.algos.learning_policy import LearningPolicy
 from sb3_hds.algos.observations import check_observations
 from sb3_hds.algos.tensor_algorithm import TensorAlgorithm
 from sb3_hds.errors import EnvironmentMismatchError
@@ -57,6 +58,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     """
 
     default_timesteps: ClassVar[int] = 20_000
+    policy: LearningPolicy
 
     def __init__(
         self,

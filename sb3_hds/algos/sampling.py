@@ -9,10 +9,10 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from sb3_hds.algos.off_policy import Batch
 
 if TYPE_CHECKING:
-    from sb3_hds.algos.soft_actor_critic import SoftActorCritic
+    from sb3_hds.algos.model_free import ModelFreeAlgorithm
 
 
-def batches_of(model: "SoftActorCritic", n: int, batch_size: int, capacity: int) -> Batch:
+def batches_of(model: "ModelFreeAlgorithm", n: int, batch_size: int, capacity: int) -> Batch:
     """
     :param n: batches that are drawn
     :param capacity: batches of the result; those beyond ``n`` are empty
@@ -31,7 +31,7 @@ def batches_of(model: "SoftActorCritic", n: int, batch_size: int, capacity: int)
     return Batch(**{name: stacked(rows) for name, rows in drawn.items()})  # type: ignore[arg-type]
 
 
-def _directly(model: "SoftActorCritic", buffer: ReplayBuffer, n: int) -> dict[str, np.ndarray]:
+def _directly(model: "ModelFreeAlgorithm", buffer: ReplayBuffer, n: int) -> dict[str, np.ndarray]:
     """As ``ReplayBuffer.sample`` does it."""
     steps = np.random.randint(buffer.buffer_size if buffer.full else buffer.pos, size=n)
     copies = np.random.randint(buffer.n_envs, size=n)
@@ -39,7 +39,7 @@ def _directly(model: "SoftActorCritic", buffer: ReplayBuffer, n: int) -> dict[st
 
 
 def transitions(
-    model: "SoftActorCritic", buffer: ReplayBuffer, steps: np.ndarray, copies: np.ndarray
+    model: "ModelFreeAlgorithm", buffer: ReplayBuffer, steps: np.ndarray, copies: np.ndarray
 ) -> dict[str, np.ndarray]:
     """
     :param steps: rows of the buffer, shape ``(n,)``
@@ -63,7 +63,7 @@ def transitions(
     }
 
 
-def _over_torch(model: "SoftActorCritic", buffer: Any, n: int) -> dict[str, np.ndarray]:
+def _over_torch(model: "ModelFreeAlgorithm", buffer: Any, n: int) -> dict[str, np.ndarray]:
     buffer.device = th.device("cpu")  # what is drawn goes to JAX by NumPy
     data, flatten = buffer.sample(n, env=model.get_vec_normalize_env()), model.policy.flatten
 

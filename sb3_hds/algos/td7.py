@@ -22,7 +22,7 @@ from sb3_hds.algos.model_free import ModelFreeAlgorithm, finite
 from sb3_hds.algos.networks import Activation, activation
 from sb3_hds.algos.observations import flattener, size_of
 from sb3_hds.algos.off_policy import Batch
-from sb3_hds.algos.sampling import transitions
+from sb3_hds.algos.sampling import batches_of, transitions
 from sb3_hds.algos.td7_update import (
     Actor,
     Checkpoint,
@@ -168,6 +168,11 @@ class TD7(ModelFreeAlgorithm):
     of them; only then it is updated, once for each step that it made. That needs one environment,
     and ``gradient_steps`` is not looked at.
 
+    Prioritised replay draws from SB3's plain buffer. With ``n_steps`` above 1, Dict observations,
+    ``optimize_memory_usage`` or a buffer of one's own (``HerReplayBuffer``), transitions are drawn
+    uniformly, and weights in the loss make its expected gradient the same (Fujimoto, Meger and
+    Precup, NeurIPS 2020).
+
     :param policy: ``"MlpPolicy"``, a policy class, or the environment itself
     :param env: an environment, its id, or a vectorised environment
     :param learning_starts: steps with random actions before learning starts
@@ -189,7 +194,6 @@ class TD7(ModelFreeAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": TD7Policy,
-        # So that these observations reach the message that says why not.
         "MultiInputPolicy": TD7Policy,
     }
     policy: TD7Policy
@@ -236,7 +240,7 @@ class TD7(ModelFreeAlgorithm):
             train_freq=1 if train_freq is None else train_freq,
             policy_delay=policy_delay,
             action_noise=action_noise,
-            replay_buffer_class=replay_buffer_class or LapReplayBuffer,
+            replay_buffer_class=replay_buffer_class,
             **arguments,
         )
 
@@ -249,6 +253,19 @@ class TD7(ModelFreeAlgorithm):
             target_noise=self.target_policy_noise,
             noise_clip=self.target_noise_clip,
             alpha=self.priority_exponent,
+            uniform=not self.prioritised,
+        )
+
+    @property
+    def assesses(self) -> bool:
+        """Whether policies are assessed before they are updated."""
+        return self.n_envs == 1 if self.use_checkpoints is None else self.use_checkpoints
+
+    @property
+    def prioritised(self) -> bool:
+        """Whether transitions are drawn by their errors."""
+        return isinstance(self.replay_buffer_class, type) and issubclass(
+            self.replay_buffer_class, LapReplayBuffer
         )
 
     def check_arguments(self) -> None:
@@ -264,27 +281,23 @@ class TD7(ModelFreeAlgorithm):
             self.refuse_unless(between(getattr(self, name), 0.0, 1.0), name, "from 0 to 1")
         several = self.n_envs > 1 and self.use_checkpoints
         self.refuse_unless(not several, "use_checkpoints", "False with several environments")
-        fits = isinstance(self.replay_buffer_class, type) and issubclass(
-            self.replay_buffer_class, LapReplayBuffer
-        )
-        self.refuse_unless(fits, "replay_buffer_class", "LapReplayBuffer, or extend it")
-        self.refuse_unless(self.n_steps == 1, "n_steps", "1 with this replay buffer")
         self.refuse_unless(not self.use_sde, "use_sde", "False: noise is added to the actions")
-        compressed = self.optimize_memory_usage
-        self.refuse_unless(not compressed, "optimize_memory_usage", "False with this replay buffer")
-        if isinstance(self.observation_space, spaces.Dict):
-            raise ValueError(
-                "TD7's replay buffer has no Dict observations: "
-                "use gymnasium.wrappers.FlattenObservation."
+        if self.prioritised:
+            self.refuse_unless(self.n_steps == 1, "n_steps", "1 with LapReplayBuffer")
+            compressed = self.optimize_memory_usage
+            self.refuse_unless(
+                not compressed, "optimize_memory_usage", "False with LapReplayBuffer"
             )
 
     def _setup_model(self) -> None:
-        if self.use_checkpoints is None:
-            self.use_checkpoints = self.n_envs == 1
-        if self._chosen_freq is None and self.use_checkpoints:
-            self.train_freq = (1, "episode")  # type: ignore[assignment]
+        is_dict = isinstance(self.observation_space, spaces.Dict)
+        plain = self.n_steps == 1 and not self.optimize_memory_usage and not is_dict
+        if plain and self.replay_buffer_class is None:
+            self.replay_buffer_class = LapReplayBuffer
+        if self._chosen_freq is None:
+            self.train_freq = (1, "episode") if self.assesses else 1  # type: ignore[assignment]
         super()._setup_model()
-        self.policy.uses_checkpoints = self.use_checkpoints
+        self.policy.uses_checkpoints = self.assesses
         if self.action_noise is None and self.exploration_noise:
             size = np.full(self.policy.n_act, self.exploration_noise, np.float32)
             self.action_noise = NormalActionNoise(np.zeros_like(size), size)
@@ -298,7 +311,7 @@ class TD7(ModelFreeAlgorithm):
         self.policy.learner = self.policy.learner._replace(n_updates=before.n_updates)
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
-        if self.use_checkpoints:
+        if self.assesses:
             gradient_steps = self._assessed()
         if gradient_steps > 0:
             super().train(gradient_steps, batch_size)
@@ -335,15 +348,24 @@ class TD7(ModelFreeAlgorithm):
         zero = jnp.zeros(())
         report, found = {}, Report(zero, zero, zero)
         for i in range(n):
-            steps, copies = buffer.draw(batch_size)
-            batch = Batch(**transitions(self, buffer, steps, copies))  # type: ignore[arg-type]
+            batch, drawn = self._drawn(batch_size)
             learner, found, priorities = update(policy.recipe, policy.learner, batch, *rates, found)
             report = finite({name: float(value) for name, value in found._asdict().items()})
             policy.learner = learner
-            buffer.set_priorities(steps, copies, np.asarray(priorities))
+            if drawn is None:
+                continue
+            buffer.set_priorities(*drawn, np.asarray(priorities))
             if (self._n_updates + i + 1) % self.target_update_interval == 0:
                 buffer.forget_highest()
         return report
+
+    def _drawn(self, batch_size: int) -> tuple[Batch, tuple[np.ndarray, np.ndarray] | None]:
+        """:return: a batch, and which transitions it is made of, where these have priorities"""
+        if not self.prioritised:
+            return Batch(*(rows[0] for rows in batches_of(self, 1, batch_size, 1))), None
+        buffer: Any = self.replay_buffer
+        drawn = buffer.draw(batch_size)
+        return Batch(**transitions(self, buffer, *drawn)), drawn  # type: ignore[arg-type]
 
     def _store_transition(
         self,

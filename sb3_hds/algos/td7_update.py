@@ -123,6 +123,7 @@ class Recipe:
     :param target_noise: standard deviation of the noise on the target policy's actions
     :param noise_clip: its limit
     :param alpha: how much priorities depend on errors
+    :param uniform: transitions are drawn without regard to priorities, and the loss makes up for it
     """
 
     encoder: nn.Module
@@ -136,6 +137,7 @@ class Recipe:
     target_noise: float = 0.2
     noise_clip: float = 0.5
     alpha: float = 0.4
+    uniform: bool = False
 
 
 class Range(NamedTuple):
@@ -270,12 +272,12 @@ def update(
     def critic_loss(params: Any) -> tuple[Array, Array]:
         value = judge(recipe, {"params": params}, batch.obs, batch.action, state, both)
         error = jnp.abs(value - target)
-        return jnp.sum(jnp.mean(jnp.where(error < 1.0, 0.5 * error**2, error), 1)), error
+        return loss_of(recipe, error), error
 
     gradient = jax.value_and_grad(critic_loss, has_aux=True)
     (loss, error), slope = gradient(learner.critic.weights["params"])
     critic = recipe.qf_optimizer.apply(slope, learner.critic, qf_learning_rate)
-    priority = jnp.maximum(error.max(0), 1.0) ** recipe.alpha
+    priority = priorities_of(recipe, error)
     learner = learner._replace(encoder=encoder, critic=critic, range=seen)
     report = report._replace(critic_loss=loss, encoder_loss=encoder_loss)
 
@@ -290,6 +292,26 @@ def update(
     due = learner.n_updates % recipe.target_every == 0
     learner = jax.lax.cond(due, lambda: copied, lambda: learner)
     return learner, report._replace(actor_loss=loss), priority
+
+
+def priorities_of(recipe: Recipe, error: Float[Array, "critics batch"]) -> Float[Array, " batch"]:
+    """:return: of transitions with these absolute errors"""
+    return jnp.maximum(error.max(0), 1.0) ** recipe.alpha
+
+
+def loss_of(recipe: Recipe, error: Float[Array, "critics batch"]) -> Float[Array, ""]:
+    """
+    :param error: absolute errors
+    :return: LAP's loss; where transitions are drawn uniformly, the one of equal expected gradient
+
+    Source: Fujimoto, Meger and Precup, *An Equivalence between Loss Functions and Non-Uniform
+    Sampling in Experience Replay*, NeurIPS 2020.
+    """
+    loss = jnp.where(error < 1.0, 0.5 * error**2, error)
+    if recipe.uniform:
+        priority = jax.lax.stop_gradient(priorities_of(recipe, error))
+        loss = loss * priority / priority.mean()
+    return jnp.sum(jnp.mean(loss, 1))
 
 
 def _update_encoder(
