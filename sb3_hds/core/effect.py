@@ -128,6 +128,14 @@ class Effect(abc.ABC):
         """:return: the same effect, with whatever depends on the twin that it is attached to"""
         return self
 
+    def starts(self, excursion: float) -> tuple[Mapping[str, float], ...]:
+        """
+        :param excursion: how far the joint moves in the data [rad] or [m]
+        :return: where a search may begin, for parameters that have no slope where nothing is wrong
+            and many optima elsewhere: values by name; empty for effects that one start serves
+        """
+        return ()
+
     def doubt(self, twin: "Twin", state: Any, action: Action, base: Params, own: Params) -> Scalar:
         """
         :param twin: the twin that the effect is attached to

@@ -6,6 +6,11 @@ import jax.numpy as jnp
 
 from sb3_hds.core import JointEffect, JointMoment, Memory, Parameter, Params, Scalar
 
+# Periods that the range of motion may hold, close enough that a fit finds those in between; and
+# parts of a period by which the force may be shifted.
+_CYCLES = (0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0)
+_TURNS = (0.0, 0.25, 0.5, 0.75)
+
 
 class Stiffness(JointEffect):
     r"""
@@ -83,6 +88,12 @@ class Cogging(JointEffect):
     }
     explanation = "The joint snaps to equally spaced positions, as motors with magnets do."
     source = "MuJoCo DC motor model 2026, section 1.2"
+
+    def starts(self, excursion: float) -> tuple[dict[str, float], ...]:
+        periods = [excursion / n for n in _CYCLES]
+        return tuple(
+            {"period": period, "phase": turn * period} for period in periods for turn in _TURNS
+        )
 
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
         per_period = 2.0 * math.pi / params["period"]

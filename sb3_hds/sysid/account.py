@@ -3,38 +3,41 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from sb3_hds.sysid.comparison import compare
 from sb3_hds.sysid.diagnosis import HorizonGain
-from sb3_hds.sysid.evidence import Evidence, Point
-from sb3_hds.sysid.hypotheses import Candidate
+from sb3_hds.sysid.evidence import Point
 from sb3_hds.sysid.pictures import Pictures, replay_of
 from sb3_hds.sysid.remainder import MissingForce
 from sb3_hds.sysid.search import LEAST_GAIN, Half
 
-# Cosine of the angle between what two causes do beyond which they look alike.
-_IMITATION = 0.95
+# Directions below this share of the largest curvature do not move.
+_RANK = 1e-10
 
 
-def standard_errors(
-    evidence: Evidence, unit: Int[np.ndarray, " n"], point: Point, free: Sequence[int]
-) -> Float[np.ndarray, " p"]:
+def standard_errors(half: Half, point: Point, free: Sequence[int]) -> Float[np.ndarray, " p"]:
     """
-    :param unit: piece of evidence of each window
+    The jackknife over units, one Newton step for each that is left out. Units are few, and the fit
+    has made the scores of each smaller than they were: the sandwich would be too sure.
+
+    Source: MacKinnon, Nielsen, Webb, *Fast and reliable jackknife and bootstrap methods for
+    cluster-robust inference*, J. Applied Econometrics 38, 2023 (CV3).
+
     :param free: indices of what was fitted
-    :return: of all parameters, by the sandwich clustered by units; infinite for what was not fitted
+    :return: of all parameters; infinite for what was not fitted
     """
     result = np.full(len(point.theta), np.inf)
     if not free:
         return result
-    slopes, labels = evidence.slopes(point, free), np.unique(unit)
-    scores = np.stack([slopes.scores[unit == label].sum(0) for label in labels])
-    bread = np.linalg.pinv(slopes.curvature.sum(0), rcond=1e-10)
-    correction = len(labels) / max(len(labels) - 1, 1)
-    covariance = correction * bread @ (scores.T @ scores) @ bread
-    variance = np.maximum(np.diag(covariance), 0.0)
-    result[list(free)] = np.sqrt(variance) * evidence.hypotheses.scale[list(free)]
+    slopes, labels = half.evidence.slopes(point, free), np.unique(half.unit)
+    total, variance = slopes.curvature.sum(0), np.zeros(len(free))
+    for label in labels:
+        own = half.unit == label
+        rest = np.linalg.pinv(total - slopes.curvature[own].sum(0), rcond=_RANK, hermitian=True)
+        variance += (rest @ slopes.scores[own].sum(0)) ** 2
+    variance *= (len(labels) - 1) / len(labels)
+    result[list(free)] = np.sqrt(variance) * half.evidence.hypotheses.scale[list(free)]
     return result
 
 
@@ -48,7 +51,7 @@ def detectable(half: Half, point: Point) -> dict[str, dict[str, float]]:
     numbers = point.raw.shape[1] * point.raw.shape[2]
     needed = 0.5 * LEAST_GAIN * half.total(point) * numbers
     nuisances, found = list(h.nuisances), {}
-    inner = np.linalg.pinv(total[np.ix_(nuisances, nuisances)], rcond=1e-10)
+    inner = np.linalg.pinv(total[np.ix_(nuisances, nuisances)], rcond=_RANK)
     for candidate in h.candidates:
         sizes = {}
         for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
@@ -58,33 +61,6 @@ def detectable(half: Half, point: Point) -> dict[str, dict[str, float]]:
             sizes[name.rpartition(".")[2]] = float(size * h.scale[i])
         found[candidate.key] = sizes
     return found
-
-
-def imitators(half: Half, point: Point, found: Candidate, nuisances: Sequence[int]) -> list[str]:
-    """
-    :param point: where the twin with this cause has been fitted
-    :param found: the cause
-    :param nuisances: indices of what else is refitted
-    :return: other candidates that could stand for nearly all of what the cause does to these
-        windows, to first order: the cosine between the two exceeds 0.95
-    """
-    h, total = half.evidence.hypotheses, half.evidence.slopes(point).curvature.sum(0)
-    rest = list(nuisances)
-    inner = np.linalg.pinv(total[np.ix_(rest, rest)], rcond=1e-10, hermitian=True)
-    total = total - total[:, rest] @ inner @ total[rest]
-    own = list(h.indices(found))
-    direction = ((point.theta - h.null) / h.scale)[own]
-    strength = direction @ total[np.ix_(own, own)] @ direction
-    names = []
-    for candidate in h.candidates:
-        other = list(h.indices(candidate))
-        if set(other) & {*own, *rest} or np.diag(total)[other].min() <= 1e-9 * strength:
-            continue
-        shared = total[np.ix_(other, own)] @ direction
-        caught = shared @ np.linalg.pinv(total[np.ix_(other, other)], hermitian=True) @ shared
-        if caught > _IMITATION**2 * strength:
-            names.append(candidate.key)
-    return names
 
 
 def by_horizon(half: Half, before: Point, after: Point, every: int) -> dict[int, HorizonGain]:

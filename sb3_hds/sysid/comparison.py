@@ -14,6 +14,8 @@ _FEWEST_UNITS = 8
 _MOST_RATIO = 1e6
 # By which factor the level of the test on windows is stricter than that on units.
 _STRICTER = 25.0
+# Errors beyond this, in units of the noise, say no more.
+_MOST_ERROR = 1e4
 
 
 class Comparison(NamedTuple):
@@ -85,6 +87,45 @@ def confirm(
         return verdict
     by_window: Any = stats.wilcoxon(ratio, alternative="greater")
     return verdict._replace(p_value=min(verdict.p_value, _STRICTER * float(by_window.pvalue)))
+
+
+def by_scores(
+    new: Float[np.ndarray, "n rows obs"],
+    old: Float[np.ndarray, "n rows obs"],
+    unit: Int[np.ndarray, " n"],
+) -> float:
+    r"""
+    Whether errors of a model lean to the side on which another one predicts otherwise.
+
+    With errors :math:`r` of the old and :math:`r'` of the new model, and :math:`\delta = r - r'`,
+    the sum of :math:`\delta \cdot r` has the mean zero if the old model is right, whatever the new
+    one is, as long as neither has seen these data. Its variance is told by the same sum with
+    :math:`r'`, which the effect is not in: so recordings that show an effect strongly and others
+    that show it weakly are no sign of chance, as they are for a t test on gains. What errors of one
+    recording have in common counts once.
+
+    Source: a score (Lagrange multiplier) test, its covariance clustered and taken under the
+    alternative; Cameron and Miller, *A practitioner's guide to cluster-robust inference*, Journal
+    of Human Resources 50(2), 2015.
+
+    :param new: errors of windows in units of the noise
+    :param old: the same of the model that is to be beaten
+    :param unit: piece of evidence of each window; negative: does not count
+    :return: one-sided p-value
+    """
+    labels = np.unique(unit[unit >= 0])
+    if len(labels) < 2:
+        return 1.0
+    before, after = (
+        np.clip(np.nan_to_num(r, nan=_MOST_ERROR), -_MOST_ERROR, _MOST_ERROR) for r in (old, new)
+    )
+    leans, noise = (np.sum((before - after) * r, (1, 2)) for r in (before, after))
+    by_unit = np.array([noise[unit == label].sum() for label in labels])
+    correction = len(labels) / (len(labels) - 1)
+    variance = max(float(np.sum(noise[unit >= 0] ** 2)), correction * float(np.sum(by_unit**2)))
+    if not variance:
+        return 1.0
+    return float(stats.t.sf(leans[unit >= 0].sum() / np.sqrt(variance), len(labels) - 1))
 
 
 def split(data: Trajectories, origin: Int[np.ndarray, " n"], seed: int) -> Split:

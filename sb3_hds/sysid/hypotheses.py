@@ -1,7 +1,7 @@
 """What may be wrong with a twin: all candidates at once, each switched by its parameters."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import jax
@@ -61,6 +61,7 @@ class Hypotheses:
     :param upper: largest admissible values
     :param nuisances: indices of those that are refitted under every hypothesis
     :param pushes: index of a constant force at each joint, to measure what force is missing
+    :param starts: for candidates by key, values by full name at which a search may begin
     """
 
     believed: Twin
@@ -73,6 +74,7 @@ class Hypotheses:
     upper: Float[np.ndarray, " p"]
     nuisances: tuple[int, ...]
     pushes: tuple[int, ...]
+    starts: Mapping[str, tuple[Mapping[str, float], ...]] = dataclasses.field(default_factory=dict)
 
     @classmethod
     def about(
@@ -136,11 +138,25 @@ class Hypotheses:
         with jax.enable_x64(True):
             return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), self.twin.params)
 
+    def effect_of(self, candidate: Candidate) -> Effect | None:
+        """:return: the effect that the candidate is; None for a parameter, or several effects"""
+        found = [a.effect for a in _attached_of(self.twin) if a.key == candidate.key]
+        return found[0] if found else None
+
     def remembers(self, candidate: Candidate) -> bool:
         """:return: whether it is a force or a command that depends on what was before"""
-        attached = [a.effect for a in _attached_of(self.twin) if a.key == candidate.key]
-        effects = [e for e in attached if isinstance(e, ForceEffect | ActionEffect)]
-        return any(jax.tree.leaves(effect.memory(self.twin)) for effect in effects)
+        effect = self.effect_of(candidate)
+        inside = isinstance(effect, ForceEffect | ActionEffect)
+        return inside and bool(jax.tree.leaves(effect.memory(self.twin)))
+
+    def related(self, candidate: Candidate) -> list[Candidate]:
+        """:return: what is declared to look like a candidate, at its place"""
+        return [
+            other
+            for other in self.candidates
+            if other.name in dict(candidate.equivalents)
+            and (other.slot != candidate.slot or other.index == candidate.index)
+        ]
 
     def indices(self, candidate: Candidate) -> tuple[int, ...]:
         return tuple(self.names.index(name) for name in candidate.parameters)

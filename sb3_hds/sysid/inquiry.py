@@ -46,10 +46,10 @@ _LEAST_SHARE = 0.9
 # A later cause that takes away a smaller share of the error than this, of what the ones before took
 # away, may be no more than what their model is off by.
 _LEAST_OF_EARLIER = 0.01
-# Causes that are looked for, and candidates that are fitted to the end to settle the noise.
-_MOST, _FOR_NOISE = 3, 3
+# Causes that are looked for.
+_MOST = 3
 # How long to search.
-EFFORTS = {"full": Effort(16, 8, 256, 4, True), "quick": Effort(8, 4, 64, 2, False)}
+EFFORTS = {"full": Effort(12, 8, 256, 4, True), "quick": Effort(8, 4, 64, 2, False)}
 # Errors that nobody minds, in shares of a channel's spread: no simulation is exact, and a finding
 # must matter.
 _IRRELEVANT = 5e-3
@@ -168,12 +168,13 @@ class Inquiry:
             if (chance := self._chance(best, base, found)) >= _FAMILY_LEVEL / (1 + len(found)):
                 self.turned_down[best.candidate.key] = CHANCE
                 break
-            others = self.search.alternatives(best, tried, base)
+            rivals = [*tried, *self.search.relatives(best, tried, base)]
+            others = self.search.alternatives(best, rivals, base)
             verdict = self.search.confirmed(best.kept, base.kept)
             found.append(Accepted(best, verdict, others, chance))
             own = self.hypotheses.indices(best.candidate)
             base = Base(best.point, best.kept, (*base.free, *own))
-        found, base = self._pruned(found, base)
+            found, base = self._pruned(found, base)
         before = left = self._left(start)
         if found:
             left = self._left(base)
@@ -183,13 +184,14 @@ class Inquiry:
                 left = before if before.remainder is not None else left
         rejected = [pair for pair in rejected if pair[0].key not in _keys(found)]
         self._set_noise(base.point)
+        start, base = map(self.search.again, (start, base))
         return self._told(found, rejected, start, base, before, left)
 
     def _determined(self, tried: Tried, base: Base) -> bool:
         """Whether the interval of some parameter leaves out the value at which nothing changes."""
         half, own = self.search.select, list(self.hypotheses.indices(tried.candidate))
         free = [*base.free, *own]
-        stderr = standard_errors(half.evidence, half.unit, tried.point, free)[own]
+        stderr = standard_errors(half, tried.point, free)[own]
         moved = np.abs(tried.point.theta - self.hypotheses.null)[own]
         if not (sure := bool((moved > margin(len(np.unique(half.unit)), stderr)).any())):
             self.turned_down[tried.candidate.key] = UNCERTAIN
@@ -224,8 +226,8 @@ class Inquiry:
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
         self._set_noise(base.point)
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
-        tried = self.search.finalists(base, [], most=_FOR_NOISE)
-        self._set_noise(min((base.point, *(t.point for t in tried)), key=lambda p: p.cost))
+        points = [base.point, *(point for _, point in self.search.glances(base, [])[:1])]
+        self._set_noise(min(points, key=lambda p: np.mean((p.raw / self.search.noise) ** 2)))
 
     def _set_noise(self, point: Point) -> None:
         noise = np.mean(point.raw**2, (0, 1)) + (_IRRELEVANT * self.spread) ** 2
@@ -264,8 +266,11 @@ class Inquiry:
         before: _Left,
         left: _Left,
     ) -> Diagnosis:
-        select, confirm, theta = self.search.select, self.search.confirm, base.point.theta
-        findings = tuple(finding(one, self.search, base) for one in found)
+        select, confirm = self.search.select, self.search.confirm
+        every, point = self.search.whole(base)
+        findings = tuple(
+            finding(one, every, point, base.free, self.effort.profiles) for one in found
+        )
         verdict = "none"
         if findings:
             verdict = "ambiguous" if findings[0].alternatives else "named"
@@ -288,7 +293,7 @@ class Inquiry:
                 *self.moved,
                 *look_alike(found, select, base),
             ),
-            twin=self.hypotheses.extended_by(_keys(found), theta).at_interval(
+            twin=self.hypotheses.extended_by(_keys(found), point.theta).at_interval(
                 self.believed.dt, self.believed.substeps
             ),
             data_hash=self.data_hash,

@@ -7,9 +7,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from rich.progress import track
 
-from sb3_hds.sysid.comparison import Comparison, confirm, effective_size
+from sb3_hds.sysid.comparison import Comparison, by_scores, confirm, effective_size
 from sb3_hds.sysid.evidence import Evidence, Point, in_threads
 from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
+from sb3_hds.sysid.imitation import imitators
+from sb3_hds.sysid.shooting import Shots
 
 # What confirms a candidate: by which share the mean square error of held-out recordings falls, at
 # which level, and by how much the information criterion of the others.
@@ -29,8 +31,9 @@ _FARTHEST = 10.0
 _FLAT, _RANK = 1e-15, 1e-9
 # Mean square error of a window that cannot be simulated, in units of the noise.
 _NOT_FINITE = 1e8
-# Steps of fits to the end, and of start states alone: to the end, and for a rough comparison.
-_ALL_STEPS, _KEPT_STEPS, _ROUGH_STEPS = 25, 6, 3
+# Steps of fits to the end, and of start states alone: to the end, for a rough comparison, and to
+# see whether it is better farther away.
+_ALL_STEPS, _KEPT_STEPS, _ROUGH_STEPS, _FEW_STEPS = 25, 6, 1, 2
 
 _Given = TypeVar("_Given")
 _Told = TypeVar("_Told")
@@ -101,6 +104,16 @@ class _Guess(NamedTuple):
     blind: bool
 
 
+class _Beginning(NamedTuple):
+    """
+    :param gain: by which the cost is lower there, or one Newton step from there promises
+    :param theta: where to begin a fit, shape ``(p,)``
+    """
+
+    gain: float
+    theta: Float[np.ndarray, " p"]
+
+
 class Effort(NamedTuple):
     """
     :param guessed: candidates that one Newton step must favour to be fitted at all
@@ -131,6 +144,7 @@ class Search:
         self.select, self.confirm, self.effort, self.progress = select, confirm, effort, progress
         self._reached: dict[str, np.ndarray] = {}
         self._far: set[str] = set()
+        self._beginnings: dict[tuple[str, ...], dict[str, _Beginning]] = {}
 
     @property
     def hypotheses(self) -> Hypotheses:
@@ -151,13 +165,27 @@ class Search:
         point = self.select.evidence.fit(theta, free)
         return Base(point, self.confirm.evidence.fit(point.theta, ()), tuple(free))
 
-    def finalists(
-        self, base: Base, accepted: Sequence[str], most: int | None = None
-    ) -> list[Tried]:
+    def again(self, base: Base) -> Base:
+        """:return: the same belief, fitted under the noise that is known now"""
+        point, kept = base.point, base.kept
+        point = self.select.evidence.fit(point.theta, base.free, point.offsets)
+        kept = self.confirm.evidence.fit(point.theta, (), kept.offsets)
+        return Base(point, kept, base.free)
+
+    def whole(self, base: Base) -> tuple[Half, Point]:
+        """:return: all evidence, and what is believed fitted to it"""
+        pair = self.select, self.confirm
+        shots = (half.evidence.shots for half in pair)
+        shots = Shots(*map(np.concatenate, zip(*shots, strict=True)))
+        unit = np.concatenate([half.unit for half in pair])
+        every = Half(self.select.evidence.on(shots), unit, self.select.irrelevant)
+        offsets = np.concatenate([base.point.offsets, base.kept.offsets])
+        return every, every.evidence.fit(base.point.theta, base.free, offsets)
+
+    def glances(self, base: Base, accepted: Sequence[str]) -> list[tuple[Candidate, Point]]:
         """
         :param accepted: keys of candidates that belong to what is believed
-        :param most: candidates that are fitted to the end; default: as many as the effort says
-        :return: the most promising candidates, best first
+        :return: promising candidates, fitted roughly on a sample of windows, best first
         """
         left = [c for c in self.hypotheses.candidates if c.key not in accepted]
         sample = self._sample()
@@ -166,7 +194,8 @@ class Search:
         if len(sample) < evidence.shots.n:
             evidence = evidence.on(type(evidence.shots)(*(x[sample] for x in evidence.shots)))
 
-        guesses = self._guessed(left, base.free, first, evidence)
+        known = self._beginnings.setdefault(tuple(accepted), {})
+        guesses = self._guessed(left, base.free, first, evidence, known)
         for candidate, guess in zip(left, guesses, strict=True):
             self._reached.setdefault(candidate.key, guess.theta)
             if guess.blind:
@@ -187,6 +216,18 @@ class Search:
         ranked = sorted(zip(likely, points, strict=True), key=lambda pair: pair[1].cost)
         for candidate, point in ranked:
             self._reached[candidate.key] = point.theta
+        return ranked
+
+    def finalists(self, base: Base, accepted: Sequence[str]) -> list[Tried]:
+        """
+        :param accepted: keys of candidates that belong to what is believed
+        :return: the most promising candidates, fitted to the end, best first
+        """
+        ranked = self.glances(base, accepted)
+        return self.finished([candidate for candidate, _ in ranked[: self.effort.finalists]], base)
+
+    def finished(self, candidates: Sequence[Candidate], base: Base) -> list[Tried]:
+        """:return: these candidates, fitted to the end, best first"""
 
         def finish(candidate: Candidate) -> Tried:
             point = self._continued(candidate, base)
@@ -195,9 +236,19 @@ class Search:
             kept = half.fit(point.theta, (), offsets, _KEPT_STEPS)
             return Tried(candidate, point, kept, self._criterion(candidate, point, base.point))
 
-        best = [candidate for candidate, _ in ranked[: most or self.effort.finalists]]
-        tried = self._each(finish, best, f"fitting the {len(best)} most likely")
+        tried = self._each(finish, candidates, f"fitting {len(candidates)} likely causes")
         return sorted(tried, key=lambda t: -t.criterion)
+
+    def relatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> list[Tried]:
+        """
+        :return: what looks like the best candidate, by declaration or in these windows, and was not
+            fitted to the end yet
+        """
+        done = {t.candidate.key for t in tried}
+        alike = imitators(self.select.evidence, best.point, best.candidate, base.free)
+        names = {c.key for c in self.hypotheses.related(best.candidate)} | set(alike)
+        left = [c for c in self.hypotheses.candidates if c.key in names - done]
+        return self.finished(left, base)
 
     def others(self, base: Base, tried: Sequence[Tried]) -> list[tuple[Candidate, Comparison]]:
         """:return: candidates that were no finalists, as they were left, on the other half"""
@@ -224,7 +275,7 @@ class Search:
         first = simplest = tried[0]
         for other in tried[1:]:
             fewer = len(other.candidate.parameters) < len(simplest.candidate.parameters)
-            as_good = self.confirmed(simplest.kept, other.kept).p_value > _LEVEL_OF_SET
+            as_good = self.better(simplest.kept, other.kept).p_value > _LEVEL_OF_SET
             if fewer and other.criterion >= LEAST_BIC and as_good:
                 simplest = other
         for one in (simplest, first):
@@ -238,7 +289,7 @@ class Search:
         for other in tried:
             if other is best or len(other.candidate.parameters) > len(best.candidate.parameters):
                 continue
-            worse = self.confirmed(best.kept, other.kept)
+            worse = self.better(best.kept, other.kept)
             same = worse.p_value > _LEVEL_OF_SET or worse.gain < _SAME
             if same and passes(self.confirmed(other.kept, base.kept)):
                 found.append(other.candidate.key)
@@ -252,15 +303,30 @@ class Search:
         without = self.base(theta, [i for i in base.free if i not in own])
         return passes(self.confirmed(base.kept, without.kept))
 
-    def confirmed(self, new: Point, old: Point) -> Comparison:
+    def better(self, new: Point, old: Point) -> Comparison:
         """:return: whether one is better than another, both on the half that confirms"""
         half = self.confirm
         return confirm(half.errors(new), half.errors(old), half.unit)
 
+    def confirmed(self, new: Point, old: Point) -> Comparison:
+        """:return: as ``better``, of a model and one that it contains"""
+        verdict = self.better(new, old)
+        by_score = by_scores(new.raw / self.noise, old.raw / self.noise, self.confirm.unit)
+        return verdict._replace(p_value=min(verdict.p_value, by_score))
+
     def _guessed(
-        self, candidates: Sequence[Candidate], free: Sequence[int], base: Point, evidence: Evidence
+        self,
+        candidates: Sequence[Candidate],
+        free: Sequence[int],
+        base: Point,
+        evidence: Evidence,
+        known: dict[str, _Beginning],
     ) -> list[_Guess]:
-        """What one Newton step promises, and where it leads; elsewhere if that is no guide."""
+        """
+        What one Newton step promises, and where it leads; elsewhere if that is no guide.
+
+        :param known: beginnings elsewhere, found before; new ones are added
+        """
         h, slopes = self.hypotheses, evidence.slopes(base)
         curvature, score = slopes.curvature.sum(0), slopes.scores.sum(0)
         flat = np.diag(curvature) < _FLAT * base.raw.size
@@ -273,17 +339,48 @@ class Search:
             own = list(h.indices(candidate))
             step, gain = _newton(curvature, score, [*free, *own], room)
             theta, blind = base.theta + h.scale * step, bool(flat[own].any())
-            if blind:
+            if candidate.key in h.starts:
+                if candidate.key not in known:
+                    known[candidate.key] = self._of_starts(candidate, free, base, evidence)
+                gain, theta, blind = known[candidate.key].gain, known[candidate.key].theta, False
+            elif blind:
                 theta = self._away(candidate, base, _AWAY)
             elif h.remembers(candidate):
-                # The first bit of a gap says little about a whole one.
-                farther = [self._away(candidate, base, distance) for distance in _DISTANCES]
-                there = [evidence.fit(x, free, base.offsets, self.effort.steps) for x in farther]
-                costs = [point.cost for point in there]
-                if blind := min(costs) < base.cost - gain:
-                    theta = farther[int(np.argmin(costs))]
+                if candidate.key not in known:
+                    known[candidate.key] = self._farther(candidate, free, base, evidence)
+                if blind := known[candidate.key].gain > gain:
+                    theta = known[candidate.key].theta
             found.append(_Guess(gain, theta, blind))
         return found
+
+    def _farther(
+        self, candidate: Candidate, free: Sequence[int], base: Point, evidence: Evidence
+    ) -> _Beginning:
+        """The first bit of a gap says little about a whole one."""
+        places = [self._away(candidate, base, distance) for distance in _DISTANCES]
+        costs = [evidence.fit(x, free, base.offsets, _FEW_STEPS).cost for x in places]
+        return _Beginning(base.cost - min(costs), places[int(np.argmin(costs))])
+
+    def _of_starts(
+        self, candidate: Candidate, free: Sequence[int], base: Point, evidence: Evidence
+    ) -> _Beginning:
+        """The start from which one Newton step of what has a slope there promises most."""
+        h, found = self.hypotheses, []
+        for start in h.starts[candidate.key]:
+            own = [i for i in h.indices(candidate) if h.names[i] not in start]
+            theta = base.theta.copy()
+            theta[[h.names.index(name) for name in start]] = list(start.values())
+            index = [*free, *own]
+            slopes = evidence.slopes(base._replace(theta=theta), index)
+            room = tuple(
+                sign * np.clip(sign * (bound - theta)[index] / h.scale[index], 0.0, _FARTHEST)
+                for sign, bound in ((-1.0, h.lower), (1.0, h.upper))
+            )
+            every = list(range(len(index)))
+            step, gain = _newton(slopes.curvature.sum(0), slopes.scores.sum(0), every, room)
+            theta[index] += h.scale[index] * step
+            found.append(_Beginning(gain, theta))
+        return max(found, key=lambda one: one.gain)
 
     def _away(self, candidate: Candidate, base: Point, distance: float) -> np.ndarray:
         h, own = self.hypotheses, list(self.hypotheses.indices(candidate))

@@ -1,6 +1,7 @@
 """How large a parameter is on a given machine: a servo and an axis of 100 kg share a catalogue."""
 
 import dataclasses
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,27 +24,51 @@ _OF_RANGE = 0.1
 _NOTHING = 1e-15
 
 
+class _Moved(NamedTuple):
+    """Largest speed, excursion and torque of each joint; no torque where inertias are unknown."""
+
+    speeds: np.ndarray
+    excursions: np.ndarray
+    torques: np.ndarray
+
+
 def sized(evidence: Evidence, data: Trajectories) -> Hypotheses:
     """
     :param evidence: windows, with the spread of each channel as its noise
-    :return: the hypotheses, with a scale for each parameter that these windows can see
+    :return: the hypotheses, with a scale for each parameter that these windows can see, and with
+        starts for searches that need several
     """
     h = evidence.hypotheses
     point = evidence.fit(h.null, ())
     curvature = np.diag(evidence.slopes(point).curvature.sum(0))
     seen = curvature > _NOTHING * point.raw.size
-    scale = np.where(seen, h.scale, _unseen(h, data))
+    moved = _motion(h, data)
+    scale = np.where(seen, h.scale, _unseen(h, data, moved))
     scale[seen] *= _SHARE * np.sqrt(point.raw.size / curvature[seen])
     # Without a slope a parameter may be a switch, which a tenth of its range does not turn.
     most = np.where(seen, _OF_RANGE, 1.0) * (h.upper - h.lower)
-    return dataclasses.replace(h, scale=np.minimum(scale, most))
+    return dataclasses.replace(h, scale=np.minimum(scale, most), starts=_starts(h, moved))
 
 
-def _unseen(h: Hypotheses, data: Trajectories) -> Float[np.ndarray, " p"]:
+def _starts(h: Hypotheses, moved: _Moved) -> dict[str, tuple[dict[str, float], ...]]:
+    found = {}
+    for candidate in h.candidates:
+        effect, excursion = h.effect_of(candidate), 0.0
+        if candidate.slot == "joint":
+            excursion = float(moved.excursions[candidate.index])
+        if effect is not None and excursion > 0.0 and (starts := effect.starts(excursion)):
+            found[candidate.key] = tuple(
+                {f"{candidate.key}.{name}": value for name, value in start.items()}
+                for start in starts
+            )
+    return found
+
+
+def _unseen(h: Hypotheses, data: Trajectories, moved: _Moved) -> Float[np.ndarray, " p"]:
     """Scales of what has no slope at its null, by the unit: a limit, a speed, a place, a spring."""
     scale = h.scale.copy()
     commands = np.abs(data.actions).max((0, 1)) if data.n_act else np.zeros(0)
-    speeds, excursions, torques = _motion(h, data)
+    speeds, excursions, torques = moved
     with np.errstate(divide="ignore", invalid="ignore"):
         springs = torques / (_STRETCH * excursions)
     for candidate in h.candidates:
@@ -66,13 +91,12 @@ def _unseen(h: Hypotheses, data: Trajectories) -> Float[np.ndarray, " p"]:
     return scale
 
 
-def _motion(h: Hypotheses, data: Trajectories) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Largest speed, excursion and torque of each joint; no number where inertias are unknown."""
+def _motion(h: Hypotheses, data: Trajectories) -> _Moved:
     parts = [motion_of(h.believed, data.episode(i)[0][None], data.dt) for i in range(len(data))]
     q, v = (np.concatenate([part[k][0] for part in parts]) for k in (0, 1))
     change = np.concatenate([np.diff(part[1][0], axis=0) for part in parts]) / data.dt
     speeds, faster = (np.quantile(np.abs(x), 0.98, axis=0) for x in (v, change))
-    return speeds, q.max(0) - q.min(0), faster * _inertias(h.believed, q[0])
+    return _Moved(speeds, q.max(0) - q.min(0), faster * _inertias(h.believed, q[0]))
 
 
 def _inertias(twin: Twin, q: np.ndarray) -> np.ndarray:

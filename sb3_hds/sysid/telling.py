@@ -6,13 +6,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from sb3_hds.sysid.account import imitators, standard_errors
+from sb3_hds.sysid.account import standard_errors
 from sb3_hds.sysid.comparison import Comparison
 from sb3_hds.sysid.diagnosis import Finding
+from sb3_hds.sysid.evidence import Point
+from sb3_hds.sysid.imitation import imitators
 from sb3_hds.sysid.profile import profiled
 from sb3_hds.sysid.remainder import Remainder
 from sb3_hds.sysid.results import Estimate
-from sb3_hds.sysid.search import LEAST_GAIN, LEVEL, Base, Half, Search, Tried
+from sb3_hds.sysid.search import LEAST_GAIN, LEVEL, Base, Half, Tried
 
 #: why a candidate was turned down that predicts better
 UNCERTAIN, SMALL, CHANCE = "has no certain size", "is small beside the others", "may be chance"
@@ -33,15 +35,21 @@ class Accepted(NamedTuple):
     chance: float
 
 
-def finding(one: Accepted, search: Search, base: Base) -> Finding:
+def finding(
+    one: Accepted, half: Half, point: Point, free: Sequence[int], profiles: bool
+) -> Finding:
     """
-    :param base: what is believed in the end, this cause among it
+    :param half: all evidence: what was confirmed is fitted to the whole of it
+    :param point: what is believed in the end, this cause among it, fitted to that
+    :param free: indices of what was fitted
+    :param profiles: whether intervals follow the likelihood, or are symmetric
     """
-    h, half, theta = search.hypotheses, search.select, base.point.theta
-    stderr = standard_errors(half.evidence, half.unit, base.point, base.free)
+    h, theta = half.evidence.hypotheses, point.theta
+    stderr = standard_errors(half, point, free)
+    reach = margin(len(np.unique(half.unit)), stderr)
     candidate, parameters = one.tried.candidate, {}
     for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
-        low, high = _interval(search, base, i, float(margin(one.verdict.n_units, stderr[i])))
+        low, high = _interval(half, point, free, i, float(reach[i]), profiles)
         parameters[name.rpartition(".")[2]] = Estimate(
             name=name,
             estimate=float(theta[i]),
@@ -75,7 +83,7 @@ def look_alike(found: Sequence[Accepted], half: Half, base: Base) -> list[str]:
     for one in found:
         own = half.evidence.hypotheses.indices(one.tried.candidate)
         rest = [i for i in base.free if i not in own]
-        alike = imitators(half, base.point, one.tried.candidate, rest)
+        alike = imitators(half.evidence, base.point, one.tried.candidate, rest)
         alike = [name for name in alike if name not in one.alternatives]
         if alike:
             sentences.append(
@@ -104,9 +112,11 @@ def in_words(left: Remainder) -> str:
     )
 
 
-def _interval(search: Search, base: Base, index: int, half: float) -> tuple[float, float]:
-    """:param half: half the width of the symmetric interval"""
-    h, best = search.hypotheses, float(base.point.theta[index])
-    if search.effort.profiles:
-        return profiled(search.select.evidence, base.point, base.free, index, half)
-    return max(best - half, float(h.lower[index])), min(best + half, float(h.upper[index]))
+def _interval(
+    half: Half, point: Point, free: Sequence[int], index: int, reach: float, profiles: bool
+) -> tuple[float, float]:
+    """:param reach: half the width of the symmetric interval"""
+    h, best = half.evidence.hypotheses, float(point.theta[index])
+    if profiles:
+        return profiled(half.evidence, point, free, index, reach)
+    return max(best - reach, float(h.lower[index])), min(best + reach, float(h.upper[index]))
