@@ -130,7 +130,7 @@ class Effect(abc.ABC):
 
     def starts(self, excursion: float) -> tuple[Mapping[str, float], ...]:
         """
-        :param excursion: how far the joint moves in the data [rad] or [m]
+        :param excursion: how far the joint moves in the data [rad] or [m], a turn at most
         :return: where a search may begin, for parameters that have no slope where nothing is wrong
             and many optima elsewhere: values by name; empty for effects that one start serves
         """

@@ -8,8 +8,8 @@ from scipy import stats
 
 from sb3_hds.core import Trajectories
 
-# Blocks into which recordings are cut where there are too few of them to be the units.
-_FEWEST_UNITS = 8
+# With fewer recordings, stretches of them are the units, about so many.
+_FEWEST_UNITS, _N_STRETCHES = 8, 16
 # Ratios of errors beyond this say no more.
 _MOST_RATIO = 1e6
 # By which factor the level of the test on windows is stricter than that on units.
@@ -166,7 +166,7 @@ def effective_size(raw: Float[np.ndarray, "n rows obs"]) -> float:
 def _in_blocks(origin: np.ndarray, recordings: np.ndarray) -> np.ndarray:
     """Stretches of recordings, about as many windows each."""
     unit, label = np.full(len(origin), -1), 0
-    n_blocks = -(-_FEWEST_UNITS // max(len(recordings), 1))
+    n_blocks = -(-_N_STRETCHES // max(len(recordings), 1))
     for recording in recordings:
         for rows in np.array_split(np.flatnonzero(origin == recording), n_blocks):
             if len(rows):

@@ -39,15 +39,16 @@ from sb3_hds.sysid.telling import (
 from sb3_hds.sysid.thinning import thinned
 from sb3_hds.sysid.timing import in_step
 
-# Length of a window [s], within these numbers of steps.
-_WINDOW, _SHORTEST, _LONGEST = 1.0, 8, 200
+# Length of a window [s], within these numbers of steps; it is half as long where there would be
+# fewer windows than that.
+_WINDOW, _SHORTEST, _LONGEST, _FEW = 1.0, 8, 200, 24
 # A cause that explains less than this share of what can be explained is not the cause.
 _LEAST_SHARE = 0.9
 # A later cause that takes away a smaller share of the error than this, of what the ones before took
 # away, may be no more than what their model is off by.
 _LEAST_OF_EARLIER = 0.01
-# Causes that are looked for.
-_MOST = 3
+# Causes that are looked for, and candidates that are fitted to the end to settle the noise.
+_MOST, _FOR_NOISE = 3, 3
 # How long to search.
 EFFORTS = {"full": Effort(12, 8, 256, 4, True), "quick": Effort(8, 4, 64, 2, False)}
 # Errors that nobody minds, in shares of a channel's spread: no simulation is exact, and a finding
@@ -58,7 +59,7 @@ _OF_IRRELEVANT = 0.18
 # Noise before it is known, in the same units.
 _FIRST_NOISE = 0.05
 # Parameters that a cause has at most, and fewer units of evidence than these cannot say anything.
-_WIDEST, _FEWEST_UNITS = 3, 4
+_WIDEST, _FEWEST_UNITS = 3, 6
 # Family-wise level of what selection proposes.
 _FAMILY_LEVEL = 0.05
 
@@ -107,10 +108,8 @@ class Inquiry:
         data, self.moved = in_step(twin, data)
         coarse, self.data, self.every = thinned(twin, data)
         self.hypotheses = Hypotheses.about(coarse, effects, calibrate)
-        self.spread, dt = spread_of(self.data), self.data.dt
-        steps = int(np.clip(round(_WINDOW / dt), _SHORTEST, _LONGEST))
-        longest = int(self.data.lengths.max())
-        self.shots, origin = shots_of(self.data, min(steps, longest), self.hypotheses.twin)
+        self.spread = spread_of(self.data)
+        self.shots, origin = shots_of(self.data, _window_of(self.data), self.hypotheses.twin)
         self.parts = split(self.data, origin, seed)
         self.effort, self.progress = EFFORTS[budget], progress
         self.turned_down: dict[str, str] = {}
@@ -178,7 +177,7 @@ class Inquiry:
         before = left = self._left(start)
         if found:
             left = self._left(base)
-            if _share(before, left) < _LEAST_SHARE:
+            if self._explained(found, start, base, before, left) < _LEAST_SHARE:
                 # Something is there, and this is not it.
                 found, base = [], start
                 left = before if before.remainder is not None else left
@@ -226,8 +225,9 @@ class Inquiry:
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
         self._set_noise(base.point)
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
-        points = [base.point, *(point for _, point in self.search.glances(base, [])[:1])]
-        self._set_noise(min(points, key=lambda p: np.mean((p.raw / self.search.noise) ** 2)))
+        likely = [candidate for candidate, _ in self.search.glances(base, [])[:_FOR_NOISE]]
+        tried = self.search.finished(likely, base)
+        self._set_noise(min((base.point, *(t.point for t in tried)), key=lambda p: p.cost))
 
     def _set_noise(self, point: Point) -> None:
         noise = np.mean(point.raw**2, (0, 1)) + (_IRRELEVANT * self.spread) ** 2
@@ -257,6 +257,26 @@ class Inquiry:
         predicted = 0.0 if found is None else unit * found.power
         return _Left(found, predicted, unit * power, missing)
 
+    def _explained(
+        self,
+        found: Sequence[Accepted],
+        start: Base,
+        base: Base,
+        before: _Left,
+        left: _Left,
+    ) -> float:
+        """
+        How much of what is wrong is explained: of the missing force, or, if a cause remembers, of
+        the error of whole windows, as windows so short hardly see what went on in it before.
+        """
+        share = _share(before, left)
+        if any(self.hypotheses.remembers(one.tried.candidate) for one in found):
+            half, noise = self.search.confirm, left.missing.noise / self.search.noise
+            floor = float(np.mean(noise**2)) * half.evidence.shots.n
+            wrong, rest = (half.total(point) - floor for point in (start.kept, base.kept))
+            share = max(share, 1.0 - rest / wrong if 0.0 < rest < wrong else float(rest <= 0.0))
+        return share
+
     def _told(
         self,
         found: Sequence[Accepted],
@@ -282,7 +302,7 @@ class Inquiry:
             findings=findings,
             unexplained="" if left.remainder is None else in_words(left.remainder),
             gain=by_horizon(confirm, start.kept, base.kept, self.every),
-            explained=_share(before, left) if findings else 0.0,
+            explained=self._explained(found, start, base, before, left) if findings else 0.0,
             detectable=detectable(select, start.point),
             rejected=tuple(
                 Rejected(one.key, c.gain, c.p_value, why(c, self.turned_down.get(one.key)))
@@ -308,6 +328,19 @@ def _share(before: _Left, left: _Left) -> float:
     """:return: of the missing force that can be predicted, how much is not missing any more"""
     gone = max(before.power - left.power, 0.0)
     return gone / (gone + left.predicted) if gone + left.predicted else 1.0
+
+
+def _window_of(data: Trajectories) -> int:
+    """:return: steps of a window, so that windows fill a typical recording"""
+    rows = int(np.median(data.lengths)) + 1
+    steps = min(int(np.clip(round(_WINDOW / data.dt), _SHORTEST, _LONGEST)), rows - 1)
+
+    def filling(steps: int) -> int:
+        return rows // max(round(rows / (steps + 1)), 1) - 1
+
+    whole = filling(steps)
+    few = np.sum((data.lengths + 1) // (whole + 1)) < _FEW
+    return filling(steps // 2) if few and steps >= 2 * _SHORTEST else whole
 
 
 def _keys(found: Sequence[Accepted]) -> list[str]:

@@ -1,7 +1,7 @@
 """Which candidate explains what is left: proposed on some windows, confirmed on others."""
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,6 +18,8 @@ from sb3_hds.sysid.shooting import Shots
 LEAST_GAIN, LEVEL, LEAST_BIC = 0.05, 0.025, 6.0
 # Another candidate belongs into the set unless it is worse than the best at this level.
 _LEVEL_OF_SET = 0.05
+# Candidates that may be confirmed, one after the other.
+_MOST_LOOKS = 3
 # Errors that differ by a smaller share are the same, however surely they differ.
 _SAME = 0.01
 # Where fits begin for which the slope at the null is no guide, in units of each parameter's scale.
@@ -31,10 +33,11 @@ _FARTHEST = 10.0
 _FLAT, _RANK = 1e-15, 1e-9
 # Mean square error of a window that cannot be simulated, in units of the noise.
 _NOT_FINITE = 1e8
-# Steps of fits to the end, and of start states alone: to the end, for a rough comparison, and to
-# see whether it is better farther away.
-_ALL_STEPS, _KEPT_STEPS, _ROUGH_STEPS, _FEW_STEPS = 25, 6, 1, 2
+# Steps of fits to the end, and of start states alone: to the end, and for a rough comparison.
+_ALL_STEPS, _KEPT_STEPS, _ROUGH_STEPS = 25, 6, 1
 
+#: values of parameters by full name, of candidates by key
+_Places: TypeAlias = dict[str, tuple[Mapping[str, float], ...]]
 _Given = TypeVar("_Given")
 _Told = TypeVar("_Told")
 
@@ -104,16 +107,6 @@ class _Guess(NamedTuple):
     blind: bool
 
 
-class _Beginning(NamedTuple):
-    """
-    :param gain: by which the cost is lower there, or one Newton step from there promises
-    :param theta: where to begin a fit, shape ``(p,)``
-    """
-
-    gain: float
-    theta: Float[np.ndarray, " p"]
-
-
 class Effort(NamedTuple):
     """
     :param guessed: candidates that one Newton step must favour to be fitted at all
@@ -144,7 +137,8 @@ class Search:
         self.select, self.confirm, self.effort, self.progress = select, confirm, effort, progress
         self._reached: dict[str, np.ndarray] = {}
         self._far: set[str] = set()
-        self._beginnings: dict[tuple[str, ...], dict[str, _Beginning]] = {}
+        # Of searches with several starts, the best one, by what is believed.
+        self._known: dict[tuple[str, ...], _Places] = {}
 
     @property
     def hypotheses(self) -> Hypotheses:
@@ -194,7 +188,7 @@ class Search:
         if len(sample) < evidence.shots.n:
             evidence = evidence.on(type(evidence.shots)(*(x[sample] for x in evidence.shots)))
 
-        known = self._beginnings.setdefault(tuple(accepted), {})
+        known = self._known.setdefault(tuple(accepted), {})
         guesses = self._guessed(left, base.free, first, evidence, known)
         for candidate, guess in zip(left, guesses, strict=True):
             self._reached.setdefault(candidate.key, guess.theta)
@@ -210,7 +204,9 @@ class Search:
             theta = first.theta.copy()
             theta[own] = self._reached[candidate.key][own]
             offsets = self._starts(candidate, theta, first.offsets, evidence)
-            return evidence.fit(theta, [*base.free, *own], offsets, self.effort.steps)
+            # The way is longer for what began elsewhere.
+            steps = self.effort.steps * (2 if candidate.key in self._far else 1)
+            return evidence.fit(theta, [*base.free, *own], offsets, steps)
 
         points = self._each(glance, likely, f"comparing {len(likely)} causes")
         ranked = sorted(zip(likely, points, strict=True), key=lambda pair: pair[1].cost)
@@ -268,19 +264,22 @@ class Search:
         :param tried: best first
         :param n_found: causes before this one: each makes the next harder to confirm
         :return: the candidate that selection prefers, if the other recordings confirm it; of two
-            that they confirm and that predict equally well, the one with fewer parameters
+            that they confirm and that predict equally well, the one with fewer parameters. Where
+            they do not, the next ones may be confirmed, each at half the level of the one before.
         """
-        if not tried or tried[0].criterion < LEAST_BIC:
+        likely = [t for t in tried if t.criterion >= LEAST_BIC]
+        if not likely:
             return None
-        first = simplest = tried[0]
-        for other in tried[1:]:
+        simplest = likely[0]
+        for other in likely[1:]:
             fewer = len(other.candidate.parameters) < len(simplest.candidate.parameters)
-            as_good = self.better(simplest.kept, other.kept).p_value > _LEVEL_OF_SET
-            if fewer and other.criterion >= LEAST_BIC and as_good:
+            if fewer and self.better(simplest.kept, other.kept).p_value > _LEVEL_OF_SET:
                 simplest = other
-        for one in (simplest, first):
-            if passes(self.confirmed(one.kept, base.kept), LEVEL / (1 + n_found)):
+        level = LEVEL / (1 + n_found)
+        for one in [simplest, *(t for t in likely if t is not simplest)][:_MOST_LOOKS]:
+            if passes(self.confirmed(one.kept, base.kept), level):
                 return one
+            level *= 0.5
         return None
 
     def alternatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
@@ -320,12 +319,12 @@ class Search:
         free: Sequence[int],
         base: Point,
         evidence: Evidence,
-        known: dict[str, _Beginning],
+        known: _Places,
     ) -> list[_Guess]:
         """
         What one Newton step promises, and where it leads; elsewhere if that is no guide.
 
-        :param known: beginnings elsewhere, found before; new ones are added
+        :param known: starts that were best before; those found now are added
         """
         h, slopes = self.hypotheses, evidence.slopes(base)
         curvature, score = slopes.curvature.sum(0), slopes.scores.sum(0)
@@ -340,47 +339,59 @@ class Search:
             step, gain = _newton(curvature, score, [*free, *own], room)
             theta, blind = base.theta + h.scale * step, bool(flat[own].any())
             if candidate.key in h.starts:
-                if candidate.key not in known:
-                    known[candidate.key] = self._of_starts(candidate, free, base, evidence)
-                gain, theta, blind = known[candidate.key].gain, known[candidate.key].theta, False
-            elif blind:
+                starts = known.get(candidate.key, h.starts[candidate.key])
+                tried = [self._from(start, candidate, free, base, evidence) for start in starts]
+                best = int(np.argmax([guess.gain for guess in tried]))
+                known[candidate.key] = (starts[best],)
+                found.append(tried[best])
+                continue
+            if blind:
                 theta = self._away(candidate, base, _AWAY)
             elif h.remembers(candidate):
-                if candidate.key not in known:
-                    known[candidate.key] = self._farther(candidate, free, base, evidence)
-                if blind := known[candidate.key].gain > gain:
-                    theta = known[candidate.key].theta
+                place = self._farther(candidate, free, base, evidence, gain)
+                theta, blind = (theta, False) if place is None else (place, True)
             found.append(_Guess(gain, theta, blind))
         return found
 
     def _farther(
-        self, candidate: Candidate, free: Sequence[int], base: Point, evidence: Evidence
-    ) -> _Beginning:
-        """The first bit of a gap says little about a whole one."""
-        places = [self._away(candidate, base, distance) for distance in _DISTANCES]
-        costs = [evidence.fit(x, free, base.offsets, _FEW_STEPS).cost for x in places]
-        return _Beginning(base.cost - min(costs), places[int(np.argmin(costs))])
+        self,
+        candidate: Candidate,
+        free: Sequence[int],
+        base: Point,
+        evidence: Evidence,
+        gain: float,
+    ) -> Float[np.ndarray, " p"] | None:
+        """
+        The first bit of a gap says little about a whole one.
 
-    def _of_starts(
-        self, candidate: Candidate, free: Sequence[int], base: Point, evidence: Evidence
-    ) -> _Beginning:
-        """The start from which one Newton step of what has a slope there promises most."""
-        h, found = self.hypotheses, []
-        for start in h.starts[candidate.key]:
-            own = [i for i in h.indices(candidate) if h.names[i] not in start]
-            theta = base.theta.copy()
-            theta[[h.names.index(name) for name in start]] = list(start.values())
-            index = [*free, *own]
-            slopes = evidence.slopes(base._replace(theta=theta), index)
-            room = tuple(
-                sign * np.clip(sign * (bound - theta)[index] / h.scale[index], 0.0, _FARTHEST)
-                for sign, bound in ((-1.0, h.lower), (1.0, h.upper))
-            )
-            every = list(range(len(index)))
-            step, gain = _newton(slopes.curvature.sum(0), slopes.scores.sum(0), every, room)
-            theta[index] += h.scale[index] * step
-            found.append(_Beginning(gain, theta))
-        return max(found, key=lambda one: one.gain)
+        :param gain: that a Newton step promises
+        :return: where it is better than that; None if nowhere
+        """
+        places = [self._away(candidate, base, distance) for distance in _DISTANCES]
+        there = [evidence.fit(x, free, base.offsets, self.effort.steps) for x in places]
+        costs = [point.cost for point in there]
+        return places[int(np.argmin(costs))] if min(costs) < base.cost - gain else None
+
+    def _from(
+        self,
+        start: Mapping[str, float],
+        candidate: Candidate,
+        free: Sequence[int],
+        base: Point,
+        evidence: Evidence,
+    ) -> _Guess:
+        """What one Newton step of what has a slope there promises."""
+        h, theta = self.hypotheses, _set(base.theta, self.hypotheses.names, start)
+        index = [*free, *(i for i in h.indices(candidate) if h.names[i] not in start)]
+        slopes = evidence.slopes(base._replace(theta=theta), index)
+        room = tuple(
+            sign * np.clip(sign * (bound - theta)[index] / h.scale[index], 0.0, _FARTHEST)
+            for sign, bound in ((-1.0, h.lower), (1.0, h.upper))
+        )
+        every = list(range(len(index)))
+        step, gain = _newton(slopes.curvature.sum(0), slopes.scores.sum(0), every, room)
+        theta[index] += h.scale[index] * step
+        return _Guess(gain, theta, False)
 
     def _away(self, candidate: Candidate, base: Point, distance: float) -> np.ndarray:
         h, own = self.hypotheses, list(self.hypotheses.indices(candidate))
@@ -438,6 +449,12 @@ def _newton(
             break
         moving = [i for i, kept in zip(moving, inside, strict=True) if kept]
     return step, -float(score @ step + 0.5 * step @ curvature @ step)
+
+
+def _set(theta: np.ndarray, names: Sequence[str], values: Mapping[str, float]) -> np.ndarray:
+    changed = theta.copy()
+    changed[[names.index(name) for name in values]] = list(values.values())
+    return changed
 
 
 def passes(verdict: Comparison, level: float = LEVEL) -> bool:

@@ -1,6 +1,7 @@
 """How large a parameter is on a given machine: a servo and an axis of 100 kg share a catalogue."""
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -55,7 +56,8 @@ def _starts(h: Hypotheses, moved: _Moved) -> dict[str, tuple[dict[str, float], .
     for candidate in h.candidates:
         effect, excursion = h.effect_of(candidate), 0.0
         if candidate.slot == "joint":
-            excursion = float(moved.excursions[candidate.index])
+            turn = 2.0 * math.pi if h.twin.joints[candidate.index].unit == "rad" else math.inf
+            excursion = min(float(moved.excursions[candidate.index]), turn)
         if effect is not None and excursion > 0.0 and (starts := effect.starts(excursion)):
             found[candidate.key] = tuple(
                 {f"{candidate.key}.{name}": value for name, value in start.items()}
