@@ -3,9 +3,11 @@ Rigs on MuJoCo's C engine, with effects planted that are computed here, not by t
 
 Each rig is one XML file, stepped every millisecond. Forces of effects go through MuJoCo's own
 damping, dry friction and springs where it has them, and otherwise through `qfrc_applied`, which is
-recomputed before each step; commands and measurements are changed on their way in and out.
+recomputed before each step; commands and measurements are changed on their way in and out. What
+parameters mean is what the catalogue says they mean; how they are computed is not.
 """
 
+import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -15,6 +17,11 @@ import mujoco
 import numpy as np
 
 _STEP = 0.001  # [s]
+# The engine's dry friction is a damper up to where it brakes at this time constant [s] and ratio.
+# Its default of 20 ms would let rigs creep: these are the hardest that its step bears.
+_DRY = (2.0 * _STEP, 1.0)
+# A recording that is not below this, in any channel, has diverged.
+_TOO_FAR = 1e4
 
 _HEAD = '<mujoco><option timestep="0.001" integrator="RK4" gravity="0 0 -9.81"/>'
 _PENDULUM = (
@@ -67,6 +74,13 @@ _AXIS_APART = (
 <inertial pos="0 0 0" mass="1.0" diaginertia="0.01 0.01 0.01"/></body></worldbody>"""
     + _TENDON
 )
+# The rod of Gymnasium's Pendulum-v1, which hangs at pi.
+_ROD = (
+    _HEAD.replace("9.81", "10")
+    + """<worldbody><body><joint name="hinge" axis="0 1 0"/>
+<inertial pos="0 0 0.5" mass="1.0" diaginertia="0.08333333333333333 0.08333333333333333 1e-12"/>
+</body></worldbody><actuator><motor joint="hinge"/></actuator></mujoco>"""
+)
 _AXIS = (
     _HEAD
     + """<worldbody><body><joint name="axis" type="slide" axis="1 0 0" damping="3"/>
@@ -84,9 +98,13 @@ class System:
     :param start: spread of the positions in which recordings begin
     :param dof: joints
     :param base: parameter of the twin that may be wrong, the body that it belongs to, and whether
-        it is the body's mass or its inertia
+        it grows with the body's mass or with its inertia, one to one
     :param apart: for the engine, where motor and load are two, with a place for what holds them
     :param inertia: of the rigid joint, where that is
+    :param damped: whether the twin has viscous friction of its own, which counts as load
+    :param dt: interval of the recordings [s]
+    :param rest: positions around which recordings begin; default: zero
+    :param seen: from positions and velocities, shape ``(n, 2 dof)``, to what is measured
     """
 
     xml: str
@@ -96,10 +114,18 @@ class System:
     base: tuple[str, int, str]
     apart: str = ""
     inertia: float = math.nan
+    damped: bool = True
+    dt: float = 0.02
+    rest: tuple[float, ...] = ()
+    seen: Callable[[np.ndarray], np.ndarray] = np.asarray
 
     @property
     def dof(self) -> int:
         return len(self.start)
+
+    @functools.cached_property
+    def around(self) -> np.ndarray:
+        return np.array(self.rest or (0.0,) * self.dof)
 
 
 SYSTEMS = {
@@ -114,16 +140,28 @@ SYSTEMS = {
     ),
     "cart_pole": System(
         _CART_POLE,
-        ("CartPole", {"gravity": 9.81, "cart_mass": 1.0, "pole_mass": 0.3, "half_length": 0.5}),
+        (
+            "CartPole",
+            {
+                "observe": "qv",
+                "substeps": 1,
+                "gravity": 9.81,
+                "cart_mass": 1.0,
+                "pole_mass": 0.3,
+                "half_length": 0.5,
+            },
+        ),
         (3.0,),
         (0.1, math.pi),
         ("cart_mass", 1, "mass"),
+        damped=False,
     ),
     "double_pendulum": System(
         _DOUBLE,
         (
             "DoublePendulum",
             {
+                "substeps": 1,
                 "mass1": 0.5,
                 "mass2": 0.4,
                 "length1": 0.3,
@@ -165,12 +203,29 @@ SYSTEMS = {
         2.0,
     ),
 }
+#: Pendulum-v1 in continuous time: its twin steps by Euler's rule, and is not to be blamed on
+#: friction
+EULER = System(
+    _ROD,
+    ("Pendulum", {}),
+    (1.5,),
+    (1.0,),
+    ("mass", 1, "mass"),
+    dt=0.05,
+    rest=(math.pi,),
+    seen=lambda rows: np.stack([np.cos(rows[:, 0]), np.sin(rows[:, 0]), rows[:, 1]], 1),
+)
 
 
-@dataclass
+class DivergedError(RuntimeError):
+    """What was planted is no machine that could be recorded."""
+
+
+@dataclass(frozen=True)
 class Planted:
     """
-    :param effect: name as in the catalogue, or of something that is not in it
+    :param effect: name as in the catalogue, or of something that is not in it; ``reversed_joint``
+        is a sign flip of all that measures a joint
     :param index: of the joint, the motor or the channel
     :param values: in its units
     """
@@ -182,6 +237,11 @@ class Planted:
 
 @dataclass
 class Moment:
+    """
+    :param motor: force of the motor on this joint
+    :param load: what gravity, Coriolis forces and the rig's own damping put on it
+    """
+
     q: float
     v: float
     motor: float
@@ -215,7 +275,7 @@ FORCES: dict[str, Callable[..., float]] = {
     "quadratic_drag": lambda at, c: -c * at.v * abs(at.v),
     "cubic_stiffness": lambda at, k3: -k3 * at.q**3,
     "cogging": lambda at, amplitude, period, phase: (
-        amplitude * math.sin(2.0 * math.pi * at.q / period + phase)
+        -amplitude * math.sin(2.0 * math.pi * (at.q - phase) / period)
     ),
     "constant_force": lambda at, tau_0: tau_0,
     # Not in the catalogue:
@@ -236,11 +296,24 @@ OUTSIDE = (
 )
 
 
+# In the order in which a command meets them.
+COMMANDS = (
+    "action_delay",
+    "dead_zone",
+    "torque_gain",
+    "directional_gain",
+    "saturation",
+    "motor_lag",
+)
+
+
 class Commands:
     """What happens to a command on its way in."""
 
     def __init__(self, planted: list[Planted]) -> None:
-        self.planted, self.lagged, self.past = planted, {}, {}
+        mine = (p for p in planted if p.effect in COMMANDS)
+        self.planted = sorted(mine, key=lambda p: COMMANDS.index(p.effect))
+        self.lagged, self.past = {}, {}
 
     def __call__(self, index: int, u: float) -> float:
         for p in self.planted:
@@ -256,10 +329,11 @@ class Commands:
             elif p.effect == "saturation":
                 u = float(np.clip(u, -v["limit"], v["limit"]))
             elif p.effect == "motor_lag":
-                share = 1.0 - math.exp(-_STEP / v["time_constant"])
-                self.lagged[index] = u = (
-                    self.lagged.get(index, 0.0) + (u - self.lagged.get(index, 0.0)) * share
-                )
+                before, slow = self.lagged.get(index, 0.0), v["time_constant"]
+                kept = math.exp(-_STEP / slow)
+                self.lagged[index] = u + (before - u) * kept
+                # What the motor does over the step, not where it arrives.
+                u += (before - u) * (1.0 - kept) * slow / _STEP
             elif p.effect == "action_delay":
                 queue = self.past.setdefault(index, [0.0] * round(v["delay"] / _STEP))
                 queue.append(u)
@@ -267,50 +341,61 @@ class Commands:
         return u
 
 
-COMMANDS = (
-    "torque_gain",
-    "directional_gain",
-    "dead_zone",
-    "saturation",
-    "motor_lag",
-    "action_delay",
-)
 TRANSMISSIONS: dict[str, Callable[..., str]] = {
     "joint_elasticity": lambda k, d: f'stiffness="{k}" damping="{d}"',
     "backlash": lambda gap: (
         f'limited="true" range="{-0.5 * gap} {0.5 * gap}" solreflimit="0.002 1"'
     ),
 }
-SENSORS = ("sensor_bias", "sensor_scale", "sensor_delay", "sign_flip")
+SENSORS = ("sensor_bias", "sensor_scale", "sensor_delay", "sign_flip", "reversed_joint")
+
+
+def can_change(system: System, change: float) -> bool:
+    """:return: whether the body that ``base`` names stays a body if it changes by so much"""
+    _, body, what = system.base
+    there = getattr(mujoco.MjModel.from_xml_string(system.xml), f"body_{what}")[body]
+    return bool(np.min(there) + change > 0.1 * np.min(there))
 
 
 def simulate(
     system: System,
     planted: list[Planted],
     *,
-    dt: float,
     n_recordings: int,
     n_steps: int,
     seed: int,
-    wrong_base: float = 1.0,
+    base_change: float = 0.0,
     disturbance: float = 0.0,
     excited: bool = True,
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """
-    :param wrong_base: factor by which a mass is not what the twin believes
+    :param base_change: by how much the parameter that ``base`` names is not what the twin believes
     :param disturbance: standard deviation of a coloured torque (correlated over 0.1 s), in units of
         the typical command
     :return: noiseless observations and commands of each recording
+    :raises DivergedError: if what was planted throws the rig out of the world
     """
+    model = modelled(system, planted, base_change)
+    rng = np.random.default_rng(seed)
+    found = [
+        _recording(model, system, planted, rng, n_steps, disturbance, excited)
+        for _ in range(n_recordings)
+    ]
+    return [system.seen(obs) for obs, _ in found], [actions for _, actions in found]
+
+
+def modelled(system: System, planted: list[Planted], base_change: float = 0.0) -> Any:
+    """:return: the engine's model, with what it can do by itself of what was planted"""
     xml = system.xml
     for p in planted:
         if p.effect in TRANSMISSIONS:
             xml = system.apart.format(hold=TRANSMISSIONS[p.effect](**p.values))
     model = mujoco.MjModel.from_xml_string(xml)
     _, body, what = system.base
-    getattr(model, f"body_{what}")[body] *= wrong_base
+    getattr(model, f"body_{what}")[body] += base_change
     # The engine keeps inertias of simple joints from when it read the file.
     mujoco.mj_setConst(model, mujoco.MjData(model))
+    model.dof_solref[:] = _DRY
     for p in planted:
         if p.effect == "viscous_friction":
             model.dof_damping[p.index] += p.values["b"]
@@ -319,13 +404,7 @@ def simulate(
         elif p.effect == "stiffness":
             model.jnt_stiffness[p.index] = p.values["k"]
             model.qpos_spring[p.index] = p.values["q0"]
-    rng = np.random.default_rng(seed)
-    per_step = round(dt / _STEP)
-    found = [
-        _recording(model, system, planted, rng, per_step, n_steps, disturbance, excited)
-        for _ in range(n_recordings)
-    ]
-    return [obs for obs, _ in found], [actions for _, actions in found]
+    return model
 
 
 def _recording(
@@ -333,50 +412,63 @@ def _recording(
     system: System,
     planted: list[Planted],
     rng: np.random.Generator,
-    per_step: int,
     n_steps: int,
     disturbance: float,
     excited: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
     data = mujoco.MjData(model)
+    data.qpos[:] = system.around
     if excited:
         # A motor that is apart begins where its load does.
-        data.qpos[:] = rng.uniform(-1.0, 1.0, system.dof) * np.array(system.start)
+        data.qpos[:] += rng.uniform(-1.0, 1.0, system.dof) * np.array(system.start)
+    mujoco.mj_forward(model, data)
     n_motors = len(system.torque)
     wander = rng.standard_normal((n_steps, n_motors)).cumsum(0) * 0.7
     actions = np.sin(wander + rng.uniform(0.0, 6.0, n_motors)) * np.array(system.torque)
     actions = actions if excited else np.zeros_like(actions)
-    commands = Commands([p for p in planted if p.effect in COMMANDS])
-    forces = [(p, {}) for p in planted if p.effect in FORCES]
-    rows, fine, push = [_state(data, system)], [_state(data, system)], np.zeros(system.dof)
+    commands, forces = Commands(planted), [(p, {}) for p in planted if p.effect in FORCES]
+    fine, push = [_state(data, system)], np.zeros(system.dof)
     size = disturbance * np.array([*system.torque, *system.torque])[: system.dof]
-    keep = math.exp(-_STEP / 0.1)
+    keep, per_step = math.exp(-_STEP / 0.1), round(system.dt / _STEP)
     for action in actions:
         for _ in range(per_step):
             data.ctrl[:] = [commands(i, u) for i, u in enumerate(action)]
             push = keep * push + math.sqrt(1.0 - keep**2) * size * rng.standard_normal(system.dof)
             data.qfrc_applied[: system.dof] = push if disturbance else 0.0
             for p, memory in forces:
-                i = p.index
-                motor = data.ctrl[i] if i < n_motors else 0.0
-                at = Moment(data.qpos[i], data.qvel[i], motor, data.qfrc_bias[i], data.time, memory)
-                data.qfrc_applied[i] += FORCES[p.effect](at, **p.values)
+                at = _moment(model, data, system, p.index, memory)
+                data.qfrc_applied[p.index] += FORCES[p.effect](at, **p.values)
             mujoco.mj_step(model, data)
             fine.append(_state(data, system))
-        rows.append(_state(data, system))
-    obs, fine = np.array(rows), np.array(fine)
-    for p in planted:
-        j = p.index
-        if p.effect == "sensor_bias":
-            obs[:, j] += p.values["bias"]
-        elif p.effect == "sensor_scale":
-            obs[:, j] *= p.values["scale"]
-        elif p.effect == "sign_flip":
-            obs[:, j] *= -1.0
-        elif p.effect == "sensor_delay":
-            late = np.arange(len(obs)) * per_step - round(p.values["delay"] / _STEP)
-            obs[:, j] = fine[np.maximum(late, 0), j]
-    return obs, actions
+    fine = np.array(fine)
+    # The engine starts again from rest where it cannot go on.
+    if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number or np.abs(fine).max() > _TOO_FAR:
+        raise DivergedError(", ".join(p.effect for p in planted))
+    return _measured(fine, planted, system, per_step), actions
+
+
+def _moment(model: Any, data: Any, system: System, i: int, memory: dict[str, float]) -> Moment:
+    motor = data.ctrl[i] if i < len(system.torque) else 0.0
+    own = model.dof_damping[i] * data.qvel[i] if system.damped else 0.0
+    return Moment(data.qpos[i], data.qvel[i], motor, data.qfrc_bias[i] + own, data.time, memory)
+
+
+def _measured(
+    fine: np.ndarray, planted: list[Planted], system: System, per_step: int
+) -> np.ndarray:
+    """What sensors make of the motion: they are late first, and then wrong."""
+    obs = fine[::per_step].copy()
+    for p in (p for p in planted if p.effect == "sensor_delay"):
+        late = np.arange(len(obs)) * per_step - round(p.values["delay"] / _STEP)
+        obs[:, p.index] = fine[np.maximum(late, 0), p.index]
+    turned = {"sign_flip": (0,), "reversed_joint": (0, system.dof)}
+    for p in (p for p in planted if p.effect in turned):
+        obs[:, [p.index + further for further in turned[p.effect]]] *= -1.0
+    for p in (p for p in planted if p.effect == "sensor_scale"):
+        obs[:, p.index] *= p.values["scale"]
+    for p in (p for p in planted if p.effect == "sensor_bias"):
+        obs[:, p.index] += p.values["bias"]
+    return obs
 
 
 def _state(data: Any, system: System) -> np.ndarray:

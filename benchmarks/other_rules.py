@@ -1,5 +1,7 @@
 """What simpler rules would have said of the same data: the peers of `hidden_effects.py`."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 # By how much an information criterion has to be lower, by common advice "very strong evidence".
@@ -11,10 +13,21 @@ _N_PRUNINGS = 10
 _HIDDEN, _N_STEPS, _RATE = 16, 400, 0.02
 
 
-def asked(inquiry) -> dict[str, str]:
+class Answer(NamedTuple):
+    """
+    :param name: empty for none; a network has no names, it says "?"
+    :param gain: share by which errors at the end of held-out windows fall; a network predicts
+        forces only, so nothing is known of them
+    """
+
+    name: str = ""
+    gain: float = 0.0
+
+
+def asked(inquiry) -> dict[str, Answer]:
     """
     :param inquiry: a `sb3_hds.sysid.inquiry.Inquiry` that has run
-    :return: by rule, the name that it gives; empty for none. A network has no names: it says "?".
+    :return: by rule, what it says
     """
     search, h = inquiry.search, inquiry.hypotheses
     start = search.base(h.null, h.nuisances)
@@ -32,7 +45,12 @@ def squares(search, point) -> float:
     return float(np.sum((point.raw / search.noise) ** 2))
 
 
-def by_bic(search, start, tried) -> str:
+def gain(search, start, kept) -> float:
+    before, after = (np.mean((x.raw[:, -1] / search.noise) ** 2) for x in (start.kept, kept))
+    return float(1.0 - after / before)
+
+
+def by_bic(search, start, tried) -> Answer:
     """The lowest Bayesian information criterion, every sample a piece of evidence."""
     n = start.point.raw.size
     before = squares(search, start.point)
@@ -42,16 +60,20 @@ def by_bic(search, start, tried) -> str:
         return lower - len(t.candidate.parameters) * np.log(n)
 
     best = max(tried, key=criterion)
-    return best.candidate.key if criterion(best) > _STRONG else ""
+    if criterion(best) <= _STRONG:
+        return Answer()
+    return Answer(best.candidate.key, gain(search, start, best.kept))
 
 
-def by_held_out(search, start, tried) -> str:
+def by_held_out(search, start, tried) -> Answer:
     """The lowest error on held-out recordings, if it is lower at all."""
     best = min(tried, key=lambda t: squares(search, t.kept))
-    return best.candidate.key if squares(search, best.kept) < squares(search, start.kept) else ""
+    if squares(search, best.kept) >= squares(search, start.kept):
+        return Answer()
+    return Answer(best.candidate.key, gain(search, start, best.kept))
 
 
-def by_parameters(search, h, start) -> str:
+def by_parameters(search, h, start) -> Answer:
     """Fit what the twin has; the parameter that moved most, in standard errors, is the cause."""
     from sb3_hds.sysid.account import standard_errors
 
@@ -59,18 +81,20 @@ def by_parameters(search, h, start) -> str:
     free = [*start.free, *own]
     fitted = search.base(start.point.theta, free)
     if not own or squares(search, fitted.kept) > 0.95 * squares(search, start.kept):
-        return ""
+        return Answer()
     stderr = standard_errors(search.select.evidence, search.select.unit, fitted.point, free)
     moved = np.abs(fitted.point.theta - h.null)[own] / np.maximum(stderr[own], 1e-300)
-    return f"parameter.{h.names[own[int(np.argmax(moved))]]}"
+    name = f"parameter.{h.names[own[int(np.argmax(moved))]]}"
+    return Answer(name, gain(search, start, fitted.kept))
 
 
-def by_regression(inquiry, start) -> str:
+def by_regression(inquiry, start) -> Answer:
     """Sequentially thresholded least squares (SINDy) of the missing force."""
     from sb3_hds.sysid.remainder import missing_force, weighed
 
     missing = missing_force(inquiry.search.select.evidence, start.point.theta, inquiry.data)
     twin, found = inquiry.hypotheses.twin, []
+    weights = weighed(missing._replace(force=np.ones_like(missing.force)))
     for j, joint in enumerate(twin.joints):
         q, v = missing.position[:, j], missing.velocity[:, j]
         columns = {
@@ -84,12 +108,18 @@ def by_regression(inquiry, start) -> str:
         for k, actuator in enumerate(twin.actuators):
             columns[f"torque_gain.{actuator.name}"] = missing.command[:, k]
         force = weighed(missing)[:, j]
-        matrix = np.stack(list(columns.values()), 1) * (force / missing.force[:, j])[:, None]
+        matrix = np.stack(list(columns.values()), 1) * weights[:, j, None]
         moved = _sparse(matrix, force)
         best = int(np.argmax(np.abs(moved)))
         if moved[best]:
             found.append((abs(moved[best]), list(columns)[best]))
-    return max(found)[1] if found else ""
+    if not found:
+        return Answer()
+    # What it names is then fitted as everything else is.
+    name, h = max(found)[1], inquiry.hypotheses
+    (chosen,) = (h.indices(c) for c in h.candidates if c.key == name)
+    fitted = inquiry.search.base(start.point.theta, [*start.free, *chosen])
+    return Answer(name, gain(inquiry.search, start, fitted.kept))
 
 
 def _sparse(matrix: np.ndarray, force: np.ndarray) -> np.ndarray:
@@ -110,7 +140,7 @@ def _sparse(matrix: np.ndarray, force: np.ndarray) -> np.ndarray:
     return moved
 
 
-def by_network(inquiry, start) -> str:
+def by_network(inquiry, start) -> Answer:
     """A network learns the missing force; something is wrong if it predicts any of the rest."""
     import torch
 
@@ -135,4 +165,5 @@ def by_network(inquiry, start) -> str:
         optimiser.step()
     with torch.no_grad():
         left = torch.sum((net(x[confirm]) - y[confirm]) ** 2)
-    return "?" if left < torch.sum(y[confirm] ** 2) else ""
+    better = bool(left < torch.sum(y[confirm] ** 2))
+    return Answer("?", np.nan) if better else Answer()

@@ -1,64 +1,281 @@
 """
 Something is hidden in data of MuJoCo's engine, and `diagnose` must find it, or say that nothing is.
 
-What is hidden depends on ``SB3_HDS_SALT``: continuous integration draws a new number each time.
+What is hidden depends on ``SB3_HDS_SALT``: continuous integration draws a new number each time. The
+generator and the judge of names are tested first: a wrong truth would make any verdict look wrong.
 """
 
+import dataclasses
 import os
+from collections import Counter
 
+import hidden_cases
 import hidden_effects
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
 import pytest
+import same_cause
+from hidden_cases import NULLS, SHARES, believed, kind_of, nothing, sensed, spread
+from hidden_scores import prepared
+from independent_rigs import SYSTEMS, Planted, _moment, modelled, simulate
+from scipy.stats import binom
 
-# Twenty diagnoses take some ten minutes.
-pytestmark = [pytest.mark.expensive, pytest.mark.timeout(3600)]
+from sb3_hds import effects
 
 SALT = int(os.environ.get("SB3_HDS_SALT", "0"))
-N_CASES = 20
+#: kinds of the twenty cases
+KINDS = Counter({"effect": 12, "null": 2, NULLS[1]: 1, NULLS[2]: 1, "outside": 2, "pair": 1})
+KINDS["still"] = 1
+# Of so many runs of these tests, one may fail though every rate is what it has to be.
+RUNS = 200
+
+
+def with_change(system, change):
+    """The twin whose uncertain parameter is what the engine's is after a change."""
+    name = SYSTEMS[system].base[0]
+    twin = believed(system)
+    return twin.with_parameters(**{name: twin.values[name] + change})
+
+
+def somewhere(system):
+    """The engine in some state, and positions and velocities of all joints there."""
+    rig, rng = SYSTEMS[system], np.random.default_rng(3)
+    model = modelled(rig, [], hidden_cases.base_value(system) * 0.1)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = rng.uniform(-1.0, 1.0, (2, rig.dof))
+    data.ctrl[:] = rig.torque
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_ten_percent_wrong_is_ten_percent_of_what_the_twin_believes(system):
+    model, data = somewhere(system)
+    engine = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, engine)
+    twin = with_change(system, 0.1 * hidden_cases.base_value(system))
+    with jax.enable_x64(True):
+        believed_mass = twin.mass_matrix(jnp.asarray(data.qpos), twin.params)
+    np.testing.assert_allclose(believed_mass, engine, rtol=1e-6)  # single-precision parameters
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_the_planted_load_is_the_load_of_the_catalogue(system):
+    model, data = somewhere(system)
+    twin = with_change(system, 0.1 * hidden_cases.base_value(system))
+    with jax.enable_x64(True):
+        q, v = jnp.asarray(data.qpos), jnp.asarray(data.qvel)
+        load = twin.bias(q, v, twin.params)
+    for joint in range(SYSTEMS[system].dof):
+        moment = _moment(model, data, SYSTEMS[system], joint, {})
+        assert moment.load == pytest.approx(float(load[joint]), rel=1e-5, abs=1e-9)
+
+
+def end_of(system, *planted):
+    obs, _ = simulate(SYSTEMS[system], list(planted), n_recordings=1, n_steps=50, seed=5)
+    return obs[0]
+
+
+def test_a_late_sensor_keeps_its_bias():
+    late = end_of("pendulum", Planted("sensor_delay", 0, {"delay": 0.04}))
+    both = end_of(
+        "pendulum",
+        Planted("sensor_bias", 0, {"bias": 0.3}),
+        Planted("sensor_delay", 0, {"delay": 0.04}),
+    )
+    np.testing.assert_allclose(both[:, 0], late[:, 0] + 0.3)
+    np.testing.assert_allclose(late[2:, 0], end_of("pendulum")[:-2, 0])
+
+
+def test_a_reversed_joint_turns_position_and_velocity():
+    turned = end_of("furuta", Planted("reversed_joint", 1, {"flipped": 1.0}))
+    np.testing.assert_allclose(turned, end_of("furuta") * [1.0, -1.0, 1.0, -1.0])
+
+
+def test_dry_friction_of_the_engine_is_dry():
+    # Thrown with a speed of 1 m/s on a level axis without damping, the mass stops after m v / tau.
+    rig = dataclasses.replace(SYSTEMS["linear_axis"])
+    model = modelled(rig, [Planted("coulomb_friction", 0, {"tau_c": 4.0})])
+    model.dof_damping[:] = 0.0
+    data = mujoco.MjData(model)
+    data.qvel[0] = 1.0
+    while data.time < 0.45:
+        mujoco.mj_step(model, data)
+    assert data.qvel[0] == pytest.approx(1.0 - 0.45 * 4.0 / 2.0, abs=2e-3)
+    while data.time < 0.52:
+        mujoco.mj_step(model, data)
+    assert abs(data.qvel[0]) < 1e-3
+
+
+def test_an_encoder_rounds_to_its_tick():
+    true = np.linspace(-3.0, 3.0, 100_001)[:, None] * spread("pendulum")
+    seen = sensed(true, "pendulum", "tick", np.random.default_rng(0))
+    error = (seen - true).std(0) / spread("pendulum")
+    # Rounding is off by the tick over the square root of 12.
+    np.testing.assert_allclose(error, hidden_cases.NOISES["tick"], rtol=0.01)
+    assert len(np.unique(seen[:, 0])) < 1000
+
+
+def test_of_a_thousand_cases_each_kind_of_null_has_120():
+    wanted = hidden_effects.numbers(1000, list(hidden_cases.RIGS), None)
+    kinds = Counter(
+        kind_of(system, n)[0]
+        for system, cases in wanted.items()
+        if system in SYSTEMS
+        for n in cases
+    )
+    assert kinds == {kind: 10 * share for kind, share in SHARES.items()}
+    asked = Counter(
+        kind_of("pendulum", n)[0]
+        for n in wanted["pendulum"]
+        if kind_of("pendulum", n)[1] % hidden_cases.ASKED == 0
+    )
+    assert asked == {kind: -(-2 * share // hidden_cases.ASKED) for kind, share in SHARES.items()}
+
+
+def test_every_effect_is_planted():
+    names = {name for rig in SYSTEMS.values() for name in hidden_cases.plantable(rig)}
+    assert names == {kind.name for kind in effects.ALL} | {"reversed_joint", "parameter"}
+
+
+def test_every_declared_equivalence_has_a_condition():
+    declared = {frozenset((kind.name, other)) for kind in effects.ALL for other in kind.equivalents}
+    assert declared <= set(same_cause.CONDITIONS)
+
+
+def judged(effect, named, v, *, index=0, values=(), u=1.0, system="double_pendulum"):
+    """Whether names are right where one effect was planted and joints move at given velocities."""
+    planted = Planted(effect, index, dict(values))
+    case = dataclasses.replace(nothing(system, "1 %"), kind="effect", planted=(planted,))
+    v = np.stack([v, v], 1)
+    motion = np.concatenate([0.02 * np.cumsum(v, 0), v], 1)
+    same = same_cause.equals(case, motion, np.full_like(v, u), named, {})
+    return same_cause.right(";".join(case.truths), same, named[0])
+
+
+FORTH, BACK_AND_FORTH = np.full(400, 2.0), 2.0 * np.sin(np.arange(400) / 20.0)
+
+
+def test_a_name_is_right_at_its_place_only():
+    assert judged("viscous_friction", ["viscous_friction.joint1"], BACK_AND_FORTH)
+    assert not judged("viscous_friction", ["viscous_friction.joint2"], BACK_AND_FORTH)
+    assert not judged("constant_force", ["coulomb_friction.joint2"], FORTH)
+
+
+def test_equivalents_are_right_under_their_condition_only():
+    for one, other in (
+        ("constant_force", "coulomb_friction.joint1"),
+        ("viscous_friction", "directional_viscous_friction.joint1"),
+        ("dead_zone", "coulomb_friction.joint1"),
+    ):
+        assert judged(one, [other], FORTH), one
+        assert not judged(one, [other], BACK_AND_FORTH), one
+    for v_s, same in ((0.1, True), (1.0, False)):
+        values = {"tau_c": 0.1, "tau_s": 0.2, "v_s": v_s}
+        assert (
+            judged("stribeck_friction", ["coulomb_friction.joint1"], FORTH, values=values) is same
+        )
+
+
+def test_two_causes_may_be_one_by_another_name():
+    pair = ["coulomb_friction.joint1", "constant_force.joint1"]
+    assert judged("directional_coulomb_friction", pair, BACK_AND_FORTH)
+    assert not judged("directional_coulomb_friction", pair[:1], BACK_AND_FORTH)
+
+
+def test_a_lag_is_a_delay_where_commands_are_slow():
+    slow = np.sin(np.arange(400) / 10.0)
+    for delay, same in ((0.002, True), (0.15, False)):
+        named = ["motor_lag.motor1"]
+        assert (
+            judged("action_delay", named, FORTH, values={"delay": delay}, u=slow[:, None]) is same
+        )
+
+
+def chances(rates):
+    """How likely each number of misses is, where each case is missed at its own rate."""
+    found = np.ones(1)
+    for rate in rates:
+        found = np.convolve(found, (1.0 - rate, rate))
+    return found
+
+
+def allowed(rates):
+    """The most misses that one run in 200 exceeds by chance, if they come at these rates."""
+    beyond = 1.0 - np.cumsum(chances(rates))
+    return int(np.argmax(beyond <= 1.0 / RUNS))
+
+
+def test_allowed_misses_are_exceeded_once_in_two_hundred_runs():
+    for n, rate in ((4, 0.025), (12, 0.05), (20, 0.1)):
+        most = allowed([rate] * n)
+        assert binom.sf(most, n, rate) <= 1.0 / RUNS < binom.sf(most - 1, n, rate)
+    # Two of four and one of two would both have to be named, or two and two.
+    assert allowed([0.025] * 4 + [0.1] * 2) == 2
 
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory):
-    patch = pytest.MonkeyPatch()
-    patch.setattr(hidden_effects, "CACHE", tmp_path_factory.mktemp("cache"))
-    rows, case = [], 1_000_000 + 1000 * SALT
-    while len(rows) < N_CASES:
-        system = ("pendulum", "linear_axis")[case % 2]
-        row = hidden_effects.run(system, case, "quick", "1 %", most=10, rules=False)
-        rows += [row] if row else []
-        case += 1
-    patch.undo()
+    import pandas as pd
+
     print(f"SB3_HDS_SALT={SALT}")
-    return rows
+    patch = pytest.MonkeyPatch()
+    patch.setattr(hidden_cases, "CACHE", tmp_path_factory.mktemp("cache"))
+    rows = []
+    for place, kind in enumerate(KINDS.elements()):
+        system = ("pendulum", "linear_axis")[place % 2]
+        case = 1_000_000 + 1000 * SALT + place
+        rows.append(
+            hidden_effects.run(system, case, "quick", kind=kind, noise="1 %", most=10, rules=False)
+        )
+    patch.undo()
+    return prepared(pd.DataFrame(rows))
 
 
-def spoken(row):
-    return row["verdict"] in ("named", "ambiguous")
+def hidden(test):
+    """Twenty diagnoses take some ten minutes."""
+    return pytest.mark.expensive(pytest.mark.timeout(3600)(test))
 
 
+def told(rows):
+    return rows[["system", "case", "kind", "truth", "factor", "verdict", "set"]].to_string()
+
+
+@hidden
 def test_nothing_is_named_where_nothing_was_hidden(table):
-    nulls = [row for row in table if row["kind"].startswith("null")]
-    alarms = [row for row in nulls if spoken(row)]
-    # At most 2.5 % of nulls: two of seven are seen once in 80 runs.
-    assert len(alarms) <= 1, alarms
+    nulls = table[table["kind"].isin(NULLS)]
+    alarms = nulls[nulls["spoke"]]
+    assert len(alarms) <= allowed([0.025] * len(nulls)), told(alarms)
 
 
+@hidden
+def test_what_the_catalogue_does_not_hold_is_not_named(table):
+    nulls, outside = table[table["kind"].isin(NULLS)], table[table["kind"] == "outside"]
+    names = [*nulls["spoke"], *outside["spoke"]]
+    most = allowed([0.025] * len(nulls) + [0.1] * len(outside))
+    assert len(outside) and sum(names) <= most, told(outside)
+
+
+@hidden
 def test_names_are_right(table):
-    named = [row for row in table if row["kind"] == "effect" and spoken(row)]
-    wrong = [row for row in named if not hidden_effects.hit(row["truth"], row["set"])]
-    # At least 95 % of the sets: three of ten are missed once in 90 runs.
-    assert len(wrong) <= 2, wrong
+    said = table[(table["kind"] == "effect") & table["spoke"]]
+    wrong = said[~said["within"]]
+    # The second bound is what this test has always asked for.
+    assert len(wrong) <= min(allowed([0.05] * len(said)), 2), told(wrong)
 
 
+@hidden
 def test_what_shows_is_found(table):
-    clear = [
-        row
-        for row in table
-        if row["kind"] == "effect" and row["factor"] >= 4.0 and not row["disturbed"]
+    clear = table[
+        (table["kind"] == "effect") & (table["factor"] >= 4.0) & (table["disturbance"] == 0.0)
     ]
-    missed = [row for row in clear if not hidden_effects.hit(row["truth"], row["set"])]
-    assert len(missed) <= 1 + len(clear) // 4, missed
+    missed = clear[~clear["within"]]
+    assert len(missed) <= min(allowed([0.1] * len(clear)), 1 + len(clear) // 4), told(missed)
 
 
+@hidden
 def test_standing_still_says_nothing(table):
-    still = [row for row in table if row["kind"] == "still"]
-    assert all(row["verdict"] == "not_identifiable" for row in still)
+    still = table[table["kind"] == "still"]
+    assert len(still) and (still["verdict"] == "not_identifiable").all(), told(still)

@@ -1,0 +1,419 @@
+"""
+The cases of `hidden_effects.py`: what is planted where, how large, and what is recorded of it.
+
+Everything about a case follows from its system and its number. Kinds of cases, effects, sizes,
+noises and numbers of recordings are dealt like cards: each comes up in its share, not by chance.
+"""
+
+import dataclasses
+import functools
+import json
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from independent_rigs import (
+    COMMANDS,
+    EULER,
+    FORCES,
+    OUTSIDE,
+    SENSORS,
+    SYSTEMS,
+    TRANSMISSIONS,
+    DivergedError,
+    Planted,
+    System,
+    can_change,
+    simulate,
+)
+from runs import CACHE
+
+N_STEPS = 200
+#: errors of the sensors, root mean squares in units of each channel's spread; of an encoder, which
+#: rounds every channel to its tick, the square root of 12 times that: two hundred ticks or so to a
+#: turn. A rig's own electronics computes the velocities, so their ticks are no finer or coarser.
+NOISES = {"tick": 2e-3, "1 %": 0.01, "5 %": 0.05}
+#: kinds of cases, and how many of a hundred
+SHARES = {
+    "effect": 40,
+    "outside": 15,
+    "null": 12,
+    "null, disturbed": 12,
+    "null, wrong base": 12,
+    "pair": 6,
+    "still": 3,
+}
+NULLS = tuple(kind for kind in SHARES if kind.startswith("null"))
+#: Pendulum-v1's twin, which steps by Euler's rule, against the engine
+EULERS = "Euler's twin"
+RIGS: dict[str, System] = {**SYSTEMS, "pendulum_v1": EULER}
+#: of four cases of a kind, the one that other rules are asked about
+ASKED = 4
+PARAMETER = "parameter"
+# Effects that are planted at joints.
+JOINT = (
+    "viscous_friction",
+    "directional_viscous_friction",
+    "coulomb_friction",
+    "directional_coulomb_friction",
+    "stribeck_friction",
+    "load_dependent_friction",
+    "quadratic_drag",
+    "stiffness",
+    "cubic_stiffness",
+    "cogging",
+    "constant_force",
+)
+# Pairs that are hard to tell from one cause, planted at one place; the other half are any two.
+_CONFOUNDED = (
+    ("action_delay", "motor_lag"),
+    ("coulomb_friction", "constant_force"),
+    ("torque_gain", PARAMETER),
+)
+# Whether the base is 10 % wrong, and which disturbance there is, of single effects.
+_CONDITIONS = (
+    *((False, 0.0),) * 10,
+    *((True, 0.0),) * 4,
+    *((False, 0.02), (False, 0.05)) * 2,
+    *((True, 0.02), (True, 0.05)),
+)
+# How often a case that cannot be is drawn again, and for how long with the same effect.
+_TRIES, _SAME = 200, 20
+
+_Card = TypeVar("_Card")
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """
+    :param system: key of ``RIGS``
+    :param number: of the case
+    :param kind: key of ``SHARES``
+    :param planted: what is there and the twin does not know
+    :param factor: by how much it is larger than the smallest that would show; 0 for nothing
+    :param noise: key of ``NOISES``
+    :param recordings: their number
+    :param wrong_base: whether a parameter is wrong that nobody believes
+    :param base_change: by how much it is off, or its planted deviation
+    :param disturbance: coloured torque, in units of the typical command
+    :param asked: whether other rules are asked, too
+    """
+
+    system: str
+    number: int
+    kind: str
+    planted: tuple[Planted, ...]
+    factor: float
+    noise: str
+    recordings: int
+    wrong_base: bool
+    base_change: float
+    disturbance: float
+    asked: bool
+
+    @property
+    def truths(self) -> tuple[str, ...]:
+        """Names and places, as a diagnosis gives them; none for what it cannot name."""
+        if self.kind == "outside":
+            return ()
+        return tuple(name_of(planted, self.system) for planted in self.planted)
+
+    @property
+    def nuisances(self) -> tuple[str, ...]:
+        return (RIGS[self.system].base[0],) if self.wrong_base else ()
+
+
+def kinds(system: str) -> tuple[str, ...]:
+    """:return: of a hundred cases in a row; any number of first ones has nearly the right shares"""
+    if system not in SYSTEMS:
+        return (EULERS,) * 100
+    dealt: list[str] = []
+    for n in range(1, 101):
+        behind = {kind: share * n / 100 - dealt.count(kind) for kind, share in SHARES.items()}
+        dealt.append(max(behind, key=lambda kind: behind[kind]))
+    return tuple(dealt)
+
+
+def kind_of(system: str, number: int) -> tuple[str, int]:
+    """:return: kind of a case, and how many of this kind come before it"""
+    hundreds, place = divmod(number, 100)
+    dealt = kinds(system)
+    kind = dealt[place]
+    return kind, hundreds * dealt.count(kind) + dealt[:place].count(kind)
+
+
+def draw(
+    system: str, number: int, *, kind: str = "", noise: str = "", most: int = 20
+) -> tuple[Case, Any, np.ndarray]:
+    """
+    :param kind: instead of the one whose turn it is
+    :param noise: likewise
+    :param most: recordings
+    :return: the case, its data, and positions and velocities as they were, ``(n, 2 dof)``
+    """
+    turn = number
+    if not kind:
+        kind, turn = kind_of(system, number)
+    deal = functools.partial(_dealt, turn, system, kind)
+    factors = {"effect": (2.0, 4.0, 8.0), "pair": (2.0, 4.0, 8.0), "outside": (4.0, 8.0)}
+    noise = noise or deal("noise", ("tick", "tick", "1 %", "1 %", "5 %"))
+    wrong, disturbance = deal("condition", _CONDITIONS) if kind == "effect" else (False, 0.0)
+    case = Case(
+        system=system,
+        number=number,
+        kind=kind,
+        planted=(),
+        factor=deal("factor", factors.get(kind, (0.0,))),
+        noise=noise,
+        recordings=min(deal("recordings", (6, 8, 10, 14, 20)), most),
+        wrong_base=wrong or kind == "null, wrong base",
+        base_change=0.0,
+        disturbance=deal("disturbance", (0.02, 0.05)) if kind == "null, disturbed" else disturbance,
+        asked=turn % ASKED == 0 and kind != EULERS,
+    )
+    for again in range(_TRIES):
+        rng = np.random.default_rng([number, zlib.crc32(system.encode()), again])
+        changed = _planted(case, deal, rng, again)
+        if changed is None:
+            continue
+        try:
+            data, motion = recorded(changed, seed=int(rng.integers(2**31)))
+        except DivergedError:
+            continue
+        return changed, data, motion
+    raise RuntimeError(f"{system}, case {number}: nothing could be planted in {_TRIES} tries.")
+
+
+def _dealt(turn: int, system: str, kind: str, what: str, cards: Sequence[_Card]) -> _Card:
+    """A card of a pack that is shuffled anew when it has been dealt."""
+    pack, place = divmod(turn, len(cards))
+    label = zlib.crc32(f"{system}, {kind}, {what}".encode())
+    return cards[int(np.random.default_rng([label, pack]).permutation(len(cards))[place])]
+
+
+def _planted(case: Case, deal: Any, rng: np.random.Generator, again: int) -> Case | None:
+    """:return: the case with something planted, as its kind says; None if that cannot be"""
+    system, rig = case.system, RIGS[case.system]
+    chosen, index = (), None
+    if case.kind == "effect":
+        kind = deal("effect", plantable(rig)) if again < _SAME else rng.choice(plantable(rig))
+        chosen = (str(kind),)
+    elif case.kind == "pair":
+        chosen = deal("pair", (*_CONFOUNDED, *((),) * len(_CONFOUNDED)))
+        index = int(rng.integers(len(rig.torque))) if chosen else None
+        chosen = chosen or tuple(map(str, rng.choice(plantable(rig), 2, replace=False)))
+    apart = [kind for kind in chosen if kind in TRANSMISSIONS]
+    if len(apart) > 1 or (apart and PARAMETER in chosen):
+        return None
+    if apart or PARAMETER in chosen:
+        case = dataclasses.replace(case, wrong_base=False)
+    planted = tuple(_effect(case, kind, rng, index) for kind in chosen)
+    if case.kind == "outside":
+        planted = (_outside(case, deal("outside", OUTSIDE), rng),)
+    if not np.all(np.isfinite([value for p in planted for value in p.values.values()])):
+        return None
+    change = sum(p.values[rig.base[0]] for p in planted if p.effect.startswith(PARAMETER))
+    if case.wrong_base:
+        change = 0.1 * base_value(system) * float(rng.choice((-1.0, 1.0)))
+    if abs(change) > 0.7 * base_value(system) or not can_change(rig, change):
+        return None
+    return dataclasses.replace(case, planted=planted, base_change=change)
+
+
+def plantable(rig: System) -> tuple[str, ...]:
+    """:return: what can be planted in this rig"""
+    apart = tuple(TRANSMISSIONS) if rig.apart else ()
+    return (*JOINT, *COMMANDS, *SENSORS, *apart, PARAMETER)
+
+
+def slot_of(effect: str) -> str:
+    sensor = effect in SENSORS and effect != "reversed_joint"
+    return "actuator" if effect in COMMANDS else "channel" if sensor else "joint"
+
+
+def places_of(effect: str, system: str) -> Sequence[Any]:
+    twin = believed(system)
+    slots = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}
+    return slots[slot_of(effect)]
+
+
+def name_of(planted: Planted, system: str) -> str:
+    """:return: effect and place, as a diagnosis names them"""
+    if planted.effect.startswith(PARAMETER):
+        return planted.effect
+    effect = "sign_flip" if planted.effect == "reversed_joint" else planted.effect
+    return f"{effect}.{places_of(planted.effect, system)[planted.index].name}"
+
+
+def _effect(case: Case, kind: str, rng: np.random.Generator, index: int | None = None) -> Planted:
+    """One effect of the catalogue, so many times as large as what would have shown."""
+    system, rig, factor = case.system, RIGS[case.system], case.factor
+    limits, wide = smallest(case), spread(system)
+    side = float(rng.choice((-1.0, 1.0)))
+    if kind == PARAMETER:
+        base = rig.base[0]
+        size = limits.get(f"parameter.{base}", {}).get(base, np.nan)
+        return Planted(f"parameter.{base}", 0, {base: side * factor * size})
+    places = places_of(kind, system)
+    index = int(rng.integers(len(places))) if index is None else index
+    # How far a motor that is apart leads its load, or the load lags: in units of the noise.
+    lead = factor * 2.0 * NOISES[case.noise] * wide[index]
+    torque = rig.torque[min(index, len(rig.torque) - 1)]
+    found = limits.get(f"{kind}.{places[index].name}", {})
+    s = {name: factor * (size or np.nan) for name, size in found.items()}
+    values = {
+        "directional_viscous_friction": lambda: {"b_pos": 1.5 * s["b_pos"], "b_neg": 0.0},
+        "directional_coulomb_friction": lambda: {"tau_pos": 1.5 * s["tau_pos"], "tau_neg": 0.0},
+        "stribeck_friction": lambda: {
+            "tau_c": s["tau_c"],
+            "tau_s": 3.0 * s["tau_c"],
+            "v_s": 0.3 * wide[rig.dof + index],
+        },
+        "load_dependent_friction": lambda: {"tau_c": 0.3 * s["tau_c"], "mu": min(s["mu"], 0.9)},
+        "stiffness": lambda: {"k": s["k"], "q0": 0.3 * wide[index]},
+        "cogging": lambda: {
+            "amplitude": s["amplitude"],
+            "period": float(np.clip(wide[index], 0.1, 1.0)),
+            "phase": 0.3 * float(np.clip(wide[index], 0.1, 1.0)),
+        },
+        "constant_force": lambda: {"tau_0": side * s["tau_0"]},
+        "torque_gain": lambda: {"gain": max(1.0 + side * s["gain"], 0.3)},
+        "directional_gain": lambda: {"gain_pos": max(1.0 - s["gain_pos"], 0.3), "gain_neg": 1.0},
+        "saturation": lambda: {"limit": torque * (1.0 - 0.08 * factor)},
+        "sensor_bias": lambda: {"bias": side * s["bias"]},
+        "sensor_scale": lambda: {"scale": 1.0 + side * min(s["scale"], 0.3)},
+        "motor_lag": lambda: {"time_constant": min(s["time_constant"], 0.3)},
+        "action_delay": lambda: {"delay": _late(s["delay"])},
+        "sensor_delay": lambda: {"delay": _late(s["delay"])},
+        "joint_elasticity": lambda: {
+            "k": torque / lead,
+            "d": 0.2 * np.sqrt(torque / lead * 0.25 * rig.inertia),
+        },
+        "backlash": lambda: {"gap": lead},
+        "sign_flip": lambda: {"flipped": 1.0},
+        "reversed_joint": lambda: {"flipped": 1.0},
+    }.get(kind, lambda: s)
+    try:
+        sizes = {name: float(value) for name, value in values().items()}
+    except KeyError:
+        sizes = {}
+    # Of an effect that the diagnosis does not try here, no size is known.
+    return Planted(kind, index, sizes or {"size": np.nan})
+
+
+def _late(delay: float) -> float:
+    """A delay that the generator can make [s]: its steps are a millisecond."""
+    return max(round(min(delay, 0.15), 3), 0.001) if np.isfinite(delay) else np.nan
+
+
+def _outside(case: Case, kind: str, rng: np.random.Generator) -> Planted:
+    """Something that no catalogue holds, in units of what would show of its nearest relative."""
+    joints, limits = believed(case.system).joints, smallest(case)
+    index = int(rng.integers(len(joints)))
+
+    def size(effect: str, name: str) -> float:
+        found = limits.get(f"{effect}.{joints[index].name}", {}).get(name) or np.nan
+        return case.factor * found
+
+    wide = spread(case.system)[index]
+    values = {
+        "position_dependent_friction": lambda: {
+            "tau_c": size("coulomb_friction", "tau_c"),
+            "period": 2.0 * wide,
+        },
+        "hysteresis": lambda: {
+            "slip": 0.3 * wide,
+            "stiffness": size("coulomb_friction", "tau_c") / (0.3 * wide),
+        },
+        "thermal_drift": lambda: {"rate": -size("viscous_friction", "b")},
+        "soft_impact": lambda: {"k": 4.0 * size("stiffness", "k"), "wall": 0.7 * wide},
+        "cable_spring": lambda: {"k": 4.0 * size("stiffness", "k"), "slack": 0.7 * wide},
+    }[kind]()
+    return Planted(kind, index, {name: float(value) for name, value in values.items()})
+
+
+@functools.cache
+def believed(system: str) -> Any:
+    """:return: the twin under diagnosis"""
+    from sb3_hds import twins
+
+    name, values = RIGS[system].twin
+    return twins.make(name, dt=RIGS[system].dt, **values)
+
+
+def base_value(system: str) -> float:
+    return believed(system).values[RIGS[system].base[0]]
+
+
+@functools.cache
+def spread(system: str) -> np.ndarray:
+    """:return: standard deviation of each channel where nothing is wrong"""
+    obs, _ = simulate(RIGS[system], [], n_recordings=8, n_steps=N_STEPS, seed=1)
+    return np.concatenate(obs).std(0)
+
+
+def sensed(true: np.ndarray, system: str, noise: str, rng: np.random.Generator) -> np.ndarray:
+    """:return: what sensors report, shape ``(n, channels)``"""
+    error = NOISES[noise] * spread(system)
+    if noise == "tick":
+        tick = np.sqrt(12.0) * error
+        return tick * np.round(true / tick)
+    return true + error * rng.standard_normal(true.shape)
+
+
+def recorded(case: Case, seed: int) -> tuple[Any, np.ndarray]:
+    """:return: data of a case, and positions and velocities as the sensors would best show them"""
+    from sb3_hds import Trajectories
+
+    obs, actions = simulate(
+        RIGS[case.system],
+        list(case.planted),
+        n_recordings=case.recordings,
+        n_steps=N_STEPS,
+        seed=seed,
+        base_change=case.base_change,
+        disturbance=case.disturbance,
+        excited=case.kind != "still",
+    )
+    rng = np.random.default_rng([seed, 1])
+    noisy = [sensed(o, case.system, case.noise, rng) for o in obs]
+    data = Trajectories.from_arrays(noisy, actions, dt=RIGS[case.system].dt)
+    return data, np.concatenate([o[:-1] for o in obs])
+
+
+def nothing(system: str, noise: str, disturbance: float = 0.0, recordings: int = 10) -> Case:
+    """:return: a case without anything planted"""
+    return Case(system, 0, "null", (), 0.0, noise, recordings, False, 0.0, disturbance, asked=False)
+
+
+def smallest(case: Case) -> dict[str, dict[str, float]]:
+    """
+    What data of this rig, with such noise, such a disturbance and such nuisances, but with nothing
+    planted, would have shown: ``Diagnosis.detectable``, kept from call to call.
+    """
+    label = f"{case.system}_{case.noise.replace(' ', '')}_{case.disturbance:g}"
+    path = CACHE / "smallest" / f"{label}{'_calibrated' if case.wrong_base else ''}.json"
+    if not path.exists():
+        from sb3_hds import diagnose
+
+        data, _ = recorded(nothing(case.system, case.noise, case.disturbance), seed=99)
+        found = diagnose(
+            believed(case.system), data, calibrate=case.nuisances, budget="quick", progress=False
+        )
+        _write(path, json.dumps(found.to_dict()["detectable"]))
+    return json.loads(path.read_text())
+
+
+def _write(path: Path, text: str) -> None:
+    """All of it or nothing, whoever else writes the same."""
+    import os
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(f".{os.getpid()}.tmp")
+    temporary.write_text(text)
+    temporary.replace(path)
+
+
+assert set(JOINT) - set(FORCES) == {"viscous_friction", "coulomb_friction", "stiffness"}

@@ -1,0 +1,356 @@
+"""What came out of `hidden_effects.py`: rates beside the targets, tables, a picture."""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from hidden_cases import EULERS, NULLS
+from runs import RESULTS
+from same_cause import right
+
+#: what Euler's twin may be told: that something is late by half a step, or that something is wrong
+LATE = ("sensor_delay", "action_delay")
+_SECONDS = {"full": 60.0, "quick": 15.0}
+_RULE, _GAIN = "rule: ", "gain: "
+
+
+class Score(NamedTuple):
+    """
+    :param label: what is counted
+    :param value: share or median
+    :param low: end of its 95 % Wilson interval; not a number where there is none
+    :param high: likewise
+    :param n: of how many
+    :param least: what has to be reached
+    :param most: what must not be exceeded
+    """
+
+    label: str
+    value: float
+    low: float
+    high: float
+    n: int
+    least: float | None = None
+    most: float | None = None
+
+    @property
+    def target(self) -> str:
+        ends = [f"at least {self.least:g}"] if self.least is not None else []
+        ends += [f"at most {self.most:g}"] if self.most is not None else []
+        return ", ".join(ends)
+
+    @property
+    def reached(self) -> str:
+        if not self.target or not np.isfinite(self.value):
+            return ""
+        enough = self.least is None or self.value >= self.least
+        return "yes" if enough and (self.most is None or self.value <= self.most) else "no"
+
+
+def wilson(hits: int, n: int) -> tuple[float, float]:
+    """:return: 95 % interval of a share"""
+    from scipy.stats import binomtest
+
+    if not n:
+        return np.nan, np.nan
+    found = binomtest(hits, n).proportion_ci(method="wilson")
+    return float(found.low), float(found.high)
+
+
+def share(label: str, hits: Any, **target: float) -> Score:
+    """:param hits: of each case, whether it counts"""
+    hits = np.asarray(hits, bool)
+    n = len(hits)
+    return Score(label, hits.mean() if n else np.nan, *wilson(int(hits.sum()), n), n, **target)
+
+
+def middle(label: str, values: Any, at: float = 0.5, **target: float) -> Score:
+    """:return: a quantile"""
+    values = np.asarray(values, float)
+    values = values[np.isfinite(values)]
+    value = float(np.quantile(values, at)) if len(values) else np.nan
+    return Score(label, value, np.nan, np.nan, len(values), **target)
+
+
+def loaded(path: Path) -> pd.DataFrame:
+    """:return: a table in which "null" is a word"""
+    return pd.read_csv(path, keep_default_na=False, na_values=[""])
+
+
+def prepared(table: pd.DataFrame) -> pd.DataFrame:
+    """With what follows from each row: whether a name was given, whether it is right."""
+    texts = table.select_dtypes(exclude=["number", "bool"]).columns
+    table = table.assign(**{name: table[name].fillna("") for name in texts})
+    judged = lambda column: [_right(row, row[column]) for _, row in table.iterrows()]  # noqa: E731
+    return table.assign(
+        spoke=table["verdict"].isin(["named", "ambiguous"]),
+        right=judged("named"),
+        within=judged("set"),
+        disturbed=table["disturbance"] > 0.0,
+    )
+
+
+def _right(row: pd.Series, names: str) -> bool:
+    return right(row["truth"], json.loads(row["same"]), names)
+
+
+def scores(table: pd.DataFrame, budget: str) -> list[Score]:
+    """:param table: as ``prepared``"""
+    nulls, effects = table[table["kind"].isin(NULLS)], table[table["kind"] == "effect"]
+    outside, pairs = table[table["kind"] == "outside"], table[table["kind"] == "pair"]
+    cases = table[table["kind"] != EULERS]
+    alone, said = cases[cases["verdict"] == "named"], effects[effects["spoke"]]
+    white = effects[~effects["disturbed"] & (effects["noise"] != "5 %")]
+    every = pairs["set"] + ";" + pairs["more"]
+    hits = [(_right(row, names)) for (_, row), names in zip(pairs.iterrows(), every, strict=True)]
+    both = [
+        all(right(truth, json.loads(row["same"]), names) for truth in row["truth"].split(";"))
+        for (_, row), names in zip(pairs.iterrows(), every, strict=True)
+    ]
+    still = table[table["kind"] == "still"]
+    named = nulls.groupby("kind")["spoke"] if len(nulls) else {}
+    alarms = dict(iter(named))
+    found = [share(f"false alarms: {k}", alarms.get(k, []), most=0.025) for k in NULLS]
+    found += [share("nulls called unknown", nulls["verdict"] == "unknown")]
+    found += [
+        share("right among named verdicts", alone["right"], least=0.95),
+        share("right among named verdicts, single effects", alone["right"][alone.kind == "effect"]),
+        share("wrong names, all data", cases["spoke"] & ~cases["right"]),
+        share("right name: white noise up to 1 %", white["right"], least=0.9),
+        share("right name: coloured disturbance", effects["right"][effects.disturbed], least=0.8),
+        share(
+            "right name: white noise of 5 %",
+            effects["right"][~effects.disturbed & (effects.noise == "5 %")],
+        ),
+        share("truth within the reported set", said["within"], least=0.95),
+        middle("mean size of the set", [np.mean([len(s.split(";")) for s in said["set"]])]),
+        share("refused: outside the catalogue", ~outside["spoke"], least=0.9),
+        share("refused: standing still", still["verdict"] == "not_identifiable", least=1.0),
+        share("pairs: one of them is named", hits),
+        share("pairs: both are", both),
+    ]
+    covered, errors = sizes_of(effects)
+    found += [
+        share("90 % intervals that cover", covered, least=0.85, most=0.95),
+        middle("error of a parameter, median", errors),
+        middle("error of a parameter, 90 % of them", errors, 0.9),
+        middle("gain over the oracle's, median", said["at_the_end"] / said["oracle"], least=0.9),
+        middle("seconds, median", cases["seconds"]),
+        middle("seconds, 90 % of them", cases["seconds"], 0.9, most=_SECONDS[budget]),
+    ]
+    return found + _eulers(table[table["kind"] == EULERS])
+
+
+def _eulers(rows: pd.DataFrame) -> list[Score]:
+    """Half a step late, or unknown, and never a friction."""
+    names = [[n for n in f"{r['set']};{r['more']}".split(";") if n] for _, r in rows.iterrows()]
+    late = [
+        bool(own or moved) and all(name.startswith(LATE) for name in own)
+        for own, moved in zip(names, rows["moved"], strict=True)
+    ]
+    answered = (rows["verdict"] == "unknown") | np.array(late, bool)
+    friction = [any("friction" in name or "drag" in name for name in own) for own in names]
+    return [
+        share(f"{EULERS}: late or unknown", answered, least=1.0),
+        share(f"{EULERS}: friction named", friction, most=0.0),
+    ]
+
+
+def sizes_of(rows: pd.DataFrame) -> tuple[list[bool], list[float]]:
+    """:return: of each parameter of a right name, whether its interval covers, and its error"""
+    covered, errors = [], []
+    for text in rows["estimate"]:
+        for value, low, high, true in json.loads(text or "{}").values():
+            # Zero is where a parameter ends: an interval that ends there, too, says little.
+            if true:
+                covered.append(low <= true <= high)
+                errors.append(abs(value - true) / abs(true))
+    return covered, errors
+
+
+def by_difficulty(table: pd.DataFrame) -> pd.DataFrame:
+    """Right names of single effects by what disturbs them and by their size."""
+    effects, rows = table[table["kind"] == "effect"], []
+    for label, own in (
+        ("white, up to 1 %", ~effects["disturbed"] & (effects["noise"] != "5 %")),
+        ("white, 5 %", ~effects["disturbed"] & (effects["noise"] == "5 %")),
+        ("coloured, up to 1 %", effects["disturbed"] & (effects["noise"] != "5 %")),
+        ("coloured, 5 %", effects["disturbed"] & (effects["noise"] == "5 %")),
+    ):
+        for factor in (2.0, 4.0, 8.0):
+            some = effects[own & (effects["factor"] == factor)]
+            rows.append({"noise": label, "times": f"{factor:.0f}"} | _told(some))
+    return pd.DataFrame(rows)
+
+
+def by_cause(table: pd.DataFrame) -> pd.DataFrame:
+    """The same for each effect."""
+    effects = table[table["kind"] == "effect"]
+    effects = effects.assign(effect=effects["truth"].str.replace(r"\.[^.]*$", "", regex=True))
+    rows = [{"effect": name} | _told(own) for name, own in effects.groupby("effect")]
+    return pd.DataFrame(rows)
+
+
+def by_system(table: pd.DataFrame) -> pd.DataFrame:
+    rows = []
+    for name, own in table.groupby("system", sort=False):
+        nulls, outside = own[own["kind"].isin(NULLS)], own[own["kind"] == "outside"]
+        rows.append(
+            {"system": name}
+            | _told(own[own["kind"] == "effect"])
+            | {
+                "false alarms": _of(nulls["spoke"]),
+                "refused outside": _of(~outside["spoke"]),
+                "seconds": f"{own['seconds'].median():.0f}",
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def by_outside(table: pd.DataFrame) -> pd.DataFrame:
+    """How often each cause outside the catalogue is refused, and how."""
+    outside = table[table["kind"] == "outside"]
+    return pd.DataFrame(
+        {
+            "cause": name.replace("_", " "),
+            "refused": _of(~own["spoke"]),
+            "as unknown": _of(own["verdict"] == "unknown"),
+        }
+        for name, own in outside.groupby("truth")
+    )
+
+
+def by_rule(table: pd.DataFrame) -> pd.DataFrame:
+    """Peers, and `diagnose` itself, on the cases that all were asked about."""
+    asked = table[table["asked"].astype(bool)]
+    rules = [name.removeprefix(_RULE) for name in table if name.startswith(_RULE)]
+    rows = [_of_rule("diagnose", asked, asked["named"], asked["at_the_end"])]
+    for rule in rules:
+        rows.append(_of_rule(rule, asked, asked[f"{_RULE}{rule}"], asked[f"{_GAIN}{rule}"]))
+    return pd.DataFrame(rows)
+
+
+def _of_rule(rule: str, asked: pd.DataFrame, names: pd.Series, gains: pd.Series) -> dict[str, str]:
+    spoke, effect = names != "", asked["kind"] == "effect"
+    good = pd.Series(
+        [_right(row, name) for (_, row), name in zip(asked.iterrows(), names, strict=True)],
+        asked.index,
+        bool,
+    )
+    ratio = (gains / asked["oracle"])[effect & spoke]
+    return {
+        "rule": rule,
+        "false alarms": _of(spoke[asked["kind"].isin(NULLS)]),
+        "named outside": _of(spoke[asked["kind"] == "outside"]),
+        "right": _of(good[effect]),
+        "wrong": _of((spoke & ~good)[effect]),
+        "gain over the oracle's": f"{np.nanmedian(ratio):.2f}" if ratio.notna().any() else "-",
+    }
+
+
+def _told(rows: pd.DataFrame) -> dict[str, str]:
+    return {
+        "right": _of(rows["right"]),
+        "to the letter": _of(rows["truth"] == rows["named"]),
+        "within the set": _of(rows["within"][rows["spoke"]]),
+        "wrong": _of(rows["spoke"] & ~rows["right"]),
+        "none": _of(rows["verdict"] == "none"),
+        "unknown": _of(rows["verdict"] == "unknown"),
+    }
+
+
+def _of(hits: Any) -> str:
+    hits = np.asarray(hits, bool)
+    if not len(hits):
+        return "-"
+    low, high = wilson(int(hits.sum()), len(hits))
+    return f"{hits.mean():.2f} [{low:.2f}, {high:.2f}] of {len(hits)}"
+
+
+def as_table(found: Sequence[Score]) -> pd.DataFrame:
+    return pd.DataFrame(
+        {
+            "what": s.label,
+            "measured": f"{s.value:.3g}",
+            "95 % interval": "" if np.isnan(s.low) else f"{s.low:.3f} to {s.high:.3f}",
+            "of": s.n,
+            "target": s.target,
+            "reached": s.reached,
+        }
+        for s in found
+    )
+
+
+PARTS: dict[str, Callable[[pd.DataFrame], pd.DataFrame]] = {
+    "difficulty": by_difficulty,
+    "causes": by_cause,
+    "systems": by_system,
+    "outside": by_outside,
+    "rules": by_rule,
+}
+
+
+def report(name: str) -> None:
+    """Print ``results/NAME.csv``, and write its tables and its picture beside it."""
+    path = RESULTS / f"{name}.csv"
+    if not path.exists():
+        print(f"{path} does not exist: nothing has been run.")
+        return
+    table, budget = prepared(loaded(path)), "quick" if name.endswith("quick") else "full"
+    found = scores(table, budget)
+    print(f"{len(table)} cases")
+    _write(as_table(found), f"{name}_targets")
+    for part, condensed in PARTS.items():
+        _write(condensed(table), f"{name}_{part}")
+    figure(found, table, name)
+    wrong = table[table["spoke"] & ~table["within"] & (table["kind"] != EULERS)]
+    columns = ["system", "case", "kind", "truth", "factor", "noise", "disturbance", "set"]
+    if len(wrong):
+        print(f"Wrong:\n{wrong[columns].to_string(index=False)}")
+
+
+def _write(table: pd.DataFrame, name: str) -> None:
+    print(f"\n{name}\n{table.to_string(index=False)}")
+    temporary = RESULTS / f"{name}.tmp"
+    table.to_csv(temporary, index=False)
+    temporary.replace(RESULTS / f"{name}.csv")
+
+
+def figure(found: Sequence[Score], table: pd.DataFrame, name: str) -> None:
+    """Rates with their intervals against targets; right names against size."""
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=(10.0, 4.6), layout="constrained")
+    left, middle_ = drawing.subplots(1, 2, width_ratios=(3, 2))
+    rates = [s for s in found if s.target and np.isfinite(s.low)]
+    for place, s in enumerate(reversed(rates)):
+        colour = "#2c6e49" if s.reached == "yes" else "#b3392f"
+        left.plot([s.low, s.high], [place, place], color=colour, lw=2.0)
+        left.plot(s.value, place, "o", color=colour)
+        for end in (s.least, s.most):
+            if end is not None:
+                left.plot([end, end], [place - 0.35, place + 0.35], color="black", lw=1.2)
+    left.set_yticks(range(len(rates)), [s.label for s in reversed(rates)], fontsize=8)
+    left.set_xlim(-0.02, 1.02)
+    left.set_xlabel("share of the cases, 95 % interval; bars: targets")
+    effects = table[table["kind"] == "effect"]
+    for label, own, colour in (
+        ("white, up to 1 %", ~effects["disturbed"] & (effects["noise"] != "5 %"), "#27496d"),
+        ("white, 5 %", ~effects["disturbed"] & (effects["noise"] == "5 %"), "#7fa6cc"),
+        ("coloured", effects["disturbed"], "#c98a2b"),
+    ):
+        groups = effects[own].groupby("factor")["right"]
+        sizes, means = groups.mean().index, groups.mean()
+        ends = np.array([wilson(int(g.sum()), len(g)) for _, g in groups]).reshape(-1, 2)
+        spans = np.abs(ends.T - means.to_numpy())
+        middle_.errorbar(sizes, means, spans, fmt="o-", color=colour, label=label, capsize=2)
+    middle_.set_xscale("log", base=2)
+    middle_.set_xticks((2, 4, 8), ("2", "4", "8"))
+    middle_.set_ylim(0.0, 1.03)
+    middle_.set_xlabel("size, in units of the smallest that shows")
+    middle_.set_ylabel("right name")
+    middle_.legend(frameon=False)
+    drawing.savefig(RESULTS / f"{name}.png", dpi=150)
