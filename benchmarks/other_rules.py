@@ -82,7 +82,7 @@ def by_parameters(search, h, start) -> Answer:
     fitted = search.base(start.point.theta, free)
     if not own or squares(search, fitted.kept) > 0.95 * squares(search, start.kept):
         return Answer()
-    stderr = standard_errors(search.select.evidence, search.select.unit, fitted.point, free)
+    stderr = standard_errors(search.select, fitted.point, free)
     moved = np.abs(fitted.point.theta - h.null)[own] / np.maximum(stderr[own], 1e-300)
     name = f"parameter.{h.names[own[int(np.argmax(moved))]]}"
     return Answer(name, gain(search, start, fitted.kept))
