@@ -26,12 +26,13 @@ def diagnose(
 
     The data are audited first: what cannot support a verdict is refused with the reason, and other
     defects are caveats. Recordings are cut into windows, each simulated from a start state of its
-    own. On one half of the recordings every candidate is fitted; the best is then confirmed once on
-    the other half, by a one-sided t test on the logarithms of error ratios (one for each
-    recording), at least 5 % less mean square error, and an information criterion that counts
+    own. On one half of the recordings every candidate is fitted; the best is then confirmed on the
+    other half, by at least 5 % less mean square error, a one-sided test on the logarithms of error
+    ratios (one for each recording) or on scores, and an information criterion that counts
     correlated errors as fewer. What is not significantly worse than the best there stays as an
     alternative. After each cause that is accepted, everything is tested again. What remains is
-    looked for in the force that is missing; a cause that leaves too much of it is not believed.
+    looked for in the force that is missing; a cause that leaves too much of it is not believed. In
+    the end, causes are fitted to all recordings.
 
     :param twin: as it is believed
     :param data: measured, sampled at the twin's ``dt``
