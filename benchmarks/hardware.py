@@ -20,7 +20,10 @@ CELLS = {
         PENDULUM,
         {"mass": 1.25, "length": 1.25, "friction": 0.2, "drag": 0.04, "noise": 0.01},
     ),
+    "euler steps": (PENDULUM, {}),
 }
+#: cells whose data sheet is right, and whose twin integrates otherwise than the system moves
+OTHER_TWIN = {"euler steps": "Pendulum"}
 #: steps of an episode
 LENGTH = {PENDULUM: 200, CART: 250}
 N_STARTS = 50
@@ -40,11 +43,14 @@ def length_of(cell: str) -> int:
     return LENGTH[CELLS[cell][0]]
 
 
-def data_sheet(env_id: str):
+def data_sheet(cell: str):
     """:return: the twin as its maker describes the system: nothing of what is hidden"""
     from sb3_hds import twins
 
-    return twins.make(env_id, **({"swing_up": True} if env_id == CART else {}))
+    env_id = CELLS[cell][0]
+    return twins.make(
+        OTHER_TWIN.get(cell, env_id), **({"swing_up": True} if env_id == CART else {})
+    )
 
 
 def pretrained(cell: str, seed: int, **changes):
@@ -54,11 +60,11 @@ def pretrained(cell: str, seed: int, **changes):
     """
     from sb3_hds import HDS
 
-    env_id = CELLS[cell][0]
+    twin = data_sheet(cell)
     label = "_".join(f"{name}={value}" for name, value in sorted(changes.items()))
-    path = CACHE / "models" / f"{env_id.split('/')[1]}_{seed}_{label or 'plain'}.zip"
+    path = CACHE / "models" / f"{twin.name}_{seed}_{label or 'plain'}.zip"
     if not path.exists():
-        model = HDS(make(cell), twin=data_sheet(env_id), seed=seed, **changes)
+        model = HDS(make(cell), twin=twin, seed=seed, **changes)
         model.learn(0).save(path)
     return HDS.load(path, env=make(cell))
 

@@ -26,7 +26,7 @@ import json
 
 import numpy as np
 import pandas as pd
-from hardware import N_STARTS, PENDULUM, data_sheet, length_of, make, pretrained, return_of
+from hardware import N_STARTS, data_sheet, length_of, make, pretrained, return_of
 from runs import CACHE, RESULTS, fresh_process, resume
 
 CELL, EPISODES = "worn", 5
@@ -159,7 +159,7 @@ def open_loop(closed: bool):
             return return_of(model, "heavy, long")
         from sb3_hds import envs
 
-        mirror, returns = envs.TwinEnv(data_sheet(PENDULUM)), []
+        mirror, returns = envs.TwinEnv(data_sheet("heavy, long")), []
         for start in range(N_STARTS):
             env.reset(seed=50_000 + start)
             data = env.unwrapped.data
