@@ -1,7 +1,9 @@
 """Stand-ins for hardware that its data sheet describes wrongly, and how policies do on them."""
 
+from pathlib import Path
+
 import numpy as np
-from runs import CACHE
+from runs import CACHE, code_version
 
 PENDULUM, CART = "sb3_hds/PendulumReal-v1", "sb3_hds/InvertedPendulumFriction-v5"
 CELLS = {
@@ -56,17 +58,26 @@ def data_sheet(cell: str):
 def pretrained(cell: str, seed: int, **changes):
     """
     :return: HDS that has planned in the data sheet's twin and has seen no data yet, in the cell's
-        environment. It is trained once for all cells that share a data sheet.
+        environment. It is trained once for all cells that share a data sheet, by this version of
+        the package.
     """
     from sb3_hds import HDS
 
     twin = data_sheet(cell)
-    label = "_".join(f"{name}={value}" for name, value in sorted(changes.items()))
-    path = CACHE / "models" / f"{twin.name}_{seed}_{label or 'plain'}.zip"
+    path = kept_at(twin.name, seed, changes)
     if not path.exists():
         model = HDS(make(cell), twin=twin, seed=seed, **changes)
         model.learn(0).save(path)
     return HDS.load(path, env=make(cell))
+
+
+def kept_at(twin: str, seed: int, changes: dict) -> Path:
+    """:return: file of a model; other code, other file"""
+    import sb3_hds
+
+    label = "_".join(f"{name}={value}" for name, value in sorted(changes.items()))
+    version = code_version(Path(sb3_hds.__file__).parent)
+    return CACHE / "models" / version / f"{twin}_{seed}_{label or 'plain'}.zip"
 
 
 def return_of(model, cell: str) -> float:

@@ -1,6 +1,9 @@
 """What the benchmarks compute from their tables, and what they keep between runs."""
 
+import hardware
 import pandas as pd
+import pytest
+import runs
 import sim_to_real
 
 
@@ -42,3 +45,41 @@ def test_a_report_without_any_gap_says_what_is_missing(monkeypatch, tmp_path, ca
     runs_of("light", 1, ("wrong_twin",)).to_csv(tmp_path / "sim_to_real.csv", index=False)
     sim_to_real.report()
     assert "wrong twin and the ceiling" in capsys.readouterr().out
+
+
+@pytest.fixture
+def sources(tmp_path):
+    (tmp_path / "inner").mkdir()
+    (tmp_path / "inner" / "learner.py").write_text("rate = 1")
+    return tmp_path
+
+
+def test_a_code_version_is_that_of_what_is_written_in_the_files(sources):
+    before = runs.code_version(sources)
+    (sources / "inner" / "notes.txt").write_text("no code")
+    assert runs.code_version(sources) == before
+    (sources / "inner" / "learner.py").write_text("rate = 2")
+    assert runs.code_version(sources) != before
+
+
+def test_a_file_that_moves_is_other_code(sources):
+    before = runs.code_version(sources)
+    (sources / "inner" / "learner.py").rename(sources / "learner.py")
+    assert runs.code_version(sources) != before
+
+
+def test_a_pretrained_model_of_other_code_is_not_used(monkeypatch):
+    before = hardware.kept_at("Pendulum", 0, {"randomisation": 1.0})
+    monkeypatch.setattr(hardware, "code_version", lambda root: "another")
+    assert hardware.kept_at("Pendulum", 0, {"randomisation": 1.0}) != before
+
+
+def test_cells_that_share_a_data_sheet_share_a_model():
+    assert hardware.data_sheet("heavy").to_spec() == hardware.data_sheet("worn").to_spec()
+
+
+def test_the_twin_of_euler_steps_is_wrong_in_nothing_but_its_integrator():
+    system, twin = hardware.make("euler steps").unwrapped, hardware.data_sheet("euler steps")
+    assert twin.name == "Pendulum"
+    assert twin.values == {name: getattr(system, name) for name in twin.values}
+    assert (system.friction, system.drag, system.delay, system.noise) == (0.0, 0.0, 0.0, 0.0)
