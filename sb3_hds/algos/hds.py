@@ -11,7 +11,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_hds.algos.correction import Correction, Wishes, correct, names_to_estimate
+from sb3_hds.algos.correction import Correction, Since, Wishes, correct, names_to_estimate
 from sb3_hds.algos.log import record_correction
 from sb3_hds.algos.measured import Measured, data_from
 from sb3_hds.algos.model import check_known, missing_effects, nulls_of, required
@@ -221,6 +221,7 @@ class HDS(TwinAlgorithm):
         self.measured = Measured(self, data_from(pretrain_data))
         self._n_blocks, self._refitted_at, self._steps_at_force = 0, 0, 0
         self._changed_at: int | None = None
+        self._changed_in = 0
         self._saw_earlier = False
         self._replanning = 0
         super().__init__(
@@ -299,10 +300,10 @@ class HDS(TwinAlgorithm):
         :return: what the data say; None before anything was measured
         :raises NoTwinError: if the model was loaded without environment and without twin
         """
-        data = self.measured.trajectories(self._since_change())
+        data, n_counted = self.measured.recordings(), self._since_change()
         if data is None or self.twin is None:
             return None
-        n_steps = data.n_steps
+        n_steps = data.n_steps if n_counted is None else min(data.n_steps, n_counted)
         found = correct(
             self.twin,
             data,
@@ -310,9 +311,11 @@ class HDS(TwinAlgorithm):
             self.model_beta,
             learn_force=n_steps >= _GROWTH * self._steps_at_force,
             n_new=self.real_timesteps - self._refitted_at,
+            since=None if n_counted is None else Since(n_counted, self._changed_in),
         )
-        if found.forgotten:
-            self._changed_at, self._steps_at_force = self._refitted_at, 0
+        if found.since is not None:
+            self._changed_at = self.real_timesteps - found.since.n_steps
+            self._changed_in, self._steps_at_force = found.since.recording, 0
         self._refitted_at = self.real_timesteps
         if found.residual is not None:
             self._steps_at_force = n_steps
