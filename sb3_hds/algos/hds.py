@@ -128,7 +128,8 @@ class HDS(TwinAlgorithm):
     :param pretrain_data: ``Trajectories``, or a file of them, from which the model is corrected
         before the first plan. The HDS project: random motion.
     :param save_data: whether the measured steps are saved with the model
-    :param max_saved_steps: how many of them, the latest
+    :param max_saved_steps: how many of them, the latest; those of ``pretrain_data`` where there is
+        room left
     :param policy_kwargs: ``net_arch``, ``activation_fn``, ``linear_path``, ``max_grad_norm``
     :param stats_window_size: episodes in the averages that are logged
     :param tensorboard_log: folder for TensorBoard

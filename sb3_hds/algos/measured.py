@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import json
 import os
 import warnings
 from typing import TYPE_CHECKING, Any
@@ -79,11 +80,12 @@ class Measured:
         except TrajectoryError:  # none of the steps is finite
             return None
         numbers = np.array(self._recordings.numbers(buffer, begins))
+        if (numbers < 0).all():  # one that has no end is older than the buffer
+            numbers[:] = self._recordings.latest
         found = Trajectories.from_arrays(obs, actions, dt=twin.dt, conditions="replay buffer")
-        found = dataclasses.replace(found, origin=np.maximum(numbers, self._n_earlier))
+        found = dataclasses.replace(found, origin=numbers)
         order = np.array(sorted(range(len(begins)), key=begins.__getitem__))
-        kept = order[numbers[order] >= 0]
-        return found[kept if len(kept) else order]
+        return found[order[numbers[order] >= 0]]
 
     def state_dict(self) -> dict[str, th.Tensor]:
         """:return: the latest steps, oldest first, shape ``(steps, n_envs, ...)``; earlier data"""
@@ -98,13 +100,13 @@ class Measured:
             for name in _COLUMNS:
                 if hasattr(buffer, name):
                     saved[name] = th.as_tensor(getattr(buffer, name)[order].copy())
+            self._numbered()  # some may not have been looked at yet
             numbers = self._recordings.state_dict(buffer, len(order))
             saved |= {f"recordings.{name}": tensor for name, tensor in numbers.items()}
-        if self.earlier is not None and limit:
-            early = self.earlier
-            for name in ("obs", "actions", "lengths"):
-                saved[f"earlier.{name}"] = th.as_tensor(np.array(getattr(early, name)))
-            saved["earlier.dt"] = th.as_tensor(early.dt, dtype=th.float64)
+            limit -= len(order) * buffer.n_envs
+        if self.earlier is not None and limit > 0:
+            earlier = _tensors_of(_whole(self.earlier, limit))
+            saved |= {f"earlier.{name}": tensor for name, tensor in earlier.items()}
         return saved
 
     def load_state_dict(self, tensors: dict[str, th.Tensor], strict: bool = True) -> None:
@@ -186,6 +188,13 @@ def latest_steps(data: Trajectories, n_steps: int) -> Trajectories:
     return dataclasses.replace(cut, origin=data.origin[first:])
 
 
+def _whole(data: Trajectories, n_steps: int) -> Trajectories:
+    """The latest recordings that have together no more steps than so many."""
+    after = np.cumsum(data.lengths[::-1])[::-1]
+    fit = np.flatnonzero(after <= n_steps)
+    return data[fit] if len(fit) else latest_steps(data, n_steps)
+
+
 def _counted(data: Trajectories) -> Trajectories:
     """With recordings numbered 0, 1, ..."""
     return dataclasses.replace(data, origin=np.unique(data.origin, return_inverse=True)[1])
@@ -213,12 +222,25 @@ def _for_copies(columns: dict[str, np.ndarray], n_envs: int) -> dict[str, np.nda
     }
 
 
+def _tensors_of(data: Trajectories) -> dict[str, th.Tensor]:
+    names = ("obs", "actions", "lengths", "origin")
+    saved = {name: th.as_tensor(np.array(getattr(data, name))) for name in names}
+    labels = np.frombuffer(json.dumps(data.conditions).encode(), np.uint8).copy()
+    dt = th.as_tensor(data.dt, dtype=th.float64)
+    return saved | {"dt": dt, "conditions": th.as_tensor(labels)}
+
+
 def _unpadded(saved: dict[str, th.Tensor]) -> Trajectories:
     obs, actions = (saved[name].cpu().numpy() for name in ("obs", "actions"))
     lengths = saved["lengths"].cpu().numpy()
-    return Trajectories.from_arrays(
+    labels, origin = "earlier", np.arange(len(lengths))
+    if "conditions" in saved:  # files of the first versions have neither
+        labels = json.loads(saved["conditions"].cpu().numpy().tobytes())
+        origin = saved["origin"].cpu().numpy()
+    found = Trajectories.from_arrays(
         [x[: n + 1] for x, n in zip(obs, lengths, strict=True)],
         [u[:n] for u, n in zip(actions, lengths, strict=True)],
         dt=float(saved["dt"]),
-        conditions="earlier",
+        conditions=labels,
     )
+    return dataclasses.replace(found, origin=origin)

@@ -34,6 +34,11 @@ class Recordings:
         since = (buffer.pos - self._position) % buffer.buffer_size
         return max(self._n_steps + since, buffer.size())
 
+    @property
+    def latest(self) -> int:
+        """The number that was given last."""
+        return max(0, self._n_before + len(self.starts) - 1)
+
     def numbers(self, buffer: Any, begins: Sequence[tuple[int, int]]) -> list[int]:
         """
         :param begins: of each recording, steps since the oldest one in the buffer, and environment
