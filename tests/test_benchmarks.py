@@ -1,6 +1,8 @@
 """What the benchmarks compute from their tables, and what they keep between runs."""
 
 import hardware
+import hds_parts
+import numpy as np
 import pandas as pd
 import pytest
 import runs
@@ -83,3 +85,43 @@ def test_the_twin_of_euler_steps_is_wrong_in_nothing_but_its_integrator():
     assert twin.name == "Pendulum"
     assert twin.values == {name: getattr(system, name) for name in twin.values}
     assert (system.friction, system.drag, system.delay, system.noise) == (0.0, 0.0, 0.0, 0.0)
+
+
+def parts_of(returns):
+    rows = [(variant, seed, x) for variant, own in returns.items() for seed, x in enumerate(own)]
+    return pd.DataFrame(rows, columns=["variant", "seed", "return"])
+
+
+def test_the_parts_of_hds_close_a_share_of_the_gap_over_seeds_that_have_both_ends():
+    rows = parts_of({"as it is": [5.0, 15.0, 99.0], "wrong twin": [0.0, 10.0], "ceiling": [10, 30]})
+    found = hds_parts.closed(rows, rows)
+    assert found["as it is"] == pytest.approx(10.0 / 30.0)
+    assert (found["wrong twin"], found["ceiling"]) == (0.0, 1.0)
+    assert hds_parts.closed(rows, rows[rows["variant"] != "ceiling"]) == {}
+
+
+def test_variants_are_reported_as_they_are_listed_whenever_they_were_measured(
+    monkeypatch, tmp_path
+):
+    monkeypatch.setattr(hds_parts, "RESULTS", tmp_path)
+    rows = parts_of({"no data": [1.0, 2.0], "dropped since": [0.0], "wrong twin": [3.0]})
+    rows.to_csv(tmp_path / "hds_parts.csv", index=False)
+    assert hds_parts.in_order("parts")["variant"].tolist() == ["wrong twin", "no data", "no data"]
+
+
+@pytest.mark.parametrize("table", hds_parts.TABLES)
+def test_a_figure_shows_every_variant(table):
+    variants = hds_parts.VARIANTS[table]
+    rows = parts_of({variant: np.arange(2.0) for variant in variants})
+    rows["gradient_norm"] = rows["derivative_worst"] = 1.0
+
+    drawing = hds_parts.FIGURES[table](rows)
+
+    drawing.canvas.draw()
+    axes = drawing.axes[0] if table == "beta" else drawing.axes
+    ticks = {
+        tick.get_text()
+        for panel in np.ravel(axes)
+        for tick in (panel.get_xticklabels() if table == "beta" else panel.get_yticklabels())
+    }
+    assert ticks == set(variants)
