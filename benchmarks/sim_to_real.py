@@ -103,6 +103,11 @@ def evaluated(model, cell: str, episodes: int) -> dict:
 def report() -> None:
     table = pd.read_csv(RESULTS / "sim_to_real.csv")
     shown = closed(table)
+    if shown.empty:
+        print(
+            "A gap needs a cell with both the wrong twin and the ceiling; none has run with both."
+        )
+        return
     wide = by_cell(table, shown)
     wide.to_csv(RESULTS / "sim_to_real_gap.csv", float_format="%.4g")
     print(wide.to_string(float_format=lambda x: f"{x:.2f}"))
@@ -143,7 +148,8 @@ def ahead(group: pd.DataFrame) -> float:
 
 def over_cells(table: pd.DataFrame, cells: list[str], n_draws: int = 2000) -> pd.DataFrame:
     """
-    The median over cells of the share of the gap that is closed, with its interval.
+    The median over cells of the share of the gap that is closed, with its interval. Of a table
+    that is not finished, over the cells that have run.
 
     :param cells: that count
     """
@@ -155,15 +161,21 @@ def over_cells(table: pd.DataFrame, cells: list[str], n_draws: int = 2000) -> pd
     for method, episodes in [("randomised", 0), *(("hds", n) for n in STEPS)]:
         drawn = []
         for returns in returns_of.values():
+            if (method, episodes) not in returns:
+                continue
             wrong, best = returns["wrong_twin", 0], returns["ceiling", 0]
             pairs = pd.concat([returns[method, episodes] - wrong, best - wrong], axis=1).dropna()
+            if pairs.empty:
+                continue
             gained, gaps = pairs.to_numpy().T
             index = rng.integers(len(pairs), size=(n_draws, len(pairs)))
             index[0] = np.arange(len(pairs))
             drawn.append(gained[index].mean(1) / gaps[index].mean(1))
+        if not drawn:
+            continue
         medians = np.median(drawn, axis=0)
         low, high = np.quantile(medians, (0.05, 0.95))
-        rows.append((method, episodes, medians[0], low, high, len(cells)))
+        rows.append((method, episodes, medians[0], low, high, len(drawn)))
     return pd.DataFrame(rows, columns=["method", "episodes", "closed", "low", "high", "cells"])
 
 

@@ -30,6 +30,7 @@ sys.path.insert(0, str(DOCS / "extensions"))
 import benchmark_results  # noqa: E402
 import catalogue  # noqa: E402
 import import_picture  # noqa: E402
+import summaries  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -268,6 +269,32 @@ def test_results_are_shown_with_the_command_that_made_them(tmp_path):
 
     assert "pendulum.py`" in shown and "Regret on a pendulum." in shown
     assert "| hds | 1.5 |" in shown and "### regret" in shown
+
+
+def test_the_share_of_a_gap_is_shown_once_both_of_its_ends_were_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr(summaries, "RESULTS", tmp_path)
+    shown = summaries.over_seeds("t", "variant", "return", ends=("t", "worst", "best"))
+    rows = "variant,seed,return\nhalf,0,5\nhalf,1,15\nworst,0,0\nworst,1,10\n"
+
+    (tmp_path / "t.csv").write_text(rows)
+    assert "| half | 10 (5 to 15) | 2 |" in shown()
+
+    (tmp_path / "t.csv").write_text(rows + "best,0,10\n")
+    assert "| half | 10 (5 to 15) | 0.5 | 2 |" in shown()
+    (tmp_path / "t.csv").write_text(rows + "best,0,10\nbest,1,30\n")
+    # Gained 5 and 5, of 10 and 20.
+    assert "| half | 10 (5 to 15) | 0.333 | 2 |" in shown()
+
+
+def test_episodes_after_the_first_are_shown_together(tmp_path, monkeypatch):
+    monkeypatch.setattr(summaries, "RESULTS", tmp_path)
+    rows = "minutes,steps,return,late\n1,200,-9,3\n2,400,-2,3\n3,600,-4,5\n"
+    (tmp_path / "t.csv").write_text(rows)
+
+    shown = summaries.first_and_rest("t", 1)()
+
+    assert "| 1 | 1 | -9 | 3 |" in shown
+    assert "| 2 to 3 | 3 | -3 (-4 to -2) | 2 |" in shown
 
 
 def test_without_results_no_number_is_shown(tmp_path):

@@ -1,5 +1,6 @@
 """HDS and the data that it measures: what they correct, what they may not spoil, what is kept."""
 
+import dataclasses
 import os
 import signal
 import subprocess
@@ -506,6 +507,41 @@ def test_how_much_is_saved_may_be_limited(tmp_path):
         if kept:
             latest = columns(model)["observations"][-kept:]
             np.testing.assert_array_equal(columns(loaded)["observations"], latest)
+
+
+@pytest.mark.parametrize(
+    ("limit", "n_real", "n_early"), [(1000, 60, 180), (200, 60, 120), (90, 60, 30), (40, 40, 0)]
+)
+def test_data_from_before_share_the_limit_and_the_latest_stay(tmp_path, limit, n_real, n_early):
+    """Recordings of 60 steps: as many whole ones as there is room for, or the end of the last."""
+    data = measured(twins.make("PendulumReal"), n=3)
+    settings = {"twin": "PendulumReal", "train_freq": 20, "refit_freq": 0}
+    model = small("hds", REAL, pretrain_data=data, max_saved_steps=limit, **settings).learn(60)
+    model.save(tmp_path / "model")
+
+    loaded = HDS.load(tmp_path / "model", env=gymnasium.make(REAL))
+
+    assert loaded.replay_buffer.size() == n_real
+    found = loaded.measured.recordings()
+    assert found.n_steps == n_real + n_early
+    assert found.origin.tolist() == [0, 1, 2, 3][-len(found) :]
+    if n_early:
+        np.testing.assert_array_equal(
+            found.episode(len(found) - 2)[0], data.obs[2][-1 - min(n_early, 60) :]
+        )
+
+
+def test_data_from_before_keep_their_labels_and_what_belongs_together(tmp_path):
+    data = measured(twins.make("PendulumReal"), n=2)
+    data = dataclasses.replace(data, conditions=("bare", "1 kg ± 10 g")).windows(20)
+    model = small("hds", REAL, twin="PendulumReal", pretrain_data=data, refit_freq=0)
+    model.save(tmp_path / "model")
+
+    loaded = HDS.load(tmp_path / "model", env=gymnasium.make(REAL)).measured.earlier
+
+    assert loaded.conditions == ("bare",) * 3 + ("1 kg ± 10 g",) * 3
+    assert loaded.origin.tolist() == [0, 0, 0, 1, 1, 1]
+    assert loaded.dt == data.dt
 
 
 def test_another_number_of_copies_takes_the_data_too(tmp_path):

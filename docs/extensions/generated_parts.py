@@ -14,6 +14,9 @@ import catalogue
 import import_picture
 import summaries
 
+# Between which planning in the data sheet's twin and in the true one lie, of the worn pendulum.
+WORN = ("hds_parts", "wrong twin", "ceiling")
+
 PARTS: dict[str, Callable[[], str]] = {
     "imports": import_picture.as_markdown,
     "twins": catalogue.twins_as_markdown,
@@ -24,7 +27,8 @@ PARTS: dict[str, Callable[[], str]] = {
     "sim_to_real_gap": summaries.whole("sim_to_real_gap"),
     "sim_to_real_median": summaries.whole("sim_to_real_median"),
     "payload_added": summaries.whole("payload_added_recovery"),
-    "hds_parts": summaries.over_seeds("hds_parts", "variant", "return"),
+    "ten_minutes": summaries.first_and_rest("ten_minutes", 3),
+    "hds_parts": summaries.over_seeds("hds_parts", "variant", "return", ends=WORN),
     "hds_weaknesses": summaries.over_seeds("hds_weaknesses", "variant", "return"),
     "hds_beta": summaries.over_seeds(
         "hds_beta",
@@ -34,6 +38,7 @@ PARTS: dict[str, Callable[[], str]] = {
         "gradient_norm",
         "derivative_median",
         "derivative_worst",
+        ends=WORN,
     ),
 }
 

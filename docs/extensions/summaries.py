@@ -1,4 +1,4 @@
-"""Tables of ``benchmarks/results`` with a row for each variant: mean and range over seeds."""
+"""Tables of ``benchmarks/results``, condensed: means and ranges, and shares of a gap."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,22 +11,57 @@ RESULTS = Path(__file__).parent.parent.parent / "benchmarks" / "results"
 _NONE = "Not measured yet in this checkout.\n\n"
 
 
-def over_seeds(name: str, variant: str, *measured: str) -> Callable[[], str]:
+def over_seeds(
+    name: str, variant: str, *measured: str, ends: tuple[str, str, str] | None = None
+) -> Callable[[], str]:
     """
     :param name: of the table, without its ending
     :param variant: column that tells variants apart
     :param measured: columns that are shown
+    :param ends: name of a table, and the variants in it between which there is a gap: the share of
+        it that each variant's return closes is shown too, once they have been measured
     :return: what makes the Markdown
     """
 
     def condensed(columns: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
         place, shown = columns.index(variant), [columns.index(column) for column in measured]
+        gap = _gap(*ends, variant) if ends else {}
         lines = []
         for one in dict.fromkeys(row[place] for row in rows):
             own = [row for row in rows if row[place] == one]
             values = [_spread([float(row[i]) for row in own]) for i in shown]
-            lines.append([one, *values, str(len(own))])
-        return [variant, *measured, "seeds"], lines
+            closed = [_closed(_by_seed(columns, own), gap)] if gap else []
+            lines.append([one, *values, *closed, str(len(own))])
+        return [variant, *measured, *(["closed"] if gap else []), "seeds"], lines
+
+    return lambda: _shown(name, condensed)
+
+
+def first_and_rest(name: str, n_first: int) -> Callable[[], str]:
+    """
+    :param name: of a table with a row for each episode: minutes, steps, return, and steps that had
+        come late by then
+    :param n_first: episodes that are shown by themselves
+    :return: what makes the Markdown
+    """
+
+    def condensed(columns: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
+        at = {column: i for i, column in enumerate(columns)}
+        late = [0.0, *(float(row[at["late"]]) for row in rows)]
+        groups = [(i, i + 1) for i in range(min(n_first, len(rows)))]
+        groups += [(n_first, len(rows))] if len(rows) > n_first else []
+        lines = []
+        for begin, end in groups:
+            own = rows[begin:end]
+            lines.append(
+                [
+                    f"{begin + 1}" if end == begin + 1 else f"{begin + 1} to {end}",
+                    rounded(own[-1][at["minutes"]]),
+                    _spread([float(row[at["return"]]) for row in own]),
+                    rounded(late[end] - late[begin]),
+                ]
+            )
+        return ["episodes", "minutes at their end", "return", "late steps"], lines
 
     return lambda: _shown(name, condensed)
 
@@ -48,3 +83,29 @@ def _shown(name: str, change: Callable) -> str:
 def _spread(values: list[float]) -> str:
     mean, low, high = (rounded(x) for x in (fmean(values), min(values), max(values)))
     return mean if low == high else f"{mean} ({low} to {high})"
+
+
+def _by_seed(columns: list[str], rows: list[list[str]]) -> dict[str, float]:
+    return {row[columns.index("seed")]: float(row[columns.index("return")]) for row in rows}
+
+
+def _gap(name: str, worst: str, best: str, variant: str) -> dict[str, tuple[float, float]]:
+    """:return: both ends of the gap, for the seeds that have been run with both"""
+    path = RESULTS / f"{name}.csv"
+    if not path.exists():
+        return {}
+    columns, rows = read(path)
+    low, high = (
+        _by_seed(columns, [row for row in rows if row[columns.index(variant)] == end])
+        for end in (worst, best)
+    )
+    return {seed: (low[seed], high[seed]) for seed in low if seed in high}
+
+
+def _closed(returns: dict[str, float], gap: dict[str, tuple[float, float]]) -> str:
+    """The share over the seeds that both have, as `benchmarks/sim_to_real.py` has it."""
+    seeds = [seed for seed in returns if seed in gap]
+    if not seeds:
+        return ""
+    gained = fmean(returns[seed] - gap[seed][0] for seed in seeds)
+    return rounded(gained / fmean(gap[seed][1] - gap[seed][0] for seed in seeds))
