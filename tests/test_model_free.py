@@ -302,6 +302,18 @@ def test_observations_of_numbers_and_choices_are_learned_from(space):
     assert env.action_space.contains(action)
 
 
+@every_algorithm
+@pytest.mark.parametrize("shape", [(2, 2), (3, 1)])
+def test_actions_have_the_shape_of_the_action_space(name, shape):
+    # It refuses what the space does not contain.
+    env = Constant(spaces.Box(-1, 1, (3,)), spaces.Box(-2.0, 3.0, shape))
+
+    model = small(name, env).learn(30)
+
+    assert model.predict(np.zeros(3, np.float32))[0].shape == shape
+    assert model.replay_buffer.actions.shape[2:] == (int(np.prod(shape)),)
+
+
 def test_models_that_were_given_the_same_dictionary_do_not_share_it():
     kwargs = {"net_arch": [8]}
     exploring = GSDESAC("Pendulum-v1", policy_kwargs=kwargs)

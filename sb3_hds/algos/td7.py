@@ -93,7 +93,8 @@ class TD7Policy(LearningPolicy):
         pi, qf = widths(net_arch, "qf")
         of_values = activation(qf_activation_fn)
         self.n_obs = size_of(observation_space)
-        self.n_act = int(np.prod(action_space.shape))
+        self.action_shape = action_space.shape
+        self.n_act = int(np.prod(self.action_shape))
         optimizer = optimizer_of(optimizer_class, optimizer_kwargs or {})
         self.parts: dict[str, Any] = {
             "encoder": Encoder(embedding_size, qf, of_values),
@@ -299,7 +300,8 @@ class TD7(ModelFreeAlgorithm):
         super()._setup_model()
         self.policy.uses_checkpoints = self.assesses
         if self.action_noise is None and self.exploration_noise:
-            size = np.full(self.policy.n_act, self.exploration_noise, np.float32)
+            # SB3 adds it to actions of the space's shape.
+            size = np.full(self.policy.action_shape, self.exploration_noise, np.float32)
             self.action_noise = NormalActionNoise(np.zeros_like(size), size)
 
     def _build(self, seed: int) -> None:
