@@ -22,10 +22,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_hds import GSDESAC, TD7, CrossQ, DroQ, SimbaSAC, algos
 from sb3_hds.algos import td7_update
 from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp
+from sb3_hds.algos.gaussian_policy import optimizer_of
 from sb3_hds.algos.heads import ExploringActor
 from sb3_hds.algos.lap import LapReplayBuffer, SumTree
 from sb3_hds.algos.observations import Seen, flattener, seen
 from sb3_hds.algos.off_policy import (
+    Trained,
     Truncated,
     average,
     judge,
@@ -394,12 +396,43 @@ def test_returns_of_several_steps_need_a_buffer_that_has_them():
         ({"policy_kwargs": {"activation_fn": "swoosh"}}, "activation_fn must be one of"),
         ({"policy_kwargs": {"optimizer_class": "magic"}}, "optimizer_class must be one of"),
         ({"policy_kwargs": {"optimizer_kwargs": {"speed": 1}}}, "optimizer_kwargs"),
+        ({"policy_kwargs": {"optimizer_class": th.optim.NAdam}}, "optimizer_class='nadam'"),
         ({"policy_kwargs": {"dropout_rate": 1.0}}, "dropout_rate must be at least 0"),
     ],
 )
 def test_what_cannot_work_is_refused_at_the_door(arguments, message):
     with pytest.raises(ValueError, match=message):
         DroQ("Pendulum-v1", **arguments)
+
+
+@pytest.mark.parametrize(
+    ("make", "arguments"),
+    [
+        (th.optim.Adam, {"betas": (0.8, 0.99), "eps": 1e-5}),
+        (th.optim.AdamW, {}),
+        (th.optim.AdamW, {"weight_decay": 0.1}),
+        (th.optim.RMSprop, {}),
+        (th.optim.RMSprop, {"alpha": 0.9, "momentum": 0.5}),
+        (th.optim.RAdam, {}),
+        (th.optim.SGD, {"momentum": 0.9, "nesterov": True}),
+    ],
+)
+def test_a_torch_class_means_what_it_does_in_torch(make, arguments):
+    rng = np.random.default_rng(0)
+    # RAdam's rectification begins with the sixth step.
+    w, slopes = rng.normal(size=(5, 2)), rng.normal(size=(8, 5, 2))
+    theirs = th.nn.Parameter(th.tensor(w))
+    torch_optimizer = make([theirs], lr=0.03, **arguments)
+    ours = optimizer_of(make, arguments)
+
+    with jax.enable_x64(True):
+        trained = Trained({"params": jnp.asarray(w)}, ours.init(jnp.asarray(w)))
+        for slope in slopes:
+            trained = ours.apply(jnp.asarray(slope), trained, 0.03)
+            theirs.grad = th.tensor(slope)
+            torch_optimizer.step()
+
+        np.testing.assert_allclose(trained.weights["params"], theirs.detach(), rtol=1e-6)
 
 
 def test_torch_classes_are_understood():
