@@ -19,6 +19,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from rl_zoo_plugin.lazy import parameters_of
 from sb3_hds import GSDESAC, TD7, CrossQ, DroQ, SimbaSAC, algos
 from sb3_hds.algos import td7_update
 from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp
@@ -405,6 +406,13 @@ def test_what_cannot_work_is_refused_at_the_door(arguments, message):
         DroQ("Pendulum-v1", **arguments)
 
 
+@every_algorithm
+def test_the_default_number_of_steps_goes_beyond_the_random_ones(name):
+    algorithm = algos.ALL[name]
+
+    assert algorithm.default_timesteps >= 2 * parameters_of(algorithm)["learning_starts"].default
+
+
 @pytest.mark.parametrize(
     ("make", "arguments"),
     [
@@ -572,6 +580,33 @@ def test_td7_does_not_judge_a_policy_by_random_actions():
 def test_what_td7_cannot_do_is_refused(arguments):
     with pytest.raises(ValueError, match=next(iter(arguments))):
         TD7("Pendulum-v1", **arguments)
+
+
+def test_td7_keeps_its_checkpoint_and_what_that_is_worth_when_networks_start_afresh():
+    model = small("td7", use_checkpoints=True, train_freq=None)
+    model.policy.keep_checkpoint()
+    model.best_worst_return = -150.0
+    obs = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, -2.0]], np.float32)
+    exploring, kept = (model.predict(obs, deterministic=way)[0] for way in (False, True))
+
+    model._restart(seed=1)
+
+    assert np.abs(model.predict(obs)[0] - exploring).min() > 1e-3
+    np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], kept)
+    assert model.best_worst_return == -150.0
+
+
+def test_td7_judges_policies_by_the_rewards_of_the_environment_itself():
+    space = spaces.Box(-1, 1, (3,))
+    # Ten steps that earn 1 each; normalised, the same ten earn less and less.
+    env = VecNormalize(DummyVecEnv([lambda: Constant(space, spaces.Box(-1, 1, (1,)))]))
+    model = small("td7", env, use_checkpoints=True, train_freq=None)
+    judged = []
+    model._assessed = lambda: judged.extend(model._finished) or 0
+
+    model.learn(60)
+
+    assert {earned for earned, _ in judged} == {10.0}
 
 
 def test_td7_loaded_with_several_environments_assesses_no_policy(tmp_path):
