@@ -140,7 +140,7 @@ class GaussianPolicy(LearningPolicy):
         n_act = int(np.prod(action_space.shape))
         pi, qf = self.widths
         body = self.actor_body(pi)
-        self.actor_network: nn.Module = GaussianActor(body, n_act)
+        self.actor_network = self.gaussian_actor(body, n_act)
         if use_sde:
             gsde = (log_std_init, full_std, use_expln, clip_mean)
             self.actor_network = ExploringActor(body, n_act, *gsde)
@@ -174,6 +174,10 @@ class GaussianPolicy(LearningPolicy):
             self.renorm_warmup_steps,
             self.batch_norm_momentum,
         )
+
+    def gaussian_actor(self, body: nn.Module, n_act: int) -> nn.Module:
+        """:return: the actor without gSDE"""
+        return GaussianActor(body, n_act)
 
     def build_plain(self) -> None:
         """That of SAC; with batch normalisation, that of CrossQ."""
