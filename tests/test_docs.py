@@ -36,6 +36,8 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 PAGES = sorted([*DOCS.glob("*.md"), *DOCS.glob("[!_]*/[!_]*.md"), ROOT / "README.md"])
 
+SCRIPTS = sorted((ROOT / "benchmarks").glob("*.py"))
+
 # The pages show the defaults that a user wants; here it is enough that the code runs.
 SMALL = {
     "pretrain_epochs": 2,
@@ -127,6 +129,15 @@ def test_the_hyperparameters_of_a_page_are_arguments_of_the_algorithms(page):
                 made = pydoc.locate(path)
                 assert set(arguments) <= set(inspect.signature(made).parameters)
             assert set(entry) - own <= set(inspect.signature(HDS).parameters)
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_the_commands_in_the_docstring_of_a_benchmark_have_the_options_shown(script):
+    text = ast.get_docstring(ast.parse(script.read_text())) or ""
+    lines = [line.partition("  #")[0].strip() for line in text.splitlines()]
+    shown = [shlex.split(line) for line in lines if line.startswith("python benchmarks/")]
+
+    assert [words for words in shown if (wrong := objection(words))] == [], wrong
 
 
 def test_commands_that_do_not_exist_are_found():

@@ -19,13 +19,16 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from rl_zoo_plugin.lazy import parameters_of
 from sb3_hds import GSDESAC, TD7, CrossQ, DroQ, SimbaSAC, algos
 from sb3_hds.algos import td7_update
 from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp
+from sb3_hds.algos.gaussian_policy import optimizer_of
 from sb3_hds.algos.heads import ExploringActor
 from sb3_hds.algos.lap import LapReplayBuffer, SumTree
 from sb3_hds.algos.observations import Seen, flattener, seen
 from sb3_hds.algos.off_policy import (
+    Trained,
     Truncated,
     average,
     judge,
@@ -302,6 +305,18 @@ def test_observations_of_numbers_and_choices_are_learned_from(space):
     assert env.action_space.contains(action)
 
 
+@every_algorithm
+@pytest.mark.parametrize("shape", [(2, 2), (3, 1)])
+def test_actions_have_the_shape_of_the_action_space(name, shape):
+    # It refuses what the space does not contain.
+    env = Constant(spaces.Box(-1, 1, (3,)), spaces.Box(-2.0, 3.0, shape))
+
+    model = small(name, env).learn(30)
+
+    assert model.predict(np.zeros(3, np.float32))[0].shape == shape
+    assert model.replay_buffer.actions.shape[2:] == (int(np.prod(shape)),)
+
+
 def test_models_that_were_given_the_same_dictionary_do_not_share_it():
     kwargs = {"net_arch": [8]}
     exploring = GSDESAC("Pendulum-v1", policy_kwargs=kwargs)
@@ -382,12 +397,50 @@ def test_returns_of_several_steps_need_a_buffer_that_has_them():
         ({"policy_kwargs": {"activation_fn": "swoosh"}}, "activation_fn must be one of"),
         ({"policy_kwargs": {"optimizer_class": "magic"}}, "optimizer_class must be one of"),
         ({"policy_kwargs": {"optimizer_kwargs": {"speed": 1}}}, "optimizer_kwargs"),
+        ({"policy_kwargs": {"optimizer_class": th.optim.NAdam}}, "optimizer_class='nadam'"),
         ({"policy_kwargs": {"dropout_rate": 1.0}}, "dropout_rate must be at least 0"),
     ],
 )
 def test_what_cannot_work_is_refused_at_the_door(arguments, message):
     with pytest.raises(ValueError, match=message):
         DroQ("Pendulum-v1", **arguments)
+
+
+@every_algorithm
+def test_the_default_number_of_steps_goes_beyond_the_random_ones(name):
+    algorithm = algos.ALL[name]
+
+    assert algorithm.default_timesteps >= 2 * parameters_of(algorithm)["learning_starts"].default
+
+
+@pytest.mark.parametrize(
+    ("make", "arguments"),
+    [
+        (th.optim.Adam, {"betas": (0.8, 0.99), "eps": 1e-5}),
+        (th.optim.AdamW, {}),
+        (th.optim.AdamW, {"weight_decay": 0.1}),
+        (th.optim.RMSprop, {}),
+        (th.optim.RMSprop, {"alpha": 0.9, "momentum": 0.5}),
+        (th.optim.RAdam, {}),
+        (th.optim.SGD, {"momentum": 0.9, "nesterov": True}),
+    ],
+)
+def test_a_torch_class_means_what_it_does_in_torch(make, arguments):
+    rng = np.random.default_rng(0)
+    # RAdam's rectification begins with the sixth step.
+    w, slopes = rng.normal(size=(5, 2)), rng.normal(size=(8, 5, 2))
+    theirs = th.nn.Parameter(th.tensor(w))
+    torch_optimizer = make([theirs], lr=0.03, **arguments)
+    ours = optimizer_of(make, arguments)
+
+    with jax.enable_x64(True):
+        trained = Trained({"params": jnp.asarray(w)}, ours.init(jnp.asarray(w)))
+        for slope in slopes:
+            trained = ours.apply(jnp.asarray(slope), trained, 0.03)
+            theirs.grad = th.tensor(slope)
+            torch_optimizer.step()
+
+        np.testing.assert_allclose(trained.weights["params"], theirs.detach(), rtol=1e-6)
 
 
 def test_torch_classes_are_understood():
@@ -527,6 +580,33 @@ def test_td7_does_not_judge_a_policy_by_random_actions():
 def test_what_td7_cannot_do_is_refused(arguments):
     with pytest.raises(ValueError, match=next(iter(arguments))):
         TD7("Pendulum-v1", **arguments)
+
+
+def test_td7_keeps_its_checkpoint_and_what_that_is_worth_when_networks_start_afresh():
+    model = small("td7", use_checkpoints=True, train_freq=None)
+    model.policy.keep_checkpoint()
+    model.best_worst_return = -150.0
+    obs = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, -2.0]], np.float32)
+    exploring, kept = (model.predict(obs, deterministic=way)[0] for way in (False, True))
+
+    model._restart(seed=1)
+
+    assert np.abs(model.predict(obs)[0] - exploring).min() > 1e-3
+    np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], kept)
+    assert model.best_worst_return == -150.0
+
+
+def test_td7_judges_policies_by_the_rewards_of_the_environment_itself():
+    space = spaces.Box(-1, 1, (3,))
+    # Ten steps that earn 1 each; normalised, the same ten earn less and less.
+    env = VecNormalize(DummyVecEnv([lambda: Constant(space, spaces.Box(-1, 1, (1,)))]))
+    model = small("td7", env, use_checkpoints=True, train_freq=None)
+    judged = []
+    model._assessed = lambda: judged.extend(model._finished) or 0
+
+    model.learn(60)
+
+    assert {earned for earned, _ in judged} == {10.0}
 
 
 def test_td7_loaded_with_several_environments_assesses_no_policy(tmp_path):
