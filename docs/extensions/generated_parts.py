@@ -24,6 +24,17 @@ PARTS: dict[str, Callable[[], str]] = {
     "sim_to_real_gap": summaries.whole("sim_to_real_gap"),
     "sim_to_real_median": summaries.whole("sim_to_real_median"),
     "payload_added": summaries.whole("payload_added_recovery"),
+    "open_loop": summaries.gaits,
+    "robustness_return": summaries.crossed(
+        "robustness", "perturbation", ("env", "policy"), "return"
+    ),
+    "robustness_share": summaries.crossed("robustness", "perturbation", ("env", "policy"), "share"),
+    "action_scale": summaries.crossed("action_scale", "scale", ("timestep",), "distance"),
+    "safe_swing_up": summaries.over_seeds(
+        "safe_swing_up", "without", "return", "violations", "continuity"
+    ),
+    "cpg_prior": summaries.crossed("cpg_prior", "prior", ("env", "learner"), "return"),
+    "elastic_quadruped": summaries.over_seeds("elastic_quadruped", "method", "return"),
     "hds_parts": summaries.over_seeds("hds_parts", "variant", "return"),
     "hds_weaknesses": summaries.over_seeds("hds_weaknesses", "variant", "return"),
     "hds_beta": summaries.over_seeds(
