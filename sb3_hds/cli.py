@@ -8,14 +8,29 @@
 """
 
 import argparse
+import functools
+import importlib
 import io
 import json
 import sys
 from collections.abc import Sequence
 from typing import Any
 
-# Of Stable-Baselines3, for continuous actions.
-_THEIRS = ("a2c", "ddpg", "ppo", "sac", "td3")
+# Ids that rl_zoo3 has by itself, and where their classes are.
+_THEIRS = {
+    "a2c": "stable_baselines3.A2C",
+    "ddpg": "stable_baselines3.DDPG",
+    "dqn": "stable_baselines3.DQN",
+    "ppo": "stable_baselines3.PPO",
+    "sac": "stable_baselines3.SAC",
+    "td3": "stable_baselines3.TD3",
+    "ars": "sb3_contrib.ARS",
+    "crossq": "sb3_contrib.CrossQ",
+    "ppo_lstm": "sb3_contrib.RecurrentPPO",
+    "qrdqn": "sb3_contrib.QRDQN",
+    "tqc": "sb3_contrib.TQC",
+    "trpo": "sb3_contrib.TRPO",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -63,9 +78,20 @@ def parser() -> argparse.ArgumentParser:
     ask.add_argument("--report", help="HTML page to write")
     ask.add_argument("--json", help="JSON file to write")
     shake = commands.add_parser("robustness", help="return under noise, failed sensors, pushes")
-    shake.add_argument("--algo", required=True, help="id in the zoo, ours or Stable-Baselines3's")
+    shake.add_argument(
+        "--algo", required=True, help="id in the zoo, ours or rl_zoo3's, or a class: sbx.SAC"
+    )
     shake.add_argument("--model", required=True, help="file that the algorithm saved")
     shake.add_argument("--env", required=True, help="environment id")
+    shake.add_argument("--env-kwargs", nargs="*", default=[], metavar="NAME:VALUE")
+    shake.add_argument(
+        "--env-wrapper",
+        nargs="*",
+        default=[],
+        metavar="CLASS",
+        help="as trained, the one next to the environment first: package.Wrapper, or with "
+        "arguments as in yml, 'package.Wrapper: {cutoff: 4.0}'",
+    )
     shake.add_argument("--episodes", type=int, default=20, help="for each perturbation")
     shake.add_argument("--encoders", choices=("own", "observation"), default="own")
     shake.add_argument("--vecnormalize", help="vecnormalize.pkl of the training")
@@ -119,9 +145,12 @@ def _robustness(given: argparse.Namespace) -> None:
 
     changed = {name: dict(settings) for name, settings in PERTURBATIONS.items()}
     changed["push"]["push"] = given.push
+    kwargs = dict(map(_yml_setting, given.env_kwargs))
+    wrap = functools.partial(_wrapped, [_wrapper(text) for text in given.env_wrapper])
     found = measure_robustness(
         _algorithm(given.algo).load(given.model),
-        given.env,
+        functools.partial(_made, given.env, kwargs),
+        wrapper=wrap,
         perturbations=changed,
         n_episodes=given.episodes,
         encoders=given.encoders,
@@ -138,16 +167,83 @@ def _robustness(given: argparse.Namespace) -> None:
 
 
 def _algorithm(name: str) -> Any:
-    import stable_baselines3
-
     from sb3_hds.algos import ALL
     from sb3_hds.errors import ParameterError
 
-    theirs = {id_: getattr(stable_baselines3, id_.upper()) for id_ in _THEIRS}
-    if name not in ALL | theirs:
-        known = ", ".join(ALL | theirs)
-        raise ParameterError(f"There is no algorithm '{name}'. There are: {known}.")
-    return (ALL | theirs)[name]
+    if name in ALL:
+        return ALL[name]
+    if name not in _THEIRS and "." not in name:
+        known = ", ".join([*ALL, *_THEIRS])
+        raise ParameterError(
+            f"There is no algorithm '{name}'. There are: {known}; or name a class: sbx.SAC."
+        )
+    found = _class_of(_THEIRS.get(name, name))
+    if not hasattr(found, "load"):
+        raise ParameterError(f"'{name}' is {found!r}, which is no algorithm: it loads no model.")
+    return found
+
+
+def _class_of(path: str) -> Any:
+    from sb3_hds.errors import ParameterError
+
+    module, _, name = path.rpartition(".")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ParameterError(f"There is no class '{path}' to import: {error}.") from error
+
+
+def _made(env_id: str, kwargs: dict[str, Any]) -> Any:
+    import gymnasium
+
+    from sb3_hds.errors import EnvironmentMismatchError
+
+    try:
+        return gymnasium.make(env_id, **kwargs)
+    except (gymnasium.error.Error, TypeError) as error:
+        raise EnvironmentMismatchError(f"There is no '{env_id}' with {kwargs}: {error}") from error
+
+
+def _wrapper(text: str) -> tuple[Any, dict[str, Any]]:
+    """:return: a class and its arguments, of ``package.Wrapper`` or ``package.Wrapper: {a: 1}``"""
+    import yaml
+
+    from sb3_hds.errors import ParameterError
+
+    try:
+        found = yaml.safe_load(text)
+    except yaml.YAMLError:
+        found = None
+    if isinstance(found, str):
+        found = {found: {}}
+    named = isinstance(found, dict) and len(found) == 1 and isinstance(next(iter(found)), str)
+    path, arguments = next(iter(found.items())) if named else ("", None)
+    if not isinstance(arguments := {} if arguments is None and named else arguments, dict):
+        raise ParameterError(
+            "--env-wrapper takes package.Wrapper, or with arguments 'package.Wrapper: {a: 1}', got "
+            f"'{text}'."
+        )
+    return _class_of(path), arguments
+
+
+def _wrapped(wrappers: Sequence[tuple[Any, dict[str, Any]]], env: Any) -> Any:
+    for wrapper, arguments in wrappers:
+        env = wrapper(env, **arguments)
+    return env
+
+
+def _yml_setting(text: str) -> tuple[str, Any]:
+    import yaml
+
+    from sb3_hds.errors import ParameterError
+
+    name, colon, value = text.partition(":")
+    try:
+        if name and colon:
+            return name, yaml.safe_load(value)
+    except yaml.YAMLError:
+        pass
+    raise ParameterError(f"--env-kwargs takes NAME:VALUE with a value as in yml, got '{text}'.")
 
 
 def _setting(text: str) -> tuple[str, float]:

@@ -106,12 +106,20 @@ def small_and_tidy(monkeypatch, tmp_path):
         del gymnasium.registry[env_id]
 
 
+# Their blocks of text are what their code prints.
+PRINTED = ("docs/modules/task_design.md",)
+
+
 @pytest.mark.parametrize("page", pages_with("python"))
-def test_the_code_of_a_page_runs_from_top_to_bottom(page, small_and_tidy):
+def test_the_code_of_a_page_runs_from_top_to_bottom(page, small_and_tidy, capsys):
     namespace = {"__name__": "a_page"}
 
     for code in blocks(page, "python"):
         exec(compile(code, str(page), "exec"), namespace)
+
+    said, shown = capsys.readouterr().out, blocks(page, "text")
+    for paragraph in "".join(shown).split("\n\n") if name_of(page) in PRINTED else ():
+        assert paragraph.strip() in said
 
 
 @pytest.mark.parametrize("page", pages_with("bash"))
@@ -306,6 +314,27 @@ def test_episodes_after_the_first_are_shown_together(tmp_path, monkeypatch):
 
     assert "| 1 | 1 | -9 | 3 |" in shown
     assert "| 2 to 3 | 3 | -3 (-4 to -2) | 2 |" in shown
+
+
+def test_results_are_turned_into_the_tables_of_the_pages(tmp_path, monkeypatch):
+    monkeypatch.setattr(summaries, "RESULTS", tmp_path)
+    turned = summaries.crossed("shares", "kind", ("env", "policy"), "share")
+    assert turned() == summaries.gaits() == "Not measured yet in this checkout.\n\n"
+    rows = [["kind", "env", "policy", "seed", "share"]]
+    rows += [["push", "A", "gait", "0", "0.2"], ["push", "A", "gait", "1", "0.4"]]
+    rows += [["noise", "B", "sac", "0", "1"]]
+    found = [["env", "steps", "return", "target", "searched", "seconds"]]
+    found += [["A", "200000", value, "290", "7", "120"] for value in ("1", "5", "3000")]
+    for name, table in (("shares", rows), ("open_loop", found)):
+        with (tmp_path / f"{name}.csv").open("w", newline="") as file:
+            csv.writer(file).writerows(table)
+    (tmp_path / "shares.png").touch()
+
+    shown = turned()
+
+    assert "| kind | A, gait | B, sac |" in shown and "shares.png)" in shown
+    assert "| push | 0.3 |  |" in shown and "| noise |  | 1 |" in shown
+    assert "| A | 200,000 | 7 | 5 (1 to 3,000) | 290 | 3 | 2 |" in summaries.gaits()
 
 
 def test_without_results_no_number_is_shown(tmp_path):

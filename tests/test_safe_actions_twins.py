@@ -25,6 +25,7 @@ from sb3_hds.wrappers import (
     ActionScale,
     ActionShield,
     ContinuityCost,
+    CPGPrior,
     HistoryObservation,
     JointLimitBarrier,
     LowPassAction,
@@ -50,6 +51,9 @@ LAYERS = {
     "barrier": lambda env: JointLimitBarrier(
         env, -2.0, 2.0, position=[[0, 1]], gain=0.5, on_breach="ignore"
     ),
+    "rhythm_offset": lambda env: CPGPrior(env, omega_swing=3.0, omega_stance=5.0, phase=0.4),
+    "rhythm_residual": lambda env: CPGPrior(env, mode="residual", omega_swing=3.0, amplitude=2.5),
+    "rhythm_parameters": lambda env: CPGPrior(env, mode="parameters", omega_swing=3.0, offset=0.3),
     "two_of_a_kind": lambda env: ActionRateLimit(ActionRateLimit(env, 30.0), 10.0),
     "nested": nested,
 }
@@ -86,7 +90,7 @@ def test_what_is_seen_tells_the_state_of_the_twin(layer, x64):
     twin = twin_of(LAYERS[layer](gymnasium.make("Pendulum-v1")))
     state = twin.initial(jax.random.key(0), twin.params)
     for k in range(5):
-        state = twin.step(state, jnp.full(1, 1.5 - k), twin.params)
+        state = twin.step(state, jnp.full(len(twin.actuators), 1.5 - k), twin.params)
 
     back = twin.infer(twin.observe(state, twin.params), twin.params)
 

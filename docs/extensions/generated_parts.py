@@ -29,6 +29,17 @@ PARTS: dict[str, Callable[[], str]] = {
     "payload_added": summaries.whole("payload_added_recovery"),
     "ten_minutes": summaries.first_and_rest("ten_minutes", 3),
     "hds_parts": summaries.over_seeds("hds_parts", "variant", "return", ends=WORN),
+    "open_loop": summaries.gaits,
+    "robustness_return": summaries.crossed(
+        "robustness", "perturbation", ("env", "policy"), "return"
+    ),
+    "robustness_share": summaries.crossed("robustness", "perturbation", ("env", "policy"), "share"),
+    "action_scale": summaries.crossed("action_scale", "scale", ("timestep",), "distance"),
+    "safe_swing_up": summaries.over_seeds(
+        "safe_swing_up", "without", "return", "violations", "continuity"
+    ),
+    "cpg_prior": summaries.crossed("cpg_prior", "prior", ("env", "learner"), "return"),
+    "elastic_quadruped": summaries.over_seeds("elastic_quadruped", "method", "return"),
     "hds_weaknesses": summaries.over_seeds("hds_weaknesses", "variant", "return"),
     "hds_beta": summaries.over_seeds(
         "hds_beta",
