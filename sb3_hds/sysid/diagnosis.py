@@ -1,7 +1,6 @@
 """What a diagnosis says."""
 
 import dataclasses
-import math
 import os
 import textwrap
 from collections.abc import Mapping
@@ -11,7 +10,7 @@ from typing import Any, Literal
 
 from sb3_hds.core import Params, Twin
 from sb3_hds.sysid.pictures import Pictures
-from sb3_hds.sysid.results import Estimate
+from sb3_hds.sysid.results import Estimate, plain
 
 Verdict = Literal["named", "ambiguous", "none", "unknown", "not_identifiable"]
 
@@ -160,14 +159,18 @@ class Diagnosis:
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """:return: the same, as plain data for JSON"""
+        """
+        :return: the same, as plain data for JSON: the twins as their specifications, numbers that
+            are not finite as None; ``params`` are the numbers of the extended twin, and arrays that
+            were learned are left out
+        """
         found = {
             field.name: getattr(self, field.name)
             for field in dataclasses.fields(self)
             if field.name not in ("believed", "twin", "pictures")
         }
         twins = {"believed": self.believed.to_spec(), "twin": self.twin.to_spec()}
-        return _plain(found) | _plain(twins)
+        return plain(found | twins | {"params": self.twin.values})
 
     def to_html(
         self, path: str | os.PathLike[str], policy_gain: Mapping[str, Any] | None = None
@@ -216,15 +219,3 @@ def _of_finding(finding: Finding) -> list[str]:
 
 def _wrapped(text: str, indent: str = "") -> list[str]:
     return textwrap.wrap(text, _WIDTH, initial_indent=indent, subsequent_indent=indent + "  ")
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return _plain({f.name: getattr(value, f.name) for f in dataclasses.fields(value)})
-    if isinstance(value, Mapping):
-        return {str(key): _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
