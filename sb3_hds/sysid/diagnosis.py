@@ -50,6 +50,12 @@ class Finding:
     gain: float
     explanation: str
 
+    @property
+    def key(self) -> str:
+        """Name and place, as in ``rejected`` and ``detectable``."""
+        own = self.where["slot"] == "parameter"
+        return self.effect if own else f"{self.effect}.{self.where['name']}"
+
 
 @dataclasses.dataclass(frozen=True)
 class Rejected:
@@ -134,9 +140,33 @@ class Diagnosis:
         """All parameters of the extended twin."""
         return self.twin.params
 
+    @property
+    def sentence(self) -> str:
+        """The verdict in one sentence."""
+        if self.verdict == "ambiguous":
+            first, *others = self.findings
+            choice = " or ".join(map(_spoken, (first.key, *first.alternatives)))
+            also = f", and {' and '.join(_spoken(f.key) for f in others)}" if others else ""
+            return f"The simulation is wrong about {choice}{also}: the data cannot tell which."
+        if self.verdict != "named":
+            return SENTENCES[self.verdict]
+        new = [f for f in self.findings if self._is_new(f)]
+        said = {"lacks": new, "is wrong about": [f for f in self.findings if f not in new]}
+        parts = [
+            f"{verb} {' and '.join(_spoken(f.key) for f in found)}"
+            for verb, found in said.items()
+            if found
+        ]
+        return f"The simulation {' and '.join(parts)}."
+
+    def _is_new(self, finding: Finding) -> bool:
+        """Whether the believed twin has nothing of the kind."""
+        names = {e.name for e in finding.parameters.values()}
+        return names <= {*self.twin.values} - {*self.believed.values}
+
     def summary(self) -> str:
         """:return: all of it in 80 columns"""
-        lines = [f"{self.verdict}: {SENTENCES[self.verdict]}", "=" * _WIDTH]
+        lines = [*_wrapped(f"{self.verdict}: {self.sentence}"), "=" * _WIDTH]
         for finding in self.findings:
             lines += _of_finding(finding)
         if self.unexplained:
@@ -149,9 +179,9 @@ class Diagnosis:
                 for g in self.gain.values()
             ]
         if self.rejected:
-            lines.append("Not accepted, best first:")
+            lines.append(f"{'Not accepted, best first:':<37} {'gain':>6} {'p':>7}  why")
             lines += [
-                f"  {r.name:<40.40} gain {r.gain:7.1%}   p {r.p_value:.2g}  {r.why}"[:_WIDTH]
+                f"  {r.name:<35.35} {max(r.gain, -9.99):6.0%} {r.p_value:7.2g}  {r.why}"[:_WIDTH]
                 for r in self.rejected[:5]
             ]
         for caveat in self.caveats:
@@ -206,8 +236,8 @@ class Diagnosis:
 
 
 def _of_finding(finding: Finding) -> list[str]:
-    place = finding.where["name"]
-    lines = [f"{finding.effect} at {finding.where['slot']} {place}"]
+    own, place = finding.where["slot"] == "parameter", finding.where["name"]
+    lines = [finding.effect if own else f"{finding.effect} at {finding.where['slot']} {place}"]
     lines += _wrapped(finding.explanation, "  ")
     for name, e in finding.parameters.items():
         lines.append(f"  {name} = {e.estimate:.4g} [{e.low:.4g}, {e.high:.4g}] {e.unit}")
@@ -215,6 +245,14 @@ def _of_finding(finding: Finding) -> list[str]:
     if finding.alternatives:
         lines += _wrapped(f"cannot be told from: {', '.join(finding.alternatives)}", "  ")
     return lines
+
+
+def _spoken(key: str) -> str:
+    """A candidate, for people: ``"coulomb_friction.hinge"`` is Coulomb friction at hinge."""
+    name, _, place = key.partition(".")
+    for person in ("coulomb", "stribeck"):
+        name = name.replace(person, person.title())
+    return place if name == "parameter" else f"{name.replace('_', ' ')} at {place}"
 
 
 def _wrapped(text: str, indent: str = "") -> list[str]:
