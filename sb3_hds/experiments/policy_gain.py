@@ -17,10 +17,12 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_hds.algos import HDS
 from sb3_hds.core import Twin
+from sb3_hds.core.storage import write_bytes
 from sb3_hds.envs import TwinEnv, true_twin
 from sb3_hds.errors import TrajectoryError
 from sb3_hds.experiments.returns import returns_of
 from sb3_hds.sysid import Diagnosis
+from sb3_hds.sysid.plots import as_png, plot_policy_gain
 
 _N_RESAMPLES = 2000
 _LEVEL = 0.9
@@ -86,9 +88,7 @@ class PolicyGain:
         :param path: of the picture
         :raises ImportError: without matplotlib (extra ``report``)
         """
-        from sb3_hds.experiments.plots import plot_policy_gain
-
-        return plot_policy_gain(self, path)
+        return write_bytes(path, as_png(plot_policy_gain(self.to_dict())))
 
     def __str__(self) -> str:
         runs, episodes = self.returns["believed"].shape
