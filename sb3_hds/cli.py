@@ -216,9 +216,11 @@ def _wrapper(text: str) -> tuple[Any, dict[str, Any]]:
         found = None
     if isinstance(found, str):
         found = {found: {}}
-    named = isinstance(found, dict) and len(found) == 1 and isinstance(next(iter(found)), str)
-    path, arguments = next(iter(found.items())) if named else ("", None)
-    if not isinstance(arguments := {} if arguments is None and named else arguments, dict):
+    path, arguments = "", None
+    if isinstance(found, dict) and len(found) == 1 and isinstance(next(iter(found)), str):
+        path, arguments = next(iter(found.items()))
+        arguments = {} if arguments is None else arguments
+    if not isinstance(arguments, dict):
         raise ParameterError(
             "--env-wrapper takes package.Wrapper, or with arguments 'package.Wrapper: {a: 1}', got "
             f"'{text}'."

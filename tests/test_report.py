@@ -4,6 +4,7 @@ import dataclasses
 import html
 import json
 import math
+import re
 import shutil
 import subprocess
 from itertools import pairwise
@@ -159,7 +160,8 @@ def test_the_report_is_one_page_that_needs_no_network(rubbing, tmp_path):
     assert "lacks Coulomb friction at hinge" in text
     # Four pictures, each for wide and for narrow pages.
     assert text.count("data:image/png;base64,") == 2 * 4
-    assert "http" not in text and "<script" not in text
+    written = re.sub('base64,[^"]*', "", text)
+    assert "http" not in written and "<script" not in written
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 

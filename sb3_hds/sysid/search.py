@@ -384,9 +384,9 @@ class Search:
         h, theta = self.hypotheses, _set(base.theta, self.hypotheses.names, start)
         index = [*free, *(i for i in h.indices(candidate) if h.names[i] not in start)]
         slopes = evidence.slopes(base._replace(theta=theta), index)
-        room = tuple(
-            sign * np.clip(sign * (bound - theta)[index] / h.scale[index], 0.0, _FARTHEST)
-            for sign, bound in ((-1.0, h.lower), (1.0, h.upper))
+        room = (
+            np.clip((h.lower - theta)[index] / h.scale[index], -_FARTHEST, 0.0),
+            np.clip((h.upper - theta)[index] / h.scale[index], 0.0, _FARTHEST),
         )
         every = list(range(len(index)))
         step, gain = _newton(slopes.curvature.sum(0), slopes.scores.sum(0), every, room)
