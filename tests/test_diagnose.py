@@ -14,9 +14,10 @@ from sb3_hds.core import JointEffect, Parameter, Trajectories, rollout
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.comparison import Comparison, compare, confirm, split
 from sb3_hds.sysid.evidence import Evidence
+from sb3_hds.sysid.guesses import newton
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.remainder import MissingForce, remainder
-from sb3_hds.sysid.search import Search, _newton
+from sb3_hds.sysid.search import Search
 from sb3_hds.sysid.shooting import shots_of
 
 CATALOGUE = (
@@ -450,9 +451,9 @@ def test_a_guess_stays_within_its_room():
     curvature, score = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([-2.0, 1.0])
     nowhere = np.array([np.inf, np.inf])
 
-    step, gain = _newton(curvature, score, [0, 1], (np.array([-np.inf, 0.0]), nowhere))
+    step, gain = newton(curvature, score, [0, 1], (np.array([-np.inf, 0.0]), nowhere))
     np.testing.assert_allclose(step, [1.0, 0.0])
     assert gain == pytest.approx(1.0)
-    step, gain = _newton(curvature, score, [0, 1], (-nowhere, nowhere))
+    step, gain = newton(curvature, score, [0, 1], (-nowhere, nowhere))
     np.testing.assert_allclose(step, np.linalg.solve(curvature, -score))
     assert gain == pytest.approx(0.5 * score @ np.linalg.solve(curvature, score))
