@@ -239,6 +239,8 @@ def test_a_wrong_state_or_torque_is_refused():
         env.step(np.array([np.nan]))
 
 
-def test_the_truth_of_another_environment_is_not_known():
+@pytest.mark.parametrize("known", ["Pendulum-v1", "CartPole-v1"])
+def test_the_truth_of_another_environment_is_not_known(known):
+    """Whether it has a twin, or not."""
     with pytest.raises(TypeError, match=r"twins\.make"):
-        envs.true_twin(gymnasium.make("Pendulum-v1"))
+        envs.true_twin(gymnasium.make(known))

@@ -223,7 +223,7 @@ class Diagnosis:
 
         :param folder: is made where it is missing; files of the same names are replaced
         :return: their paths
-        :raises ImportError: without matplotlib (extra ``report``)
+        :raises ImportError: without matplotlib and jinja2 (extra ``report``)
         """
         from sb3_hds.sysid.report import write_pictures
 

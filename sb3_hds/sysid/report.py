@@ -3,6 +3,7 @@
 import base64
 import os
 from collections.abc import Callable, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -98,6 +99,12 @@ Where there is none, the effect cannot be seen by its slope at zero.</p>
 """
 
 
+def check_installed() -> None:
+    """:raises ImportError: without matplotlib and jinja2"""
+    if not all(map(find_spec, ("jinja2", "matplotlib"))):
+        raise ImportError(_INSTALL)
+
+
 class _Picture(NamedTuple):
     """
     :param draw: called with whether the picture is for a narrow page
@@ -118,10 +125,9 @@ def write_report(
     :param policy_gain: as plain data
     :raises ImportError: without matplotlib and jinja2
     """
-    try:
-        import jinja2
-    except ImportError as error:
-        raise ImportError(_INSTALL) from error
+    check_installed()
+    import jinja2
+
     pictures = [_inlined(picture) for picture in _pictures(diagnosis)]
     page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     text = page.from_string(_PAGE).render(
@@ -134,16 +140,16 @@ def write_pictures(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list
     """
     :param folder: is made where it is missing; files of the same names are replaced
     :return: one PNG for each picture of the report
-    :raises ImportError: without matplotlib
+    :raises ImportError: without matplotlib and jinja2
     """
-    pictures = _pictures(diagnosis)
+    check_installed()
     Path(folder).mkdir(parents=True, exist_ok=True)
     return [
         write_bytes(
             Path(folder) / f"{picture.title.lower().replace(' ', '_')}.png",
             plots.as_png(picture.draw(False)),
         )
-        for picture in pictures
+        for picture in _pictures(diagnosis)
     ]
 
 
@@ -252,13 +258,6 @@ def _policy(gain: Mapping[str, Any] | None) -> dict[str, Any] | None:
 
 
 def _pictures(d: Diagnosis) -> list[_Picture]:
-    """
-    :raises ImportError: without matplotlib
-    """
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError as error:
-        raise ImportError(_INSTALL) from error
     p = d.pictures
     if p is None:
         return []
