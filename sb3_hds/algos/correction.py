@@ -1,4 +1,4 @@
-"""Correct the twin by what was measured: parameters, then effects, then a learned force."""
+"""Correct the twin by what was measured: its parameters with those of effects, then a force."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -353,27 +353,22 @@ def _with_residual(
             )
         except CalibrationError:
             residual = None
-    # Simulating a force that does not help costs time.
-    if residual is not None and (residual.accepted or _shares(twin)):
-        twin = residual.twin
-    key = next(iter(_shares(twin)), None)
+    hybrid = twin if residual is None else residual.twin
+    key = next(iter(_shares(hybrid)), None)
     if key is None:
-        hybrid = np.nan if residual is None else _mean(residual.error_after)
-        return dataclasses.replace(found, residual=residual, error_hybrid=hybrid), errors
-    whole = windows.errors(twin, {**twin.params, key: 1.0})
+        return found, errors
+    whole = windows.errors(hybrid, {**hybrid.params, key: 1.0})
+    found = dataclasses.replace(found, residual=residual, error_hybrid=_mean(whole[held]))
+    # Simulating a force that does not help costs time.
+    if residual is not None and not (residual.accepted or _shares(twin)):
+        return found, errors
     helps = is_better(whole[held], errors[held])
     share = 0.0
     if helps:
         trust = min(1.0, gain(whole[held], errors[held]) / _TRUSTED)
         share = trust if wishes.beta == "auto" else float(wishes.beta)
-    twin = twin.with_parameters(**{key: 1.0 if helps else 0.0})
-    found = dataclasses.replace(
-        found,
-        twin=twin,
-        beta=share,
-        residual=residual,
-        error_hybrid=_mean(whole[held]),
-    )
+    twin = hybrid.with_parameters(**{key: 1.0 if helps else 0.0})
+    found = dataclasses.replace(found, twin=twin, beta=share)
     return found, whole if share > 0.0 else errors
 
 

@@ -35,8 +35,9 @@ class HDS(TwinAlgorithm):
 
     What it adds to PODS: exploration noise that decays, annealed acceptance of step sizes, plans
     that start where the real environment was seen; and after each block of real steps, the model is
-    corrected by what the environment answered: parameters and attached effects are estimated, then
-    a force is learned for what remains, and a share ``beta`` of the plans is made in that hybrid.
+    corrected by what the environment answered: parameters of the twin and of effects are estimated
+    together, since one can stand for another; then a force is learned for what remains, again
+    whenever the data have doubled, and a share ``beta`` of the plans is made in that hybrid.
     Nothing is kept that does not predict held-out windows of the data better; a twin that is exact
     is left alone.
 
