@@ -24,6 +24,18 @@ PARTS: dict[str, Callable[[], str]] = {
     "sim_to_real_gap": summaries.whole("sim_to_real_gap"),
     "sim_to_real_median": summaries.whole("sim_to_real_median"),
     "payload_added": summaries.whole("payload_added_recovery"),
+    **{
+        f"hidden_effects_{part}": summaries.whole(f"hidden_effects_{part}")
+        for part in ("targets", "kinds", "difficulty", "causes", "systems", "outside", "rules")
+    },
+    "hidden_effects_picture": summaries.picture(
+        "hidden_effects", "rates with intervals beside their targets, right names against size"
+    ),
+    "diagnosis_cost": summaries.whole("diagnosis_cost"),
+    "diagnosis_cost_lines": summaries.whole("diagnosis_cost_lines"),
+    "diagnosis_cost_picture": summaries.picture(
+        "diagnosis_cost", "seconds of a diagnosis against the number of recordings"
+    ),
     "hds_parts": summaries.over_seeds("hds_parts", "variant", "return"),
     "hds_weaknesses": summaries.over_seeds("hds_weaknesses", "variant", "return"),
     "hds_beta": summaries.over_seeds(

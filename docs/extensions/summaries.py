@@ -1,4 +1,4 @@
-"""Tables of ``benchmarks/results`` with a row for each variant: mean and range over seeds."""
+"""Tables and pictures of ``benchmarks/results``: as they are, or mean and range over seeds."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -34,6 +34,16 @@ def over_seeds(name: str, variant: str, *measured: str) -> Callable[[], str]:
 def whole(name: str) -> Callable[[], str]:
     """:return: what makes the Markdown of a table that is shown as it is, numbers rounded"""
     return lambda: _shown(name, lambda columns, rows: (columns, [[*map(rounded, r)] for r in rows]))
+
+
+def picture(name: str, shows: str) -> Callable[[], str]:
+    """
+    :param name: of the picture, without its ending
+    :param shows: what is to be seen on it
+    :return: what makes the Markdown for a page of a folder of `docs`, once there is a picture
+    """
+    there = f"![{shows}](../../benchmarks/results/{name}.png)"
+    return lambda: there if (RESULTS / f"{name}.png").exists() else _NONE
 
 
 def _shown(name: str, change: Callable) -> str:
