@@ -2,63 +2,126 @@
 What a diagnosis costs against the number of recordings.
 
     python benchmarks/diagnosis_cost.py
-    python benchmarks/diagnosis_cost.py --recordings 10 30 --budgets quick
+    python benchmarks/diagnosis_cost.py --systems pendulum --recordings 10 30 --budgets quick
+    python benchmarks/diagnosis_cost.py --report-only
 
-A pendulum on MuJoCo's engine with dry friction that `diagnose` is not told of, against the whole
-catalogue; recordings of 200 steps. One fresh process for each row, nothing compiled beforehand.
-Memory is the peak resident size of the process. Finished rows are kept.
+A pendulum and a double pendulum on MuJoCo's engine with dry friction that `diagnose` is not told
+of, against the whole catalogue; recordings of 200 steps. Each row is a fresh process: first with
+nothing compiled beforehand, then with the programs that the first one kept. Starting Python and
+making the data do not count. Memory is the peak resident size of the process. A straight line is
+fitted to the seconds, relative errors of all rows counting the same: its ends, how far rows are
+from it, and the exponent between the two largest numbers of recordings, 1 where cost is linear.
+Finished rows are kept.
 """
 
 import argparse
+import dataclasses
 import json
 import resource
+import shutil
+from collections.abc import Iterable
 
 import numpy as np
 import pandas as pd
-from hidden_effects import believed, recorded
+from hidden_cases import believed, nothing, recorded
 from independent_rigs import Planted
-from runs import RESULTS, fresh_process, resume, seconds_since_start
+from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
 
 RECORDINGS = (10, 30, 100, 300, 1000)
 BUDGETS = ("quick", "full")
-SYSTEM, NOISE, FRICTION = "pendulum", "1 %", 0.05
+#: and how strong the dry friction at the first joint is [N m]
+SYSTEMS = {"pendulum": 0.05, "double_pendulum": 0.05}
+NOISE = "1 %"
+#: seconds that ten recordings may take, compilation included
+PROMISED = {"quick": 15.0, "full": 60.0}
+_LINES = ("system", "budget", "programs")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument("--systems", nargs="*", default=list(SYSTEMS), choices=SYSTEMS)
     parser.add_argument("--recordings", nargs="*", type=int, default=list(RECORDINGS))
     parser.add_argument("--budgets", nargs="*", default=list(BUDGETS), choices=BUDGETS)
-    parser.add_argument("--worker", nargs=2, metavar=("BUDGET", "RECORDINGS"))
+    parser.add_argument("--report-only", action="store_true")
+    parser.add_argument("--worker", nargs=3, metavar=("SYSTEM", "BUDGET", "RECORDINGS"))
     arguments = parser.parse_args()
     if arguments.worker:
-        budget, n = arguments.worker
-        print(json.dumps({"rows": [worker(budget, int(n))]}))
+        system, budget, n = arguments.worker
+        print(json.dumps(worker(system, budget, int(n))))
         return
-    wanted = [(budget, n) for n in arguments.recordings for budget in arguments.budgets]
-    in_process = lambda *run: fresh_process(__file__, *run)["rows"]  # noqa: E731
-    resume("diagnosis_cost", ("budget", "recordings"), wanted, in_process, jobs=1)
+    if not arguments.report_only:
+        wanted = [
+            (system, budget, n)
+            for n in arguments.recordings
+            for system in arguments.systems
+            for budget in arguments.budgets
+        ]
+        resume("diagnosis_cost", ("system", "budget", "recordings"), wanted, cold_and_warm, jobs=1)
     table = pd.read_csv(RESULTS / "diagnosis_cost.csv")
     print(table.to_string(index=False, float_format="%.3g"))
+    lines = straight_lines(table)
+    lines.to_csv(RESULTS / "diagnosis_cost_lines.csv", index=False, float_format="%.3g")
+    print(lines.to_string(index=False, float_format="%.3g"))
     figure(table)
 
 
-def worker(budget: str, n: int) -> dict:
-    data = recorded(
-        SYSTEM,
-        [Planted("coulomb_friction", 0, {"tau_c": FRICTION})],
-        NOISE,
-        np.random.default_rng(n),
-        n,
-    )
+def cold_and_warm(system: str, budget: str, n: int) -> list[dict]:
+    """The same diagnosis by two processes, of which the second finds what the first compiled."""
+    folder = CACHE / "cost"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return [
+        {"programs": programs} | fresh_process(__file__, system, budget, n, cache=folder)
+        for programs in ("compiled", "kept")
+    ]
+
+
+def worker(system: str, budget: str, n: int) -> dict:
+    planted = Planted("coulomb_friction", 0, {"tau_c": SYSTEMS[system]})
+    case = dataclasses.replace(nothing(system, NOISE, recordings=n), planted=(planted,))
+    data, _ = recorded(case, seed=n)
+    twin = believed(system)
     simulated = seconds_since_start()
     from sb3_hds import diagnose
 
-    found = diagnose(believed(SYSTEM), data, budget=budget, progress=False)
+    found = diagnose(twin, data, budget=budget, progress=False)
     return {
         "seconds": seconds_since_start() - simulated,
         "peak_memory_MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "verdict": found.verdict,
-        "named": " ".join(f.effect for f in found.findings),
+        "named": " ".join(f"{f.effect}.{f.where['name']}" for f in found.findings),
+    }
+
+
+def straight_lines(table: pd.DataFrame) -> pd.DataFrame:
+    """:return: of each system, budget and state of the programs, what the cost is made of"""
+    rows = []
+    for label, own in table.groupby(list(_LINES), sort=False):
+        own = own.sort_values("recordings")
+        row = dict(zip(_LINES, label, strict=True)) | fitted(own["recordings"], own["seconds"])
+        ten = own.loc[own["recordings"] == 10, "seconds"]
+        if row["programs"] == "compiled" and len(ten):
+            row["promise"] = PROMISED[row["budget"]]
+            row["kept"] = "yes" if ten.iloc[0] <= row["promise"] else "no"
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def fitted(recordings: Iterable[float], seconds: Iterable[float]) -> dict[str, float]:
+    """
+    :return: seconds that do not depend on the number of recordings, those of a hundred, the largest
+        relative distance from this line, and the exponent between the last two numbers
+    """
+    n, t = (np.array(list(x), float) for x in (recordings, seconds))
+    if len(n) < 2:
+        return {}
+    matrix = np.stack([np.ones_like(n), n], 1)
+    fixed, each = np.linalg.lstsq(matrix / t[:, None], np.ones_like(t), rcond=None)[0]
+    return {
+        "fixed_seconds": float(fixed),
+        "seconds_per_hundred": float(100.0 * each),
+        "largest_deviation": float(np.max(np.abs((fixed + each * n) / t - 1.0))),
+        "exponent": float(np.log(t[-1] / t[-2]) / np.log(n[-1] / n[-2])),
     }
 
 
@@ -66,14 +129,20 @@ def figure(table: pd.DataFrame) -> None:
     """Seconds against recordings."""
     from matplotlib.figure import Figure
 
-    drawing = Figure(figsize=(4.5, 3.2), layout="constrained")
-    panel = drawing.subplots()
-    for budget, colour in zip(BUDGETS, ("#7fa6cc", "#27496d"), strict=True):
-        rows = table[table["budget"] == budget].sort_values("recordings")
-        panel.loglog(rows["recordings"], rows["seconds"], "o-", color=colour, label=budget)
-    panel.set_xlabel("recordings of 200 steps")
-    panel.set_ylabel("seconds, compilation included")
-    panel.legend(frameon=False)
+    systems = list(dict.fromkeys(table["system"]))
+    drawing = Figure(figsize=(4.2 * len(systems), 3.4), layout="constrained")
+    panels = drawing.subplots(1, len(systems), squeeze=False, sharey=True)[0]
+    for panel, system in zip(panels, systems, strict=True):
+        for budget, colour in zip(BUDGETS, ("#7fa6cc", "#27496d"), strict=True):
+            for programs, line in (("compiled", "o-"), ("kept", "o:")):
+                own = (table["system"] == system) & (table["budget"] == budget)
+                rows = table[own & (table["programs"] == programs)].sort_values("recordings")
+                label = f"{budget}, programs {programs}"
+                panel.loglog(rows["recordings"], rows["seconds"], line, color=colour, label=label)
+        panel.set_title(system.replace("_", " "))
+        panel.set_xlabel("recordings of 200 steps")
+    panels[0].set_ylabel("seconds")
+    panels[0].legend(frameon=False, fontsize=8)
     drawing.savefig(RESULTS / "diagnosis_cost.png", dpi=150)
 
 

@@ -7,14 +7,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from hidden_cases import EULERS, NULLS
+from hidden_cases import EULERS, NULLS, SHARES
 from runs import RESULTS
 from same_cause import right
 
 #: what Euler's twin may be told: that something is late by half a step, or that something is wrong
 LATE = ("sensor_delay", "action_delay")
+VERDICTS = ("named", "ambiguous", "none", "unknown", "not_identifiable")
+# What a diagnosis may take [s].
 _SECONDS = {"full": 60.0, "quick": 15.0}
 _RULE, _GAIN = "rule: ", "gain: "
+_TEXTS = ("truth", "same", "verdict", "named", "set", "more", "moved", "estimate")
 
 
 class Score(NamedTuple):
@@ -82,8 +85,9 @@ def loaded(path: Path) -> pd.DataFrame:
 
 def prepared(table: pd.DataFrame) -> pd.DataFrame:
     """With what follows from each row: whether a name was given, whether it is right."""
-    texts = table.select_dtypes(exclude=["number", "bool"]).columns
-    table = table.assign(**{name: table[name].fillna("") for name in texts})
+    # A column without any word looks like one of numbers.
+    texts = [name for name in table if name in _TEXTS or name.startswith(_RULE)]
+    table = table.assign(**{name: table[name].astype(object).fillna("") for name in texts})
     judged = lambda column: [_right(row, row[column]) for _, row in table.iterrows()]  # noqa: E731
     return table.assign(
         spoke=table["verdict"].isin(["named", "ambiguous"]),
@@ -111,6 +115,7 @@ def scores(table: pd.DataFrame, budget: str) -> list[Score]:
         for (_, row), names in zip(pairs.iterrows(), every, strict=True)
     ]
     still = table[table["kind"] == "still"]
+    sizes = pd.Series([len(names.split(";")) for names in said["set"]], dtype=float)
     named = nulls.groupby("kind")["spoke"] if len(nulls) else {}
     alarms = dict(iter(named))
     found = [share(f"false alarms: {k}", alarms.get(k, []), most=0.025) for k in NULLS]
@@ -126,7 +131,7 @@ def scores(table: pd.DataFrame, budget: str) -> list[Score]:
             effects["right"][~effects.disturbed & (effects.noise == "5 %")],
         ),
         share("truth within the reported set", said["within"], least=0.95),
-        middle("mean size of the set", [np.mean([len(s.split(";")) for s in said["set"]])]),
+        Score("mean size of the set", float(sizes.mean()), np.nan, np.nan, len(sizes)),
         share("refused: outside the catalogue", ~outside["spoke"], least=0.9),
         share("refused: standing still", still["verdict"] == "not_identifiable", least=1.0),
         share("pairs: one of them is named", hits),
@@ -210,6 +215,19 @@ def by_system(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def by_kind(table: pd.DataFrame) -> pd.DataFrame:
+    """Every verdict on every kind of case."""
+    rows = []
+    for kind in (*SHARES, EULERS):
+        own = table[table["kind"] == kind]
+        counts = own["verdict"].value_counts()
+        rows.append(
+            {"kind": kind, "cases": len(own)}
+            | {verdict.replace("_", " "): int(counts.get(verdict, 0)) for verdict in VERDICTS}
+        )
+    return pd.DataFrame(rows)
+
+
 def by_outside(table: pd.DataFrame) -> pd.DataFrame:
     """How often each cause outside the catalogue is refused, and how."""
     outside = table[table["kind"] == "outside"]
@@ -254,12 +272,16 @@ def _of_rule(rule: str, asked: pd.DataFrame, names: pd.Series, gains: pd.Series)
 def _told(rows: pd.DataFrame) -> dict[str, str]:
     return {
         "right": _of(rows["right"]),
-        "to the letter": _of(rows["truth"] == rows["named"]),
-        "within the set": _of(rows["within"][rows["spoke"]]),
-        "wrong": _of(rows["spoke"] & ~rows["right"]),
-        "none": _of(rows["verdict"] == "none"),
-        "unknown": _of(rows["verdict"] == "unknown"),
+        "to the letter": _share(rows["truth"] == rows["named"]),
+        "within the set": _share(rows["within"][rows["spoke"]]),
+        "wrong": _share(rows["spoke"] & ~rows["right"]),
+        "none": _share(rows["verdict"] == "none"),
+        "unknown": _share(rows["verdict"] == "unknown"),
     }
+
+
+def _share(hits: pd.Series) -> str:
+    return f"{hits.mean():.2f}" if len(hits) else "-"
 
 
 def _of(hits: Any) -> str:
@@ -285,6 +307,7 @@ def as_table(found: Sequence[Score]) -> pd.DataFrame:
 
 
 PARTS: dict[str, Callable[[pd.DataFrame], pd.DataFrame]] = {
+    "kinds": by_kind,
     "difficulty": by_difficulty,
     "causes": by_cause,
     "systems": by_system,

@@ -6,19 +6,23 @@ generator and the judge of names are tested first: a wrong truth would make any 
 """
 
 import dataclasses
+import json
 import os
 from collections import Counter
 
+import diagnosis_cost
 import hidden_cases
 import hidden_effects
+import hidden_scores
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import pandas as pd
 import pytest
 import same_cause
 from hidden_cases import NULLS, SHARES, believed, kind_of, nothing, sensed, spread
-from hidden_scores import prepared
+from hidden_scores import prepared, scores
 from independent_rigs import SYSTEMS, Planted, _moment, modelled, simulate
 from scipy.stats import binom
 
@@ -194,6 +198,114 @@ def test_a_lag_is_a_delay_where_commands_are_slow():
         )
 
 
+def row_of(case, kind, verdict="none", named="", **more):
+    """A case of the table in which nothing was measured but the verdict."""
+    nothing_else = {
+        "factor": 0.0,
+        "noise": "1 %",
+        "disturbance": 0.0,
+        "seconds": 1.0,
+        "asked": False,
+    }
+    words = {"truth": "", "same": "{}", "more": "", "moved": "", "estimate": "{}"}
+    numbers = {"at_the_end": np.nan, "oracle": np.nan}
+    said = {"verdict": verdict, "named": named, "set": named}
+    own = {"system": "pendulum", "case": case, "kind": kind}
+    return own | nothing_else | words | numbers | said | more
+
+
+def score(rows, label):
+    return next(s for s in scores(prepared(pd.DataFrame(rows)), "full") if s.label == label)
+
+
+def test_a_name_given_to_a_null_is_an_alarm_and_a_wrong_name():
+    rows = [row_of(n, "null") for n in range(39)]
+    rows += [row_of(39, "null", "named", "coulomb_friction.hinge")]
+    truth = "coulomb_friction.hinge"
+    rows += [row_of(40, "effect", "named", truth, truth=truth)]
+
+    alarms, right = score(rows, "false alarms: null"), score(rows, "right among named verdicts")
+
+    assert (alarms.value, alarms.n, alarms.reached) == (1 / 40, 40, "yes")
+    # Wilson's interval for 1 of 40, from its formula with z = 1.96.
+    z2, p, n = 1.959964**2, 1 / 40, 40
+    centre, half = (p + z2 / (2 * n)), np.sqrt(z2 * p * (1 - p) / n + (z2 / (2 * n)) ** 2)
+    ends = [(centre - half) / (1 + z2 / n), (centre + half) / (1 + z2 / n)]
+    assert [alarms.low, alarms.high] == pytest.approx(ends, rel=1e-5)
+    assert (right.value, right.n, right.reached) == (0.5, 2, "no")
+    assert score(rows, "right name: white noise up to 1 %").value == 1.0
+
+
+def test_euler_s_twin_may_be_late_or_unknown_and_rubs_nowhere():
+    late, friction = "sensor_delay.cos", "coulomb_friction.hinge"
+    rows = [
+        row_of(0, hidden_cases.EULERS, "unknown"),
+        row_of(1, hidden_cases.EULERS, "named", late),
+        row_of(2, hidden_cases.EULERS, "none", moved="speed comes 2 ms late"),
+        row_of(3, hidden_cases.EULERS, "none"),
+        row_of(4, hidden_cases.EULERS, "named", friction),
+    ]
+    assert score(rows, "Euler's twin: late or unknown").value == 3 / 5
+    assert score(rows, "Euler's twin: friction named").value == 1 / 5
+
+
+def test_an_interval_covers_or_not():
+    estimate = json.dumps({"a": (1.0, 0.8, 1.2, 1.1), "b": (2.0, 1.9, 2.1, 4.0)})
+    rows = [row_of(0, "effect", "named", "x", truth="x", estimate=estimate)]
+    assert score(rows, "90 % intervals that cover").value == 0.5
+    assert score(rows, "error of a parameter, median").value == pytest.approx(
+        0.5 * (0.1 / 1.1 + 0.5)
+    )
+
+
+def test_rows_are_kept_one_by_one_and_null_stays_a_word(monkeypatch, tmp_path):
+    monkeypatch.setattr(hidden_effects, "RESULTS", tmp_path)
+    monkeypatch.setattr(hidden_effects, "CACHE", tmp_path / "cache")
+    for row in (row_of(0, "null"), row_of(1, "effect"), row_of(0, "null", "unknown")):
+        hidden_effects.keep("cases", row)
+
+    kept = hidden_effects.read("cases")
+
+    assert [(row["case"], row["kind"], row["verdict"]) for row in kept] == [
+        (1, "effect", "none"),
+        (0, "null", "unknown"),
+    ]
+
+
+def test_a_report_writes_a_table_for_each_question(monkeypatch, tmp_path):
+    monkeypatch.setattr(hidden_effects, "RESULTS", tmp_path)
+    monkeypatch.setattr(hidden_effects, "CACHE", tmp_path / "cache")
+    monkeypatch.setattr(hidden_scores, "RESULTS", tmp_path)
+    truth = "coulomb_friction.hinge"
+    effect = {"truth": truth, "factor": 2.0, "asked": True, "at_the_end": 0.8, "oracle": 0.9}
+    rules = {"rule: naive BIC": "stiffness.hinge", "gain: naive BIC": 0.3}
+    for row in (
+        row_of(0, "null"),
+        row_of(1, "effect", "named", truth, **effect, **rules),
+        row_of(2, "outside", "unknown", truth="hysteresis"),
+    ):
+        hidden_effects.keep("hidden_effects", row)
+
+    hidden_scores.report("hidden_effects")
+
+    rules = pd.read_csv(tmp_path / "hidden_effects_rules.csv").set_index("rule")
+    assert rules.loc["diagnose", "right"].startswith("1.00")
+    assert rules.loc["naive BIC", "right"].startswith("0.00")
+    assert float(rules.loc["naive BIC", "gain over the oracle's"]) == pytest.approx(
+        0.3 / 0.9, abs=0.01
+    )
+    assert (tmp_path / "hidden_effects.png").stat().st_size > 10_000
+
+
+def test_what_grows_in_proportion_is_linear():
+    n = np.array([10.0, 30.0, 100.0, 1000.0])
+    line = diagnosis_cost.fitted(n, 5.0 + 0.02 * n)
+    assert line["fixed_seconds"] == pytest.approx(5.0)
+    assert line["seconds_per_hundred"] == pytest.approx(2.0)
+    assert line["largest_deviation"] == pytest.approx(0.0, abs=1e-9)
+    assert diagnosis_cost.fitted(n, 0.1 * n**1.5)["exponent"] == pytest.approx(1.5)
+
+
 def chances(rates):
     """How likely each number of misses is, where each case is missed at its own rate."""
     found = np.ones(1)
@@ -218,8 +330,6 @@ def test_allowed_misses_are_exceeded_once_in_two_hundred_runs():
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory):
-    import pandas as pd
-
     print(f"SB3_HDS_SALT={SALT}")
     patch = pytest.MonkeyPatch()
     patch.setattr(hidden_cases, "CACHE", tmp_path_factory.mktemp("cache"))

@@ -40,6 +40,18 @@ PARTS: dict[str, Callable[[], str]] = {
     ),
     "cpg_prior": summaries.crossed("cpg_prior", "prior", ("env", "learner"), "return"),
     "elastic_quadruped": summaries.over_seeds("elastic_quadruped", "method", "return"),
+    **{
+        f"hidden_effects_{part}": summaries.whole(f"hidden_effects_{part}")
+        for part in ("targets", "kinds", "difficulty", "causes", "systems", "outside", "rules")
+    },
+    "hidden_effects_picture": summaries.picture(
+        "hidden_effects", "rates with intervals beside their targets, right names against size"
+    ),
+    "diagnosis_cost": summaries.whole("diagnosis_cost"),
+    "diagnosis_cost_lines": summaries.whole("diagnosis_cost_lines"),
+    "diagnosis_cost_picture": summaries.picture(
+        "diagnosis_cost", "seconds of a diagnosis against the number of recordings"
+    ),
     "hds_weaknesses": summaries.over_seeds("hds_weaknesses", "variant", "return"),
     "hds_beta": summaries.over_seeds(
         "hds_beta",

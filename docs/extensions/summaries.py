@@ -1,4 +1,4 @@
-"""Tables of ``benchmarks/results``, condensed: means and ranges, and shares of a gap."""
+"""Tables and pictures of ``benchmarks/results``: as they are, or condensed."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -124,6 +124,16 @@ def gaits() -> str:
 
 def _mean(values: list[float]) -> str:
     return rounded(fmean(values)) if values else ""
+
+
+def picture(name: str, shows: str) -> Callable[[], str]:
+    """
+    :param name: of the picture, without its ending
+    :param shows: what is to be seen on it
+    :return: what makes the Markdown for a page of a folder of `docs`, once there is a picture
+    """
+    there = f"![{shows}](../../benchmarks/results/{name}.png)"
+    return lambda: there if (RESULTS / f"{name}.png").exists() else _NONE
 
 
 def _shown(name: str, change: Callable) -> str:
