@@ -1,6 +1,7 @@
 """What model-free algorithms are made of, beside references, and what only they can do."""
 
 import dataclasses
+import inspect
 from functools import partial
 from typing import Any
 
@@ -8,13 +9,18 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
+import sbx
 import torch as th
 from gymnasium import spaces
 from small_models import OFF_POLICY, PLANNERS, SMALL, logged, small
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.distributions import StateDependentNoiseDistribution
+from stable_baselines3.common.distributions import (
+    SquashedDiagGaussianDistribution,
+    StateDependentNoiseDistribution,
+)
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -22,12 +28,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from rl_zoo_plugin.lazy import parameters_of
 from sb3_hds import GSDESAC, TD7, CrossQ, DroQ, SimbaSAC, algos
 from sb3_hds.algos import td7_update
-from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp
+from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp, SimbaBody
 from sb3_hds.algos.gaussian_policy import optimizer_of
 from sb3_hds.algos.heads import ExploringActor
 from sb3_hds.algos.lap import LapReplayBuffer, SumTree
 from sb3_hds.algos.observations import Seen, flattener, seen
 from sb3_hds.algos.off_policy import (
+    Knobs,
     Trained,
     Truncated,
     average,
@@ -121,6 +128,21 @@ def test_an_exploring_actor_is_that_of_stable_baselines_with_its_weights(x64):
     np.testing.assert_allclose(log_probability(gaussian, before), expected, rtol=1e-9, atol=1e-5)
 
 
+def test_a_squashed_gaussian_is_that_of_stable_baselines(x64):
+    rng = np.random.default_rng(0)
+    means, log_std, before = rng.normal(size=(3, 7, 2))
+    before[0, 0] = 5.0  # where the action is 1 but for 1e-4
+    theirs = SquashedDiagGaussianDistribution(2)
+    theirs.proba_distribution(th.as_tensor(means), th.as_tensor(log_std))
+    expected = theirs.log_prob(th.tanh(th.as_tensor(before)), th.as_tensor(before))
+
+    gaussian = Gaussian(jnp.asarray(means), jnp.exp(log_std), jnp.zeros((7, 0)))
+
+    np.testing.assert_allclose(jnp.tanh(gaussian.mean), theirs.mode(), rtol=1e-12)
+    # 1 - tanh^2 + 1e-6 has lost eight digits where SB3 takes it of the action.
+    np.testing.assert_allclose(log_probability(gaussian, before), expected, rtol=1e-8)
+
+
 def test_noise_depends_on_the_state_and_stays_until_it_is_drawn_again():
     model = small("gsde_sac", policy_kwargs={"net_arch": [8], "log_std_init": 0.0})
     obs = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 2.0]], np.float32)
@@ -148,6 +170,19 @@ def test_each_environment_has_its_noise_matrix_and_the_deviation_is_logged():
     stds = lines.column("train/std")
     assert stds and stds[-1] == pytest.approx(np.exp(-3.0), rel=0.5)
     assert isinstance(model.policy.actor_network, ExploringActor)
+
+
+@pytest.mark.parametrize("at_warmup", [True, False])
+def test_noise_acts_before_learning_starts_only_where_it_is_told_to(at_warmup):
+    how = {"learning_starts": 100, "train_freq": 10, "use_sde_at_warmup": at_warmup}
+    model = small("gsde_sac", **how).learn(10)
+    seen, taken = model.replay_buffer.observations[:10, 0], model.replay_buffer.actions[:10, 0]
+
+    # One matrix in the whole collection: the policy's actions can be had again.
+    explored = model.policy.scale_action(model.predict(seen)[0])
+
+    assert np.allclose(explored, taken, atol=1e-5) == at_warmup
+    assert model._n_updates == 0
 
 
 @pytest.mark.parametrize("name", ["tqc_jax", "crossq_jax"])
@@ -390,6 +425,7 @@ def test_returns_of_several_steps_need_a_buffer_that_has_them():
     ("arguments", "message"),
     [
         ({"tau": 2.0}, "tau must be from 0 to 1"),
+        ({"target_update_interval": 0}, "target_update_interval must be a whole number of at"),
         ({"policy_delay": 0}, "policy_delay must be a whole number of at least 1"),
         ({"ent_coef": "automatic"}, "ent_coef must be a number above 0, 'auto'"),
         ({"target_entropy": "low"}, "target_entropy must be 'auto' or a number"),
@@ -555,6 +591,60 @@ def test_simba_sees_observations_in_units_of_what_it_saw():
     assert float(scales.count) == 60.0
     speeds = model.replay_buffer.next_observations[:60, 0, 2]
     assert float(scales.mean[2]) == pytest.approx(speeds.mean(), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["tqc_jax", "droq"])
+def test_networks_of_simba_serve_other_algorithms(name):
+    model = small(name, policy="SimbaPolicy").learn(30)
+
+    assert isinstance(model.policy.actor_network.body, SimbaBody)
+    assert isinstance(model.policy.critic_network.body, SimbaBody)
+    assert float(model.policy.learner.seen.count) == 30.0 and model._n_updates > 0
+    assert model.policy.optimizers[0].make is optax.adamw
+    assert model.policy.critic_network.body.dropout_rate == (0.01 if name == "droq" else 0.0)
+
+
+def of_sbx(params: dict[str, Any]) -> dict[str, Any]:
+    """:return: weights of a SimBa network of SBX under the names that they have here"""
+    n_blocks = sum(name.startswith("SimbaResidualBlock") for name in params)
+    body = {"Dense_0": params["Dense_0"], f"LayerNorm_{n_blocks}": params["LayerNorm_0"]}
+    for i in range(n_blocks):
+        block = params[f"SimbaResidualBlock_{i}"]
+        body |= {f"LayerNorm_{i}": block["LayerNorm_0"]}
+        body |= {f"Dense_{2 * i + 1}": block["Dense_0"], f"Dense_{2 * i + 2}": block["Dense_1"]}
+    heads = [params[name] for name in ("Dense_1", "Dense_2") if name in params]
+    return {"body": body} | {f"Dense_{i}": head for i, head in enumerate(heads)}
+
+
+def test_simba_with_the_arguments_in_its_docstring_is_that_of_sbx():
+    net = {"net_arch": [8, 8], "normalize_observations": False}
+    kwargs = net | {"optimizer_kwargs": {"weight_decay": 1e-4}}
+    how = {"ent_coef": "auto", "target_entropy": -1.0, "gradient_steps": 1, "learning_rate": 3e-4}
+    ours = SimbaSAC("Pendulum-v1", policy_kwargs=kwargs, buffer_size=10, **how)
+    theirs = sbx.SAC(
+        "SimbaPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [8, 8]}, buffer_size=10
+    )
+    rng = np.random.default_rng(0)
+    obs, action = rng.normal(size=(5, 3)).astype("f"), rng.uniform(-1.0, 1.0, (5, 1)).astype("f")
+    actor, qf = theirs.policy.actor_state, theirs.policy.qf_state
+    [critic] = qf.params["params"].values()
+    of_actor, of_critic = of_sbx(actor.params["params"]), of_sbx(critic)
+
+    gaussian = ours.policy.recipe.actor.apply({"params": of_actor}, obs)
+    values, _ = judge(ours.policy.recipe, {"params": of_critic}, obs, action, jax.random.key(0))
+
+    before_tanh = actor.apply_fn(actor.params, obs).distribution
+    np.testing.assert_allclose(gaussian.mean, before_tanh.loc, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(gaussian.std, before_tanh.stddev(), rtol=1e-4)
+    np.testing.assert_allclose(values, qf.apply_fn(qf.params, obs, action), rtol=1e-4, atol=1e-6)
+    assert ours.knobs() == Knobs(theirs.learning_rate, 3e-4, theirs.tau, theirs.target_entropy)
+    assert ours.gradient_steps == theirs.gradient_steps
+    [start], entropy = jax.tree.leaves(theirs.ent_coef_state.params), ours.policy.learner
+    assert start == entropy.log_ent_coef.weights["params"]
+    assert (
+        inspect.signature(theirs.policy.optimizer_class).parameters["weight_decay"].default
+        == (dict(ours.policy.optimizers[0].arguments)["weight_decay"])
+    )
 
 
 def test_td7_does_not_judge_a_policy_by_random_actions():

@@ -20,6 +20,7 @@ from numpy_networks import (
     descend,
     elu,
     gaussian,
+    layer_norm,
     member,
     mlp,
     quantile_huber,
@@ -32,6 +33,7 @@ from numpy_networks import (
 
 from sb3_hds import algos
 from sb3_hds.algos import td7_update
+from sb3_hds.algos.bodies import Dropout
 from sb3_hds.algos.observations import Seen
 from sb3_hds.algos.off_policy import Batch, Knobs, Optimizer, Trained, update
 
@@ -243,6 +245,71 @@ def test_droq_climbs_the_mean_and_regresses_on_the_least():
     recipe, learner = begun("droq", {"dropout_rate": 0.0}, policy_delay=1)
 
     check(recipe, learner, Soft(learner, mlp, least, half_square, mean_worth))
+
+
+@pytest.mark.parametrize(("policy_delay", "target_every"), [(2, 1), (1, 2)])
+def test_actors_and_target_networks_may_be_updated_less_often(policy_delay, target_every):
+    kwargs = {"dropout_rate": 0.0}
+    delays = {"policy_delay": policy_delay, "target_update_interval": target_every}
+    recipe, learner = begun("droq", kwargs, **delays)
+    delays = {"policy_delay": policy_delay, "target_every": target_every}
+
+    # The third update is the first after one that was due.
+    check(recipe, learner, Soft(learner, mlp, least, half_square, mean_worth, **delays), n=3)
+
+
+class Dropped(Soft):
+    """
+    Dropout before layer norm (Hiraoka et al. 2022, figure 1), in every pass of the critics.
+
+    :param masks: weights of a critic, observations, actions and a key to the entries that are kept
+    """
+
+    rate = 0.3
+
+    def __init__(self, learner, masks) -> None:
+        super().__init__(learner, mlp, least, half_square, mean_worth)
+        self.masks = masks
+
+    def values(self, critic: Weights, obs: np.ndarray, action: np.ndarray, key: Any) -> np.ndarray:
+        found, both = [], np.concatenate([obs, action], -1)
+        for i, keep in enumerate(self.masks(critic, obs, action, key)):
+            w = member(critic, i)
+            x = dense(w["body"]["Dense_0"], both) * keep / (1.0 - self.rate)
+            found.append(dense(w["Dense_0"], relu(layer_norm(w["body"]["LayerNorm_0"], x))))
+        return np.stack(found)
+
+
+def test_droq_drops_out_in_every_pass_of_its_critics_each_with_a_mask_of_its_own():
+    recipe, learner = begun("droq", {"dropout_rate": Dropped.rate}, policy_delay=1)
+    drawn = {}
+
+    def masks(critic: Weights, obs: np.ndarray, action: np.ndarray, key: Any) -> np.ndarray:
+        """What is not zero after dropout, seen once: it is the same for all weights."""
+        name = np.asarray(jax.random.key_data(key)).tobytes()
+        if name not in drawn:
+            seen = partial(_after_dropout, recipe.critic, obs, action)
+            drawn[name] = np.asarray(jax.vmap(seen)(critic, jax.random.split(key, 2))) != 0.0
+        return drawn[name]
+
+    check(recipe, learner, Dropped(learner, masks))
+
+    # Three passes of two critics in each update; masks of 24 entries agree by chance in none.
+    kept = [mask for both in drawn.values() for mask in both]
+    assert len(kept) == 6 * N_UPDATES
+    assert len({mask.tobytes() for mask in kept}) == len(kept)
+
+
+def _after_dropout(critic: Any, obs: Any, action: Any, w: Weights, key: Any) -> Any:
+    _, seen = critic.apply(
+        {"params": w},
+        obs,
+        action,
+        rngs={"dropout": key},
+        capture_intermediates=lambda module, _: isinstance(module, Dropout),
+        mutable=["intermediates"],
+    )
+    return seen["intermediates"]["body"]["Dropout_0"]["__call__"][0]
 
 
 def test_tqc_drops_the_largest_of_all_quantiles():
