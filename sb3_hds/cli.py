@@ -214,11 +214,10 @@ def _wrapper(text: str) -> tuple[Any, dict[str, Any]]:
         found = yaml.safe_load(text)
     except yaml.YAMLError:
         found = None
-    if isinstance(found, str):
-        found = {found: {}}
-    named = isinstance(found, dict) and len(found) == 1 and isinstance(next(iter(found)), str)
-    path, arguments = next(iter(found.items())) if named else ("", None)
-    if not isinstance(arguments := {} if arguments is None and named else arguments, dict):
+    entries = list(found.items()) if isinstance(found, dict) else [(found, None)]
+    path, arguments = entries[0] if len(entries) == 1 else (None, None)
+    arguments = {} if arguments is None else arguments
+    if not isinstance(path, str) or not isinstance(arguments, dict):
         raise ParameterError(
             "--env-wrapper takes package.Wrapper, or with arguments 'package.Wrapper: {a: 1}', got "
             f"'{text}'."
