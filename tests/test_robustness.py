@@ -158,7 +158,12 @@ def test_the_command_takes_what_the_environment_was_made_and_wrapped_with(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("name", "path"), [("tqc", "sb3_contrib.TQC"), ("sbx.SAC", "sbx.SAC"), ("ppo_lstm", None)]
+    ("name", "path"),
+    [
+        ("tqc", "sb3_contrib.TQC"),
+        ("sbx.SAC", "sbx.SAC"),
+        pytest.param("ppo_lstm", None, marks=pytest.mark.expensive),
+    ],
 )
 def test_the_command_runs_models_of_the_packages_around(name, path, tmp_path):
     pytest.importorskip("sb3_contrib")
