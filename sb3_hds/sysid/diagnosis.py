@@ -240,7 +240,8 @@ def _of_finding(finding: Finding) -> list[str]:
     lines = [finding.effect if own else f"{finding.effect} at {finding.where['slot']} {place}"]
     lines += _wrapped(finding.explanation, "  ")
     for name, e in finding.parameters.items():
-        lines.append(f"  {name} = {e.estimate:.4g} [{e.low:.4g}, {e.high:.4g}] {e.unit}")
+        unit = "" if e.unit == "1" else f" {e.unit}"
+        lines.append(f"  {name} = {e.estimate:.4g} [{e.low:.4g}, {e.high:.4g}]{unit}")
     lines.append(f"  held-out gain {finding.gain:.1%}, p = {finding.p_value:.2g}")
     if finding.alternatives:
         lines += _wrapped(f"cannot be told from: {', '.join(finding.alternatives)}", "  ")
