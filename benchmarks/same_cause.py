@@ -110,6 +110,10 @@ CONDITIONS: dict[frozenset[str], Condition] = {
         ("motor_lag", "action_delay", slow_commands),
         ("action_delay", "sensor_delay", never),
         ("torque_gain", "parameter.mass", never),
+        ("sensor_bias", "parameter.tilt", never),
+        ("constant_force", "parameter.tilt", never),
+        ("constant_force", "parameter.tilt_x", never),
+        ("constant_force", "parameter.tilt_y", never),
         ("sensor_bias", "parameter.gravity_x", never),
         ("constant_force", "parameter.gravity_x", never),
         # Only all three together: `_TOGETHER`.
