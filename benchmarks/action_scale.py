@@ -106,7 +106,7 @@ def main() -> None:
         wanted = [(seed, arguments.steps) for seed in range(arguments.seeds)]
         work = lambda *run: fresh_process(__file__, *run, cache=CACHE)["rows"]  # noqa: E731
         resume("action_scale", ["seed", "steps"], wanted, work, arguments.jobs)
-    report()
+    report(arguments.steps)
 
 
 def learn(scale: str, seed: int, steps: int) -> list[dict]:
@@ -155,10 +155,15 @@ def evaluate(model, env, seed: int, n_episodes: int = 3) -> tuple[float, float]:
     return covered / n_episodes, finished / n_episodes
 
 
-def report() -> None:
+def report(steps: int) -> None:
+    """Print and draw the runs of so many steps: those of other lengths have another schedule."""
     import pandas as pd
 
     table = pd.read_csv(RESULTS / "action_scale.csv", dtype={"scale": str})
+    table = table[table.steps == steps]
+    if table.empty:
+        print(f"{RESULTS / 'action_scale.csv'} has no runs of {steps} steps.")
+        return
     grouped = table.groupby(["scale", "timestep"]).distance.agg(["mean", "std", "count"])
     print(grouped.round(1).to_string())
     draw(table)
@@ -170,7 +175,8 @@ def draw(table) -> None:
     figure = Figure(figsize=(6.0, 3.6), layout="constrained")
     axes = figure.subplots()
     for scale, color in zip(map(str, SCALES), ("#4c956c", "#27496d", "#b8422e", "#888888")):  # noqa: B905
-        runs = table[table.scale == scale].pivot(index="timestep", columns="seed")["distance"]
+        own = table[table.scale == scale]
+        runs = own.pivot(index="timestep", columns="seed", values="distance")
         if runs.empty:
             continue
         mean, error = runs.mean(1), runs.std(1) / np.sqrt(runs.count(1))

@@ -1,7 +1,9 @@
 """Stand-ins for hardware that its data sheet describes wrongly, and how policies do on them."""
 
+from pathlib import Path
+
 import numpy as np
-from runs import CACHE
+from runs import CACHE, code_version
 
 PENDULUM, CART = "sb3_hds/PendulumReal-v1", "sb3_hds/InvertedPendulumFriction-v5"
 CELLS = {
@@ -20,7 +22,10 @@ CELLS = {
         PENDULUM,
         {"mass": 1.25, "length": 1.25, "friction": 0.2, "drag": 0.04, "noise": 0.01},
     ),
+    "euler steps": (PENDULUM, {}),
 }
+#: cells whose data sheet is right, and whose twin integrates otherwise than the system moves
+OTHER_TWIN = {"euler steps": "Pendulum"}
 #: steps of an episode
 LENGTH = {PENDULUM: 200, CART: 250}
 N_STARTS = 50
@@ -40,27 +45,39 @@ def length_of(cell: str) -> int:
     return LENGTH[CELLS[cell][0]]
 
 
-def data_sheet(env_id: str):
+def data_sheet(cell: str):
     """:return: the twin as its maker describes the system: nothing of what is hidden"""
     from sb3_hds import twins
 
-    return twins.make(env_id, **({"swing_up": True} if env_id == CART else {}))
+    env_id = CELLS[cell][0]
+    return twins.make(
+        OTHER_TWIN.get(cell, env_id), **({"swing_up": True} if env_id == CART else {})
+    )
 
 
 def pretrained(cell: str, seed: int, **changes):
     """
     :return: HDS that has planned in the data sheet's twin and has seen no data yet, in the cell's
-        environment. It is trained once for all cells that share a data sheet.
+        environment. It is trained once for all cells that share a data sheet, by this version of
+        the package.
     """
     from sb3_hds import HDS
 
-    env_id = CELLS[cell][0]
-    label = "_".join(f"{name}={value}" for name, value in sorted(changes.items()))
-    path = CACHE / "models" / f"{env_id.split('/')[1]}_{seed}_{label or 'plain'}.zip"
+    twin = data_sheet(cell)
+    path = kept_at(twin.name, seed, changes)
     if not path.exists():
-        model = HDS(make(cell), twin=data_sheet(env_id), seed=seed, **changes)
+        model = HDS(make(cell), twin=twin, seed=seed, **changes)
         model.learn(0).save(path)
     return HDS.load(path, env=make(cell))
+
+
+def kept_at(twin: str, seed: int, changes: dict) -> Path:
+    """:return: file of a model; other code, other file"""
+    import sb3_hds
+
+    label = "_".join(f"{name}={value}" for name, value in sorted(changes.items()))
+    version = code_version(Path(sb3_hds.__file__).parent)
+    return CACHE / "models" / version / f"{twin}_{seed}_{label or 'plain'}.zip"
 
 
 def return_of(model, cell: str) -> float:

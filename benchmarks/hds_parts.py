@@ -3,6 +3,7 @@ What each part of HDS is worth: one changed at a time, on hardware that wore out
 
     python benchmarks/hds_parts.py                        # beta, parts and weaknesses, five seeds
     python benchmarks/hds_parts.py --tables parts --seeds 2 --jobs 1
+    python benchmarks/hds_parts.py --figure                # draw the figures again from the tables
 
 The cell "worn" of `hardware.py` is heavier and longer than its data sheet says, has dry friction,
 and stirs the air, for which the twin has no parameter and HDS suspects no effect. Runs with the
@@ -16,7 +17,9 @@ not finite, the norm of the policy's gradient, and that of the derivative of the
 by the first action, at the median and at its worst over 256 start states, in the model that was
 learned.
 
-parts: each remedy and each way to use the data switched off.
+parts: each remedy and each way to use the data switched off. "wrong twin" and "ceiling", what was
+planned in the data sheet's twin and in the true one, are the ends of the gap; the share of it that
+is closed is printed beside the returns, for beta too.
 
 weaknesses: the four that the authors of HDS name, with the remedy off and on, without data.
 """
@@ -26,11 +29,14 @@ import json
 
 import numpy as np
 import pandas as pd
-from hardware import N_STARTS, PENDULUM, data_sheet, length_of, make, pretrained, return_of
+from hardware import N_STARTS, data_sheet, length_of, make, pretrained, return_of
 from runs import CACHE, RESULTS, fresh_process, resume
+from sim_to_real import planner
 
 CELL, EPISODES = "worn", 5
 BETAS = (0.0, 0.05, 0.1, 0.3, 1.0, "auto")
+# Ends of the gap, as `sim_to_real.py` calls them.
+ENDS = {"wrong twin": "wrong_twin", "ceiling": "ceiling"}
 PARTS = {
     "as it is": {},
     "noise does not decay": {"exploration_decay": 1.0},
@@ -38,7 +44,7 @@ PARTS = {
     "no terminal value": {"terminal_value": False},
     "relabelling": {"relabel_share": 0.25},
     "no calibration": {"calibrated": None},
-    "no dry friction suspected": {"suspected": ()},
+    "nothing suspected": {"suspected": ()},
     "no learned force": {"residual": False},
     "beta 0.05": {"beta": 0.05},
     "no data": {"refit_freq": 0},
@@ -52,17 +58,18 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--tables", nargs="*", default=list(TABLES), choices=TABLES)
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--figure", action="store_true")
     parser.add_argument("--worker", nargs=3, metavar=("TABLE", "VARIANT", "SEED"))
     arguments = parser.parse_args()
     if arguments.worker:
         table, variant, seed = arguments.worker
         print(json.dumps({"rows": [WORK[table](variant, int(seed))]}))
         return
-    variants = {"beta": BETAS, "parts": PARTS, "weaknesses": WEAKNESSES}
     for table in arguments.tables:
-        wanted = [(str(v), seed) for seed in range(arguments.seeds) for v in variants[table]]
-        work = lambda v, seed, t=table: fresh_process(__file__, t, v, seed, cache=CACHE)["rows"]  # noqa: E731
-        resume(f"hds_{table}", ("variant", "seed"), wanted, work, arguments.jobs)
+        if not arguments.figure:
+            wanted = [(v, seed) for seed in range(arguments.seeds) for v in VARIANTS[table]]
+            work = lambda v, seed, t=table: fresh_process(__file__, t, v, seed, cache=CACHE)["rows"]  # noqa: E731
+            resume(f"hds_{table}", ("variant", "seed"), wanted, work, arguments.jobs)
         report(table)
 
 
@@ -115,6 +122,8 @@ def derivative_norms(model, n_steps: int = 100, n_starts: int = 256) -> np.ndarr
 
 
 def parts(variant: str, seed: int) -> dict:
+    if variant in ENDS:
+        return {"return": return_of(planner(ENDS[variant], CELL, seed), CELL)}
     model, _ = learned(PARTS[variant], seed)
     return {"return": return_of(model, CELL)}
 
@@ -128,7 +137,7 @@ def in_twin(cell: str, **changes):
     return work
 
 
-def balanced(counted: bool):
+def balanced(**changes):
     """
     Steps upright of a pole on a cart. HDS counts rewards from the best one that it saw, so that all
     others are negative: dying pays if a terminated episode is worth zero on that scale.
@@ -139,12 +148,9 @@ def balanced(counted: bool):
         from stable_baselines3.common.evaluation import evaluate_policy
 
         from sb3_hds import HDS
-        from sb3_hds.planning import Problem
 
-        if not counted:
-            Problem.value_when_terminated = property(lambda problem: 0.0)
         env = gymnasium.make("InvertedPendulum-v5")
-        model = HDS(env, seed=seed, pretrain_epochs=60).learn(0)
+        model = HDS(env, seed=seed, pretrain_epochs=60, **changes).learn(0)
         return float(evaluate_policy(model, env, 20)[0])
 
     return work
@@ -159,7 +165,7 @@ def open_loop(closed: bool):
             return return_of(model, "heavy, long")
         from sb3_hds import envs
 
-        mirror, returns = envs.TwinEnv(data_sheet(PENDULUM)), []
+        mirror, returns = envs.TwinEnv(data_sheet("heavy, long")), []
         for start in range(N_STARTS):
             env.reset(seed=50_000 + start)
             data = env.unwrapped.data
@@ -185,8 +191,8 @@ WEAKNESSES = {
         "cart friction", horizon=100, terminal_value=False, lookahead=0, n_rollouts=32, **SHORT
     ),
     "contact, on": in_twin("cart friction", n_rollouts=32, **SHORT),
-    "termination, off": balanced(counted=False),
-    "termination, on": balanced(counted=True),
+    "termination, off": balanced(shift_ends=False),
+    "termination, on": balanced(),
     "local minima, off": in_twin(
         "heavy", n_random_plans=0, reset_share=1.0, exploration_noise=0.0, temperature=0.0
     ),
@@ -201,13 +207,112 @@ def weaknesses(variant: str, seed: int) -> dict:
 
 
 WORK = {"beta": beta, "parts": parts, "weaknesses": weaknesses}
+VARIANTS = {
+    "beta": [str(share) for share in BETAS],
+    "parts": [*ENDS, *PARTS],
+    "weaknesses": list(WEAKNESSES),
+}
 
 
 def report(table: str) -> None:
-    rows = pd.read_csv(RESULTS / f"hds_{table}.csv")
+    rows = in_order(table)
     columns = [name for name in rows.columns if name not in ("variant", "seed")]
     found = rows.groupby("variant", sort=False)[columns].agg(["mean", "min", "max"])
+    if table != "weaknesses":
+        shares = closed(rows, in_order("parts"))
+        found["closed"] = found.index.map(shares)
     print(found.to_string(float_format=lambda x: f"{x:.4g}"))
+    FIGURES[table](rows).savefig(RESULTS / f"hds_{table}.png", dpi=150)
+
+
+def in_order(table: str) -> pd.DataFrame:
+    """:return: rows of the table, whenever they were measured, as variants are listed here"""
+    rows = pd.read_csv(RESULTS / f"hds_{table}.csv", dtype={"variant": str})
+    place = {variant: i for i, variant in enumerate(VARIANTS[table])}
+    rows = rows[rows["variant"].isin(place)]
+    return (
+        rows.assign(place=rows["variant"].map(place))
+        .sort_values(["place", "seed"])
+        .drop(columns="place")
+    )
+
+
+def closed(rows: pd.DataFrame, ends: pd.DataFrame) -> dict[str, float]:
+    """
+    :param ends: rows of which some are of the wrong twin and of the ceiling
+    :return: share of the gap that each variant closes, over seeds that it and both ends have
+    """
+    returns = ends.pivot(index="seed", columns="variant", values="return")
+    if not set(ENDS) <= set(returns):
+        return {}
+    wrong, best = (returns[end].dropna() for end in ENDS)
+    found = {}
+    for variant, group in rows.groupby("variant", sort=False):
+        own = group.set_index("seed")["return"]
+        seeds = own.index.intersection(wrong.index).intersection(best.index)
+        found[variant] = (own - wrong)[seeds].mean() / (best - wrong)[seeds].mean()
+    return found
+
+
+def beta_figure(rows: pd.DataFrame):
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=(9.0, 3.0), layout="constrained")
+    panels = drawing.subplots(1, 3)
+    shown = (
+        ("return", "return after five episodes", "linear"),
+        ("gradient_norm", "norm of the policy's gradient", "linear"),
+        ("derivative_worst", "worst derivative of 100 steps", "log"),
+    )
+    variants = list(dict.fromkeys(rows["variant"]))
+    for axes, (column, title, scale) in zip(panels, shown, strict=True):
+        for i, (_, group) in enumerate(rows.groupby("seed")):
+            values = group.set_index("variant")[column].reindex(variants)
+            axes.plot(variants, values, "o-", markersize=3.0, label=f"seed {i}")
+        axes.set_yscale(scale)
+        axes.set_title(title, fontsize=9)
+        axes.set_xlabel("share of plans in the learned model", fontsize=8)
+        axes.tick_params(labelsize=8)
+    panels[0].legend(fontsize=7, frameon=False)
+    return drawing
+
+
+def parts_figure(rows: pd.DataFrame):
+    from matplotlib.figure import Figure
+
+    variants = list(dict.fromkeys(rows["variant"]))[::-1]
+    drawing = Figure(figsize=(6.0, 0.6 + 0.28 * len(variants)), layout="constrained")
+    axes = drawing.subplots()
+    draw_seeds(axes, rows, variants)
+    axes.set_xlabel("return on the real system")
+    return drawing
+
+
+def weaknesses_figure(rows: pd.DataFrame):
+    """A panel for each, because they are different tasks."""
+    from matplotlib.figure import Figure
+
+    names = list(dict.fromkeys(v.rpartition(", ")[0] for v in rows["variant"]))
+    drawing = Figure(figsize=(6.0, 1.0 * len(names)), layout="constrained")
+    for axes, name in zip(drawing.subplots(len(names), 1), names, strict=True):
+        draw_seeds(axes, rows, [f"{name}, on", f"{name}, off"])
+    axes.set_xlabel("return on the real system; for termination, steps upright")
+    return drawing
+
+
+def draw_seeds(axes, rows: pd.DataFrame, variants: list[str]) -> None:
+    """A dot for each seed, a line at the mean."""
+    for place, variant in enumerate(variants):
+        returns = rows[rows["variant"] == variant]["return"]
+        axes.plot(returns, [place] * len(returns), "o", color="#27496d", markersize=4.0, alpha=0.6)
+        axes.plot([returns.mean()] * 2, [place - 0.3, place + 0.3], color="#d1495b")
+    axes.set_yticks(range(len(variants)), variants, fontsize=8)
+    axes.set_ylim(-0.6, len(variants) - 0.4)
+    axes.tick_params(axis="x", labelsize=8)
+    axes.grid(axis="x", color="#e4e2db")
+
+
+FIGURES = {"beta": beta_figure, "parts": parts_figure, "weaknesses": weaknesses_figure}
 
 
 if __name__ == "__main__":

@@ -3,25 +3,32 @@ The model-free family beside SB3, SB3-contrib and SBX: return against steps and 
 
     python benchmarks/model_free.py                                   # Pendulum-v1, five seeds
     python benchmarks/model_free.py --env HalfCheetah-v5 --seeds 2 --methods crossq_jax droq
-    python benchmarks/model_free.py --figure
+    python benchmarks/model_free.py --figure                          # tables and figures again
 
 Ours run with their file in `hyperparams/`, the others with what RL Zoo has for SAC, TQC and CrossQ
-on that environment (SBX's DroQ: its own documented setting). Each run is a fresh process; training
-stops for each evaluation, whose time does not count. On Pendulum-v1, policies start from the 500
-states whose best return is known (SB3_HDS_DATA); elsewhere, ten episodes with the same seeds.
-Finished runs are kept: an interrupted benchmark goes on where it stopped.
+on that environment (those of -v4 for -v5; SBX's DroQ: that of SAC with its documented arguments).
+`sac` is our GSDESAC without gSDE, `bro_fast` BRO with two updates per step. HDS, which knows a
+simulation of Pendulum-v1, stands beside them with the few steps of its own file. Each run is a
+fresh process; training stops for each evaluation, whose time does not count. On Pendulum-v1,
+policies start from the 500 states whose best return is known (SB3_HDS_DATA); elsewhere, ten
+episodes with the same seeds. Learners that only stop at the end of an episode may have made more
+steps than the mark at which they are compared. One run at a time (`--jobs`), or wall times would
+be those of runs that share the machine. Finished runs are kept: an interrupted benchmark goes on
+where it stopped.
 """
 
 import argparse
+import importlib
 import json
 import time
+from functools import cache
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 import yaml
 from pendulum import held_out_states, rollouts
-from runs import CACHE, RESULTS, fresh_process, resume
+from runs import CACHE, fresh_process, resume
 
 PENDULUM = "Pendulum-v1"
 #: steps of a run, and between two evaluations
@@ -30,24 +37,61 @@ LENGTHS = {
     "Hopper-v5": (50_000, 5_000),
     "HalfCheetah-v5": (100_000, 10_000),
 }
-OURS = ("gsde_sac", "droq", "crossq_jax", "tqc_jax", "simba", "td7", "bro")
-#: of each peer: library, class, and what is compared with it
-PEERS = {
-    "sb3_sac": ("stable_baselines3", "SAC", ("gsde_sac", "simba", "td7", "bro")),
-    "contrib_tqc": ("sb3_contrib", "TQC", ("tqc_jax",)),
-    "contrib_crossq": ("sb3_contrib", "CrossQ", ("crossq_jax",)),
-    "sbx_sac": ("sbx", "SAC", ("gsde_sac", "simba", "td7", "bro")),
-    "sbx_tqc": ("sbx", "TQC", ("tqc_jax",)),
-    "sbx_crossq": ("sbx", "CrossQ", ("crossq_jax",)),
-    "sbx_droq": ("sbx", "SAC", ("droq",)),
+
+
+class Ours(NamedTuple):
+    """
+    :param file: id in the zoo, whose hyperparameters are used
+    :param changes: to them
+    :param peers: methods that are the same elsewhere; without an equal, what it improves on
+    """
+
+    file: str
+    changes: dict[str, Any]
+    peers: tuple[str, ...]
+
+
+class Peer(NamedTuple):
+    """
+    :param file: of RL Zoo, whose hyperparameters are used
+    :param changes: to them
+    """
+
+    library: str
+    name: str
+    file: str
+    changes: dict[str, Any]
+
+
+_SAC = ("sb3_sac", "sbx_sac")
+OURS = {
+    "sac": Ours("gsde_sac", {"use_sde": False, "train_freq": 1, "gradient_steps": 1}, _SAC),
+    "gsde_sac": Ours("gsde_sac", {}, _SAC),
+    "droq": Ours("droq", {}, ("sbx_droq",)),
+    "crossq_jax": Ours("crossq_jax", {}, ("contrib_crossq", "sbx_crossq")),
+    "tqc_jax": Ours("tqc_jax", {}, ("contrib_tqc", "sbx_tqc")),
+    "simba": Ours("simba", {}, _SAC),
+    "td7": Ours("td7", {}, _SAC),
+    "bro": Ours("bro", {}, _SAC),
+    "bro_fast": Ours("bro", {"gradient_steps": 2}, _SAC),
+    "hds": Ours("hds", {}, _SAC),
 }
-#: of RL Zoo, where they are not the constructor's defaults
-ZOO = {PENDULUM: {"learning_rate": 1e-3}}
-DROQ = {
+_DROQ = {
     "policy_kwargs": {"dropout_rate": 0.01, "layer_norm": True},
     "gradient_steps": 20,
     "policy_delay": 20,
 }
+PEERS = {
+    "sb3_sac": Peer("stable_baselines3", "SAC", "sac", {}),
+    "contrib_tqc": Peer("sb3_contrib", "TQC", "tqc", {}),
+    "contrib_crossq": Peer("sb3_contrib", "CrossQ", "crossq", {}),
+    "sbx_sac": Peer("sbx", "SAC", "sac", {}),
+    "sbx_tqc": Peer("sbx", "TQC", "tqc", {}),
+    "sbx_crossq": Peer("sbx", "CrossQ", "crossq", {}),
+    "sbx_droq": Peer("sbx", "SAC", "sac", _DROQ),
+}
+#: it plans in the twin of the environment, and has settings for those that have one
+ONLY_ON = {"hds": (PENDULUM,)}
 N_EPISODES = 10
 KEYS = ("env", "method", "seed")
 
@@ -55,9 +99,9 @@ KEYS = ("env", "method", "seed")
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("--env", default=PENDULUM, choices=list(LENGTHS))
-    parser.add_argument("--methods", nargs="*", default=[*OURS, *PEERS])
+    parser.add_argument("--methods", nargs="*", choices=[*OURS, *PEERS], default=[*OURS, *PEERS])
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
     parser.add_argument("--worker", nargs=3, metavar=("ENV", "METHOD", "SEED"))
     arguments = parser.parse_args()
@@ -70,49 +114,86 @@ def main() -> None:
             (arguments.env, method, seed)
             for seed in range(arguments.seeds)
             for method in arguments.methods
+            if arguments.env in ONLY_ON.get(method, LENGTHS)
         ]
         in_process = lambda *run: fresh_process(__file__, *run, cache=CACHE)["rows"]  # noqa: E731
         resume("model_free", KEYS, wanted, in_process, arguments.jobs)
+    from model_free_report import report
+
     report()
 
 
 def worker(env: str, method: str, seed: int) -> list[dict]:
-    """Train; stop the clock and evaluate after every so many steps."""
+    """Train; stop the clock and evaluate at every mark."""
     model, evaluate = learner(env, method, seed), evaluation(env)
-    total, every = LENGTHS[env]
     rows, seconds = [], 0.0
-    while model.num_timesteps < total:
+    for mark in marks(env, method):
         begin = time.perf_counter()
-        model.learn(every, reset_num_timesteps=False)
+        if model.num_timesteps < mark:
+            model.learn(mark - model.num_timesteps, reset_num_timesteps=False)
         seconds += time.perf_counter() - begin
         returns = evaluate(model)
         stderr = returns.std() / np.sqrt(len(returns))
-        now = {"steps": model.num_timesteps, "seconds": seconds}
+        now = {"mark": mark, "steps": model.num_timesteps, "seconds": seconds}
         rows.append(now | {"return": returns.mean(), "stderr": stderr})
     return rows
 
 
-def learner(env: str, method: str, seed: int):
-    if method in OURS:
-        from sb3_hds import algos
+def marks(env: str, method: str) -> range:
+    """:return: steps after which a method is evaluated"""
+    total, every = LENGTHS[env]
+    if method == "hds":
+        total = int(entry(_own_file("hds"), env)["n_timesteps"])
+    return range(every, total + 1, every)
 
-        settings = ours(env, method)
-        return algos.ALL[method](env=env, seed=seed, **settings)
-    import importlib
 
-    library, name, _ = PEERS[method]
-    settings = ZOO.get(env, {}) | (DROQ if method == "sbx_droq" else {})
-    if env != PENDULUM:
-        settings |= {"learning_starts": 5_000 if method == "sbx_droq" else 10_000}
-    algorithm = getattr(importlib.import_module(library), name)
+def learner(env: str, method: str, seed: int) -> Any:
+    """:return: a model that has not learned yet"""
+    algorithm, settings = made_of(env, method)
     return algorithm("MlpPolicy", env, seed=seed, **settings)
 
 
-def ours(env: str, method: str) -> dict:
-    path = Path(__file__).parent.parent / "hyperparams" / f"{method}.yml"
-    settings = dict(yaml.safe_load(path.read_text())[env])
-    settings.pop("n_timesteps")
-    return settings
+def made_of(env: str, method: str) -> tuple[type, dict[str, Any]]:
+    """:return: class and hyperparameters of a method"""
+    if method in OURS:
+        from sb3_hds import algos
+
+        ours = OURS[method]
+        settings = entry(_own_file(ours.file), env) | ours.changes
+        algorithm = algos.ALL[ours.file]
+    else:
+        peer = PEERS[method]
+        settings = entry(_zoo_file(peer.file), env) | peer.changes
+        algorithm = getattr(importlib.import_module(peer.library), peer.name)
+    return algorithm, {k: v for k, v in settings.items() if k not in ("n_timesteps", "policy")}
+
+
+@cache
+def _entries(path: Path) -> dict[str, dict[str, Any]]:
+    return yaml.safe_load(path.read_text())
+
+
+def entry(path: Path, env: str) -> dict[str, Any]:
+    """
+    :param path: of a file of hyperparameters in the format of RL Zoo
+    :return: the entry of an environment, or of the version before
+    """
+    entries = _entries(path)
+    found = dict(entries[env if env in entries else env.replace("-v5", "-v4")])
+    if isinstance(found.get("policy_kwargs"), str):
+        names = {"__builtins__": {}, "dict": dict}
+        found["policy_kwargs"] = eval(found["policy_kwargs"], names)
+    return found
+
+
+def _own_file(name: str) -> Path:
+    return Path(__file__).parent.parent / "hyperparams" / f"{name}.yml"
+
+
+def _zoo_file(name: str) -> Path:
+    import rl_zoo3
+
+    return Path(rl_zoo3.__file__).parent / "hyperparams" / f"{name}.yml"
 
 
 def evaluation(env: str):
@@ -134,48 +215,6 @@ def evaluation(env: str):
         return np.array(returns)
 
     return episodes
-
-
-def report() -> None:
-    path = RESULTS / "model_free.csv"
-    if not path.exists():
-        print("Nothing has been measured yet.")
-        return
-    table = pd.read_csv(path)
-    last = table.sort_values("steps").groupby(list(KEYS)).tail(1)
-    for env, runs in last.groupby("env"):
-        print(f"\n{env} after {runs['steps'].max():,} steps")
-        summary = runs.groupby("method").agg(
-            runs=("return", "size"),
-            mean=("return", "mean"),
-            worst=("return", "min"),
-            best=("return", "max"),
-            seconds=("seconds", "mean"),
-        )
-        print(summary.to_string(float_format="%.1f"))
-        figure(table[table["env"] == env], str(env))
-
-
-def figure(table: pd.DataFrame, env: str) -> None:
-    """Return against steps and against wall time; a line for each method, a band over its seeds."""
-    from matplotlib import colormaps
-    from matplotlib.figure import Figure
-
-    drawing = Figure(figsize=(10.0, 4.0), layout="constrained")
-    panels = drawing.subplots(1, 2, sharey=True)
-    present = set(table["method"])
-    for i, method in enumerate(m for m in (*OURS, *PEERS) if m in present):
-        runs = table[table["method"] == method].groupby("steps")
-        middle, low, high = (runs["return"].agg(f) for f in ("mean", "min", "max"))
-        style = {"color": colormaps["tab10"](i % 10), "linestyle": "-" if method in OURS else "--"}
-        seconds = runs["seconds"].mean()
-        for panel, x in zip(panels, (middle.index, seconds), strict=True):
-            panel.plot(x, middle, label=method, linewidth=1.5, **style)
-            panel.fill_between(x, low, high, color=style["color"], alpha=0.12, linewidth=0.0)
-    panels[0].set(xlabel="steps in the environment", ylabel=f"return on {env}")
-    panels[1].set(xlabel="wall time of training [s]", xscale="log")
-    panels[1].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    drawing.savefig(RESULTS / f"model_free_{env}.png", dpi=150)
 
 
 if __name__ == "__main__":

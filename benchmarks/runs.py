@@ -1,5 +1,6 @@
 """Fresh processes, and tables that survive an interrupted run."""
 
+import hashlib
 import json
 import os
 import subprocess
@@ -42,6 +43,16 @@ def fresh_process(script: str, *arguments: Any, cache: Path | None = None) -> di
     if done.returncode:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr[-3000:]}")
     return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+def code_version(*roots: Path) -> str:
+    """:return: of all Python sources under these folders: what code that is not changed keeps"""
+    found = hashlib.sha256()
+    for root in roots:
+        for path in sorted(root.rglob("*.py")):
+            found.update(str(path.relative_to(root)).encode() + b"\0")
+            found.update(path.read_bytes() + b"\0")
+    return found.hexdigest()[:12]
 
 
 def seconds_since_start() -> float:

@@ -2,7 +2,7 @@
 Steps and updates per second of the model-free family, beside SBX, SB3 and SB3-contrib.
 
     python benchmarks/speed.py                     # all rows; resumable
-    python benchmarks/speed.py --rows "droq, 20" --start-up
+    python benchmarks/speed.py --rows "droq, 20" "droq, 1, start-up"
     python benchmarks/speed.py --table
 
 Pendulum-v1, equal networks, batches and replay ratios. The two that are compared learn by turns in

@@ -1,18 +1,20 @@
 """
 Swinging a pendulum up without hitting the end of the rail: what each ingredient changes.
 
-    python examples/safe_swing_up.py [--steps 6000] [--seeds 1]
+    python examples/safe_swing_up.py [--steps 6000] [--seeds 1] [--without barrier]
 
 The pivot of the pendulum moves along a rail of 1.2 m as fast as it is told, as a stepper drives it.
 Four ingredients make learning on such hardware bearable: exploration that is smooth (gSDE), a
 low-pass behind the policy, a barrier in front of the ends of the rail, and a time limit that
-truncates instead of terminating. Each is left out once. Writes ``safe_swing_up/runs.csv`` and
-``safe_swing_up/ingredients.png``.
+truncates instead of terminating. Each is left out once. Prints a table, and writes
+``safe_swing_up/safe_swing_up.csv`` and ``.png``; with ``--folder benchmarks/results`` they are what
+the page on smooth and safe actions shows.
 """
 
 import argparse
 import csv
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import gymnasium
@@ -20,7 +22,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_hds import GSDESAC
-from sb3_hds.wrappers import JointLimitBarrier, LowPassAction
+from sb3_hds.wrappers import JointLimitBarrier, LowPassAction, TruncateToTerminate
 
 DT, SUBSTEPS = 0.05, 5  # [s]
 RAIL, SPEED = 0.6, 2.0  # [m] to either side, [m/s]
@@ -79,14 +81,6 @@ class RailPendulum(gymnasium.Env):
         return np.array(seen, np.float32)
 
 
-class LimitTerminates(gymnasium.Wrapper):
-    """What is wrong with a time limit that counts as an end of the task."""
-
-    def step(self, action):
-        obs, reward, terminated, truncated, info = self.env.step(action)
-        return obs, reward, terminated or truncated, False, info
-
-
 class Protocol(gymnasium.Wrapper):
     """Counts hits of the ends, and adds up squared changes of the command."""
 
@@ -115,7 +109,7 @@ def made(missing: str) -> tuple[gymnasium.Env, Protocol]:
     if missing != "low-pass":
         env = LowPassAction(env, cutoff=3.0)
     env = gymnasium.wrappers.TimeLimit(env, EPISODE)
-    return (LimitTerminates(env) if missing == "truncation" else env), protocol
+    return (TruncateToTerminate(env) if missing == "truncation" else env), protocol
 
 
 def run(missing: str, seed: int, steps: int) -> dict:
@@ -126,7 +120,7 @@ def run(missing: str, seed: int, steps: int) -> dict:
         use_sde=missing != "gSDE",
         train_freq=8,
         gradient_steps=8,
-        learning_starts=400,
+        learning_starts=min(400, steps // 4),
         gamma=0.98,
         learning_rate=1e-3,
         policy_kwargs={"net_arch": [64, 64], "log_std_init": -2.0},
@@ -141,7 +135,7 @@ def run(missing: str, seed: int, steps: int) -> dict:
             obs, reward, *_ = tested.step(model.predict(obs, deterministic=True)[0])
             total += float(reward)
     return {
-        "missing": missing,
+        "without": missing or "nothing",
         "seed": seed,
         "steps": steps,
         "return": total / 5,
@@ -150,27 +144,38 @@ def run(missing: str, seed: int, steps: int) -> dict:
     }
 
 
-def main() -> None:
+def main(words: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("--steps", type=int, default=6_000)
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--without", nargs="*", default=INGREDIENTS, choices=INGREDIENTS)
     parser.add_argument("--folder", type=Path, default=Path("safe_swing_up"))
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(words)
     arguments.folder.mkdir(parents=True, exist_ok=True)
     rows = []
     for seed in range(arguments.seeds):
-        for missing in ("", *INGREDIENTS):
+        for missing in ("", *arguments.without):
             rows.append(run(missing, seed, arguments.steps))
             print(rows[-1], flush=True)
             write(rows, arguments.folder)
+    show(rows)
 
 
 def write(rows: list[dict], folder: Path) -> None:
-    with (folder / "runs.csv").open("w", newline="") as file:
-        table = csv.DictWriter(file, list(rows[0]))
+    with (folder / "safe_swing_up.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         table.writeheader()
         table.writerows(rows)
-    draw(rows, folder / "ingredients.png")
+    draw(rows, folder / "safe_swing_up.png")
+
+
+def show(rows: list[dict]) -> None:
+    """Means over seeds."""
+    print(f"{'without':<12}" + "".join(f"{measure:>14}" for measure in MEASURES))
+    for missing in dict.fromkeys(row["without"] for row in rows):
+        own = [row for row in rows if row["without"] == missing]
+        means = [np.mean([row[measure] for row in own]) for measure in MEASURES]
+        print(f"{missing:<12}" + "".join(f"{mean:>14.4g}" for mean in means))
 
 
 def draw(rows: list[dict], path: Path) -> None:
@@ -179,9 +184,9 @@ def draw(rows: list[dict], path: Path) -> None:
     figure = Figure(figsize=(9.0, 3.2), layout="constrained")
     labels = ["all", *(f"no {name}" for name in INGREDIENTS)]
     for axes, (measure, title) in zip(figure.subplots(1, 3), MEASURES.items(), strict=True):
-        for place, missing in enumerate(("", *INGREDIENTS)):
-            values = [row[measure] for row in rows if row["missing"] == missing]
-            color = "#27496d" if not missing else "#9db4c0"
+        for place, missing in enumerate(("nothing", *INGREDIENTS)):
+            values = [row[measure] for row in rows if row["without"] == missing]
+            color = "#27496d" if missing == "nothing" else "#9db4c0"
             axes.barh(place, np.mean(values) if values else 0.0, color=color)
             axes.plot(values, [place] * len(values), ".", color="black", markersize=4.0)
         axes.set_yticks(range(len(labels)), labels if measure == "return" else [""] * len(labels))

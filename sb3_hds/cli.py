@@ -2,20 +2,42 @@
 ``sb3-hds``: what is wrong with a simulation, and how robust a policy is, from the command line.
 
     sb3-hds diagnose --twin PendulumReal --data 'logs/*.csv' --columns map.yml --report out.html
+    sb3-hds diagnose --twin LinearAxis --set observe:q mass:95 --data log.mat --columns map.yml
     sb3-hds robustness --algo openloop --model model.zip --env Swimmer-v5
     sb3-hds effects
     sb3-hds twins
 """
 
 import argparse
+import functools
+import importlib
 import io
 import json
 import sys
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-# Of Stable-Baselines3, for continuous actions.
-_THEIRS = ("a2c", "ddpg", "ppo", "sac", "td3")
+if TYPE_CHECKING:
+    from sb3_hds.core import Effect, Twin
+    from sb3_hds.experiments import PolicyGain
+    from sb3_hds.sysid import Diagnosis
+
+# Ids that rl_zoo3 has by itself, and where their classes are.
+_THEIRS = {
+    "a2c": "stable_baselines3.A2C",
+    "ddpg": "stable_baselines3.DDPG",
+    "dqn": "stable_baselines3.DQN",
+    "ppo": "stable_baselines3.PPO",
+    "sac": "stable_baselines3.SAC",
+    "td3": "stable_baselines3.TD3",
+    "ars": "sb3_contrib.ARS",
+    "crossq": "sb3_contrib.CrossQ",
+    "ppo_lstm": "sb3_contrib.RecurrentPPO",
+    "qrdqn": "sb3_contrib.QRDQN",
+    "tqc": "sb3_contrib.TQC",
+    "trpo": "sb3_contrib.TRPO",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -55,17 +77,47 @@ def parser() -> argparse.ArgumentParser:
     ask.add_argument("--twin", required=True, help="name or environment id, see 'sb3-hds twins'")
     ask.add_argument("--data", required=True, nargs="+", help="files, or patterns in quotes")
     ask.add_argument("--columns", help="yml file: what the columns of a log mean")
-    ask.add_argument("--set", nargs="*", default=[], metavar="NAME:VALUE", help="of the twin")
+    ask.add_argument(
+        "--correct", action="store_true", help="cut and shift the data where their audit says so"
+    )
+    ask.add_argument(
+        "--set",
+        nargs="*",
+        default=[],
+        metavar="NAME:VALUE",
+        help="parameters and options of the twin: mass:0.3 observe:q driven:true",
+    )
     ask.add_argument("--calibrate", nargs="*", default=[], help="parameters that are not believed")
     ask.add_argument("--effects", nargs="*", help="candidates; default: all, see 'sb3-hds effects'")
     ask.add_argument("--budget", choices=("full", "quick"), default="full")
     ask.add_argument("--seed", type=int, default=0)
     ask.add_argument("--report", help="HTML page to write")
     ask.add_argument("--json", help="JSON file to write")
+    worth = ask.add_argument_group("what it buys", "policies from both twins, on the real system")
+    worth.add_argument("--env", help="id of the real system")
+    worth.add_argument("--env-kwargs", nargs="*", default=[], metavar="NAME:VALUE", help="of it")
+    worth.add_argument("--algo", default="hds", help="id in the zoo; default: hds")
+    worth.add_argument("--policies", type=int, default=5, help="trained in each twin; default: 5")
+    worth.add_argument("--policy-budget", type=int, default=0, help="steps of training in a twin")
+    worth.add_argument("--episodes", type=int, default=20, help="for each policy; default: 20")
+    worth.add_argument(
+        "--hyperparams", nargs="*", default=[], metavar="NAME:VALUE", help="of the algorithm"
+    )
     shake = commands.add_parser("robustness", help="return under noise, failed sensors, pushes")
-    shake.add_argument("--algo", required=True, help="id in the zoo, ours or Stable-Baselines3's")
+    shake.add_argument(
+        "--algo", required=True, help="id in the zoo, ours or rl_zoo3's, or a class: sbx.SAC"
+    )
     shake.add_argument("--model", required=True, help="file that the algorithm saved")
     shake.add_argument("--env", required=True, help="environment id")
+    shake.add_argument("--env-kwargs", nargs="*", default=[], metavar="NAME:VALUE")
+    shake.add_argument(
+        "--env-wrapper",
+        nargs="*",
+        default=[],
+        metavar="CLASS",
+        help="as trained, the one next to the environment first: package.Wrapper, or with "
+        "arguments as in yml, 'package.Wrapper: {cutoff: 4.0}'",
+    )
     shake.add_argument("--episodes", type=int, default=20, help="for each perturbation")
     shake.add_argument("--encoders", choices=("own", "observation"), default="own")
     shake.add_argument("--vecnormalize", help="vecnormalize.pkl of the training")
@@ -78,37 +130,94 @@ def parser() -> argparse.ArgumentParser:
 
 def _diagnose(given: argparse.Namespace) -> None:
     from sb3_hds.core.storage import write_bytes
-    from sb3_hds.data import Trajectories
-    from sb3_hds.effects import ALL
-    from sb3_hds.errors import EffectError
+    from sb3_hds.data import Trajectories, audit
     from sb3_hds.sysid import diagnose
     from sb3_hds.twins import make
 
-    known = {effect.name: effect for effect in ALL}
-    unknown = [name for name in given.effects or () if name not in known]
-    if unknown:
-        raise EffectError(
-            f"There is no effect {', '.join(unknown)}. There are: {', '.join(known)}."
-        )
-    twin = make(given.twin, **dict(map(_setting, given.set)))
+    _check_targets(given)
+    twin = make(given.twin, **_settings("--set", given.set))
+    measure = None if given.env is None else _policy_question(given, twin)
     files = given.data[0] if len(given.data) == 1 else given.data
     data = Trajectories.load(files, columns=given.columns)
-    chosen = ALL if given.effects is None else tuple(known[name] for name in given.effects)
+    if given.correct:
+        data = audit(data, channels=twin.channels).corrected(data)
     found = diagnose(
         twin,
         data,
-        effects=chosen,
+        effects=_chosen(given.effects),
         calibrate=given.calibrate,
         seed=given.seed,
         budget=given.budget,
         progress=sys.stderr.isatty(),
     )
     print(found)
+    plain, gain = found.to_dict(), None
+    if measure is not None and found.twin.values == found.believed.values:
+        print("The twin is left as it was, so there are no policies to compare.")
+    elif measure is not None:
+        measured = measure(found)
+        print(measured)
+        plain["policy_gain"] = gain = measured.to_dict()
     if given.json:
-        text = json.dumps(found.to_dict(), indent=1, allow_nan=False) + "\n"
+        text = json.dumps(plain, indent=1, allow_nan=False) + "\n"
         write_bytes(given.json, text.encode())
     if given.report:
-        print(f"The report is {found.to_html(given.report)}.")
+        print(f"The report is {found.to_html(given.report, gain)}.")
+
+
+def _check_targets(given: argparse.Namespace) -> None:
+    """What would fail after minutes fails now."""
+    for target in filter(None, (given.report, given.json)):
+        if not Path(target).parent.is_dir():
+            raise FileNotFoundError(f"{target} cannot be written: there is no such folder.")
+        if Path(target).is_dir():
+            raise IsADirectoryError(f"{target} is a folder. Name a file.")
+    if given.report:
+        from sb3_hds.sysid.report import check_installed
+
+        check_installed()
+
+
+def _chosen(names: Sequence[str] | None) -> "tuple[type[Effect], ...]":
+    from sb3_hds.effects import ALL
+    from sb3_hds.errors import EffectError
+
+    known = {effect.name: effect for effect in ALL}
+    unknown = [name for name in names or () if name not in known]
+    if unknown:
+        raise EffectError(
+            f"There is no effect {', '.join(unknown)}. There are: {', '.join(known)}."
+        )
+    return tuple(ALL) if names is None else tuple(known[name] for name in names)
+
+
+def _policy_question(
+    given: argparse.Namespace, twin: "Twin"
+) -> "Callable[[Diagnosis], PolicyGain]":
+    """How policies are compared, once there is a diagnosis; what makes no sense is refused now."""
+    import gymnasium
+
+    from sb3_hds.errors import ParameterError
+    from sb3_hds.experiments import measure_policy_gain
+    from sb3_hds.experiments.policy_gain import check_question
+
+    arguments = _settings("--hyperparams", given.hyperparams)
+    try:
+        env = gymnasium.make(given.env, **_settings("--env-kwargs", given.env_kwargs))
+    except (gymnasium.error.Error, TypeError) as error:
+        raise ParameterError(f"{given.env} cannot be made: {error}") from None
+    algorithm, size = _algorithm(given.algo), (given.policy_budget, given.policies, given.episodes)
+    check_question(twin, env, algorithm, *size, arguments)
+    return lambda found: measure_policy_gain(
+        found,
+        env,
+        algorithm,
+        budget=given.policy_budget,
+        seeds=given.policies,
+        n_episodes=given.episodes,
+        progress=sys.stderr.isatty(),
+        **arguments,
+    )
 
 
 def _robustness(given: argparse.Namespace) -> None:
@@ -119,9 +228,12 @@ def _robustness(given: argparse.Namespace) -> None:
 
     changed = {name: dict(settings) for name, settings in PERTURBATIONS.items()}
     changed["push"]["push"] = given.push
+    kwargs = dict(map(_yml_setting, given.env_kwargs))
+    wrap = functools.partial(_wrapped, [_wrapper(text) for text in given.env_wrapper])
     found = measure_robustness(
         _algorithm(given.algo).load(given.model),
-        given.env,
+        functools.partial(_made, given.env, kwargs),
+        wrapper=wrap,
         perturbations=changed,
         n_episodes=given.episodes,
         encoders=given.encoders,
@@ -138,26 +250,109 @@ def _robustness(given: argparse.Namespace) -> None:
 
 
 def _algorithm(name: str) -> Any:
-    import stable_baselines3
-
     from sb3_hds.algos import ALL
     from sb3_hds.errors import ParameterError
 
-    theirs = {id_: getattr(stable_baselines3, id_.upper()) for id_ in _THEIRS}
-    if name not in ALL | theirs:
-        known = ", ".join(ALL | theirs)
-        raise ParameterError(f"There is no algorithm '{name}'. There are: {known}.")
-    return (ALL | theirs)[name]
+    if name in ALL:
+        return ALL[name]
+    if name not in _THEIRS and "." not in name:
+        known = ", ".join([*ALL, *_THEIRS])
+        raise ParameterError(
+            f"There is no algorithm '{name}'. There are: {known}; or name a class: sbx.SAC."
+        )
+    found = _class_of(_THEIRS.get(name, name))
+    if not hasattr(found, "load"):
+        raise ParameterError(f"'{name}' is {found!r}, which is no algorithm: it loads no model.")
+    return found
 
 
-def _setting(text: str) -> tuple[str, float]:
+def _class_of(path: str) -> Any:
     from sb3_hds.errors import ParameterError
 
-    name, _, value = text.partition(":")
+    module, _, name = path.rpartition(".")
     try:
-        return name, float(value)
-    except ValueError:
-        raise ParameterError(f"--set takes NAME:VALUE with a number, got '{text}'.") from None
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ParameterError(f"There is no class '{path}' to import: {error}.") from error
+
+
+def _made(env_id: str, kwargs: dict[str, Any]) -> Any:
+    import gymnasium
+
+    from sb3_hds.errors import EnvironmentMismatchError
+
+    try:
+        return gymnasium.make(env_id, **kwargs)
+    except (gymnasium.error.Error, TypeError) as error:
+        raise EnvironmentMismatchError(f"There is no '{env_id}' with {kwargs}: {error}") from error
+
+
+def _wrapper(text: str) -> tuple[Any, dict[str, Any]]:
+    """:return: a class and its arguments, of ``package.Wrapper`` or ``package.Wrapper: {a: 1}``"""
+    import yaml
+
+    from sb3_hds.errors import ParameterError
+
+    try:
+        found = yaml.safe_load(text)
+    except yaml.YAMLError:
+        found = None
+    if isinstance(found, str):
+        found = {found: {}}
+    path, arguments = "", None
+    if isinstance(found, dict) and len(found) == 1 and isinstance(next(iter(found)), str):
+        path, arguments = next(iter(found.items()))
+        arguments = {} if arguments is None else arguments
+    if not isinstance(arguments, dict):
+        raise ParameterError(
+            "--env-wrapper takes package.Wrapper, or with arguments 'package.Wrapper: {a: 1}', got "
+            f"'{text}'."
+        )
+    return _class_of(path), arguments
+
+
+def _wrapped(wrappers: Sequence[tuple[Any, dict[str, Any]]], env: Any) -> Any:
+    for wrapper, arguments in wrappers:
+        env = wrapper(env, **arguments)
+    return env
+
+
+def _yml_setting(text: str) -> tuple[str, Any]:
+    import yaml
+
+    from sb3_hds.errors import ParameterError
+
+    name, colon, value = text.partition(":")
+    try:
+        if name and colon:
+            return name, yaml.safe_load(value)
+    except yaml.YAMLError:
+        pass
+    raise ParameterError(f"--env-kwargs takes NAME:VALUE with a value as in yml, got '{text}'.")
+
+
+def _settings(option: str, texts: Sequence[str]) -> dict[str, Any]:
+    """Numbers, truth values and words, by name."""
+    from sb3_hds.errors import ParameterError
+
+    found: dict[str, Any] = {}
+    for text in texts:
+        name, colon, value = text.partition(":")
+        if not (name and colon and value):
+            raise ParameterError(f"{option} takes NAME:VALUE, got '{text}'.")
+        found[name] = _value(value)
+    return found
+
+
+def _value(text: str) -> bool | int | float | str:
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
 
 
 def _effects(given: argparse.Namespace) -> None:
@@ -178,25 +373,38 @@ def _effects(given: argparse.Namespace) -> None:
 
 
 def _twins(given: argparse.Namespace) -> None:
+    import inspect
+    import re
+
     from sb3_hds.twins import make, names
 
     rows = []
     for name in names():
         twin = make(name)
+        explained = (inspect.getdoc(type(twin)) or "").partition("\n\n")[0].replace("\n", " ")
         described = ", ".join(
             f"{key} {value:g} {twin.parameters[key].unit}" for key, value in twin.values.items()
         )
-        rows.append((name, twin.env_id or "", described))
-    _show(("twin", "environment", "parameters"), rows)
+        options = " ".join(f"{key}:{value}" for key, value in twin.to_spec()["options"].items())
+        rows.append(
+            (
+                f"{name}\n{twin.env_id or ''}".strip(),
+                re.sub(r":\w+:`([^`]*)`", r"\1", explained),
+                f"{described}\noptions: {options}",
+            )
+        )
+    _show(("twin, environment", "what it is", "parameters and options, for --set"), rows)
 
 
 def _show(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     from rich.console import Console
-    from rich.table import Table
+    from rich.markup import escape
+    from rich.table import Column, Table
 
-    table = Table(*columns)
+    table = Table(*(Column(name, overflow="fold") for name in columns), show_lines=True)
     for row in rows:
-        table.add_row(*map(str, row))
+        # Units in brackets are no markup.
+        table.add_row(*(escape(str(cell)) for cell in row))
     Console(width=None if sys.stdout.isatty() else 120).print(table)
 
 

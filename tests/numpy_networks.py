@@ -101,20 +101,31 @@ def bro(w: Weights, x: np.ndarray) -> np.ndarray:
     return x + layer_norm(w["LayerNorm_2"], dense(w["Dense_2"], inside))
 
 
-def gaussian(w: Weights, latent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def clipped(log_std: np.ndarray) -> np.ndarray:
+    return np.clip(log_std, -20.0, 2.0)
+
+
+def squashed_between(raw: np.ndarray, low: float, high: float) -> np.ndarray:
+    return low + (high - low) * (1.0 + np.tanh(raw)) / 2.0
+
+
+def gaussian(
+    w: Weights, latent: np.ndarray, log_std_of: Callable[[np.ndarray], np.ndarray] = clipped
+) -> tuple[np.ndarray, np.ndarray]:
     """:return: mean and deviation; with gSDE (Raffin et al., CoRL 2021, equation 6) or without"""
     mean = dense(w["Dense_0"], latent)
     if "log_std" in w:
         variance = latent**2 @ np.exp(w["log_std"]) ** 2
         return np.clip(mean, -2.0, 2.0), np.sqrt(variance + 1e-6)
-    return mean, np.exp(np.clip(dense(w["Dense_1"], latent), -20.0, 2.0))
+    return mean, np.exp(log_std_of(dense(w["Dense_1"], latent)))
 
 
 def squashed(mean: np.ndarray, std: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """:return: actions, and their log-density (Haarnoja et al. 2018, appendix C)"""
-    action = np.tanh(mean + std * noise)
+    before = mean + std * noise
     density = -0.5 * noise**2 - np.log(std) - _LOG_SQRT_TAU
-    return action, np.sum(density - np.log(1.0 - action**2 + 1e-6), -1)
+    # 1 - tanh^2 = cosh^-2, whose digits do not cancel where actions are near their limits.
+    return np.tanh(before), np.sum(density - np.log(np.cosh(before) ** -2.0 + 1e-6), -1)
 
 
 def quantile_huber(values: np.ndarray, targets: np.ndarray) -> float:

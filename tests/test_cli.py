@@ -7,6 +7,7 @@ import pytest
 from measuring import measured
 
 from sb3_hds import Trajectories, cli, effects, twins
+from sb3_hds.errors import CalibrationError
 
 
 @pytest.fixture(scope="module")
@@ -50,9 +51,23 @@ def test_any_verdict_is_success(tmp_path, capsys):
         ({"--twin": "Nothing"}, "There is no twin for 'Nothing'"),
         ({"--data": "missing.npz"}, "missing.npz"),
         ({"--effects": "magic"}, "There is no effect magic"),
-        ({"--set": "mass=2"}, "NAME:VALUE"),
+        ({"--set": "mass=2"}, "--set takes NAME:VALUE, got 'mass=2'"),
+        ({"--set": "mass:"}, "--set takes NAME:VALUE, got 'mass:'"),
         ({"--set": "mass:-1"}, "mass"),
+        ({"--set": "mass:heavy"}, "Parameter 'mass' must be a number [kg], got 'heavy'"),
+        ({"--set": "weight:1"}, "has no parameter 'weight'"),
         ({"--calibrate": "weight"}, "Its parameters are"),
+        ({"--columns": "missing.yml"}, "missing.yml"),
+        ({"--report": "nowhere/out.html"}, "nowhere/out.html cannot be written"),
+        ({"--json": "."}, ". is a folder"),
+        ({"--env": "Nothing-v0"}, "Nothing"),
+        ({"--env": "Pendulum-v1", "--algo": "magic"}, "There is no algorithm 'magic'"),
+        ({"--env": "Pendulum-v1", "--env-kwargs": "g"}, "--env-kwargs takes NAME:VALUE"),
+        ({"--env": "Pendulum-v1", "--env-kwargs": "friction:1"}, "friction"),
+        ({"--env": "Pendulum-v1", "--hyperparams": "speed:1"}, "speed"),
+        ({"--env": "Pendulum-v1", "--policies": "0"}, "at least 1"),
+        ({"--env": "Pendulum-v1", "--algo": "sac"}, "SAC learns nothing in 0 steps"),
+        ({"--env": "MountainCarContinuous-v0"}, "observations of shape (2,)"),
     ],
 )
 def test_a_question_that_makes_no_sense_is_one_message(log, capsys, changes, message):
@@ -65,9 +80,95 @@ def test_a_question_that_makes_no_sense_is_one_message(log, capsys, changes, mes
     assert told.startswith("sb3-hds: ") and message in told and "Traceback" not in told
 
 
-def test_what_exists_is_listed_with_units(capsys):
-    assert cli.main(["effects"]) == cli.main(["twins"]) == 0
-    shown = " ".join(capsys.readouterr().out.split())
-    assert "coulomb_friction" in shown and "tau_c [N m]" in shown
-    assert "PendulumReal" in shown
-    assert np.all([effect.name in shown for effect in effects.ALL])
+def test_what_exists_is_listed_with_units_and_explanations(capsys):
+    assert cli.main(["effects"]) == 0
+    shown = capsys.readouterr().out.replace("│", " ").split()
+    for effect in effects.ALL:
+        assert effect.name in shown
+        units = [f"{name} [{p.unit}]" for name, p in effect.parameters.items()]
+        words = [*", ".join(units).split(), *effect.explanation.split()]
+        assert set(words) <= set(shown), effect.name
+
+    assert cli.main(["twins"]) == 0
+    shown = capsys.readouterr().out
+    words = shown.replace("│", " ").split()
+    assert {*twins.names(), *twins.all_ids()} <= set(words)
+    assert {"observe:qv", "zero:down", "driven:both", "dt:0.005"} <= set(words)
+    assert "A carriage with a ball screw" in " ".join(words) and ":class:" not in shown
+
+
+def test_a_twin_is_set_by_numbers_words_and_truth_values(tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def diagnose(twin, data, **_):
+        asked.append(twin)
+        raise CalibrationError("enough")
+
+    monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
+    data = Trajectories.from_arrays([np.zeros((9, 1))], [np.zeros((8, 1))], dt=0.01)
+    log = data.save(tmp_path / "log")
+    settings = {
+        "FreePendulum": ["observe:q", "zero:up", "driven:true", "mass:2e-1", "substeps:4"],
+        "ServoPendulum": ["commands:goal, enable"],
+    }
+
+    for name, words in settings.items():
+        assert ask("--twin", name, "--data", log, "--set", *words) == 1
+
+    free, servo = asked
+    assert (free.observed, free.zero, free.driven, free.substeps) == ("q", "up", True, 4)
+    assert free.values["mass"] == 0.2
+    assert len(servo.actuators) == 2
+
+
+def test_what_the_audit_proposes_is_done_if_wanted(tmp_path, monkeypatch):
+    """A filter in the drive: the speed comes four samples late."""
+    asked = []
+
+    def diagnose(twin, data, **_):
+        asked.append(data)
+        raise CalibrationError("enough")
+
+    monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
+    time = 0.01 * np.arange(2000)
+    obs = np.stack([np.sin(3.0 * time), 3.0 * np.cos(3.0 * (time - 0.04))], 1)
+    commands = np.random.default_rng(0).standard_normal((1999, 1))
+    log = Trajectories.from_arrays([obs], [commands], dt=0.01).save(tmp_path / "log")
+    words = ["--twin", "LinearAxis", "--data", log]
+
+    assert ask(*words) == ask(*words, "--correct") == 1
+
+    plain, corrected = asked
+    np.testing.assert_array_equal(plain.obs[0], obs)
+    np.testing.assert_allclose(
+        corrected.obs[0, :, 1], 3.0 * np.cos(3.0 * time[: len(corrected.obs[0])]), atol=0.02
+    )
+
+
+def test_the_gain_in_policy_is_in_the_report(log, tmp_path, capsys):
+    page, plain = tmp_path / "out.html", tmp_path / "out.json"
+    small = ["pretrain_epochs:1", "n_rollouts:4", "n_random_plans:0", "compare_every:0"]
+
+    code = ask(
+        *("--twin", "PendulumReal", "--data", log, "--effects", "coulomb_friction"),
+        *("--report", page, "--json", plain),
+        *("--env", "sb3_hds/PendulumReal-v1", "--env-kwargs", "friction:0.1"),
+        *("--policies", 1, "--episodes", 2, "--hyperparams", *small),
+    )
+
+    assert code == 0
+    assert "Return on the real system, 1 run, 2 start states" in capsys.readouterr().out
+    gain = json.loads(plain.read_text())["policy_gain"]
+    assert set(gain["simulations"]) == {"believed", "extended", "true"}
+    assert f"{gain['gain']['mean']:.1f}" in page.read_text()
+
+
+def test_where_nothing_was_found_no_policies_are_compared(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sb3_hds.algos.HDS.learn", None)
+    still = np.array([-1.0, 0.0, 0.0]) + np.zeros((8, 61, 3))
+    data = Trajectories.from_arrays(list(still), [np.zeros((60, 1))] * 8, dt=0.05)
+    words = ["--twin", "PendulumReal", "--data", data.save(tmp_path / "still")]
+
+    code = ask(*words, "--env", "sb3_hds/PendulumReal-v1")
+
+    assert code == 0 and "no policies to compare" in capsys.readouterr().out

@@ -462,7 +462,7 @@ def test_an_effect_is_taken_away_again_and_the_rest_keeps_its_values():
             ),
             "A twin was saved with the transform 'flip', which is not known here. "
             "Known are: rescale_action, rescale_observation, rate_limit, low_pass, delay, scale, "
-            "history, barrier, continuity.",
+            "history, barrier, continuity, rhythm.",
         ),
     ],
 )

@@ -8,16 +8,30 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
+from moving_joints import MovingJoints
 from small_models import small
 from stable_baselines3.common.env_checker import check_env as sb3_check
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_hds.core.cpg import Rhythm
+from sb3_hds.core import Actuator, Channel, Rhythm, Signals, TransformedTwin
 from sb3_hds.core.oscillators import advance_phase
+from sb3_hds.envs import twin_of
 from sb3_hds.errors import EnvironmentMismatchError, ParameterError
-from sb3_hds.wrappers import CPGPrior, Perturb, ShowJoints
+from sb3_hds.wrappers import (
+    ActionRateLimit,
+    ActionShield,
+    CPGPrior,
+    JointLimitBarrier,
+    Perturb,
+    ShowJoints,
+)
 
 TAU = 2.0 * np.pi
+#: two motors, and what Swimmer-v5 observes
+BELOW = Signals(
+    tuple(Actuator(name, "1", -1.0, 1.0) for name in "ab"),
+    tuple(Channel(f"obs[{i}]", "1") for i in range(8)),
+)
 SETTINGS = {
     "omega_swing": TAU * 0.6,
     "omega_stance": TAU * 0.9,
@@ -110,15 +124,14 @@ def test_in_the_third_mode_actions_are_amplitudes_and_the_frequency():
 @every_mode
 def test_what_happens_next_depends_on_the_observation_and_the_action_alone(mode):
     """Two ways to the same observation below and the same memory lead to the same targets."""
-    rhythm = swimmer(mode).rhythm
     cycle = np.pi / SETTINGS["omega_swing"] + np.pi / SETTINGS["omega_stance"]
+    rhythm = swimmer(mode, dt=cycle / 50).rhythm
     rest = np.zeros(rhythm.n_actions)
-    dt = cycle / 50
 
-    once = rhythm.start()
+    once = rhythm.start(np.zeros(8), BELOW)
     targets = []
     for _ in range(100):
-        target, once = rhythm.target(rest, once, dt)
+        target, once = rhythm.target(rest, once)
         targets.append(target)
 
     # After a whole cycle, the memory is that of the start, and all repeats itself. Amplitudes that
@@ -133,19 +146,19 @@ def test_targets_and_commands_are_differentiable_in_jax_and_the_same_in_numpy(mo
     rhythm = swimmer(mode).rhythm
     action = np.linspace(-0.4, 0.6, rhythm.n_actions)
     # A while after the start: where the clock turns over, the phase has a corner.
-    _, memory = rhythm.target(action, rhythm.start(), 0.13)
+    _, memory = swimmer(mode, dt=0.13).rhythm.target(action, rhythm.start(np.zeros(8), BELOW))
 
     def aim(a):
-        return rhythm.target(a, jnp.asarray(memory), 0.04)[0]
+        return rhythm.target(a, jnp.asarray(memory))[0]
 
-    expected, _ = rhythm.target(action, memory, 0.04)
+    expected, _ = rhythm.target(action, memory)
     with jax.enable_x64(True):
         np.testing.assert_allclose(aim(jnp.asarray(action)), expected, atol=1e-12)
         slope = jax.jacfwd(aim)(jnp.asarray(action))
     h, columns = 1e-6, []
     for i in range(rhythm.n_actions):
         step = h * np.eye(rhythm.n_actions)[i]
-        ends = (rhythm.target(action + sign * step, memory, 0.04)[0] for sign in (1.0, -1.0))
+        ends = (rhythm.target(action + sign * step, memory)[0] for sign in (1.0, -1.0))
         columns.append(np.subtract(*ends) / (2.0 * h))
     np.testing.assert_allclose(slope, np.transpose(columns), atol=1e-6)
     assert (np.abs(slope).max() > 0.0) == (mode != "residual")
@@ -205,10 +218,128 @@ def test_arguments_that_make_no_sense_are_named(changes, reason):
 
 
 def test_an_environment_that_it_cannot_be_put_around_is_refused():
-    with pytest.raises(EnvironmentMismatchError, match="boxes of one axis"):
+    with pytest.raises(ParameterError, match="bounded Box with one axis"):
         CPGPrior(gymnasium.make("CartPole-v1"), omega_swing=1.0)
     with pytest.raises(EnvironmentMismatchError, match="needs an environment of MuJoCo"):
         pendulum(control="track")
+    with pytest.raises(EnvironmentMismatchError, match="tracks no joints"):
+        pendulum(control="direct", position=[0], velocity=[2])
+    with pytest.raises(ParameterError, match="as many as positions"):
+        pendulum(position=[0])
+    with pytest.raises(ParameterError, match="an observation has 3"):
+        pendulum(position=[0], velocity=[3])
+
+
+# --- a layer like the others ---------------------------------------------------------------------
+
+
+def test_actions_that_are_not_finite_reach_no_environment():
+    env = CPGPrior(MovingJoints(2), omega_swing=4.0)
+    env.reset(seed=0)
+
+    with pytest.raises(ValueError, match="takes finite actions"):
+        env.step(np.array([np.nan, 0.0]))
+    assert not hasattr(env.unwrapped, "told")
+
+
+def test_learners_store_what_they_chose_whatever_a_layer_below_would_have():
+    limited = ActionRateLimit(MovingJoints(2), max_rate=20.0, store="executed")
+    env = CPGPrior(limited, omega_swing=4.0, amplitude=0.3)
+    env.reset(seed=0)
+    action = np.array([1.0, -0.5], np.float32)
+
+    *_, info = env.step(action)
+
+    # Commands below are in other units, and no action stands for them.
+    assert "stored_action" not in info
+    np.testing.assert_array_equal(info["raw_action"], action)
+    np.testing.assert_array_equal(info["executed_action"], action)
+    np.testing.assert_array_equal(info["safe_action"], env.unwrapped.told)
+
+
+@pytest.mark.parametrize(
+    "safe",
+    [
+        lambda env: JointLimitBarrier(env, -1.0, 1.0, position=[0, 1]),
+        lambda env: ActionShield(env, ([[1.0, 1.0]], [1.0])),
+    ],
+)
+def test_a_safety_layer_has_the_last_word_over_a_rhythm(safe):
+    with pytest.raises(ParameterError, match="CPGPrior below it changes commands"):
+        safe(CPGPrior(MovingJoints(2), omega_swing=4.0))
+    env = CPGPrior(safe(MovingJoints(2)), omega_swing=4.0, amplitude=3.0)
+    env.reset(seed=0)
+    for _ in range(100):
+        assert env.step(np.ones(2))[-1]["constraint_cost"] == 0.0
+
+
+def test_joints_are_tracked_where_the_observation_shows_them():
+    settings = {"kp": 2.0, "kd": 0.1, "amplitude": 0.4, "omega_swing": 3.0}
+    seen, read = (
+        CPGPrior(gymnasium.make("InvertedPendulum-v5"), **settings, **entries)
+        for entries in ({"position": [0], "velocity": [2]}, {"control": "track"})
+    )
+    seen.reset(seed=1)
+    obs, _ = read.reset(seed=1)
+
+    for _ in range(10):
+        expected = 2.0 * (0.0 - obs[0]) - 0.1 * obs[2]
+        obs, *_, info = read.step(np.zeros(1))
+        np.testing.assert_array_equal(seen.step(np.zeros(1))[0], obs)
+        assert info["command"] == pytest.approx(expected + 2.0 * info["target"], rel=1e-5)
+
+
+@quickly
+def test_a_twin_tracks_the_joints_that_the_observation_shows(x64):
+    env = CPGPrior(
+        gymnasium.make("InvertedPendulum-v5"),
+        omega_swing=3.0,
+        amplitude=0.1,
+        kp=2.0,
+        kd=0.3,
+        position=[0],
+        velocity=[2],
+    )
+    twin = twin_of(env)
+    obs, _ = env.reset(seed=0)
+    state, step = twin.infer(jnp.asarray(obs), twin.params), jax.jit(twin.step)
+
+    for _ in range(20):
+        obs, *_, info = env.step(np.array([0.5]))
+        state = step(state, jnp.array([0.5]), twin.params)
+        assert abs(info["command"][0]) < 3.0
+        # MuJoCo and the twin integrate alike to 1e-8; twenty steps of an unstable pole magnify it.
+        np.testing.assert_allclose(twin.observe(state, twin.params), obs, atol=1e-5)
+
+
+@quickly
+def test_a_twin_is_refused_where_joints_are_read_from_mujoco():
+    env = CPGPrior(gymnasium.make("InvertedPendulum-v5"), omega_swing=3.0)
+
+    with pytest.raises(EnvironmentMismatchError, match="CPGPrior may change"):
+        twin_of(env)
+
+
+@quickly
+@every_mode
+def test_planners_plan_through_a_rhythm(mode):
+    model = small("pods", pendulum(mode))
+
+    model.learn(25)
+
+    assert isinstance(model.twin, TransformedTwin) and model.twin == twin_of(model.env)
+    assert model.twin.stateful.mode == mode
+
+
+@quickly
+def test_a_rhythm_of_single_numbers_is_one_for_every_actuator():
+    single = Rhythm(omega_swing=4.0, omega_stance=6.0, amplitude=0.5, dt=0.04)
+    memory = single.start(np.zeros(8), BELOW)
+
+    command, _ = single.act(np.array([0.2, -0.2]), np.zeros(8), memory, BELOW)
+
+    # 0.02 s after the start of the swing.
+    np.testing.assert_allclose(command, 0.5 * np.sin(0.08) + np.array([0.02, -0.02]), atol=1e-12)
 
 
 def test_show_joints_appends_what_the_actuators_drive():

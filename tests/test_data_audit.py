@@ -389,7 +389,9 @@ def test_too_few_steps_are_not_usable(data):
     found = audit(data.windows(20)[:3], channels_of("PendulumReal"))
 
     assert not found.usable
-    assert found.reason == "There are 60 steps in all; a verdict needs 100 at least."
+    assert found.reason == (
+        "There are 60 steps in all; a verdict needs 100 at least. Record longer, or more often."
+    )
 
 
 @pytest.mark.filterwarnings("error")
@@ -434,6 +436,49 @@ def test_a_command_that_never_changes_is_found(data):
 
     assert kinds(found) == {"ConstantCommand"} and found.usable
     assert "'action[0]' is 0.4 throughout" in str(found.findings[0])
+
+
+@pytest.mark.parametrize(
+    ("spread", "said"), [(1e-13, "is 100 throughout"), (0.4, "is between 99.6 and 100.4")]
+)
+def test_a_command_that_hardly_varies_is_found(data, spread, said):
+    """Interpolation makes it of a gain that nobody changed, and drift of a set point."""
+    rng = np.random.default_rng(0)
+
+    def nearly_constant(_, obs, actions):
+        return obs, 100.0 + spread * rng.uniform(-1.0, 1.0, actions.shape)
+
+    found = audit(changed(data, nearly_constant))
+
+    assert kinds(found) == {"ConstantCommand"}
+    assert said in str(found.findings[0])
+
+
+@pytest.mark.parametrize(("period", "n_strokes"), [(12.0, 22), (2.0, None)])
+def test_motion_that_goes_to_and_fro_too_seldom_is_found(period, n_strokes):
+    """Two recordings of five periods: each has a quarter, nine halves, and a quarter."""
+    rng, dt = np.random.default_rng(0), 0.02
+    time = dt * np.arange(3000)
+    obs, actions = [], []
+    for _ in range(2):
+        slow = np.sin(2.0 * np.pi * time / period)
+        drift = time / time[-1]
+        obs.append(np.stack([slow, drift], 1) + 0.01 * rng.standard_normal((3000, 2)))
+        actions.append(rng.standard_normal((2999, 1)))
+    recorded = Trajectories.from_arrays(obs, actions, dt=dt, conditions=["light", "heavy"])
+
+    found = audit(recorded, ["angle", "temperature"])
+
+    if n_strokes is None:
+        assert found.findings == ()
+        return
+    (finding,) = found.findings
+    assert (finding.channel, finding.n_strokes, finding.n_conditions) == ("angle", n_strokes, 2)
+    assert "Excitation is poor" in str(finding) and "'angle'" in str(finding)
+    assert "Record more strokes" in str(finding) and "2 recordings under 2 conditions" in str(
+        finding
+    )
+    assert found.usable
 
 
 def test_a_command_that_follows_from_the_observations_is_found(data):

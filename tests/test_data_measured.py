@@ -134,9 +134,10 @@ def test_regular_data_sets_are_left_as_they_are(load):
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("emps", set()),
+        # One slow profile, and one with pulses.
+        ("emps", {"PoorExcitation"}),
         ("bam_xl330", {"UnevenSampling", "VelocityShift"}),
-        ("bam_sts3250", {"UnevenSampling", "VelocityShift"}),
+        ("bam_sts3250", {"UnevenSampling", "VelocityShift", "PoorExcitation"}),
         ("multiarm", {"ConstantCommand"}),
         ("multiarm_validation", set()),
         ("dfki", {"UnevenSampling"}),

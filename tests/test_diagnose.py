@@ -1,26 +1,23 @@
 """What is wrong with a twin: causes are planted in another simulator, and must be found."""
 
-import html
-import json
-import re
-import shutil
-import subprocess
 from types import SimpleNamespace
 
 import gymnasium
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from measuring import measured
 
 from sb3_hds import diagnose, effects, twins
-from sb3_hds.core import JointEffect, Parameter, Trajectories
+from sb3_hds.core import JointEffect, Parameter, Trajectories, rollout
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.comparison import Comparison, compare, confirm, split
 from sb3_hds.sysid.evidence import Evidence
+from sb3_hds.sysid.guesses import newton
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.remainder import MissingForce, remainder
-from sb3_hds.sysid.search import Search, _newton
+from sb3_hds.sysid.search import Search
 from sb3_hds.sysid.shooting import shots_of
 
 CATALOGUE = (
@@ -280,24 +277,25 @@ def rubbing():
     return asked(on_engine(friction=0.1))
 
 
-def test_a_diagnosis_prints_itself_in_80_columns(rubbing):
-    text = str(rubbing)
-    assert max(map(len, text.splitlines())) <= 80
-    assert "coulomb_friction" in text and "N m" in text and "Not accepted" in text
+def missed(twin, data, n_steps=40):
+    """Root mean square error of simulations that begin where the recordings do."""
+    starts, commands = jnp.asarray(data.obs[:, 0]), jnp.asarray(data.actions[:, :n_steps])
 
+    def one(start, actions):
+        return rollout(twin, twin.params, twin.infer(start, twin.params), actions).obs
 
-def test_a_diagnosis_is_plain_json(rubbing):
-    loaded = json.loads(json.dumps(rubbing.to_dict(), allow_nan=False))
-    assert loaded["verdict"] == "named"
-    assert loaded["findings"][0]["where"] == {"slot": "joint", "index": 0, "name": "hinge"}
-    assert set(loaded["versions"]) == {"sb3-hds", "jax", "numpy"}
+    simulated = np.asarray(jax.vmap(one)(starts, commands))
+    return np.sqrt(np.mean((simulated - data.obs[:, : n_steps + 1]) ** 2))
 
 
 def test_the_extended_twin_predicts_better(rubbing):
-    assert rubbing.explained > 0.3
+    # Nothing else was hidden, so nothing is left that can be predicted.
+    assert not rubbing.unexplained and rubbing.explained == 1.0
     assert all(gain.after < gain.before for gain in rubbing.gain.values())
-    assert rubbing.twin.extend is not None
     assert rubbing.twin.values["coulomb_friction.hinge.tau_c"] == pytest.approx(0.1, rel=0.1)
+    unseen = on_engine(n=4, seed=1, noise=0.0, friction=0.1)
+    # Friction is known to a tenth, and so is what it does.
+    assert missed(rubbing.twin, unseen) < 0.2 * missed(TWIN, unseen)
 
 
 @pytest.mark.expensive
@@ -313,53 +311,6 @@ def test_what_would_have_been_seen_is_said(rubbing):
 def test_the_same_seed_tells_the_same():
     data = on_engine(n=8, friction=0.1)
     assert asked(data).to_dict() == asked(data).to_dict()
-
-
-def test_the_report_is_one_page_that_needs_no_network(rubbing, tmp_path):
-    path = rubbing.to_html(tmp_path / "report.html")
-
-    text = path.read_text()
-    assert "coulomb friction at hinge" in text
-    assert text.count("data:image/png;base64,") == 4
-    written = re.sub('base64,[^"]*', "", text)
-    assert "http" not in written and "<script" not in written
-    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
-
-
-def test_its_pictures_are_files_too(rubbing, tmp_path):
-    saved = rubbing.save_pictures(tmp_path / "pictures")
-    assert [path.name for path in saved] == [
-        "before_and_after.png",
-        "error_against_horizon.png",
-        "the_missing_force.png",
-        "the_evidence_for_every_candidate.png",
-    ]
-    assert all(path.read_bytes().startswith(b"\x89PNG") for path in saved)
-
-
-@pytest.mark.skipif(not shutil.which("chromium"), reason="chromium is not installed")
-@pytest.mark.parametrize("width", [500, 1400])
-def test_the_report_fits_a_browser(rubbing, tmp_path, width):
-    """Chromium reports the width of the laid-out page; pictures that do not load have no width."""
-    page = rubbing.to_html(tmp_path / "report.html")
-    probe = (
-        "<script>addEventListener('load', () => { document.title = JSON.stringify("
-        "[document.documentElement.scrollWidth, innerWidth, "
-        "[...document.images].every(i => i.complete && i.naturalWidth > 0)]) })</script>"
-    )
-    page.write_text(page.read_text().replace("</body>", f"{probe}</body>"))
-    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom"]
-
-    shown = subprocess.run(
-        [*command, f"--window-size={width},900", page.as_uri()],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-
-    title = html.unescape(shown.stdout.partition("<title>")[2].partition("</title>")[0])
-    laid_out, visible, loaded = json.loads(title)
-    assert laid_out <= visible and loaded
 
 
 # --- at the door
@@ -500,9 +451,9 @@ def test_a_guess_stays_within_its_room():
     curvature, score = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([-2.0, 1.0])
     nowhere = np.array([np.inf, np.inf])
 
-    step, gain = _newton(curvature, score, [0, 1], (np.array([-np.inf, 0.0]), nowhere))
+    step, gain = newton(curvature, score, [0, 1], (np.array([-np.inf, 0.0]), nowhere))
     np.testing.assert_allclose(step, [1.0, 0.0])
     assert gain == pytest.approx(1.0)
-    step, gain = _newton(curvature, score, [0, 1], (-nowhere, nowhere))
+    step, gain = newton(curvature, score, [0, 1], (-nowhere, nowhere))
     np.testing.assert_allclose(step, np.linalg.solve(curvature, -score))
     assert gain == pytest.approx(0.5 * score @ np.linalg.solve(curvature, score))

@@ -2,14 +2,17 @@
 
 import os
 
+import jax
 import measured_rigs
 import numpy as np
 import pytest
 
 from sb3_hds import diagnose
+from sb3_hds.core import rollout
 from sb3_hds.sysid.calibrate import spread_of
 from sb3_hds.sysid.evidence import Evidence, portion_for
 from sb3_hds.sysid.hypotheses import Hypotheses
+from sb3_hds.sysid.motion import motion_of
 from sb3_hds.sysid.shooting import shots_of
 
 pytestmark = [
@@ -34,6 +37,27 @@ def error_over(twin, data, seconds):
     return np.sqrt(np.mean(evidence.fit(hypotheses.null, (), n_steps=25).raw ** 2))
 
 
+def rollout_error(twin, data, seconds):
+    """
+    Root mean square over windows that begin at the measured position, and at the velocity that its
+    differences say: nothing is fitted to the window.
+    """
+    n = round(seconds / data.dt)
+    obs, actions = data.episode(0)
+    _, v = motion_of(twin, obs[None], data.dt)
+    begins = np.arange(1, len(obs) - n, n)
+
+    def one(measured, v, commands):
+        start = twin.infer(measured, twin.params)._replace(v=v)
+        return rollout(twin, twin.params, start, commands).obs
+
+    with jax.enable_x64(True):
+        commands = np.stack([actions[k : k + n] for k in begins])
+        simulated = np.asarray(jax.jit(jax.vmap(one))(obs[begins], v[0, begins], commands))
+    measured = np.stack([obs[k : k + n + 1] for k in begins])
+    return np.sqrt(np.mean((simulated - measured) ** 2))
+
+
 def test_a_free_pendulum_lacks_nothing():
     found = asked(measured_rigs.multiarm())
 
@@ -48,7 +72,11 @@ def test_an_axis_has_friction_that_depends_on_the_direction():
     offset = "constant_force.axis.tau_0"
     assert abs(found.twin.values[offset]) < 0.5 * abs(question.twin.values[offset])
     official = measured_rigs.emps("emps/DATA_EMPS_PULSES.mat").data
-    assert error_over(found.twin, official, 1.0) <= 1.40e-3
+    # A fit of the published model to rollouts misses 1.994 mm; other ways of fitting it, a tenth
+    # more or less.
+    published = asked(question, effects=()).twin
+    assert rollout_error(published, official, 1.0) == pytest.approx(1.994e-3, rel=0.1)
+    assert rollout_error(found.twin, official, 1.0) <= 1.40e-3
 
 
 def test_a_servos_friction_depends_on_its_load():
@@ -59,6 +87,8 @@ def test_a_servos_friction_depends_on_its_load():
 
     first, *others = found.findings
     assert first.effect == "load_dependent_friction", found
+    # By far the largest: what gains next most gains two thirds of it at most.
+    assert max(r.gain for r in found.rejected) < first.gain / 1.5, found
     assert all(f.where["slot"] == "joint" and "friction" in f.effect for f in others), found
     unseen = question.data[held_out]
     before = asked(question._replace(data=question.data[~held_out]), effects=())
@@ -84,5 +114,9 @@ def test_a_double_pendulum_has_dry_friction_at_both_joints():
 def test_a_servo_that_hardly_moves_supports_no_confident_name():
     found = asked(measured_rigs.bam_sts3250())
 
-    assert found.verdict != "named", found
-    assert found.caveats, found
+    assert found.verdict in ("none", "unknown", "not_identifiable"), found
+    assert not found.findings
+    (poor,) = [caveat for caveat in found.caveats if "Excitation is poor" in caveat]
+    assert "4 recordings under 1 condition" in poor and "Record more strokes" in poor
+    assert "vary what stayed the same: the load, the gain" in poor
+    assert any("'kp' is 32 throughout" in caveat for caveat in found.caveats)

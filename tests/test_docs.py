@@ -30,10 +30,13 @@ sys.path.insert(0, str(DOCS / "extensions"))
 import benchmark_results  # noqa: E402
 import catalogue  # noqa: E402
 import import_picture  # noqa: E402
+import summaries  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 PAGES = sorted([*DOCS.glob("*.md"), *DOCS.glob("[!_]*/[!_]*.md"), ROOT / "README.md"])
+
+SCRIPTS = sorted((ROOT / "benchmarks").glob("*.py"))
 
 # The pages show the defaults that a user wants; here it is enough that the code runs.
 SMALL = {
@@ -103,12 +106,20 @@ def small_and_tidy(monkeypatch, tmp_path):
         del gymnasium.registry[env_id]
 
 
+# Their blocks of text are what their code prints.
+PRINTED = ("docs/modules/task_design.md",)
+
+
 @pytest.mark.parametrize("page", pages_with("python"))
-def test_the_code_of_a_page_runs_from_top_to_bottom(page, small_and_tidy):
+def test_the_code_of_a_page_runs_from_top_to_bottom(page, small_and_tidy, capsys):
     namespace = {"__name__": "a_page"}
 
     for code in blocks(page, "python"):
         exec(compile(code, str(page), "exec"), namespace)
+
+    said, shown = capsys.readouterr().out, blocks(page, "text")
+    for paragraph in "".join(shown).split("\n\n") if name_of(page) in PRINTED else ():
+        assert paragraph.strip() in said
 
 
 @pytest.mark.parametrize("page", pages_with("bash"))
@@ -126,6 +137,15 @@ def test_the_hyperparameters_of_a_page_are_arguments_of_the_algorithms(page):
                 made = pydoc.locate(path)
                 assert set(arguments) <= set(inspect.signature(made).parameters)
             assert set(entry) - own <= set(inspect.signature(HDS).parameters)
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_the_commands_in_the_docstring_of_a_benchmark_have_the_options_shown(script):
+    text = ast.get_docstring(ast.parse(script.read_text())) or ""
+    lines = [line.partition("  #")[0].strip() for line in text.splitlines()]
+    shown = [shlex.split(line) for line in lines if line.startswith("python benchmarks/")]
+
+    assert [words for words in shown if (wrong := objection(words))] == [], wrong
 
 
 def test_commands_that_do_not_exist_are_found():
@@ -268,6 +288,53 @@ def test_results_are_shown_with_the_command_that_made_them(tmp_path):
 
     assert "pendulum.py`" in shown and "Regret on a pendulum." in shown
     assert "| hds | 1.5 |" in shown and "### regret" in shown
+
+
+def test_the_share_of_a_gap_is_shown_once_both_of_its_ends_were_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr(summaries, "RESULTS", tmp_path)
+    shown = summaries.over_seeds("t", "variant", "return", ends=("t", "worst", "best"))
+    rows = "variant,seed,return\nhalf,0,5\nhalf,1,15\nworst,0,0\nworst,1,10\n"
+
+    (tmp_path / "t.csv").write_text(rows)
+    assert "| half | 10 (5 to 15) | 2 |" in shown()
+
+    (tmp_path / "t.csv").write_text(rows + "best,0,10\n")
+    assert "| half | 10 (5 to 15) | 0.5 | 2 |" in shown()
+    (tmp_path / "t.csv").write_text(rows + "best,0,10\nbest,1,30\n")
+    # Gained 5 and 5, of 10 and 20.
+    assert "| half | 10 (5 to 15) | 0.333 | 2 |" in shown()
+
+
+def test_episodes_after_the_first_are_shown_together(tmp_path, monkeypatch):
+    monkeypatch.setattr(summaries, "RESULTS", tmp_path)
+    rows = "minutes,steps,return,late\n1,200,-9,3\n2,400,-2,3\n3,600,-4,5\n"
+    (tmp_path / "t.csv").write_text(rows)
+
+    shown = summaries.first_and_rest("t", 1)()
+
+    assert "| 1 | 1 | -9 | 3 |" in shown
+    assert "| 2 to 3 | 3 | -3 (-4 to -2) | 2 |" in shown
+
+
+def test_results_are_turned_into_the_tables_of_the_pages(tmp_path, monkeypatch):
+    monkeypatch.setattr(summaries, "RESULTS", tmp_path)
+    turned = summaries.crossed("shares", "kind", ("env", "policy"), "share")
+    assert turned() == summaries.gaits() == "Not measured yet in this checkout.\n\n"
+    rows = [["kind", "env", "policy", "seed", "share"]]
+    rows += [["push", "A", "gait", "0", "0.2"], ["push", "A", "gait", "1", "0.4"]]
+    rows += [["noise", "B", "sac", "0", "1"]]
+    found = [["env", "steps", "return", "target", "searched", "seconds"]]
+    found += [["A", "200000", value, "290", "7", "120"] for value in ("1", "5", "3000")]
+    for name, table in (("shares", rows), ("open_loop", found)):
+        with (tmp_path / f"{name}.csv").open("w", newline="") as file:
+            csv.writer(file).writerows(table)
+    (tmp_path / "shares.png").touch()
+
+    shown = turned()
+
+    assert "| kind | A, gait | B, sac |" in shown and "shares.png)" in shown
+    assert "| push | 0.3 |  |" in shown and "| noise |  | 1 |" in shown
+    assert "| A | 200,000 | 7 | 5 (1 to 3,000) | 290 | 3 | 2 |" in summaries.gaits()
 
 
 def test_without_results_no_number_is_shown(tmp_path):

@@ -1,10 +1,10 @@
 """HDS and the data that it measures: what they correct, what they may not spoil, what is kept."""
 
+import dataclasses
 import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import gymnasium
 import jax
@@ -19,6 +19,7 @@ from sb3_hds import HDS, PODS, effects, twins
 from sb3_hds.algos.arguments import knobs_of
 from sb3_hds.algos.correction import Correction, Wishes, correct
 from sb3_hds.algos.epoch import plan_ahead
+from sb3_hds.algos.log import record_correction
 from sb3_hds.core import Trajectories
 from sb3_hds.effects import force_of
 from sb3_hds.errors import CalibrationError, EffectError, TrajectoryError
@@ -79,7 +80,8 @@ def test_a_nuisance_that_may_not_be_corrected_stays(heavier):
     assert found.twin.values["mass"] == 1.0
 
 
-def test_a_system_that_friction_holds_fast_is_not_taken_for_a_heavier_one():
+def held_fast():
+    """A pendulum that dry friction holds near the top: it looks like a heavier one."""
     env = gymnasium.make(REAL, friction=0.3, noise=0.01, max_episode_steps=200)
     obs, actions = [env.reset(seed=0, options={"state": ([0.06], [0.9])})[0]], []
     for _ in range(200):
@@ -87,9 +89,12 @@ def test_a_system_that_friction_holds_fast_is_not_taken_for_a_heavier_one():
         actions.append(np.clip([-8.0 * angle - 2.0 * speed], -2.0, 2.0))
         obs.append(env.step(actions[-1])[0])
     assert np.abs(np.array(obs)[50:, 1]).max() < 0.2
+    return Trajectories.from_arrays([obs], [actions], dt=0.05)
 
+
+def test_a_system_that_friction_holds_fast_is_not_taken_for_a_heavier_one():
     twin = twins.make("PendulumReal")
-    found = corrected(twin, Trajectories.from_arrays([obs], [actions], dt=twin.dt))
+    found = corrected(twin, held_fast())
 
     assert found.fit["mass"].estimate > 1.5
     assert found.twin.values == twin.values and not found.changed
@@ -156,16 +161,44 @@ def test_what_has_no_parameter_is_left_to_the_learned_force():
     assert found.error_hybrid < 0.9 * found.error_calibrated < 0.9 * found.error_twin
 
 
+TINY = {"residual": True, "residual_kwargs": {"n_members": 2, "net_arch": [4]}}
+
+
+@pytest.mark.expensive
+def test_a_share_that_was_fixed_is_planned_in_the_force_where_that_helps(heavier):
+    twin = twins.make("PendulumReal")
+    data = measured(twin.extend(effects.CoulombFriction(0, tau_c=0.4)), noise=0.005, n=10)
+
+    helps = corrected(twin, data, residual=True, beta=0.3)
+    does_not = corrected(twin, heavier, **TINY | {"beta": 0.3})
+
+    ((key, _),) = [force_of(helps.twin)]
+    assert helps.beta == 0.3 and helps.twin.values[f"{key}.share"] == 1.0
+    assert does_not.beta == 0.0 and force_of(does_not.twin) is None
+
+
+@pytest.mark.parametrize("beta", ["auto", 0.3])
+def test_an_attached_force_that_no_longer_helps_is_switched_off(heavier, beta):
+    """Its weights are random here: what it learned is no longer true."""
+    plain = twins.make("PendulumReal", mass=1.3, damping=0.1)
+    twin = plain.extend(effects.NeuralForce(n_members=2, net_arch=(4,), share=1.0))
+    own = wishes(plain, **TINY | {"beta": beta})
+
+    found = correct(twin, heavier, own, 1.0, learn_force=False, n_new=1000)
+
+    ((key, _),) = [force_of(found.twin)]
+    assert found.beta == 0.0 and found.twin.values[f"{key}.share"] == 0.0
+    assert found.error_hybrid > 1.5 * found.error_calibrated
+    assert found.changed
+
+
 def test_a_learned_force_that_does_not_help_is_not_even_attached(heavier):
-    found = corrected(
-        twins.make("PendulumReal"),
-        heavier,
-        residual=True,
-        residual_kwargs={"n_members": 2, "net_arch": [4]},
-    )
+    found = corrected(twins.make("PendulumReal"), heavier, **TINY)
 
     assert found.residual is not None and not found.residual.accepted
     assert found.beta == 0.0 and force_of(found.twin) is None
+    # A force that finds nothing to do leaves the error as it was, in the same unit.
+    assert found.error_hybrid == pytest.approx(found.error_calibrated, rel=0.5)
 
 
 def test_data_from_before_a_change_are_forgotten():
@@ -252,13 +285,67 @@ def return_of(model, env, n=20):
 
 @pytest.mark.expensive
 def test_what_the_data_say_is_logged():
-    model = small("hds", gymnasium.make(REAL, mass=1.4), twin="PendulumReal", train_freq=100)
+    env = gymnasium.make(REAL, mass=1.4, noise=0.01)
+    model = small("hds", env, twin="PendulumReal", train_freq=100)
     lines = logged(model)
 
     model.learn(200, log_interval=1)
 
-    for key in ("error_twin", "error_calibrated", "error_hybrid", "beta", "mass", "mass_low"):
+    errors = ("error_twin", "error_calibrated", "error_hybrid")
+    for key in (*errors, "beta", "disagreement", "forgotten", "mass", "mass_low", "mass_high"):
         assert lines.column(f"model/{key}"), key
+
+
+def recorded(found):
+    model = small("hds", REAL)
+    lines = logged(model)
+    record_correction(model, found)
+    model.logger.dump()
+    (line,) = lines.lines
+    return {key: value for key, value in line.items() if key.startswith("model/")}
+
+
+def test_beta_is_logged_of_an_exact_twin_and_without_calibration_too(heavier):
+    twin = twins.make("PendulumReal")
+    exact = corrected(twin, measured(twin))
+    assert recorded(exact) == {
+        "model/error_twin": exact.error_twin,
+        "model/beta": 0.0,
+        "model/forgotten": 0,
+    }
+
+    found = corrected(twin, heavier, names=(), **TINY)
+    assert found.fit is None
+    assert recorded(found) == {
+        "model/error_twin": found.error_twin,
+        "model/error_hybrid": found.error_hybrid,
+        "model/beta": found.beta,
+        "model/forgotten": 0,
+        "model/disagreement": found.residual.disagreement,
+    }
+
+
+def test_values_that_were_not_taken_over_are_not_logged_as_those_of_the_model():
+    data = held_fast()
+    twin = twins.make("PendulumReal")
+    found = corrected(twin, data)
+    assert found.fit["mass"].estimate > 1.5 and found.twin.values["mass"] == 1.0
+
+    line = recorded(found)
+
+    assert line["model/mass"] == 1.0
+    assert not [key for key in line if key.endswith(("_low", "_high"))]
+
+
+def test_effects_that_were_let_go_are_not_logged(heavier):
+    found = corrected(twins.make("PendulumReal"), heavier, suspected=("action_delay",))
+    assert found.fit["action_delay.torque.delay"] and not found.attached
+
+    line = recorded(found)
+
+    assert line["model/damping"] == found.twin.values["damping"] == pytest.approx(0.1, rel=0.1)
+    assert line["model/damping_low"] < 0.1 < line["model/damping_high"]
+    assert not [key for key in line if "action_delay" in key]
 
 
 def test_a_model_diagnoses_its_data_sheet_by_what_it_has_measured(heavier):
@@ -508,6 +595,41 @@ def test_how_much_is_saved_may_be_limited(tmp_path):
             np.testing.assert_array_equal(columns(loaded)["observations"], latest)
 
 
+@pytest.mark.parametrize(
+    ("limit", "n_real", "n_early"), [(1000, 60, 180), (200, 60, 120), (90, 60, 30), (40, 40, 0)]
+)
+def test_data_from_before_share_the_limit_and_the_latest_stay(tmp_path, limit, n_real, n_early):
+    """Recordings of 60 steps: as many whole ones as there is room for, or the end of the last."""
+    data = measured(twins.make("PendulumReal"), n=3)
+    settings = {"twin": "PendulumReal", "train_freq": 20, "refit_freq": 0}
+    model = small("hds", REAL, pretrain_data=data, max_saved_steps=limit, **settings).learn(60)
+    model.save(tmp_path / "model")
+
+    loaded = HDS.load(tmp_path / "model", env=gymnasium.make(REAL))
+
+    assert loaded.replay_buffer.size() == n_real
+    found = loaded.measured.recordings()
+    assert found.n_steps == n_real + n_early
+    assert found.origin.tolist() == [0, 1, 2, 3][-len(found) :]
+    if n_early:
+        np.testing.assert_array_equal(
+            found.episode(len(found) - 2)[0], data.obs[2][-1 - min(n_early, 60) :]
+        )
+
+
+def test_data_from_before_keep_their_labels_and_what_belongs_together(tmp_path):
+    data = measured(twins.make("PendulumReal"), n=2)
+    data = dataclasses.replace(data, conditions=("bare", "1 kg ± 10 g")).windows(20)
+    model = small("hds", REAL, twin="PendulumReal", pretrain_data=data, refit_freq=0)
+    model.save(tmp_path / "model")
+
+    loaded = HDS.load(tmp_path / "model", env=gymnasium.make(REAL)).measured.earlier
+
+    assert loaded.conditions == ("bare",) * 3 + ("1 kg ± 10 g",) * 3
+    assert loaded.origin.tolist() == [0, 0, 0, 1, 1, 1]
+    assert loaded.dt == data.dt
+
+
 def test_another_number_of_copies_takes_the_data_too(tmp_path):
     model = small("hds", make_vec_env("Pendulum-v1", 2, seed=0)).learn(100)
     model.save(tmp_path / "model")
@@ -537,38 +659,73 @@ def test_an_episode_that_was_ended_by_hand_is_truncated():
 
 SCRIPT = """
 import glob, os, signal, sys
-import gymnasium, torch
+import gymnasium, jax, numpy as np, torch
+from measuring import measured
 from small_models import small
-from stable_baselines3.common.callbacks import CheckpointCallback
+from stable_baselines3.common.callbacks import CheckpointCallback, ConvertCallback
+
+from sb3_hds import effects, twins
 
 write, calls = torch.save, []
 
 def deadly(*args, **kwargs):
     calls.append(len(glob.glob(sys.argv[1] + "/*.zip")))
     if calls.count(2) == 4:
+        buffer = model.replay_buffer
+        columns = {name: getattr(buffer, name)[:200] for name in sys.argv[2:]}
+        np.savez(sys.argv[1] + "/buffer.npz", **columns)
         os.kill(os.getpid(), signal.SIGKILL)
     write(*args, **kwargs)
 
+def keep(known, _):
+    if model.num_timesteps == 200:
+        leaves = [*jax.tree.leaves(model.twin.tensors), list(model.twin.values.values())]
+        np.savez(sys.argv[1] + "/twin.npz", *map(np.asarray, leaves))
+    return True
+
 torch.save = deadly
-env = gymnasium.make("sb3_hds/PendulumReal-v1", mass=1.3)
-small("hds", env, twin="PendulumReal", residual=False, replan_epochs=1).learn(
-    1_000, callback=CheckpointCallback(100, sys.argv[1])
+env = gymnasium.make("sb3_hds/PendulumReal-v1", mass=1.3, noise=0.01)
+force = effects.NeuralForce(n_members=2, net_arch=(4,))
+model = small(
+    "hds",
+    env,
+    twin=twins.make("PendulumReal").extend(force),
+    pretrain_data=measured(twins.make("PendulumReal", mass=1.3), n=3, noise=0.01),
+    suspected=(),
+    replan_epochs=1,
+    train_freq=50,
 )
+model.learn(1_000, callback=[CheckpointCallback(100, sys.argv[1]), ConvertCallback(keep)])
 """
 
 
 @pytest.mark.expensive
-def test_a_killed_run_resumes_with_its_data_and_its_corrected_twin(tmp_path):
-    environ = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-    killed = subprocess.run([sys.executable, "-c", SCRIPT, str(tmp_path)], env=environ)
+def test_a_killed_run_resumes_with_nothing_lost(tmp_path):
+    environ = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    names = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+    killed = subprocess.run([sys.executable, "-c", SCRIPT, str(tmp_path), *names], env=environ)
 
     assert killed.returncode == -signal.SIGKILL
     last = max(tmp_path.glob("*.zip"), key=steps_of)
-    model = HDS.load(last, env=gymnasium.make(REAL, mass=1.3))
+    model = HDS.load(last, env=gymnasium.make(REAL, mass=1.3, noise=0.01))
     assert model.num_timesteps == steps_of(last) == 200
     assert model.replay_buffer.size() == 200
+    for name, values in np.load(tmp_path / "buffer.npz").items():
+        kept = getattr(model.replay_buffer, name)[:200]
+        np.testing.assert_array_equal(kept, values, err_msg=name)
+    early = measured(twins.make("PendulumReal", mass=1.3), n=3, noise=0.01)
+    np.testing.assert_array_equal(model.measured.earlier.obs, early.obs)
+    np.testing.assert_array_equal(model.measured.earlier.actions, early.actions)
+
+    *force, values = np.load(tmp_path / "twin.npz").values()
+    assert list(model.twin.values.values()) == values.tolist()
+    fresh = twins.make("PendulumReal").extend(effects.NeuralForce(n_members=2, net_arch=(4,)))
+    kept, random = jax.tree.leaves(model.twin.tensors), jax.tree.leaves(fresh.tensors)
+    assert all(map(np.array_equal, force, kept)) and len(force) == len(kept)
+    assert not all(map(np.array_equal, force, random))
     inertia = model.twin.values["mass"] / 3.0 * model.twin.values["length"] ** 2
     inertia += model.twin.values["payload"] * model.twin.values["length"] ** 2
     assert inertia == pytest.approx(1.3 / 3.0, rel=0.02)
+
     model.learn(50, reset_num_timesteps=False)
     assert model.replay_buffer.size() == 250

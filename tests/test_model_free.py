@@ -1,6 +1,7 @@
 """What model-free algorithms are made of, beside references, and what only they can do."""
 
 import dataclasses
+import inspect
 from functools import partial
 from typing import Any
 
@@ -8,24 +9,33 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
+import sbx
 import torch as th
 from gymnasium import spaces
 from small_models import OFF_POLICY, PLANNERS, SMALL, logged, small
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.distributions import StateDependentNoiseDistribution
+from stable_baselines3.common.distributions import (
+    SquashedDiagGaussianDistribution,
+    StateDependentNoiseDistribution,
+)
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from rl_zoo_plugin.lazy import parameters_of
 from sb3_hds import GSDESAC, TD7, CrossQ, DroQ, SimbaSAC, algos
 from sb3_hds.algos import td7_update
-from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp
+from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp, SimbaBody
+from sb3_hds.algos.gaussian_policy import optimizer_of
 from sb3_hds.algos.heads import ExploringActor
 from sb3_hds.algos.lap import LapReplayBuffer, SumTree
 from sb3_hds.algos.observations import Seen, flattener, seen
 from sb3_hds.algos.off_policy import (
+    Knobs,
+    Trained,
     Truncated,
     average,
     judge,
@@ -118,6 +128,21 @@ def test_an_exploring_actor_is_that_of_stable_baselines_with_its_weights(x64):
     np.testing.assert_allclose(log_probability(gaussian, before), expected, rtol=1e-9, atol=1e-5)
 
 
+def test_a_squashed_gaussian_is_that_of_stable_baselines(x64):
+    rng = np.random.default_rng(0)
+    means, log_std, before = rng.normal(size=(3, 7, 2))
+    before[0, 0] = 5.0  # where the action is 1 but for 1e-4
+    theirs = SquashedDiagGaussianDistribution(2)
+    theirs.proba_distribution(th.as_tensor(means), th.as_tensor(log_std))
+    expected = theirs.log_prob(th.tanh(th.as_tensor(before)), th.as_tensor(before))
+
+    gaussian = Gaussian(jnp.asarray(means), jnp.exp(log_std), jnp.zeros((7, 0)))
+
+    np.testing.assert_allclose(jnp.tanh(gaussian.mean), theirs.mode(), rtol=1e-12)
+    # 1 - tanh^2 + 1e-6 has lost eight digits where SB3 takes it of the action.
+    np.testing.assert_allclose(log_probability(gaussian, before), expected, rtol=1e-8)
+
+
 def test_noise_depends_on_the_state_and_stays_until_it_is_drawn_again():
     model = small("gsde_sac", policy_kwargs={"net_arch": [8], "log_std_init": 0.0})
     obs = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 2.0]], np.float32)
@@ -145,6 +170,19 @@ def test_each_environment_has_its_noise_matrix_and_the_deviation_is_logged():
     stds = lines.column("train/std")
     assert stds and stds[-1] == pytest.approx(np.exp(-3.0), rel=0.5)
     assert isinstance(model.policy.actor_network, ExploringActor)
+
+
+@pytest.mark.parametrize("at_warmup", [True, False])
+def test_noise_acts_before_learning_starts_only_where_it_is_told_to(at_warmup):
+    how = {"learning_starts": 100, "train_freq": 10, "use_sde_at_warmup": at_warmup}
+    model = small("gsde_sac", **how).learn(10)
+    seen, taken = model.replay_buffer.observations[:10, 0], model.replay_buffer.actions[:10, 0]
+
+    # One matrix in the whole collection: the policy's actions can be had again.
+    explored = model.policy.scale_action(model.predict(seen)[0])
+
+    assert np.allclose(explored, taken, atol=1e-5) == at_warmup
+    assert model._n_updates == 0
 
 
 @pytest.mark.parametrize("name", ["tqc_jax", "crossq_jax"])
@@ -302,6 +340,18 @@ def test_observations_of_numbers_and_choices_are_learned_from(space):
     assert env.action_space.contains(action)
 
 
+@every_algorithm
+@pytest.mark.parametrize("shape", [(2, 2), (3, 1)])
+def test_actions_have_the_shape_of_the_action_space(name, shape):
+    # It refuses what the space does not contain.
+    env = Constant(spaces.Box(-1, 1, (3,)), spaces.Box(-2.0, 3.0, shape))
+
+    model = small(name, env).learn(30)
+
+    assert model.predict(np.zeros(3, np.float32))[0].shape == shape
+    assert model.replay_buffer.actions.shape[2:] == (int(np.prod(shape)),)
+
+
 def test_models_that_were_given_the_same_dictionary_do_not_share_it():
     kwargs = {"net_arch": [8]}
     exploring = GSDESAC("Pendulum-v1", policy_kwargs=kwargs)
@@ -375,6 +425,7 @@ def test_returns_of_several_steps_need_a_buffer_that_has_them():
     ("arguments", "message"),
     [
         ({"tau": 2.0}, "tau must be from 0 to 1"),
+        ({"target_update_interval": 0}, "target_update_interval must be a whole number of at"),
         ({"policy_delay": 0}, "policy_delay must be a whole number of at least 1"),
         ({"ent_coef": "automatic"}, "ent_coef must be a number above 0, 'auto'"),
         ({"target_entropy": "low"}, "target_entropy must be 'auto' or a number"),
@@ -382,12 +433,50 @@ def test_returns_of_several_steps_need_a_buffer_that_has_them():
         ({"policy_kwargs": {"activation_fn": "swoosh"}}, "activation_fn must be one of"),
         ({"policy_kwargs": {"optimizer_class": "magic"}}, "optimizer_class must be one of"),
         ({"policy_kwargs": {"optimizer_kwargs": {"speed": 1}}}, "optimizer_kwargs"),
+        ({"policy_kwargs": {"optimizer_class": th.optim.NAdam}}, "optimizer_class='nadam'"),
         ({"policy_kwargs": {"dropout_rate": 1.0}}, "dropout_rate must be at least 0"),
     ],
 )
 def test_what_cannot_work_is_refused_at_the_door(arguments, message):
     with pytest.raises(ValueError, match=message):
         DroQ("Pendulum-v1", **arguments)
+
+
+@every_algorithm
+def test_the_default_number_of_steps_goes_beyond_the_random_ones(name):
+    algorithm = algos.ALL[name]
+
+    assert algorithm.default_timesteps >= 2 * parameters_of(algorithm)["learning_starts"].default
+
+
+@pytest.mark.parametrize(
+    ("make", "arguments"),
+    [
+        (th.optim.Adam, {"betas": (0.8, 0.99), "eps": 1e-5}),
+        (th.optim.AdamW, {}),
+        (th.optim.AdamW, {"weight_decay": 0.1}),
+        (th.optim.RMSprop, {}),
+        (th.optim.RMSprop, {"alpha": 0.9, "momentum": 0.5}),
+        (th.optim.RAdam, {}),
+        (th.optim.SGD, {"momentum": 0.9, "nesterov": True}),
+    ],
+)
+def test_a_torch_class_means_what_it_does_in_torch(make, arguments):
+    rng = np.random.default_rng(0)
+    # RAdam's rectification begins with the sixth step.
+    w, slopes = rng.normal(size=(5, 2)), rng.normal(size=(8, 5, 2))
+    theirs = th.nn.Parameter(th.tensor(w))
+    torch_optimizer = make([theirs], lr=0.03, **arguments)
+    ours = optimizer_of(make, arguments)
+
+    with jax.enable_x64(True):
+        trained = Trained({"params": jnp.asarray(w)}, ours.init(jnp.asarray(w)))
+        for slope in slopes:
+            trained = ours.apply(jnp.asarray(slope), trained, 0.03)
+            theirs.grad = th.tensor(slope)
+            torch_optimizer.step()
+
+        np.testing.assert_allclose(trained.weights["params"], theirs.detach(), rtol=1e-6)
 
 
 def test_torch_classes_are_understood():
@@ -504,6 +593,60 @@ def test_simba_sees_observations_in_units_of_what_it_saw():
     assert float(scales.mean[2]) == pytest.approx(speeds.mean(), rel=1e-3)
 
 
+@pytest.mark.parametrize("name", ["tqc_jax", "droq"])
+def test_networks_of_simba_serve_other_algorithms(name):
+    model = small(name, policy="SimbaPolicy").learn(30)
+
+    assert isinstance(model.policy.actor_network.body, SimbaBody)
+    assert isinstance(model.policy.critic_network.body, SimbaBody)
+    assert float(model.policy.learner.seen.count) == 30.0 and model._n_updates > 0
+    assert model.policy.optimizers[0].make is optax.adamw
+    assert model.policy.critic_network.body.dropout_rate == (0.01 if name == "droq" else 0.0)
+
+
+def of_sbx(params: dict[str, Any]) -> dict[str, Any]:
+    """:return: weights of a SimBa network of SBX under the names that they have here"""
+    n_blocks = sum(name.startswith("SimbaResidualBlock") for name in params)
+    body = {"Dense_0": params["Dense_0"], f"LayerNorm_{n_blocks}": params["LayerNorm_0"]}
+    for i in range(n_blocks):
+        block = params[f"SimbaResidualBlock_{i}"]
+        body |= {f"LayerNorm_{i}": block["LayerNorm_0"]}
+        body |= {f"Dense_{2 * i + 1}": block["Dense_0"], f"Dense_{2 * i + 2}": block["Dense_1"]}
+    heads = [params[name] for name in ("Dense_1", "Dense_2") if name in params]
+    return {"body": body} | {f"Dense_{i}": head for i, head in enumerate(heads)}
+
+
+def test_simba_with_the_arguments_in_its_docstring_is_that_of_sbx():
+    net = {"net_arch": [8, 8], "normalize_observations": False}
+    kwargs = net | {"optimizer_kwargs": {"weight_decay": 1e-4}}
+    how = {"ent_coef": "auto", "target_entropy": -1.0, "gradient_steps": 1, "learning_rate": 3e-4}
+    ours = SimbaSAC("Pendulum-v1", policy_kwargs=kwargs, buffer_size=10, **how)
+    theirs = sbx.SAC(
+        "SimbaPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [8, 8]}, buffer_size=10
+    )
+    rng = np.random.default_rng(0)
+    obs, action = rng.normal(size=(5, 3)).astype("f"), rng.uniform(-1.0, 1.0, (5, 1)).astype("f")
+    actor, qf = theirs.policy.actor_state, theirs.policy.qf_state
+    [critic] = qf.params["params"].values()
+    of_actor, of_critic = of_sbx(actor.params["params"]), of_sbx(critic)
+
+    gaussian = ours.policy.recipe.actor.apply({"params": of_actor}, obs)
+    values, _ = judge(ours.policy.recipe, {"params": of_critic}, obs, action, jax.random.key(0))
+
+    before_tanh = actor.apply_fn(actor.params, obs).distribution
+    np.testing.assert_allclose(gaussian.mean, before_tanh.loc, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(gaussian.std, before_tanh.stddev(), rtol=1e-4)
+    np.testing.assert_allclose(values, qf.apply_fn(qf.params, obs, action), rtol=1e-4, atol=1e-6)
+    assert ours.knobs() == Knobs(theirs.learning_rate, 3e-4, theirs.tau, theirs.target_entropy)
+    assert ours.gradient_steps == theirs.gradient_steps
+    [start], entropy = jax.tree.leaves(theirs.ent_coef_state.params), ours.policy.learner
+    assert start == entropy.log_ent_coef.weights["params"]
+    assert (
+        inspect.signature(theirs.policy.optimizer_class).parameters["weight_decay"].default
+        == (dict(ours.policy.optimizers[0].arguments)["weight_decay"])
+    )
+
+
 def test_td7_does_not_judge_a_policy_by_random_actions():
     model = small("td7", use_checkpoints=True, train_freq=None, learning_starts=250)
     judged = []
@@ -527,6 +670,33 @@ def test_td7_does_not_judge_a_policy_by_random_actions():
 def test_what_td7_cannot_do_is_refused(arguments):
     with pytest.raises(ValueError, match=next(iter(arguments))):
         TD7("Pendulum-v1", **arguments)
+
+
+def test_td7_keeps_its_checkpoint_and_what_that_is_worth_when_networks_start_afresh():
+    model = small("td7", use_checkpoints=True, train_freq=None)
+    model.policy.keep_checkpoint()
+    model.best_worst_return = -150.0
+    obs = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, -2.0]], np.float32)
+    exploring, kept = (model.predict(obs, deterministic=way)[0] for way in (False, True))
+
+    model._restart(seed=1)
+
+    assert np.abs(model.predict(obs)[0] - exploring).min() > 1e-3
+    np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], kept)
+    assert model.best_worst_return == -150.0
+
+
+def test_td7_judges_policies_by_the_rewards_of_the_environment_itself():
+    space = spaces.Box(-1, 1, (3,))
+    # Ten steps that earn 1 each; normalised, the same ten earn less and less.
+    env = VecNormalize(DummyVecEnv([lambda: Constant(space, spaces.Box(-1, 1, (1,)))]))
+    model = small("td7", env, use_checkpoints=True, train_freq=None)
+    judged = []
+    model._assessed = lambda: judged.extend(model._finished) or 0
+
+    model.learn(60)
+
+    assert {earned for earned, _ in judged} == {10.0}
 
 
 def test_td7_loaded_with_several_environments_assesses_no_policy(tmp_path):

@@ -66,6 +66,33 @@ def test_its_gradient_is_that_of_finite_differences(name, x64):
     np.testing.assert_allclose(jax.jit(jax.jacrev(moved))(jnp.zeros(2)), slopes, rtol=1e-8)
 
 
+@every_system
+def test_its_gradient_in_a_weight_the_state_and_the_action_is_that_of_finite_differences(name, x64):
+    twin = twins.make(name).extend(NeuralForce(share=0.5, net_arch=(3,)))
+    (key,) = {k.rpartition(".")[0] for k in twin.tensors}
+    start = twin.initial(jax.random.key(3), twin.params)
+    weights, n_joints = twin.tensors[f"{key}.weights"], len(twin.joints)
+
+    def moved(change):
+        """One weight of one member, position and velocity of the first joint, the action."""
+        kernel = weights["Dense_1"]["kernel"].astype(change.dtype).at[0, 0, 0].add(change[0])
+        dense = weights["Dense_1"] | {"kernel": kernel}
+        params = twin.params | {f"{key}.weights": weights | {"Dense_1": dense}}
+        first = jnp.eye(n_joints, dtype=change.dtype)[0]
+        state = start._replace(q=start.q + change[1] * first, v=start.v + change[2] * first)
+        actions = (0.1 + change[3]) * jnp.ones((3, len(twin.actuators)))
+        return rollout(twin, params, state, actions).obs[-1]
+
+    slopes = jax.jit(jax.jacfwd(moved))(jnp.zeros(4))
+    width = 1e-6
+    for i in range(4):
+        step = width * jnp.eye(4)[i]
+        difference = (moved(step) - moved(-step)) / (2.0 * width)
+        np.testing.assert_allclose(slopes[:, i], difference, rtol=1e-5, atol=1e-7)
+        assert np.abs(slopes[:, i]).max() > 1e-6
+    np.testing.assert_allclose(jax.jit(jax.jacrev(moved))(jnp.zeros(4)), slopes, rtol=1e-8)
+
+
 def test_it_turns_with_a_hinge_and_is_bounded(x64):
     force = NeuralForce(share=1.0).fitted_to(twins.make("Pendulum"))
     own = {"share": 1.0, **force.tensors}

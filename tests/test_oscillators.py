@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 
 from sb3_hds.core import oscillators
 from sb3_hds.core.oscillators import AmplitudeState, Gait, Hopf, HopfState
+from sb3_hds.errors import ParameterError
 
 pytestmark = pytest.mark.usefixtures("x64", "quick_compilation")
 TAU = 2.0 * math.pi
@@ -120,7 +121,7 @@ def reference(state: HopfState, hopf: Hopf, until: float) -> tuple[np.ndarray, n
     offsets, h = np.array(hopf.offsets), 5e-6
     for _ in range(round(until / h)):
         ahead = np.sin(phase[None, :] - phase[:, None] - offsets)
-        pull = hopf.coupling * (ahead * radius[None, :]).sum(1)
+        pull = (hopf.coupling * ahead * radius[None, :]).sum(1)
         omega = np.where(np.sin(phase) > 0.0, hopf.omega_swing, hopf.omega_stance)
         radius = radius + h * hopf.alpha * (hopf.mu - radius**2) * radius
         phase = phase + h * (omega + pull)
@@ -131,14 +132,52 @@ def start() -> HopfState:
     return HopfState(jnp.array([0.3, 1.4, 0.8, 1.0]), jnp.array([0.1, 1.0, 4.0, 2.5]))
 
 
-def test_coupled_oscillators_are_as_close_to_a_fine_reference_as_their_docstring_says():
-    radius, phase = reference(start(), hopf("trot"), 0.3)
+@pytest.mark.parametrize("frequencies", [(3.0, 2.0), (2.0, 6.0)])
+def test_coupled_oscillators_are_as_close_to_a_fine_reference_as_their_docstring_says(frequencies):
+    swing, stance = TAU * np.array(frequencies)
+    trot = hopf("trot")._replace(omega_swing=swing, omega_stance=stance)
+    radius, phase = reference(start(), trot, 0.3)
 
-    found = oscillators.advance_hopf(start(), hopf("trot"), 0.3, substeps=300)
+    coarse, fine = (oscillators.advance_hopf(start(), trot, 0.3, n) for n in (300, 3000))
 
-    np.testing.assert_allclose(found.radius, radius, atol=1e-3)
-    # Sub-steps of 1 ms: at each change-over at most 1 ms of the difference of the frequencies.
-    assert apart(found.phase, phase).max() < 1e-3 * TAU
+    np.testing.assert_allclose(coarse.radius, radius, atol=1e-3)
+    # Two change-overs in each cycle of half a swing and half a stance, and one that is begun.
+    changes = 2.0 * 0.3 / (math.pi / swing + math.pi / stance) + 1.0
+    for found, h in ((coarse, 1e-3), (fine, 1e-4)):
+        # The reference itself is 5e-6 s late at each of them, and errs by 1e-3 rad.
+        late = changes * (h + 5e-6) * abs(swing - stance)
+        assert apart(found.phase, phase).max() < late + 1e-3
+
+
+def test_weights_are_those_of_each_leg_on_each_leg():
+    row = np.zeros((4, 4))
+    row[1, 0] = 3.0  # the first leg leads the second; nobody pulls at the others
+    led = hopf("trot")._replace(omega_swing=TAU * 2.0, coupling=jnp.array(row))
+    begun = start()._replace(radius=jnp.ones(4))
+
+    found = oscillators.advance_hopf(begun, led, 0.7, 1_000)
+
+    assert apart(found.phase, begun.phase + 0.7 * TAU * 2.0)[[0, 2, 3]].max() < 1e-9
+    # How far the second is from half a turn behind: d' = -w sin d.
+    behind = float(begun.phase[1] - begun.phase[0]) + math.pi
+    expected = 2.0 * math.atan(math.tan(0.5 * behind) * math.exp(-3.0 * 0.7))
+    assert apart(found.phase[1] - found.phase[0] + math.pi, expected) < 1e-6
+
+
+def test_one_weight_is_a_matrix_full_of_it():
+    one, full = hopf("trot", coupling=2.0), hopf("trot")._replace(coupling=jnp.full((4, 4), 2.0))
+
+    first, second = (oscillators.advance_hopf(start(), legs, 0.1, 100) for legs in (one, full))
+
+    np.testing.assert_allclose(first.phase, second.phase, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(4,), (3, 3), (4, 1)])
+def test_weights_of_another_shape_are_refused(shape):
+    wrong = hopf("trot")._replace(coupling=jnp.ones(shape))
+
+    with pytest.raises(ParameterError, match="one for each pair of legs"):
+        oscillators.advance_hopf(start(), wrong, 0.1, 10)
 
 
 def test_an_uncoupled_amplitude_follows_the_solution_of_its_equation():
@@ -201,11 +240,19 @@ def test_commanded_amplitudes_follow_their_equation():
     assert apart(found.phase, np.array(begun.phase) + 0.08 * omega).max() < 1e-12
 
 
-def test_commanded_amplitudes_have_the_derivatives_that_finite_differences_give():
+@pytest.mark.parametrize(
+    ("name", "at"), [("mu", 1.3), ("omega", 9.0), ("dt", 0.02), ("gain", 150.0)]
+)
+def test_commanded_amplitudes_have_the_derivatives_that_finite_differences_give(name, at):
     begun = AmplitudeState(jnp.array([0.2]), jnp.array([3.0]), jnp.array([0.0]))
 
-    def end(mu):
-        after = oscillators.advance_amplitude(begun, jnp.array([1.0]) * mu, 9.0, 0.02)
+    def end(value):
+        given = {"mu": 1.3, "omega": 9.0, "dt": 0.02, "gain": 150.0} | {name: value}
+        given["mu"] = jnp.array([1.0]) * given["mu"]
+        after = oscillators.advance_amplitude(begun, **given)
         return after.radius * jnp.sin(after.phase)
 
-    np.testing.assert_allclose(jax.jacfwd(end)(1.3), central_difference(end, 1.3), rtol=1e-6)
+    expected = central_difference(end, at)
+    np.testing.assert_allclose(jax.jacfwd(end)(at), expected, rtol=1e-5)
+    np.testing.assert_allclose(jax.jacrev(end)(at), expected, rtol=1e-5)
+    assert np.abs(expected).max() > 1e-4

@@ -326,6 +326,19 @@ def test_shifting_all_rewards_shifts_the_objective_also_of_an_episode_that_ends(
 
 
 @pytest.mark.usefixtures("x64")
+def test_without_shifted_ends_only_the_rewards_of_an_episode_that_ends_are_shifted():
+    twin, discount, offset = Cliff(), 0.9, 0.7
+    start, controls = State(jnp.array([0.5]), jnp.array([3.0]), {}), jnp.zeros((8, 1))
+    problem = Problem(twin, twin.params, discount, reward_offset=offset, shift_ends=False)
+
+    plan = planning.simulate(problem, start, controls)
+
+    lived = int(jnp.sum(plan.alive)) - 1
+    expected = sum(discount**t * (1.0 - offset) for t in range(lived + 1))
+    assert plan.value == pytest.approx(expected)
+
+
+@pytest.mark.usefixtures("x64")
 def test_after_the_end_of_an_episode_nothing_counts_and_nothing_pulls():
     twin = Cliff()
     problem = Problem(twin, twin.params)

@@ -8,7 +8,8 @@ import pytest
 from stable_baselines3 import SAC
 
 from sb3_hds import HDS, effects, twins
-from sb3_hds.errors import TrajectoryError
+from sb3_hds.envs import TwinEnv
+from sb3_hds.errors import EnvironmentMismatchError, ParameterError, TrajectoryError
 from sb3_hds.experiments import PolicyGain, measure_policy_gain
 from sb3_hds.experiments.policy_gain import _summarised
 from sb3_hds.sysid import Diagnosis
@@ -101,9 +102,86 @@ def test_it_is_drawn_and_told_in_the_report(measured, tmp_path):
     assert "What it buys" not in a_diagnosis().to_html(tmp_path / "report.html").read_text()
 
 
+class OneStep(gymnasium.Env):
+    """A real system whose episodes end at once."""
+
+    def __init__(self, n_obs=3, most=2.0):
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (n_obs,))
+        self.action_space = gymnasium.spaces.Box(-most, most, (1,))
+        self.closed = False
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(self.observation_space.shape, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(self.observation_space.shape, np.float32), 1.0, True, False, {}
+
+    def close(self):
+        self.closed = True
+
+
+def test_a_truth_that_is_known_is_the_ceiling_of_any_system():
+    """Of a system made of a twin, that twin; of another one, what the user says."""
+    diagnosis, truth = a_diagnosis(), twins.make("PendulumReal", mass=1.2)
+    simulated = gymnasium.wrappers.TimeLimit(TwinEnv(truth), 5)
+    names = []
+    for env, ceiling in ((simulated, True), (OneStep(), truth), (OneStep(), True)):
+        gain = measure_policy_gain(
+            diagnosis,
+            env,
+            seeds=1,
+            n_episodes=1,
+            ceiling=ceiling,
+            progress=False,
+            **SMALL | {"pretrain_epochs": 1},
+        )
+        names.append([*gain.returns])
+
+    assert names == [["believed", "extended", "true"]] * 2 + [["believed", "extended"]]
+
+
+def test_an_environment_that_was_made_here_is_closed_here():
+    made, own = [], OneStep()
+
+    def factory():
+        made.append(OneStep())
+        return made[-1]
+
+    for env in (factory, own):
+        settings = SMALL | {"pretrain_epochs": 1}
+        measure_policy_gain(a_diagnosis(), env, seeds=1, n_episodes=1, progress=False, **settings)
+
+    assert [env.closed for env in made] == [True] and not own.closed
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "changes"), [(SAC, {}), (HDS, {"pretrain_epochs": 0}), (SAC, {"budget": 0})]
+)
+def test_policies_that_learned_nothing_are_not_compared(algorithm, changes):
+    with pytest.raises(TrajectoryError, match=f"{algorithm.__name__} learns nothing in 0 steps"):
+        measure_policy_gain(a_diagnosis(), ROBOT, algorithm, **changes)
+
+
+@pytest.mark.parametrize(
+    ("real", "message"),
+    [
+        (OneStep(n_obs=4), r"observations of shape \(4,\).*\(3,\)"),
+        (OneStep(most=1.0), r"actions in \[-1\] to \[1\].*\[-2\] to \[2\]"),
+    ],
+)
+def test_a_system_that_the_twins_do_not_describe_is_refused(real, message):
+    with pytest.raises(EnvironmentMismatchError, match=message):
+        measure_policy_gain(a_diagnosis(), real)
+
+
+def test_an_argument_that_the_algorithm_does_not_have_is_refused():
+    with pytest.raises(ParameterError, match=r"HDS cannot be made.*'speed'"):
+        measure_policy_gain(a_diagnosis(), ROBOT, speed=1)
+
+
 @pytest.mark.parametrize("wrong", [{"seeds": 0}, {"n_episodes": 0}, {"budget": -1}])
 def test_nothing_to_measure_is_an_error(wrong):
-    with pytest.raises(TrajectoryError, match="at least 1"):
+    with pytest.raises(TrajectoryError, match="at least"):
         measure_policy_gain(a_diagnosis(), ROBOT, HDS, **wrong)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sb3_hds import twins
+from sb3_hds import effects, twins
 from sb3_hds.core import rollout
 from sb3_hds.errors import ParameterError
 
@@ -49,6 +49,19 @@ FURUTA = """
 """
 
 
+def tilted(xml, *gravity):
+    return xml.replace("0 0 -9.81", " ".join(f"{g:.17g}" for g in gravity))
+
+
+def loaded(xml, mass, distance):
+    """A point of that mass hangs on the last link."""
+    tip = (
+        f'<body pos="0 0 {-distance}">'
+        f'<inertial pos="0 0 0" mass="{mass}" diaginertia="1e-9 1e-9 1e-9"/></body>'
+    )
+    return xml.replace("</body>", f"{tip}</body>", 1)
+
+
 def on_engine(xml, start, torques, dt):
     """:return: positions and velocities, shape ``(T + 1, 2 dof)``"""
     model = mujoco.MjModel.from_xml_string(xml)
@@ -73,43 +86,70 @@ def torques(n_steps, n, size):
     return size * np.sin(0.2 * rng.standard_normal((n_steps, n)).cumsum(0))
 
 
+ON_ENGINE = {
+    "DoublePendulum": (
+        DOUBLE_PENDULUM,
+        0.5,
+        {
+            "mass1": 0.5,
+            "mass2": 0.6,
+            "length1": 0.3,
+            "com1": 0.25,
+            "com2": 0.15,
+            "inertia1": 0.02 + 0.5 * 0.25**2,
+            "inertia2": 0.015 + 0.6 * 0.15**2,
+            "damping1": 0.01,
+            "damping2": 0.02,
+        },
+    ),
+    "Furuta": (
+        FURUTA,
+        0.01,
+        {
+            "arm_inertia": 6e-4,
+            "arm_length": 0.1,
+            "mass": 0.03,
+            "com": 0.07,
+            "inertia": 4e-5,
+            "arm_damping": 1e-3,
+            "pendulum_damping": 1e-4,
+        },
+    ),
+}
+
+
 @pytest.mark.parametrize(
-    ("name", "xml", "size", "parameters"),
+    ("name", "changed", "change"),
     [
+        ("DoublePendulum", {}, lambda xml: xml),
+        ("Furuta", {}, lambda xml: xml),
         (
             "DoublePendulum",
-            DOUBLE_PENDULUM,
-            0.5,
-            {
-                "mass1": 0.5,
-                "mass2": 0.6,
-                "length1": 0.3,
-                "com1": 0.25,
-                "com2": 0.15,
-                "inertia1": 0.02 + 0.5 * 0.25**2,
-                "inertia2": 0.015 + 0.6 * 0.15**2,
-                "damping1": 0.01,
-                "damping2": 0.02,
-            },
+            {"tilt": 0.2},
+            lambda xml: tilted(xml, -9.81 * np.sin(0.2), 0.0, -9.81 * np.cos(0.2)),
         ),
         (
             "Furuta",
-            FURUTA,
-            0.01,
-            {
-                "arm_inertia": 6e-4,
-                "arm_length": 0.1,
-                "mass": 0.03,
-                "com": 0.07,
-                "inertia": 4e-5,
-                "arm_damping": 1e-3,
-                "pendulum_damping": 1e-4,
-            },
+            {"tilt_x": 0.2, "tilt_y": -0.1},
+            lambda xml: tilted(
+                xml,
+                9.81 * np.sin(0.2),
+                9.81 * np.cos(0.2) * np.sin(-0.1),
+                -9.81 * np.cos(0.2) * np.cos(-0.1),
+            ),
         ),
+        (
+            "DoublePendulum",
+            {"tip_payload": 0.15, "tip": 0.25},
+            lambda xml: loaded(xml, 0.15, 0.25),
+        ),
+        ("Furuta", {"tip_payload": 0.01, "tip": 0.12}, lambda xml: loaded(xml, 0.01, 0.12)),
     ],
 )
-def test_two_joints_move_as_in_mujoco(x64, name, xml, size, parameters):
-    twin = twins.make(name, **parameters)
+def test_two_joints_move_as_in_mujoco(x64, name, changed, change):
+    xml, size, parameters = ON_ENGINE[name]
+    xml = change(xml)
+    twin = twins.make(name, **parameters | changed)
     start, actions = np.array([0.3, 1.0]), torques(100, len(twin.actuators), size)
 
     found = replayed(twin, start, actions)
@@ -142,6 +182,24 @@ def test_one_motor_leaves_the_other_joint_alone(x64):
             lambda q, v, u: (0.2 * 9.81 * 0.2 * np.sin(q) - 1e-3 * v) / (1e-3 + 0.2 * 0.2**2),
         ),
         (
+            "FreePendulum",
+            {"mass": 0.2, "com": 0.2, "inertia": 1e-3, "tilt": 0.3, "tip_payload": 0.1, "tip": 0.4},
+            lambda q, v, u: (
+                -9.81 * (0.2 * 0.2 + 0.1 * 0.4) * np.sin(q + 0.3) / (1e-3 + 0.2**3 + 0.1 * 0.4**2)
+            ),
+        ),
+        (
+            "ServoPendulum",
+            {"torque_constant": 0.5, "resistance": 2.0, "tilt": -0.2},
+            lambda q, v, u: (
+                (
+                    0.5 / 2.0 * (7.4 * np.clip(400.0 * 2.877e-3 * (u - q), -1.0, 1.0) - 0.5 * v)
+                    - 0.5 * 9.81 * 0.1 * np.sin(q - 0.2)
+                )
+                / (0.5 * 0.1**2 + 0.002)
+            ),
+        ),
+        (
             "ServoPendulum",
             {"kp": 200.0, "torque_constant": 0.5, "resistance": 2.0, "voltage": 6.0},
             lambda q, v, u: (
@@ -170,6 +228,17 @@ def test_one_joint_moves_as_its_equation_says(x64, name, settings, acceleration)
         expected.append(tuple(solved.y[:, -1]))
 
     np.testing.assert_allclose(replayed(twin, [q], actions), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_tilted_gravity_looks_like_a_wrong_zero_in_free_swing(x64):
+    tilted = twins.make("FreePendulum", tilt=0.1, damping=1e-3)
+    level = twins.make("FreePendulum", damping=1e-3)
+    rest = np.zeros((50, 0))
+
+    found = replayed(tilted, [0.3], rest)
+
+    np.testing.assert_allclose(found, replayed(level, [0.4], rest) - [0.1, 0.0], atol=1e-12)
+    assert "parameter.tilt" in effects.SensorBias.equivalents
 
 
 def test_a_servo_that_is_switched_off_swings_freely(x64):
@@ -215,6 +284,8 @@ def test_encoders_report_positions_and_if_wanted_velocities(name, observe):
         ("LinearAxis", {"observe": "v"}, "can observe 'q' or 'qv', got 'v'"),
         ("CartPole", {"observe": "v"}, "'task' or 'q' or 'qv'"),
         ("FreePendulum", {"zero": "left"}, "'down' or 'up'"),
+        ("FreePendulum", {"tip": 0.0}, "tip of FreePendulum must be a length above 0 m, got 0"),
+        ("Furuta", {"tip": "end"}, "must be a length above 0 m, got 'end'"),
         ("DoublePendulum", {"driven": "none"}, "'both', 'first', 'second'"),
         ("ServoPendulum", {"commands": "torque"}, "'goal', 'goal, enable'"),
     ],

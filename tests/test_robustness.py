@@ -1,6 +1,7 @@
 """What a table of robustness says, and the command that prints it."""
 
 import csv
+import functools
 
 import gymnasium
 import numpy as np
@@ -8,9 +9,10 @@ import pytest
 from small_models import small
 from test_open_loop import SWIMMER
 
-from sb3_hds import OpenLoop, cli
-from sb3_hds.errors import TrajectoryError
+from sb3_hds import OpenLoop, algos, cli
+from sb3_hds.errors import EnvironmentMismatchError, TrajectoryError
 from sb3_hds.experiments import PERTURBATIONS, Robustness, measure_robustness, returns_of
+from sb3_hds.wrappers import CPGPrior, LowPassAction
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 N_STEPS = 100
@@ -80,10 +82,121 @@ def test_the_command_prints_and_writes_the_table(swimmer, tmp_path, capsys):
 
     assert done == 0
     assert "sensor constant" in capsys.readouterr().out
-    with (tmp_path / "table.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "table.csv")
     assert [row["perturbation"] for row in rows] == list(PERTURBATIONS)
     assert float(rows[1]["share"]) == 1.0
+
+
+def test_a_push_without_mujoco_is_left_out_and_named():
+    model = small("droq", "Pendulum-v1")
+
+    found = measure_robustness(model, "Pendulum-v1", n_episodes=1, progress=False)
+
+    assert list(found.returns) == [name for name in PERTURBATIONS if name != "push"]
+    assert "push is left out: A push needs an environment of MuJoCo" in str(found)
+    assert "push" not in [row["perturbation"] for row in found.to_rows()]
+    assert all(len(line) <= 80 for line in str(found).splitlines())
+
+
+def test_observations_that_cannot_be_perturbed_are_refused_before_any_episode():
+    class Pictures(gymnasium.Env):
+        observation_space = gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
+        action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+    with pytest.raises(EnvironmentMismatchError, match="a Box with one axis"):
+        measure_robustness(small("droq"), Pictures, n_episodes=1)
+
+
+def test_what_wrappers_add_is_no_sensor():
+    wrap = functools.partial(CPGPrior, omega_swing=4.0)
+    model = small("droq", wrap(gymnasium.make("Pendulum-v1")))
+    seen = []
+
+    class Seeing(gymnasium.ObservationWrapper):
+        def observation(self, observation):
+            seen.append(observation)
+            return observation
+
+    kinds = {name: PERTURBATIONS[name] for name in ("none", "noise 0.5")}
+    measure_robustness(
+        model,
+        "Pendulum-v1",
+        wrapper=lambda env: Seeing(wrap(env)),
+        perturbations=kinds,
+        n_episodes=1,
+        progress=False,
+    )
+
+    calm, noisy = np.array_split(np.array(seen), 2)
+    # Cosine and sine of the angle, which the sensors show; sine and cosine of the clock.
+    assert np.abs(np.hypot(calm[:, 0], calm[:, 1]) - 1.0).max() < 1e-6
+    assert np.abs(np.hypot(noisy[:, 0], noisy[:, 1]) - 1.0).max() > 0.1
+    np.testing.assert_allclose(np.hypot(noisy[:, 3], noisy[:, 4]), 1.0, atol=1e-6)
+
+
+def rows_of(path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_command_takes_what_the_environment_was_made_and_wrapped_with(tmp_path, capsys):
+    env = LowPassAction(gymnasium.make("Pendulum-v1", g=5.0), cutoff=4.0)
+    small("droq", env).save(tmp_path / "model")
+    words = ["--algo", "droq", "--model", str(tmp_path / "model.zip"), "--env", "Pendulum-v1"]
+    wrapper = ["--env-wrapper", "sb3_hds.wrappers.LowPassAction: {cutoff: 4.0}"]
+    made = ["--env-kwargs", "g:5.0", "render_mode:null"]
+    ask = ["robustness", *words, *made, "--episodes", "1", "--csv"]
+
+    assert cli.main([*ask, str(tmp_path / "table.csv"), *wrapper]) == 0
+    without = cli.main([*ask, str(tmp_path / "none.csv")])
+
+    model = algos.DroQ.load(tmp_path / "model.zip")
+    expected = returns_of(model, env, 1)[0]
+    assert float(rows_of(tmp_path / "table.csv")[0]["return"]) == pytest.approx(expected, rel=1e-5)
+    # Without the filter, whose state is observed.
+    assert without == 1 and "put the wrappers around it" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "path"),
+    [
+        ("tqc", "sb3_contrib.TQC"),
+        ("sbx.SAC", "sbx.SAC"),
+        pytest.param("ppo_lstm", None, marks=pytest.mark.expensive),
+    ],
+)
+def test_the_command_runs_models_of_the_packages_around(name, path, tmp_path):
+    pytest.importorskip("sb3_contrib")
+    algorithm = cli._algorithm(name)
+    policy = "MlpLstmPolicy" if name == "ppo_lstm" else "MlpPolicy"
+    algorithm(policy, "Pendulum-v1", seed=0).save(tmp_path / "model")
+    words = ["--algo", name, "--model", str(tmp_path / "model.zip"), "--env", "Pendulum-v1"]
+
+    done = cli.main(["robustness", *words, "--episodes", "1", "--csv", str(tmp_path / "t.csv")])
+
+    assert done == 0 and len(rows_of(tmp_path / "t.csv")) == len(PERTURBATIONS) - 1
+    assert path is None or f"{algorithm.__module__.split('.')[0]}." in path
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--algo", "sbx.Nothing"], "no class 'sbx.Nothing'"),
+        (["--algo", "sbx.common"], "loads no model"),
+        (["--env-wrapper", "nowhere.Wrapper"], "no class 'nowhere.Wrapper'"),
+        (["--env-wrapper", "[1, 2]"], "--env-wrapper takes package.Wrapper"),
+        (["--env-wrapper", "sb3_hds.wrappers.LowPassAction: 4"], "--env-wrapper takes"),
+        (["--env-kwargs", "g=5"], "--env-kwargs takes NAME:VALUE"),
+        (["--env-kwargs", "weight:5"], "There is no 'Pendulum-v1' with {'weight': 5}"),
+        (["--env", "Nothing-v0"], "There is no 'Nothing-v0'"),
+    ],
+)
+def test_the_command_says_in_one_line_what_it_does_not_know(words, message, tmp_path, capsys):
+    small("droq").save(tmp_path / "model")
+    known = ["--algo", "droq", "--model", str(tmp_path / "model.zip"), "--env", "Pendulum-v1"]
+
+    assert cli.main(["robustness", *known, *words]) == 1
+    assert message in capsys.readouterr().err
 
 
 def test_the_command_names_an_algorithm_that_there_is_not(capsys):

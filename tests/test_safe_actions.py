@@ -20,6 +20,7 @@ from sb3_hds.wrappers import (
     ActionScale,
     ActionShield,
     ContinuityCost,
+    CPGPrior,
     HistoryObservation,
     JointLimitBarrier,
     LowPassAction,
@@ -48,6 +49,7 @@ LAYERS = {
     "continuity": lambda env: ContinuityCost(env, weight=0.1),
     "shield": lambda env: ActionShield(env, "moving_joints.walls", guard="moving_joints.distances"),
     "template": lambda env: SharedControlTemplate(env, PHASES),
+    "rhythm": lambda env: CPGPrior(env, mode="parameters", omega_swing=6.0, amplitude=[1.0, 2.0]),
 }
 ALL = pytest.mark.parametrize("layer", LAYERS)
 
@@ -178,7 +180,9 @@ def test_layers_need_bounded_actions(layer):
         LAYERS[layer](env)
 
 
-@pytest.mark.parametrize("layer", ["rate_limit", "low_pass", "delay", "scale", "continuity"])
+@pytest.mark.parametrize(
+    "layer", ["rate_limit", "low_pass", "delay", "scale", "continuity", "rhythm"]
+)
 def test_the_memory_can_be_left_out_of_observations(layer):
     shown = LAYERS[layer](joints())
     hidden = {
@@ -187,6 +191,9 @@ def test_the_memory_can_be_left_out_of_observations(layer):
         "delay": lambda env: ActionDelay(env, 2, observe_state=False),
         "scale": lambda env: ActionScale(env, schedule=[[0, 0.2], [10, 1.0]], observe_state=False),
         "continuity": lambda env: ContinuityCost(env, 0.1, observe_state=False),
+        "rhythm": lambda env: CPGPrior(
+            env, mode="parameters", omega_swing=6.0, amplitude=[1.0, 2.0], observe_state=False
+        ),
     }[layer](joints())
 
     assert hidden.observation_space == hidden.env.observation_space

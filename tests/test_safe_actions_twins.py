@@ -1,5 +1,6 @@
 """Layers around an environment have twins, planners plan through them, learners store as asked."""
 
+import functools
 import json
 
 import gymnasium
@@ -25,6 +26,7 @@ from sb3_hds.wrappers import (
     ActionScale,
     ActionShield,
     ContinuityCost,
+    CPGPrior,
     HistoryObservation,
     JointLimitBarrier,
     LowPassAction,
@@ -50,6 +52,9 @@ LAYERS = {
     "barrier": lambda env: JointLimitBarrier(
         env, -2.0, 2.0, position=[[0, 1]], gain=0.5, on_breach="ignore"
     ),
+    "rhythm_offset": lambda env: CPGPrior(env, omega_swing=3.0, omega_stance=5.0, phase=0.4),
+    "rhythm_residual": lambda env: CPGPrior(env, mode="residual", omega_swing=3.0, amplitude=2.5),
+    "rhythm_parameters": lambda env: CPGPrior(env, mode="parameters", omega_swing=3.0, offset=0.3),
     "two_of_a_kind": lambda env: ActionRateLimit(ActionRateLimit(env, 30.0), 10.0),
     "nested": nested,
 }
@@ -86,7 +91,7 @@ def test_what_is_seen_tells_the_state_of_the_twin(layer, x64):
     twin = twin_of(LAYERS[layer](gymnasium.make("Pendulum-v1")))
     state = twin.initial(jax.random.key(0), twin.params)
     for k in range(5):
-        state = twin.step(state, jnp.full(1, 1.5 - k), twin.params)
+        state = twin.step(state, jnp.full(len(twin.actuators), 1.5 - k), twin.params)
 
     back = twin.infer(twin.observe(state, twin.params), twin.params)
 
@@ -230,7 +235,7 @@ def test_an_action_to_store_in_other_units_is_an_error():
 
 
 class Reacher(gymnasium.Env):
-    """A joint commanded by its speed that has to go to 0.3 rad; the limits of 1.5 are far away."""
+    """A joint commanded by its speed that has to go to 0.3 rad, from anywhere within 1 rad."""
 
     dt = 0.05
 
@@ -249,31 +254,59 @@ class Reacher(gymnasium.Env):
         return np.array([self.q], np.float32), reward, False, self.n >= 50, {}
 
 
-@pytest.mark.expensive
-@pytest.mark.parametrize(
-    "guard",
-    [
-        lambda env: JointLimitBarrier(env, -1.5, 1.5),
-        lambda env: ActionShield(env, ([[1.0], [-1.0]], [1.1, 1.1])),
-    ],
-    ids=["barrier", "shield"],
-)
-def test_a_policy_trained_behind_a_layer_that_does_not_bind_is_as_good_as_without(guard):
-    def trained(wrap):
-        settings = {"learning_starts": 200, "learning_rate": 3e-3, "gamma": 0.9, "batch_size": 64}
-        model = small("tqc_jax", wrap(Reacher()), **settings, gradient_steps=5).learn(2_000)
-        env, total = wrap(Reacher()), 0.0
-        for episode in range(20):
-            obs, _ = env.reset(seed=episode)
-            for _ in range(50):
-                obs, reward, *_ = env.step(model.predict(obs, deterministic=True)[0])
-                total += reward
-        return total / 20
+class Corrections(gymnasium.Wrapper):
+    """Counts steps in which a layer below changed what was chosen."""
 
-    free, guarded = trained(lambda env: env), trained(guard)
+    n = 0
+
+    def step(self, action):
+        result = self.env.step(action)
+        self.n += bool(np.any(np.abs(result[4].get("correction", 0.0)) > 1e-6))
+        return result
+
+
+def within_105(obs):
+    """Half of the distance to 1.05 rad on either side in a step: G u <= h."""
+    step = Reacher.dt
+    return [[step], [-step]], [0.5 * (1.05 - obs[0]), 0.5 * (1.05 + obs[0])]
+
+
+GUARDS = {
+    "none": lambda env: env,
+    # 50 steps of 0.05 rad lead to 3.5 rad at most.
+    "barrier, far": lambda env: JointLimitBarrier(env, -4.0, 4.0),
+    "shield, far": lambda env: ActionShield(env, ([[1.0], [-1.0]], [1.1, 1.1])),
+    # Active beyond 0.95 rad for who goes on outwards, which only exploration does.
+    "barrier, near": lambda env: JointLimitBarrier(env, -1.05, 1.05),
+    "shield, near": lambda env: ActionShield(env, within_105),
+}
+
+
+@functools.cache
+def trained(guard):
+    """:return: mean return, and corrections while training and after it"""
+    settings = {"learning_starts": 200, "learning_rate": 3e-3, "gamma": 0.9, "batch_size": 64}
+    before, after = (Corrections(GUARDS[guard](Reacher())) for _ in range(2))
+    model = small("tqc_jax", before, **settings, gradient_steps=5).learn(2_000)
+    total = 0.0
+    for episode in range(20):
+        obs, _ = after.reset(seed=episode)
+        for _ in range(50):
+            obs, reward, *_ = after.step(model.predict(obs, deterministic=True)[0])
+            total += reward
+    return total / 20, before.n, after.n
+
+
+@pytest.mark.expensive
+@pytest.mark.parametrize("guard", [name for name in GUARDS if name != "none"])
+def test_a_policy_trained_behind_a_layer_that_does_not_bind_is_as_good_as_without(guard):
+    free, *_ = trained("none")
+
+    guarded, explored, used = trained(guard)
 
     assert free > 35.0  # a policy that stays where it begins gets 50 (1 - 0.55) = 22
     assert guarded > free - 0.05 * abs(free)
+    assert (explored > 0) == guard.endswith("near") and used == 0
 
 
 @pytest.mark.expensive

@@ -4,18 +4,21 @@ from typing import Any
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
 from small_models import OFF_POLICY, PLANNERS
 from stable_baselines3.common.buffers import NStepReplayBuffer
 
 from sb3_hds import algos
-from sb3_hds.algos import td7_update
+from sb3_hds.algos import learn_compiled, td7_update
 from sb3_hds.algos.observations import seen
 from sb3_hds.algos.off_policy import judge
 from sb3_hds.algos.sampling import batches_of
-from sb3_hds.envs import ConstantReward
+from sb3_hds.core import Actuator, AnalyticTwin, Channel, Joint, State
+from sb3_hds.envs import ConstantReward, TwinEnv
 from sb3_hds.errors import ParameterError
 from sb3_hds.wrappers import TruncateToTerminate
 
@@ -115,6 +118,62 @@ def test_where_the_limit_is_an_end_nothing_counts_after_it(name):
 
     assert pytest.approx(3.88, abs=5e-3) == TERMINATED
     assert value == pytest.approx(TERMINATED, rel=0.05)
+
+
+class Clock(AnalyticTwin):
+    """
+    The twin of the example: a hand that goes round in four steps, whatever it is told, and is paid.
+
+    :param over: option; whether the round is the end
+    """
+
+    name = "Clock"
+    dt = 1.0
+    joints = (Joint("hand", "rad"),)
+    actuators = (Actuator("nothing", "1", -1.0, 1.0),)
+    channels = (Channel("cos", "1", -1.0, 1.0), Channel("sin", "1", -1.0, 1.0))
+    parameters = {}
+    options = {"over": False}
+
+    def initial(self, key, params):
+        return State(jnp.zeros(1), jnp.full(1, 0.5 * jnp.pi), {})
+
+    def infer(self, obs, params):
+        return State(jnp.arctan2(obs[1:], obs[:1]), jnp.full(1, 0.5 * jnp.pi, obs.dtype), {})
+
+    def observe(self, state, params):
+        return jnp.concatenate([jnp.cos(state.q), jnp.sin(state.q)])
+
+    def actuate(self, state, action, params):
+        return 0.0 * action
+
+    def mass_matrix(self, q, params):
+        return jnp.ones((1, 1), q.dtype)
+
+    def bias(self, q, v, params):
+        return 0.0 * q
+
+    def reward(self, state, action, next_state, params):
+        return jnp.ones(())
+
+    def terminated(self, state, params):
+        return self.over & (state.q[0] > 1.9 * jnp.pi)
+
+
+@pytest.mark.parametrize(
+    ("over", "expected"), [(False, TRUNCATED), (True, TERMINATED)], ids=["truncated", "terminated"]
+)
+def test_what_learns_within_one_program_takes_a_time_limit_for_what_it_is(over, expected):
+    env = TimeLimit(TwinEnv(Clock(over=over)), 4)
+    arguments, n_updates = LEARNERS["gsde_sac"]
+    n_steps = arguments["buffer_size"]
+    each = n_updates // (n_steps - arguments["learning_starts"])
+    model = algos.GSDESAC(env=env, **(arguments | {"gradient_steps": each, "batch_size": 32}))
+
+    (learned,), (episodes,) = learn_compiled(model, n_steps)
+
+    assert episodes.timesteps.tolist() == list(range(4, n_steps + 1, 4))
+    assert value_of(learned, env.reset()[0]) == pytest.approx(expected, rel=0.05)
 
 
 def test_the_example_is_a_clock_that_pays_the_same_for_ever():

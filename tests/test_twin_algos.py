@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import (
 from sb3_hds import algos, effects, twins
 from sb3_hds.algos import twin_algorithm
 from sb3_hds.algos.arguments import knobs_of, visited_states
+from sb3_hds.algos.learner import problem_of
 from sb3_hds.algos.regression import regress
 from sb3_hds.algos.twin_policy import all_finite
 from sb3_hds.core import Twin
@@ -538,6 +539,21 @@ def test_each_choice_improves_plans(changes):
 
     before, after = (lines.column(f"train/plan_return_{when}") for when in ("before", "after"))
     assert (np.array(after) > np.array(before)).all() and finite(model)
+
+
+@every_planner
+def test_what_an_end_is_worth_has_a_switch(name):
+    worth = {}
+    for shifted in (True, False):
+        model = small(name, "InvertedPendulum-v5", shift_ends=shifted)
+        learner, settings = model._learner(), model._settings
+        knobs = knobs_of(model, settings.twin, 1.0, 4)
+        problem = problem_of(settings, learner, knobs)
+        worth[shifted] = float(problem.value_when_terminated)
+        best = float(problem.reward_offset * problem.reward_scale)
+    # A reward of zero for ever, counted from the best one; or nothing.
+    assert worth == {True: pytest.approx(-best / (1.0 - model.gamma)), False: 0.0}
+    assert best > 0.0
 
 
 def test_frozen_statistics_of_a_normalised_environment_are_left_alone():

@@ -1,7 +1,8 @@
 """Two updates of every model-free algorithm beside plain NumPy, weight by weight."""
 
 from collections.abc import Iterator
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import gymnasium
 import jax
@@ -19,16 +20,20 @@ from numpy_networks import (
     descend,
     elu,
     gaussian,
+    layer_norm,
     member,
     mlp,
     quantile_huber,
     relu,
     simba,
+    slope,
     squashed,
+    squashed_between,
 )
 
 from sb3_hds import algos
 from sb3_hds.algos import td7_update
+from sb3_hds.algos.bodies import Dropout
 from sb3_hds.algos.observations import Seen
 from sb3_hds.algos.off_policy import Batch, Knobs, Optimizer, Trained, update
 
@@ -71,8 +76,8 @@ def plain(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: np.array(leaf, np.float64), tree)
 
 
-def batches(n_updates: int = N_UPDATES) -> Batch:
-    rng = np.random.default_rng(0)
+def batches(n_updates: int = N_UPDATES, seed: int = 0) -> Batch:
+    rng = np.random.default_rng(seed)
     draw = lambda *shape: rng.normal(size=(n_updates, N_BATCH, *shape))  # noqa: E731
     return Batch(
         obs=draw(N_OBS),
@@ -91,12 +96,23 @@ def assert_same(found: Any, expected: Any) -> None:
         np.testing.assert_allclose(other, leaf, err_msg=str(path), **CLOSE)
 
 
-def keys_of(learner: Any) -> Iterator[tuple[Any, ...]]:
-    """:return: of each update, the keys of the next action, the action and what else there is"""
+class Keys(NamedTuple):
+    """Of one update: two of noise, three of dropout masks, and what else there is."""
+
+    next_action: Any
+    critic: Any
+    next_critic: Any
+    action: Any
+    critic_of_actor: Any
+    extra: Any
+
+
+def keys_of(learner: Any) -> Iterator[Keys]:
+    """:return: of one update after the other"""
     key = learner.key
     while True:
         key, critic_key, actor_key = jax.random.split(key, 3)
-        yield jax.random.split(critic_key, 3)[0], *jax.random.split(actor_key, 3)[::2]
+        yield Keys(*jax.random.split(critic_key, 3), *jax.random.split(actor_key, 3))
 
 
 def normal(key: Any) -> np.ndarray:
@@ -113,62 +129,83 @@ class Soft:
     :param error: of the values of one critic, given targets
     :param worth: values of all critics to what the actor climbs, shape ``(batch,)``
     :param b1: Adam's, of the entropy coefficient
+    :param policy_delay: updates of the critics for each of the actor
+    :param target_every: updates of the critics for each of the target networks
     """
 
-    def __init__(self, learner, body, target_of, error, worth, b1=0.9) -> None:
+    gaussian = staticmethod(gaussian)
+
+    def __init__(
+        self, learner, body, target_of, error, worth, b1=0.9, policy_delay=1, target_every=1
+    ) -> None:
         self.body, self.target_of, self.error, self.worth = body, target_of, error, worth
+        self.policy_delay, self.target_every = policy_delay, target_every
         self.actor = plain(learner.actor.weights["params"])
         self.critic = plain(learner.critic.weights["params"])
         self.target = plain(learner.target["params"])
         self.log_ent_coef = float(learner.log_ent_coef.weights["params"])
         self.adam = Adam(KNOBS.learning_rate, b1)
-        self.keys = keys_of(learner)
+        self.keys, self.n, self.report = keys_of(learner), 0, {}
 
-    def values(self, critic: Weights, obs: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def values(self, critic: Weights, obs: np.ndarray, action: np.ndarray, key: Any) -> np.ndarray:
+        """:param key: of dropout masks, where there are some"""
         both = np.concatenate([obs, action], -1)
         each = [member(critic, i) for i in range(2)]
         return np.stack([dense(w["Dense_0"], self.body(w["body"], both)) for w in each])
 
     def acts(self, actor: Weights, obs: np.ndarray, noise: np.ndarray) -> Any:
-        return squashed(*gaussian(actor, self.body(actor["body"], obs)), noise)
+        return squashed(*self.gaussian(actor, self.body(actor["body"], obs)), noise)
 
     def update(self, batch: Batch) -> dict[str, float]:
-        next_key, key, extra_key = next(self.keys)
-        ent_coef, noise = np.exp(self.log_ent_coef), normal(key)
-        next_action, log_prob = self.acts(self.actor, batch.next_obs, normal(next_key))
-        chosen = self.target_of(self.values(self.target, batch.next_obs, next_action))
+        keys, self.n = next(self.keys), self.n + 1
+        ent_coef, noise = np.exp(self.log_ent_coef), normal(keys.action)
+        next_action, log_prob = self.acts(self.actor, batch.next_obs, normal(keys.next_action))
+        chosen = self.target_of(
+            self.values(self.target, batch.next_obs, next_action, keys.next_critic)
+        )
         alive = (batch.discount * (1.0 - batch.terminated))[:, None]
         y = batch.reward[:, None] + alive * (chosen - ent_coef * log_prob[:, None])
 
         def critic_loss(critic: Weights) -> float:
-            return sum(self.error(v, y) for v in self.values(critic, batch.obs, batch.action))
+            values = self.values(critic, batch.obs, batch.action, keys.critic)
+            return sum(self.error(v, y) for v in values)
 
         def actor_loss(actor: Weights) -> float:
             action, log_prob = self.acts(actor, batch.obs, noise)
-            worth = self.worth(self.values(self.critic, batch.obs, action))
+            worth = self.worth(self.values(self.critic, batch.obs, action, keys.critic_of_actor))
             return np.mean(ent_coef * log_prob - worth)
 
-        report = {"critic_loss": critic_loss(self.critic)}
+        self.report["critic_loss"] = critic_loss(self.critic)
         self.critic = descend(critic_loss, self.critic, KNOBS.qf_learning_rate)
-        follow = lambda old, new: (1.0 - KNOBS.tau) * old + KNOBS.tau * new  # noqa: E731
-        self.target = jax.tree.map(follow, self.target, self.critic)
-        report |= {"actor_loss": actor_loss(self.actor), "ent_coef": ent_coef}
+        if self.n % self.target_every == 0:
+            follow = lambda old, new: (1.0 - KNOBS.tau) * old + KNOBS.tau * new  # noqa: E731
+            self.target = jax.tree.map(follow, self.target, self.critic)
+        if self.n % self.policy_delay:
+            return self.report
+        self.report |= {"actor_loss": actor_loss(self.actor), "ent_coef": ent_coef}
         excess = -self.acts(self.actor, batch.obs, noise)[1].mean() - KNOBS.target_entropy
-        report["ent_coef_loss"] = self.log_ent_coef * excess
+        self.report["ent_coef_loss"] = self.log_ent_coef * excess
         self.actor = descend(actor_loss, self.actor, KNOBS.learning_rate)
         self.log_ent_coef = self.adam.step(self.log_ent_coef, excess)
-        self.explore(batch, extra_key)
-        return report
+        self.explore(batch, keys.extra)
+        return self.report
 
     def explore(self, batch: Batch, key: Any) -> None:
         """What follows the actor."""
 
 
-def check(recipe: Any, learner: Any, expected: Any, seen: Any = lambda obs: obs) -> Any:
+def check(
+    recipe: Any,
+    learner: Any,
+    expected: Any,
+    seen: Any = lambda obs: obs,
+    n: int = N_UPDATES,
+    seed: int = 0,
+) -> Any:
     """:return: the learner after as many updates as the reference makes, which agree with it"""
-    given = batches()
-    learner, report = update(recipe, learner, given, N_UPDATES, KNOBS)
-    for i in range(N_UPDATES):
+    given = batches(n, seed)
+    learner, report = update(recipe, learner, given, n, KNOBS)
+    for i in range(n):
         batch = jax.tree.map(lambda x, i=i: np.array(x[i]), given)
         said = expected.update(batch._replace(obs=seen(batch.obs), next_obs=seen(batch.next_obs)))
     assert_same(report._asdict(), said)
@@ -210,6 +247,71 @@ def test_droq_climbs_the_mean_and_regresses_on_the_least():
     check(recipe, learner, Soft(learner, mlp, least, half_square, mean_worth))
 
 
+@pytest.mark.parametrize(("policy_delay", "target_every"), [(2, 1), (1, 2)])
+def test_actors_and_target_networks_may_be_updated_less_often(policy_delay, target_every):
+    kwargs = {"dropout_rate": 0.0}
+    delays = {"policy_delay": policy_delay, "target_update_interval": target_every}
+    recipe, learner = begun("droq", kwargs, **delays)
+    delays = {"policy_delay": policy_delay, "target_every": target_every}
+
+    # The third update is the first after one that was due.
+    check(recipe, learner, Soft(learner, mlp, least, half_square, mean_worth, **delays), n=3)
+
+
+class Dropped(Soft):
+    """
+    Dropout before layer norm (Hiraoka et al. 2022, figure 1), in every pass of the critics.
+
+    :param masks: weights of a critic, observations, actions and a key to the entries that are kept
+    """
+
+    rate = 0.3
+
+    def __init__(self, learner, masks) -> None:
+        super().__init__(learner, mlp, least, half_square, mean_worth)
+        self.masks = masks
+
+    def values(self, critic: Weights, obs: np.ndarray, action: np.ndarray, key: Any) -> np.ndarray:
+        found, both = [], np.concatenate([obs, action], -1)
+        for i, keep in enumerate(self.masks(critic, obs, action, key)):
+            w = member(critic, i)
+            x = dense(w["body"]["Dense_0"], both) * keep / (1.0 - self.rate)
+            found.append(dense(w["Dense_0"], relu(layer_norm(w["body"]["LayerNorm_0"], x))))
+        return np.stack(found)
+
+
+def test_droq_drops_out_in_every_pass_of_its_critics_each_with_a_mask_of_its_own():
+    recipe, learner = begun("droq", {"dropout_rate": Dropped.rate}, policy_delay=1)
+    drawn = {}
+
+    def masks(critic: Weights, obs: np.ndarray, action: np.ndarray, key: Any) -> np.ndarray:
+        """What is not zero after dropout, seen once: it is the same for all weights."""
+        name = np.asarray(jax.random.key_data(key)).tobytes()
+        if name not in drawn:
+            seen = partial(_after_dropout, recipe.critic, obs, action)
+            drawn[name] = np.asarray(jax.vmap(seen)(critic, jax.random.split(key, 2))) != 0.0
+        return drawn[name]
+
+    check(recipe, learner, Dropped(learner, masks))
+
+    # Three passes of two critics in each update; masks of 24 entries agree by chance in none.
+    kept = [mask for both in drawn.values() for mask in both]
+    assert len(kept) == 6 * N_UPDATES
+    assert len({mask.tobytes() for mask in kept}) == len(kept)
+
+
+def _after_dropout(critic: Any, obs: Any, action: Any, w: Weights, key: Any) -> Any:
+    _, seen = critic.apply(
+        {"params": w},
+        obs,
+        action,
+        rngs={"dropout": key},
+        capture_intermediates=lambda module, _: isinstance(module, Dropout),
+        mutable=["intermediates"],
+    )
+    return seen["intermediates"]["body"]["Dropout_0"]["__call__"][0]
+
+
 def test_tqc_drops_the_largest_of_all_quantiles():
     recipe, learner = begun("tqc_jax", {"n_quantiles": 5}, top_quantiles_to_drop_per_net=2)
 
@@ -245,13 +347,22 @@ class Optimistic(Soft):
         target_of = lambda values: values.mean(0)  # noqa: E731
         super().__init__(learner, bro, target_of, quantile_huber, mean_worth, b1=0.5)
         self.shift = plain(learner.extra["actor"].weights["params"])
-        self.log_optimism, self.log_regularizer = np.log(1.0), np.log(0.25)
+        # As NormalTanhPolicy and Adjustment of the authors have them.
+        self.gaussian = partial(gaussian, log_std_of=partial(squashed_between, low=-10.0, high=2.0))
+        self.raw_optimism, self.raw_regularizer = (
+            np.arctanh((np.log(start) + 10.0) / 8.75 - 1.0) for start in (1.0, 0.25)
+        )
         self.adams = Adam(3e-5, 0.5), Adam(3e-5, 0.5)
+
+    @staticmethod
+    def multiplier(raw: Any) -> Any:
+        return np.exp(squashed_between(raw, -10.0, 7.5))
 
     def explore(self, batch: Batch, key: Any) -> None:
         noise = normal(jax.random.split(key)[0])
-        mean, std = gaussian(self.actor, self.body(self.actor["body"], batch.obs))
-        optimism, regularizer = np.exp(self.log_optimism), np.exp(self.log_regularizer)
+        mean, std = self.gaussian(self.actor, self.body(self.actor["body"], batch.obs))
+        optimism = self.multiplier(self.raw_optimism)
+        regularizer = self.multiplier(self.raw_regularizer)
 
         def moved(w: Weights) -> np.ndarray:
             inside = np.concatenate([batch.obs, mean], -1)
@@ -263,26 +374,44 @@ class Optimistic(Soft):
 
         def loss(w: Weights) -> float:
             action = np.tanh(mean + moved(w) + 0.75 * std * noise)
-            one, other = self.values(self.critic, batch.obs, action)
+            one, other = self.values(self.critic, batch.obs, action, None)
             upper = (one + other) / 2.0 + optimism * np.abs(one - other) / 2.0
             return regularizer * divergence(w) - upper.mean()
 
         excess = divergence(self.shift) / N_ACT - 0.05
         self.shift = descend(loss, self.shift, KNOBS.learning_rate)
         of_optimism, of_regularizer = self.adams
-        self.log_optimism = of_optimism.step(self.log_optimism, optimism * excess)
-        self.log_regularizer = of_regularizer.step(self.log_regularizer, -regularizer * excess)
+        rise = lambda raw: slope(self.multiplier, raw)  # noqa: E731
+        self.raw_optimism = of_optimism.step(self.raw_optimism, excess * rise(self.raw_optimism))
+        down = -excess * rise(self.raw_regularizer)
+        self.raw_regularizer = of_regularizer.step(self.raw_regularizer, down)
+
+
+def test_actions_of_bro_start_with_the_deviation_of_its_authors_code():
+    recipe, learner = begun("bro", {"n_quantiles": 5})
+    weights = jax.tree.map(jnp.zeros_like, learner.actor.weights)
+    obs = np.random.default_rng(0).normal(size=(5, N_OBS))
+
+    # Halfway between e^-10 and e^2, wherever the last layer is zero.
+    np.testing.assert_allclose(recipe.actor.apply(weights, obs).std, np.exp(-4.0), rtol=1e-6)
+    for sign, limit in ((-1.0, -10.0), (1.0, 2.0)):
+        weights["params"]["Dense_1"]["bias"] = jnp.full(N_ACT, sign * 20.0)
+        np.testing.assert_allclose(recipe.actor.apply(weights, obs).std, np.exp(limit), rtol=1e-6)
 
 
 def test_bro_regresses_and_climbs_means_and_explores_by_another_actor():
     recipe, learner = begun("bro", {"n_quantiles": 5})
+    # Deviations near e^-1: the divergence goes by their square, and this is plain gradient descent.
+    of_std = learner.actor.weights["params"]["Dense_1"]
+    of_std |= {"kernel": 0.1 * of_std["kernel"], "bias": of_std["bias"] + 0.6}
     expected = Optimistic(learner)
 
-    learner = check(recipe, learner, expected)
+    # With the batches of seed 0, a unit of a critic is so near its kink that differences cross it.
+    learner = check(recipe, learner, expected, seed=1)
 
     assert_same(learner.extra["actor"].weights["params"], expected.shift)
-    assert_same(learner.extra["optimism"].weights["params"], expected.log_optimism)
-    assert_same(learner.extra["regularizer"].weights["params"], expected.log_regularizer)
+    assert_same(learner.extra["optimism"].weights["params"], expected.raw_optimism)
+    assert_same(learner.extra["regularizer"].weights["params"], expected.raw_regularizer)
 
 
 class Renormed:
@@ -358,9 +487,10 @@ class Joint(Soft):
         return squashed(*gaussian(actor, getattr(self.of_actor, how)(actor["body"], obs)), noise)
 
     def update(self, batch: Batch) -> dict[str, float]:
-        next_key, key, _ = next(self.keys)
-        ent_coef, noise = np.exp(self.log_ent_coef), normal(key)
-        next_action, log_prob = self.acted(self.actor, batch.next_obs, normal(next_key), "running")
+        keys = next(self.keys)
+        ent_coef, noise = np.exp(self.log_ent_coef), normal(keys.action)
+        drawn = normal(keys.next_action)
+        next_action, log_prob = self.acted(self.actor, batch.next_obs, drawn, "running")
         obs = np.concatenate([batch.obs, batch.next_obs])
         action = np.concatenate([batch.action, next_action])
         both = self.judged(self.critic, obs, action, "training")

@@ -46,6 +46,14 @@ class Case(NamedTuple):
     in_yml: bool = True
 
 
+def standing_still() -> float:
+    return 0.0
+
+
+def no_waiting(seconds: float) -> None:
+    pass
+
+
 CASES = {
     "ActionDelay": Case(wrappers.ActionDelay, {"steps": 2}),
     "ActionRateLimit": Case(wrappers.ActionRateLimit, {"max_rate": 10.0}),
@@ -54,6 +62,15 @@ CASES = {
     "ActionShield": Case(wrappers.ActionShield, {"constraints": [[[1.0]], [1.5]]}),
     "CPGPrior": Case(wrappers.CPGPrior, {"omega_swing": 6.0}),
     "CPGPrior, own parameters": Case(wrappers.CPGPrior, {"mode": "parameters", "omega_swing": 6.0}),
+    "CPGPrior, joints of MuJoCo": Case(
+        wrappers.CPGPrior, {"omega_swing": 4.0, "phase": [0.0, 1.5]}, "Swimmer-v5", pickles=False
+    ),
+    "CPGPrior, joints observed": Case(
+        wrappers.CPGPrior,
+        {"omega_swing": 4.0, "mode": "residual", "position": [0], "velocity": [2]},
+        "InvertedPendulum-v5",
+        pickles=False,
+    ),
     "ContinuityCost": Case(wrappers.ContinuityCost, {"weight": 0.1}),
     "HistoryObservation": Case(wrappers.HistoryObservation, {"n_observations": 2}),
     "InfiniteHorizon": Case(wrappers.InfiniteHorizon, {"max_episode_steps": 20}),
@@ -63,11 +80,24 @@ CASES = {
         {"low": -2.0, "high": 2.0, "position": [[0, 1]], "on_breach": "ignore"},
     ),
     "LowPassAction": Case(wrappers.LowPassAction, {"cutoff": 4.0}),
-    # May hold a function, which no spec should carry to another process.
-    "ManualReset": Case(wrappers.ManualReset, remade=False),
+    "ManualReset": Case(wrappers.ManualReset),
+    "ManualReset, by name": Case(wrappers.ManualReset, {"wanted": "moving_joints.nobody"}),
     "Perturb": Case(wrappers.Perturb, {"noise": 0.1}),
-    # Without a watchdog, which would act where the machine is busy.
+    # Without a watchdog, which would act where the machine is busy; and with one, at a clock that
+    # stands still.
     "RealTime": Case(wrappers.RealTime, {"period": 1e-4}),
+    "RealTime, watchdog": Case(
+        wrappers.RealTime,
+        {
+            "period": 0.1,
+            "safe_action": [0.0],
+            "threaded": False,
+            "clock": standing_still,
+            "sleep": no_waiting,
+        },
+        remade=False,
+        in_yml=False,
+    ),
     # An open file, which is never overwritten.
     "Record": Case(
         wrappers.Record,

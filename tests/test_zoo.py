@@ -214,6 +214,23 @@ def test_the_training_curve_is_drawn_from_the_monitor_files(zoo, trained):
     assert "No data available" not in output
 
 
+@pytest.mark.expensive
+def test_a_gait_is_searched_and_replayed(zoo):
+    agent = ("--algo", "openloop", "--env", "Pendulum-v1", "-f", "gaits")
+    short = ("population_size:3", "n_resets:1", "horizon:20", "n_elites:2", "n_envs:2")
+
+    zoo.succeeds(
+        *CONSOLE,
+        *("train", *agent, "--seed", "0", "-n", "800", "--eval-freq", "400"),
+        *("--eval-episodes", "1", "-params", *short),
+    )
+    output = zoo.succeeds(*CONSOLE, "enjoy", *agent, "--no-render", "-n", "400")
+
+    run = zoo.folder / "gaits" / "openloop" / "Pendulum-v1_1"
+    assert {"Pendulum-v1.zip", "best_model.zip"} <= {path.name for path in run.iterdir()}
+    assert "2 Episodes" in output and "Mean reward" in output
+
+
 def test_an_unknown_key_in_a_yml_file_is_named_with_the_one_that_was_meant(zoo):
     entry = {"n_timesteps": 100, "policy": "MlpPolicy", "n_rolouts": 8}
     (zoo.folder / "typo.yml").write_text(yaml.dump({"Pendulum-v1": entry}))

@@ -14,6 +14,9 @@ import catalogue
 import import_picture
 import summaries
 
+# Between which planning in the data sheet's twin and in the true one lie, of the worn pendulum.
+WORN = ("hds_parts", "wrong twin", "ceiling")
+
 PARTS: dict[str, Callable[[], str]] = {
     "imports": import_picture.as_markdown,
     "twins": catalogue.twins_as_markdown,
@@ -24,6 +27,19 @@ PARTS: dict[str, Callable[[], str]] = {
     "sim_to_real_gap": summaries.whole("sim_to_real_gap"),
     "sim_to_real_median": summaries.whole("sim_to_real_median"),
     "payload_added": summaries.whole("payload_added_recovery"),
+    "ten_minutes": summaries.first_and_rest("ten_minutes", 3),
+    "hds_parts": summaries.over_seeds("hds_parts", "variant", "return", ends=WORN),
+    "open_loop": summaries.gaits,
+    "robustness_return": summaries.crossed(
+        "robustness", "perturbation", ("env", "policy"), "return"
+    ),
+    "robustness_share": summaries.crossed("robustness", "perturbation", ("env", "policy"), "share"),
+    "action_scale": summaries.crossed("action_scale", "scale", ("timestep",), "distance"),
+    "safe_swing_up": summaries.over_seeds(
+        "safe_swing_up", "without", "return", "violations", "continuity"
+    ),
+    "cpg_prior": summaries.crossed("cpg_prior", "prior", ("env", "learner"), "return"),
+    "elastic_quadruped": summaries.over_seeds("elastic_quadruped", "method", "return"),
     **{
         f"hidden_effects_{part}": summaries.whole(f"hidden_effects_{part}")
         for part in ("targets", "kinds", "difficulty", "causes", "systems", "outside", "rules")
@@ -36,7 +52,6 @@ PARTS: dict[str, Callable[[], str]] = {
     "diagnosis_cost_picture": summaries.picture(
         "diagnosis_cost", "seconds of a diagnosis against the number of recordings"
     ),
-    "hds_parts": summaries.over_seeds("hds_parts", "variant", "return"),
     "hds_weaknesses": summaries.over_seeds("hds_weaknesses", "variant", "return"),
     "hds_beta": summaries.over_seeds(
         "hds_beta",
@@ -46,6 +61,7 @@ PARTS: dict[str, Callable[[], str]] = {
         "gradient_norm",
         "derivative_median",
         "derivative_worst",
+        ends=WORN,
     ),
 }
 

@@ -1,8 +1,8 @@
-"""Tables and pictures of ``benchmarks/results``: as they are, or mean and range over seeds."""
+"""Tables and pictures of ``benchmarks/results``: as they are, or condensed."""
 
 from collections.abc import Callable
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, median
 
 from tables import read, rounded, table
 
@@ -11,22 +11,57 @@ RESULTS = Path(__file__).parent.parent.parent / "benchmarks" / "results"
 _NONE = "Not measured yet in this checkout.\n\n"
 
 
-def over_seeds(name: str, variant: str, *measured: str) -> Callable[[], str]:
+def over_seeds(
+    name: str, variant: str, *measured: str, ends: tuple[str, str, str] | None = None
+) -> Callable[[], str]:
     """
     :param name: of the table, without its ending
     :param variant: column that tells variants apart
     :param measured: columns that are shown
+    :param ends: name of a table, and the variants in it between which there is a gap: the share of
+        it that each variant's return closes is shown too, once they have been measured
     :return: what makes the Markdown
     """
 
     def condensed(columns: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
         place, shown = columns.index(variant), [columns.index(column) for column in measured]
+        gap = _gap(*ends, variant) if ends else {}
         lines = []
         for one in dict.fromkeys(row[place] for row in rows):
             own = [row for row in rows if row[place] == one]
             values = [_spread([float(row[i]) for row in own]) for i in shown]
-            lines.append([one, *values, str(len(own))])
-        return [variant, *measured, "seeds"], lines
+            closed = [_closed(_by_seed(columns, own), gap)] if gap else []
+            lines.append([one, *values, *closed, str(len(own))])
+        return [variant, *measured, *(["closed"] if gap else []), "seeds"], lines
+
+    return lambda: _shown(name, condensed)
+
+
+def first_and_rest(name: str, n_first: int) -> Callable[[], str]:
+    """
+    :param name: of a table with a row for each episode: minutes, steps, return, and steps that had
+        come late by then
+    :param n_first: episodes that are shown by themselves
+    :return: what makes the Markdown
+    """
+
+    def condensed(columns: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
+        at = {column: i for i, column in enumerate(columns)}
+        late = [0.0, *(float(row[at["late"]]) for row in rows)]
+        groups = [(i, i + 1) for i in range(min(n_first, len(rows)))]
+        groups += [(n_first, len(rows))] if len(rows) > n_first else []
+        lines = []
+        for begin, end in groups:
+            own = rows[begin:end]
+            lines.append(
+                [
+                    f"{begin + 1}" if end == begin + 1 else f"{begin + 1} to {end}",
+                    rounded(own[-1][at["minutes"]]),
+                    _spread([float(row[at["return"]]) for row in own]),
+                    rounded(late[end] - late[begin]),
+                ]
+            )
+        return ["episodes", "minutes at their end", "return", "late steps"], lines
 
     return lambda: _shown(name, condensed)
 
@@ -34,6 +69,61 @@ def over_seeds(name: str, variant: str, *measured: str) -> Callable[[], str]:
 def whole(name: str) -> Callable[[], str]:
     """:return: what makes the Markdown of a table that is shown as it is, numbers rounded"""
     return lambda: _shown(name, lambda columns, rows: (columns, [[*map(rounded, r)] for r in rows]))
+
+
+def crossed(name: str, row: str, columns: tuple[str, ...], value: str) -> Callable[[], str]:
+    """
+    :param name: of the table, without its ending
+    :param row: column whose entries are the rows
+    :param columns: columns whose entries together are the columns
+    :param value: column that is shown, the mean over whatever else there is
+    :return: what makes the Markdown
+    """
+
+    def turned(titles: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
+        place, shown = titles.index(row), titles.index(value)
+        across = [titles.index(column) for column in columns]
+        cells: dict[tuple[str, str], list[float]] = {}
+        for one in rows:
+            at = one[place], ", ".join(one[i] for i in across)
+            cells.setdefault(at, []).append(float(one[shown]))
+        left, top = (dict.fromkeys(at[i] for at in cells) for i in (0, 1))
+        lines = [[one, *(_mean(cells.get((one, other), [])) for other in top)] for one in left]
+        return [row, *top], lines
+
+    return lambda: _shown(name, turned)
+
+
+def gaits() -> str:
+    """:return: Markdown of what open-loop searches found, by environment and budget"""
+
+    def condensed(titles: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
+        runs = [dict(zip(titles, row, strict=True)) for row in rows]
+        lines = []
+        for key in sorted({(int(run["steps"]), run["env"]) for run in runs}):
+            own = [run for run in runs if (int(run["steps"]), run["env"]) == key]
+            returns = [float(run["return"]) for run in own]
+            low, middle, high = map(rounded, (min(returns), median(returns), max(returns)))
+            minutes = median(float(run["seconds"]) for run in own) / 60.0
+            lines.append(
+                [
+                    key[1],
+                    f"{key[0]:,}",
+                    own[0]["searched"],
+                    f"{middle} ({low} to {high})",
+                    rounded(own[0]["target"]) if own[0]["target"] else "",
+                    str(len(own)),
+                    rounded(minutes),
+                ]
+            )
+        numbers = ["numbers searched", "median return", "target", "seeds", "minutes"]
+        return ["environment", "steps", *numbers], lines
+
+    return _shown("open_loop", condensed)
+
+
+def _mean(values: list[float]) -> str:
+    return rounded(fmean(values)) if values else ""
 
 
 def picture(name: str, shows: str) -> Callable[[], str]:
@@ -52,9 +142,38 @@ def _shown(name: str, change: Callable) -> str:
         return _NONE
     columns, rows = change(*read(path))
     titles = [column.replace("_", " ") for column in columns]
-    return table(titles, rows) + f"From `benchmarks/results/{name}.csv`."
+    shown = table(titles, rows)
+    if path.with_suffix(".png").exists():
+        shown += f"![{name.replace('_', ' ')}](../../benchmarks/results/{name}.png)\n\n"
+    return shown + f"From `benchmarks/results/{name}.csv`."
 
 
 def _spread(values: list[float]) -> str:
     mean, low, high = (rounded(x) for x in (fmean(values), min(values), max(values)))
     return mean if low == high else f"{mean} ({low} to {high})"
+
+
+def _by_seed(columns: list[str], rows: list[list[str]]) -> dict[str, float]:
+    return {row[columns.index("seed")]: float(row[columns.index("return")]) for row in rows}
+
+
+def _gap(name: str, worst: str, best: str, variant: str) -> dict[str, tuple[float, float]]:
+    """:return: both ends of the gap, for the seeds that have been run with both"""
+    path = RESULTS / f"{name}.csv"
+    if not path.exists():
+        return {}
+    columns, rows = read(path)
+    low, high = (
+        _by_seed(columns, [row for row in rows if row[columns.index(variant)] == end])
+        for end in (worst, best)
+    )
+    return {seed: (low[seed], high[seed]) for seed in low if seed in high}
+
+
+def _closed(returns: dict[str, float], gap: dict[str, tuple[float, float]]) -> str:
+    """The share over the seeds that both have, as `benchmarks/sim_to_real.py` has it."""
+    seeds = [seed for seed in returns if seed in gap]
+    if not seeds:
+        return ""
+    gained = fmean(returns[seed] - gap[seed][0] for seed in seeds)
+    return rounded(gained / fmean(gap[seed][1] - gap[seed][0] for seed in seeds))

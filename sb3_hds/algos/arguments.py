@@ -42,6 +42,7 @@ def settings_of(model: "TwinAlgorithm", twin: Twin) -> Settings:
         random_share=model.random_share,
         discount=model.gamma,
         terminal_value=model.terminal_value,
+        shift_ends=model.shift_ends,
         plan_memory=model.plan_memory,
         n_learned=max(1, round(model.learned_share * horizon)),
         batch_size=model.batch_size,

@@ -1,6 +1,7 @@
 """BRO: large regularised critics, and an optimistic actor that explores."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, cast
 
@@ -37,7 +38,8 @@ _RESETS = (15_000, 50_000, 250_000, 500_000, 750_000, 1_000_000, 1_500_000, 2_00
 _FAST, _FAST_RESETS = 2, _RESETS[:1]
 _INITIAL_OPTIMISM, _INITIAL_REGULARIZER = 1.0, 0.25
 _MULTIPLIER_RATE = 3e-5
-_LOG_LIMITS = (-10.0, 7.5)
+# Of the logarithms of the multipliers and of the deviation of actions.
+_MULTIPLIER_LIMITS, _STD_LIMITS = (-10.0, 7.5), (-10.0, 2.0)
 
 
 class BroPolicy(GaussianPolicy):
@@ -59,9 +61,12 @@ class BroPolicy(GaussianPolicy):
     def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
         return BroBody(net_arch, self.activation_fn)
 
+    def gaussian_actor(self, body: nn.Module, n_act: int) -> nn.Module:
+        return BroActor(body, n_act)
+
 
 class BRO(SoftActorCritic):
-    """
+    r"""
     Bigger, regularised, optimistic: BroNet critics with 100 quantiles, whose **mean** is what both
     targets and actor go by, a second actor that explores where the critics disagree, and networks
     that start afresh.
@@ -69,10 +74,12 @@ class BRO(SoftActorCritic):
     Source: Nauman et al., *Bigger, Regularized, Optimistic: scaling for compute and
     sample-efficient continuous control*, NeurIPS 2024: replay ratio 10 (``gradient_steps=2`` is
     their fast variant), batches of 128, AdamW with 3e-4, target entropy of minus half the number of
-    controls, Adam with b1 = 0.5 for the temperature and the multipliers. Fresh starts include the
-    temperature, the multipliers and all optimisers, as in the authors' code. Where that squashes
-    the spread of actions and the multipliers, here they are clipped; its quantile loss is a sum
-    over quantiles where this is their mean, a factor that Adam takes out again.
+    controls, Adam with b1 = 0.5 for the temperature and the multipliers. As in the authors' code
+    (MIT licence), fresh starts include the temperature, the multipliers and all optimisers, and the
+    logarithms of multipliers and of the deviation of actions are squashed into their limits by
+    :math:`\tanh`: actions start with a deviation near :math:`e^{-4}`, not near 1 as with SAC. Its
+    quantile loss is a sum over quantiles where this is their mean, a factor that Adam takes out
+    again. SBX has no BRO.
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
@@ -139,6 +146,28 @@ class BRO(SoftActorCritic):
         )
 
 
+class BroActor(nn.Module):
+    r"""
+    Observation to a Gaussian, the logarithm of whose deviation is squashed into [-10, 2].
+
+    Source: ``NormalTanhPolicy`` of the authors' code.
+
+    :param body: see ``bodies.py``
+    :param n_act: number of controls
+    """
+
+    body: nn.Module
+    n_act: int
+
+    @nn.compact
+    def __call__(self, obs: Float[Array, "*batch obs"], train: bool = False) -> Gaussian:
+        latent = self.body(obs, train)
+        of_mean, of_std = (nn.initializers.orthogonal(scale) for scale in (math.sqrt(2), 1.0))
+        mean = nn.Dense(self.n_act, kernel_init=of_mean)(latent)
+        log_std = _squashed(nn.Dense(self.n_act, kernel_init=of_std)(latent), _STD_LIMITS)
+        return Gaussian(mean, jnp.exp(log_std), latent)
+
+
 class Shift(nn.Module):
     """
     How far the optimistic actor's mean is from the other one's.
@@ -181,9 +210,9 @@ class Optimist:
         n_act = cast(Any, self.network).n_act
         weights = self.network.init(key, obs, jnp.zeros((1, n_act)))
         multipliers = {"optimism": _INITIAL_OPTIMISM, "regularizer": _INITIAL_REGULARIZER}
-        fresh = {name: {"params": jnp.log(start)} for name, start in multipliers.items()}
+        fresh = {name: {"params": _before(math.log(start))} for name, start in multipliers.items()}
         return {"actor": Trained(weights, self.optimizer.init(weights["params"]))} | {
-            name: Trained(log, _MULTIPLIER.init(log["params"])) for name, log in fresh.items()
+            name: Trained(raw, _MULTIPLIER.init(raw["params"])) for name, raw in fresh.items()
         }
 
     def update(
@@ -192,7 +221,7 @@ class Optimist:
         act_key, judge_key = jax.random.split(key)
         state = learner.extra
         gaussian, _ = act(recipe.actor, learner.actor.weights, batch.obs)
-        values = {n: jnp.exp(state[n].weights["params"]) for n in ("optimism", "regularizer")}
+        values = {n: _value(state[n].weights["params"]) for n in ("optimism", "regularizer")}
         noise = jax.random.normal(act_key, gaussian.mean.shape)
 
         def loss(params: Any) -> tuple[Array, Array]:
@@ -210,8 +239,8 @@ class Optimist:
         excess = divergence / gaussian.mean.shape[-1] - self.kl_target
         return {
             "actor": self.optimizer.apply(slope, state["actor"], knobs.learning_rate),
-            "optimism": _limited(state["optimism"], values["optimism"] * excess),
-            "regularizer": _limited(state["regularizer"], -values["regularizer"] * excess),
+            "optimism": _following(state["optimism"], excess),
+            "regularizer": _following(state["regularizer"], -excess),
         }
 
     def explore(self, state: Any, obs: Array, gaussian: Gaussian, noise: Array) -> Array:
@@ -219,9 +248,25 @@ class Optimist:
         return jnp.tanh(gaussian.mean + shift + self.std_multiplier * gaussian.std * noise)
 
 
-def _limited(multiplier: Trained, slope: Array) -> Trained:
-    moved = _MULTIPLIER.apply(slope, multiplier, _MULTIPLIER_RATE)
-    return moved._replace(weights={"params": jnp.clip(moved.weights["params"], *_LOG_LIMITS)})
+def _squashed(raw: Array, limits: tuple[float, float]) -> Array:
+    low, high = limits
+    return low + 0.5 * (high - low) * (1.0 + jnp.tanh(raw))
+
+
+def _value(raw: Array) -> Array:
+    """Of a multiplier."""
+    return jnp.exp(_squashed(raw, _MULTIPLIER_LIMITS))
+
+
+def _before(log: float) -> Array:
+    """:return: what is squashed into that logarithm of a multiplier"""
+    low, high = _MULTIPLIER_LIMITS
+    return jnp.asarray(math.atanh(2.0 * (log - low) / (high - low) - 1.0), jnp.float32)
+
+
+def _following(multiplier: Trained, excess: Array) -> Trained:
+    slope = jax.grad(lambda raw: excess * _value(raw))(multiplier.weights["params"])
+    return _MULTIPLIER.apply(slope, multiplier, _MULTIPLIER_RATE)
 
 
 _MULTIPLIER = Optimizer(optax.adam, (("b1", 0.5),))

@@ -1,4 +1,4 @@
-"""Correct the twin by what was measured: parameters, then effects, then a learned force."""
+"""Correct the twin by what was measured: its parameters with those of effects, then a force."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from sb3_hds.algos.measured import latest_steps
 from sb3_hds.algos.model import missing_effects, nulls_of
 from sb3_hds.core import Params, Trajectories, Twin
 from sb3_hds.effects import force_of
@@ -24,14 +25,13 @@ from sb3_hds.sysid.prediction import (
     gain,
     has_grown,
     hold_out,
-    holds_out_recordings,
     is_better,
     probability_before,
     single_step_errors,
     window_errors,
 )
 from sb3_hds.sysid.residual import Residual, fit_force
-from sb3_hds.sysid.shooting import Shots, shots_of
+from sb3_hds.sysid.shooting import Shots, places_of, shots_of
 
 # Rows of the compiled programs: the latest windows are used.
 _N_WINDOWS = 128
@@ -83,6 +83,18 @@ class Wishes:
     suspected: tuple[str, ...] = ()
 
 
+class Since(NamedTuple):
+    """
+    What counts of the data, after the system has become another one.
+
+    :param n_steps: the latest of them
+    :param recording: number of the recording in which they begin
+    """
+
+    n_steps: int
+    recording: int
+
+
 @dataclasses.dataclass(frozen=True)
 class Correction:
     """
@@ -92,7 +104,7 @@ class Correction:
     :param twin: to plan in from now on
     :param beta: share of rollouts in the learned model
     :param changed: whether the model is so different that plans should be made anew
-    :param forgotten: whether data from before a change of the system were left out
+    :param since: what counts from now on, if data from before a change of the system were left out
     :param attached: what was believed of the parameters of effects that the twin has now and had
         not before
     :param fit: of the parameters, if they were estimated
@@ -105,13 +117,18 @@ class Correction:
     twin: Twin
     beta: float
     changed: bool
-    forgotten: bool = False
+    since: Since | None = None
     attached: Mapping[str, float] = dataclasses.field(default_factory=dict)
     fit: Fit | None = None
     residual: Residual | None = None
     error_twin: float = np.nan
     error_calibrated: float = np.nan
     error_hybrid: float = np.nan
+
+    @property
+    def forgotten(self) -> bool:
+        """Whether data from before a change of the system were left out."""
+        return self.since is not None
 
 
 class _Windows(NamedTuple):
@@ -120,14 +137,29 @@ class _Windows(NamedTuple):
 
     :param shots: windows of the data
     :param origin: of each window, the recording it is from; negative where it does not count
+    :param place: of each window in its recording
+    :param age: of each window, steps from its beginning to the end of the data
     :param spread: of the channels
     :param held: whether each window is held out of what is learned from
     """
 
     shots: Shots
     origin: np.ndarray
+    place: np.ndarray
+    age: np.ndarray
     spread: Float[np.ndarray, " obs"]
     held: np.ndarray
+
+    @property
+    def counted(self) -> np.ndarray:
+        """Indices of those that count, oldest first."""
+        return np.flatnonzero(self.origin >= 0)
+
+    @property
+    def of_other_recordings(self) -> bool:
+        """Whether nothing is learned from the recordings that windows are held out of."""
+        learned = self.origin[~self.held & (self.origin >= 0)]
+        return not np.isin(self.origin[self.held], learned).any()
 
     @property
     def learned(self) -> Shots:
@@ -147,42 +179,47 @@ def correct(
     beta: float,
     learn_force: bool,
     n_new: int,
+    since: Since | None = None,
 ) -> Correction:
     """
     Estimate parameters, then learn what remains; keep each only if held-out windows say so.
 
     :param twin: as it is now
-    :param data: everything measured, oldest first
+    :param data: everything measured, oldest first; ``origin`` numbers the recordings
     :param wishes: what is to be corrected
     :param beta: as it is now
     :param learn_force: whether it is time to learn the force again
     :param n_new: steps that came since the last correction
+    :param since: what counts of the data; None: everything
     :raises CalibrationError: for data that cannot have been measured on what the twin simulates
     """
     check_fits(twin, data)
+    recent = data if since is None else latest_steps(data, since.n_steps)
+    spread = spread_of(recent)
     if twin.values == wishes.nominal:
-        single = single_step_errors(twin, data, spread_of(data), _N_SINGLE)
+        single = single_step_errors(twin, recent, spread, _N_SINGLE)
         typical = float(np.quantile(single, _MOST_STEPS))
         if typical < _EXACT_STEP:
             return Correction(twin, beta, changed=False, error_twin=typical)
     try:
-        shots, origin = shots_of(data, default_window(data), twin, _N_WINDOWS, seed=None)
+        windows = _windows_of(data, twin, spread, since)
     except TrajectoryError:
         return Correction(twin, beta, changed=False)
-    spread = spread_of(data)
     nominal = twin.with_parameters(**wishes.nominal)
-    bare, now = (window_errors(t, _without_force(t), shots, spread) for t in (nominal, twin))
-    real = origin >= 0
-    if real.sum() < _FEWEST:
+    bare, now = (windows.errors(t) for t in (nominal, twin))
+    real = windows.counted
+    if len(real) < _FEWEST:
         return Correction(twin, beta, changed=False, error_twin=_mean(bare[real]))
-    latest = _latest(shots, origin, n_new)
+    latest = _latest(windows, n_new)
     if max(_mean(bare[real]), _mean(bare[latest])) < _EXACT:
         changed = gain(bare[real], now[real]) > _NOTICEABLE
         return Correction(nominal, 0.0, changed=changed, error_twin=_mean(bare[real]))
+    windows, forgotten = _since_change(windows, now, latest, n_new)
+    windows = _divided(windows, forgotten or since)
+    held, real = windows.held, windows.counted
+    if len(real) < _FEWEST or not held.any():
+        return Correction(twin, beta, changed=False, since=forgotten, error_twin=_mean(bare[real]))
     nominal, twin, wishes, added = _with_suspects(nominal, twin, wishes)
-    shots, origin, forgotten = _since_change(shots, origin, now, latest)
-    held = hold_out(origin, _HELD if real.sum() >= _MANY else _HELD_OF_FEW)
-    windows = _Windows(shots, origin, spread, held)
 
     fit = _calibrated(nominal, twin, windows, wishes)
     calibrated, errors = _best(nominal, twin, fit, bare, now, windows)
@@ -191,7 +228,7 @@ def correct(
         calibrated,
         0.0,
         changed=False,
-        forgotten=forgotten,
+        since=forgotten,
         attached=added,
         fit=fit,
         error_twin=_mean(bare[held]),
@@ -285,7 +322,7 @@ def _best(
     current = (twin, now) if now[held].mean() < bare[held].mean() else (nominal, bare)
     if fit is None or not all(np.isfinite(e.estimate) for e in fit.estimates):
         return current
-    if not holds_out_recordings(windows.origin) and probability_before(fit, nominal) < _IMPROBABLE:
+    if not windows.of_other_recordings and probability_before(fit, nominal) < _IMPROBABLE:
         return current
     new = twin.with_parameters(**{e.name: e.estimate for e in fit.estimates})
     errors = windows.errors(new)
@@ -316,48 +353,73 @@ def _with_residual(
             )
         except CalibrationError:
             residual = None
-    # Simulating a force that does not help costs time.
-    if residual is not None and (residual.accepted or _shares(twin)):
-        twin = residual.twin
-    key = next(iter(_shares(twin)), None)
+    hybrid = twin if residual is None else residual.twin
+    key = next(iter(_shares(hybrid)), None)
     if key is None:
-        hybrid = np.nan if residual is None else _mean(residual.error_after)
-        return dataclasses.replace(found, residual=residual, error_hybrid=hybrid), errors
-    whole = windows.errors(twin, {**twin.params, key: 1.0})
+        return found, errors
+    whole = windows.errors(hybrid, {**hybrid.params, key: 1.0})
+    found = dataclasses.replace(found, residual=residual, error_hybrid=_mean(whole[held]))
+    # Simulating a force that does not help costs time.
+    if residual is not None and not (residual.accepted or _shares(twin)):
+        return found, errors
     helps = is_better(whole[held], errors[held])
     share = 0.0
     if helps:
         trust = min(1.0, gain(whole[held], errors[held]) / _TRUSTED)
         share = trust if wishes.beta == "auto" else float(wishes.beta)
-    twin = twin.with_parameters(**{key: 1.0 if helps else 0.0})
-    found = dataclasses.replace(
-        found,
-        twin=twin,
-        beta=share,
-        residual=residual,
-        error_hybrid=_mean(whole[held]),
-    )
+    twin = hybrid.with_parameters(**{key: 1.0 if helps else 0.0})
+    found = dataclasses.replace(found, twin=twin, beta=share)
     return found, whole if share > 0.0 else errors
 
 
-def _latest(shots: Shots, origin: np.ndarray, n_new: int) -> np.ndarray:
+def _windows_of(
+    data: Trajectories, twin: Twin, spread: Float[np.ndarray, " obs"], since: Since | None
+) -> _Windows:
+    """The latest windows, not yet divided into those to learn from and those to check on."""
+    length = default_window(data)
+    shots, origin = shots_of(data, length, twin, _N_WINDOWS, seed=None)
+    place, age = places_of(data, length, _N_WINDOWS, seed=None)
+    windows = _Windows(shots, origin, place, age, spread, np.zeros(len(origin), bool))
+    return windows if since is None else _without(windows, np.flatnonzero(age > since.n_steps))
+
+
+def _without(windows: _Windows, left_out: np.ndarray) -> _Windows:
+    weight, origin = windows.shots.weight.copy(), windows.origin.copy()
+    weight[left_out], origin[left_out] = 0.0, -1
+    return windows._replace(shots=windows.shots._replace(weight=weight), origin=origin)
+
+
+def _latest(windows: _Windows, n_new: int) -> np.ndarray:
     """:return: indices of the windows that came since the last correction"""
-    n_latest = max(_FEWEST, n_new // (shots.actions.shape[1] + 1))
-    return np.flatnonzero(origin >= 0)[-n_latest:]
+    counted = windows.counted
+    n_latest = int(np.sum(windows.age[counted] <= n_new))
+    return counted[-max(_FEWEST, n_latest) :]
 
 
 def _since_change(
-    shots: Shots, origin: np.ndarray, errors: np.ndarray, latest: np.ndarray
-) -> tuple[Shots, np.ndarray, bool]:
-    """Leave out what was measured before the system became another one, if it did."""
-    older = np.setdiff1d(np.flatnonzero(origin >= 0), latest)
+    windows: _Windows, errors: np.ndarray, latest: np.ndarray, n_new: int
+) -> tuple[_Windows, Since | None]:
+    """
+    Leave out what was measured before the last correction, if the system has become another one.
+    """
+    older = np.setdiff1d(windows.counted, latest)
     if len(older) < _FEWEST or _mean(errors[latest]) < _EXACT:
-        return shots, origin, False
+        return windows, None
     if not has_grown(errors[latest], errors[older]):
-        return shots, origin, False
-    weight = shots.weight.copy()
-    weight[older] = 0.0
-    return shots._replace(weight=weight), np.where(weight > 0.0, origin, -1), True
+        return windows, None
+    # The latest may be more than came since then.
+    counted = windows.counted
+    newest = counted[windows.age[counted] <= n_new]
+    recording = windows.origin[newest[0] if len(newest) else counted[-1]]
+    return _without(windows, np.setdiff1d(counted, newest)), Since(n_new, int(recording))
+
+
+def _divided(windows: _Windows, since: Since | None) -> _Windows:
+    """Which windows are held out depends on nothing that moves on with the data."""
+    first = 0 if since is None else since.recording
+    number = np.where(windows.origin >= 0, windows.origin - first, -1)
+    share = _HELD if len(windows.counted) >= _MANY else _HELD_OF_FEW
+    return windows._replace(held=hold_out(number, windows.place, share))
 
 
 def _shares(twin: Twin) -> tuple[str, ...]:

@@ -25,7 +25,8 @@ class CrossQ(SoftActorCritic):
     :param env: likewise
     :param learning_rate: of actor, entropy coefficient and critics
     :param policy_delay: updates of the critics for each of the actor
-    :param arguments: those of ``SoftActorCritic``; ``tau`` has no meaning here
+    :param arguments: those of ``SoftActorCritic``; ``tau`` and ``target_update_interval`` have
+        no meaning here
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {

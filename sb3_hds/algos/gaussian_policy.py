@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
@@ -42,6 +43,15 @@ _OPTIMIZERS = {
     "adabelief": optax.adabelief,
     "lion": optax.lion,
 }
+# Of torch's classes: where their defaults are not those of optax. NAdam's momentum has a schedule
+# that optax does not have.
+_TORCH: dict[str, dict[str, Any]] = {
+    "adam": {},
+    "adamw": {"weight_decay": 1e-2},
+    "sgd": {},
+    "rmsprop": {"decay": 0.99, "eps_in_sqrt": False},
+    "radam": {},
+}
 
 
 class GaussianPolicy(LearningPolicy):
@@ -68,8 +78,10 @@ class GaussianPolicy(LearningPolicy):
     :param use_expln: gSDE: slower growth than the exponential above 0
     :param clip_mean: gSDE: the mean is clipped to this before tanh; 0: not
     :param normalize_observations: by running mean and variance, inside the policy
-    :param optimizer_class: name, optax function or torch class
-    :param optimizer_kwargs: besides the learning rate; torch's ``betas`` are understood
+    :param optimizer_class: name or function of optax, with its defaults, or torch class, with those
+        of torch
+    :param optimizer_kwargs: besides the learning rate; torch's ``betas`` and ``alpha`` are
+        understood
     :param qf_optimizer_kwargs: of the critics, where they differ
     """
 
@@ -128,7 +140,7 @@ class GaussianPolicy(LearningPolicy):
         n_act = int(np.prod(action_space.shape))
         pi, qf = self.widths
         body = self.actor_body(pi)
-        self.actor_network: nn.Module = GaussianActor(body, n_act)
+        self.actor_network = self.gaussian_actor(body, n_act)
         if use_sde:
             gsde = (log_std_init, full_std, use_expln, clip_mean)
             self.actor_network = ExploringActor(body, n_act, *gsde)
@@ -162,6 +174,10 @@ class GaussianPolicy(LearningPolicy):
             self.renorm_warmup_steps,
             self.batch_norm_momentum,
         )
+
+    def gaussian_actor(self, body: nn.Module, n_act: int) -> nn.Module:
+        """:return: the actor without gSDE"""
+        return GaussianActor(body, n_act)
 
     def build_plain(self) -> None:
         """That of SAC; with batch normalisation, that of CrossQ."""
@@ -295,15 +311,25 @@ def widths(
 
 def optimizer_of(make: str | Callable[..., Any], arguments: Mapping[str, Any]) -> Optimizer:
     """
-    :param make: name, optax function, or torch class of the same name
-    :param arguments: of optax's function, or torch's ``betas``
+    :param make: name or function of optax, with its defaults, or torch class, with those of torch
+    :param arguments: of optax's function, or torch's ``betas`` and ``alpha``
     :raises ValueError: for one that is not known here
     """
     arguments = dict(arguments)
     if "betas" in arguments:
         arguments["b1"], arguments["b2"] = arguments.pop("betas")
+    if "alpha" in arguments:
+        arguments["decay"] = arguments.pop("alpha")
     name = make if isinstance(make, str) else getattr(make, "__name__", "")
     found = _OPTIMIZERS.get(name.lower())
+    if isinstance(make, type) and issubclass(make, th.optim.Optimizer):
+        if name.lower() not in _TORCH:
+            other = f"optimizer_class='{name.lower()}'" if found else "one of these names"
+            raise ValueError(
+                f"optimizer_class={name} of torch has no equal in optax, as "
+                f"{', '.join(_TORCH)} have: use {other}."
+            )
+        arguments = _TORCH[name.lower()] | arguments
     if found is None and (isinstance(make, str | type) or not callable(make)):
         raise ValueError(
             f"optimizer_class must be one of {', '.join(_OPTIMIZERS)}, an optax function or a "

@@ -11,7 +11,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_hds.algos.correction import Correction, Wishes, correct, names_to_estimate
+from sb3_hds.algos.correction import Correction, Since, Wishes, correct, names_to_estimate
 from sb3_hds.algos.log import record_correction
 from sb3_hds.algos.measured import Measured, data_from
 from sb3_hds.algos.model import check_known, missing_effects, nulls_of, required
@@ -35,8 +35,9 @@ class HDS(TwinAlgorithm):
 
     What it adds to PODS: exploration noise that decays, annealed acceptance of step sizes, plans
     that start where the real environment was seen; and after each block of real steps, the model is
-    corrected by what the environment answered: parameters and attached effects are estimated, then
-    a force is learned for what remains, and a share ``beta`` of the plans is made in that hybrid.
+    corrected by what the environment answered: parameters of the twin and of effects are estimated
+    together, since one can stand for another; then a force is learned for what remains, again
+    whenever the data have doubled, and a share ``beta`` of the plans is made in that hybrid.
     Nothing is kept that does not predict held-out windows of the data better; a twin that is exact
     is left alone.
 
@@ -78,6 +79,9 @@ class HDS(TwinAlgorithm):
     :param lookahead: steps for which the policy is followed beyond the end of a plan when plans are
         compared; None: five horizons; 0 switches it off (the paper)
     :param terminal_value: whether a value network judges the end of a plan (the paper: no)
+    :param shift_ends: whether an episode that has terminated counts as one that earns the reward
+        zero for ever. Rewards are counted from the best one that was seen; without it, an end is
+        worth zero on that scale, and dying pays.
     :param reset_share: share of start states drawn from the reset distribution in each epoch, the
         others go on from where the policy went; 1 is the paper's choice
     :param exploration_noise: standard deviation of a constant offset of the controls while start
@@ -128,7 +132,8 @@ class HDS(TwinAlgorithm):
     :param pretrain_data: ``Trajectories``, or a file of them, from which the model is corrected
         before the first plan. The HDS project: random motion.
     :param save_data: whether the measured steps are saved with the model
-    :param max_saved_steps: how many of them, the latest
+    :param max_saved_steps: how many of them, the latest; those of ``pretrain_data`` where there is
+        room left
     :param policy_kwargs: ``net_arch``, ``activation_fn``, ``linear_path``, ``max_grad_norm``
     :param stats_window_size: episodes in the averages that are logged
     :param tensorboard_log: folder for TensorBoard
@@ -168,6 +173,7 @@ class HDS(TwinAlgorithm):
         random_share: float = 0.5,
         lookahead: int | None = None,
         terminal_value: bool = True,
+        shift_ends: bool = True,
         reset_share: float = 0.5,
         exploration_noise: float = 0.25,
         exploration_decay: float = 0.997,
@@ -221,6 +227,7 @@ class HDS(TwinAlgorithm):
         self.measured = Measured(self, data_from(pretrain_data))
         self._n_blocks, self._refitted_at, self._steps_at_force = 0, 0, 0
         self._changed_at: int | None = None
+        self._changed_in = 0
         self._saw_earlier = False
         self._replanning = 0
         super().__init__(
@@ -250,6 +257,7 @@ class HDS(TwinAlgorithm):
             random_share=random_share,
             lookahead=lookahead,
             terminal_value=terminal_value,
+            shift_ends=shift_ends,
             reset_share=reset_share,
             exploration_noise=exploration_noise,
             exploration_decay=exploration_decay,
@@ -299,10 +307,10 @@ class HDS(TwinAlgorithm):
         :return: what the data say; None before anything was measured
         :raises NoTwinError: if the model was loaded without environment and without twin
         """
-        data = self.measured.trajectories(self._since_change())
+        data, n_counted = self.measured.recordings(), self._since_change()
         if data is None or self.twin is None:
             return None
-        n_steps = data.n_steps
+        n_steps = data.n_steps if n_counted is None else min(data.n_steps, n_counted)
         found = correct(
             self.twin,
             data,
@@ -310,9 +318,11 @@ class HDS(TwinAlgorithm):
             self.model_beta,
             learn_force=n_steps >= _GROWTH * self._steps_at_force,
             n_new=self.real_timesteps - self._refitted_at,
+            since=None if n_counted is None else Since(n_counted, self._changed_in),
         )
-        if found.forgotten:
-            self._changed_at, self._steps_at_force = self._refitted_at, 0
+        if found.since is not None:
+            self._changed_at = self.real_timesteps - found.since.n_steps
+            self._changed_in, self._steps_at_force = found.since.recording, 0
         self._refitted_at = self.real_timesteps
         if found.residual is not None:
             self._steps_at_force = n_steps

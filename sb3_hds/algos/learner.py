@@ -49,6 +49,7 @@ class Settings:
     random_share: float
     discount: float
     terminal_value: bool
+    shift_ends: bool
     plan_memory: int
     n_learned: int
     batch_size: int
@@ -315,6 +316,7 @@ def problem_of(settings: Settings, learner: Learner, knobs: Knobs) -> Problem:
         learner.progress.reward_offset,
         (lambda obs: value_of(roots(obs))) if settings.terminal_value else None,
         terminal_roots=of_shortfall if settings.terminal_value else None,
+        shift_ends=settings.shift_ends,
     )
 
 

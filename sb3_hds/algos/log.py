@@ -1,5 +1,6 @@
 """What an epoch tells SB3's logger."""
 
+import math
 from typing import TYPE_CHECKING, Any
 
 from sb3_hds.algos.epoch import Report
@@ -37,18 +38,24 @@ def record_epoch(model: "TwinAlgorithm", report: Report, knobs: Knobs, returns: 
 
 
 def record_correction(model: "HDS", found: "Correction") -> None:
-    """Record what the data say about the model."""
+    """
+    Record what the data say about the model: errors that there are, and parameters as the model has
+    them now, with the interval of those that it took over from the fit.
+    """
     record = model.logger.record
-    record("model/error_twin", found.error_twin)
-    if found.fit is None:
-        return
-    record("model/error_calibrated", found.error_calibrated)
-    record("model/error_hybrid", found.error_hybrid)
     record("model/beta", found.beta)
     record("model/forgotten", int(found.forgotten))
+    for name in ("error_twin", "error_calibrated", "error_hybrid"):
+        error = getattr(found, name)
+        if not (math.isnan(error) or (name == "error_calibrated" and found.fit is None)):
+            record(f"model/{name}", error)
     if found.residual is not None:
         record("model/disagreement", found.residual.disagreement)
-    for estimate in found.fit.estimates:
-        record(f"model/{estimate.name}", estimate.estimate)
-        record(f"model/{estimate.name}_low", estimate.low, exclude="stdout")
-        record(f"model/{estimate.name}_high", estimate.high, exclude="stdout")
+    for estimate in found.fit.estimates if found.fit is not None else ():
+        value = found.twin.values.get(estimate.name)
+        if value is None:
+            continue
+        record(f"model/{estimate.name}", value)
+        if value == estimate.estimate:
+            record(f"model/{estimate.name}_low", estimate.low, exclude="stdout")
+            record(f"model/{estimate.name}_high", estimate.high, exclude="stdout")

@@ -1,6 +1,8 @@
 """The real steps that a model has seen, and how they travel with it."""
 
 import copy
+import dataclasses
+import json
 import os
 import warnings
 from typing import TYPE_CHECKING, Any
@@ -9,7 +11,9 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_hds.algos.recordings import Recordings
 from sb3_hds.core import Trajectories
+from sb3_hds.core.replay_buffer import episodes_in
 from sb3_hds.errors import TrajectoryError
 
 if TYPE_CHECKING:
@@ -28,7 +32,8 @@ class Measured:
 
     def __init__(self, model: "HDS", earlier: Trajectories | None = None) -> None:
         self._model = model
-        self.earlier = earlier
+        self.earlier = None if earlier is None else _counted(earlier)
+        self._recordings = Recordings(self._n_earlier)
 
     def trajectories(self, latest: int | None = None) -> Trajectories | None:
         """
@@ -45,7 +50,42 @@ class Measured:
             except TrajectoryError:  # none of the steps is finite
                 pass
         data = Trajectories.concatenate(parts) if parts else None
-        return data if data is None or latest is None else _latest(data, latest)
+        return data if data is None or latest is None else latest_steps(data, latest)
+
+    def recordings(self) -> Trajectories | None:
+        """
+        :return: everything measured, oldest first; ``origin`` numbers the recordings from the first
+            there ever was. Those whose beginning is lost are left out where there are others.
+        """
+        parts = [self.earlier] if self.earlier is not None else []
+        found = self._numbered()
+        if found is not None:
+            parts.append(found)
+        if not parts:
+            return None
+        origin = np.concatenate([part.origin for part in parts])
+        return dataclasses.replace(Trajectories.concatenate(parts), origin=origin)
+
+    @property
+    def _n_earlier(self) -> int:
+        return 0 if self.earlier is None else int(self.earlier.origin.max()) + 1
+
+    def _numbered(self) -> Trajectories | None:
+        """What is in the replay buffer, in the order in which it began."""
+        buffer, twin = self._model.replay_buffer, self._model.twin
+        if buffer is None or buffer.size() == 0 or twin is None:
+            return None
+        try:
+            obs, actions, begins = episodes_in(buffer, self._model.action_space, only_finite=True)
+        except TrajectoryError:  # none of the steps is finite
+            return None
+        numbers = np.array(self._recordings.numbers(buffer, begins))
+        if (numbers < 0).all():  # one that has no end is older than the buffer
+            numbers[:] = self._recordings.latest
+        found = Trajectories.from_arrays(obs, actions, dt=twin.dt, conditions="replay buffer")
+        found = dataclasses.replace(found, origin=numbers)
+        order = np.array(sorted(range(len(begins)), key=begins.__getitem__))
+        return found[order[numbers[order] >= 0]]
 
     def state_dict(self) -> dict[str, th.Tensor]:
         """:return: the latest steps, oldest first, shape ``(steps, n_envs, ...)``; earlier data"""
@@ -60,11 +100,13 @@ class Measured:
             for name in _COLUMNS:
                 if hasattr(buffer, name):
                     saved[name] = th.as_tensor(getattr(buffer, name)[order].copy())
-        if self.earlier is not None and limit:
-            early = self.earlier
-            for name in ("obs", "actions", "lengths"):
-                saved[f"earlier.{name}"] = th.as_tensor(np.array(getattr(early, name)))
-            saved["earlier.dt"] = th.as_tensor(early.dt, dtype=th.float64)
+            self._numbered()  # some may not have been looked at yet
+            numbers = self._recordings.state_dict(buffer, len(order))
+            saved |= {f"recordings.{name}": tensor for name, tensor in numbers.items()}
+            limit -= len(order) * buffer.n_envs
+        if self.earlier is not None and limit > 0:
+            earlier = _tensors_of(_whole(self.earlier, limit))
+            saved |= {f"earlier.{name}": tensor for name, tensor in earlier.items()}
         return saved
 
     def load_state_dict(self, tensors: dict[str, th.Tensor], strict: bool = True) -> None:
@@ -74,13 +116,15 @@ class Measured:
         :raises RuntimeError: if the data do not fit the spaces
         """
         if "earlier.obs" in tensors:
-            self.earlier = _unpadded({k.partition(".")[2]: v for k, v in tensors.items()})
+            self.earlier = _unpadded(_part(tensors, "earlier"))
         buffer = self._model.replay_buffer
         if buffer is None or "observations" not in tensors:
             return
         columns = {name: tensors[name].cpu().numpy() for name in _COLUMNS if name in tensors}
+        as_saved = columns["observations"].shape[1] == buffer.n_envs
         columns = _for_copies(columns, buffer.n_envs)
-        n = min(len(columns["observations"]), buffer.buffer_size)
+        n_saved = len(columns["observations"])
+        n = min(n_saved, buffer.buffer_size)
         for name, values in columns.items():
             kept = getattr(buffer, name, None)
             if kept is None:
@@ -92,6 +136,9 @@ class Measured:
                 )
             kept[:n] = values[-n:]
         buffer.pos, buffer.full = n % buffer.buffer_size, n == buffer.buffer_size
+        self._recordings = Recordings(self._n_earlier)
+        if as_saved and "recordings.starts" in tensors:
+            self._recordings.load_state_dict(_part(tensors, "recordings"), buffer, n_saved)
 
 
 def _up_to_date(model: "HDS") -> Any:
@@ -126,7 +173,7 @@ def data_from(source: Any) -> Trajectories | None:
     )
 
 
-def _latest(data: Trajectories, n_steps: int) -> Trajectories:
+def latest_steps(data: Trajectories, n_steps: int) -> Trajectories:
     """The end of the data; the recording in which it begins is cut."""
     obs, actions, left = [], [], max(n_steps, 1)
     for i in reversed(range(len(data))):
@@ -136,8 +183,29 @@ def _latest(data: Trajectories, n_steps: int) -> Trajectories:
         left -= len(actions[0])
         if left <= 0:
             break
-    labels = data.conditions[len(data) - len(obs) :]
-    return Trajectories.from_arrays(obs, actions, dt=data.dt, conditions=labels)
+    first = len(data) - len(obs)
+    cut = Trajectories.from_arrays(obs, actions, dt=data.dt, conditions=data.conditions[first:])
+    return dataclasses.replace(cut, origin=data.origin[first:])
+
+
+def _whole(data: Trajectories, n_steps: int) -> Trajectories:
+    """The latest recordings that have together no more steps than so many."""
+    after = np.cumsum(data.lengths[::-1])[::-1]
+    fit = np.flatnonzero(after <= n_steps)
+    return data[fit] if len(fit) else latest_steps(data, n_steps)
+
+
+def _counted(data: Trajectories) -> Trajectories:
+    """With recordings numbered 0, 1, ..."""
+    return dataclasses.replace(data, origin=np.unique(data.origin, return_inverse=True)[1])
+
+
+def _part(tensors: dict[str, th.Tensor], name: str) -> dict[str, th.Tensor]:
+    return {
+        key.partition(".")[2]: tensor
+        for key, tensor in tensors.items()
+        if key.startswith(f"{name}.")
+    }
 
 
 def _for_copies(columns: dict[str, np.ndarray], n_envs: int) -> dict[str, np.ndarray]:
@@ -154,12 +222,25 @@ def _for_copies(columns: dict[str, np.ndarray], n_envs: int) -> dict[str, np.nda
     }
 
 
+def _tensors_of(data: Trajectories) -> dict[str, th.Tensor]:
+    names = ("obs", "actions", "lengths", "origin")
+    saved = {name: th.as_tensor(np.array(getattr(data, name))) for name in names}
+    labels = np.frombuffer(json.dumps(data.conditions).encode(), np.uint8).copy()
+    dt = th.as_tensor(data.dt, dtype=th.float64)
+    return saved | {"dt": dt, "conditions": th.as_tensor(labels)}
+
+
 def _unpadded(saved: dict[str, th.Tensor]) -> Trajectories:
     obs, actions = (saved[name].cpu().numpy() for name in ("obs", "actions"))
     lengths = saved["lengths"].cpu().numpy()
-    return Trajectories.from_arrays(
+    labels, origin = "earlier", np.arange(len(lengths))
+    if "conditions" in saved:  # files of the first versions have neither
+        labels = json.loads(saved["conditions"].cpu().numpy().tobytes())
+        origin = saved["origin"].cpu().numpy()
+    found = Trajectories.from_arrays(
         [x[: n + 1] for x, n in zip(obs, lengths, strict=True)],
         [u[:n] for u, n in zip(actions, lengths, strict=True)],
         dt=float(saved["dt"]),
-        conditions="earlier",
+        conditions=labels,
     )
+    return dataclasses.replace(found, origin=origin)

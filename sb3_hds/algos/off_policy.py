@@ -102,6 +102,7 @@ class Recipe:
     :param qf_optimizer: of the critics
     :param ent_coef_optimizer: of the logarithm of the entropy coefficient; None: Adam
     :param policy_delay: updates of the critics for each of the actor
+    :param target_every: updates of the critics for each of the target networks
     :param learns_ent_coef: whether the entropy coefficient follows the target entropy
     :param joint_pass: whether current and next values come from one pass of the critics, without
         target networks (CrossQ)
@@ -119,6 +120,7 @@ class Recipe:
     qf_optimizer: "Optimizer"
     ent_coef_optimizer: "Optimizer | None" = None
     policy_delay: int = 1
+    target_every: int = 1
     learns_ent_coef: bool = True
     joint_pass: bool = False
     normalize: bool = False
@@ -382,11 +384,23 @@ def update_critics(
     critic = recipe.qf_optimizer.apply(
         slope, Trained(weights, learner.critic.optimizer), knobs.qf_learning_rate
     )
-    target = learner.target
-    if not recipe.joint_pass:
-        follow = lambda old, new: old + knobs.tau * (new - old)  # noqa: E731
-        target = jax.tree.map(follow, learner.target, critic.weights)
-    return learner._replace(critic=critic, target=target), report._replace(critic_loss=value)
+    learner, report = learner._replace(critic=critic), report._replace(critic_loss=value)
+    return _with_target(recipe, learner, knobs), report
+
+
+def _with_target(recipe: Recipe, learner: Learner, knobs: Knobs) -> Learner:
+    """The target critics follow, where there are some."""
+    if recipe.joint_pass:
+        return learner
+
+    def follow() -> Weights:
+        nearer = lambda old, new: old + knobs.tau * (new - old)  # noqa: E731
+        return jax.tree.map(nearer, learner.target, learner.critic.weights)
+
+    if recipe.target_every == 1:
+        return learner._replace(target=follow())
+    due = learner.n_updates % recipe.target_every == 0
+    return learner._replace(target=jax.lax.cond(due, follow, lambda: learner.target))
 
 
 def update_actor(

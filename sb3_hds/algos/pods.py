@@ -69,6 +69,9 @@ class PODS(TwinAlgorithm):
     :param lookahead: steps for which the policy is followed beyond the end of a plan when plans are
         compared; None: five horizons; 0 switches it off (the paper)
     :param terminal_value: whether a value network judges the end of a plan (the paper: no)
+    :param shift_ends: whether an episode that has terminated counts as one that earns the reward
+        zero for ever. Rewards are counted from the best one that was seen; without it, an end is
+        worth zero on that scale, and dying pays.
     :param reset_share: share of start states drawn from the reset distribution in each epoch, the
         others go on from where the policy went; 1 is the paper's choice
     :param exploration_noise: standard deviation of a constant offset of the controls while start
@@ -132,6 +135,7 @@ class PODS(TwinAlgorithm):
         random_share: float = 0.5,
         lookahead: int | None = None,
         terminal_value: bool = True,
+        shift_ends: bool = True,
         reset_share: float = 0.5,
         exploration_noise: float = 0.0,
         plan_memory: int = 8,
@@ -180,6 +184,7 @@ class PODS(TwinAlgorithm):
             random_share=random_share,
             lookahead=lookahead,
             terminal_value=terminal_value,
+            shift_ends=shift_ends,
             reset_share=reset_share,
             exploration_noise=exploration_noise,
             exploration_decay=1.0,

@@ -9,7 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
-from sb3_hds.algos.call_forms import between, jax_device
+from sb3_hds.algos.call_forms import between, is_count, jax_device
 from sb3_hds.algos.gaussian_policy import GaussianPolicy, SimbaPolicy
 from sb3_hds.algos.model_free import ModelFreeAlgorithm, finite
 from sb3_hds.algos.off_policy import Knobs, Recipe, Report, update
@@ -29,6 +29,8 @@ class SoftActorCritic(ModelFreeAlgorithm):
     :param env: an environment, its id, or a vectorised environment
     :param ent_coef: a number, ``"auto"``, or ``"auto_0.1"`` to start there
     :param target_entropy: a number, or ``"auto"``: minus the number of controls
+    :param target_update_interval: updates of the critics for each of the target networks, counted
+        from the first; SB3 counts anew in each call of ``train``
     :param arguments: those of :class:`~sb3_hds.algos.model_free.ModelFreeAlgorithm`
     """
 
@@ -48,9 +50,11 @@ class SoftActorCritic(ModelFreeAlgorithm):
         *,
         ent_coef: float | str = "auto",
         target_entropy: float | str = "auto",
+        target_update_interval: int = 1,
         **arguments: Any,
     ) -> None:
         self.ent_coef, self.target_entropy = ent_coef, target_entropy
+        self.target_update_interval = target_update_interval
         super().__init__(policy, env, **arguments)
 
     def recipe(self) -> Recipe:
@@ -58,6 +62,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
         return dataclasses.replace(
             self.policy.plain_recipe(),
             policy_delay=self.policy_delay,
+            target_every=self.target_update_interval,
             learns_ent_coef=isinstance(self.ent_coef, str),
         )
 
@@ -70,6 +75,8 @@ class SoftActorCritic(ModelFreeAlgorithm):
         entropy = self.target_entropy
         fine = entropy == "auto" or between(entropy, -math.inf, math.inf)
         self.refuse_unless(fine, "target_entropy", "'auto' or a number")
+        fine = is_count(self.target_update_interval, 1)
+        self.refuse_unless(fine, "target_update_interval", "a whole number of at least 1")
         _initial_ent_coef(self.ent_coef)
 
     def _build(self, seed: int) -> None:

@@ -62,7 +62,8 @@ class TD7Policy(LearningPolicy):
     :param activation_fn: of the actor: name, JAX function or torch module class
     :param qf_activation_fn: of encoder and critics
     :param n_critics: members of the ensemble
-    :param optimizer_class: name, optax function or torch class
+    :param optimizer_class: name or function of optax, with its defaults, or torch class, with those
+        of torch
     :param optimizer_kwargs: besides the learning rate
     :param use_sde: accepted for SB3's sake; the policy is deterministic
     :param uses_checkpoints: whether that of the last checkpoint acts; its algorithm says so
@@ -93,7 +94,8 @@ class TD7Policy(LearningPolicy):
         pi, qf = widths(net_arch, "qf")
         of_values = activation(qf_activation_fn)
         self.n_obs = size_of(observation_space)
-        self.n_act = int(np.prod(action_space.shape))
+        self.action_shape = action_space.shape
+        self.n_act = int(np.prod(self.action_shape))
         optimizer = optimizer_of(optimizer_class, optimizer_kwargs or {})
         self.parts: dict[str, Any] = {
             "encoder": Encoder(embedding_size, qf, of_values),
@@ -165,8 +167,10 @@ class TD7(ModelFreeAlgorithm):
     0.4, and 20 episodes assess a policy from 750,000 updates on, one before.
 
     With checkpoints, as in the paper, a policy acts for whole episodes and is assessed by the worst
-    of them; only then it is updated, once for each step that it made. That needs one environment,
-    and ``gradient_steps`` is not looked at.
+    of them, in rewards of the environment itself; only then it is updated, once for each step that
+    it made. That needs one environment, and ``gradient_steps`` is not looked at. Networks that
+    start afresh (``param_resets``) leave the checkpoint and its assessment as they are. SBX has no
+    TD7.
 
     Prioritised replay draws from SB3's plain buffer. With ``n_steps`` above 1, Dict observations,
     ``optimize_memory_usage`` or a buffer of one's own (``HerReplayBuffer``), transitions are drawn
@@ -196,6 +200,8 @@ class TD7(ModelFreeAlgorithm):
         "MlpPolicy": TD7Policy,
         "MultiInputPolicy": TD7Policy,
     }
+    #: twice as many as are random
+    default_timesteps: ClassVar[int] = 50_000
     policy: TD7Policy
 
     def __init__(
@@ -299,16 +305,21 @@ class TD7(ModelFreeAlgorithm):
         super()._setup_model()
         self.policy.uses_checkpoints = self.assesses
         if self.action_noise is None and self.exploration_noise:
-            size = np.full(self.policy.n_act, self.exploration_noise, np.float32)
+            # SB3 adds it to actions of the space's shape.
+            size = np.full(self.policy.action_shape, self.exploration_noise, np.float32)
             self.action_noise = NormalActionNoise(np.zeros_like(size), size)
 
     def _build(self, seed: int) -> None:
         self.policy.build(self.recipe(), seed, jax_device(self._device_name))
 
     def _restart(self, seed: int) -> None:
+        """The policy of the last checkpoint goes on acting until a new one does no worse."""
         before = self.policy.learner
         self._build(seed)
-        self.policy.learner = self.policy.learner._replace(n_updates=before.n_updates)
+        kept: dict[str, Any] = {"n_updates": before.n_updates}
+        if self.assesses:
+            kept["checkpoint"] = before.checkpoint
+        self.policy.learner = self.policy.learner._replace(**kept)
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         if self.assesses:
@@ -377,7 +388,10 @@ class TD7(ModelFreeAlgorithm):
         infos: list[dict[str, Any]],
     ) -> None:
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        self._episode_return += float(reward[0])
+        normalizer = self.get_vec_normalize_env()
+        # The scale of normalised rewards drifts, and an assessment may be compared much later.
+        earned = reward if normalizer is None else normalizer.get_original_reward()
+        self._episode_return += float(earned[0])
         self._episode_length += 1
         if dones[0]:
             # What random actions earned says nothing of a policy.

@@ -96,6 +96,7 @@ class TwinAlgorithm(TensorAlgorithm):
         random_share: float,
         lookahead: int | None,
         terminal_value: bool,
+        shift_ends: bool,
         reset_share: float,
         exploration_noise: float,
         exploration_decay: float,
@@ -163,6 +164,7 @@ class TwinAlgorithm(TensorAlgorithm):
         self.random_share = random_share
         self.lookahead = lookahead
         self.terminal_value = terminal_value
+        self.shift_ends = shift_ends
         self.reset_share = reset_share
         self.exploration_noise = exploration_noise
         self.exploration_decay = exploration_decay

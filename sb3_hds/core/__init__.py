@@ -3,6 +3,7 @@
 from sb3_hds.core.analytic import AnalyticTwin
 from sb3_hds.core.barrier import Barrier
 from sb3_hds.core.continuity import Continuity
+from sb3_hds.core.cpg import Rhythm
 from sb3_hds.core.effect import (
     NO_EFFECTS,
     ActionEffect,
@@ -83,6 +84,7 @@ __all__ = [
     "RateLimit",
     "RescaleAction",
     "RescaleObservation",
+    "Rhythm",
     "Rollout",
     "Scalar",
     "Scale",

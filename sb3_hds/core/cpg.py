@@ -2,25 +2,33 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
 
+from sb3_hds.core.filters import clipped
 from sb3_hds.core.oscillators import AmplitudeState, advance_amplitude, advance_phase, period
+from sb3_hds.core.signals import Actuator, Channel
+from sb3_hds.core.stateful import Signals, StatefulTransform, namespace, refuse_unless
 from sb3_hds.errors import ParameterError
 
-_PER_JOINT = ("amplitude", "offset", "phase", "kp", "kd")
+_PER_JOINT = ("amplitude", "offset", "phase", "kp", "kd", "action_range")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Rhythm:
+class Rhythm(StatefulTransform):
     r"""
     Oscillators :math:`q_i^* = a_i \sin(\theta_i + \varphi_i) + b_i` that a policy adjusts, with
-    actions :math:`\alpha` from -1 to 1. Fields are plain data; the methods take arrays of NumPy and
-    JAX alike, so that the wrapper of an environment and a twin can run the same lines.
+    actions :math:`\alpha` from -1 to 1.
 
     All joints share one clock :math:`c`, the share of the cycle that has passed, from 0 to 1.
+    Remembers its sine and cosine, and with ``"parameters"`` the amplitudes and their rates.
+
+    The commands are :math:`u = k_p (q^* - q) - k_d\,\dot q`, with joints that the observation
+    shows, or :math:`u = q^*` where ``position`` is empty; they are clipped to the limits of the
+    actuators.
 
     :param mode: ``"offset"``: :math:`q^* + \rho\,\alpha`; ``"residual"``: the command
         :math:`u + \rho\,\alpha`; ``"parameters"``: factors on each amplitude, and one on both
@@ -37,8 +45,13 @@ class Rhythm:
     :param amplitude_factor: smallest and largest
     :param frequency_factor: smallest and largest, above 0
     :param amplitude_gain: how fast amplitudes follow their commands [1/s]
+    :param position: where the observation has the position of the joint of each actuator
+    :param velocity: likewise its velocity
+    :param dt: control interval [s]
+    :raises ParameterError: for numbers out of range
     """
 
+    name: ClassVar[str] = "rhythm"
     modes: ClassVar[tuple[str, ...]] = ("offset", "residual", "parameters")
 
     mode: str = "offset"
@@ -50,34 +63,44 @@ class Rhythm:
     kp: Any = 1.0
     kd: Any = 0.05
     action_range: Any = 0.1
-    amplitude_factor: tuple[float, float] = (0.0, 2.0)
-    frequency_factor: tuple[float, float] = (0.5, 2.0)
+    amplitude_factor: Sequence[float] = (0.0, 2.0)
+    frequency_factor: Sequence[float] = (0.5, 2.0)
     amplitude_gain: float = 50.0
+    position: Sequence[int] = ()
+    velocity: Sequence[int] = ()
+    dt: float
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.mode not in self.modes:
             wanted = ", ".join(map(repr, self.modes))
             raise ParameterError(f"Rhythm(mode={self.mode!r}): mode must be one of {wanted}.")
-        for name in ("omega_swing", "omega_stance", "amplitude_gain"):
+        for name in ("omega_swing", "omega_stance", "amplitude_gain", "dt"):
             if not (math.isfinite(value := getattr(self, name)) and value > 0.0):
                 raise ParameterError(f"Rhythm({name}={value}): {name} must be above 0 and finite.")
         for name in ("amplitude_factor", "frequency_factor"):
+            refuse_unless(self, name, len(getattr(self, name)) == 2, "smallest and largest")
             low, high = getattr(self, name)
             if not (0.0 <= low < high < math.inf and (low > 0.0 or name[0] == "a")):
                 raise ParameterError(f"Rhythm({name}={[low, high]}): needs 0 <= lowest < highest.")
-        for name in (*_PER_JOINT, "action_range"):
+        for name in _PER_JOINT:
             if not np.isfinite(np.asarray(getattr(self, name), float)).all():
                 raise ParameterError(
                     f"Rhythm({name}={getattr(self, name)}): {name} must be finite."
                 )
+        both = len(self.position) == len(self.velocity)
+        refuse_unless(self, "velocity", both, f"as many as positions ({len(self.position)})")
 
     def sized(self, n: int) -> "Rhythm":
         """
         :return: the same with one number for each of ``n`` joints
         :raises ParameterError: if it has another number of them
         """
+        per_joint = [getattr(self, name) for name in _PER_JOINT]
+        if all(isinstance(values, tuple) and len(values) == n for values in per_joint):
+            return self
         found = {}
-        for name in (*_PER_JOINT, "action_range"):
+        for name in _PER_JOINT:
             values = np.asarray(getattr(self, name), float)
             if values.shape not in ((), (n,)):
                 raise ParameterError(
@@ -97,32 +120,78 @@ class Rhythm:
         """How many numbers the policy chooses."""
         return self.n_joints + (self.mode == "parameters")
 
-    @property
-    def memory_names(self) -> tuple[str, ...]:
-        """What is remembered, and shown: sine and cosine of the clock, then amplitudes."""
-        clock = ("sin(clock)", "cos(clock)")
+    def remembers(self, below: Signals) -> tuple[Channel, ...]:
+        """
+        :return: sine and cosine of the clock, then amplitudes and their rates
+        :raises ParameterError: for another number of joints, or entries that are not observed
+        """
+        n, n_seen = len(below.actuators), len(below.channels)
+        self.sized(n)
+        if len(self.position) not in (0, n):
+            raise ParameterError(
+                f"Rhythm has {len(self.position)} entries in position, and there are {n} "
+                "actuators. Pass one for each, or none: then targets are the commands."
+            )
+        if not all(0 <= i < n_seen for i in (*self.position, *self.velocity)):
+            raise ParameterError(
+                f"Rhythm reads joints from the entries {list(self.position)} and "
+                f"{list(self.velocity)}, but an observation has {n_seen}."
+            )
+        clock = Channel("sin(clock)", "1", -1.0, 1.0), Channel("cos(clock)", "1", -1.0, 1.0)
         if self.mode != "parameters":
             return clock
-        joints = range(self.n_joints)
-        return (*clock, *(f"r[{i}]" for i in joints), *(f"dr/dt[{i}] / gain" for i in joints))
+        # From rest within their range, critically damped amplitudes do not leave it, nor do their
+        # rates exceed the gain times its width.
+        least, most = self.amplitude_factor
+        width, names = most - least, [a.name for a in below.actuators]
+        radii = [
+            Channel(f"amplitude of {name}", "1", least - width, most + width) for name in names
+        ]
+        rates = [Channel(f"rate of it / gain, {name}", "1", -width, width) for name in names]
+        return (*clock, *radii, *rates)
 
-    def start(self) -> Float[np.ndarray, " memory"]:
-        """:return: the memory at the start of an episode"""
-        memory = np.zeros(len(self.memory_names))
-        memory[1] = 1.0
+    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+        radii, n = [], len(below.actuators)
         if self.mode == "parameters":
-            memory[2 : 2 + self.n_joints] = 0.5 * sum(self.amplitude_factor)
-        return memory
+            radii = [0.5 * sum(self.amplitude_factor)] * n + [0.0] * n
+        return namespace(obs).asarray(np.array([0.0, 1.0, *radii]), dtype=obs.dtype)
+
+    def actuators(self, below: Signals) -> tuple[Actuator, ...]:
+        names = [f"{self.mode} of {a.name}" for a in below.actuators]
+        if self.mode == "parameters":
+            names.append("frequency")
+        return tuple(Actuator(name, "1", -1.0, 1.0) for name in names)
+
+    def act(
+        self,
+        action: Float[Any, " outer"],
+        obs: Float[Any, " obs"],
+        memory: Float[Any, " memory"],
+        below: Signals,
+    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        rhythm, chosen = self.sized(len(below.actuators)), action.clip(-1.0, 1.0)
+        target, after = rhythm.target(chosen, memory)
+        position, velocity = rhythm.joints_in(obs)
+        return clipped(rhythm.command(chosen, target, position, velocity), below), after
+
+    def joints_in(
+        self, obs: Float[Any, " obs"]
+    ) -> tuple[Float[Any, " act"] | None, Float[Any, " act"] | None]:
+        """:return: positions and velocities that an observation shows; None where none are read"""
+        if not self.position:
+            return None, None
+        return obs[np.array(self.position)], obs[np.array(self.velocity)]
 
     def target(
-        self, action: Float[Any, " outer"], memory: Float[Any, " memory"], dt: float
+        self, action: Float[Any, " outer"], memory: Float[Any, " memory"]
     ) -> tuple[Float[Any, " act"], Float[Any, " memory"]]:
         """
+        Of a rhythm that is :meth:`sized`.
+
         :param action: of the policy, from -1 to 1
-        :param dt: how long it acts [s]
-        :return: what the joints aim at in the middle of that time, and the memory after it
+        :return: what the joints aim at in the middle of the interval, and the memory after it
         """
-        xp = memory.__array_namespace__()
+        xp, dt = namespace(memory), self.dt
         cycle, n = period(self.omega_swing, self.omega_stance), self.n_joints
         clock = xp.arctan2(memory[0], memory[1]) / (2.0 * math.pi)
         rate, radius, after = 1.0, 1.0, memory[2:]
@@ -136,11 +205,10 @@ class Rhythm:
             settled = advance_amplitude(state, wanted, 0.0, dt, gain)
             after = xp.concatenate([settled.radius, settled.speed / gain])
         gone = (clock * cycle + 0.5 * rate * dt) % cycle
-        phase = xp.asarray(self.phase, dtype=memory.dtype)
-        phase = advance_phase(phase, gone, self.omega_swing, self.omega_stance)
-        aim = radius * xp.asarray(self.amplitude) * xp.sin(phase) + xp.asarray(self.offset)
+        phase = advance_phase(_like(memory, self.phase), gone, self.omega_swing, self.omega_stance)
+        aim = radius * _like(memory, self.amplitude) * xp.sin(phase) + _like(memory, self.offset)
         if self.mode == "offset":
-            aim = aim + xp.asarray(self.action_range) * action
+            aim = aim + _like(memory, self.action_range) * action
         turned = 2.0 * math.pi * (clock + rate * dt / cycle)
         shown = xp.stack([xp.sin(turned), xp.cos(turned)])
         return aim, xp.concatenate([shown, after]).astype(memory.dtype)
@@ -157,16 +225,20 @@ class Rhythm:
         :param velocity: likewise
         :return: what the actuators are told, not clipped
         """
-        xp = action.__array_namespace__()
         command = target
         if position is not None:
-            kp, kd = xp.asarray(self.kp), xp.asarray(self.kd)
+            kp, kd = _like(target, self.kp), _like(target, self.kd)
             command = kp * (target - position) - kd * velocity
         if self.mode == "residual":
-            command = command + xp.asarray(self.action_range) * action
+            command = command + _like(target, self.action_range) * action
         return command
 
 
-def _within(share: Any, ends: tuple[float, float]) -> Any:
+def _within(share: Any, ends: Sequence[float]) -> Any:
     """From -1 to 1 onto an interval."""
     return ends[0] + 0.5 * (share + 1.0) * (ends[1] - ends[0])
+
+
+def _like(array: Any, values: Any) -> Any:
+    """The values where the array lives, in its precision."""
+    return namespace(array).asarray(values, dtype=array.dtype)

@@ -9,7 +9,7 @@ from sb3_hds.errors import TrajectoryError
 
 def episodes_in(
     buffer: Any, action_space: Any = None, scaled: bool = True, only_finite: bool = False
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
+) -> tuple[list[np.ndarray], list[np.ndarray], list[tuple[int, int]]]:
     """
     Follow each environment through the ring, oldest step first.
 
@@ -22,7 +22,8 @@ def episodes_in(
     :param action_space: the box that actions are scaled back to; default: the buffer's own
     :param scaled: whether stored actions are scaled to [-1, 1], as SB3's algorithms store them
     :param only_finite: whether to leave out steps with a value that is not finite, and to cut there
-    :return: observations, each ``(T + 1, n_obs)``, and actions, each ``(T, n_act)``
+    :return: observations, each ``(T + 1, n_obs)``; actions, each ``(T, n_act)``; and where each
+        begins: steps since the oldest one in the ring, and the environment
     :raises TrajectoryError: for spaces other than boxes of one axis, and for an empty buffer
     """
     if not isinstance(buffer.observations, np.ndarray) or buffer.observations.ndim != 3:
@@ -35,7 +36,8 @@ def episodes_in(
     space = buffer.action_space if action_space is None else action_space
     commands = _unscaled(buffer, space, scaled)
     following = (order + 1) % buffer.buffer_size
-    obs, actions = [], []
+    obs, actions, begins = [], [], []
+    first = int(shared and buffer.full)
     for env in range(buffer.n_envs):
         before = buffer.observations[order, env]
         stored = buffer.observations[following] if shared else buffer.next_observations[order]
@@ -49,9 +51,10 @@ def episodes_in(
                 if len(piece):
                     obs.append(np.concatenate([before[piece], after[piece[-1:]]]))
                     actions.append(commands[order[piece], env])
+                    begins.append((first + int(piece[0]), env))
     if not obs:
         raise TrajectoryError("The replay buffer holds no step yet. Collect some first.")
-    return obs, actions
+    return obs, actions, begins
 
 
 def _finite_runs(steps: np.ndarray, before: np.ndarray, after: np.ndarray) -> list[np.ndarray]:

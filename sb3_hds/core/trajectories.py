@@ -112,7 +112,7 @@ class Trajectories:
         :param condition: label for all of them
         :raises TrajectoryError: for spaces other than boxes of one axis, and for an empty buffer
         """
-        obs, actions = episodes_in(replay_buffer, action_space, scaled, only_finite)
+        obs, actions, _ = episodes_in(replay_buffer, action_space, scaled, only_finite)
         return cls.from_arrays(obs, actions, dt=dt, conditions=condition)
 
     @classmethod

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from sb3_hds.core.barrier import Barrier
 from sb3_hds.core.continuity import Continuity
+from sb3_hds.core.cpg import Rhythm
 from sb3_hds.core.filters import Delay, LowPass, RateLimit, Scale
 from sb3_hds.core.history import History
 from sb3_hds.core.signals import Actuator, Channel
@@ -160,6 +161,7 @@ TRANSFORMS: tuple[type[Transform], ...] = (
     History,
     Barrier,
     Continuity,
+    Rhythm,
 )
 
 

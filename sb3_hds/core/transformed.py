@@ -142,11 +142,13 @@ class TransformedTwin(Twin):
         inside = ", ".join(map(repr, (self._base_with_values(), *self._parts())))
         return f"{type(self).__name__}({inside})"
 
-    def command(self, state: State, action: Action, params: Params) -> Action:
+    def command(self, state: State, action: Action, params: Params) -> Float[Array, " inner"]:
         """:return: what the twin below is told"""
         return self._act(state, action, params)[0]
 
-    def _act(self, state: State, action: Action, params: Params) -> tuple[Action, Memory]:
+    def _act(
+        self, state: State, action: Action, params: Params
+    ) -> tuple[Float[Array, " inner"], Memory]:
         if self.stateful is not None:
             obs = self.base.observe(state, params)
             return self.stateful.act(action, obs, state.memory[self._key], self._below)

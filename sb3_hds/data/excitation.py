@@ -10,6 +10,7 @@ from sb3_hds.data.findings import (
     ConstantCommand,
     DependentCommand,
     MostlyStill,
+    PoorExcitation,
     StandingStill,
     TooShort,
     WeakMotion,
@@ -22,6 +23,12 @@ _THROUGHOUT = 0.95  # share of the time
 _MOSTLY = 0.8  # share of the time
 _WEAK = 5.0  # noise
 _DEPENDENT = 0.999  # share of the variance
+_CONSTANT = 0.01  # of its largest value: a command that varies less tells nothing about its drive
+_STROKE = 0.1  # of a channel's range, from one turning point to the next
+# Half of the strokes propose and half confirm. The logarithm of the mean square error of a stroke
+# scatters by about a half: of twenty, the mean has a standard error of 0.11, and a fifth less error
+# (0.22) is just beyond chance at 2.5 %.
+_STROKES = 40
 
 
 def excitation(
@@ -52,12 +59,38 @@ def excitation(
         return [*found, WithinNoise("all channels", places, float(ratios.max()))]
     weak = zip(obs, ratios.tolist(), strict=True)
     found += [WeakMotion(name, places, ratio) for name, ratio in weak if ratio < _WEAK]
+    strokes = [_strokes([o[:, j] for o, _ in episodes]) for j in range(data.n_obs)]
+    if max(strokes) < _STROKES:
+        busiest = int(np.argmax(strokes))
+        found.append(
+            PoorExcitation(obs[busiest], places, strokes[busiest], len(set(data.conditions)))
+        )
     for j, name in enumerate(actions):
-        if np.ptp(u[:, j]) == 0.0:
-            found.append(ConstantCommand(name, places, float(u[0, j])))
+        low, high = float(u[:, j].min()), float(u[:, j].max())
+        if high - low <= _CONSTANT * max(abs(low), abs(high)):
+            found.append(ConstantCommand(name, places, low, high))
         elif (r2 := _r2(x, u[:, j])) > _DEPENDENT:
             found.append(DependentCommand(name, places, r2))
     return found
+
+
+def _strokes(recordings: Sequence[np.ndarray]) -> int:
+    """How often a channel moves one way or the other, counted until there are enough."""
+    least = _STROKE * (max(x.max() for x in recordings) - min(x.min() for x in recordings))
+    n = 0
+    for x in recordings:
+        # The turning point that the last stroke began at, and the way it goes: 0 before the first.
+        low = high = float(x[0])
+        way = 0
+        for value in x.tolist():
+            low, high = min(low, value), max(high, value)
+            if (way < 1 and value - low > least) or (way > -1 and high - value > least):
+                way = 1 if value - low > least and way < 1 else -1
+                low = high = value
+                n += 1
+                if n >= _STROKES:
+                    return n
+    return n
 
 
 def _r2(x: np.ndarray, u: np.ndarray) -> float:

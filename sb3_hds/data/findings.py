@@ -259,17 +259,46 @@ class MostlyStill(Finding):
 
 
 @dataclasses.dataclass(frozen=True)
-class ConstantCommand(Finding):
-    """:param value: of the command, in its unit"""
+class PoorExcitation(Finding):
+    """
+    :param n_strokes: how often the channel moves one way or the other in all recordings, by a tenth
+        of its range at least; no other channel does so more often
+    :param n_conditions: under which was recorded
+    """
 
-    value: float
+    n_strokes: int
+    n_conditions: int
 
     @property
     def sentence(self) -> str:
         return (
-            f"The command '{self.channel}' is {self.value:.4g} throughout "
-            f"({recordings(self.places)})."
+            f"Excitation is poor: no channel goes to and fro more often than '{self.channel}', "
+            f"{counted(self.n_strokes, 'stroke')} in {counted(len(self.places), 'recording')} "
+            f"under {counted(self.n_conditions, 'condition')} ({recordings(self.places)})."
         )
+
+    remedy = (
+        "What takes away less than a fifth of the error hardly stands out from chance in so few. "
+        "Record more strokes, at other speeds, and vary what stayed the same: the load, the gain, "
+        "the course of the commands."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class ConstantCommand(Finding):
+    """
+    :param low: smallest value of the command, in its unit
+    :param high: largest one
+    """
+
+    low: float
+    high: float
+
+    @property
+    def sentence(self) -> str:
+        span = f"between {self.low:.5g} and {self.high:.5g}"
+        value = span if f"{self.low:.4g}" != f"{self.high:.4g}" else f"{self.high:.4g}"
+        return f"The command '{self.channel}' is {value} throughout ({recordings(self.places)})."
 
     remedy = (
         "Gain, delay and lag of this actuator cannot be estimated from this. If it is meant to do "

@@ -62,8 +62,8 @@ class Audit:
 
     @property
     def reason(self) -> str:
-        """Why they cannot; empty if they can."""
-        return " ".join(finding.sentence for finding in self.findings if finding.blocks)
+        """Why they cannot, and what to record instead; empty if they can."""
+        return " ".join(str(finding) for finding in self.findings if finding.blocks)
 
     @property
     def velocity_shift(self) -> dict[str, float]:

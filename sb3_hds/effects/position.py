@@ -124,6 +124,9 @@ class ConstantForce(JointEffect):
         "directional_coulomb_friction": "together with a coulomb_friction, while the joint moves",
         "stiffness": "where the joint hardly moves",
         "parameter.gravity_x": "at a slider, or where a hinge hardly turns",
+        "parameter.tilt": "where a hinge hardly turns",
+        "parameter.tilt_x": "where the arm that carries a pendulum hardly turns",
+        "parameter.tilt_y": "where the arm that carries a pendulum hardly turns",
     }
 
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:

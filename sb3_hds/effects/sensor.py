@@ -33,7 +33,10 @@ class SensorBias(SensorEffect):
     parameters = {"bias": Parameter(null=0.0, scale=0.05, unit="channel unit")}
     explanation = "A sensor reports too much, or too little, by the same amount all the time."
     source = "JCGM 200:2012, 4.20"
-    equivalents = {"parameter.gravity_x": "in free swing, where it is a tilt of the whole system"}
+    equivalents = {
+        "parameter.gravity_x": "in free swing, where it is a tilt of the whole system",
+        "parameter.tilt": "in free swing, of an angle: the zero of a sensor or of gravity",
+    }
 
     def sense(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Scalar:
         return measured + params["bias"]

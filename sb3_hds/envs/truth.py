@@ -27,27 +27,28 @@ def true_twin(env: Any) -> Twin:
     :raises TypeError: for another environment
     """
     bare = env.unwrapped
+    if not isinstance(bare, PendulumReal | InvertedPendulumFriction):
+        raise TypeError(
+            "The truth is known of sb3_hds/PendulumReal-v1 and sb3_hds/InvertedPendulumFriction-v5,"
+            f" not of {bare!r}. Build its twin yourself: twins.make(...).extend(...)."
+        )
     twin = registry.from_env(env)
+    hidden: list[tuple[float, float, Effect]]
     if isinstance(bare, PendulumReal):
         twin = twin.with_parameters(payload=bare.payload)
-        hidden: list[tuple[float, float, Effect]] = [
+        hidden = [
             (bare.delay, 0.0, ActionDelay("torque", delay=bare.delay)),
             (bare.gain, 1.0, TorqueGain("torque", gain=bare.gain)),
             (bare.lag, 0.0, MotorLag("torque", time_constant=bare.lag)),
             (bare.friction, 0.0, CoulombFriction("hinge", tau_c=bare.friction)),
             (bare.drag, 0.0, QuadraticDrag("hinge", c=bare.drag)),
         ]
-    elif isinstance(bare, InvertedPendulumFriction):
+    else:
         hidden = [
             (bare.slider_damping, 0.0, ViscousFriction("slider", b=bare.slider_damping)),
             (bare.hinge_damping, 0.0, ViscousFriction("hinge", b=bare.hinge_damping)),
             (bare.slider_friction, 0.0, CoulombFriction("slider", tau_c=bare.slider_friction)),
             (bare.hinge_friction, 0.0, CoulombFriction("hinge", tau_c=bare.hinge_friction)),
         ]
-    else:
-        raise TypeError(
-            "The truth is known of sb3_hds/PendulumReal-v1 and sb3_hds/InvertedPendulumFriction-v5,"
-            f" not of {bare!r}. Build its twin yourself: twins.make(...).extend(...)."
-        )
     present = [effect for value, null, effect in hidden if value != null]
     return twin.extend(*present) if present else twin

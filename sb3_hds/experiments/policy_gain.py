@@ -1,7 +1,7 @@
 """What a diagnosis is worth for the policy: return on the real system."""
 
-import contextlib
 import dataclasses
+import inspect
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -16,11 +16,14 @@ from scipy.stats import trim_mean
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_hds.algos import HDS
+from sb3_hds.algos.twin_algorithm import TwinAlgorithm
 from sb3_hds.core import Twin
+from sb3_hds.core.storage import write_bytes
 from sb3_hds.envs import TwinEnv, true_twin
-from sb3_hds.errors import TrajectoryError
+from sb3_hds.errors import EnvironmentMismatchError, ParameterError, TrajectoryError
 from sb3_hds.experiments.returns import returns_of
 from sb3_hds.sysid import Diagnosis
+from sb3_hds.sysid.plots import as_png, plot_policy_gain
 
 _N_RESAMPLES = 2000
 _LEVEL = 0.9
@@ -86,9 +89,7 @@ class PolicyGain:
         :param path: of the picture
         :raises ImportError: without matplotlib (extra ``report``)
         """
-        from sb3_hds.experiments.plots import plot_policy_gain
-
-        return plot_policy_gain(self, path)
+        return write_bytes(path, as_png(plot_policy_gain(self.to_dict())))
 
     def __str__(self) -> str:
         runs, episodes = self.returns["believed"].shape
@@ -115,7 +116,7 @@ def measure_policy_gain(
     budget: int = 0,
     seeds: int = 5,
     n_episodes: int = 20,
-    ceiling: bool = True,
+    ceiling: bool | Twin = True,
     progress: bool = True,
     **arguments: Any,
 ) -> PolicyGain:
@@ -123,50 +124,129 @@ def measure_policy_gain(
     Train with the same budget in the old and in the extended twin, and act on the real system.
 
     Runs with the same seed differ in the twin only, and all act from the same start states. Where
-    ``env`` is one of our stand-ins for hardware, policies from its true twin are the ceiling.
+    ``env`` is one of our stand-ins for hardware, or made of a twin, policies from its true twin are
+    the ceiling.
 
     :param diagnosis: whose ``believed`` and extended ``twin`` are compared
     :param env: the real system, its id, or a function that makes it
     :param algorithm: trained in the simulations only
-    :param budget: steps of the simulated environment; 0 is enough for an algorithm that plans in
-        its twin before it acts
+    :param budget: steps of the simulated environment; 0 is enough for PODS and HDS, which plan in
+        their twin before they act
     :param seeds: runs in each simulation
     :param n_episodes: start states on the real system
-    :param ceiling: whether policies from the true twin are trained too, where there is one
+    :param ceiling: whether policies from the true twin are trained too, where there is one; or that
+        twin
     :param progress: whether a bar shows how far it is
     :param arguments: of the algorithm
     :return: returns by simulation, and the gain with its interval
-    :raises TrajectoryError: for a twin without task, or fewer than one run or episode
+    :raises TrajectoryError: for a twin without task, fewer than one run or episode, or an algorithm
+        that learns nothing in so few steps
+    :raises ParameterError: for an argument that the algorithm does not have
+    :raises EnvironmentMismatchError: if the real system has other observations or actions
     """
-    if min(seeds, n_episodes) < 1 or budget < 0:
-        raise TrajectoryError(
-            f"seeds and n_episodes must be at least 1 and budget at least 0, got seeds={seeds}, "
-            f"n_episodes={n_episodes}, budget={budget}."
-        )
-    if diagnosis.believed.max_episode_steps is None:
-        raise TrajectoryError(
-            f"{diagnosis.believed.name} has no episode length, so no task to be good at. "
-            "Give its class max_episode_steps and a reward."
-        )
     real = _made(env)
+    check_question(diagnosis.believed, real, algorithm, budget, seeds, n_episodes, arguments)
     simulations = {"believed": diagnosis.believed, "extended": diagnosis.twin}
-    if ceiling:
-        with contextlib.suppress(TypeError):
-            simulations["true"] = true_twin(real)
+    if (truth := _truth(real, ceiling)) is not None:
+        simulations["true"] = truth
     runs = [(name, seed) for seed in range(seeds) for name in simulations]
     returns: dict[str, list[np.ndarray]] = {name: [] for name in simulations}
     for name, seed in track(runs, "training", transient=True, disable=not progress):
         model = algorithm("MlpPolicy", _task(simulations[name]), seed=seed, **arguments)
         model.learn(budget)
         returns[name].append(returns_of(model, real, n_episodes))
+    if real is not env:
+        real.close()
     found = {name: np.stack(rows) for name, rows in returns.items()}
     return PolicyGain(found, _summarised(found["extended"] - found["believed"]))
+
+
+def check_question(
+    believed: Twin,
+    real: gymnasium.Env,
+    algorithm: type[BaseAlgorithm],
+    budget: int,
+    seeds: int,
+    n_episodes: int,
+    arguments: Mapping[str, Any],
+) -> None:
+    """
+    What :func:`measure_policy_gain` refuses, for whoever wants to know before there is a diagnosis.
+
+    :param believed: the twin as it is believed
+    :param arguments: of the algorithm
+    :raises TrajectoryError: as there
+    :raises ParameterError: as there
+    :raises EnvironmentMismatchError: as there
+    """
+    if min(seeds, n_episodes) < 1 or budget < 0:
+        raise TrajectoryError(
+            f"seeds and n_episodes must be at least 1 and budget at least 0, got seeds={seeds}, "
+            f"n_episodes={n_episodes}, budget={budget}."
+        )
+    try:
+        inspect.signature(algorithm).bind_partial("MlpPolicy", real, seed=0, **arguments)
+    except TypeError as error:
+        raise ParameterError(f"{algorithm.__name__} cannot be made: {error}.") from None
+    plans = issubclass(algorithm, TwinAlgorithm) and arguments.get("pretrain_epochs", 1) > 0
+    if budget == 0 and not plans:
+        raise TrajectoryError(
+            f"{algorithm.__name__} learns nothing in 0 steps: give it a budget, for example "
+            "10,000 steps."
+        )
+    if believed.max_episode_steps is None:
+        raise TrajectoryError(
+            f"{believed.name} has no episode length, so no task to be good at. "
+            "Give its class max_episode_steps and a reward."
+        )
+    _check_same_signals(real, believed)
 
 
 def _made(env: gymnasium.Env | str | Callable[[], gymnasium.Env]) -> gymnasium.Env:
     if isinstance(env, str):
         return gymnasium.make(env)
     return env if isinstance(env, gymnasium.Env) else env()
+
+
+def _check_same_signals(real: gymnasium.Env, believed: Twin) -> None:
+    simulated = TwinEnv(believed)
+    ours, theirs = simulated.observation_space.shape, real.observation_space.shape
+    if ours != theirs:
+        raise EnvironmentMismatchError(
+            f"The real system has observations of shape {theirs}, {believed.name} of shape {ours}. "
+            "A policy from the one cannot act on the other: wrap the system, so that it reports "
+            "what the twin does."
+        )
+    ours, theirs = simulated.action_space, real.action_space
+    if not (
+        isinstance(theirs, gymnasium.spaces.Box)
+        and theirs.shape == ours.shape
+        and np.allclose([theirs.low, theirs.high], [ours.low, ours.high])
+    ):
+        shown = "no Box" if not isinstance(theirs, gymnasium.spaces.Box) else _range(theirs)
+        raise EnvironmentMismatchError(
+            f"The real system takes actions in {shown}, {believed.name} in {_range(ours)}. Wrap "
+            "the system, so that the same number means the same."
+        )
+
+
+def _range(space: gymnasium.spaces.Box) -> str:
+    low, high = ("[" + ", ".join(f"{x:g}" for x in end) + "]" for end in (space.low, space.high))
+    return f"{low} to {high}"
+
+
+def _truth(real: gymnasium.Env, ceiling: bool | Twin) -> Twin | None:
+    """The twin that is the real system; None where nobody knows it, or nobody asks."""
+    if isinstance(ceiling, Twin):
+        return ceiling
+    if not ceiling:
+        return None
+    if isinstance(real.unwrapped, TwinEnv):
+        return real.unwrapped.twin
+    try:
+        return true_twin(real)
+    except TypeError:
+        return None
 
 
 def _task(twin: Twin) -> gymnasium.Env:

@@ -1,6 +1,8 @@
 """What is left of a return when sensors are noisy or fail, or something pushes."""
 
 import dataclasses
+import functools
+import textwrap
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -12,7 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_hds.algos import OpenLoop
-from sb3_hds.errors import TrajectoryError
+from sb3_hds.errors import EnvironmentMismatchError, TrajectoryError
 from sb3_hds.experiments.returns import FIRST_START
 from sb3_hds.wrappers import Perturb
 
@@ -33,9 +35,11 @@ class Robustness:
     Returns of one policy under perturbations. Prints itself.
 
     :param returns: by perturbation, one for each episode; all start alike
+    :param left_out: perturbations that the environment does not have, and why
     """
 
     returns: Mapping[str, Float[np.ndarray, " episodes"]]
+    left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def share(self, perturbation: str) -> float:
         """:return: mean return as a share of the unperturbed one, nan unless that is positive"""
@@ -64,6 +68,9 @@ class Robustness:
         for row in self.to_rows():
             numbers = f"{row['return']:>10.1f}{row['std']:>9.1f}{row['worst']:>10.1f}"
             lines.append(f"  {row['perturbation']:<16}{numbers}{row['share']:>8.2f}")
+        for name, why in self.left_out.items():
+            said = f"{name} is left out: {why}"
+            lines += textwrap.wrap(said, 78, initial_indent="  ", subsequent_indent="  ")
         return "\n".join(lines)
 
     __repr__ = __str__
@@ -73,6 +80,7 @@ def measure_robustness(
     model: BaseAlgorithm,
     env: str | Callable[[], gymnasium.Env],
     *,
+    wrapper: Callable[[gymnasium.Env], gymnasium.Env] | None = None,
     perturbations: Mapping[str, Mapping[str, Any]] = PERTURBATIONS,
     n_episodes: int = 20,
     encoders: str = "own",
@@ -85,6 +93,8 @@ def measure_robustness(
     Noise and failures are in what the policy observes. The motors of an open-loop gait have
     encoders of their own, as on a robot, so that neither reaches them; ``encoders="observation"``
     lets the loop that tracks joints see what the policy sees. A push reaches everybody.
+    Perturbations that the environment does not have, such as a push without MuJoCo, are left out
+    and named.
 
     Source: after Raffin et al., *An Open-Loop Baseline*, RLJ 2024, table 2; how it defined units,
     sensors and pushes is not published, see :class:`~sb3_hds.wrappers.Perturb` for what is done
@@ -92,12 +102,16 @@ def measure_robustness(
 
     :param model: any saved model of Stable-Baselines3, SBX or this package
     :param env: its id, or a function that makes it
+    :param wrapper: puts the wrappers that the model was trained with around it; what they see is
+        perturbed already, as behind the sensors of a robot
     :param perturbations: arguments of ``Perturb`` by name, ``"none"`` among them
     :param n_episodes: of each
     :param encoders: ``"own"`` or ``"observation"``
     :param normalize: file of the statistics of ``VecNormalize`` that the model was trained with
     :param progress: whether a bar shows how far it is
     :raises TrajectoryError: for fewer than one episode, or without the perturbation ``"none"``
+    :raises EnvironmentMismatchError: where observations cannot be perturbed at all, or are not what
+        the model observes
     """
     if n_episodes < 1 or "none" not in perturbations or encoders not in ("own", "observation"):
         raise TrajectoryError(
@@ -105,10 +119,13 @@ def measure_robustness(
             f"'none' among others (got {', '.join(perturbations)}), and encoders 'own' or "
             f"'observation' (got {encoders!r})."
         )
-    returns = {}
-    shown = track(perturbations.items(), "perturbing", transient=True, disable=not progress)
+    make = functools.partial(_perturbed, env, wrapper or (lambda inner: inner))
+    _check_fits(model, make(perturbations["none"]))
+    returns, left_out = {}, _impossible(make, perturbations)
+    possible = {name: how for name, how in perturbations.items() if name not in left_out}
+    shown = track(possible.items(), "perturbing", transient=True, disable=not progress)
     for name, settings in shown:
-        venv: VecEnv = DummyVecEnv([lambda settings=settings: _perturbed(env, settings)])
+        venv: VecEnv = DummyVecEnv([functools.partial(make, settings)])
         try:
             seen = VecNormalize.load(normalize, venv) if normalize else venv
             if isinstance(seen, VecNormalize):
@@ -116,12 +133,43 @@ def measure_robustness(
             returns[name] = _returns(model, seen, n_episodes, encoders)
         finally:
             venv.close()
-    return Robustness(returns)
+    return Robustness(returns, left_out)
 
 
-def _perturbed(env: str | Callable[[], gymnasium.Env], settings: Mapping[str, Any]):
+def _perturbed(
+    env: str | Callable[[], gymnasium.Env],
+    wrapper: Callable[[gymnasium.Env], gymnasium.Env],
+    settings: Mapping[str, Any],
+) -> gymnasium.Env:
     made = gymnasium.make(env) if isinstance(env, str) else env()
-    return Perturb(made, **settings)
+    return wrapper(Perturb(made, **settings))
+
+
+def _check_fits(model: BaseAlgorithm, env: gymnasium.Env) -> None:
+    env.close()
+    ours = model.observation_space, model.action_space
+    for mine, given in zip(ours, (env.observation_space, env.action_space), strict=True):
+        if type(mine) is not type(given) or mine.shape != given.shape:
+            raise EnvironmentMismatchError(
+                f"The model was trained with {mine}, and the environment has {given}. Make it with "
+                "the same arguments, and put the wrappers around it that were there in training."
+            )
+
+
+def _impossible(
+    make: Callable[[Mapping[str, Any]], gymnasium.Env],
+    perturbations: Mapping[str, Mapping[str, Any]],
+) -> dict[str, str]:
+    """:return: why the environment does not have these perturbations, before any episode is run"""
+    reasons = {}
+    for name, settings in perturbations.items():
+        try:
+            make(settings).close()
+        except EnvironmentMismatchError as error:
+            if name == "none":
+                raise
+            reasons[name] = str(error)
+    return reasons
 
 
 def _returns(

@@ -43,6 +43,7 @@ class Problem:
     where :math:`r` is the twin's planning reward. An episode that has terminated is worth
     :math:`-s\,r_0/(1-\gamma)` from there on: shifting every reward by the same :math:`r_0` then
     changes the objective by a constant only, and does not make dying pay. There is no auto-reset.
+    Without ``shift_ends`` an end is worth zero, which is more than any reward below :math:`r_0`.
 
     :param twin: what is simulated
     :param params: its parameters
@@ -54,6 +55,7 @@ class Problem:
     :param terminal_roots: observation to :math:`\rho`, shape ``(k,)``, with :math:`V \approx c -
         |\rho|^2`. What their slopes say of the curvature stands in for the Hessian of :math:`V`:
         never of the wrong sign, and as smooth as a gradient (Gauss-Newton).
+    :param shift_ends: whether an episode that has terminated is shifted with the rewards
     """
 
     twin: Twin
@@ -64,6 +66,7 @@ class Problem:
     terminal_value: TerminalValue | None = None
     terminal_curvature: bool = False
     terminal_roots: Callable[[Obs], Float[Array, " k"]] | None = None
+    shift_ends: bool = True
 
     @property
     def n_controls(self) -> int:
@@ -97,7 +100,7 @@ class Problem:
     @property
     def value_when_terminated(self) -> Scalar:
         """What an episode that has ended is worth, scaled and shifted."""
-        if self.discount == 1.0:
+        if self.discount == 1.0 or not self.shift_ends:
             return jnp.zeros(())
         return -jnp.asarray(self.reward_offset * self.reward_scale) / (1.0 - self.discount)
 

@@ -1,7 +1,6 @@
 """What a diagnosis says."""
 
 import dataclasses
-import math
 import os
 import textwrap
 from collections.abc import Mapping
@@ -11,7 +10,7 @@ from typing import Any, Literal
 
 from sb3_hds.core import Params, Twin
 from sb3_hds.sysid.pictures import Pictures
-from sb3_hds.sysid.results import Estimate
+from sb3_hds.sysid.results import Estimate, plain
 
 Verdict = Literal["named", "ambiguous", "none", "unknown", "not_identifiable"]
 
@@ -50,6 +49,12 @@ class Finding:
     family_p_value: float
     gain: float
     explanation: str
+
+    @property
+    def key(self) -> str:
+        """Name and place, as in ``rejected`` and ``detectable``."""
+        own = self.where["slot"] == "parameter"
+        return self.effect if own else f"{self.effect}.{self.where['name']}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,9 +140,33 @@ class Diagnosis:
         """All parameters of the extended twin."""
         return self.twin.params
 
+    @property
+    def sentence(self) -> str:
+        """The verdict in one sentence."""
+        if self.verdict == "ambiguous":
+            first, *others = self.findings
+            choice = " or ".join(map(_spoken, (first.key, *first.alternatives)))
+            also = f", and {' and '.join(_spoken(f.key) for f in others)}" if others else ""
+            return f"The simulation is wrong about {choice}{also}: the data cannot tell which."
+        if self.verdict != "named":
+            return SENTENCES[self.verdict]
+        new = [f for f in self.findings if self._is_new(f)]
+        said = {"lacks": new, "is wrong about": [f for f in self.findings if f not in new]}
+        parts = [
+            f"{verb} {' and '.join(_spoken(f.key) for f in found)}"
+            for verb, found in said.items()
+            if found
+        ]
+        return f"The simulation {' and '.join(parts)}."
+
+    def _is_new(self, finding: Finding) -> bool:
+        """Whether the believed twin has nothing of the kind."""
+        names = {e.name for e in finding.parameters.values()}
+        return names <= {*self.twin.values} - {*self.believed.values}
+
     def summary(self) -> str:
         """:return: all of it in 80 columns"""
-        lines = [f"{self.verdict}: {SENTENCES[self.verdict]}", "=" * _WIDTH]
+        lines = [*_wrapped(f"{self.verdict}: {self.sentence}"), "=" * _WIDTH]
         for finding in self.findings:
             lines += _of_finding(finding)
         if self.unexplained:
@@ -150,9 +179,9 @@ class Diagnosis:
                 for g in self.gain.values()
             ]
         if self.rejected:
-            lines.append("Not accepted, best first:")
+            lines.append(f"{'Not accepted, best first:':<37} {'gain':>6} {'p':>7}  why")
             lines += [
-                f"  {r.name:<40.40} gain {r.gain:7.1%}   p {r.p_value:.2g}  {r.why}"[:_WIDTH]
+                f"  {r.name:<35.35} {max(r.gain, -9.99):6.0%} {r.p_value:7.2g}  {r.why}"[:_WIDTH]
                 for r in self.rejected[:5]
             ]
         for caveat in self.caveats:
@@ -160,14 +189,18 @@ class Diagnosis:
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """:return: the same, as plain data for JSON"""
+        """
+        :return: the same, as plain data for JSON: the twins as their specifications, numbers that
+            are not finite as None; ``params`` are the numbers of the extended twin, and arrays that
+            were learned are left out
+        """
         found = {
             field.name: getattr(self, field.name)
             for field in dataclasses.fields(self)
             if field.name not in ("believed", "twin", "pictures")
         }
         twins = {"believed": self.believed.to_spec(), "twin": self.twin.to_spec()}
-        return _plain(found) | _plain(twins)
+        return plain(found | twins | {"params": self.twin.values})
 
     def to_html(
         self, path: str | os.PathLike[str], policy_gain: Mapping[str, Any] | None = None
@@ -190,7 +223,7 @@ class Diagnosis:
 
         :param folder: is made where it is missing; files of the same names are replaced
         :return: their paths
-        :raises ImportError: without matplotlib (extra ``report``)
+        :raises ImportError: without matplotlib and jinja2 (extra ``report``)
         """
         from sb3_hds.sysid.report import write_pictures
 
@@ -203,28 +236,25 @@ class Diagnosis:
 
 
 def _of_finding(finding: Finding) -> list[str]:
-    place = finding.where["name"]
-    lines = [f"{finding.effect} at {finding.where['slot']} {place}"]
+    own, place = finding.where["slot"] == "parameter", finding.where["name"]
+    lines = [finding.effect if own else f"{finding.effect} at {finding.where['slot']} {place}"]
     lines += _wrapped(finding.explanation, "  ")
     for name, e in finding.parameters.items():
-        lines.append(f"  {name} = {e.estimate:.4g} [{e.low:.4g}, {e.high:.4g}] {e.unit}")
+        unit = "" if e.unit == "1" else f" {e.unit}"
+        lines.append(f"  {name} = {e.estimate:.4g} [{e.low:.4g}, {e.high:.4g}]{unit}")
     lines.append(f"  held-out gain {finding.gain:.1%}, p = {finding.p_value:.2g}")
     if finding.alternatives:
         lines += _wrapped(f"cannot be told from: {', '.join(finding.alternatives)}", "  ")
     return lines
 
 
+def _spoken(key: str) -> str:
+    """A candidate, for people: ``"coulomb_friction.hinge"`` is Coulomb friction at hinge."""
+    name, _, place = key.partition(".")
+    for person in ("coulomb", "stribeck"):
+        name = name.replace(person, person.title())
+    return place if name == "parameter" else f"{name.replace('_', ' ')} at {place}"
+
+
 def _wrapped(text: str, indent: str = "") -> list[str]:
     return textwrap.wrap(text, _WIDTH, initial_indent=indent, subsequent_indent=indent + "  ")
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return _plain({f.name: getattr(value, f.name) for f in dataclasses.fields(value)})
-    if isinstance(value, Mapping):
-        return {str(key): _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

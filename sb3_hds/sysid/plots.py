@@ -1,13 +1,36 @@
 """Pictures of results; matplotlib is imported only here, and only when one is drawn."""
 
+import io
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from sb3_hds.sysid.diagnosis import Diagnosis
+    from sb3_hds.sysid.pictures import Pictures
     from sb3_hds.sysid.results import Fit
 
-_BEFORE, _AFTER, _NOISE = "#d1495b", "#27496d", "#9a978c"
+_MEASURED, _BEFORE, _AFTER, _ALIKE, _QUIET = "#3b3a36", "#d1495b", "#27496d", "#8fabc9", "#9a978c"
+# Widths on a desk or on paper, and on a telephone [in]: letters keep their size.
+_WIDE, _NARROW = 9.0, 4.4
+_DPI = 150
+# A candidate that makes predictions worse than this is drawn as if it did so by this much.
+_WORST = -0.05
+
+#: what each simulation of a measured gain in policy is called
+TRAINED_IN = {
+    "believed": "the twin as believed",
+    "extended": "the extended twin",
+    "true": "the true twin",
+}
+
+
+def as_png(figure: Any) -> bytes:
+    """:return: the picture, as a file would hold it"""
+    data = io.BytesIO()
+    figure.savefig(data, dpi=_DPI, format="png")
+    return data.getvalue()
 
 
 def plot_fit(fit: "Fit", path: Any) -> None:
@@ -20,6 +43,169 @@ def plot_fit(fit: "Fit", path: Any) -> None:
     _draw_estimates(left, fit)
     _draw_errors(right, fit)
     figure.savefig(path, dpi=150)
+
+
+def plot_rollouts(p: "Pictures", narrow: bool = False) -> Any:
+    """Each channel, and beside it what the simulations miss."""
+    figure, panels = _figure(len(p.channels), 2, 1.6, narrow)
+    seen = p.replay
+    for j, (name, unit) in enumerate(p.channels):
+        left, right = panels[j]
+        left.plot(seen.time, seen.measured[:, j], ".", color=_MEASURED, ms=3, label="measured")
+        for values, colour, label in (
+            (seen.before, _BEFORE, "before"),
+            (seen.after, _AFTER, "after"),
+        ):
+            left.plot(seen.time, values[:, j], color=colour, lw=1.2, label=label)
+            missed = values[:, j] - seen.measured[:, j]
+            right.plot(seen.time, missed, color=colour, lw=1.2, label=label)
+        for axes, centre in ((left, seen.after), (right, seen.after - seen.measured)):
+            ends = [centre[:, j] + side * seen.margin[:, j] for side in (-1.0, 1.0)]
+            axes.fill_between(seen.time, *ends, color=_AFTER, alpha=0.15, lw=0.0)
+        right.axhline(0.0, color=_MEASURED, lw=0.6)
+        left.set_ylabel(f"{name} [{unit}]", fontsize=8)
+        if j == 0 or narrow:
+            left.set_title("simulated and measured", fontsize=9)
+            right.set_title("simulated minus measured", fontsize=9)
+    if narrow:
+        for row, (name, unit) in zip(panels, p.channels, strict=True):
+            row[1].set_ylabel(f"{name} [{unit}]", fontsize=8)
+    figure.legend(
+        *panels[0, 0].get_legend_handles_labels(),
+        fontsize=8,
+        frameon=False,
+        ncols=3,
+        loc="outside upper center",
+    )
+    for axes in panels[-1]:
+        axes.set_xlabel("time [s]", fontsize=8)
+    return figure
+
+
+def plot_horizons(d: "Diagnosis", p: "Pictures", narrow: bool = False) -> Any:
+    """Error against the number of steps that are predicted."""
+    figure, panels = _figure(1, 1, 2.6, narrow)
+    axes = panels[0, 0]
+    for errors, colour, label in zip(p.errors, (_BEFORE, _AFTER), ("before", "after"), strict=True):
+        axes.plot(p.steps, errors, "o-", color=colour, ms=3, label=label)
+    for gain in d.gain.values():
+        ends = [gain.before * np.sqrt(max(1.0 - end, 0.0)) for end in (gain.low, gain.high)]
+        axes.plot([gain.steps] * 2, ends, color=_AFTER, lw=4.0, alpha=0.3)
+    axes.axhline(1.0, color=_QUIET, lw=1.0, ls="--", label="noise")
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("steps from the start of a window", fontsize=8)
+    axes.set_ylabel("error / noise", fontsize=8)
+    axes.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def plot_missing_force(p: "Pictures", narrow: bool = False) -> Any:
+    """The force that is missing against position, velocity, command and time, joint by joint."""
+    columns = 4 if p.actuators else 3
+    figure, panels = _figure(len(p.joints), columns, 2.2, narrow)
+    explained = p.missing.force - p.left.force
+    for j, (name, unit) in enumerate(p.joints):
+        joint_unit = "m" if unit == "N" else "rad"
+        against: list[tuple[str, np.ndarray]] = [
+            (f"position [{joint_unit}]", p.missing.position[:, j]),
+            (f"velocity [{joint_unit}/s]", p.missing.velocity[:, j]),
+            ("time [s]", p.missing.time),
+        ]
+        if p.actuators:
+            command = min(j, len(p.actuators) - 1)
+            label = f"command [{p.actuators[command][1]}]"
+            against.insert(2, (label, p.missing.command[:, command]))
+        low, high = np.quantile(p.missing.force[:, j], [0.01, 0.99])
+        margin = 0.2 * (high - low) + 1e-12
+        for k, (axes, (label, values)) in enumerate(zip(panels[j], against, strict=True)):
+            axes.plot(values, p.missing.force[:, j], ".", color=_QUIET, ms=3)
+            if np.any(explained[:, j]):
+                axes.plot(values, explained[:, j], ".", color=_AFTER, ms=3)
+            axes.axhline(0.0, color=_MEASURED, lw=0.6)
+            axes.set_ylim(low - margin, high + margin)
+            axes.set_xlabel(label, fontsize=8)
+            if k == 0 or narrow:
+                axes.set_ylabel(f"{name} [{unit}]", fontsize=8)
+    return figure
+
+
+def plot_evidence(d: "Diagnosis", narrow: bool = False) -> Any:
+    """A bar for every candidate, those that were named first."""
+    from matplotlib.patches import Patch
+
+    alike = {name for finding in d.findings for name in finding.alternatives}
+    bars = [(f.key, f.gain, _AFTER) for f in d.findings]
+    bars += [(r.name, r.gain, _ALIKE if r.name in alike else _QUIET) for r in d.rejected]
+    figure, panels = _figure(1, 1, 0.4 + 0.18 * len(bars), narrow)
+    axes, rows = panels[0, 0], np.arange(len(bars))
+    axes.barh(rows, [max(gain, _WORST) for _, gain, _ in bars], color=[c for *_, c in bars])
+    axes.axvline(0.05, color=_BEFORE, lw=1.0, ls="--")
+    axes.axvline(0.0, color=_MEASURED, lw=0.6)
+    for row, (_, gain, _) in enumerate(bars):
+        axes.annotate(
+            "far worse" if gain < -1.0 else f"{round(100.0 * gain):d} %",
+            (max(gain, 0.0), row),
+            (3, 0),
+            textcoords="offset points",
+            va="center",
+            size=7,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.4},
+        )
+    axes.set_yticks(rows, [name for name, *_ in bars], fontsize=7)
+    axes.tick_params(axis="y", length=0)
+    axes.set_ylim(len(bars) - 0.4, -0.6)
+    axes.set_xlim(_WORST - 0.01, 1.08)
+    axes.set_xlabel("gain on held-out recordings", fontsize=8)
+    kinds = {_AFTER: "named", _ALIKE: "cannot be told from it", _QUIET: "not accepted"}
+    drawn = [colour for colour in kinds if any(colour == c for *_, c in bars)]
+    if len(drawn) > 1:
+        handles = [Patch(color=colour, label=kinds[colour]) for colour in drawn]
+        figure.legend(
+            handles=handles, fontsize=7, frameon=False, ncols=3, loc="outside upper center"
+        )
+    return figure
+
+
+def plot_policy_gain(gain: Mapping[str, Any], narrow: bool = False) -> Any:
+    """
+    A dot for each run, a line at the interquartile mean, a bar over its interval.
+
+    :param gain: ``PolicyGain.to_dict()``
+    """
+    colours = {"believed": _BEFORE, "extended": _AFTER, "true": _QUIET}
+    names = list(gain["simulations"])
+    figure, panels = _figure(1, 1, 0.5 + 0.6 * len(names), narrow)
+    axes = panels[0, 0]
+    for row, name in enumerate(names):
+        found, means = gain["simulations"][name], np.mean(gain["returns"][name], 1)
+        spread = row + np.linspace(-0.15, 0.15, len(means) + 2)[1:-1]
+        axes.plot([found["low"], found["high"]], [row] * 2, color=colours[name], lw=8, alpha=0.3)
+        axes.plot([found["mean"]] * 2, [row - 0.25, row + 0.25], color=colours[name], lw=2)
+        axes.plot(means, spread, "o", color=colours[name], ms=4, alpha=0.6)
+    axes.set_yticks(range(len(names)), [TRAINED_IN[name] for name in names])
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.margins(x=0.1)
+    axes.set_xlabel("return on the real system", fontsize=8)
+    return figure
+
+
+def _figure(rows: int, columns: int, height: float, narrow: bool) -> tuple[Any, np.ndarray]:
+    """
+    :param height: of a row [in]
+    :param narrow: whether the panels of a row stand two in a row, or one
+    :return: figure, and its panels in ``rows`` and ``columns`` wherever they stand
+    """
+    from matplotlib.figure import Figure
+
+    beside = columns if not narrow else 2 if columns == 4 else 1
+    deep = rows * columns // beside
+    size = (_NARROW if narrow else _WIDE, 0.5 + height * deep)
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(deep, beside, squeeze=False).reshape(rows, columns)
+    for axes in panels.ravel():
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=8)
+    return figure, panels
 
 
 def _draw_estimates(axes: Any, fit: "Fit") -> None:
@@ -46,7 +232,7 @@ def _draw_errors(axes: Any, fit: "Fit") -> None:
     rows = np.arange(len(fit.channels))
     axes.barh(rows - 0.2, fit.error_before / fit.noise, 0.35, color=_BEFORE, label="before")
     axes.barh(rows + 0.2, fit.error_after / fit.noise, 0.35, color=_AFTER, label="after")
-    axes.axvline(1.0, color=_NOISE, linewidth=1.0, label="noise")
+    axes.axvline(1.0, color=_QUIET, linewidth=1.0, label="noise")
     axes.set_xscale("log")
     axes.set_yticks(rows, [name for name, _ in fit.channels])
     axes.invert_yaxis()

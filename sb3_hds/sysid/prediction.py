@@ -18,8 +18,8 @@ from sb3_hds.sysid.shooting import Shots, fit_start, n_free, simulate, with_slop
 _N_STEPS = 8
 # Better is what lowers the error by this share, at this level, judged by so many samples.
 _LEAST_GAIN, _LEVEL, _N_BOOTSTRAP = 0.05, 0.05, 1000
-# Recordings from which on whole ones are held out.
-_ENOUGH_RECORDINGS = 4
+# The first recording that may be held out as a whole, and how many of its windows at most.
+_FIRST_WHOLE, _LONG = 3, 32
 # What `has_grown` asks for.
 _GROWN, _GROWN_LEVEL = 1.5, 1e-4
 
@@ -128,24 +128,26 @@ def probability_before(fit: Fit, believed: Twin) -> float:
     return float(stats.chi2.sf(np.sum(np.square(away)), len(away)))
 
 
-def hold_out(origin: np.ndarray, share: float = 0.25) -> np.ndarray:
+def hold_out(number: np.ndarray, place: np.ndarray, share: float = 0.25) -> np.ndarray:
     """
     Which windows are kept from learning: whole recordings where there are at least four, otherwise
-    stretches of each.
+    stretches of each; of a recording that goes on for long, stretches from there on.
 
-    :param origin: recording of each window, -1 for padding, shape ``(n,)``
+    What was learned from is never held out later: not when more has come, for the first three
+    recordings are not held out as a whole; not when old windows are left out, since numbers and
+    places stay; and not when the share becomes smaller, as long as it is halved.
+
+    :param number: of each window's recording, counted from the first there ever was; -1 for
+        padding, shape ``(n,)``
+    :param place: of each window in its recording: 0, 1, ..., shape ``(n,)``
     :return: shape ``(n,)``
     """
     every = max(2, round(1.0 / share))
-    if holds_out_recordings(origin):
-        return np.isin(origin, np.unique(origin[origin >= 0])[every - 1 :: every])
-    position = np.arange(len(origin))
-    return (position % every == every - 1) & (origin >= 0)
-
-
-def holds_out_recordings(origin: np.ndarray) -> bool:
-    """:return: whether :func:`hold_out` keeps whole recordings from learning"""
-    return len(np.unique(origin[origin >= 0])) >= _ENOUGH_RECORDINGS
+    stretches = (number + place) % every == every - 1
+    if number.max() < _FIRST_WHOLE:
+        return stretches & (number >= 0)
+    whole = (number % every == every - 1) & (number >= _FIRST_WHOLE)
+    return np.where(place < _LONG, whole, stretches) & (number >= 0)
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)

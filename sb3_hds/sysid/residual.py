@@ -17,7 +17,7 @@ from sb3_hds.effects import NeuralForce, force_of
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.calibrate import check_fits, default_window, spread_of
 from sb3_hds.sysid.prediction import hold_out, is_better, start_states, window_errors
-from sb3_hds.sysid.shooting import Shots, shots_of, simulate
+from sb3_hds.sysid.shooting import Shots, places_of, shots_of, simulate
 
 # Share of a channel's spread that an error of one means, where its noise is not known.
 _UNIT_ERROR = 0.05
@@ -117,11 +117,13 @@ def fit_residual(
     check_fits(twin, data)
     spread = spread_of(data)
     scale = _UNIT_ERROR * spread if noise is None else np.maximum(noise, 1e-3 * spread)
-    shots, origin = shots_of(data, window or default_window(data), twin, n_windows, seed)
+    length = window or default_window(data)
+    shots, origin = shots_of(data, length, twin, n_windows, seed)
+    rank = np.where(origin < 0, -1, np.searchsorted(np.unique(data.origin), origin))
     return fit_force(
         twin,
         shots,
-        hold_out(origin),
+        hold_out(rank, places_of(data, length, n_windows, seed)[0]),
         scale,
         n_members=n_members,
         net_arch=net_arch,

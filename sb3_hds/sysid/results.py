@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -109,10 +110,10 @@ class Fit:
         """:return: plain data, ready for JSON; what is not finite is None"""
         return {
             "twin": self.twin.name,
-            "estimates": [_plain(dataclasses.asdict(e)) for e in self.estimates],
-            "covariance": _plain(self.covariance.tolist()),
+            "estimates": plain(self.estimates),
+            "covariance": plain(self.covariance),
             "channels": [
-                _plain({"name": name, "unit": unit, "before": b, "after": a, "noise": n})
+                plain({"name": name, "unit": unit, "before": b, "after": a, "noise": n})
                 for (name, unit), b, a, n in zip(
                     self.channels,
                     self.error_before.tolist(),
@@ -161,11 +162,16 @@ class Fit:
         plot_fit(self, path)
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_plain(entry) for entry in value]
+def plain(value: Any) -> Any:
+    """:return: the same for JSON: dictionaries, lists, numbers; what is not finite is None"""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return plain({f.name: getattr(value, f.name) for f in dataclasses.fields(value)})
+    if isinstance(value, Mapping):
+        return {str(key): plain(inner) for key, inner in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

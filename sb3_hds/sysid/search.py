@@ -1,7 +1,7 @@
 """Which candidate explains what is left: proposed on some windows, confirmed on others."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple, TypeAlias, TypeVar
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -9,6 +9,7 @@ from rich.progress import track
 
 from sb3_hds.sysid.comparison import Comparison, by_scores, confirm, effective_size
 from sb3_hds.sysid.evidence import Evidence, Point, in_threads
+from sb3_hds.sysid.guesses import Here, Places, guesses
 from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
 from sb3_hds.sysid.imitation import imitators
 from sb3_hds.sysid.shooting import Shots
@@ -22,22 +23,11 @@ _LEVEL_OF_SET = 0.05
 _MOST_LOOKS = 3
 # Errors that differ by a smaller share are the same, however surely they differ.
 _SAME = 0.01
-# Where fits begin for which the slope at the null is no guide, in units of each parameter's scale.
-_AWAY = 3.0
-# Where else it may be better, in the same units.
-_DISTANCES = (0.1, 0.3, 1.0, 3.0)
-# A Newton step promises nothing beyond, in the same units.
-_FARTHEST = 10.0
-# Curvature, per measurement, below which there is no slope; directions below this share of the
-# largest curvature do not move.
-_FLAT, _RANK = 1e-15, 1e-9
 # Mean square error of a window that cannot be simulated, in units of the noise.
 _NOT_FINITE = 1e8
 # Steps of fits to the end, and of start states alone: to the end, and for a rough comparison.
 _ALL_STEPS, _KEPT_STEPS, _ROUGH_STEPS = 25, 6, 1
 
-#: values of parameters by full name, of candidates by key
-_Places: TypeAlias = dict[str, tuple[Mapping[str, float], ...]]
 _Given = TypeVar("_Given")
 _Told = TypeVar("_Told")
 
@@ -94,19 +84,6 @@ class Tried(NamedTuple):
     criterion: float
 
 
-class _Guess(NamedTuple):
-    """
-    :param gain: by which the cost would fall
-    :param theta: where to begin a fit, shape ``(p,)``
-    :param blind: what the slope says where nothing is wrong is no guide: it is none, or it leads
-        nowhere although things are better farther away
-    """
-
-    gain: float
-    theta: Float[np.ndarray, " p"]
-    blind: bool
-
-
 class Effort(NamedTuple):
     """
     :param guessed: candidates that one Newton step must favour to be fitted at all
@@ -138,7 +115,7 @@ class Search:
         self._reached: dict[str, np.ndarray] = {}
         self._far: set[str] = set()
         # Of searches with several starts, the best one, by what is believed.
-        self._known: dict[tuple[str, ...], _Places] = {}
+        self._known: dict[tuple[str, ...], Places] = {}
 
     @property
     def hypotheses(self) -> Hypotheses:
@@ -189,13 +166,13 @@ class Search:
             evidence = evidence.on(type(evidence.shots)(*(x[sample] for x in evidence.shots)))
 
         known = self._known.setdefault(tuple(accepted), {})
-        guesses = self._guessed(left, base.free, first, evidence, known)
-        for candidate, guess in zip(left, guesses, strict=True):
+        guessed = guesses(Here(evidence, first, base.free, self.effort.steps), left, known)
+        for candidate, guess in zip(left, guessed, strict=True):
             self._reached.setdefault(candidate.key, guess.theta)
             if guess.blind:
                 self._far.add(candidate.key)
-        blind = [c for c, guess in zip(left, guesses, strict=True) if guess.blind]
-        seen = [(guess.gain, c) for c, guess in zip(left, guesses, strict=True) if not guess.blind]
+        blind = [c for c, guess in zip(left, guessed, strict=True) if guess.blind]
+        seen = [(guess.gain, c) for c, guess in zip(left, guessed, strict=True) if not guess.blind]
         seen = sorted(seen, key=lambda pair: -pair[0])[: self.effort.guessed]
         likely = [*blind, *(candidate for _, candidate in seen)]
 
@@ -313,92 +290,6 @@ class Search:
         by_score = by_scores(new.raw / self.noise, old.raw / self.noise, self.confirm.unit)
         return verdict._replace(p_value=min(verdict.p_value, by_score))
 
-    def _guessed(
-        self,
-        candidates: Sequence[Candidate],
-        free: Sequence[int],
-        base: Point,
-        evidence: Evidence,
-        known: _Places,
-    ) -> list[_Guess]:
-        """
-        What one Newton step promises, and where it leads; elsewhere if that is no guide.
-
-        :param known: starts that were best before; those found now are added
-        """
-        h, slopes = self.hypotheses, evidence.slopes(base)
-        curvature, score = slopes.curvature.sum(0), slopes.scores.sum(0)
-        flat = np.diag(curvature) < _FLAT * base.raw.size
-        room = (
-            np.maximum((h.lower - base.theta) / h.scale, -_FARTHEST),
-            np.minimum((h.upper - base.theta) / h.scale, _FARTHEST),
-        )
-        found = []
-        for candidate in candidates:
-            own = list(h.indices(candidate))
-            step, gain = _newton(curvature, score, [*free, *own], room)
-            theta, blind = base.theta + h.scale * step, bool(flat[own].any())
-            if candidate.key in h.starts:
-                starts = known.get(candidate.key, h.starts[candidate.key])
-                tried = [self._from(start, candidate, free, base, evidence) for start in starts]
-                best = int(np.argmax([guess.gain for guess in tried]))
-                known[candidate.key] = (starts[best],)
-                found.append(tried[best])
-                continue
-            if blind:
-                theta = self._away(candidate, base, _AWAY)
-            elif h.remembers(candidate):
-                place = self._farther(candidate, free, base, evidence, gain)
-                theta, blind = (theta, False) if place is None else (place, True)
-            found.append(_Guess(gain, theta, blind))
-        return found
-
-    def _farther(
-        self,
-        candidate: Candidate,
-        free: Sequence[int],
-        base: Point,
-        evidence: Evidence,
-        gain: float,
-    ) -> Float[np.ndarray, " p"] | None:
-        """
-        The first bit of a gap says little about a whole one.
-
-        :param gain: that a Newton step promises
-        :return: where it is better than that; None if nowhere
-        """
-        places = [self._away(candidate, base, distance) for distance in _DISTANCES]
-        there = [evidence.fit(x, free, base.offsets, self.effort.steps) for x in places]
-        costs = [point.cost for point in there]
-        return places[int(np.argmin(costs))] if min(costs) < base.cost - gain else None
-
-    def _from(
-        self,
-        start: Mapping[str, float],
-        candidate: Candidate,
-        free: Sequence[int],
-        base: Point,
-        evidence: Evidence,
-    ) -> _Guess:
-        """What one Newton step of what has a slope there promises."""
-        h, theta = self.hypotheses, _set(base.theta, self.hypotheses.names, start)
-        index = [*free, *(i for i in h.indices(candidate) if h.names[i] not in start)]
-        slopes = evidence.slopes(base._replace(theta=theta), index)
-        room = tuple(
-            sign * np.clip(sign * (bound - theta)[index] / h.scale[index], 0.0, _FARTHEST)
-            for sign, bound in ((-1.0, h.lower), (1.0, h.upper))
-        )
-        every = list(range(len(index)))
-        step, gain = _newton(slopes.curvature.sum(0), slopes.scores.sum(0), every, room)
-        theta[index] += h.scale[index] * step
-        return _Guess(gain, theta, False)
-
-    def _away(self, candidate: Candidate, base: Point, distance: float) -> np.ndarray:
-        h, own = self.hypotheses, list(self.hypotheses.indices(candidate))
-        theta = base.theta.copy()
-        theta[own] = np.clip(h.null[own] + distance * h.scale[own], h.lower[own], h.upper[own])
-        return theta
-
     def _continued(self, candidate: Candidate, base: Base) -> Point:
         own = list(self.hypotheses.indices(candidate))
         reached = self._reached[candidate.key]
@@ -430,31 +321,6 @@ class Search:
         done = in_threads(work, given)
         shown = track(done, what, total=len(given), transient=True, disable=not self.progress)
         return list(shown)
-
-
-def _newton(
-    curvature: np.ndarray, score: np.ndarray, moving: list[int], room: tuple[np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, float]:
-    """
-    :param moving: indices; what would leave its room ends at its border
-    :return: the step of all parameters, and by how much the cost would fall
-    """
-    step = np.zeros(len(score))
-    while moving:
-        inner = np.linalg.pinv(curvature[np.ix_(moving, moving)], rcond=_RANK, hermitian=True)
-        step[moving] -= inner @ (score + curvature @ step)[moving]
-        wanted, allowed = step[moving], np.clip(step[moving], room[0][moving], room[1][moving])
-        step[moving] = allowed
-        if (inside := wanted == allowed).all():
-            break
-        moving = [i for i, kept in zip(moving, inside, strict=True) if kept]
-    return step, -float(score @ step + 0.5 * step @ curvature @ step)
-
-
-def _set(theta: np.ndarray, names: Sequence[str], values: Mapping[str, float]) -> np.ndarray:
-    changed = theta.copy()
-    changed[[names.index(name) for name in values]] = list(values.values())
-    return changed
 
 
 def passes(verdict: Comparison, level: float = LEVEL) -> bool:

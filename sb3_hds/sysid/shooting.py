@@ -72,6 +72,43 @@ def shots_of(
         from; padding has -1
     :raises TrajectoryError: if no recording is long enough
     """
+    cuts = _windows_in(data, length)
+    n = len(cuts) if n_rows is None else n_rows
+    lead = _lead_of(twin, data.dt)
+    cuts = [cuts[i] for i in _chosen(len(cuts), n, seed)]
+    rows = [_cut(data, i, k, length, lead) for i, k in cuts]
+    padding = [rows[0]._replace(weight=np.zeros(()))] * (n - len(rows))
+    shots = Shots(*(np.stack(leaves) for leaves in zip(*rows, *padding, strict=True)))
+    origin = np.array([data.origin[i] for i, _ in cuts] + [-1] * len(padding))
+    return shots, origin
+
+
+def places_of(
+    data: Trajectories, length: int, n_rows: int | None = None, seed: int | None = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    :return: of each window of :func:`shots_of`, how many windows of its recording come before it,
+        and how many steps there are from its beginning to the end of the data; padding has -1
+    """
+    cuts = _windows_in(data, length)
+    before = np.cumsum(data.lengths) - data.lengths
+    begins = np.array([before[i] + k for i, k in cuts])
+    origin = data.origin[[i for i, _ in cuts]]
+    place = np.zeros(len(cuts), int)
+    for number in np.unique(origin):
+        place[origin == number] = np.arange(np.sum(origin == number))
+    n = len(cuts) if n_rows is None else n_rows
+    chosen = _chosen(len(cuts), n, seed)
+    filled = np.full((2, n), -1)
+    filled[:, : len(chosen)] = place[chosen], data.n_steps - begins[chosen]
+    return filled[0], filled[1]
+
+
+def _windows_in(data: Trajectories, length: int) -> list[tuple[int, int]]:
+    """
+    :return: trajectory and first step of all windows that share no measurement
+    :raises TrajectoryError: if no recording is long enough
+    """
     cuts = [
         (i, k) for i, n in enumerate(data.lengths) for k in range(0, n - length + 1, length + 1)
     ]
@@ -80,18 +117,16 @@ def shots_of(
             f"No recording has {length} steps; the longest has {data.lengths.max()}. "
             "Ask for shorter windows, or record for longer."
         )
-    n = len(cuts) if n_rows is None else n_rows
-    if len(cuts) > n:
-        chosen = np.arange(len(cuts))[-n:]
-        if seed is not None:
-            chosen = np.random.default_rng(seed).choice(len(cuts), n, replace=False)
-        cuts = [cuts[i] for i in np.sort(chosen)]
-    lead = _lead_of(twin, data.dt)
-    rows = [_cut(data, i, k, length, lead) for i, k in cuts]
-    padding = [rows[0]._replace(weight=np.zeros(()))] * (n - len(rows))
-    shots = Shots(*(np.stack(leaves) for leaves in zip(*rows, *padding, strict=True)))
-    origin = np.array([data.origin[i] for i, _ in cuts] + [-1] * len(padding))
-    return shots, origin
+    return cuts
+
+
+def _chosen(n_windows: int, n_rows: int, seed: int | None) -> np.ndarray:
+    """Which of the windows there is room for, in their order."""
+    if n_windows <= n_rows:
+        return np.arange(n_windows)
+    if seed is None:
+        return np.arange(n_windows)[-n_rows:]
+    return np.sort(np.random.default_rng(seed).choice(n_windows, n_rows, replace=False))
 
 
 def simulate(twin: Twin, params: Params, shot: Shots, offset: Offset) -> Float[Array, "rows obs"]:

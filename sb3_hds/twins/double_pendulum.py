@@ -1,6 +1,7 @@
 """Two links in a row, one motor or two."""
 
 import math
+from typing import Any
 
 import jax.numpy as jnp
 
@@ -17,7 +18,7 @@ from sb3_hds.core import (
     Velocity,
 )
 from sb3_hds.errors import ParameterError
-from sb3_hds.twins.rig import Rig
+from sb3_hds.twins.rig import TILT, Rig, check_length
 
 _SHOULDER, _ELBOW = (Actuator(name, "N m", -math.inf, math.inf) for name in ("motor1", "motor2"))
 _DRIVEN = {"both": (_SHOULDER, _ELBOW), "first": (_SHOULDER,), "second": (_ELBOW,)}
@@ -36,17 +37,21 @@ class DoublePendulum(Rig):
 
     with moments of inertia :math:`I_i` about the joints, distances :math:`r_i` from joints to
     centres of mass, and rotors :math:`I_r` behind gears of ratio :math:`n`. Joints have viscous
-    friction; dry friction is an effect.
+    friction; dry friction is an effect. A payload :math:`m_p` at a distance :math:`l` along the
+    second link adds to its mass, to :math:`m_2 r_2` by :math:`m_p l` and to :math:`I_2` by
+    :math:`m_p l^2`; gravity may be tilted in the plane of the links.
 
     Source: Wiebe et al., *Open source dual-purpose acrobot and pendubot platform*, IEEE Robotics
     and Automation Magazine, 2023, equations of motion.
 
     :param driven: option; ``"both"``, ``"first"`` or ``"second"``
+    :param tip: option; how far from the second joint a payload hangs [m]
     """
 
     name = "DoublePendulum"
-    options = {"driven": "both"}
+    options = {"driven": "both", "tip": 0.3}
     driven: str
+    tip: float
     joints = (Joint("joint1", "rad"), Joint("joint2", "rad"))
     actuators = (_SHOULDER, _ELBOW)
     parameters = {
@@ -62,6 +67,8 @@ class DoublePendulum(Rig):
         "gear_ratio": Parameter(null=6.0, scale=0.5, unit="1", lower=0.0),
         "damping1": Parameter(null=0.0, scale=0.005, unit="N m s/rad", lower=0.0),
         "damping2": Parameter(null=0.0, scale=0.005, unit="N m s/rad", lower=0.0),
+        "tilt": TILT,
+        "tip_payload": Parameter(null=0.0, scale=0.05, unit="kg", lower=0.0),
     }
     native_effects = {
         ("viscous_friction", 0): {"b": "damping1"},
@@ -74,6 +81,7 @@ class DoublePendulum(Rig):
             raise ParameterError(
                 f"driven must be one of {', '.join(map(repr, _DRIVEN))}, got {self.driven!r}."
             )
+        check_length(self.name, "tip", self.tip)
         self.actuators = _DRIVEN[self.driven]
 
     def actuate(self, state: State, action: Action, params: Params) -> Force:
@@ -84,19 +92,22 @@ class DoublePendulum(Rig):
         return jnp.stack(pair)
 
     def mass_matrix(self, q: Position, params: Params) -> MassMatrix:
-        both = params["mass2"] * params["length1"] * params["com2"] * jnp.cos(q[1])
+        mass, moment = self._second_link(params)
+        both = moment * params["length1"] * jnp.cos(q[1])
         rotor, ratio = params["rotor_inertia"], params["gear_ratio"]
-        second = params["inertia2"] + 0.0 * both
-        first = params["inertia1"] + second + params["mass2"] * params["length1"] ** 2 + 2.0 * both
+        second = params["inertia2"] + params["tip_payload"] * self.tip**2 + 0.0 * both
+        first = params["inertia1"] + second + mass * params["length1"] ** 2 + 2.0 * both
         across = second + both - ratio * rotor
         rows = (first + (ratio**2 + 1.0) * rotor, across, across, second + ratio**2 * rotor)
         return jnp.stack(rows).reshape(2, 2)
 
     def bias(self, q: Position, v: Velocity, params: Params) -> Force:
-        bend = params["mass2"] * params["length1"] * params["com2"] * jnp.sin(q[1])
-        g, inner = params["gravity"], jnp.sin(q[0])
-        upper = params["mass1"] * params["com1"] + params["mass2"] * params["length1"]
-        outer = g * params["mass2"] * params["com2"] * jnp.sin(q[0] + q[1])
+        mass, moment = self._second_link(params)
+        bend = moment * params["length1"] * jnp.sin(q[1])
+        g, angle = params["gravity"], q[0] + params["tilt"]
+        inner = jnp.sin(angle)
+        upper = params["mass1"] * params["com1"] + mass * params["length1"]
+        outer = g * moment * jnp.sin(angle + q[1])
         return jnp.stack(
             [
                 -bend * (2.0 * v[0] + v[1]) * v[1]
@@ -106,3 +117,9 @@ class DoublePendulum(Rig):
                 bend * v[0] ** 2 + outer + params["damping2"] * v[1],
             ]
         )
+
+    def _second_link(self, params: Params) -> tuple[Any, Any]:
+        """Mass [kg] and first moment about the second joint [kg m], payload included."""
+        payload = params["tip_payload"]
+        moment = params["mass2"] * params["com2"] + payload * self.tip
+        return params["mass2"] + payload, moment

@@ -17,7 +17,7 @@ from sb3_hds.core import (
     Velocity,
 )
 from sb3_hds.errors import ParameterError
-from sb3_hds.twins.rig import Rig
+from sb3_hds.twins.rig import TILT, Rig, check_length
 
 _ZEROS = ("down", "up")
 _MOTOR = Actuator("motor", "N m", -math.inf, math.inf)
@@ -27,21 +27,26 @@ class FreePendulum(Rig):
     r"""
     A compound pendulum, by default without a motor.
 
-    .. math:: (I + m a^2)\,\dot\omega = -m g a \sin(\theta + \theta_0) - b\,\omega + u
+    .. math::
+        (I + m a^2 + m_p l^2)\,\dot\omega
+        = -(m a + m_p l)\,g \sin(\theta + \theta_0 + \gamma) - b\,\omega + u
 
-    with the distance :math:`a` from the pivot to the centre of mass and the moment of inertia
-    :math:`I` about that. :math:`\theta_0` is 0 where the angle counts from hanging, and
-    :math:`\pi` where it counts from upright. Only :math:`m g a / (I + m a^2)` and
-    :math:`b / (I + m a^2)` show in the motion.
+    with the distance :math:`a` from the pivot to the centre of mass, the moment of inertia
+    :math:`I` about that, and a payload :math:`m_p` at a distance :math:`l` from the pivot.
+    :math:`\theta_0` is 0 where the angle counts from hanging, and :math:`\pi` where it counts from
+    upright; by :math:`\gamma`, gravity is tilted, as on a table that is not level. Without a motor,
+    only their quotients show in the motion.
 
     :param zero: option; ``"down"`` or ``"up"``: where the angle is zero
     :param driven: option; whether a motor at the pivot takes a torque
+    :param tip: option; how far from the pivot a payload hangs [m]
     """
 
     name = "FreePendulum"
-    options = {"zero": "down", "driven": False}
+    options = {"zero": "down", "driven": False, "tip": 0.3}
     zero: str
     driven: bool
+    tip: float
     joints = (Joint("hinge", "rad"),)
     actuators = ()
     parameters = {
@@ -50,6 +55,8 @@ class FreePendulum(Rig):
         "com": Parameter(null=0.15, scale=0.02, unit="m", lower=1e-6),
         "inertia": Parameter(null=1e-4, scale=1e-4, unit="kg m2", lower=0.0),
         "damping": Parameter(null=0.0, scale=1e-4, unit="N m s/rad", lower=0.0),
+        "tilt": TILT,
+        "tip_payload": Parameter(null=0.0, scale=0.01, unit="kg", lower=0.0),
     }
     native_effects = {("viscous_friction", 0): {"b": "damping"}}
 
@@ -57,15 +64,19 @@ class FreePendulum(Rig):
         super().__init__(**settings)  # type: ignore[arg-type]
         if self.zero not in _ZEROS:
             raise ParameterError(f"zero must be 'down' or 'up', got {self.zero!r}.")
+        check_length(self.name, "tip", self.tip)
         self.actuators = (_MOTOR,) if self.driven else ()
 
     def actuate(self, state: State, action: Action, params: Params) -> Force:
         return action if self.driven else jnp.zeros_like(state.q)
 
     def mass_matrix(self, q: Position, params: Params) -> MassMatrix:
-        return (params["inertia"] + params["mass"] * params["com"] ** 2 + 0.0 * q).reshape(1, 1)
+        payload = params["tip_payload"] * self.tip**2
+        inertia = params["inertia"] + params["mass"] * params["com"] ** 2 + payload
+        return (inertia + 0.0 * q).reshape(1, 1)
 
     def bias(self, q: Position, v: Velocity, params: Params) -> Force:
         side = 1.0 if self.zero == "down" else -1.0
-        pull = side * params["mass"] * params["gravity"] * params["com"] * jnp.sin(q)
+        lever = params["mass"] * params["com"] + params["tip_payload"] * self.tip
+        pull = side * params["gravity"] * lever * jnp.sin(q + params["tilt"])
         return pull + jnp.asarray(params["damping"], v.dtype) * v

@@ -1,13 +1,17 @@
 """Machines on a bench: measured joint by joint, without a task."""
 
+import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from sb3_hds.core import AnalyticTwin, Channel, Obs, Params, State, rk4
+from sb3_hds.core import AnalyticTwin, Channel, Obs, Parameter, Params, State, rk4
 from sb3_hds.errors import ParameterError
+
+#: by how much gravity is turned in the plane of a pendulum, the way the angle counts
+TILT = Parameter(null=0.0, scale=0.02, unit="rad", lower=-0.5 * math.pi, upper=0.5 * math.pi)
 
 
 class Rig(AnalyticTwin):
@@ -64,3 +68,9 @@ class Rig(AnalyticTwin):
 
     def structure(self) -> tuple[Any, ...]:
         return (*super().structure(), self.observed)
+
+
+def check_length(twin: str, option: str, value: Any) -> None:
+    """:raises ParameterError: for an option that is no length"""
+    if not (isinstance(value, int | float) and 0.0 < value < math.inf):
+        raise ParameterError(f"{option} of {twin} must be a length above 0 m, got {value!r}.")

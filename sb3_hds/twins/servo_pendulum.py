@@ -17,7 +17,7 @@ from sb3_hds.core import (
     Velocity,
 )
 from sb3_hds.errors import ParameterError
-from sb3_hds.twins.rig import Rig
+from sb3_hds.twins.rig import TILT, Rig
 
 _GOAL = Actuator("goal", "rad", -math.pi, math.pi)
 _ENABLE = Actuator("enable", "1", 0.0, 1.0)
@@ -35,10 +35,12 @@ class ServoPendulum(Rig):
 
     .. math::
         d &= \mathrm{clip}\big(k_p\,e\,(u - q),\,-1,\,1\big) \\
-        (m l^2 + I)\,\dot v &= \frac{k_t}{R}\,V d - \frac{k_t^2}{R}\,v - b\,v - m g l \sin q
+        (m l^2 + I)\,\dot v &= \frac{k_t}{R}\,V d - \frac{k_t^2}{R}\,v - b\,v
+        - m g l \sin(q + \gamma)
 
-    The angle is zero where the arm hangs; the command :math:`u` is the goal position. With the
-    motor off (``enable`` at 0) the winding is open: neither torque nor its damping.
+    The angle is zero where the arm hangs if the servo stands upright; by :math:`\gamma` it is
+    tilted. The command :math:`u` is the goal position. With the motor off (``enable`` at 0) the
+    winding is open: neither torque nor its damping. A payload at the tip is a larger mass.
 
     Source: Duclusaud et al., arXiv 2410.08650, 2024, section III; a DC motor without inductance.
 
@@ -63,6 +65,7 @@ class ServoPendulum(Rig):
         "torque_constant": Parameter(null=0.4, scale=0.05, unit="N m/A", lower=1e-6),
         "resistance": Parameter(null=3.0, scale=0.5, unit="ohm", lower=1e-6),
         "damping": Parameter(null=0.0, scale=0.02, unit="N m s/rad", lower=0.0),
+        "tilt": TILT,
     }
     native_effects = {("viscous_friction", 0): {"b": "damping"}}
 
@@ -89,5 +92,6 @@ class ServoPendulum(Rig):
         return (inertia + 0.0 * q).reshape(1, 1)
 
     def bias(self, q: Position, v: Velocity, params: Params) -> Force:
-        pull = params["mass"] * params["gravity"] * params["length"] * jnp.sin(q)
+        torque = params["mass"] * params["gravity"] * params["length"]
+        pull = torque * jnp.sin(q + params["tilt"])
         return pull + jnp.asarray(params["damping"], v.dtype) * v

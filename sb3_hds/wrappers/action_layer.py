@@ -165,7 +165,7 @@ class TransformLayer(ActionLayer):
         arguments: Mapping[str, Any],
     ) -> None:
         super().__init__(env, store, arguments)
-        self.twin_transform = transform
+        self._transform = transform
         self._below = signals_of(env)
         remembered = transform.remembers(self._below)
         self._memory = transform.start(np.zeros(len(self._below.channels)), self._below)
@@ -175,19 +175,24 @@ class TransformLayer(ActionLayer):
         self._charged = 0.0
 
     @property
+    def twin_transform(self) -> StatefulTransform | None:
+        """What a twin can be seen through; None where it would not be right."""
+        return self._transform
+
+    @property
     def twin_transforms(self) -> list[tuple[str, StatefulTransform]]:
         """The layers from here to the environment that a twin can be seen through, by class."""
         layers, env = [], self
         while isinstance(env, gymnasium.Wrapper):
-            if isinstance(env, TransformLayer):
+            if isinstance(env, TransformLayer) and env.twin_transform is not None:
                 layers.append((type(env).__name__, env.twin_transform))
             env = env.env
         return layers
 
     def decide(self, action: np.ndarray) -> np.ndarray:
         given = action, self._obs, self._memory, self._below
-        self._charged = float(self.twin_transform.cost(*given))
-        command, self._memory = self.twin_transform.act(*given)
+        self._charged = float(self._transform.cost(*given))
+        command, self._memory = self._transform.act(*given)
         return command
 
     def charged(self) -> float:
@@ -195,8 +200,8 @@ class TransformLayer(ActionLayer):
 
     def begin(self, obs: Any) -> None:
         super().begin(obs)
-        if not self.twin_transform.persists:
-            self._memory = self.twin_transform.start(self._obs, self._below)
+        if not self._transform.persists:
+            self._memory = self._transform.start(self._obs, self._below)
 
     def seen(self, obs: Any) -> Any:
         if not self._appends:

@@ -1,5 +1,6 @@
 """Does a time-out reach the learner as what it is?"""
 
+import math
 from collections import Counter
 from typing import Any
 
@@ -16,8 +17,10 @@ from sb3_hds.wrappers.step_limit import step_limit_of
 
 # Steps that are made where no limit is known.
 _USUAL = 2_000
-# Ends after equally many steps that are no coincidence, if they are half of all ends.
+# Ends after equally many steps that are no coincidence, if they are half of all; or so many times
+# those after any number of steps in the last fifth before, and those after any other number.
 _FEWEST = 3
+_THAN_BEFORE, _THAN_ANY = 3.0, 1.5
 
 
 class TruncationReport(Report):
@@ -82,7 +85,7 @@ def _of_vec_env(env: VecEnv, n_steps: int | None, seed: int) -> tuple[list, list
     limit = _limit_of_copies(env)
     seen = ends_of_vec_env(env, n_steps or env.num_envs * 4 * (limit or _USUAL // 4), seed)
     problems = _missing_keys(seen) + _lost_observations(env, seen)
-    if all("TimeLimit.truncated" in end.told for end in seen.ends):
+    if _tells_time_outs(seen):
         problems += _looks_like_a_limit(seen, limit)
     problems += _nothing_ended(seen)
     return problems, [] if problems else _unseen(seen, limit), seen
@@ -117,10 +120,10 @@ def _only_in_info(seen: Seen) -> list[str]:
 
 def _looks_like_a_limit(seen: Seen, limit: int | None) -> list[str]:
     """Ends that are terminations and come after the same number of steps."""
-    lengths = Counter(end.length for end in seen.ends)
-    longest = max(lengths, default=0)
+    longest = max((end.length for end in seen.ends), default=0)
+    lengths = Counter(end.length for end in seen.ends if end.terminated)
     n, at_end = lengths[longest], [end for end in seen.ends if end.length == longest]
-    often = n >= _FEWEST and 2 * n >= len(seen.ends)
+    often = n >= _FEWEST and (2 * n >= lengths.total() or _stands_out(lengths, longest))
     # An episode of one step has no time to run out.
     if longest < 2 or not (often or (longest == limit and n > 1)) or seen.clock:
         return []
@@ -135,10 +138,23 @@ def _looks_like_a_limit(seen: Seen, limit: int | None) -> list[str]:
     ]
 
 
+def _stands_out(lengths: Counter, longest: int) -> bool:
+    """Whether far more episodes ended at the longest length than failures alone would have it."""
+    n, earlier = lengths[longest], {k: m for k, m in lengths.items() if k < longest}
+    before = max((m for k, m in earlier.items() if k >= 0.8 * longest), default=0)
+    return n >= max(_THAN_BEFORE * before, _THAN_ANY * max(earlier.values(), default=0))
+
+
+def _tells_time_outs(seen: Seen) -> bool:
+    """Whether each end, or at least each time-out, is told; SB3 reads nothing as False."""
+    told = [end.told.get("TimeLimit.truncated") for end in seen.ends]
+    return any(told) or None not in told
+
+
 def _missing_keys(seen: Seen) -> list[str]:
     problems = []
     n = sum("TimeLimit.truncated" not in end.told for end in seen.ends)
-    if n:
+    if n and not _tells_time_outs(seen):
         problems.append(
             f"In {n} of {counted(len(seen.ends), 'end')}, infos[i] had no 'TimeLimit.truncated'. "
             "SB3 takes such an end for a termination, time-outs included. The VecEnv must set it "
@@ -190,10 +206,13 @@ def _nothing_ended(seen: Seen) -> list[str]:
 def _unseen(seen: Seen, limit: int | None) -> list[str]:
     if not all(end.terminated for end in seen.ends):
         return []
-    before = f" before the limit of {limit} steps" if limit else ""
+    late = sum(end.length >= (limit or math.inf) for end in seen.ends)
+    when = f", {late} of them at the limit of {limit} steps"
+    if not late:
+        when = f" before the limit of {limit} steps" if limit else ""
     return [
-        f"No time-out was seen: all {counted(len(seen.ends), 'episode')} terminated{before}. How "
-        "one arrives has not been checked."
+        f"No time-out was seen: all {counted(len(seen.ends), 'episode')} terminated{when}. How one "
+        "arrives has not been checked."
     ]
 
 

@@ -6,8 +6,10 @@ from typing import Any
 
 import gymnasium
 
+from sb3_hds.wrappers.by_name import function_of
 
-class ManualReset(gymnasium.Wrapper):
+
+class ManualReset(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     """
     Ends an episode when asked to: with a key, a foot switch, or from another thread.
 
@@ -16,12 +18,17 @@ class ManualReset(gymnasium.Wrapper):
     left alone.
 
     :param env: of any kind
-    :param wanted: asked after every step whether to end; default: only :meth:`request` ends
+    :param wanted: asked after every step whether to end, or its name ``"package.module.function"``;
+        default: only :meth:`request` ends. In ``env.spec``, a name is remembered and a function is
+        not: it may be one that no other process has.
+    :raises ParameterError: if there is no function of that name
     """
 
-    def __init__(self, env: gymnasium.Env, wanted: Callable[[], bool] | None = None) -> None:
-        super().__init__(env)
-        self._wanted = wanted
+    def __init__(self, env: gymnasium.Env, wanted: Callable[[], bool] | str | None = None) -> None:
+        name = wanted if isinstance(wanted, str) else None
+        gymnasium.utils.RecordConstructorArgs.__init__(self, wanted=name)
+        gymnasium.Wrapper.__init__(self, env)
+        self._wanted = function_of(wanted) if isinstance(wanted, str) else wanted
         self._requested = threading.Event()
 
     def request(self) -> None:

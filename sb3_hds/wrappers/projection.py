@@ -1,6 +1,5 @@
 """The nearest command that linear constraints allow."""
 
-import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
@@ -9,6 +8,7 @@ import daqp
 import numpy as np
 
 from sb3_hds.errors import ParameterError
+from sb3_hds.wrappers.by_name import function_of
 
 #: ``(G, h)`` with ``G u <= h``; or a function of the observation that returns them; or its name
 Constraints: TypeAlias = (
@@ -99,21 +99,6 @@ class ConstraintSet:
                 f"returns them, or its name 'package.module.function'; got {pair!r}."
             )
         return G, h
-
-
-def function_of(name: str) -> Callable[..., Any]:
-    """
-    :param name: ``"package.module.function"``, as a yml file can hold it
-    :raises ParameterError: if there is no such function
-    """
-    module, _, attribute = name.replace(":", ".").rpartition(".")
-    try:
-        found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ParameterError(f"There is no function '{name}' to import: {error}.") from error
-    if not callable(found):
-        raise ParameterError(f"'{name}' is {found!r}, which is no function.")
-    return found
 
 
 def condition_of(given: Any, n_obs: int) -> Callable[[Any], Any]:

@@ -12,13 +12,8 @@ from sb3_hds.core import Channel
 from sb3_hds.errors import ParameterError, SafetyError
 from sb3_hds.wrappers.action_layer import ActionLayer, is_vector, with_channels
 from sb3_hds.wrappers.barrier import refuse_layers_below
-from sb3_hds.wrappers.projection import (
-    Constraints,
-    ConstraintSet,
-    condition_of,
-    function_of,
-    nearest,
-)
+from sb3_hds.wrappers.by_name import function_of
+from sb3_hds.wrappers.projection import Constraints, ConstraintSet, condition_of, nearest
 
 
 @dataclasses.dataclass(frozen=True)

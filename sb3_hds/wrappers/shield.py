@@ -9,7 +9,8 @@ import numpy as np
 from sb3_hds.errors import ParameterError, SafetyError
 from sb3_hds.wrappers.action_layer import ActionLayer
 from sb3_hds.wrappers.barrier import check_on_breach, refuse_layers_below, report_breach
-from sb3_hds.wrappers.projection import Constraints, ConstraintSet, function_of, nearest
+from sb3_hds.wrappers.by_name import function_of
+from sb3_hds.wrappers.projection import Constraints, ConstraintSet, nearest
 
 # How far a guard may be below zero because of single precision, without being a breach.
 _ROUNDING = 1e-5

@@ -1,0 +1,198 @@
+"""
+What the runs of ``model_free.py`` say: each method beside its peers and its paper.
+
+Intervals are those of means over seeds (see ``intervals.py``): of five seeds they are rough, of two
+little more than the spread.
+"""
+
+from typing import Any
+
+import intervals
+import numpy as np
+import pandas as pd
+from model_free import OURS, PEERS, PENDULUM
+from runs import RESULTS
+
+#: return that every method shall reach
+TARGETS = {PENDULUM: -150.0}
+#: mean and standard deviation over seeds, and their number, after as many steps as our runs have,
+#: on the tasks of -v4 for ours of -v5: from `results/baseline` and `results/scaling/utd` (SimBa) of
+#: github.com/DAVIAN-Robotics/SimbaV2, commit 86899c2 (Lee et al. 2025)
+PUBLISHED = {
+    ("HalfCheetah-v5", "sac"): (6156.0, 700.0, 10),
+    ("HalfCheetah-v5", "droq"): (7744.0, 1291.0, 10),
+    ("HalfCheetah-v5", "crossq_jax"): (8112.0, 896.0, 10),
+    ("HalfCheetah-v5", "simba"): (5462.0, 598.0, 10),
+    ("HalfCheetah-v5", "bro"): (8330.0, 1352.0, 5),
+    ("HalfCheetah-v5", "bro_fast"): (6516.0, 858.0, 5),
+    ("Hopper-v5", "sac"): (530.0, 284.0, 10),
+    ("Hopper-v5", "droq"): (1569.0, 1132.0, 10),
+    ("Hopper-v5", "crossq_jax"): (1421.0, 910.0, 10),
+    ("Hopper-v5", "simba"): (828.0, 263.0, 10),
+    ("Hopper-v5", "bro"): (721.0, 371.0, 5),
+    ("Hopper-v5", "bro_fast"): (631.0, 114.0, 5),
+}
+#: methods that shall need fewer steps than another one for the return that this one ends with
+FEWER_STEPS = (("droq", "sac"), ("droq", "sb3_sac"), ("droq", "sbx_sac"))
+
+
+def report() -> None:
+    """Print and write the tables, and draw the figures."""
+    path = RESULTS / "model_free.csv"
+    if not path.exists():
+        print("Nothing has been measured yet.")
+        return
+    runs = pd.read_csv(path)
+    tables = {
+        "summary": summary(runs),
+        "peers": beside_peers(runs),
+        "papers": beside_papers(runs),
+        "fewer_steps": fewer_steps(runs),
+    }
+    for name, table in tables.items():
+        if len(table):
+            table.to_csv(RESULTS / f"model_free_{name}.csv", index=False, float_format="%.5g")
+            print(f"\n{name.replace('_', ' ')}\n{shown(table)}")
+    for env, some in runs.groupby("env"):
+        figure(some, str(env))
+
+
+def shown(table: pd.DataFrame) -> str:
+    return table.to_string(index=False, float_format="{:.5g}".format)
+
+
+def summary(runs: pd.DataFrame) -> pd.DataFrame:
+    """
+    A row for each method at its last mark: mean return over seeds with its interval, the seconds
+    that training took, and the steps after which the mean reached the target of its environment.
+    """
+    rows = []
+    for (env, method), some in runs.groupby(["env", "method"], sort=False):
+        last = some[some["mark"] == some["mark"].max()]
+        returns = last["return"].to_numpy()
+        mean, low, high = intervals.of_mean(returns)
+        row = {"env": env, "method": method, "mark": last["mark"].iloc[0], "seeds": len(last)}
+        row |= {"return": mean, "low": low, "high": high, "worst": returns.min()}
+        row |= {"seconds": last["seconds"].mean()}
+        if env in TARGETS:
+            row["steps_to_target"] = first_mark(some, TARGETS[env])
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def beside_peers(runs: pd.DataFrame) -> pd.DataFrame:
+    """
+    A row for each method of ours and each of its peers, at the last mark that both have. ``worse``:
+    our mean lies below the interval of the peer's.
+    """
+    rows = []
+    for env, some in runs.groupby("env", sort=False):
+        for method, ours in OURS.items():
+            for peer in ours.peers:
+                at = common_mark(some, method, peer)
+                if at is None:
+                    continue
+                mine, theirs = (returns_at(some, name, at) for name in (method, peer))
+                their_mean, their_low, _ = intervals.of_mean(theirs)
+                difference, low, high = intervals.of_difference(mine, theirs)
+                row = {"env": env, "method": method, "peer": peer, "mark": at}
+                row |= {"return": mine.mean(), "of_peer": their_mean, "low_of_peer": their_low}
+                row |= {"difference": difference, "low": low, "high": high}
+                row |= {"chance_of_more": intervals.chance_of_more(mine, theirs)}
+                row |= {"worse": "yes" if mine.mean() < their_low else "no"}
+                rows.append(row | {"seeds": f"{len(mine)} and {len(theirs)}"})
+    return pd.DataFrame(rows)
+
+
+def beside_papers(runs: pd.DataFrame) -> pd.DataFrame:
+    """
+    A row for each published mean. ``z``: ours minus it, in its standard deviations over seeds;
+    below -2, something is wrong.
+    """
+    rows = []
+    for (env, method), (mean, deviation, n) in PUBLISHED.items():
+        some = runs[(runs["env"] == env) & (runs["method"] == method)]
+        if not len(some):
+            continue
+        at = some["mark"].max()
+        mine, low, high = intervals.of_mean(returns_at(some, method, at))
+        row = {"env": env, "method": method, "mark": at, "seeds": some["seed"].nunique()}
+        row |= {"return": mine, "low": low, "high": high}
+        row |= {"published": mean, "deviation": deviation, "published_seeds": n}
+        rows.append(row | {"z": (mine - mean) / deviation})
+    return pd.DataFrame(rows)
+
+
+def fewer_steps(runs: pd.DataFrame) -> pd.DataFrame:
+    """How many times fewer steps one method needs for the mean return that another ends with."""
+    rows = []
+    for env, some in runs.groupby("env", sort=False):
+        for method, other in FEWER_STEPS:
+            theirs = some[some["method"] == other]
+            mine = some[some["method"] == method]
+            if not (len(mine) and len(theirs)):
+                continue
+            end = int(theirs["mark"].max())
+            goal = float(returns_at(theirs, other, end).mean())
+            reached = first_mark(mine, goal)
+            row = {"env": env, "method": method, "than": other, "goal": goal, "steps": reached}
+            rows.append(row | {"steps_of_other": end, "times": end / reached})
+    return pd.DataFrame(rows)
+
+
+def first_mark(some: pd.DataFrame, goal: float) -> float:
+    """:return: the first mark at which the mean over seeds is no less; nan: none"""
+    means = some.groupby("mark")["return"].mean()
+    reached = means.index[means >= goal]
+    return float(reached[0]) if len(reached) else np.nan
+
+
+def common_mark(some: pd.DataFrame, *methods: str) -> int | None:
+    """:return: the last mark that all their runs have; None: there is none"""
+    if not set(methods) <= set(some["method"]):
+        return None
+    runs = some[some["method"].isin(methods)].groupby(["method", "seed"])
+    return max(set.intersection(*(set(run["mark"]) for _, run in runs)), default=None)
+
+
+def returns_at(some: pd.DataFrame, method: str, mark: int) -> np.ndarray:
+    """:return: of every seed"""
+    chosen = (some["method"] == method) & (some["mark"] == mark)
+    return some.loc[chosen, "return"].to_numpy()
+
+
+def figure(table: pd.DataFrame, env: str) -> None:
+    """
+    Return against steps and against wall time: a line for each method, a band over its seeds; at
+    the end what was published, with its deviation. Peers have the colour of ours.
+    """
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=(10.0, 4.0), layout="constrained")
+    panels = drawing.subplots(1, 2, sharey=True)
+    present = set(table["method"])
+    for method in (m for m in (*OURS, *PEERS) if m in present):
+        runs = table[table["method"] == method].groupby("mark")
+        middle, low, high = (runs["return"].agg(f) for f in ("mean", "min", "max"))
+        style, seconds = style_of(method), runs["seconds"].mean()
+        for panel, x in zip(panels, (middle.index, seconds), strict=True):
+            panel.plot(x, middle, label=method, linewidth=1.5, **style)
+            panel.fill_between(x, low, high, color=style["color"], alpha=0.12, linewidth=0.0)
+        if (env, method) in PUBLISHED:
+            mean, deviation, _ = PUBLISHED[env, method]
+            beside = 1.03 + 0.015 * list(OURS).index(method)
+            at, colour = middle.index[-1] * beside, style["color"]
+            panels[0].errorbar(at, mean, deviation, fmt="_", color=colour, alpha=0.6, capsize=2)
+    panels[0].set(xlabel="steps in the environment", ylabel=f"return on {env}")
+    panels[1].set(xlabel="wall time of training [s]", xscale="log")
+    panels[1].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    drawing.savefig(RESULTS / f"model_free_{env}.png", dpi=150)
+
+
+def style_of(method: str) -> dict[str, Any]:
+    """:return: colour by algorithm, line by library"""
+    from matplotlib import colormaps
+
+    same = next(name for name, ours in OURS.items() if method in (name, *ours.peers))
+    line = "-" if method in OURS else "--" if method.startswith("sbx") else ":"
+    return {"color": colormaps["tab10"](list(OURS).index(same)), "linestyle": line}

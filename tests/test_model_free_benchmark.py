@@ -1,0 +1,145 @@
+"""What the benchmark of the model-free family runs, and what it makes of the runs."""
+
+import inspect
+from importlib.util import find_spec
+
+import intervals
+import model_free
+import model_free_report
+import numpy as np
+import pandas as pd
+import pytest
+from model_free import LENGTHS, ONLY_ON, OURS, PEERS, PENDULUM
+
+from rl_zoo_plugin.lazy import parameters_of
+
+zoo = pytest.mark.skipif(find_spec("rl_zoo3") is None, reason="needs the extra 'zoo'")
+
+#: what RL Zoo 2.9.2 has for -v4
+_WIDE = {"net_arch": {"pi": [256, 256], "qf": [2048, 2048]}}
+OF_THE_ZOO = {
+    (PENDULUM, "sb3_sac"): {"learning_rate": 1e-3},
+    (PENDULUM, "sbx_tqc"): {"learning_rate": 1e-3},
+    (PENDULUM, "sbx_crossq"): {"policy_delay": 2, "policy_kwargs": {"net_arch": [256, 256]}},
+    ("Hopper-v5", "contrib_tqc"): {"learning_starts": 10_000, "top_quantiles_to_drop_per_net": 5},
+    ("HalfCheetah-v5", "contrib_tqc"): {"learning_starts": 10_000},
+    ("HalfCheetah-v5", "sbx_crossq"): {
+        "buffer_size": 1_000_000,
+        "learning_rate": 1e-3,
+        "learning_starts": 5_000,
+        "policy_delay": 3,
+        "policy_kwargs": _WIDE,
+    },
+    ("HalfCheetah-v5", "sbx_droq"): {
+        "learning_starts": 10_000,
+        "policy_kwargs": {"dropout_rate": 0.01, "layer_norm": True},
+        "gradient_steps": 20,
+        "policy_delay": 20,
+    },
+}
+
+
+def table(**runs: dict[int, list[tuple[int, float]]]) -> pd.DataFrame:
+    """:param runs: of each method, by seed, steps and returns at the marks 1000, 2000, ..."""
+    return pd.DataFrame(
+        {
+            "env": PENDULUM,
+            "method": method,
+            "seed": seed,
+            "mark": 1000 * (i + 1),
+            "steps": steps,
+            "seconds": float(i + 1),
+            "return": earned,
+        }
+        for method, by_seed in runs.items()
+        for seed, points in by_seed.items()
+        for i, (steps, earned) in enumerate(points)
+    )
+
+
+@zoo
+@pytest.mark.parametrize(("env", "peer"), OF_THE_ZOO)
+def test_peers_run_with_the_settings_of_the_zoo(env, peer):
+    assert model_free.made_of(env, peer)[1] == OF_THE_ZOO[env, peer]
+
+
+@zoo
+@pytest.mark.parametrize("method", [*OURS, *PEERS])
+def test_every_setting_of_a_method_is_an_argument_of_its_class(method):
+    for env in ONLY_ON.get(method, LENGTHS):
+        algorithm, settings = model_free.made_of(env, method)
+        read = parameters_of if method in OURS else inspect.signature
+        known = read(algorithm) if method in OURS else read(algorithm).parameters
+        assert set(settings) <= set(known), env
+        assert len(model_free.marks(env, method)) > 1
+
+
+def test_learners_that_stop_at_the_ends_of_episodes_are_compared_at_their_marks():
+    runs = table(
+        td7={
+            0: [(1004, -900.0), (2013, -300.0)],
+            1: [(1090, -700.0), (2001, -100.0)],
+        }
+    )
+
+    [row] = model_free_report.summary(runs).to_dict("records")
+
+    assert (row["mark"], row["seeds"], row["return"]) == (2000, 2, -200.0)
+    assert model_free_report.first_mark(runs, -800.0) == 1000.0
+
+
+def test_a_method_below_the_interval_of_its_peer_is_named_at_the_last_mark_of_both():
+    low, high = [(1000, -900.0), (2000, -310.0)], [(1000, -800.0), (2000, -290.0), (3000, -140.0)]
+    runs = table(
+        td7={0: low, 1: low},
+        bro={0: high, 1: high},
+        sbx_sac={0: high, 1: [(1000, -1000.0), (2000, -270.0)]},
+    )
+
+    shown = model_free_report.beside_peers(runs).set_index("method")
+
+    assert shown.loc["td7", ["mark", "difference", "worse"]].tolist() == [2000, -30.0, "yes"]
+    assert shown.loc["bro", ["mark", "difference", "worse"]].tolist() == [2000, -10.0, "no"]
+    assert shown.loc["bro", "chance_of_more"] == 0.25
+
+
+def test_runs_stand_beside_what_was_published():
+    runs = table(sac={0: [(100_000, 5000.0)], 1: [(100_000, 4512.0)]})
+    runs["env"], runs["mark"] = "HalfCheetah-v5", 100_000
+
+    [row] = model_free_report.beside_papers(runs).to_dict("records")
+
+    # Published: 6156 +- 700.
+    assert row["z"] == pytest.approx((4756.0 - 6156.0) / 700.0)
+
+
+def test_steps_that_one_method_saves_are_counted_to_the_last_return_of_the_other():
+    sac = [(1000 * i, -1000.0 + 100.0 * i) for i in range(1, 9)]
+    runs = table(sac={0: sac}, droq={0: [(1000, -900.0), (2000, -150.0), (3000, -300.0)]})
+
+    [row] = model_free_report.fewer_steps(runs).to_dict("records")
+
+    assert (row["goal"], row["steps"], row["times"]) == (-200.0, 2000.0, 4.0)
+
+
+def test_intervals_are_those_of_rliable():
+    library = pytest.importorskip("rliable.library")
+    metrics = pytest.importorskip("rliable.metrics")
+    rng = np.random.default_rng(0)
+    ours, theirs = rng.normal(size=5), rng.normal(0.3, 2.0, size=8)
+    of_mean = lambda scores: np.array([metrics.aggregate_mean(scores)])  # noqa: E731
+
+    points, limits = library.get_interval_estimates({"ours": ours[:, None]}, of_mean, reps=10_000)
+
+    mean, low, high = intervals.of_mean(ours)
+    assert mean == pytest.approx(points["ours"][0])
+    # Three standard errors of a 2.5 % quantile of 10,000 draws, in deviations of the mean.
+    apart = 3.0 * 2.0 * ours.std() / np.sqrt(5) * np.sqrt(0.025 * 0.975 / 10_000) / 0.0584
+    np.testing.assert_allclose([low, high], limits["ours"][:, 0], atol=apart)
+    chance = metrics.probability_of_improvement(ours[:, None], theirs[:, None])
+    assert intervals.chance_of_more(ours, theirs) == pytest.approx(chance)
+
+
+def test_one_seed_has_no_interval():
+    assert np.isnan(intervals.of_mean([3.0])[1:]).all()
+    assert np.isnan(intervals.of_difference([3.0], [1.0, 2.0])[1:]).all()
