@@ -296,7 +296,7 @@ def as_table(found: Sequence[Score]) -> pd.DataFrame:
     return pd.DataFrame(
         {
             "what": s.label,
-            "measured": f"{s.value:.3g}",
+            "measured": f"{s.value:.3g}" if np.isfinite(s.value) else "-",
             "95 % interval": "" if np.isnan(s.low) else f"{s.low:.3f} to {s.high:.3f}",
             "of": s.n,
             "target": s.target,
