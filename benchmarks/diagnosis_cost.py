@@ -8,9 +8,10 @@ What a diagnosis costs against the number of recordings.
 A pendulum and a double pendulum on MuJoCo's engine with dry friction that `diagnose` is not told
 of, against the whole catalogue; recordings of 200 steps. Each row is a fresh process: first with
 nothing compiled beforehand, then with the programs that the first one kept. Starting Python and
-making the data do not count. Memory is the peak resident size of the process. A straight line is
-fitted to the seconds, relative errors of all rows counting the same: its ends, how far rows are
-from it, and the exponent between the two largest numbers of recordings, 1 where cost is linear.
+making the data do not count. Processor seconds are those of all cores, and hardly depend on what
+else the machine does. Memory is the peak resident size of the process. A straight line is fitted to
+the seconds, relative errors of all rows counting the same: its ends, how far rows are from it, and
+the exponent between the two largest numbers of recordings, which is 1 where the cost is linear.
 Finished rows are kept.
 """
 
@@ -19,6 +20,7 @@ import dataclasses
 import json
 import resource
 import shutil
+import time
 from collections.abc import Iterable
 
 import numpy as np
@@ -34,6 +36,8 @@ SYSTEMS = {"pendulum": 0.05, "double_pendulum": 0.05}
 NOISE = "1 %"
 #: seconds that ten recordings may take, compilation included
 PROMISED = {"quick": 15.0, "full": 60.0}
+# Two numbers always lie on a line.
+_FEWEST = 3
 _LINES = ("system", "budget", "programs")
 
 
@@ -81,12 +85,13 @@ def worker(system: str, budget: str, n: int) -> dict:
     case = dataclasses.replace(nothing(system, NOISE, recordings=n), planted=(planted,))
     data, _ = recorded(case, seed=n)
     twin = believed(system)
-    simulated = seconds_since_start()
+    simulated, busy = seconds_since_start(), time.process_time()
     from sb3_hds import diagnose
 
     found = diagnose(twin, data, budget=budget, progress=False)
     return {
         "seconds": seconds_since_start() - simulated,
+        "processor_seconds": time.process_time() - busy,
         "peak_memory_MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "verdict": found.verdict,
         "named": " ".join(f"{f.effect}.{f.where['name']}" for f in found.findings),
@@ -113,7 +118,7 @@ def fitted(recordings: Iterable[float], seconds: Iterable[float]) -> dict[str, f
         relative distance from this line, and the exponent between the last two numbers
     """
     n, t = (np.array(list(x), float) for x in (recordings, seconds))
-    if len(n) < 2:
+    if len(n) < _FEWEST:
         return {}
     matrix = np.stack([np.ones_like(n), n], 1)
     fixed, each = np.linalg.lstsq(matrix / t[:, None], np.ones_like(t), rcond=None)[0]

@@ -296,7 +296,7 @@ def as_table(found: Sequence[Score]) -> pd.DataFrame:
     return pd.DataFrame(
         {
             "what": s.label,
-            "measured": f"{s.value:.3g}",
+            "measured": f"{s.value:.3g}" if np.isfinite(s.value) else "-",
             "95 % interval": "" if np.isnan(s.low) else f"{s.low:.3f} to {s.high:.3f}",
             "of": s.n,
             "target": s.target,
@@ -358,15 +358,15 @@ def figure(found: Sequence[Score], table: pd.DataFrame, name: str) -> None:
                 left.plot([end, end], [place - 0.35, place + 0.35], color="black", lw=1.2)
     left.set_yticks(range(len(rates)), [s.label for s in reversed(rates)], fontsize=8)
     left.set_xlim(-0.02, 1.02)
-    left.set_xlabel("share of the cases, 95 % interval; bars: targets")
+    left.set_xlabel("share of the cases, 95 % interval; bars: targets, green: reached")
     effects = table[table["kind"] == "effect"]
-    for label, own, colour in (
-        ("white, up to 1 %", ~effects["disturbed"] & (effects["noise"] != "5 %"), "#27496d"),
-        ("white, 5 %", ~effects["disturbed"] & (effects["noise"] == "5 %"), "#7fa6cc"),
-        ("coloured", effects["disturbed"], "#c98a2b"),
+    for label, own, colour, aside in (
+        ("white, up to 1 %", ~effects["disturbed"] & (effects["noise"] != "5 %"), "#27496d", 0.97),
+        ("white, 5 %", ~effects["disturbed"] & (effects["noise"] == "5 %"), "#7fa6cc", 1.0),
+        ("coloured", effects["disturbed"], "#c98a2b", 1.03),
     ):
         groups = effects[own].groupby("factor")["right"]
-        sizes, means = groups.mean().index, groups.mean()
+        sizes, means = aside * groups.mean().index.to_numpy(), groups.mean()
         ends = np.array([wilson(int(g.sum()), len(g)) for _, g in groups]).reshape(-1, 2)
         spans = np.abs(ends.T - means.to_numpy())
         middle_.errorbar(sizes, means, spans, fmt="o-", color=colour, label=label, capsize=2)
