@@ -169,8 +169,10 @@ def test_a_share_that_was_fixed_is_planned_in_the_force_where_that_helps(heavier
     twin = twins.make("PendulumReal")
     data = measured(twin.extend(effects.CoulombFriction(0, tau_c=0.4)), noise=0.005, n=10)
 
-    helps = corrected(twin, data, residual=True, beta=0.3)
-    does_not = corrected(twin, heavier, **TINY | {"beta": 0.3})
+    helps, does_not = (
+        correct(twin, seen, wishes(twin, **how, beta=0.3), 0.0, learn_force=True, n_new=10_000)
+        for seen, how in ((data, {"residual": True}), (heavier, TINY))
+    )
 
     ((key, _),) = [force_of(helps.twin)]
     assert helps.beta == 0.3 and helps.twin.values[f"{key}.share"] == 1.0

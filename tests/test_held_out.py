@@ -9,6 +9,7 @@ from small_models import small
 from sb3_hds import HDS, twins
 from sb3_hds.algos import correction
 from sb3_hds.errors import CalibrationError
+from sb3_hds.sysid.prediction import hold_out
 
 REAL = "sb3_hds/PendulumReal-v1"
 
@@ -73,7 +74,7 @@ def test_windows_keep_their_side_while_recordings_come(longest):
             continue
         number, place = windows.T
         few = len(windows) < 24
-        kept = correction.hold_out(number, place, 0.5 if few else 0.25)
+        kept = hold_out(number, place, 0.5 if few else 0.25)
         now_held, now_learned = ({*map(tuple, windows[side])} for side in (kept, ~kept))
         assert now_held and now_learned
         assert not now_held & learned

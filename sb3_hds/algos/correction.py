@@ -2,20 +2,29 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from sb3_hds.algos.measured import latest_steps
 from sb3_hds.algos.model import missing_effects, nulls_of
-from sb3_hds.core import Params, Trajectories, Twin
-from sb3_hds.effects import force_of
+from sb3_hds.algos.windows import (
+    EXACT,
+    FEWEST,
+    Since,
+    Windows,
+    divided,
+    latest_windows,
+    mean_error,
+    shares_of,
+    since_change,
+    windows_of,
+)
+from sb3_hds.core import Trajectories, Twin
 from sb3_hds.errors import CalibrationError, TrajectoryError
 from sb3_hds.sysid import Fit
 from sb3_hds.sysid.calibrate import (
     check_fits,
-    default_window,
     every_name,
     fit_windows,
     free_names,
@@ -23,27 +32,15 @@ from sb3_hds.sysid.calibrate import (
 )
 from sb3_hds.sysid.prediction import (
     gain,
-    has_grown,
-    hold_out,
     is_better,
     probability_before,
     single_step_errors,
-    window_errors,
 )
 from sb3_hds.sysid.residual import Residual, fit_force
-from sb3_hds.sysid.shooting import Shots, places_of, shots_of
 
-# Rows of the compiled programs: the latest windows are used.
-_N_WINDOWS = 128
-# A twin whose windows miss by less than this share of the channels' spread needs no correction.
-_EXACT = 1e-3
-# The same for nearly all of the latest single steps, since at rest any twin is exact: how little,
-# which share, of how many.
+# As `EXACT`, for nearly all of the latest single steps, since at rest any twin is exact: how
+# little, which share, of how many.
 _EXACT_STEP, _MOST_STEPS, _N_SINGLE = 1e-4, 0.98, 256
-# Fewer windows than this are too few to check on some what was learned from others.
-_FEWEST = 6
-# Share of windows to check on, and that share where there are not many.
-_HELD, _HELD_OF_FEW, _MANY = 0.25, 0.5, 24
 # Of the solver, in each of its passes: the next correction goes on where this one ends.
 _SOLVER_STEPS = 20
 # Plans are made anew where the corrected model's error is lower by this share.
@@ -83,18 +80,6 @@ class Wishes:
     suspected: tuple[str, ...] = ()
 
 
-class Since(NamedTuple):
-    """
-    What counts of the data, after the system has become another one.
-
-    :param n_steps: the latest of them
-    :param recording: number of the recording in which they begin
-    """
-
-    n_steps: int
-    recording: int
-
-
 @dataclasses.dataclass(frozen=True)
 class Correction:
     """
@@ -131,47 +116,6 @@ class Correction:
         return self.since is not None
 
 
-class _Windows(NamedTuple):
-    """
-    What models are compared on.
-
-    :param shots: windows of the data
-    :param origin: of each window, the recording it is from; negative where it does not count
-    :param place: of each window in its recording
-    :param age: of each window, steps from its beginning to the end of the data
-    :param spread: of the channels
-    :param held: whether each window is held out of what is learned from
-    """
-
-    shots: Shots
-    origin: np.ndarray
-    place: np.ndarray
-    age: np.ndarray
-    spread: Float[np.ndarray, " obs"]
-    held: np.ndarray
-
-    @property
-    def counted(self) -> np.ndarray:
-        """Indices of those that count, oldest first."""
-        return np.flatnonzero(self.origin >= 0)
-
-    @property
-    def of_other_recordings(self) -> bool:
-        """Whether nothing is learned from the recordings that windows are held out of."""
-        learned = self.origin[~self.held & (self.origin >= 0)]
-        return not np.isin(self.origin[self.held], learned).any()
-
-    @property
-    def learned(self) -> Shots:
-        """Those that are not held out."""
-        return self.shots._replace(weight=self.shots.weight * ~self.held)
-
-    def errors(self, twin: Twin, params: Params | None = None) -> np.ndarray:
-        """:return: of each window, with these parameters; None: the twin's, without its force"""
-        params = _without_force(twin) if params is None else params
-        return window_errors(twin, params, self.shots, self.spread)
-
-
 def correct(
     twin: Twin,
     data: Trajectories,
@@ -202,23 +146,25 @@ def correct(
         if typical < _EXACT_STEP:
             return Correction(twin, beta, changed=False, error_twin=typical)
     try:
-        windows = _windows_of(data, twin, spread, since)
+        windows = windows_of(data, twin, spread, since)
     except TrajectoryError:
         return Correction(twin, beta, changed=False)
     nominal = twin.with_parameters(**wishes.nominal)
     bare, now = (windows.errors(t) for t in (nominal, twin))
     real = windows.counted
-    if len(real) < _FEWEST:
-        return Correction(twin, beta, changed=False, error_twin=_mean(bare[real]))
-    latest = _latest(windows, n_new)
-    if max(_mean(bare[real]), _mean(bare[latest])) < _EXACT:
+    if len(real) < FEWEST:
+        return Correction(twin, beta, changed=False, error_twin=mean_error(bare[real]))
+    latest = latest_windows(windows, n_new)
+    if max(mean_error(bare[real]), mean_error(bare[latest])) < EXACT:
         changed = gain(bare[real], now[real]) > _NOTICEABLE
-        return Correction(nominal, 0.0, changed=changed, error_twin=_mean(bare[real]))
-    windows, forgotten = _since_change(windows, now, latest, n_new)
-    windows = _divided(windows, forgotten or since)
+        return Correction(nominal, 0.0, changed=changed, error_twin=mean_error(bare[real]))
+    windows, forgotten = since_change(windows, now, latest, n_new)
+    windows = divided(windows, forgotten or since)
     held, real = windows.held, windows.counted
-    if len(real) < _FEWEST or not held.any():
-        return Correction(twin, beta, changed=False, since=forgotten, error_twin=_mean(bare[real]))
+    if len(real) < FEWEST or not held.any():
+        return Correction(
+            twin, beta, changed=False, since=forgotten, error_twin=mean_error(bare[real])
+        )
     nominal, twin, wishes, added = _with_suspects(nominal, twin, wishes)
 
     fit = _calibrated(nominal, twin, windows, wishes)
@@ -231,8 +177,8 @@ def correct(
         since=forgotten,
         attached=added,
         fit=fit,
-        error_twin=_mean(bare[held]),
-        error_calibrated=_mean(errors[held]),
+        error_twin=mean_error(bare[held]),
+        error_calibrated=mean_error(errors[held]),
     )
     if beta > 0.0:
         now = windows.errors(twin, twin.params)
@@ -264,7 +210,7 @@ def _cleared(
     twin: Twin,
     errors: np.ndarray,
     added: Mapping[str, float],
-    windows: _Windows,
+    windows: Windows,
 ) -> tuple[Twin, np.ndarray, dict[str, float]]:
     """
     What was suspected and explains nothing is let go, since simulating it costs time; it is
@@ -286,14 +232,14 @@ def _cleared(
 def _calibrated(
     nominal: Twin,
     twin: Twin,
-    windows: _Windows,
+    windows: Windows,
     wishes: Wishes,
 ) -> Fit | None:
     """From the values as they are, with what was believed before any data as prior."""
     if not wishes.names:
         return None
     believed = np.array([nominal.values[name] for name in wishes.names])
-    start = twin.with_parameters(**{k: 0.0 for k in _shares(twin)})
+    start = twin.with_parameters(**{k: 0.0 for k in shares_of(twin)})
     try:
         return fit_windows(
             start,
@@ -315,7 +261,7 @@ def _best(
     fit: Fit | None,
     bare: np.ndarray,
     now: np.ndarray,
-    windows: _Windows,
+    windows: Windows,
 ) -> tuple[Twin, np.ndarray]:
     """:return: the calibrated twin if it predicts better, otherwise the twin as it is or was"""
     held = windows.held
@@ -336,14 +282,14 @@ def _best(
 
 def _with_residual(
     found: Correction,
-    windows: _Windows,
+    windows: Windows,
     errors: np.ndarray,
     wishes: Wishes,
     learn_force: bool,
 ) -> tuple[Correction, np.ndarray]:
     """:return: the correction, and the errors of the model that is planned in"""
     twin, residual, held = found.twin, None, windows.held
-    wanted = wishes.residual and wishes.beta != 0.0 and _mean(errors[held]) > _EXACT
+    wanted = wishes.residual and wishes.beta != 0.0 and mean_error(errors[held]) > EXACT
     if wanted and learn_force:
         scale = 0.05 * windows.spread if found.fit is None else found.fit.noise
         scale = np.maximum(scale, 1e-3 * windows.spread)
@@ -354,13 +300,13 @@ def _with_residual(
         except CalibrationError:
             residual = None
     hybrid = twin if residual is None else residual.twin
-    key = next(iter(_shares(hybrid)), None)
+    key = next(iter(shares_of(hybrid)), None)
     if key is None:
         return found, errors
     whole = windows.errors(hybrid, {**hybrid.params, key: 1.0})
-    found = dataclasses.replace(found, residual=residual, error_hybrid=_mean(whole[held]))
+    found = dataclasses.replace(found, residual=residual, error_hybrid=mean_error(whole[held]))
     # Simulating a force that does not help costs time.
-    if residual is not None and not (residual.accepted or _shares(twin)):
+    if residual is not None and not (residual.accepted or shares_of(twin)):
         return found, errors
     helps = is_better(whole[held], errors[held])
     share = 0.0
@@ -370,69 +316,6 @@ def _with_residual(
     twin = hybrid.with_parameters(**{key: 1.0 if helps else 0.0})
     found = dataclasses.replace(found, twin=twin, beta=share)
     return found, whole if share > 0.0 else errors
-
-
-def _windows_of(
-    data: Trajectories, twin: Twin, spread: Float[np.ndarray, " obs"], since: Since | None
-) -> _Windows:
-    """The latest windows, not yet divided into those to learn from and those to check on."""
-    length = default_window(data)
-    shots, origin = shots_of(data, length, twin, _N_WINDOWS, seed=None)
-    place, age = places_of(data, length, _N_WINDOWS, seed=None)
-    windows = _Windows(shots, origin, place, age, spread, np.zeros(len(origin), bool))
-    return windows if since is None else _without(windows, np.flatnonzero(age > since.n_steps))
-
-
-def _without(windows: _Windows, left_out: np.ndarray) -> _Windows:
-    weight, origin = windows.shots.weight.copy(), windows.origin.copy()
-    weight[left_out], origin[left_out] = 0.0, -1
-    return windows._replace(shots=windows.shots._replace(weight=weight), origin=origin)
-
-
-def _latest(windows: _Windows, n_new: int) -> np.ndarray:
-    """:return: indices of the windows that came since the last correction"""
-    counted = windows.counted
-    n_latest = int(np.sum(windows.age[counted] <= n_new))
-    return counted[-max(_FEWEST, n_latest) :]
-
-
-def _since_change(
-    windows: _Windows, errors: np.ndarray, latest: np.ndarray, n_new: int
-) -> tuple[_Windows, Since | None]:
-    """
-    Leave out what was measured before the last correction, if the system has become another one.
-    """
-    older = np.setdiff1d(windows.counted, latest)
-    if len(older) < _FEWEST or _mean(errors[latest]) < _EXACT:
-        return windows, None
-    if not has_grown(errors[latest], errors[older]):
-        return windows, None
-    # The latest may be more than came since then.
-    counted = windows.counted
-    newest = counted[windows.age[counted] <= n_new]
-    recording = windows.origin[newest[0] if len(newest) else counted[-1]]
-    return _without(windows, np.setdiff1d(counted, newest)), Since(n_new, int(recording))
-
-
-def _divided(windows: _Windows, since: Since | None) -> _Windows:
-    """Which windows are held out depends on nothing that moves on with the data."""
-    first = 0 if since is None else since.recording
-    number = np.where(windows.origin >= 0, windows.origin - first, -1)
-    share = _HELD if len(windows.counted) >= _MANY else _HELD_OF_FEW
-    return windows._replace(held=hold_out(number, windows.place, share))
-
-
-def _shares(twin: Twin) -> tuple[str, ...]:
-    force = force_of(twin)
-    return () if force is None else (f"{force[0]}.share",)
-
-
-def _without_force(twin: Twin) -> dict[str, Any]:
-    return twin.params | dict.fromkeys(_shares(twin), 0.0)
-
-
-def _mean(errors: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan")
 
 
 def names_to_estimate(twin: Twin, wanted: str | Sequence[str] | None) -> tuple[str, ...]:
