@@ -25,6 +25,7 @@ from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
 
 METHODS = ("ceiling", "wrong_twin", "randomised", "hds", "sac", "tqc", "droq")
 _DEEPEST = 1800.0  # below the best return, in the figure
+_LEAST_SHOWN, _MOST_SHOWN = -0.4, 1.3  # shares of a gap, in the figure
 STEPS = (1, 5, 10)  # real episodes after which learners are evaluated
 SWEEP = [cell for cell in CELLS if cell != "worn"]
 
@@ -117,6 +118,7 @@ def report() -> None:
     medians.to_csv(RESULTS / "sim_to_real_median.csv", index=False, float_format="%.4g")
     print(medians.to_string(index=False, float_format=lambda x: f"{x:.2f}"))
     figure(shown)
+    figure_of_gap(shown)
 
 
 def by_cell(table: pd.DataFrame, shown: pd.DataFrame) -> pd.DataFrame:
@@ -244,8 +246,63 @@ def figure(shown: pd.DataFrame) -> None:
     for panel in panels[len(cells) :]:
         panel.set_visible(False)
     panels[0].set_ylabel("return on the real system", fontsize=8)
-    panels[0].legend(fontsize=6, frameon=False)
+    named = {
+        label: handle
+        for panel in panels
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)
+    }
+    drawing.legend(
+        named.values(),
+        [label.replace("_", " ") for label in named],
+        loc="outside upper center",
+        ncols=len(named),
+        fontsize=8,
+        frameon=False,
+    )
     drawing.savefig(RESULTS / "sim_to_real.png", dpi=150)
+
+
+def figure_of_gap(shown: pd.DataFrame) -> None:
+    """The share of each cell's gap that is closed, with what counts on top."""
+    from matplotlib.figure import Figure
+
+    own = shown[~shown["cell"].isin(OTHER_TWIN)]
+    cells = list(dict.fromkeys(own.sort_values("counts", ascending=False, kind="stable")["cell"]))
+    counts = own.groupby("cell")["counts"].first()
+    drawing = Figure(figsize=(6.4, 0.34 * len(cells) + 1.2), layout="constrained")
+    panel = drawing.subplots()
+    panel.axvline(0.0, color="#9a978c", linestyle="--", linewidth=1)
+    panel.axvline(1.0, color="#9a978c", linewidth=1)
+    styles = {
+        ("randomised", 0): ("domain randomisation, no data", "#edae49", "D"),
+        ("hds", 1): ("HDS, 1 episode", "#a9bdd3", "o"),
+        ("hds", 5): ("HDS, 5 episodes", "#5d82a8", "o"),
+        ("hds", 10): ("HDS, 10 episodes", "#27496d", "o"),
+    }
+    for (method, episodes), (label, colour, marker) in styles.items():
+        rows = own[(own["method"] == method) & (own["episodes"] == episodes)]
+        share = rows.set_index("cell")["closed"].reindex(cells)
+        height = [-cells.index(cell) for cell in share.index]
+        inside = share.clip(_LEAST_SHOWN, _MOST_SHOWN)
+        panel.plot(inside, height, marker, color=colour, label=label, markersize=6)
+        for x, y, value in zip(inside, height, share, strict=True):
+            if x != value and np.isfinite(value):
+                side = 1 if value < x else -1
+                panel.annotate(
+                    f"{value:.1f}", (x, y), (7 * side, 0), textcoords="offset points",
+                    ha="left" if side > 0 else "right", va="center", fontsize=7, color=colour,
+                )  # fmt: skip
+    panel.set_yticks(
+        range(0, -len(cells), -1),
+        [cell if counts[cell] else f"{cell} (not counted)" for cell in cells],
+    )
+    panel.set_xlim(_LEAST_SHOWN - 0.05, _MOST_SHOWN + 0.05)
+    panel.set_xlabel("share of the gap that is closed", fontsize=8)
+    panel.grid(axis="x", color="#e4e2da", linewidth=0.6)
+    panel.spines[["top", "right", "left"]].set_visible(False)
+    panel.tick_params(length=0, labelsize=8)
+    drawing.legend(loc="outside upper center", ncols=2, fontsize=8, frameon=False)
+    drawing.savefig(RESULTS / "sim_to_real_gap.png", dpi=150)
 
 
 if __name__ == "__main__":
