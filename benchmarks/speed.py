@@ -12,6 +12,8 @@ start-up is that of a fresh process each, from the interpreter to the first upda
 program kept.
 
 Beside them, `learn_compiled`: environment and updates in one program, several seeds side by side.
+A second table says what SBX gains over SB3, both measured beside ours; it is said to be up to
+twenty times, and depends on how many updates there are for each step in the environment.
 """
 
 import argparse
@@ -185,7 +187,38 @@ def report() -> None:
     if not path.exists():
         print("Nothing has been measured yet.", file=sys.stderr)
         return
-    print(pd.read_csv(path).to_string(index=False, float_format="%.3g"))
+    measured = pd.read_csv(path)
+    tables = {"speed_targets": beside_targets(measured), "speed_sbx_sb3": sbx_beside_sb3(measured)}
+    print(measured.to_string(index=False, float_format="%.3g"))
+    for name, table in tables.items():
+        if len(table):
+            table.to_csv(RESULTS / f"{name}.csv", index=False, float_format="%.4g")
+            print(f"\n{table.to_string(index=False, float_format='%.3g')}")
+
+
+def wanted(ratio: int, peer: str) -> float:
+    """:return: how many times as fast as the peer ours shall be"""
+    if peer == "sb3":
+        return 3.0
+    return 1.3 if ratio == 20 else 1.0
+
+
+def beside_targets(measured: pd.DataFrame) -> pd.DataFrame:
+    """:return: a row for each pair, with the speed-up that it shall have"""
+    pairs = measured[measured["peer"].isin(("sbx", "sb3"))]
+    pairs = pairs[["name", "ratio", "peer", "speed_up", "low", "high"]].copy()
+    pairs["wanted"] = [wanted(*pair) for pair in pairs[["ratio", "peer"]].itertuples(index=False)]
+    pairs["reached"] = np.where(pairs["speed_up"] >= pairs["wanted"], "yes", "no")
+    return pairs
+
+
+def sbx_beside_sb3(measured: pd.DataFrame) -> pd.DataFrame:
+    """:return: how many times as fast SBX is, from the speed-ups of ours beside both"""
+    wide = measured.pivot_table("speed_up", ["name", "ratio"], "peer").reindex(
+        columns=["sbx", "sb3"]
+    )
+    found = (wide["sb3"] / wide["sbx"]).dropna()
+    return found.rename("sbx_times_sb3").reset_index()
 
 
 if __name__ == "__main__":

@@ -1,0 +1,32 @@
+"""What the benchmark of speed makes of what it measured."""
+
+import pandas as pd
+import pytest
+import speed
+
+
+def measured() -> pd.DataFrame:
+    """Of SAC: 1.2 times SBX; 4.8 times SB3 with one update per step, 9 with twenty."""
+    rows = [
+        ("sac", 1, "sbx", 1.2),
+        ("sac", 20, "sbx", 1.2),
+        ("sac", 1, "sb3", 4.8),
+        ("sac", 20, "sb3", 9.0),
+        ("droq", 20, "sbx", 1.5),
+        ("sac", 4, "compiled", None),
+    ]
+    table = pd.DataFrame(rows, columns=["name", "ratio", "peer", "speed_up"])
+    return table.assign(low=table["speed_up"], high=table["speed_up"])
+
+
+def test_speed_ups_stand_beside_what_they_shall_be():
+    shown = speed.beside_targets(measured()).set_index(["name", "ratio", "peer"])
+
+    assert shown["wanted"].tolist() == [1.0, 1.3, 3.0, 3.0, 1.3]
+    assert shown["reached"].tolist() == ["yes", "no", "yes", "yes", "yes"]
+
+
+def test_what_sbx_gains_over_sb3_is_the_ratio_of_what_ours_gains_over_both():
+    shown = speed.sbx_beside_sb3(measured()).set_index(["name", "ratio"])["sbx_times_sb3"]
+
+    assert shown.to_dict() == pytest.approx({("sac", 1): 4.0, ("sac", 20): 7.5})
