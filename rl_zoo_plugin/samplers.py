@@ -53,6 +53,14 @@ def convert_planner_params(sampled_params: Params) -> Params:
     }
 
 
+def _suggest_usual(trial: Any) -> None:
+    trial.suggest_float("one_minus_gamma", 1e-3, 0.1, log=True)
+    trial.suggest_float("learning_rate", 1e-5, 2e-3, log=True)
+    trial.suggest_int("batch_size_pow", 5, 9)
+    trial.suggest_int("learning_starts", 100, 10_000, log=True)
+    trial.suggest_categorical("net_arch", list(_NET_ARCHS))
+
+
 def sample_model_free_params(
     trial: Any, n_actions: int, n_envs: int, additional_args: Params
 ) -> Params:
@@ -63,13 +71,9 @@ def sample_model_free_params(
     :param n_actions: unused, as are the next two: the zoo calls every sampler with them
     :return: hyperparameters
     """
-    trial.suggest_float("one_minus_gamma", 1e-3, 0.1, log=True)
-    trial.suggest_float("learning_rate", 1e-5, 2e-3, log=True)
-    trial.suggest_int("batch_size_pow", 5, 9)
-    trial.suggest_int("learning_starts", 100, 10_000, log=True)
+    _suggest_usual(trial)
     trial.suggest_int("gradient_steps_pow", 0, 4)
     trial.suggest_categorical("policy_delay", [1, 2, 3, 10, 20])
-    trial.suggest_categorical("net_arch", list(_NET_ARCHS))
     return convert_model_free_params(trial.params)
 
 
@@ -79,11 +83,14 @@ def convert_model_free_params(sampled_params: Params) -> Params:
     :return: hyperparameters
     """
     params = dict(sampled_params)
+    updates = {}
+    if "gradient_steps_pow" in params:
+        updates["gradient_steps"] = 2 ** params.pop("gradient_steps_pow")
     return {
         "gamma": 1 - params.pop("one_minus_gamma"),
         "batch_size": 2 ** params.pop("batch_size_pow"),
-        "gradient_steps": 2 ** params.pop("gradient_steps_pow"),
         "policy_kwargs": {"net_arch": list(_NET_ARCHS[params.pop("net_arch")])},
+        **updates,
         **params,
     }
 
@@ -94,17 +101,52 @@ def sample_soft_params(trial: Any, n_actions: int, n_envs: int, additional_args:
     return sample_model_free_params(trial, n_actions, n_envs, additional_args)
 
 
+def sample_tqc_params(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+    """Sampler of TQC: also how many quantiles there are, and how many of them are left out."""
+    n_quantiles = trial.suggest_int("n_quantiles", 5, 50)
+    trial.suggest_int("top_quantiles_to_drop_per_net", 0, n_quantiles - 1)
+    trial.suggest_float("tau", 1e-3, 0.08, log=True)
+    sample_model_free_params(trial, n_actions, n_envs, additional_args)
+    return convert_tqc_params(trial.params)
+
+
+def convert_tqc_params(sampled_params: Params) -> Params:
+    """
+    :param sampled_params: ``trial.params`` of a trial of :func:`sample_tqc_params`
+    :return: hyperparameters
+    """
+    others = {name: value for name, value in sampled_params.items() if name != "n_quantiles"}
+    params = convert_model_free_params(others)
+    params["policy_kwargs"]["n_quantiles"] = sampled_params["n_quantiles"]
+    return params
+
+
+def sample_td7_params(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+    """
+    Sampler of TD7: also how often its copies move, and how much it explores. In one environment,
+    it updates as often as it has acted, so that the number of updates is nothing to suggest.
+
+    :param trial: an Optuna trial
+    :param n_actions: unused, as is the last: the zoo calls every sampler with them
+    :param n_envs: copies of the environment
+    :return: hyperparameters
+    """
+    trial.suggest_categorical("target_update_interval", [100, 250, 500])
+    trial.suggest_float("exploration_noise", 0.05, 0.4, log=True)
+    _suggest_usual(trial)
+    if n_envs > 1:
+        trial.suggest_int("gradient_steps_pow", 0, 4)
+    trial.suggest_categorical("policy_delay", [1, 2, 3])
+    return convert_model_free_params(trial.params)
+
+
 def sample_gsde_params(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
     """Sampler of gSDE-SAC: also when the noise matrix is drawn, and where its size starts."""
     trial.suggest_categorical("train_freq", [4, 8, 16, 64])
     trial.suggest_float("log_std_init", -4.0, 0.0)
     trial.suggest_float("tau", 1e-3, 0.08, log=True)
-    trial.suggest_float("one_minus_gamma", 1e-3, 0.1, log=True)
-    trial.suggest_float("learning_rate", 1e-5, 2e-3, log=True)
-    trial.suggest_int("batch_size_pow", 5, 9)
-    trial.suggest_int("learning_starts", 100, 10_000, log=True)
+    _suggest_usual(trial)
     trial.suggest_int("gradient_steps_pow", 0, 6)
-    trial.suggest_categorical("net_arch", list(_NET_ARCHS))
     return convert_gsde_params(trial.params)
 
 
@@ -159,14 +201,15 @@ def convert_open_loop_params(sampled_params: Params) -> Params:
     }
 
 
-_SOFT = ("droq", "tqc_jax", "simba", "bro")
+_SOFT = ("droq", "simba", "bro")
 
 SAMPLERS: dict[str, Callable[[Any, int, int, Params], Params]] = {
     "pods": sample_planner_params,
     "hds": sample_planner_params,
     "gsde_sac": sample_gsde_params,
     "crossq_jax": sample_model_free_params,
-    "td7": sample_model_free_params,
+    "tqc_jax": sample_tqc_params,
+    "td7": sample_td7_params,
     "openloop": sample_open_loop_params,
     **dict.fromkeys(_SOFT, sample_soft_params),
 }
@@ -175,6 +218,7 @@ CONVERTERS: dict[str, Callable[[Params], Params]] = {
     "hds": convert_planner_params,
     "gsde_sac": convert_gsde_params,
     "crossq_jax": convert_model_free_params,
+    "tqc_jax": convert_tqc_params,
     "td7": convert_model_free_params,
     "openloop": convert_open_loop_params,
     **dict.fromkeys(_SOFT, convert_model_free_params),

@@ -168,15 +168,31 @@ def test_what_a_trial_means():
     }
 
 
+@pytest.mark.parametrize("n_envs", [1, 2])
 @pytest.mark.parametrize("algo", tables.ALGORITHMS)
-def test_what_is_sampled_are_arguments_of_the_algorithm(algo):
+def test_what_is_sampled_are_arguments_of_the_algorithm(algo, n_envs):
     optuna = pytest.importorskip("optuna")
     algorithm = LazyAlgorithm(tables.ALGORITHMS[algo]).resolve()
     trial = optuna.create_study().ask()
 
-    sampled = SAMPLERS[algo](trial, n_actions=1, n_envs=1, additional_args={})
+    sampled = SAMPLERS[algo](trial, n_actions=1, n_envs=n_envs, additional_args={})
 
     assert set(sampled) <= set(lazy.parameters_of(algorithm))
+
+
+@pytest.mark.parametrize(("n_envs", "suggested"), [(1, False), (2, True)])
+def test_updates_of_td7_are_suggested_where_their_number_counts(n_envs, suggested):
+    trial = pytest.importorskip("optuna").create_study().ask()
+    sampled = SAMPLERS["td7"](trial, n_actions=1, n_envs=n_envs, additional_args={})
+    assert ("gradient_steps" in sampled) == suggested
+
+
+def test_no_trial_of_tqc_drops_all_quantiles():
+    study = pytest.importorskip("optuna").create_study()
+    for _ in range(20):
+        sampled = SAMPLERS["tqc_jax"](study.ask(), n_actions=1, n_envs=1, additional_args={})
+        kept = sampled["policy_kwargs"]["n_quantiles"]
+        assert 0 <= sampled["top_quantiles_to_drop_per_net"] < kept
 
 
 def test_installing_twice_installs_one_finder(monkeypatch):

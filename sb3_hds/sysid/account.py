@@ -35,7 +35,8 @@ def standard_errors(half: Half, point: Point, free: Sequence[int]) -> Float[np.n
     for label in labels:
         own = half.unit == label
         rest = np.linalg.pinv(total - slopes.curvature[own].sum(0), rcond=_RANK, hermitian=True)
-        variance += (rest @ slopes.scores[own].sum(0)) ** 2
+        with np.errstate(over="ignore"):  # infinite is right: one unit alone knows of it
+            variance += (rest @ slopes.scores[own].sum(0)) ** 2
     variance *= (len(labels) - 1) / len(labels)
     result[list(free)] = np.sqrt(variance) * half.evidence.hypotheses.scale[list(free)]
     return result
