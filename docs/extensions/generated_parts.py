@@ -24,11 +24,21 @@ PARTS: dict[str, Callable[[], str]] = {
     "effects": catalogue.effects_as_markdown,
     "environments": catalogue.environments_as_markdown,
     "benchmarks": benchmark_results.as_markdown,
-    "sim_to_real_gap": summaries.whole("sim_to_real_gap"),
+    "sim_to_real_gap": summaries.whole(
+        "sim_to_real_gap", "share of the gap that is closed, by cell"
+    ),
     "sim_to_real_median": summaries.whole("sim_to_real_median"),
     "payload_added": summaries.whole("payload_added_recovery"),
-    "ten_minutes": summaries.first_and_rest("ten_minutes", 3),
-    "hds_parts": summaries.over_seeds("hds_parts", "variant", "return", ends=WORN),
+    "ten_minutes": summaries.first_and_rest(
+        "ten_minutes", 3, "return of each episode against minutes"
+    ),
+    "hds_parts": summaries.over_seeds(
+        "hds_parts",
+        "variant",
+        "return",
+        ends=WORN,
+        shows="return with each part switched off, a dot for each seed",
+    ),
     "open_loop": summaries.gaits,
     "robustness_return": summaries.crossed(
         "robustness", "perturbation", ("env", "policy"), "return"
@@ -52,7 +62,12 @@ PARTS: dict[str, Callable[[], str]] = {
     "diagnosis_cost_picture": summaries.picture(
         "diagnosis_cost", "seconds of a diagnosis against the number of recordings"
     ),
-    "hds_weaknesses": summaries.over_seeds("hds_weaknesses", "variant", "return"),
+    "hds_weaknesses": summaries.over_seeds(
+        "hds_weaknesses",
+        "variant",
+        "return",
+        shows="return with each remedy off and on, a dot for each seed",
+    ),
     "hds_beta": summaries.over_seeds(
         "hds_beta",
         "variant",
@@ -62,6 +77,7 @@ PARTS: dict[str, Callable[[], str]] = {
         "derivative_median",
         "derivative_worst",
         ends=WORN,
+        shows="return, gradient and derivative against the share, a line for each seed",
     ),
 }
 

@@ -12,7 +12,11 @@ _NONE = "Not measured yet in this checkout.\n\n"
 
 
 def over_seeds(
-    name: str, variant: str, *measured: str, ends: tuple[str, str, str] | None = None
+    name: str,
+    variant: str,
+    *measured: str,
+    ends: tuple[str, str, str] | None = None,
+    shows: str = "",
 ) -> Callable[[], str]:
     """
     :param name: of the table, without its ending
@@ -20,6 +24,7 @@ def over_seeds(
     :param measured: columns that are shown
     :param ends: name of a table, and the variants in it between which there is a gap: the share of
         it that each variant's return closes is shown too, once they have been measured
+    :param shows: what is to be seen on the picture of the same name, if there is one
     :return: what makes the Markdown
     """
 
@@ -34,14 +39,15 @@ def over_seeds(
             lines.append([one, *values, *closed, str(len(own))])
         return [variant, *measured, *(["closed"] if gap else []), "seeds"], lines
 
-    return lambda: _shown(name, condensed)
+    return lambda: _shown(name, condensed, shows)
 
 
-def first_and_rest(name: str, n_first: int) -> Callable[[], str]:
+def first_and_rest(name: str, n_first: int, shows: str = "") -> Callable[[], str]:
     """
     :param name: of a table with a row for each episode: minutes, steps, return, and steps that had
         come late by then
     :param n_first: episodes that are shown by themselves
+    :param shows: what is to be seen on the picture of the same name, if there is one
     :return: what makes the Markdown
     """
 
@@ -63,12 +69,20 @@ def first_and_rest(name: str, n_first: int) -> Callable[[], str]:
             )
         return ["episodes", "minutes at their end", "return", "late steps"], lines
 
-    return lambda: _shown(name, condensed)
+    return lambda: _shown(name, condensed, shows)
 
 
-def whole(name: str) -> Callable[[], str]:
-    """:return: what makes the Markdown of a table that is shown as it is, numbers rounded"""
-    return lambda: _shown(name, lambda columns, rows: (columns, [[*map(rounded, r)] for r in rows]))
+def whole(name: str, shows: str = "") -> Callable[[], str]:
+    """
+    :param name: of a table that is shown as it is, numbers rounded
+    :param shows: what is to be seen on the picture of the same name, if there is one
+    :return: what makes the Markdown
+    """
+
+    def as_it_is(columns: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
+        return columns, [[*map(rounded, row)] for row in rows]
+
+    return lambda: _shown(name, as_it_is, shows)
 
 
 def crossed(name: str, row: str, columns: tuple[str, ...], value: str) -> Callable[[], str]:
@@ -136,7 +150,7 @@ def picture(name: str, shows: str) -> Callable[[], str]:
     return lambda: there if (RESULTS / f"{name}.png").exists() else _NONE
 
 
-def _shown(name: str, change: Callable) -> str:
+def _shown(name: str, change: Callable, shows: str = "") -> str:
     path = RESULTS / f"{name}.csv"
     if not path.exists():
         return _NONE
@@ -144,7 +158,7 @@ def _shown(name: str, change: Callable) -> str:
     titles = [column.replace("_", " ") for column in columns]
     shown = table(titles, rows)
     if path.with_suffix(".png").exists():
-        shown += f"![{name.replace('_', ' ')}](../../benchmarks/results/{name}.png)\n\n"
+        shown += f"![{shows or name.replace('_', ' ')}](../../benchmarks/results/{name}.png)\n\n"
     return shown + f"From `benchmarks/results/{name}.csv`."
 
 
