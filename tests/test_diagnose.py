@@ -118,6 +118,10 @@ def test_what_the_data_cannot_tell_apart_is_said():
     (finding,) = found.findings
     assert {finding.effect, *finding.alternatives} >= {"parameter.mass"}
     assert any("torque_gain" in name for name in (finding.effect, *finding.alternatives))
+    assert any(
+        "look alike where the mass scales" in c and "would tell them apart" in c
+        for c in found.caveats
+    ), found.caveats
 
 
 @pytest.mark.expensive

@@ -158,6 +158,12 @@ class Hypotheses:
             and (other.slot != candidate.slot or other.index == candidate.index)
         ]
 
+    def alike(self, key: str, other: str) -> str:
+        """:return: when two candidates look alike, as one of them declares, or nothing"""
+        one, two = (next(c for c in self.candidates if c.key == name) for name in (key, other))
+        found = dict(one.equivalents).get(two.name) or dict(two.equivalents).get(one.name)
+        return found or ""
+
     def indices(self, candidate: Candidate) -> tuple[int, ...]:
         return tuple(self.names.index(name) for name in candidate.parameters)
 

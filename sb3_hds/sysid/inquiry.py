@@ -34,6 +34,7 @@ from sb3_hds.sysid.telling import (
     in_words,
     look_alike,
     margin,
+    to_tell_apart,
     why,
 )
 from sb3_hds.sysid.thinning import thinned
@@ -311,6 +312,7 @@ class Inquiry:
             caveats=(
                 *(f"{found.sentence} {found.remedy}" for found in self.audit.findings),
                 *self.moved,
+                *to_tell_apart(found, self.hypotheses),
                 *look_alike(found, select, base),
             ),
             twin=self.hypotheses.extended_by(_keys(found), point.theta).at_interval(

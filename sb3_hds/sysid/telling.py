@@ -10,6 +10,7 @@ from sb3_hds.sysid.account import standard_errors
 from sb3_hds.sysid.comparison import Comparison
 from sb3_hds.sysid.diagnosis import Finding
 from sb3_hds.sysid.evidence import Point
+from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.imitation import imitators
 from sb3_hds.sysid.profile import profiled
 from sb3_hds.sysid.remainder import Remainder
@@ -75,6 +76,27 @@ def finding(
 def margin(n_units: int, stderr: np.ndarray) -> np.ndarray:
     """:return: half the width of a symmetric interval"""
     return stats.t.ppf(0.5 + 0.5 * _CONFIDENCE, max(n_units - 1, 1)) * stderr
+
+
+def to_tell_apart(found: Sequence[Accepted], hypotheses: Hypotheses) -> list[str]:
+    """:return: sentences on what to record, where the data cannot tell a cause from others"""
+    sentences, undeclared = [], []
+    for one in found:
+        key = one.tried.candidate.key
+        for other in one.alternatives:
+            if when := hypotheses.alike(key, other):
+                sentences.append(
+                    f"{key} and {other} look alike {when}. Recordings of which that is not true "
+                    "would tell them apart."
+                )
+            else:
+                undeclared.append(f"{key} from {other}")
+    if undeclared:
+        sentences.append(
+            f"To tell {', '.join(undeclared)}, record other speeds, positions and commands: in "
+            "these data they make much the same difference."
+        )
+    return sentences
 
 
 def look_alike(found: Sequence[Accepted], half: Half, base: Base) -> list[str]:
