@@ -273,7 +273,8 @@ def beta_figure(rows: pd.DataFrame):
         axes.set_title(title, fontsize=9)
         axes.set_xlabel("share of plans in the learned model", fontsize=8)
         axes.tick_params(labelsize=8)
-    panels[0].legend(fontsize=7, frameon=False)
+    named = panels[0].get_legend_handles_labels()
+    drawing.legend(*named, loc="outside upper center", ncols=5, fontsize=8, frameon=False)
     return drawing
 
 
