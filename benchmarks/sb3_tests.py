@@ -60,10 +60,10 @@ def main() -> None:
     wanted = [row for row in arguments.rows if package[row] in sources]
     if arguments.k:
         cases = [{"class": row} | case for row in wanted for case in work(row)]
-        report(pd.DataFrame(cases))
+        report(pd.DataFrame(cases), kept=False)
         return
     resume("sb3_tests", ("class",), [(row,) for row in wanted], work, jobs=1)
-    report(pd.read_csv(RESULTS / "sb3_tests.csv", keep_default_na=False))
+    report(pd.read_csv(RESULTS / "sb3_tests.csv", keep_default_na=False), kept=True)
 
 
 def package_of(source: Path) -> str:
@@ -107,11 +107,15 @@ def outcome(case: ElementTree.Element) -> dict[str, Any]:
     }
 
 
-def report(cases: pd.DataFrame) -> None:
-    """Print how many cases of each class ended how, and each that failed for no known reason."""
+def report(cases: pd.DataFrame, kept: bool) -> None:
+    """
+    Print how many cases of each class ended how, and each that failed for no known reason.
+
+    :param kept: whether the counts are written beside the cases
+    """
     counted = table(cases)
     print(counted.to_string())
-    if set(counted.index) == set(REPLACED):
+    if kept:
         counted.to_csv(RESULTS / "sb3_tests_table.csv")
     for _, case in cases[cases["reason"] == "other"].iterrows():
         print(f"{case['class']:16} {case['case']}\n{'':16} {case['message']}")

@@ -62,6 +62,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "diagnosis_cost_picture": summaries.picture(
         "diagnosis_cost", "seconds of a diagnosis against the number of recordings"
     ),
+    "sb3_tests": summaries.whole("sb3_tests_table"),
     "hds_weaknesses": summaries.over_seeds(
         "hds_weaknesses",
         "variant",
