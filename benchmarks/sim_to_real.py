@@ -117,6 +117,9 @@ def report() -> None:
     medians = over_cells(table, list(wide.index[counts]))
     medians.to_csv(RESULTS / "sim_to_real_median.csv", index=False, float_format="%.4g")
     print(medians.to_string(index=False, float_format=lambda x: f"{x:.2f}"))
+    leads = seed_by_seed(table[~table["cell"].isin(OTHER_TWIN)])
+    leads.to_csv(RESULTS / "sim_to_real_ahead.csv", index=False, float_format="%.4g")
+    print(leads.to_string(index=False, float_format=lambda x: f"{x:.2f}"))
     figure(shown)
     figure_of_gap(shown)
 
@@ -148,6 +151,18 @@ def ahead(group: pd.DataFrame) -> float:
         return np.nan
     differences = returns[others].rsub(returns["hds"], axis=0).groupby("episodes").mean()
     return float(differences.min(axis=None))
+
+
+def seed_by_seed(table: pd.DataFrame) -> pd.DataFrame:
+    """How often HDS is behind a learner with the same seed after as many real steps, if ever."""
+    returns = table.pivot_table("return", ["cell", "seed", "episodes"], "method")
+    rows = []
+    for method in ("sac", "tqc", "droq"):
+        if "hds" in returns and method in returns:
+            leads = (returns["hds"] - returns[method]).dropna()
+            behind = int((leads <= 0.0).sum())
+            rows.append((method, len(leads), behind, leads.min()))
+    return pd.DataFrame(rows, columns=["learner", "comparisons", "HDS behind", "least lead"])
 
 
 def over_cells(table: pd.DataFrame, cells: list[str], n_draws: int = 2000) -> pd.DataFrame:

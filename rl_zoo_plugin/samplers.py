@@ -95,6 +95,15 @@ def convert_model_free_params(sampled_params: Params) -> Params:
     }
 
 
+def _of_policy(name: str, sampled_params: Params) -> Params:
+    """One of them is an argument of the policy."""
+    others = dict(sampled_params)
+    value = others.pop(name)
+    params = convert_model_free_params(others)
+    params["policy_kwargs"][name] = value
+    return params
+
+
 def sample_soft_params(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
     """Sampler of the SAC family: also how fast target networks follow."""
     trial.suggest_float("tau", 1e-3, 0.08, log=True)
@@ -115,10 +124,7 @@ def convert_tqc_params(sampled_params: Params) -> Params:
     :param sampled_params: ``trial.params`` of a trial of :func:`sample_tqc_params`
     :return: hyperparameters
     """
-    others = {name: value for name, value in sampled_params.items() if name != "n_quantiles"}
-    params = convert_model_free_params(others)
-    params["policy_kwargs"]["n_quantiles"] = sampled_params["n_quantiles"]
-    return params
+    return _of_policy("n_quantiles", sampled_params)
 
 
 def sample_td7_params(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
@@ -155,10 +161,7 @@ def convert_gsde_params(sampled_params: Params) -> Params:
     :param sampled_params: ``trial.params`` of a trial of :func:`sample_gsde_params`
     :return: hyperparameters
     """
-    others = {name: value for name, value in sampled_params.items() if name != "log_std_init"}
-    params = convert_model_free_params(others)
-    params["policy_kwargs"]["log_std_init"] = sampled_params["log_std_init"]
-    return params
+    return _of_policy("log_std_init", sampled_params)
 
 
 def sample_open_loop_params(

@@ -183,6 +183,8 @@ def test_exploration_noise_of_stable_baselines_is_applied_and_is_deterministic(n
 def test_one_observation_gives_one_action_and_a_batch_gives_a_batch(name):
     model = small(name)
     space = model.action_space
+    # Of this seed, no action is so near zero that single precision tells on it.
+    model.observation_space.seed(22)
     batch = np.stack([model.observation_space.sample() for _ in range(5)])
 
     actions, state = model.predict(batch, deterministic=True)
@@ -193,7 +195,7 @@ def test_one_observation_gives_one_action_and_a_batch_gives_a_batch(name):
     assert (state is None) == (name in OFF_POLICY)
     assert all(space.contains(action) for action in actions)
     # One program for each batch size: they may round differently.
-    np.testing.assert_allclose(singles, actions, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(singles, actions, rtol=1e-5, atol=1e-7)
 
 
 @every_off_policy

@@ -42,6 +42,15 @@ def test_seeds_that_have_not_run_yet_do_not_count():
     assert found.loc[("hds", 10), "closed"] == 0.9
 
 
+def test_leads_are_those_of_equal_seeds_after_as_many_steps():
+    table = runs_of("light", 2)
+    sac = table[table["method"] == "hds"].assign(method="sac")
+    sac["return"] += [-5.0, -5.0, -5.0, -5.0, 1.0, -5.0]
+    found = sim_to_real.seed_by_seed(pd.concat([table, sac]))
+    assert found.to_numpy().tolist() == [["sac", 6, 1, -1.0]]
+    assert sim_to_real.seed_by_seed(table).empty
+
+
 def test_a_report_without_any_gap_says_what_is_missing(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(sim_to_real, "RESULTS", tmp_path)
     runs_of("light", 1, ("wrong_twin",)).to_csv(tmp_path / "sim_to_real.csv", index=False)

@@ -124,6 +124,15 @@ def test_what_the_data_cannot_tell_apart_is_said():
     ), found.caveats
 
 
+def test_causes_look_alike_at_one_place_only():
+    kinds = (effects.CoulombFriction, effects.ConstantForce)
+    hypotheses = Hypotheses.about(twins.make("DoublePendulum", dt=0.02), kinds, ())
+
+    one_way = "while the joint moves in one direction"
+    assert hypotheses.alike("coulomb_friction.joint1", "constant_force.joint1") == one_way
+    assert hypotheses.alike("coulomb_friction.joint1", "constant_force.joint2") == ""
+
+
 @pytest.mark.expensive
 def test_what_is_refitted_as_a_nuisance_is_no_finding():
     data = on_engine(mass=1.1)

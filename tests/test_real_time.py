@@ -230,7 +230,7 @@ def test_in_real_time_a_learner_that_hangs_is_replaced_by_the_watchdog():
     commands = [command for _, command in env.unwrapped.told]
     # Never faster than the clock, and how much slower depends on the machine.
     assert elapsed >= 5 * 0.02 + 0.3
-    assert 1 <= info["missed_steps"] <= elapsed / 0.02 + 1
+    assert 1 <= info["missed_steps"] <= 16
     assert commands[-1] == 1.0 and commands[-2] == -1.0
     assert env.timing.steps == 6 and env.timing.safe_actions >= info["missed_steps"]
     assert env.overrun and env.latencies()[0].sum() == 6

@@ -27,6 +27,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "sim_to_real_gap": summaries.whole(
         "sim_to_real_gap", "share of the gap that is closed, by cell"
     ),
+    "sim_to_real_ahead": summaries.whole("sim_to_real_ahead"),
     "sim_to_real_median": summaries.whole("sim_to_real_median"),
     "payload_added": summaries.whole("payload_added_recovery"),
     "ten_minutes": summaries.first_and_rest(

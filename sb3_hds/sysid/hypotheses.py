@@ -45,6 +45,11 @@ class Candidate:
         """Name and place: unique."""
         return self.name if self.slot == PARAMETER else f"{self.name}.{self.place}"
 
+    def resembles(self, other: "Candidate") -> str:
+        """:return: when it looks like another one, as it declares; nothing at another place"""
+        elsewhere = other.slot == self.slot and other.index != self.index
+        return "" if elsewhere else dict(self.equivalents).get(other.name, "")
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Hypotheses:
@@ -151,18 +156,12 @@ class Hypotheses:
 
     def related(self, candidate: Candidate) -> list[Candidate]:
         """:return: what is declared to look like a candidate, at its place"""
-        return [
-            other
-            for other in self.candidates
-            if other.name in dict(candidate.equivalents)
-            and (other.slot != candidate.slot or other.index == candidate.index)
-        ]
+        return [other for other in self.candidates if candidate.resembles(other)]
 
     def alike(self, key: str, other: str) -> str:
         """:return: when two candidates look alike, as one of them declares, or nothing"""
         one, two = (next(c for c in self.candidates if c.key == name) for name in (key, other))
-        found = dict(one.equivalents).get(two.name) or dict(two.equivalents).get(one.name)
-        return found or ""
+        return one.resembles(two) or two.resembles(one)
 
     def indices(self, candidate: Candidate) -> tuple[int, ...]:
         return tuple(self.names.index(name) for name in candidate.parameters)
