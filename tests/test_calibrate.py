@@ -47,6 +47,23 @@ def test_planted_parameters_are_found_within_three_standard_errors(fit):
         assert fit.twin.values[name] == found.estimate
 
 
+def test_a_spring_that_rings_longer_than_a_window_is_found_as_it_is():
+    # At 1.1 Hz with 4 % of critical damping, half the swing is left after 2.4 s.
+    axis = twins.make("LinearAxis", dt=0.02, damping=3.0)
+    planted = {"k": 12.0, "d": 0.15}
+    commands = np.random.default_rng(1).standard_normal((8, 20, 1)).repeat(10, 1)
+    ringing = axis.extend(effects.JointElasticity(**planted))
+    data = measured(ringing, noise=0.002, commands=4.0 * commands)
+
+    believed = axis.extend(effects.JointElasticity(k=10.0, d=0.3))
+    fit = calibrate(believed, data, free=[f"joint_elasticity.axis.{name}" for name in planted])
+
+    for name, value in planted.items():
+        found = fit[f"joint_elasticity.axis.{name}"]
+        assert abs(found.estimate - value) < 3.0 * found.stderr
+        assert found.stderr < 0.05 * value
+
+
 def test_noise_and_errors_are_those_of_the_data(fit):
     np.testing.assert_allclose(fit.noise, 0.02, rtol=0.2)
     # Over a window, start states take up some of the noise.

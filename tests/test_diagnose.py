@@ -459,6 +459,34 @@ def test_a_fit_stays_within_physical_bounds():
         np.testing.assert_array_equal(found[others], hypotheses.null[others])
 
 
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        (effects.JointElasticity, {"k": 12.0, "d": 0.15}),
+        (effects.ActionDelay, {"delay": 0.05}),
+        (effects.MotorLag, {"time_constant": 0.03}),
+        (effects.QuadraticDrag, {"c": 0.2}),
+    ],
+)
+def test_every_window_begins_with_what_happened_before_it(kind, values):
+    """A candidate as it was planted explains windows from the middle of a recording exactly."""
+    axis = twins.make("LinearAxis", dt=0.02, damping=3.0)
+    data = measured(axis.extend(kind(0, **values)), commands=_steps(n=8, each=10))
+    hypotheses = Hypotheses.about(axis, [kind, effects.CoulombFriction], ())
+    shots, _ = shots_of(data, 50, hypotheses.twin)
+    evidence = Evidence(hypotheses, shots, np.full(2, 0.01), 3)
+    candidate = next(c for c in hypotheses.candidates if c.name == kind.name)
+    theta = hypotheses.null.copy()
+    theta[list(hypotheses.indices(candidate))] = list(values.values())
+
+    np.testing.assert_allclose(evidence.fit(theta, ()).raw, 0.0, atol=1e-5)
+
+
+def _steps(n, each):
+    """Commands that jump now and then."""
+    return 4.0 * np.random.default_rng(1).standard_normal((n, 20, 1)).repeat(each, 1)
+
+
 def test_a_guess_stays_within_its_room():
     """The second of two coupled parameters may not move below zero: the first moves alone then."""
     curvature, score = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([-2.0, 1.0])

@@ -225,6 +225,22 @@ def test_a_push_makes_motor_and_load_swing_as_two_masses_on_a_spring(x64, share,
     assert lead.max() > 0.15
 
 
+def test_half_the_sub_step_quarters_the_error_of_a_damped_axis_on_a_spring(x64):
+    # Damping makes what drives the motor apart change within a sub-step.
+    pushes = 2.0 * np.sin(0.3 * np.arange(100))[:, None]
+
+    def position(substeps):
+        axis = twins.make("LinearAxis", dt=0.02, damping=3.0).at_interval(0.02, substeps)
+        twin = axis.extend(JointElasticity(k=13.0, d=0.5))
+        start = twin.infer(jnp.zeros(2), twin.params)
+        return rollout(twin, twin.params, start, jnp.asarray(pushes)).states.q[:, 0]
+
+    exact = position(256)
+    coarse, fine = (np.abs(position(n) - exact).max() for n in (4, 8))
+
+    np.testing.assert_allclose(coarse / fine, 4.0, rtol=0.1)
+
+
 def test_a_stiff_joint_is_nearly_rigid_at_any_sub_step(x64):
     twin = twins.make("Pendulum")
     actions = 1.5 * np.sin(0.3 * np.arange(60))[:, None]

@@ -28,7 +28,7 @@ class AnalyticTwin(Twin):
     A subclass gives :math:`\tau` (:meth:`actuate`), :math:`M` (:meth:`mass_matrix`) and :math:`c`
     (:meth:`bias`: gravity, Coriolis, centrifugal and the twin's own damping), and names the
     integrator that its environment uses. Effects are evaluated wherever the equation of motion is,
-    but for those that are held over a sub-step.
+    but for those that are held over a sub-step: they are evaluated in its middle.
     """
 
     integrator: Integrator = staticmethod(semi_implicit_euler)
@@ -70,18 +70,17 @@ class AnalyticTwin(Twin):
                     q, v, actuator, self.bias(q, v, params), self.mass_matrix(q, params), h
                 )
 
-            start = moment(state.q, state.v)
-            held = effects.force(start, memory, held=True)
+            held, middle = effects.held(moment, state.q, state.v, memory, h)
 
             def acceleration(q: Position, v: Velocity) -> Velocity:
                 now = moment(q, v)
-                added = held + effects.force(now, memory, held=False)
+                added = held + effects.force(now, memory)
                 return solve_spd(now.mass_matrix, now.actuator + added - now.load)
 
             q, v = self.integrator(acceleration, state.q, state.v, h, self.limit_velocity)
             q, v = self.limit(q, v)
             # With the new velocity: an elastic memory then keeps energy, as the twin itself does.
-            return State(q, v, effects.advance(start, moment(q, v), memory)), None
+            return State(q, v, effects.advance(middle, moment(q, v), memory)), None
 
         if self.substeps == 1:
             return substep(state, None)[0]

@@ -136,6 +136,7 @@ class JointElasticity(Transmission):
     }
     explanation = "The drive is springy: its motor can turn a little before the load follows."
     source = "De Luca and Book 2008, section 13.1.1"
+    forgets = 5.0
 
     def lead(
         self, memory: Memory, drive: Scalar, inertia: Scalar, h: float, params: Params

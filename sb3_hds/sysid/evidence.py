@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sb3_hds.core import Params, Twin
-from sb3_hds.core.compilation import QUICKEST_COMPILATION
+from sb3_hds.core import Effect, Params, Twin
+from sb3_hds.core.compilation import QUICK_COMPILATION
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.motion import first_offsets
-from sb3_hds.sysid.shooting import Shots, simulate, with_slopes
+from sb3_hds.sysid.shooting import Shots, n_steps_of, simulate, with_slopes
 
 # Beyond this, in units of the noise, an error counts in proportion, not by its square.
 _HUBER = 3.0
@@ -208,6 +208,16 @@ class Evidence:
         n, rows = self.shots.obs.shape[:2]
         return 0 if not len(index) and n * rows > _MANY_STEPS else self.width
 
+    def _lead_under(self, theta: np.ndarray, index: np.ndarray) -> int:
+        """:return: steps before a window in which memory must be filled under these parameters"""
+        h = self.hypotheses
+        active = theta != h.null
+        # What is absent remembers nothing, but its slope may need the last few commands.
+        begins = np.where(active, h.forgets, np.minimum(h.forgets, Effect.forgets))
+        active[index] = True
+        longest = max(h.always, float(begins[active].max(initial=0.0)))
+        return min(n_steps_of(longest, h.twin.dt), self.shots.lead_obs.shape[1])
+
     def _blocks(self, theta: np.ndarray, index: np.ndarray, offsets: np.ndarray) -> _Blocks:
         """Normal equations at a point, of the parameters named by ``index``."""
 
@@ -221,13 +231,15 @@ class Evidence:
     def _portion(
         self, shots: Shots, theta: np.ndarray, index: np.ndarray, offsets: np.ndarray, n: int
     ) -> _Blocks:
-        h = self.hypotheses
+        h, n_lead = self.hypotheses, self._lead_under(theta, index)
         filled = np.zeros((self.portion, offsets.shape[1]))
         filled[:n] = offsets
         slopes = []
         for chosen in _in_groups(index, self._width_for(index), len(theta)):
             with jax.enable_x64(True):
-                found = _look(h.twin, h.names, h.fixed, shots, theta, chosen, filled, h.scale)
+                found = _look(
+                    h.twin, h.names, h.fixed, shots, theta, chosen, filled, h.scale, n_lead
+                )
             raw, by_start, by_theta = (np.asarray(leaf)[:n] for leaf in found)
             slopes.append(by_theta)
         by_theta = np.concatenate(slopes, -1)[..., : len(index)]
@@ -252,7 +264,7 @@ def _in_groups(index: np.ndarray, width: int, nothing: int) -> Iterator[np.ndarr
         yield np.concatenate([own, np.full(width - len(own), nothing)])
 
 
-@partial(jax.jit, static_argnums=(0, 1), compiler_options=QUICKEST_COMPILATION)
+@partial(jax.jit, static_argnums=(0, 1), compiler_options=QUICK_COMPILATION)
 def _look(
     twin: Twin,
     names: tuple[str, ...],
@@ -262,8 +274,10 @@ def _look(
     index: Array,
     offsets: Float[Array, "n free"],
     scale: Float[Array, " p"],
+    n_lead: Array,
 ) -> tuple[Array, Array, Array]:
     """
+    :param n_lead: steps before each window that matter to what is remembered
     :return: simulated minus measured, and its slopes by start state and by the parameters that
         ``index`` names (in units of their scale)
     """
@@ -275,7 +289,7 @@ def _look(
             step = jnp.zeros(len(names) + 1, theta.dtype).at[index].set(both[n:])
             values = theta + scale * step[:-1]
             params = fixed | {name: values[i] for i, name in enumerate(names)}
-            return simulate(twin, params, shot, offset + both[:n]) - shot.obs
+            return simulate(twin, params, shot, offset + both[:n], n_lead) - shot.obs
 
         error, slopes = with_slopes(of, jnp.zeros(n + index.shape[0], theta.dtype))
         return error, slopes[..., :n], slopes[..., n:]

@@ -9,10 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.core import ActionEffect, Effect, ExtendedTwin, ForceEffect, Params, Twin
+from sb3_hds.core import (
+    ActionEffect,
+    Effect,
+    ExtendedTwin,
+    ForceEffect,
+    Params,
+    SensorEffect,
+    Twin,
+)
 from sb3_hds.core.layers import layers_of, plant_of
 from sb3_hds.effects import ConstantForce, NeuralForce, SignFlip, reversed_joint
 from sb3_hds.errors import CalibrationError, EffectError
+from sb3_hds.sysid.shooting import remembered_for
 
 #: the slot of a twin's own parameter, beside those of effects
 PARAMETER = "parameter"
@@ -143,6 +152,22 @@ class Hypotheses:
         with jax.enable_x64(True):
             return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), self.twin.params)
 
+    @cached_property
+    def forgets(self) -> Float[np.ndarray, " p"]:
+        """:return: after how long the memory that each parameter shapes is forgotten [s]"""
+        found = {
+            f"{a.key}.{name}": a.effect.forgets
+            for a in _attached_of(self.twin)
+            if _remembers(a.effect, self.twin)
+            for name in a.effect.parameters
+        }
+        return np.array([found.get(name, 0.0) for name in self.names])
+
+    @cached_property
+    def always(self) -> float:
+        """:return: the same for what the twin as it came remembers [s]"""
+        return remembered_for(self.believed)
+
     def effect_of(self, candidate: Candidate) -> Effect | None:
         """:return: the effect that the candidate is; None for a parameter, or several effects"""
         found = [a.effect for a in _attached_of(self.twin) if a.key == candidate.key]
@@ -151,8 +176,7 @@ class Hypotheses:
     def remembers(self, candidate: Candidate) -> bool:
         """:return: whether it is a force or a command that depends on what was before"""
         effect = self.effect_of(candidate)
-        inside = isinstance(effect, ForceEffect | ActionEffect)
-        return inside and bool(jax.tree.leaves(effect.memory(self.twin)))
+        return isinstance(effect, ForceEffect | ActionEffect) and _remembers(effect, self.twin)
 
     def related(self, candidate: Candidate) -> list[Candidate]:
         """:return: what is declared to look like a candidate, at its place"""
@@ -249,6 +273,14 @@ def _reversed_joints(twin: Twin) -> list[Candidate]:
             names = tuple(f"{SignFlip.name}.{flip.where}.flipped" for flip in flips)
             found.append(Candidate(SignFlip.name, "joint", joint.name, i, names, _OF_DIRECTION))
     return found
+
+
+def _remembers(effect: Effect, twin: Twin) -> bool:
+    if isinstance(effect, SensorEffect):
+        return bool(jax.tree.leaves(effect.memory(jnp.zeros(()), twin)))
+    return isinstance(effect, ForceEffect | ActionEffect) and bool(
+        jax.tree.leaves(effect.memory(twin))
+    )
 
 
 def _attached_of(twin: Twin) -> tuple:

@@ -14,15 +14,16 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from sb3_hds.core import Obs, Params, State, Trajectories, Twin
+from sb3_hds.core import Effect, ExtendedTwin, Obs, Params, State, Trajectories, Twin
+from sb3_hds.core.layers import layers_of
 from sb3_hds.errors import TrajectoryError
 
 # Error that stands for a simulation that is not finite, in units of the noise.
 _NOT_FINITE = 1e6
 # Added to the normal equations of a start state, relative to their diagonal.
 _DAMPING = 1e-9
-# Commands before a window that memory (a delay, a lag) is filled with [s].
-_LEAD = 0.4
+# For how long before a window memory of unknown kind, as of a wrapper, is filled [s].
+_LEAD = Effect.forgets
 
 Offset = Float[Array, " tangent"]
 
@@ -74,7 +75,7 @@ def shots_of(
     """
     cuts = _windows_in(data, length)
     n = len(cuts) if n_rows is None else n_rows
-    lead = _lead_of(twin, data.dt)
+    lead = min(n_steps_of(remembered_for(twin), data.dt), int(data.lengths.max()))
     cuts = [cuts[i] for i in _chosen(len(cuts), n, seed)]
     rows = [_cut(data, i, k, length, lead) for i, k in cuts]
     padding = [rows[0]._replace(weight=np.zeros(()))] * (n - len(rows))
@@ -129,36 +130,43 @@ def _chosen(n_windows: int, n_rows: int, seed: int | None) -> np.ndarray:
     return np.sort(np.random.default_rng(seed).choice(n_windows, n_rows, replace=False))
 
 
-def simulate(twin: Twin, params: Params, shot: Shots, offset: Offset) -> Float[Array, "rows obs"]:
+def simulate(
+    twin: Twin, params: Params, shot: Shots, offset: Offset, n_lead: Array | None = None
+) -> Float[Array, "rows obs"]:
     """
     Commands before the window fill what the twin remembers: the motion is measured there.
 
     :param shot: one window
     :param offset: of the start state from what the first measurement says, as a tangent vector of
         positions and velocities
+    :param n_lead: how many of the steps before the window are simulated, the last ones; default:
+        all. Where it is given, only forward derivatives can be taken.
     :return: what the twin's sensors would have reported, shape ``(steps + 1, n_obs)``
     """
     lead, steps = shot.lead_actions.shape[0], shot.actions.shape[0]
     obs = jnp.concatenate([shot.lead_obs, shot.obs[:-1]])
     actions = jnp.concatenate([shot.lead_actions, shot.actions])
     known = jnp.concatenate([shot.lead_known, jnp.ones(steps)]) > 0.0
-    place = jnp.arange(lead + steps) - lead
 
-    def advance(state: State, given: tuple[Array, ...]) -> tuple[State, Obs]:
-        obs, action, known, place = given
-        seen = twin.infer(obs, params)
+    def advance(i: Array, now: tuple[State, Array]) -> tuple[State, Array]:
+        state, simulated = now
+        place = i - lead
+        seen = twin.infer(obs[i], params)
         seen = _moved(twin, seen, jnp.where(place == 0, offset, 0.0))
         q, v = (jnp.where(place > 0, *pair) for pair in zip(state[:2], seen[:2], strict=True))
         state = State(q, v, state.memory)
-        after = twin.step(state, action, params)
+        after = twin.step(state, actions[i], params)
         memory = jax.tree.map(
-            lambda new, old: jnp.where(known, new, old), after.memory, state.memory
+            lambda new, old: jnp.where(known[i], new, old), after.memory, state.memory
         )
-        return after._replace(memory=memory), twin.observe(state, params)
+        row = jnp.maximum(place, 0)
+        return after._replace(memory=memory), simulated.at[row].set(twin.observe(state, params))
 
-    first = twin.infer(obs[0], params)
-    last, seen = jax.lax.scan(advance, first, (obs, actions, known, place))
-    return jnp.concatenate([seen[lead:], twin.observe(last, params)[None]])
+    begin = 0 if n_lead is None else lead - n_lead
+    first = twin.infer(obs[begin], params)
+    rows = jnp.zeros((steps, obs.shape[1]), twin.observe(first, params).dtype)
+    last, simulated = jax.lax.fori_loop(begin, lead + steps, advance, (first, rows))
+    return jnp.concatenate([simulated, twin.observe(last, params)[None]])
 
 
 def n_free(twin: Twin) -> int:
@@ -252,10 +260,18 @@ def _moved(twin: Twin, state: State, offset: Offset) -> State:
     return twin.retract(state, jnp.concatenate([offset, jnp.zeros_like(rest)]))
 
 
-def _lead_of(twin: Twin, dt: float) -> int:
+def remembered_for(twin: Twin) -> float:
+    """:return: how long before a window what the twin remembers may have begun to differ [s]"""
     obs = jnp.zeros(len(twin.channels))
-    remembers = jax.eval_shape(lambda: twin.infer(obs, twin.params).memory)
-    return int(np.ceil(_LEAD / dt)) if jax.tree.leaves(remembers) else 0
+    if not jax.tree.leaves(jax.eval_shape(lambda: twin.infer(obs, twin.params).memory)):
+        return 0.0
+    extended = (layer for layer in layers_of(twin) if isinstance(layer, ExtendedTwin))
+    return max([_LEAD, *(a.effect.forgets for layer in extended for a in layer.attached)])
+
+
+def n_steps_of(seconds: float, dt: float) -> int:
+    """:return: steps that cover a time"""
+    return int(np.ceil(seconds / dt - 1e-9))
 
 
 def _cut(data: Trajectories, i: int, k: int, length: int, lead: int) -> Shots:
