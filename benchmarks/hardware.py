@@ -8,9 +8,15 @@ from runs import CACHE, code_version
 PENDULUM, CART = "sb3_hds/PendulumReal-v1", "sb3_hds/InvertedPendulumFriction-v5"
 CELLS = {
     "light": (PENDULUM, {"mass": 0.75}),
+    "a little light": (PENDULUM, {"mass": 0.875}),
+    "a little heavy": (PENDULUM, {"mass": 1.125}),
     "heavy": (PENDULUM, {"mass": 1.25}),
     "short": (PENDULUM, {"length": 0.5}),
+    "a little short": (PENDULUM, {"length": 0.75}),
+    "a little long": (PENDULUM, {"length": 1.25}),
     "long": (PENDULUM, {"length": 1.5}),
+    "noise 0.1": (PENDULUM, {"noise": 0.1}),
+    "noise 0.2": (PENDULUM, {"noise": 0.2}),
     "heavy, long": (PENDULUM, {"mass": 1.25, "length": 1.25}),
     "heavy, long, noise 0.1": (PENDULUM, {"mass": 1.25, "length": 1.25, "noise": 0.1}),
     "heavy, long, noise 0.2": (PENDULUM, {"mass": 1.25, "length": 1.25, "noise": 0.2}),

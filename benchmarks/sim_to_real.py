@@ -211,7 +211,8 @@ def closed(table: pd.DataFrame) -> pd.DataFrame:
             values = by_seed[method, episodes].dropna()
             paired = values.index.intersection(gaps.index)
             gained = (values - by_seed["wrong_twin", 0])[paired]
-            share = gained.mean() / gaps[paired].mean()
+            gap = gaps[paired].mean()
+            share = gained.mean() / gap if gap else np.nan
             rows.append(
                 {
                     "cell": cell,
@@ -228,11 +229,16 @@ def closed(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def learned_in(shown: pd.DataFrame) -> list[str]:
+    """:return: cells in which somebody has learned, in their order"""
+    return list(dict.fromkeys(shown[shown["episodes"] > 0]["cell"]))
+
+
 def figure(shown: pd.DataFrame) -> None:
     """Return against real episodes, a panel for each cell."""
     from matplotlib.figure import Figure
 
-    cells = list(dict.fromkeys(shown["cell"]))
+    cells = learned_in(shown)
     columns = min(4, len(cells))
     lines = -(-len(cells) // columns)
     drawing = Figure(figsize=(3.2 * columns, 2.6 * lines), layout="constrained")
@@ -281,7 +287,7 @@ def figure_of_gap(shown: pd.DataFrame) -> None:
     """The share of each cell's gap that is closed, with what counts on top."""
     from matplotlib.figure import Figure
 
-    own = shown[~shown["cell"].isin(OTHER_TWIN)]
+    own = shown[shown["cell"].isin(learned_in(shown)) & ~shown["cell"].isin(OTHER_TWIN)]
     cells = list(dict.fromkeys(own.sort_values("counts", ascending=False, kind="stable")["cell"]))
     counts = own.groupby("cell")["counts"].first()
     drawing = Figure(figsize=(6.4, 0.34 * len(cells) + 1.2), layout="constrained")
