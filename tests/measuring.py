@@ -35,6 +35,11 @@ def measured(twin, n=8, n_steps=60, noise=0.0, seed=0, share=0.8, commands=None)
     )
 
 
+def jumping(n, n_levels=20, each=10, size=4.0):
+    """:return: commands that jump now and then, shape ``(n, n_levels * each, 1)``"""
+    return size * np.random.default_rng(1).standard_normal((n, n_levels, 1)).repeat(each, 1)
+
+
 def wandering(twin, n, n_steps, share, rng):
     low, high = (np.array([getattr(a, end) for a in twin.actuators]) for end in ("low", "high"))
     wander = rng.standard_normal((n, n_steps, len(low))).cumsum(1)

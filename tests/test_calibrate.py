@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from measuring import measured
+from measuring import jumping, measured
 from scipy.optimize import least_squares
 
 from sb3_hds import effects, twins
@@ -51,9 +51,8 @@ def test_a_spring_that_rings_longer_than_a_window_is_found_as_it_is():
     # At 1.1 Hz with 4 % of critical damping, half the swing is left after 2.4 s.
     axis = twins.make("LinearAxis", dt=0.02, damping=3.0)
     planted = {"k": 12.0, "d": 0.15}
-    commands = np.random.default_rng(1).standard_normal((8, 20, 1)).repeat(10, 1)
     ringing = axis.extend(effects.JointElasticity(**planted))
-    data = measured(ringing, noise=0.002, commands=4.0 * commands)
+    data = measured(ringing, noise=0.002, commands=jumping(8))
 
     believed = axis.extend(effects.JointElasticity(k=10.0, d=0.3))
     fit = calibrate(believed, data, free=[f"joint_elasticity.axis.{name}" for name in planted])

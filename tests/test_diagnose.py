@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from measuring import measured
+from measuring import jumping, measured
 
 from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import JointEffect, Parameter, Trajectories, rollout
@@ -471,7 +471,7 @@ def test_a_fit_stays_within_physical_bounds():
 def test_every_window_begins_with_what_happened_before_it(kind, values):
     """A candidate as it was planted explains windows from the middle of a recording exactly."""
     axis = twins.make("LinearAxis", dt=0.02, damping=3.0)
-    data = measured(axis.extend(kind(0, **values)), commands=_steps(n=8, each=10))
+    data = measured(axis.extend(kind(0, **values)), commands=jumping(8))
     hypotheses = Hypotheses.about(axis, [kind, effects.CoulombFriction], ())
     shots, _ = shots_of(data, 50, hypotheses.twin)
     evidence = Evidence(hypotheses, shots, np.full(2, 0.01), 3)
@@ -480,11 +480,6 @@ def test_every_window_begins_with_what_happened_before_it(kind, values):
     theta[list(hypotheses.indices(candidate))] = list(values.values())
 
     np.testing.assert_allclose(evidence.fit(theta, ()).raw, 0.0, atol=1e-5)
-
-
-def _steps(n, each):
-    """Commands that jump now and then."""
-    return 4.0 * np.random.default_rng(1).standard_normal((n, 20, 1)).repeat(each, 1)
 
 
 def test_a_guess_stays_within_its_room():

@@ -5,7 +5,7 @@
 QUICK_COMPILATION = {"xla_cpu_use_fusion_emitters": False}
 
 #: For programs that run a few hundred times at most: a sixth to a half off the time to compile, and
-#: up to a quarter more to run.
+#: more to run, the more the larger the program.
 QUICKEST_COMPILATION = QUICK_COMPILATION | {
     "xla_backend_optimization_level": 1,
     "xla_llvm_disable_expensive_passes": True,

@@ -194,6 +194,11 @@ class Evidence:
         return np.ones(self.shots.obs.shape[1]) if self.rows is None else self.rows
 
     @cached_property
+    def _most_known(self) -> int:
+        """Of all windows, the most steps that were recorded before one."""
+        return int(np.asarray(self.shots.lead_known).sum(1).max(initial=0.0))
+
+    @cached_property
     def _portions(self) -> list[tuple[Shots, slice]]:
         """Windows, some at a time, the last ones filled up."""
         found = []
@@ -216,7 +221,7 @@ class Evidence:
         begins = np.where(active, h.forgets, np.minimum(h.forgets, Effect.forgets))
         active[index] = True
         longest = max(h.always, float(begins[active].max(initial=0.0)))
-        return min(n_steps_of(longest, h.twin.dt), self.shots.lead_obs.shape[1])
+        return min(n_steps_of(longest, h.twin.dt), self._most_known)
 
     def _blocks(self, theta: np.ndarray, index: np.ndarray, offsets: np.ndarray) -> _Blocks:
         """Normal equations at a point, of the parameters named by ``index``."""

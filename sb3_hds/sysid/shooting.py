@@ -75,7 +75,7 @@ def shots_of(
     """
     cuts = _windows_in(data, length)
     n = len(cuts) if n_rows is None else n_rows
-    lead = min(n_steps_of(remembered_for(twin), data.dt), int(data.lengths.max()))
+    lead = n_steps_of(remembered_for(twin), data.dt)
     cuts = [cuts[i] for i in _chosen(len(cuts), n, seed)]
     rows = [_cut(data, i, k, length, lead) for i, k in cuts]
     padding = [rows[0]._replace(weight=np.zeros(()))] * (n - len(rows))
