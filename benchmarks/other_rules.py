@@ -90,9 +90,10 @@ def by_parameters(search, h, start) -> Answer:
 
 def by_regression(inquiry, start) -> Answer:
     """Sequentially thresholded least squares (SINDy) of the missing force."""
-    from sb3_hds.sysid.remainder import missing_force, weighed
+    from sb3_hds.sysid.remainder import missing_force, short_windows, weighed
 
-    missing = missing_force(inquiry.search.select.evidence, start.point.theta, inquiry.data)
+    short = short_windows(inquiry.search.select.evidence, start.point.theta, inquiry.data)
+    missing = missing_force(short, inquiry.data)
     twin, found = inquiry.hypotheses.twin, []
     weights = weighed(missing._replace(force=np.ones_like(missing.force)))
     for j, joint in enumerate(twin.joints):
@@ -145,9 +146,10 @@ def by_network(inquiry, start) -> Answer:
     import torch
 
     from sb3_hds.sysid.comparison import split
-    from sb3_hds.sysid.remainder import missing_force, weighed
+    from sb3_hds.sysid.remainder import missing_force, short_windows, weighed
 
-    missing = missing_force(inquiry.search.select.evidence, start.point.theta, inquiry.data)
+    short = short_windows(inquiry.search.select.evidence, start.point.theta, inquiry.data)
+    missing = missing_force(short, inquiry.data)
     inputs = np.concatenate(
         [np.cos(missing.position), np.sin(missing.position), missing.velocity, missing.command], 1
     )

@@ -26,7 +26,7 @@ from hidden_scores import prepared, scores
 from independent_rigs import SYSTEMS, Planted, _moment, modelled, simulate
 from scipy.stats import binom
 
-from sb3_hds import effects
+from sb3_hds import diagnose, effects
 
 SALT = int(os.environ.get("SB3_HDS_SALT", "0"))
 #: kinds of the twenty cases
@@ -342,6 +342,18 @@ def table(tmp_path_factory):
         )
     patch.undo()
     return prepared(pd.DataFrame(rows))
+
+
+@pytest.mark.expensive
+def test_a_richer_relative_stays_in_the_set_where_something_remains():
+    """Load-dependent friction behind a coloured torque, six recordings: dry friction is simpler."""
+    _, data, _ = hidden_cases.draw("linear_axis", 26)
+    found = diagnose(believed("linear_axis"), data, seed=26, progress=False)
+
+    assert found.unexplained
+    assert "load_dependent_friction.axis" in {
+        f"{finding.effect}.{finding.where['name']}" for finding in found.findings
+    } | {name for finding in found.findings for name in finding.alternatives}
 
 
 def hidden(test):

@@ -17,16 +17,26 @@ from sb3_hds.sysid.account import (
 )
 from sb3_hds.sysid.calibrate import spread_of
 from sb3_hds.sysid.comparison import Comparison, split
+from sb3_hds.sysid.constancy import change
 from sb3_hds.sysid.diagnosis import Diagnosis, Rejected
 from sb3_hds.sysid.evidence import Evidence, Point, portion_for
 from sb3_hds.sysid.family import chance_of_the_best
 from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
-from sb3_hds.sysid.remainder import MissingForce, Remainder, missing_force, remainder, weighed
+from sb3_hds.sysid.remainder import (
+    MissingForce,
+    Remainder,
+    ShortWindows,
+    missing_force,
+    remainder,
+    short_windows,
+    weighed,
+)
 from sb3_hds.sysid.search import Base, Effort, Half, Search, Tried
 from sb3_hds.sysid.shooting import Shots, shots_of
 from sb3_hds.sysid.sizes import sized
 from sb3_hds.sysid.telling import (
     CHANCE,
+    NO_CONSTANT,
     SMALL,
     UNCERTAIN,
     Accepted,
@@ -34,6 +44,7 @@ from sb3_hds.sysid.telling import (
     in_words,
     look_alike,
     margin,
+    nearest_in_words,
     to_tell_apart,
     why,
 )
@@ -73,12 +84,14 @@ class _Left(NamedTuple):
     :param predicted: mean square of that, in units of the force's error under the search's noise
     :param power: mean square of all of it, likewise
     :param missing: all of it
+    :param short: windows that ask for it
     """
 
     remainder: Remainder | None
     predicted: float
     power: float
     missing: MissingForce
+    short: ShortWindows
 
 
 class Inquiry:
@@ -150,9 +163,30 @@ class Inquiry:
     def run(self) -> Diagnosis:
         self.prepare()
         self.settle_noise()
-        start = base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
+        start = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
+        found, rejected, base = self._named(start)
+        before = left = self._left(start)
+        nearest = ""
+        if found:
+            found, base, left, nearest = self._constant(found, base)
+        if found and self._explained(found, start, base, before, left) < _LEAST_SHARE:
+            # Something is there, and this is not it.
+            found, base = [], start
+            left = before if before.remainder is not None else left
+        if left.remainder is not None:
+            found = [one._replace(alternatives=one.alternatives + one.richer) for one in found]
+        rejected = [pair for pair in rejected if pair[0].key not in _keys(found)]
+        self._set_noise(base.point)
+        start, base = map(self.search.again, (start, base))
+        return self._told(found, rejected, start, base, before, left, nearest)
+
+    def _named(
+        self, start: Base
+    ) -> tuple[list[Accepted], list[tuple[Candidate, Comparison]], Base]:
+        """:return: causes one after the other, what was looked at beside the first, and a belief"""
         found: list[Accepted] = []
         rejected: list[tuple[Candidate, Comparison]] = []
+        base = start
         while len(found) < _MOST:
             tried = self.search.finalists(base, _keys(found))
             if not found:
@@ -170,22 +204,13 @@ class Inquiry:
                 break
             rivals = [*tried, *self.search.relatives(best, tried, base)]
             others = self.search.alternatives(best, rivals, base)
+            richer = self.search.richer(best, rivals, base)
             verdict = self.search.confirmed(best.kept, base.kept)
-            found.append(Accepted(best, verdict, others, chance))
+            found.append(Accepted(best, verdict, others, richer, chance))
             own = self.hypotheses.indices(best.candidate)
             base = Base(best.point, best.kept, (*base.free, *own))
             found, base = self._pruned(found, base)
-        before = left = self._left(start)
-        if found:
-            left = self._left(base)
-            if self._explained(found, start, base, before, left) < _LEAST_SHARE:
-                # Something is there, and this is not it.
-                found, base = [], start
-                left = before if before.remainder is not None else left
-        rejected = [pair for pair in rejected if pair[0].key not in _keys(found)]
-        self._set_noise(base.point)
-        start, base = map(self.search.again, (start, base))
-        return self._told(found, rejected, start, base, before, left)
+        return found, rejected, base
 
     def _determined(self, tried: Tried, base: Base) -> bool:
         """Whether the interval of some parameter leaves out the value at which nothing changes."""
@@ -238,16 +263,53 @@ class Inquiry:
         """Without causes that later ones have made superfluous."""
         for one in found[:-1]:
             if not self.search.needed(one.tried.candidate, base):
-                own = self.hypotheses.indices(one.tried.candidate)
-                theta = base.point.theta.copy()
-                theta[list(own)] = self.hypotheses.null[list(own)]
-                base = self.search.base(theta, [i for i in base.free if i not in own])
+                base = self._without(one, base)
                 found = [other for other in found if other is not one]
         return found, base
 
+    def _without(self, one: Accepted, base: Base) -> Base:
+        own = self.hypotheses.indices(one.tried.candidate)
+        theta = base.point.theta.copy()
+        theta[list(own)] = self.hypotheses.null[list(own)]
+        return self.search.base(theta, [i for i in base.free if i not in own])
+
+    def _constant(
+        self, found: list[Accepted], base: Base
+    ) -> tuple[list[Accepted], Base, _Left, str]:
+        """
+        A cause whose size is no constant is not the cause, but what comes nearest. What remembers
+        is not asked, as windows so short hardly see it.
+
+        :return: the causes before the first that is none, what is believed and left with them, and
+            a sentence on that one
+        """
+        left = self._left(base)
+        for n, one in enumerate(found):
+            candidate = one.tried.candidate
+            if self.hypotheses.remembers(candidate):
+                continue
+            own = self.hypotheses.indices(candidate)
+            changes = change(left.short, left.missing, own, base.free)
+            if changes is None:
+                continue
+            gone = max(self._gone(one, base, left), 0.0)
+            if gone < _LEAST_SHARE * (gone + changes.gain):
+                self.turned_down[candidate.key] = NO_CONSTANT
+                for later in found[n:]:
+                    base = self._without(later, base)
+                return found[:n], base, self._left(base), nearest_in_words(candidate.key, changes)
+        return found, base, left, ""
+
+    def _gone(self, one: Accepted, base: Base, left: _Left) -> float:
+        """:return: by which a cause lowers the cost of short windows"""
+        theta = self._without(one, base).point.theta
+        without = short_windows(self.search.select.evidence, theta, self.data)
+        return without.point.cost - left.short.point.cost
+
     def _left(self, base: Base) -> _Left:
         """:return: what the twin leaves as it is believed now"""
-        missing = missing_force(self.search.select.evidence, base.point.theta, self.data)
+        short = short_windows(self.search.select.evidence, base.point.theta, self.data)
+        missing = missing_force(short, self.data)
         joints = tuple(joint.name for joint in self.hypotheses.twin.joints)
         power = float(np.mean(np.sum(weighed(missing) ** 2, 1)))
         mind = float(np.mean((_IRRELEVANT * self.spread / missing.noise) ** 2))
@@ -256,7 +318,7 @@ class Inquiry:
         # Errors of forces are known better the less is missing: two twins need one unit.
         unit = float(np.mean((missing.noise / self.search.noise) ** 2))
         predicted = 0.0 if found is None else unit * found.power
-        return _Left(found, predicted, unit * power, missing)
+        return _Left(found, predicted, unit * power, missing, short)
 
     def _explained(
         self,
@@ -286,22 +348,25 @@ class Inquiry:
         base: Base,
         before: _Left,
         left: _Left,
+        nearest: str,
     ) -> Diagnosis:
         select, confirm = self.search.select, self.search.confirm
         every, point = self.search.whole(base)
         findings = tuple(
             finding(one, every, point, base.free, self.effort.profiles) for one in found
         )
+        remains = "" if left.remainder is None else in_words(left.remainder)
+        unexplained = " ".join(filter(None, (nearest, remains)))
         verdict = "none"
         if findings:
             verdict = "ambiguous" if findings[0].alternatives else "named"
-        elif left.remainder is not None:
+        elif unexplained:
             verdict = "unknown"
         return Diagnosis(
             verdict=verdict,
             believed=self.believed,
             findings=findings,
-            unexplained="" if left.remainder is None else in_words(left.remainder),
+            unexplained=unexplained,
             gain=by_horizon(confirm, start.kept, base.kept, self.every),
             explained=self._explained(found, start, base, before, left) if findings else 0.0,
             detectable=detectable(select, start.point),

@@ -31,6 +31,22 @@ _MOST_OF_IT = 0.8
 _MOST_RATIO = 4.0
 
 
+class ShortWindows(NamedTuple):
+    """
+    Windows over which a missing force counts as constant, start states fitted.
+
+    :param evidence: of windows that are lengthened to those of its program
+    :param point: what is believed, on them
+    :param shots: the windows themselves
+    :param origin: recording of each, shape ``(n,)``
+    """
+
+    evidence: Evidence
+    point: Point
+    shots: Shots
+    origin: np.ndarray
+
+
 class MissingForce(NamedTuple):
     """
     The force that each window asks for, beyond what the twin has.
@@ -83,26 +99,31 @@ class _Predicted(NamedTuple):
     agreement: np.ndarray
 
 
-def missing_force(
+def short_windows(
     evidence: Evidence, theta: Float[np.ndarray, " p"], data: Trajectories
-) -> MissingForce:
+) -> ShortWindows:
     """
     :param evidence: whose program simulates short windows too
     :param theta: all parameters that may move, shape ``(p,)``; they stay as they are
     :param data: measured
     """
-    h = evidence.hypotheses
     longest = evidence.shots.actions.shape[1]
     steps = min(int(np.clip(round(_WINDOW / data.dt), _SHORTEST, _LONGEST)), longest)
-    shots, origin = shots_of(data, steps, h.twin)
+    shots, origin = shots_of(data, steps, evidence.hypotheses.twin)
     counted = (np.arange(longest + 1) <= steps).astype(float)
     short = evidence.on(_lengthened(shots, longest), counted)
-    point = short.fit(theta, (), n_steps=_STEPS)
+    return ShortWindows(short, short.fit(theta, (), n_steps=_STEPS), shots, origin)
+
+
+def missing_force(short: ShortWindows, data: Trajectories) -> MissingForce:
+    """:param data: measured"""
+    evidence, point, shots, origin = short
+    h, steps = evidence.hypotheses, shots.actions.shape[1]
     scale = h.scale[list(h.pushes)]
-    slopes = short.slopes(point, h.pushes)
+    slopes = evidence.slopes(point, h.pushes)
     informed = np.maximum(np.einsum("njj->nj", slopes.curvature), 1e-12)
     numbers = (steps + 1) * data.n_obs
-    rest = _left_by_forces(point, slopes, evidence.noise, counted)
+    rest = _left_by_forces(short, slopes)
     calmer = np.sqrt(np.median(rest) / max(numbers - point.offsets.shape[1] - len(scale), 1))
     q, v = motion_of(h.believed, shots.obs, data.dt)
     counter = {recording: 0 for recording in origin}
@@ -123,14 +144,14 @@ def missing_force(
     )
 
 
-def _left_by_forces(
-    point: Point, slopes: Slopes, noise: np.ndarray, counted: np.ndarray
-) -> Float[np.ndarray, " n"]:
+def _left_by_forces(short: ShortWindows, slopes: Slopes) -> Float[np.ndarray, " n"]:
     """
     What a constant force leaves of each window, sum of squares in units of the noise. That noise
     was measured over long windows, where what is missing has had time to grow.
     """
-    whole = np.sum((np.nan_to_num(point.raw, nan=0.0) / noise) ** 2 * counted[:, None], (1, 2))
+    measured = short.shots.obs.shape[1]
+    raw = np.nan_to_num(short.point.raw[:, :measured], nan=0.0)
+    whole = np.sum((raw / short.evidence.noise) ** 2, (1, 2))
     inverse = np.linalg.pinv(slopes.curvature, hermitian=True)
     gained = np.einsum("ni,nij,nj->n", slopes.scores, inverse, slopes.scores)
     return np.maximum(whole - gained, 0.0)

@@ -271,6 +271,22 @@ class Search:
                 found.append(other.candidate.key)
         return tuple(found)
 
+    def richer(self, best: Tried, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
+        """
+        :return: what is declared to look like the best, has more freedom and predicts better,
+            though not so surely that it is preferred
+        """
+        declared = {c.key for c in self.hypotheses.related(best.candidate)}
+        found = []
+        for other in tried:
+            more = len(other.candidate.parameters) > len(best.candidate.parameters)
+            if not more or other.candidate.key not in declared:
+                continue
+            gain = self.better(other.kept, best.kept).gain
+            if gain >= _SAME and passes(self.confirmed(other.kept, base.kept)):
+                found.append(other.candidate.key)
+        return tuple(found)
+
     def needed(self, candidate: Candidate, base: Base) -> bool:
         """:return: whether what is believed gets worse without this part of it"""
         own = self.hypotheses.indices(candidate)

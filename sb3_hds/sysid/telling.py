@@ -8,6 +8,7 @@ from scipy import stats
 
 from sb3_hds.sysid.account import standard_errors
 from sb3_hds.sysid.comparison import Comparison
+from sb3_hds.sysid.constancy import Change
 from sb3_hds.sysid.diagnosis import Finding
 from sb3_hds.sysid.evidence import Point
 from sb3_hds.sysid.hypotheses import Hypotheses
@@ -19,6 +20,7 @@ from sb3_hds.sysid.search import LEAST_GAIN, LEVEL, Base, Half, Tried
 
 #: why a candidate was turned down that predicts better
 UNCERTAIN, SMALL, CHANCE = "has no certain size", "is small beside the others", "may be chance"
+NO_CONSTANT = "comes near, but its size changes"
 _CONFIDENCE = 0.9
 
 
@@ -27,12 +29,14 @@ class Accepted(NamedTuple):
     A cause that was confirmed.
 
     :param alternatives: what the data cannot tell from it
+    :param richer: what may be in its place if something remains
     :param chance: that the best of all candidates would gain as much if nothing were wrong
     """
 
     tried: Tried
     verdict: Comparison
     alternatives: tuple[str, ...]
+    richer: tuple[str, ...]
     chance: float
 
 
@@ -131,6 +135,13 @@ def in_words(left: Remainder) -> str:
     return (
         f"a force at {left.joint} goes with {' and '.join(left.goes_with)}; {share} of its "
         f"variance is predictable on held-out recordings (p = {left.p_value:.2g})."
+    )
+
+
+def nearest_in_words(key: str, changes: Change) -> str:
+    return (
+        f"{key} comes nearest, but its size is no constant: it goes with {changes.goes_with} "
+        f"(p = {changes.p_value:.2g})."
     )
 
 
