@@ -68,6 +68,15 @@ def test_what_changes_is_seen_and_its_gain_is_that_of_a_fit_that_follows_it():
     assert np.mean([one.gain for one in found]) == pytest.approx(change**2 / 24.0, rel=0.1)
 
 
+def test_what_changes_less_than_anybody_minds_is_constant():
+    curvature, scores, waves = windows(np.random.default_rng(1), change=40.0)
+    minded, unminded = (
+        _tested(curvature / noise**2, scores / noise**2, SIZE, waves) for noise in (1.0, 10.0)
+    )
+
+    assert minded.p_value < 1e-4 and unminded.p_value > 0.5
+
+
 @pytest.mark.expensive
 def test_friction_that_depends_on_position_is_no_friction_of_the_catalogue():
     twin = twins.make("LinearAxis", dt=0.02)
