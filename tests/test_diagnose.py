@@ -13,12 +13,13 @@ from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import JointEffect, Parameter, Trajectories, rollout
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.comparison import Comparison, compare, confirm, split
-from sb3_hds.sysid.evidence import Evidence
+from sb3_hds.sysid.evidence import Evidence, Point
 from sb3_hds.sysid.guesses import newton
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.remainder import MissingForce, remainder
-from sb3_hds.sysid.search import Search
+from sb3_hds.sysid.search import Half, Search
 from sb3_hds.sysid.shooting import shots_of
+from sb3_hds.sysid.telling import out_of_reach
 
 CATALOGUE = (
     effects.ViscousFriction,
@@ -131,6 +132,19 @@ def test_causes_look_alike_at_one_place_only():
     one_way = "while the joint moves in one direction"
     assert hypotheses.alike("coulomb_friction.joint1", "constant_force.joint1") == one_way
     assert hypotheses.alike("coulomb_friction.joint1", "constant_force.joint2") == ""
+
+
+def test_windows_that_the_twin_does_not_come_near_are_said():
+    raw = np.ones((6, 10, 2))
+    raw[4] = 30.0
+    half = Half(SimpleNamespace(noise=np.ones(2)), np.arange(6), np.zeros(2))
+
+    def said(error):
+        return out_of_reach(half, Point(None, None, error, 0.0), np.array([0, 0, 1, 1, 2, 2]))
+
+    (sentence,) = said(raw)
+    assert "1 of 6 windows" in sentence and "(trajectory 2)" in sentence
+    assert not said(np.minimum(raw, 9.0))
 
 
 @pytest.mark.expensive

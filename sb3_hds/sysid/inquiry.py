@@ -45,6 +45,7 @@ from sb3_hds.sysid.telling import (
     look_alike,
     margin,
     nearest_in_words,
+    out_of_reach,
     to_tell_apart,
     why,
 )
@@ -123,8 +124,8 @@ class Inquiry:
         coarse, self.data, self.every = thinned(twin, data)
         self.hypotheses = Hypotheses.about(coarse, effects, calibrate)
         self.spread = spread_of(self.data)
-        self.shots, origin = shots_of(self.data, _window_of(self.data), self.hypotheses.twin)
-        self.parts = split(self.data, origin, seed)
+        self.shots, self.origin = shots_of(self.data, _window_of(self.data), self.hypotheses.twin)
+        self.parts = split(self.data, self.origin, seed)
         self.effort, self.progress = EFFORTS[budget], progress
         self.turned_down: dict[str, str] = {}
 
@@ -379,6 +380,7 @@ class Inquiry:
                 *self.moved,
                 *to_tell_apart(found, self.hypotheses),
                 *look_alike(found, select, base),
+                *out_of_reach(confirm, base.kept, self.origin[self.parts.confirm]),
             ),
             twin=self.hypotheses.extended_by(_keys(found), point.theta).at_interval(
                 self.believed.dt, self.believed.substeps

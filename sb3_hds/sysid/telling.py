@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Int
 from scipy import stats
 
 from sb3_hds.sysid.account import standard_errors
@@ -22,6 +23,8 @@ from sb3_hds.sysid.search import LEAST_GAIN, LEVEL, Base, Half, Tried
 UNCERTAIN, SMALL, CHANCE = "has no certain size", "is small beside the others", "may be chance"
 NO_CONSTANT = "comes near, but its size changes"
 _CONFIDENCE = 0.9
+# Error of a window that a twin does not come near, in units of the noise, or of what is usual.
+_LOST = 10.0
 
 
 class Accepted(NamedTuple):
@@ -118,6 +121,25 @@ def look_alike(found: Sequence[Accepted], half: Half, base: Base) -> list[str]:
                 "excite other speeds, positions and commands would tell them further apart."
             )
     return sentences
+
+
+def out_of_reach(half: Half, kept: Point, origin: Int[np.ndarray, " n"]) -> list[str]:
+    """
+    :param half: recordings that nothing was fitted to
+    :param kept: what is believed in the end, on their windows
+    :param origin: recording of each window
+    :return: a sentence on windows that the twin does not come near, if there are any
+    """
+    errors = np.sqrt(half.errors(kept))
+    lost = errors > _LOST * max(float(np.median(errors)), 1.0)
+    if not lost.any():
+        return []
+    where = ", ".join(f"trajectory {i}" for i in np.unique(origin[lost]))
+    return [
+        f"The simulation is off by more than ten times the noise in {lost.sum()} of {len(lost)} "
+        f"windows that nothing was fitted to ({where}). What happens there is not in the other "
+        "recordings: look at them, and record more of it."
+    ]
 
 
 def why(verdict: Comparison, turned_down: str | None) -> str:
