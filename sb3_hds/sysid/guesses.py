@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.sysid.evidence import Evidence, Point
+from sb3_hds.sysid.evidence import Evidence, Point, in_threads
 from sb3_hds.sysid.hypotheses import Candidate
 
 # Where fits begin for which the slope at the null is no guide, in units of each parameter's scale.
@@ -62,15 +62,15 @@ def guesses(here: Here, candidates: Sequence[Candidate], known: Places) -> list[
     slopes = here.evidence.slopes(point)
     curvature, score = slopes.curvature.sum(0), slopes.scores.sum(0)
     flat = np.diag(curvature) < _FLAT * point.raw.size
-    room, found = _room(here, point.theta), []
-    for candidate in candidates:
+    room = _room(here, point.theta)
+
+    def guess(candidate: Candidate) -> Guess:
         if candidate.key in h.starts:
             starts = known.get(candidate.key, h.starts[candidate.key])
             tried = [_from_start(here, candidate, start) for start in starts]
             best = int(np.argmax([guess.gain for guess in tried]))
             known[candidate.key] = (starts[best],)
-            found.append(tried[best])
-            continue
+            return tried[best]
         own = list(h.indices(candidate))
         step, gain = newton(curvature, score, [*here.free, *own], room)
         theta, blind = point.theta + h.scale * step, bool(flat[own].any())
@@ -79,8 +79,9 @@ def guesses(here: Here, candidates: Sequence[Candidate], known: Places) -> list[
         elif h.remembers(candidate):
             place = _farther(here, candidate, gain)
             theta, blind = (theta, False) if place is None else (place, True)
-        found.append(Guess(gain, theta, blind))
-    return found
+        return Guess(gain, theta, blind)
+
+    return list(in_threads(guess, candidates))
 
 
 def newton(
