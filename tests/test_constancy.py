@@ -77,6 +77,15 @@ def test_what_changes_less_than_anybody_minds_is_constant():
     assert minded.p_value < 1e-4 and unminded.p_value > 0.5
 
 
+def test_one_window_that_alone_knows_the_size_says_nothing_of_its_change():
+    curvature, scores, waves = windows(np.random.default_rng(1), change=40.0)
+    curvature[1:, SIZE], curvature[1:, :, SIZE], scores[1:, SIZE] = 0.0, 0.0, 0.0
+
+    found = _tested(curvature, scores, SIZE, waves)
+
+    assert np.isfinite(found.gain) and found.p_value > 0.05
+
+
 @pytest.mark.expensive
 def test_friction_that_depends_on_position_is_no_friction_of_the_catalogue():
     twin = twins.make("LinearAxis", dt=0.02)

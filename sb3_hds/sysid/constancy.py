@@ -13,8 +13,9 @@ from sb3_hds.sysid.remainder import MissingForce, ShortWindows
 _WAVES, _LEVEL = 4, 0.01
 # By which factor that level is stricter, because windows of one recording are not independent.
 _STRICTER = 25.0
-# Directions below this share of the largest curvature do not move.
-_RANK = 1e-10
+# Directions below this share of the largest curvature do not move; of what all windows know, the
+# share that others than one know at least.
+_RANK, _LEAST_OF_OTHERS = 1e-10, 1e-9
 
 
 class Change(NamedTuple):
@@ -91,7 +92,8 @@ def _tested(
     of_fitted, of_waves = -whole @ scores.sum(0), -free @ slope
     then = scores + curvature @ of_fitted + np.einsum("nfg,nkg,k->nf", curvature, moves, of_waves)
     left_out = np.einsum("nkf,nfg,nlg->nkl", moves, curvature, moves) @ free
-    noise = np.linalg.solve(np.eye(waves.shape[1]) - left_out, by_window(then)[..., None])[..., 0]
+    others = (1.0 + _LEAST_OF_OTHERS) * np.eye(waves.shape[1]) - left_out
+    noise = np.linalg.solve(others, by_window(then)[..., None])[..., 0]
     statistic = float(slope @ np.linalg.pinv(noise.T @ noise, rcond=_RANK, hermitian=True) @ slope)
     # Waves gain by chance, too: as much as they gain of the statistic.
     n_waves, gained = waves.shape[1], float(slope @ free @ slope)
