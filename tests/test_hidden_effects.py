@@ -356,6 +356,18 @@ def test_a_richer_relative_stays_in_the_set_where_something_remains():
     } | {name for finding in found.findings for name in finding.alternatives}
 
 
+@pytest.mark.expensive
+def test_what_shows_only_once_the_noise_is_known_is_found():
+    """
+    A joint taken the wrong way round: the error of the twin as it came says nothing of the noise,
+    and a rough fit under it prefers other causes.
+    """
+    case, data, _ = hidden_cases.draw("cart_pole", 8)
+    found = diagnose(believed("cart_pole"), data, calibrate=case.nuisances, seed=8, progress=False)
+
+    assert [(f.effect, f.where["name"]) for f in found.findings] == [("sign_flip", "track")]
+
+
 def hidden(test):
     """Twenty diagnoses take some ten minutes."""
     return pytest.mark.expensive(pytest.mark.timeout(3600)(test))

@@ -164,10 +164,6 @@ class Evidence:
                 break
         return Point(theta, offsets, now.raw, float(now.cost.sum()))
 
-    def cost(self, raw: Float[np.ndarray, "n rows obs"]) -> float:
-        """:return: of these errors, under the noise that is known now"""
-        return float(_costs(_error(raw, self.noise, self._counted)).sum())
-
     def slopes(self, point: Point, index: Sequence[int] | None = None) -> Slopes:
         """
         :param index: of the parameters; default: all
@@ -314,8 +310,12 @@ def _normal(
     counted: np.ndarray,
 ) -> _Blocks:
     n = len(raw)
-    error = _error(raw, noise, counted)
-    weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(np.abs(error), 1e-12)))
+    finite = np.isfinite(raw)
+    error = np.where(finite, raw / noise, _NOT_FINITE) * counted[:, None]
+    size = np.abs(error)
+    small = np.minimum(size, _HUBER)
+    cost = np.sum(0.5 * small**2 + _HUBER * (size - small), (1, 2))
+    weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(size, 1e-12)))
     factor = (weight * counted[:, None] / noise)[..., None]
     start, theta = (
         np.where(np.isfinite(slopes), slopes, 0.0) * factor for slopes in (by_start, by_theta)
@@ -326,23 +326,13 @@ def _normal(
     across = start.transpose(0, 2, 1)
     return _Blocks(
         raw=raw,
-        cost=_costs(error),
+        cost=cost,
         own=across @ start,
         cross=across @ theta,
         shared=theta.transpose(0, 2, 1) @ theta,
         by_start=(across @ right)[..., 0],
         by_theta=(theta.transpose(0, 2, 1) @ right)[..., 0],
     )
-
-
-def _error(raw: np.ndarray, noise: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    return np.where(np.isfinite(raw), raw / noise, _NOT_FINITE) * counted[:, None]
-
-
-def _costs(error: np.ndarray) -> Float[np.ndarray, " n"]:
-    size = np.abs(error)
-    small = np.minimum(size, _HUBER)
-    return np.sum(0.5 * small**2 + _HUBER * (size - small), (1, 2))
 
 
 def _eliminated(blocks: _Blocks, damping: float) -> _Step:

@@ -163,9 +163,9 @@ class Inquiry:
 
     def run(self) -> Diagnosis:
         self.prepare()
-        seen = self.settle_noise()
+        self.settle_noise()
         start = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
-        found, rejected, base = self._named(start, seen)
+        found, rejected, base = self._named(start)
         before = left = self._left(start)
         nearest = ""
         if found:
@@ -182,20 +182,15 @@ class Inquiry:
         return self._told(found, rejected, start, base, before, left, nearest)
 
     def _named(
-        self, start: Base, seen: Sequence[tuple[Candidate, Point]]
+        self, start: Base
     ) -> tuple[list[Accepted], list[tuple[Candidate, Comparison]], Base]:
-        """
-        :param seen: candidates that promise most where nothing has been found
-        :return: causes one after the other, what was looked at beside the first, and a belief
-        """
+        """:return: causes one after the other, what was looked at beside the first, and a belief"""
         found: list[Accepted] = []
         rejected: list[tuple[Candidate, Comparison]] = []
         base = start
         while len(found) < _MOST:
-            if found:
-                tried = self.search.finalists(base, _keys(found))
-            else:
-                tried = self.search.first_finalists(base, seen)
+            tried = self.search.finalists(base, _keys(found))
+            if not found:
                 rejected = [(t.candidate, self.search.confirmed(t.kept, base.kept)) for t in tried]
                 rejected += self.search.others(base, tried)
             sure = [t for t in tried if self._determined(t, base)]
@@ -252,19 +247,14 @@ class Inquiry:
             seed=self.seed,
         )
 
-    def settle_noise(self) -> list[tuple[Candidate, Point]]:
-        """
-        What is left under the best explanation, of whatever kind, is the noise.
-
-        :return: candidates that promise most, fitted roughly
-        """
+    def settle_noise(self) -> None:
+        """What is left under the best explanation, of whatever kind, is the noise."""
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
         self._set_noise(base.point)
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
-        seen = self.search.glances(base, [])
-        tried = self.search.finished([candidate for candidate, _ in seen[:_FOR_NOISE]], base)
+        likely = [candidate for candidate, _ in self.search.glances(base, [])[:_FOR_NOISE]]
+        tried = self.search.finished(likely, base)
         self._set_noise(min((base.point, *(t.point for t in tried)), key=lambda p: p.cost))
-        return seen
 
     def _set_noise(self, point: Point) -> None:
         noise = np.mean(point.raw**2, (0, 1)) + (_IRRELEVANT * self.spread) ** 2

@@ -196,15 +196,8 @@ class Search:
         :param accepted: keys of candidates that belong to what is believed
         :return: the most promising candidates, fitted to the end, best first
         """
-        return self.finished(self._likely(self.glances(base, accepted)), base)
-
-    def first_finalists(self, base: Base, seen: Sequence[tuple[Candidate, Point]]) -> list[Tried]:
-        """
-        :param seen: glances from the same belief, before the noise was known
-        :return: as ``finalists``, where nothing has been accepted yet
-        """
-        cost = self.select.evidence.cost
-        return self.finished(self._likely(sorted(seen, key=lambda pair: cost(pair[1].raw))), base)
+        ranked = self.glances(base, accepted)
+        return self.finished([candidate for candidate, _ in ranked[: self.effort.finalists]], base)
 
     def finished(self, candidates: Sequence[Candidate], base: Base) -> list[Tried]:
         """:return: these candidates, fitted to the end, best first"""
@@ -331,9 +324,6 @@ class Search:
         n = effective_size(base.raw / self.noise)
         ratio = np.log(self.select.total(base) / self.select.total(point))
         return n * ratio - len(candidate.parameters) * np.log(max(n, 2.0))
-
-    def _likely(self, ranked: Sequence[tuple[Candidate, Point]]) -> list[Candidate]:
-        return [candidate for candidate, _ in ranked[: self.effort.finalists]]
 
     def _sample(self) -> np.ndarray:
         n = self.select.evidence.shots.n
