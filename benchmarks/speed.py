@@ -54,7 +54,7 @@ PAIRS = {
 #: what SB3 and SB3-contrib have of these
 IN_SB3 = ("sac", "gsde_sac", "tqc", "crossq")
 #: without a peer: their own speed
-ALONE = {"td7": ("TD7", {"use_checkpoints": False, "train_freq": 1}), "bro": ("BRO", {})}
+ALONE = {"td7": ("TD7", {"use_checkpoints": False}), "bro": ("BRO", {})}
 RATIOS = (1, 20)
 N_BLOCKS = 9
 SEEDS = (1, 2, 4, 8)
@@ -188,7 +188,12 @@ def report() -> None:
         print("Nothing has been measured yet.", file=sys.stderr)
         return
     measured = pd.read_csv(path)
-    tables = {"speed_targets": beside_targets(measured), "speed_sbx_sb3": sbx_beside_sb3(measured)}
+    tables = {
+        "speed_targets": beside_targets(measured),
+        "speed_sbx_sb3": sbx_beside_sb3(measured),
+        "speed_start_up": start_ups(measured),
+        "speed_alone": alone(measured),
+    }
     print(measured.to_string(index=False, float_format="%.3g"))
     for name, table in tables.items():
         if len(table):
@@ -219,6 +224,21 @@ def sbx_beside_sb3(measured: pd.DataFrame) -> pd.DataFrame:
     )
     found = (wide["sb3"] / wide["sbx"]).dropna()
     return found.rename("sbx_times_sb3").reset_index()
+
+
+def start_ups(measured: pd.DataFrame) -> pd.DataFrame:
+    """:return: seconds to the first update, of each pair"""
+    if "start_up_s" not in measured:
+        return pd.DataFrame()
+    wide = measured.pivot_table("start_up_s", "name", "peer")
+    wide = wide.rename(columns=lambda peer: peer.removeprefix("start-up of ") + "_s")
+    return wide.assign(speed_up=wide["sbx_s"] / wide["ours_s"]).reset_index()
+
+
+def alone(measured: pd.DataFrame) -> pd.DataFrame:
+    """:return: what has no peer; of the compiled path, ``ratio`` is the number of seeds"""
+    rows = measured[measured["peer"].isin(("none", "compiled"))]
+    return rows[["name", "ratio", "peer", "steps_per_s", "updates_per_s"]]
 
 
 if __name__ == "__main__":

@@ -64,6 +64,10 @@ PARTS: dict[str, Callable[[], str]] = {
         "diagnosis_cost", "seconds of a diagnosis against the number of recordings"
     ),
     "sb3_tests": summaries.whole("sb3_tests_table"),
+    "speed": summaries.whole("speed_targets"),
+    "speed_of_sbx": summaries.whole("speed_sbx_sb3"),
+    "speed_start_up": summaries.whole("speed_start_up"),
+    "speed_alone": summaries.whole("speed_alone"),
     "hds_weaknesses": summaries.over_seeds(
         "hds_weaknesses",
         "variant",

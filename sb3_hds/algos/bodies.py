@@ -154,9 +154,11 @@ class BatchRenorm(nn.Module):
         bias = self.param("bias", nn.initializers.zeros, (n,))
         running = jnp.sqrt(variance.value + _RENORM_EPSILON)
         if not train or self.is_initializing():
-            return (x - mean.value) / running * scale + bias
+            return (x - mean.value) * (scale / running) + bias
         axes = tuple(range(x.ndim - 1))
-        now_mean, now_var = x.mean(axes), x.var(axes)
+        now_mean = x.mean(axes)
+        centred = x - now_mean
+        now_var = (centred**2).mean(axes)
         now = jnp.sqrt(now_var + _RENORM_EPSILON)
         r = jnp.clip(jax.lax.stop_gradient(now / running), 1.0 / _R_MAX, _R_MAX)
         d = jnp.clip(jax.lax.stop_gradient((now_mean - mean.value) / running), -_D_MAX, _D_MAX)
@@ -165,7 +167,7 @@ class BatchRenorm(nn.Module):
         for held, value in ((mean, now_mean), (variance, now_var)):
             held.value = self.momentum * held.value + (1.0 - self.momentum) * value
         steps.value = steps.value + 1
-        return ((x - now_mean) / now * r + d) * scale + bias
+        return centred * (r / now * scale) + (d * scale + bias)
 
 
 def _mixed(word: jax.Array) -> jax.Array:

@@ -69,6 +69,14 @@ class Learner(NamedTuple):
     n_updates: Int[Array, ""]
 
 
+class _Improved(NamedTuple):
+    """What an update of the actor changes of a ``Learner``."""
+
+    actor: Trained
+    log_ent_coef: Trained
+    extra: Any
+
+
 class Knobs(NamedTuple):
     """What may change from call to call without compiling again."""
 
@@ -288,6 +296,7 @@ def explored(recipe: Recipe, weights: Weights, extra: Any, obs: Array, noise: Ar
     return jnp.tanh(gaussian.mean + gaussian.std * noise)
 
 
+@partial(jax.jit, static_argnums=(0, 1, 2))
 def begin(recipe: Recipe, n_obs: int, n_act: int, ent_coef: float, key: PRNGKeyArray) -> Learner:
     """:return: fresh networks and optimisers"""
     key, actor_key, critic_key, extra_key = jax.random.split(key, 4)
@@ -316,7 +325,7 @@ def update(
     """
     :param batches: with a leading axis of at least ``n`` batches; the rest is not looked at, so
         that different ``n`` share a compiled program
-    :param n: how many updates
+    :param n: how many updates, at least 1
     """
 
     def one(i: Array, carry: tuple[Learner, Report]) -> tuple[Learner, Report]:
@@ -324,7 +333,10 @@ def update(
         return update_once(recipe, learner, jax.tree.map(lambda x: x[i], batches), knobs, report)
 
     zero = jnp.zeros(())
-    return jax.lax.fori_loop(0, n, one, (learner, Report(zero, zero, zero, zero)))
+    before = learner, Report(zero, zero, zero, zero)
+    if len(batches.reward) == 1:  # without a loop, whose carry would be copied
+        return one(jnp.zeros((), jnp.int32), before)
+    return jax.lax.fori_loop(0, n, one, before)
 
 
 def update_once(
@@ -338,11 +350,18 @@ def update_once(
     key, critic_key, actor_key = jax.random.split(learner.key, 3)
     learner = learner._replace(key=key, n_updates=learner.n_updates + 1)
     learner, report = update_critics(recipe, learner, batch, knobs, report, critic_key)
-    improve = lambda: update_actor(recipe, learner, batch, knobs, report, actor_key)  # noqa: E731
+
+    def improved() -> tuple[_Improved, Report]:
+        return update_actor(recipe, learner, batch, knobs, report, actor_key)
+
     if recipe.policy_delay == 1:
-        return improve()
-    due = learner.n_updates % recipe.policy_delay == 0
-    return jax.lax.cond(due, improve, lambda: (learner, report))
+        now, report = improved()
+    else:
+        # Critics stay outside: what a branch hands through is copied.
+        before = _Improved(learner.actor, learner.log_ent_coef, learner.extra)
+        due = learner.n_updates % recipe.policy_delay == 0
+        now, report = jax.lax.cond(due, improved, lambda: (before, report))
+    return learner._replace(**now._asdict()), report
 
 
 def update_critics(
@@ -410,7 +429,7 @@ def update_actor(
     knobs: Knobs,
     report: Report,
     key: PRNGKeyArray,
-) -> tuple[Learner, Report]:
+) -> tuple[_Improved, Report]:
     r"""
     Climb what the critics think of the actor's own actions, and follow the target entropy.
 
@@ -442,11 +461,11 @@ def update_actor(
     if recipe.learns_ent_coef:
         of_ent_coef = recipe.ent_coef_optimizer or _ADAM
         log_ent_coef = of_ent_coef.apply(excess, log_ent_coef, knobs.learning_rate)
-    learner = learner._replace(actor=actor, log_ent_coef=log_ent_coef)
+    extra = learner.extra
     if recipe.extra is not None:
-        extra = recipe.extra.update(recipe, learner, batch, knobs, extra_key)
-        learner = learner._replace(extra=extra)
-    return learner, report
+        now = learner._replace(actor=actor, log_ent_coef=log_ent_coef)
+        extra = recipe.extra.update(recipe, now, batch, knobs, extra_key)
+    return _Improved(actor, log_ent_coef, extra), report
 
 
 _ADAM = Optimizer(optax.adam)

@@ -13,15 +13,14 @@ from sb3_hds.sysid.account import (
     by_horizon,
     detectable,
     pictures_of,
-    standard_errors,
 )
 from sb3_hds.sysid.calibrate import spread_of
 from sb3_hds.sysid.comparison import Comparison, split
-from sb3_hds.sysid.constancy import change
+from sb3_hds.sysid.constancy import Change, change
 from sb3_hds.sysid.diagnosis import Diagnosis, Rejected
 from sb3_hds.sysid.evidence import Evidence, Point, portion_for
-from sb3_hds.sysid.family import chance_of_the_best
 from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
+from sb3_hds.sysid.naming import Naming, keys_of
 from sb3_hds.sysid.remainder import (
     MissingForce,
     Remainder,
@@ -35,15 +34,11 @@ from sb3_hds.sysid.search import Base, Effort, Half, Search, Tried
 from sb3_hds.sysid.shooting import Shots, shots_of
 from sb3_hds.sysid.sizes import sized
 from sb3_hds.sysid.telling import (
-    CHANCE,
     NO_CONSTANT,
-    SMALL,
-    UNCERTAIN,
     Accepted,
     finding,
     in_words,
     look_alike,
-    margin,
     nearest_in_words,
     out_of_reach,
     to_tell_apart,
@@ -57,11 +52,8 @@ from sb3_hds.sysid.timing import in_step
 _WINDOW, _SHORTEST, _LONGEST, _FEW = 1.0, 8, 200, 24
 # A cause that explains less than this share of what can be explained is not the cause.
 _LEAST_SHARE = 0.9
-# A later cause that takes away a smaller share of the error than this, of what the ones before took
-# away, may be no more than what their model is off by.
-_LEAST_OF_EARLIER = 0.01
-# Causes that are looked for, and candidates that are fitted to the end to settle the noise.
-_MOST, _FOR_NOISE = 3, 3
+# Candidates that are fitted to the end to settle the noise.
+_FOR_NOISE = 3
 # How long to search.
 EFFORTS = {"full": Effort(12, 8, 256, 4, True), "quick": Effort(8, 4, 64, 2, False)}
 # Errors that nobody minds, in shares of a channel's spread: no simulation is exact, and a finding
@@ -73,8 +65,6 @@ _OF_IRRELEVANT = 0.18
 _FIRST_NOISE = 0.05
 # Parameters that a cause has at most, and fewer units of evidence than these cannot say anything.
 _WIDEST, _FEWEST_UNITS = 3, 6
-# Family-wise level of what selection proposes.
-_FAMILY_LEVEL = 0.05
 
 
 class _Left(NamedTuple):
@@ -165,77 +155,34 @@ class Inquiry:
         self.prepare()
         self.settle_noise()
         start = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
-        found, rejected, base = self._named(start)
+        naming = Naming(self.search, start, self.seed)
+        firsts = self.search.finalists(start, [])
+        rejected = self._weighed(firsts, start)
+        found, base = naming.one_by_one(firsts)
         before = left = self._left(start)
         nearest = ""
         if found:
             found, base, left, nearest = self._constant(found, base)
+        if len(found) == 1 and left.remainder is not None:
+            pair = naming.pair(found[0], base, firsts)
+            if pair is not None and (rest := self._left_by(*pair)) is not None:
+                found, base, left = *pair, rest
+        self.turned_down = naming.turned_down | self.turned_down
         if found and self._explained(found, start, base, before, left) < _LEAST_SHARE:
             # Something is there, and this is not it.
             found, base = [], start
             left = before if before.remainder is not None else left
         if left.remainder is not None:
             found = [one._replace(alternatives=one.alternatives + one.richer) for one in found]
-        rejected = [pair for pair in rejected if pair[0].key not in _keys(found)]
+        rejected = [pair for pair in rejected if pair[0].key not in keys_of(found)]
         self._set_noise(base.point)
         start, base = map(self.search.again, (start, base))
         return self._told(found, rejected, start, base, before, left, nearest)
 
-    def _named(
-        self, start: Base
-    ) -> tuple[list[Accepted], list[tuple[Candidate, Comparison]], Base]:
-        """:return: causes one after the other, what was looked at beside the first, and a belief"""
-        found: list[Accepted] = []
-        rejected: list[tuple[Candidate, Comparison]] = []
-        base = start
-        while len(found) < _MOST:
-            tried = self.search.finalists(base, _keys(found))
-            if not found:
-                rejected = [(t.candidate, self.search.confirmed(t.kept, base.kept)) for t in tried]
-                rejected += self.search.others(base, tried)
-            sure = [t for t in tried if self._determined(t, base)]
-            best = self.search.best(sure, base, len(found))
-            if best is None:
-                break
-            if self._is_leftover(best, base, start):
-                self.turned_down[best.candidate.key] = SMALL
-                break
-            if (chance := self._chance(best, base, found)) >= _FAMILY_LEVEL / (1 + len(found)):
-                self.turned_down[best.candidate.key] = CHANCE
-                break
-            rivals = [*tried, *self.search.relatives(best, tried, base)]
-            others = self.search.alternatives(best, rivals, base)
-            richer = self.search.richer(best, rivals, base)
-            verdict = self.search.confirmed(best.kept, base.kept)
-            found.append(Accepted(best, verdict, others, richer, chance))
-            own = self.hypotheses.indices(best.candidate)
-            base = Base(best.point, best.kept, (*base.free, *own))
-            found, base = self._pruned(found, base)
-        return found, rejected, base
-
-    def _determined(self, tried: Tried, base: Base) -> bool:
-        """Whether the interval of some parameter leaves out the value at which nothing changes."""
-        half, own = self.search.select, list(self.hypotheses.indices(tried.candidate))
-        free = [*base.free, *own]
-        stderr = standard_errors(half, tried.point, free)[own]
-        moved = np.abs(tried.point.theta - self.hypotheses.null)[own]
-        if not (sure := bool((moved > margin(len(np.unique(half.unit)), stderr)).any())):
-            self.turned_down[tried.candidate.key] = UNCERTAIN
-        return sure
-
-    def _is_leftover(self, best: Tried, base: Base, start: Base) -> bool:
-        """Whether an imperfect model of the causes before explains as much as this one."""
-        first, now, then = map(self.search.confirm.total, (start.kept, base.kept, best.kept))
-        return now - then < _LEAST_OF_EARLIER * (first - now)
-
-    def _chance(self, best: Tried, base: Base, found: Sequence[Accepted]) -> float:
-        """:return: family-wise p-value on the half that selects"""
-        left = [c for c in self.hypotheses.candidates if c.key not in _keys(found)]
-        slopes = self.search.select.evidence.slopes(best.point)
-        own = [self.hypotheses.indices(c) for c in left]
-        fitted = (*base.free, *self.hypotheses.indices(best.candidate))
-        gain = base.point.cost - best.point.cost
-        return chance_of_the_best(slopes, own, base.free, fitted, gain, self.seed)
+    def _weighed(self, firsts: Sequence[Tried], start: Base) -> list[tuple[Candidate, Comparison]]:
+        """:return: every candidate alone, on the half that confirms"""
+        weighed = [(t.candidate, self.search.confirmed(t.kept, start.kept)) for t in firsts]
+        return weighed + self.search.others(start, firsts)
 
     def refused(self, reason: str) -> Diagnosis:
         return Diagnosis(
@@ -260,20 +207,6 @@ class Inquiry:
         noise = np.mean(point.raw**2, (0, 1)) + (_IRRELEVANT * self.spread) ** 2
         self.search.set_noise(np.sqrt(noise))
 
-    def _pruned(self, found: list[Accepted], base: Base) -> tuple[list[Accepted], Base]:
-        """Without causes that later ones have made superfluous."""
-        for one in found[:-1]:
-            if not self.search.needed(one.tried.candidate, base):
-                base = self._without(one, base)
-                found = [other for other in found if other is not one]
-        return found, base
-
-    def _without(self, one: Accepted, base: Base) -> Base:
-        own = self.hypotheses.indices(one.tried.candidate)
-        theta = base.point.theta.copy()
-        theta[list(own)] = self.hypotheses.null[list(own)]
-        return self.search.base(theta, [i for i in base.free if i not in own])
-
     def _constant(
         self, found: list[Accepted], base: Base
     ) -> tuple[list[Accepted], Base, _Left, str]:
@@ -286,24 +219,35 @@ class Inquiry:
         """
         left = self._left(base)
         for n, one in enumerate(found):
-            candidate = one.tried.candidate
-            if self.hypotheses.remembers(candidate):
+            if (changes := self._varies(one, base, left)) is None:
                 continue
-            own = self.hypotheses.indices(candidate)
-            changes = change(left.short, left.missing, own, base.free)
-            if changes is None:
-                continue
-            gone = max(self._gone(one, base, left), 0.0)
-            if gone < _LEAST_SHARE * (gone + changes.gain):
-                self.turned_down[candidate.key] = NO_CONSTANT
-                for later in found[n:]:
-                    base = self._without(later, base)
-                return found[:n], base, self._left(base), nearest_in_words(candidate.key, changes)
+            key = one.tried.candidate.key
+            self.turned_down[key] = NO_CONSTANT
+            for later in found[n:]:
+                base = self.search.without(later.tried.candidate, base)
+            return found[:n], base, self._left(base), nearest_in_words(key, changes)
         return found, base, left, ""
+
+    def _varies(self, one: Accepted, base: Base, left: _Left) -> Change | None:
+        """:return: how the size of a cause changes, if to follow that would explain much"""
+        candidate = one.tried.candidate
+        if self.hypotheses.remembers(candidate):
+            return None
+        own = self.hypotheses.indices(candidate)
+        changes = change(left.short, left.missing, own, base.free)
+        if changes is None:
+            return None
+        gone = max(self._gone(one, base, left), 0.0)
+        return changes if gone < _LEAST_SHARE * (gone + changes.gain) else None
+
+    def _left_by(self, found: Sequence[Accepted], base: Base) -> _Left | None:
+        """:return: what is left beside these causes; None: the size of one of them changes"""
+        left = self._left(base)
+        return None if any(self._varies(one, base, left) for one in found) else left
 
     def _gone(self, one: Accepted, base: Base, left: _Left) -> float:
         """:return: by which a cause lowers the cost of short windows"""
-        theta = self._without(one, base).point.theta
+        theta = self.search.without(one.tried.candidate, base).point.theta
         without = short_windows(self.search.select.evidence, theta, self.data)
         return without.point.cost - left.short.point.cost
 
@@ -382,7 +326,7 @@ class Inquiry:
                 *look_alike(found, select, base),
                 *out_of_reach(confirm, base.kept, self.origin[self.parts.confirm]),
             ),
-            twin=self.hypotheses.extended_by(_keys(found), point.theta).at_interval(
+            twin=self.hypotheses.extended_by(keys_of(found), point.theta).at_interval(
                 self.believed.dt, self.believed.substeps
             ),
             data_hash=self.data_hash,
@@ -410,10 +354,6 @@ def _window_of(data: Trajectories) -> int:
     whole = filling(steps)
     few = np.sum((data.lengths + 1) // (whole + 1)) < _FEW
     return filling(steps // 2) if few and steps >= 2 * _SHORTEST else whole
-
-
-def _keys(found: Sequence[Accepted]) -> list[str]:
-    return [one.tried.candidate.key for one in found]
 
 
 def _rows_of(shots: Shots, rows: np.ndarray) -> Shots:

@@ -19,8 +19,8 @@ from sb3_hds.sysid.shooting import Shots
 LEAST_GAIN, LEVEL, LEAST_BIC = 0.05, 0.025, 6.0
 # Another candidate belongs into the set unless it is worse than the best at this level.
 _LEVEL_OF_SET = 0.05
-# Candidates that may be confirmed, one after the other.
-_MOST_LOOKS = 3
+# Candidates that may be confirmed, one after the other, and that others are tried beside.
+_MOST_LOOKS, _MOST_FIRSTS = 3, 4
 # Errors that differ by a smaller share are the same, however surely they differ.
 _SAME = 0.01
 # Mean square error of a window that cannot be simulated, in units of the noise.
@@ -136,6 +136,18 @@ class Search:
         point = self.select.evidence.fit(theta, free)
         return Base(point, self.confirm.evidence.fit(point.theta, ()), tuple(free))
 
+    def believing(self, tried: Tried, base: Base) -> Base:
+        """:return: what is believed, and this candidate besides"""
+        own = self.hypotheses.indices(tried.candidate)
+        return Base(tried.point, tried.kept, (*base.free, *own))
+
+    def without(self, candidate: Candidate, base: Base) -> Base:
+        """:return: what is believed, but for this candidate; the rest refitted"""
+        own = self.hypotheses.indices(candidate)
+        theta = base.point.theta.copy()
+        theta[list(own)] = self.hypotheses.null[list(own)]
+        return self.base(theta, [i for i in base.free if i not in own])
+
     def again(self, base: Base) -> Base:
         """:return: the same belief, fitted under the noise that is known now"""
         point, kept = base.point, base.kept
@@ -207,7 +219,7 @@ class Search:
             half = self.confirm.evidence
             offsets = self._starts(candidate, point.theta, base.kept.offsets, half)
             kept = half.fit(point.theta, (), offsets, _KEPT_STEPS)
-            return Tried(candidate, point, kept, self._criterion(candidate, point, base.point))
+            return Tried(candidate, point, kept, self.criterion([candidate], point, base.point))
 
         tried = self._each(finish, candidates, f"fitting {len(candidates)} likely causes")
         return sorted(tried, key=lambda t: -t.criterion)
@@ -221,7 +233,11 @@ class Search:
         alike = imitators(self.select.evidence, best.point, best.candidate, base.free)
         names = {c.key for c in self.hypotheses.related(best.candidate)} | set(alike)
         left = [c for c in self.hypotheses.candidates if c.key in names - done]
-        return self.finished(left, base)
+        return self.finished([c for c in left if not self.part_of(c, base)], base)
+
+    def part_of(self, candidate: Candidate, base: Base) -> bool:
+        """:return: whether what is believed has this candidate already"""
+        return set(self.hypotheses.indices(candidate)) <= set(base.free)
 
     def others(self, base: Base, tried: Sequence[Tried]) -> list[tuple[Candidate, Comparison]]:
         """:return: candidates that were no finalists, as they were left, on the other half"""
@@ -235,6 +251,28 @@ class Search:
             return self.confirmed(kept, base.kept)
 
         return list(zip(rest, self._each(verdict, rest, "weighing the others"), strict=True))
+
+    def pair(
+        self, firsts: Sequence[Tried], base: Base, known: Candidate
+    ) -> tuple[Tried, list[Tried]] | None:
+        """
+        :param firsts: what was tried beside what is believed, best first
+        :param known: one of them, beside which others have been tried already
+        :return: the first cause of the pair that selection prefers, and what was tried beside it,
+            best first; None: there is none
+        """
+        likely = [t for t in firsts if t.criterion >= LEAST_BIC and t.candidate != known]
+        pairs = []
+        for first in likely[:_MOST_FIRSTS]:
+            seconds = self.finalists(self.believing(first, base), [first.candidate.key])
+            if not seconds:
+                continue
+            both = [first.candidate, seconds[0].candidate]
+            pairs.append((self.criterion(both, seconds[0].point, base.point), first, seconds))
+        if not pairs:
+            return None
+        _, first, seconds = max(pairs, key=lambda pair: pair[0])
+        return first, seconds
 
     def best(self, tried: Sequence[Tried], base: Base, n_found: int = 0) -> Tried | None:
         """
@@ -289,11 +327,13 @@ class Search:
 
     def needed(self, candidate: Candidate, base: Base) -> bool:
         """:return: whether what is believed gets worse without this part of it"""
-        own = self.hypotheses.indices(candidate)
-        theta = base.point.theta.copy()
-        theta[list(own)] = self.hypotheses.null[list(own)]
-        without = self.base(theta, [i for i in base.free if i not in own])
-        return passes(self.confirmed(base.kept, without.kept))
+        return passes(self.confirmed(base.kept, self.without(candidate, base).kept))
+
+    def criterion(self, candidates: Sequence[Candidate], point: Point, base: Point) -> float:
+        """:return: by which the information criterion is lower with these candidates"""
+        n = effective_size(base.raw / self.noise)
+        ratio = np.log(self.select.total(base) / self.select.total(point))
+        return n * ratio - sum(len(c.parameters) for c in candidates) * np.log(max(n, 2.0))
 
     def better(self, new: Point, old: Point) -> Comparison:
         """:return: whether one is better than another, both on the half that confirms"""
@@ -307,11 +347,11 @@ class Search:
         return verdict._replace(p_value=min(verdict.p_value, by_score))
 
     def _continued(self, candidate: Candidate, base: Base) -> Point:
-        own = list(self.hypotheses.indices(candidate))
-        reached = self._reached[candidate.key]
-        evidence, moving = self.select.evidence, [*base.free, *own]
-        offsets = self._starts(candidate, reached, base.point.offsets, evidence)
-        point = evidence.fit(reached, moving, offsets, _ALL_STEPS)
+        evidence, theta = self.select.evidence, base.point.theta.copy()
+        moving = [*base.free, *self.hypotheses.indices(candidate)]
+        theta[moving] = self._reached[candidate.key][moving]
+        offsets = self._starts(candidate, theta, base.point.offsets, evidence)
+        point = evidence.fit(theta, moving, offsets, _ALL_STEPS)
         return min(base.point, point, key=lambda p: p.cost)
 
     def _starts(
@@ -319,11 +359,6 @@ class Search:
     ) -> np.ndarray:
         """Far from what is believed, its start states may be those of another motion."""
         return evidence.nearer(theta, offsets) if candidate.key in self._far else offsets
-
-    def _criterion(self, candidate: Candidate, point: Point, base: Point) -> float:
-        n = effective_size(base.raw / self.noise)
-        ratio = np.log(self.select.total(base) / self.select.total(point))
-        return n * ratio - len(candidate.parameters) * np.log(max(n, 2.0))
 
     def _sample(self) -> np.ndarray:
         n = self.select.evidence.shots.n

@@ -1,0 +1,151 @@
+"""Which causes are named: one after the other, or, where that leads nowhere, two at once."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sb3_hds.sysid.account import standard_errors
+from sb3_hds.sysid.family import chance_of_the_best
+from sb3_hds.sysid.search import Base, Search, Tried, passes
+from sb3_hds.sysid.telling import CHANCE, SMALL, UNCERTAIN, Accepted, margin
+
+# Causes that are looked for.
+_MOST = 3
+# A later cause that takes away a smaller share of the error than this, of what the ones before took
+# away, may be no more than what their model is off by.
+_LEAST_OF_EARLIER = 0.01
+# Family-wise level of what selection proposes.
+_FAMILY_LEVEL = 0.05
+
+
+class Naming:
+    """
+    :param search: candidates on two halves of the evidence
+    :param start: what is believed at first
+    :param seed: of the bootstrap
+    """
+
+    def __init__(self, search: Search, start: Base, seed: int) -> None:
+        self.search, self.start, self.seed = search, start, seed
+        self.turned_down: dict[str, str] = {}
+
+    def one_by_one(self, firsts: Sequence[Tried]) -> tuple[list[Accepted], Base]:
+        """
+        :param firsts: candidates beside what is believed at first, best first
+        :return: causes, each confirmed beside those before it, and what is believed with them
+        """
+        found: list[Accepted] = []
+        tried, base = firsts, self.start
+        while (one := self._next(tried, base, keys_of(found))) is not None:
+            found.append(one)
+            base = self.search.believing(one.tried, base)
+            found, base = self._pruned(found, base)
+            if len(found) == _MOST:
+                break
+            tried = self.search.finalists(base, keys_of(found))
+        if len(found) > 1:
+            again = [self._asked_again(one, base) for one in found]
+            pairs = zip(found, again, strict=True)
+            found = [new if passes(new.verdict) else old for old, new in pairs]
+        return found, base
+
+    def pair(
+        self, alone: Accepted, base: Base, firsts: Sequence[Tried]
+    ) -> tuple[list[Accepted], Base] | None:
+        """
+        A cause that is named first takes on what belongs to a second one, and may leave too little
+        of it to be confirmed. So others are tried as the first one.
+
+        :param alone: the cause beside which no second one was confirmed
+        :param base: what is believed with it
+        :param firsts: candidates beside what is believed at first, best first
+        :return: the pair that selection prefers, and what is believed with it, if both causes are
+            confirmed beside each other and predict better than the one alone
+        """
+        chosen = self.search.pair(firsts, self.start, alone.tried.candidate)
+        if chosen is None:
+            return None
+        first, tried = chosen
+        belief = self.search.believing(first, self.start)
+        second = self._next(tried, belief, [first.candidate.key])
+        if second is None:
+            return None
+        both = self.search.believing(second.tried, belief)
+        if not passes(self.search.better(both.kept, base.kept)):
+            return None
+        chance = self._chance(first, self.start, [])
+        found, both = self._pruned(
+            [self._accepted(first, firsts, self.start, chance), second], both
+        )
+        found = [self._asked_again(one, both) for one in found]
+        if len(found) < 2 or not all(passes(one.verdict) for one in found):
+            return None
+        return found, both
+
+    def _next(self, tried: Sequence[Tried], base: Base, known: Sequence[str]) -> Accepted | None:
+        """:return: the best of what was tried, if it is a cause beside those that are known"""
+        sure = [t for t in tried if self._determined(t, base)]
+        best = self.search.best(sure, base, len(known))
+        if best is None:
+            return None
+        if self._is_leftover(best, base):
+            self.turned_down[best.candidate.key] = SMALL
+            return None
+        if (chance := self._chance(best, base, known)) >= _FAMILY_LEVEL / (1 + len(known)):
+            self.turned_down[best.candidate.key] = CHANCE
+            return None
+        return self._accepted(best, tried, base, chance)
+
+    def _accepted(self, best: Tried, tried: Sequence[Tried], base: Base, chance: float) -> Accepted:
+        """:param base: what is believed without it"""
+        rivals = [*tried, *self.search.relatives(best, tried, base)]
+        others = self.search.alternatives(best, rivals, base)
+        richer = self.search.richer(best, rivals, base)
+        verdict = self.search.confirmed(best.kept, base.kept)
+        return Accepted(best, verdict, others, richer, chance)
+
+    def _asked_again(self, one: Accepted, base: Base) -> Accepted:
+        """A cause beside what looks like it, now that the other causes are known."""
+        without = self.search.without(one.tried.candidate, base)
+        names = (one.tried.candidate.key, *one.alternatives, *one.richer)
+        named = [c for c in self.search.hypotheses.candidates if c.key in names]
+        named = [c for c in named if not self.search.part_of(c, without)]
+        tried = self.search.finished(named, without)
+        same = next(t for t in tried if t.candidate is one.tried.candidate)
+        return self._accepted(same, tried, without, one.chance)
+
+    def _determined(self, tried: Tried, base: Base) -> bool:
+        """Whether the interval of some parameter leaves out the value at which nothing changes."""
+        half, own = self.search.select, list(self.search.hypotheses.indices(tried.candidate))
+        free = [*base.free, *own]
+        stderr = standard_errors(half, tried.point, free)[own]
+        moved = np.abs(tried.point.theta - self.search.hypotheses.null)[own]
+        if not (sure := bool((moved > margin(len(np.unique(half.unit)), stderr)).any())):
+            self.turned_down[tried.candidate.key] = UNCERTAIN
+        return sure
+
+    def _is_leftover(self, best: Tried, base: Base) -> bool:
+        """Whether an imperfect model of the causes before explains as much as this one."""
+        first, now, then = map(self.search.confirm.total, (self.start.kept, base.kept, best.kept))
+        return now - then < _LEAST_OF_EARLIER * (first - now)
+
+    def _chance(self, best: Tried, base: Base, known: Sequence[str]) -> float:
+        """:return: family-wise p-value on the half that selects"""
+        left = [c for c in self.search.hypotheses.candidates if c.key not in known]
+        slopes = self.search.select.evidence.slopes(best.point)
+        own = [self.search.hypotheses.indices(c) for c in left]
+        fitted = (*base.free, *self.search.hypotheses.indices(best.candidate))
+        gain = base.point.cost - best.point.cost
+        return chance_of_the_best(slopes, own, base.free, fitted, gain, self.seed)
+
+    def _pruned(self, found: list[Accepted], base: Base) -> tuple[list[Accepted], Base]:
+        """Without causes that later ones have made superfluous."""
+        for one in found[:-1]:
+            if not self.search.needed(one.tried.candidate, base):
+                base = self.search.without(one.tried.candidate, base)
+                found = [other for other in found if other is not one]
+        return found, base
+
+
+def keys_of(found: Sequence[Accepted]) -> list[str]:
+    return [one.tried.candidate.key for one in found]
