@@ -174,6 +174,33 @@ def test_two_causes_are_found_one_after_the_other():
     assert found.twin.values["action_delay.torque.delay"] == pytest.approx(0.05, rel=0.15)
 
 
+@pytest.mark.parametrize("seed", [3, expensive(4)])
+def test_two_causes_are_found_where_the_one_found_first_leads_nowhere(seed):
+    # The second joint's friction alone takes on so much that beside it nothing is confirmed.
+    joints = {"joint1": (0.128, 1.0), "joint2": (0.106, 2.0)}
+    friction = [
+        effects.StribeckFriction(joint, tau_c=size, tau_s=2.0 * size, v_s=speed)
+        for joint, (size, speed) in joints.items()
+    ]
+    rig = twins.make("DoublePendulum", dt=0.01, substeps=4).extend(*friction)
+    rng, time = np.random.default_rng(seed), 0.01 * np.arange(250)[:, None]
+    recordings = []
+    for _ in range(5):
+        commands = np.sin(2 * np.pi * rng.uniform(0.3, 1.5, 2) * time + rng.uniform(0, 6, 2))
+        begin = rig.infer(jnp.array([*rng.uniform(-0.5, 0.5, 2), 0.0, 0.0]), rig.params)
+        obs = np.asarray(rollout(rig, rig.params, begin, jnp.asarray(commands)).obs)
+        recordings.append((obs + 0.01 * obs.std(0) * rng.standard_normal(obs.shape), commands))
+    data = Trajectories.from_arrays(*map(list, zip(*recordings, strict=True)), dt=0.01)
+
+    kinds = (*CATALOGUE[:3], effects.DirectionalViscousFriction, effects.DirectionalCoulombFriction)
+    found = asked(data, twins.make("DoublePendulum", dt=0.01, substeps=1), effects=kinds)
+
+    assert {f.key for f in found.findings} == {
+        "coulomb_friction.joint1",
+        "coulomb_friction.joint2",
+    }, found
+
+
 def swinging(*hidden, n_steps=120, strength=0.05):
     """:return: a driven pendulum without what is hidden, and recordings of it with that"""
     pushed = twins.make("FreePendulum", driven=True, dt=0.02)
