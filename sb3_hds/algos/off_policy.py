@@ -296,7 +296,6 @@ def explored(recipe: Recipe, weights: Weights, extra: Any, obs: Array, noise: Ar
     return jnp.tanh(gaussian.mean + gaussian.std * noise)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
 def begin(recipe: Recipe, n_obs: int, n_act: int, ent_coef: float, key: PRNGKeyArray) -> Learner:
     """:return: fresh networks and optimisers"""
     key, actor_key, critic_key, extra_key = jax.random.split(key, 4)

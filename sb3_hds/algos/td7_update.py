@@ -195,7 +195,6 @@ class Report(NamedTuple):
     encoder_loss: Float[Array, ""]
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
 def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
     """:return: fresh networks and optimisers"""
     key, encoder_key, actor_key, critic_key = jax.random.split(key, 4)
