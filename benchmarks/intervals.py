@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.stats import trim_mean
 
 _N_DRAWS, _LEVEL = 10_000, 0.95
 
@@ -26,6 +27,17 @@ def of_difference(ours: Sequence[float], theirs: Sequence[float]) -> tuple[float
         return difference, np.nan, np.nan
     rng = np.random.default_rng(0)
     return difference, *_limits(_means(ours, rng) - _means(theirs, rng))
+
+
+def of_iqm(groups: Sequence[np.ndarray]) -> tuple[float, float, float]:
+    """
+    :param groups: scores of one method, by seed, for each environment
+    :return: their interquartile mean and its 95 % interval: seeds are drawn within each environment
+    """
+    rng = np.random.default_rng(0)
+    drawn = [group[rng.integers(len(group), size=(_N_DRAWS, len(group)))] for group in groups]
+    middles = trim_mean(np.concatenate(drawn, 1), 0.25, axis=1)
+    return float(trim_mean(np.concatenate(groups), 0.25)), *_limits(middles)
 
 
 def chance_of_more(ours: Sequence[float], theirs: Sequence[float]) -> float:

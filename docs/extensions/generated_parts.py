@@ -41,6 +41,9 @@ PARTS: dict[str, Callable[[], str]] = {
         shows="return with each part switched off, a dot for each seed",
     ),
     "open_loop": summaries.gaits,
+    "open_loop_scores": summaries.whole(
+        "open_loop_scores", "scores of open loop and PPO in each environment and over all of them"
+    ),
     "robustness_return": summaries.crossed(
         "robustness", "perturbation", ("env", "policy"), "return"
     ),
