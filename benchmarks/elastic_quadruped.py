@@ -1,7 +1,7 @@
 """
 A quadruped with springs: RL alone, an optimised rhythm, and both, in which order.
 
-    python benchmarks/elastic_quadruped.py              # 100,000 steps, three seeds
+    python benchmarks/elastic_quadruped.py              # 50,000 steps, three seeds
     python benchmarks/elastic_quadruped.py --figure     # draw the figure again from the table
 
 `sb3_hds/ElasticQuadruped-v0`, the same number of real steps for all:
@@ -50,7 +50,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("--methods", nargs="*", default=list(METHODS), choices=METHODS)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--steps", type=int, default=100_000)
+    parser.add_argument("--steps", type=int, default=50_000)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
     parser.add_argument("--worker", nargs=3, metavar=("METHOD", "SEED", "STEPS"))

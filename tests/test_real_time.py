@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from small_models import small
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_hds.algos import TrainBeside
 from sb3_hds.errors import ParameterError, SafetyError
@@ -42,6 +43,8 @@ class Plant(gymnasium.Env):
         return np.zeros(1, np.float32), {}
 
     def step(self, action):
+        if not np.isfinite(action).all():
+            raise ValueError("no number")
         self.told.append((self.time.clock() if self.time else time.monotonic(), float(action[0])))
         self.time.sleep(self.takes) if self.time else time.sleep(self.takes)
         self.n += 1
@@ -49,10 +52,10 @@ class Plant(gymnasium.Env):
 
 
 def controlled(takes=0.0, length=1000, safe=None, **settings):
-    """A period of 0.1 s, begun at 100 s."""
+    """A period of 0.1 s, begun with a first command at 100 s."""
     ours = Time()
     env = RealTime(
-        Plant(ours, takes, length),
+        Plant(ours, 0.0, length),
         0.1,
         safe,
         threaded=False,
@@ -61,6 +64,8 @@ def controlled(takes=0.0, length=1000, safe=None, **settings):
         **settings,
     )
     env.reset(seed=0)
+    env.step(GO)
+    env.unwrapped.takes = takes
     return env, ours
 
 
@@ -68,7 +73,8 @@ GO = np.array([1.0], np.float32)
 
 
 def times(env):
-    return [at for at, _ in env.unwrapped.told]
+    """After the first command."""
+    return [at for at, _ in env.unwrapped.told[1:]]
 
 
 def test_commands_act_at_the_ticks_however_fast_the_learner_is():
@@ -80,7 +86,7 @@ def test_commands_act_at_the_ticks_however_fast_the_learner_is():
 
     assert times(env) == pytest.approx([100.1, 100.2, 100.3])
     assert env.latency == pytest.approx(0.03) and not env.overrun
-    assert env.timing == Timing(steps=3)
+    assert env.timing == Timing(steps=4)
 
 
 def test_a_late_command_is_counted_and_acts_at_once():
@@ -94,7 +100,7 @@ def test_a_late_command_is_counted_and_acts_at_once():
     # Nobody kept the ticks meanwhile: the next period counts from the late command.
     assert times(env) == pytest.approx([100.17, 100.27])
     assert late and not env.overrun and info["missed_steps"] == 0
-    assert env.timing == Timing(steps=2, overruns=1)
+    assert env.timing == Timing(steps=3, overruns=1)
 
 
 def test_a_command_within_the_grace_keeps_the_ticks_where_they_are():
@@ -106,7 +112,7 @@ def test_a_command_within_the_grace_keeps_the_ticks_where_they_are():
     env.step(GO)
 
     assert times(env) == pytest.approx([100.12, 100.2])
-    assert env.timing == Timing(steps=2, overruns=1)
+    assert env.timing == Timing(steps=3, overruns=1)
 
 
 def test_the_watchdog_sends_the_safe_action_at_each_tick_without_a_command():
@@ -119,10 +125,10 @@ def test_the_watchdog_sends_the_safe_action_at_each_tick_without_a_command():
     obs, reward, _, _, info = env.step(GO)
 
     # Ticks at 0.1, 0.2 and 0.3 s, each with 0.05 s of grace; the command acts at the next one.
-    assert [command for _, command in env.unwrapped.told] == [-1.0, -1.0, -1.0, 1.0]
+    assert [command for _, command in env.unwrapped.told[1:]] == [-1.0, -1.0, -1.0, 1.0]
     assert times(env) == pytest.approx([100.15, 100.25, 100.35, 100.4])
-    assert (obs[0], reward, info["missed_steps"]) == (4.0, 4.0, 3)
-    assert env.timing == Timing(steps=1, overruns=1, safe_actions=3)
+    assert (obs[0], reward, info["missed_steps"]) == (5.0, 4.0, 3)
+    assert env.timing == Timing(steps=2, overruns=1, safe_actions=3)
 
 
 def test_a_watchdog_that_was_held_up_does_not_make_up_for_ticks_in_a_burst():
@@ -131,36 +137,89 @@ def test_a_watchdog_that_was_held_up_does_not_make_up_for_ticks_in_a_burst():
     ours.now += 0.57
     *_, info = env.step(GO)
 
-    assert [command for _, command in env.unwrapped.told] == [-1.0, 1.0]
+    assert [command for _, command in env.unwrapped.told[1:]] == [-1.0, 1.0]
     assert times(env) == pytest.approx([100.57, 100.6])
     assert info["missed_steps"] == 1
 
 
 def test_an_episode_that_ends_under_the_watchdog_is_reported_and_the_command_dropped():
-    env, ours = controlled(safe=[-1.0], length=2)
+    env, ours = controlled(safe=[-1.0], length=3)
 
     for _ in range(30):
         ours.now += 0.025
         env.watch()
     obs, reward, terminated, truncated, info = env.step(GO)
 
-    assert (obs[0], reward, terminated, truncated) == (2.0, 2.0, False, True)
+    assert (obs[0], reward, terminated, truncated) == (3.0, 2.0, False, True)
     assert info["command_dropped"] and info["missed_steps"] == 2
-    assert env.timing == Timing(safe_actions=2, dropped=1)
+    assert env.timing == Timing(steps=1, safe_actions=2, dropped=1)
 
 
-def test_no_tick_passes_between_episodes():
-    env, ours = controlled(safe=[-1.0], length=1)
+@pytest.mark.parametrize("when", ["before reset", "after reset"])
+def test_no_tick_passes_between_episodes(when):
+    env, ours = controlled(safe=[-1.0], length=2)
     env.step(GO)
 
+    if when == "after reset":
+        env.reset()
     ours.now += 60.0  # training
     assert not env.watch()
-    env.reset()
+    if when == "before reset":
+        env.reset()
+    env.step(GO)
     ours.now += 0.05
     env.step(GO)
 
-    assert not env.overrun and env.timing == Timing(steps=2)
-    assert times(env) == pytest.approx([100.1, 160.2])
+    assert not env.overrun and env.timing == Timing(steps=4)
+    assert times(env) == pytest.approx([100.1, 160.1, 160.2])
+    assert env.latencies()[0].sum() == 2
+
+
+def test_learners_that_train_between_episodes_keep_every_tick():
+    ours = Time()
+    plant = gymnasium.wrappers.TimeLimit(Plant(ours), 10)
+    env = RealTime(plant, 0.1, [-1.0], threaded=False, clock=ours.clock, sleep=ours.sleep)
+
+    class Slow(BaseCallback):
+        """Each training takes a second, in which a watchdog would look."""
+
+        def _on_step(self):
+            return True
+
+        def _on_rollout_end(self):
+            ours.now += 1.0
+            assert not env.watch()
+
+    settings = {"train_freq": (1, "episode"), "gradient_steps": 1, "learning_starts": 10}
+    small("gsde_sac", env, **settings).learn(40, callback=Slow())
+
+    assert env.timing == Timing(steps=40)
+
+
+@pytest.mark.parametrize("how", ["interrupted", "refused"])
+def test_the_watchdog_goes_on_where_a_step_was_not_finished(how):
+    env, ours = controlled(safe=[-1.0])
+    ours.now += 0.16
+    assert env.watch()
+    if how == "interrupted":
+
+        def sleep(seconds):
+            raise KeyboardInterrupt
+
+        env._sleep, action, error = sleep, GO, KeyboardInterrupt
+    else:
+        action, error = np.array([np.nan]), ValueError
+    with pytest.raises(error):
+        env.step(action)
+
+    for _ in range(20):
+        ours.now += 0.025
+        env.watch()
+
+    assert [command for _, command in env.unwrapped.told[1:]] == [-1.0] * 6
+    env._sleep = ours.sleep
+    *_, info = env.step(GO)
+    assert info["missed_steps"] == 6
 
 
 def test_a_step_longer_than_the_period_is_counted_and_skips_to_the_next_tick():
@@ -171,7 +230,7 @@ def test_a_step_longer_than_the_period_is_counted_and_skips_to_the_next_tick():
 
     # From 0.1 to 0.35 s, so the next tick is at 0.4 s.
     assert times(env) == pytest.approx([100.1, 100.4])
-    assert env.timing == Timing(steps=2, slow_steps=2)
+    assert env.timing == Timing(steps=3, slow_steps=2)
 
 
 def test_latencies_fill_a_histogram_with_an_open_end():
@@ -229,11 +288,11 @@ def test_in_real_time_a_learner_that_hangs_is_replaced_by_the_watchdog():
 
     commands = [command for _, command in env.unwrapped.told]
     # Never faster than the clock, and how much slower depends on the machine.
-    assert elapsed >= 5 * 0.02 + 0.3
+    assert elapsed >= 4 * 0.02 + 0.3
     assert 1 <= info["missed_steps"] <= 16
     assert commands[-1] == 1.0 and commands[-2] == -1.0
     assert env.timing.steps == 6 and env.timing.safe_actions >= info["missed_steps"]
-    assert env.overrun and env.latencies()[0].sum() == 6
+    assert env.overrun and env.latencies()[0].sum() == 5
 
 
 def test_a_watchdog_whose_safe_action_fails_says_so_and_stays_still():

@@ -608,6 +608,28 @@ def test_a_projection_meets_the_conditions_of_optimality(n):
         assert residual < 1e-5
 
 
+@pytest.mark.parametrize("scale", [1e-9, 1e-6, 1e-3, 1.0, 1e6])
+@pytest.mark.parametrize("unit", [1e-4, 1.0, 1e3])
+def test_a_projection_does_not_depend_on_units(scale, unit):
+    generator = np.random.default_rng(0)
+    for _ in range(30):
+        G = generator.normal(size=(5, 3))
+        h = G @ generator.uniform(-0.5, 0.5, 3) + generator.uniform(0.01, 0.3, 5)
+        wanted, most = generator.uniform(-2.0, 2.0, 3), np.ones(3)
+
+        found = nearest(unit * wanted, scale * G, unit * scale * h, -unit * most, unit * most)
+
+        np.testing.assert_allclose(found / unit, nearest(wanted, G, h, -most, most), atol=1e-9)
+        assert np.all(G @ found <= unit * h)
+
+
+def test_a_constraint_without_coefficients_holds_or_does_not():
+    wanted, most = np.full(2, 0.5), np.ones(2)
+
+    assert nearest(wanted, np.zeros((1, 2)), np.zeros(1), -most, most) == pytest.approx(wanted)
+    assert nearest(wanted, np.zeros((1, 2)), np.full(1, -1e-9), -most, most) is None
+
+
 def test_a_shield_without_any_allowed_command_raises_or_falls_back():
     contradiction = lambda obs: ([[1.0], [-1.0]], [-1.0, -1.0])  # noqa: E731
     action = np.array([1.0], np.float32)

@@ -21,6 +21,9 @@ Constraints: TypeAlias = (
 _ROUNDING = 1.2e-7
 # More than any constraint asks for: what DAQP takes for no bound.
 _NO_BOUND = -1e30
+# By how much DAQP may miss a constraint whose coefficients have length one, as a share of the
+# largest command, or of the bound if that is more.
+_MISS = 1e-5
 
 
 def nearest(
@@ -37,14 +40,22 @@ def nearest(
     programming using recursive LDL updates*, IEEE Transactions on Automatic Control 67(8), 2022.
 
     :param wanted: shape ``(n,)``
-    :param G: shape ``(m, n)``
+    :param G: shape ``(m, n)``; constraints mean the same whatever a row is multiplied by
     :param h: shape ``(m,)``
     :return: the command, shape ``(n,)``, or None where no command is allowed
     """
-    wanted = np.clip(wanted, low, high)
-    tight = h - _ROUNDING * (np.abs(G) @ np.maximum(np.abs(low), np.abs(high)))
+    wanted, largest = np.clip(wanted, low, high), np.maximum(np.abs(low), np.abs(high))
+    length = np.linalg.norm(G, axis=1)
+    if np.any(h[length == 0.0] < 0.0):
+        return None
+    kept, unit = length > 0.0, largest.max() or 1.0
+    G = G[kept] / length[kept, None]
+    # In units of the largest command from here on, as DAQP's tolerances are absolute.
+    h = h[kept] / (length[kept] * unit)
+    wanted, low, high, largest = (x / unit for x in (wanted, low, high, largest))
+    tight = h - _ROUNDING * (np.abs(G) @ largest)
     if np.all(G @ wanted <= tight):
-        return wanted
+        return wanted * unit
     n, m = len(wanted), len(h)
     found, _, flag, _ = daqp.solve(
         np.eye(n),
@@ -54,7 +65,9 @@ def nearest(
         np.concatenate([low, np.full(m, _NO_BOUND)]).astype(float),
         np.zeros(n + m, np.int32),
     )
-    return np.clip(found, low, high) if flag > 0 else None
+    found = np.clip(found, low, high)
+    kept_to = np.all(G @ found <= h + _MISS * np.maximum(1.0, np.abs(h)))
+    return found * unit if flag > 0 and kept_to else None
 
 
 class ConstraintSet:

@@ -13,6 +13,8 @@ from sb3_hds.errors import ParameterError, SafetyError
 
 # The histogram of latencies has this many bins per period, over this many periods.
 _BINS, _PERIODS = 20, 2
+# The least time between two looks of a watchdog that has nothing to do, as a share of the period.
+_LEAST_PAUSE = 0.1
 
 
 class Timing(NamedTuple):
@@ -46,14 +48,16 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     the learner saw. An episode that ends meanwhile is reported by the next ``step``, whose command
     is dropped (``info["command_dropped"]``).
 
-    Between the end of an episode and the next reset no tick passes: train there
-    (``train_freq=(1, "episode")``), or beside the loop with
-    :class:`sb3_hds.algos.TrainBeside`. A general-purpose operating system wakes a process a little
+    The first command after a reset begins the ticks, so none passes between the end of an episode
+    and that command: train there (``train_freq=(1, "episode")``; vectorised environments reset
+    first), or beside the loop with :class:`sb3_hds.algos.TrainBeside`. Where ``step`` is
+    interrupted or raises, the watchdog goes on with the safe action until ``reset`` or ``close``. A general-purpose operating system wakes a process a little
     late, on a busy machine by milliseconds: this is no hard real time, and no substitute for a
     watchdog in the drive.
 
     Times are no part of ``info``, which is a function of seed and actions: they are attributes,
-    ``timing``, ``latency`` (of the latest command, from observation to command [s]), ``overrun``
+    ``timing``, ``latency`` (of the latest command, from observation to command [s]; 0 for the first of an
+    episode, which is on time whenever it comes), ``overrun``
     (whether that came late) and :meth:`latencies`.
 
     :param env: of any kind; simulated ones wait for the clock, real ones must return promptly
@@ -92,7 +96,7 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         self.timing, self.latency, self.overrun = Timing(), 0.0, False
         self._counts = np.zeros(_BINS * _PERIODS + 1, int)
         self._deadline, self._answered = 0.0, 0.0
-        self._running, self._claimed = False, False
+        self._begun, self._running, self._claimed = False, False, False
         self._missed: list[tuple[Any, Any, bool, bool, dict[str, Any]]] = []
         self._begin_watching()
 
@@ -100,14 +104,9 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         with self._lock:
-            self._running, self._failure = False, None
+            self._begun, self._running, self._failure = False, False, None
             self._missed.clear()
-            obs, info = self.env.reset(seed=seed, options=options)
-            self._answered = self._clock()
-            self._deadline = self._answered + self.period
-            self._running, self._claimed = True, False
-        self._watch_on()
-        return obs, info
+            return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """
@@ -120,27 +119,43 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
                 "The watchdog could not execute the safe action; nothing was executed since. Stop "
                 "the robot by hand, then reset."
             ) from self._failure
-        self.latency, self.overrun = came - self._answered, True
-        self._note(self.latency)
-        self.watch()
+        if self._begun:
+            self.latency = came - self._answered
+            self._note(self.latency)
+            self.watch()
+        else:
+            self._begin(came)
         with self._lock:
             missed, self._missed = self._missed, []
             if missed and (missed[-1][2] or missed[-1][3]):
+                self.overrun = True
                 self.timing = self.timing._replace(dropped=self.timing.dropped + 1)
                 return self._merged(missed, dropped=True)
             self._claimed = True
         self.overrun = bool(missed) or came > self._deadline
-        if (wait := self._deadline - self._clock()) > 0.0:
-            self._sleep(wait)
-        with self._lock:
-            missed.append(self._execute(action))
+        try:
+            if (wait := self._deadline - self._clock()) > 0.0:
+                self._sleep(wait)
+            with self._lock:
+                result = self._execute(action)
+                self._answered = self._clock()
+                self.timing = self.timing._replace(
+                    steps=self.timing.steps + 1,
+                    overruns=self.timing.overruns + int(self.overrun),
+                )
+        except BaseException:
+            with self._lock:
+                self._missed = missed + self._missed
+            raise
+        finally:
             self._claimed = False
-            self._answered = self._clock()
-            timing = self.timing
-            self.timing = timing._replace(
-                steps=timing.steps + 1, overruns=timing.overruns + int(self.overrun)
-            )
-        return self._merged(missed, dropped=False)
+        return self._merged([*missed, result], dropped=False)
+
+    def _begin(self, now: float) -> None:
+        with self._lock:
+            self._deadline, self.latency = now, 0.0
+            self._begun, self._running = True, True
+        self._watch_on()
 
     def watch(self) -> bool:
         """
@@ -218,7 +233,8 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
             due = self._deadline + self.grace * self.period - self._clock()
             idle = not self._running or self._claimed
             if idle or due > 0.0:
-                self._stopped.wait(self.grace * self.period if idle else due)
+                pause = max(self.grace, _LEAST_PAUSE) * self.period
+                self._stopped.wait(pause if idle else due)
                 continue
             try:
                 self.watch()
@@ -231,7 +247,7 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._begin_watching()
-        self._running = False
+        self._begun, self._running = False, False
 
 
 def _in_space(env: gymnasium.Env, action: Sequence[float] | np.ndarray) -> np.ndarray:
