@@ -224,7 +224,7 @@ def test_a_rate_limit_lets_commands_change_by_rate_times_interval():
     np.testing.assert_allclose(told, expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize("order", [1, 2, 3, 4])
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 8])
 def test_a_low_pass_is_scipy_s_butterworth(order):
     actions = np.random.default_rng(0).uniform(-3.0, 3.0, (60, 2))  # too small to be clipped
 
@@ -332,7 +332,7 @@ def test_a_continuity_cost_is_the_squared_change_of_the_action():
         (lambda env: ActionRateLimit(env, -1.0), "max_change must be positive"),
         (lambda env: ActionRateLimit(env, [1.0, 1.0, 1.0]), "3 values of max_change"),
         (lambda env: LowPassAction(env, 10.0), "below 10 Hz"),
-        (lambda env: LowPassAction(env, 1.0, 5), "whole number from 1 to 4"),
+        (lambda env: LowPassAction(env, 1.0, 9), "whole number from 1 to 8"),
         (lambda env: ActionDelay(env, 0), "whole number of at least 1"),
         (lambda env: ActionDelay(env, 1, store="executed"), "store must be one of"),
         (lambda env: ActionScale(env), "either a scale or a schedule"),

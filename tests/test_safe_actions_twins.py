@@ -153,13 +153,31 @@ def test_a_stateful_transform_comes_alone():
 
 
 def test_derivatives_of_a_filter_pass_through_the_twin(x64):
-    twin = TransformedTwin(Pendulum(), stateful=LowPass(b=(0.4, 0.4), a=(1.0, -0.2)))
+    # g = 2 / 3, so g / (1 + g) = 0.4.
+    low_pass = LowPass(cutoff=np.arctan(2.0 / 3.0) / np.pi, order=1)
+    twin = TransformedTwin(Pendulum(), stateful=low_pass)
     state = twin.infer(jnp.array([1.0, 0.0, 0.0, 0.1]), twin.params)
 
     slope = jax.jacfwd(lambda u: twin.step(state, u, twin.params).v[0])(jnp.zeros(1))
 
     # The command is 0.4 u + z; 1 N m during 0.05 s speeds m l^2 / 3 up by 0.15.
     assert float(slope[0]) == pytest.approx(0.4 * 0.15, rel=1e-9)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 8])
+@pytest.mark.parametrize("cutoff", [1e-4, 1e-3, 0.01, 0.1, 0.4])
+def test_a_constant_passes_a_filter_in_single_precision(cutoff, order):
+    low_pass, below = LowPass(cutoff=cutoff, order=order), Signals(Pendulum().actuators, Pendulum().channels)
+    command = jnp.full(1, 1.3, jnp.float32)
+
+    def step(memory, _):
+        passed, memory = low_pass.act(command, jnp.zeros(3), memory, below)
+        return memory, passed
+
+    start = jnp.asarray(low_pass.start(np.zeros(3, np.float32), below))
+    _, passed = jax.lax.scan(step, start, length=200 + int(20 / cutoff))
+
+    assert float(passed[-1, 0]) == pytest.approx(1.3, rel=2e-3)
 
 
 def test_limits_of_the_filters_memory_are_those_of_the_twin_and_the_wrapper():

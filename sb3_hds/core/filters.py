@@ -12,9 +12,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from sb3_hds.core.signals import Channel
 from sb3_hds.core.stateful import Signals, StatefulTransform, namespace, per_place, refuse_unless
 
+#: of a low-pass [cycles per step]: 0.1 Hz at 10 kHz
+LOWEST_CUTOFF = 1e-5
 # A bound of an observation must hold in single precision, too.
 _ROUNDING = 1e-5
-# The impulse response of a filter is summed until it is below this share of its sum.
+# The impulse response of a filter is summed until this share of what was remembered is left.
 _NEGLIGIBLE = 1e-12
 
 
@@ -63,39 +65,36 @@ class RateLimit(StatefulTransform):
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LowPass(StatefulTransform):
     r"""
-    A digital filter of each command, in transposed direct form II:
+    A Butterworth low-pass of each command, by the bilinear transform: sections of second order one
+    after the other, each two trapezoidal integrators of :math:`g = \tan(\pi f)`, and one of first
+    order where the order is odd:
 
-    .. math:: y = b_0 a + z_1, \quad z_i \leftarrow b_i a - c_i y + z_{i+1}
+    .. math:: v = \frac{z_1 + g\,(a - z_2)}{1 + g\,(g + k)}, \quad y = z_2 + g v, \quad
+        z_1 \leftarrow 2 v - z_1, \quad z_2 \leftarrow 2 y - z_2
 
-    The command is :math:`y`, clipped to the limits of the actuator: from second order on, a
-    low-pass overshoots. Remembers :math:`z`; before an episode, the one at rest at the command
-    nearest to zero. Gain at zero frequency must be one.
+    In this form a constant passes unchanged however low the cut-off and the precision; polynomials
+    of the same filter lose it in single precision. The command is :math:`y` of the last section,
+    clipped to the limits of the actuator: from second order on, a low-pass overshoots. Remembers
+    the :math:`z`; before an episode, those at rest at the command nearest to zero.
 
-    Source: Oppenheim and Schafer, *Discrete-Time Signal Processing*, 3rd ed., section 6.3.
+    Source: Zavalishin, *The Art of VA Filter Design*, 2018, chapters 3 to 5.
 
-    :param b: numerator :math:`b_0 \dots b_n`
-    :param a: denominator :math:`1, c_1 \dots c_n`
-    :raises ParameterError: unless both have one length, and the filter is stable with gain one
+    :param cutoff: :math:`f`, where half of the power passes [cycles per step], below a half
+    :param order: a whole number from 1
+    :raises ParameterError: for a cut-off or an order out of range
     """
 
     name: ClassVar[str] = "low_pass"
 
-    b: Sequence[float]
-    a: Sequence[float]
+    cutoff: float
+    order: int
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        refuse_unless(self, "a", self.a[0] == 1.0, "a denominator that begins with 1")
-        refuse_unless(self, "b", len(self.b) == len(self.a) >= 2, f"{len(self.a)} coefficients")
-        stable = bool(np.all(np.abs(np.roots(self.a)) < 1.0))
-        refuse_unless(self, "a", stable, "the denominator of a stable filter")
-        gain = sum(self.b) / sum(self.a)
-        refuse_unless(self, "b", math.isclose(gain, 1.0, rel_tol=1e-6), "of gain 1 at frequency 0")
-
-    @property
-    def order(self) -> int:
-        """Numbers that the filter of one command remembers."""
-        return len(self.a) - 1
+        fine = LOWEST_CUTOFF <= self.cutoff < 0.5
+        refuse_unless(self, "cutoff", fine, f"from {LOWEST_CUTOFF:g} to below 0.5")
+        whole = isinstance(self.order, int) and self.order >= 1
+        refuse_unless(self, "order", whole, "a whole number of at least 1")
 
     def remembers(self, below: Signals) -> tuple[Channel, ...]:
         low, high = below.limits()
@@ -118,27 +117,39 @@ class LowPass(StatefulTransform):
         below: Signals,
     ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
         n, wanted = len(below.actuators), clipped(action, below)
-        z = [memory[i * n : (i + 1) * n] for i in range(self.order)]
-        y = self.b[0] * wanted + z[0]
-        after = [
-            self.b[i] * wanted - self.a[i] * y + (z[i] if i < self.order else 0.0)
-            for i in range(1, self.order + 1)
-        ]
+        y, after = self._passed(wanted, [memory[i * n : (i + 1) * n] for i in range(self.order)])
         return clipped(y, below), namespace(action).concatenate(after)
+
+    def _passed(self, y: Any, z: Sequence[Any]) -> tuple[Any, list[Any]]:
+        """
+        :param y: what comes in
+        :param z: what each integrator remembers
+        :return: what comes out, and what they remember then
+        """
+        g, after = math.tan(math.pi * self.cutoff), []
+        for i in range(self.order // 2):
+            damping = 2.0 * math.sin((2 * i + 1) * math.pi / (2 * self.order))
+            first, second = z[2 * i : 2 * i + 2]
+            v = (first + g * (y - second)) / (1.0 + g * (g + damping))
+            y = second + g * v
+            after += [2.0 * v - first, 2.0 * y - second]
+        if self.order % 2:
+            v = (y - z[-1]) * (g / (1.0 + g))
+            y = v + z[-1]
+            after.append(y + v)
+        return y, after
 
     def _at_rest(self) -> np.ndarray:
         """What it remembers of a command of one that never changed, shape ``(order,)``."""
-        differences = np.array(self.b[1:]) - np.array(self.a[1:])
-        return np.cumsum(differences[::-1])[::-1]
+        return np.array([0.0, 1.0] * (self.order // 2) + [1.0] * (self.order % 2))
 
     def _largest(self) -> np.ndarray:
         """The most that it remembers of commands within [-1, 1], shape ``(order,)``."""
-        z, total, given = np.zeros(self.order), np.zeros(self.order), 1.0
-        while given or np.any(np.abs(z) > _NEGLIGIBLE * total):
-            y = self.b[0] * given + z[0]
-            z = np.array(self.b[1:]) * given - np.array(self.a[1:]) * y + np.append(z[1:], 0.0)
-            total, given = total + np.abs(z), 0.0
-        return total
+        step = np.array(self._passed(0.0, list(np.eye(self.order)))[1])
+        answers = np.array(self._passed(1.0, [0.0] * self.order)[1])[:, None]
+        while np.abs(step).max() > _NEGLIGIBLE:
+            answers, step = np.concatenate([answers, step @ answers], 1), step @ step
+        return np.abs(answers).sum(1)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -1,17 +1,17 @@
 """Commands without high frequencies."""
 
-from typing import Any
+import math
 
 import gymnasium
-from scipy import signal
 
 from sb3_hds.core import LowPass
+from sb3_hds.core.filters import LOWEST_CUTOFF
 from sb3_hds.errors import ParameterError
 from sb3_hds.wrappers.action_layer import TransformLayer
 from sb3_hds.wrappers.interval import interval_of
 
-# Beyond it, coefficients of one fraction lose their meaning in single precision.
-_HIGHEST_ORDER = 4
+# As many numbers per action are appended to observations.
+_HIGHEST_ORDER = 8
 
 
 class LowPassAction(TransformLayer):
@@ -22,11 +22,11 @@ class LowPassAction(TransformLayer):
     to their limits. Put limits of joints below it: a filter delays what they ask for.
 
     Source: Butterworth, *On the theory of filter amplifiers*, Experimental Wireless 7, 1930;
-    bilinear transform as in ``scipy.signal.butter``.
+    bilinear transform as in ``scipy.signal.butter``, see :class:`sb3_hds.core.LowPass`.
 
     :param env: its actions are a bounded Box with one axis
     :param cutoff: frequency at which half of the power passes [Hz], below half the control rate
-    :param order: 1 to 4
+    :param order: 1 to 8
     :param dt: control interval [s]; default: the environment's own ``dt`` or ``tau``
     :param observe_state: whether the state is appended, ``order`` numbers per action; without it,
         the task is not Markov
@@ -45,18 +45,19 @@ class LowPassAction(TransformLayer):
         store: str = "raw",
     ) -> None:
         interval = interval_of(env, ParameterError) if dt is None else dt
-        if not 0.0 < cutoff < 0.5 / interval:
+        if not 0.0 < interval < math.inf:
+            raise ParameterError(f"LowPassAction(dt={dt!r}): dt must be above 0 s.")
+        if not LOWEST_CUTOFF <= cutoff * interval < 0.5:
             raise ParameterError(
                 f"LowPassAction(cutoff={cutoff!r}): with a step of {interval:g} s, cutoff must be "
-                f"above 0 and below {0.5 / interval:g} Hz, half the control rate."
+                f"at least {LOWEST_CUTOFF / interval:g} Hz and below {0.5 / interval:g} Hz, half "
+                "the control rate."
             )
         if order not in range(1, _HIGHEST_ORDER + 1):
             raise ParameterError(
                 f"LowPassAction(order={order!r}): order must be a whole number from 1 to "
                 f"{_HIGHEST_ORDER}."
             )
-        filtered: Any = signal.butter(order, cutoff, fs=1.0 / interval)
-        b, a = filtered
         arguments = {
             "cutoff": cutoff,
             "order": order,
@@ -64,5 +65,5 @@ class LowPassAction(TransformLayer):
             "observe_state": observe_state,
             "store": store,
         }
-        transform = LowPass(b=b.tolist(), a=a.tolist(), observed=observe_state)
+        transform = LowPass(cutoff=cutoff * interval, order=order, observed=observe_state)
         super().__init__(env, transform, store, arguments)
