@@ -5,6 +5,7 @@ import pickle
 import gymnasium
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
@@ -15,7 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_hds.core import Actuator, Channel, Rhythm, Signals, TransformedTwin
 from sb3_hds.core.oscillators import advance_phase
-from sb3_hds.envs import twin_of
+from sb3_hds.envs import TwinEnv, twin_of
 from sb3_hds.errors import EnvironmentMismatchError, ParameterError
 from sb3_hds.wrappers import (
     ActionRateLimit,
@@ -25,6 +26,7 @@ from sb3_hds.wrappers import (
     Perturb,
     ShowJoints,
 )
+from sb3_hds.wrappers.actuated_joints import commands_positions, refuse_servos
 
 TAU = 2.0 * np.pi
 #: two motors, and what Swimmer-v5 observes
@@ -406,3 +408,42 @@ def test_a_push_is_a_force_on_the_torso_in_some_steps_only():
 @pytest.mark.parametrize("settings", [{"noise": 0.1}, {"failing": "zero"}, {"push": 5.0}], ids=str)
 def test_the_checkers_accept_perturbed_environments(settings):
     gymnasium_check(perturbed(**settings), skip_render_check=True)
+
+
+# --- commands that are positions already, and intervals
+
+SERVO = """
+<mujoco>
+  <worldbody>
+    <body><joint name="hinge" axis="0 1 0" range="-90 90" limited="true"/>
+      <geom size="0.02 0.2" type="capsule" mass="0.1"/></body>
+  </worldbody>
+  <actuator><position joint="hinge" kp="20" kv="1"/></actuator>
+</mujoco>
+"""
+
+
+def test_servos_are_left_to_track_by_themselves():
+    model = mujoco.MjModel.from_xml_string(SERVO)
+
+    assert commands_positions(model)
+    assert not commands_positions(gymnasium.make("Swimmer-v5").unwrapped.model)
+    with pytest.raises(EnvironmentMismatchError, match="control='direct'"):
+        refuse_servos(model, None)
+
+
+@pytest.mark.parametrize(("control", "tracks"), [("position", False), ("torque", True)])
+def test_an_environment_says_whether_its_actions_are_positions(control, tracks):
+    env = gymnasium.make("sb3_hds/ElasticQuadruped-v0", control=control)
+
+    assert (CPGPrior(env, omega_swing=6.0)._joints is not None) == tracks
+    if not tracks:
+        with pytest.raises(EnvironmentMismatchError, match="second loop"):
+            CPGPrior(env, omega_swing=6.0, control="track")
+
+
+def test_intervals_are_those_of_the_twin_before_those_of_the_drawing():
+    assert CPGPrior(TwinEnv("Pendulum", dt=0.03), omega_swing=4.0).rhythm.dt == 0.03
+    car = gymnasium.make("MountainCarContinuous-v0")
+    with pytest.warns(UserWarning, match="Pass dt=SECONDS"):
+        assert CPGPrior(car, omega_swing=4.0).rhythm.dt == pytest.approx(1.0 / 30.0)

@@ -111,6 +111,13 @@ def test_the_limit_counts_from_every_reset_and_is_the_environment_s_own_by_defau
     assert played(env, 2)[0] == played(env, 2)[0] == [GOES_ON, IS_CUT]
 
 
+def test_of_several_limits_the_least_counts():
+    inner = TimeLimit(Script(GOES_ON), 200)
+
+    assert TimeAware(InfiniteHorizon(inner, 50)).max_episode_steps == 50
+    assert TimeAware(TimeLimit(inner, 500)).max_episode_steps == 200
+
+
 def test_the_remaining_time_falls_from_one_to_zero():
     env = TimeAware(Script(GOES_ON), max_episode_steps=4)
 

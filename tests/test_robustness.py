@@ -72,6 +72,9 @@ def test_a_question_that_makes_no_sense_is_refused(swimmer):
         measure_robustness(swimmer, short, n_episodes=0)
     with pytest.raises(TrajectoryError, match="a perturbation 'none'"):
         measure_robustness(swimmer, short, perturbations={"push": {"push": 5.0}})
+    endless = lambda: gymnasium.make("Swimmer-v5", max_episode_steps=-1)  # noqa: E731
+    with pytest.raises(EnvironmentMismatchError, match="TimeLimit"):
+        measure_robustness(swimmer, endless)
 
 
 def test_the_command_prints_and_writes_the_table(swimmer, tmp_path, capsys):

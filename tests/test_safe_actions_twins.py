@@ -167,7 +167,10 @@ def test_derivatives_of_a_filter_pass_through_the_twin(x64):
 @pytest.mark.parametrize("order", [1, 2, 3, 4, 8])
 @pytest.mark.parametrize("cutoff", [1e-4, 1e-3, 0.01, 0.1, 0.4])
 def test_a_constant_passes_a_filter_in_single_precision(cutoff, order):
-    low_pass, below = LowPass(cutoff=cutoff, order=order), Signals(Pendulum().actuators, Pendulum().channels)
+    low_pass, below = (
+        LowPass(cutoff=cutoff, order=order),
+        Signals(Pendulum().actuators, Pendulum().channels),
+    )
     command = jnp.full(1, 1.3, jnp.float32)
 
     def step(memory, _):
@@ -207,6 +210,13 @@ def test_our_learners_store_what_was_executed(name):
     assert np.max(np.abs(np.diff(stored, prepend=0.0))) <= 0.5 + 1e-5
     # The observation that follows holds the same command.
     np.testing.assert_allclose(stored, model.replay_buffer.next_observations[:30, 0, 3], atol=1e-5)
+
+
+def test_a_layer_below_another_that_rescales_is_found_out():
+    env = gymnasium.wrappers.RescaleAction(jumping(), -1.0, 1.0)
+
+    with pytest.raises(ValueError, match="outside that layer changes actions"):
+        small("droq", env, learning_starts=40).learn(30)
 
 
 def test_learners_of_sb3_store_what_was_executed_with_our_buffer():

@@ -1,6 +1,7 @@
 """What an open-loop policy knows of the system that it moves: its time step and its joints."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,13 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_hds.algos.gait_space import GaitSpace
 from sb3_hds.errors import EnvironmentMismatchError
-from sb3_hds.wrappers.actuated_joints import ActuatedJoints, actuated_joints
+from sb3_hds.wrappers.actuated_joints import (
+    COMMANDS_POSITIONS,
+    ActuatedJoints,
+    actuated_joints,
+    refuse_servos,
+)
+from sb3_hds.wrappers.interval import interval_told
 
 # Resets, which differ from each other, that must agree on where a joint is in the observation.
 _N_RESETS = 3
@@ -85,7 +92,10 @@ def body_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Body:
     :param dt: how long a step takes [s]; None: as the environment says
     :raises EnvironmentMismatchError: if the environment does not have what is asked for
     """
-    interval = _interval(env) if dt is None else float(dt)
+    attribute, error = functools.partial(_attribute, env), EnvironmentMismatchError
+    interval = (
+        interval_told(attribute, "The environment", error, drawn=True) if dt is None else float(dt)
+    )
     driven = _driven(env, control)
     if driven is None:
         low, high = _commands(env)
@@ -172,24 +182,13 @@ def refuse_without_state(env: VecEnv) -> None:
         )
 
 
-def _interval(env: VecEnv) -> float:
-    for name in ("dt", "tau"):
-        if isinstance(value := _attribute(env, name), float | int):
-            return float(value)
-    rate = (_attribute(env, "metadata") or {}).get("render_fps")
-    if rate:
-        return 1.0 / rate
-    raise EnvironmentMismatchError(
-        "The environment does not say how long a step is: it has no attribute dt. Pass dt=SECONDS."
-    )
-
-
 def _driven(env: VecEnv, control: str) -> ActuatedJoints | None:
     if control == "direct":
         return None
     model = _attribute(env, "model")
     if hasattr(model, "actuator_trnid") and model.nu == _commands(env)[0].size:
         try:
+            refuse_servos(model, _attribute(env, COMMANDS_POSITIONS))
             return actuated_joints(model)
         except EnvironmentMismatchError:
             if control == "track":

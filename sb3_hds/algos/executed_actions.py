@@ -9,6 +9,8 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 
 # How far beyond its limits a stored action may be because of single precision, as a share of them.
 _ROUNDING = 1e-5
+# How far what arrives at a layer may be from what was chosen, as a share of the range.
+_REACHED = 1e-4
 
 
 def executed(
@@ -22,7 +24,8 @@ def executed(
     :param chosen: scaled to [-1, 1] where the space is a Box, shape ``(n_envs, n_act)``
     :param infos: of the step, one for each environment
     :return: as ``chosen``
-    :raises ValueError: for a stored action that is not in the space
+    :raises ValueError: for a stored action that is not in the space, or where the layer was given
+        another action than was chosen
     """
     given = [info.get("stored_action") for info in infos]
     if all(action is None for action in given) or not isinstance(space, spaces.Box):
@@ -30,7 +33,9 @@ def executed(
     stored = np.array(chosen, copy=True)
     for i, action in enumerate(given):
         if action is not None:
-            stored[i] = _scaled(space, np.asarray(action, float)).reshape(stored[i].shape)
+            found = _scaled(space, np.asarray(action, float)).reshape(stored[i].shape)
+            _check_reached(space, stored[i], infos[i])
+            stored[i] = found
     return stored
 
 
@@ -68,6 +73,21 @@ class ExecutedDictReplayBuffer(DictReplayBuffer):
     ) -> None:
         stored = executed(self.action_space, action, infos)
         super().add(obs, next_obs, stored, reward, done, infos)
+
+
+def _check_reached(space: spaces.Box, chosen: np.ndarray, info: Mapping[str, Any]) -> None:
+    raw = info.get("raw_action")
+    # Where a watchdog acted instead, nothing of what was chosen was executed.
+    if raw is None or info.get("command_dropped"):
+        return
+    low, high = space.low.astype(float), space.high.astype(float)
+    wanted = low + 0.5 * (chosen.reshape(space.shape) + 1.0) * (high - low)
+    if not np.allclose(raw, wanted, rtol=0.0, atol=_REACHED * np.max(high - low)):
+        raise ValueError(
+            f"A layer asks to store what was executed for the action {raw}, and {wanted} was "
+            "chosen. Some wrapper outside that layer changes actions, for example rescales them: "
+            "put it below, or use store='raw'."
+        )
 
 
 def _scaled(space: spaces.Box, action: np.ndarray) -> np.ndarray:

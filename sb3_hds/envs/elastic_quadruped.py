@@ -129,6 +129,7 @@ class ElasticQuadruped(gymnasium.Env[np.ndarray, np.ndarray]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}.")
         self.control, self.render_mode = control, render_mode
+        self.commands_positions = control == "position"
         self.stiffness = checked("stiffness", stiffness, positive=True)
         self.damping = checked("damping", damping)
         self.noise = checked("noise", noise)

@@ -17,6 +17,7 @@ from sb3_hds.algos import OpenLoop
 from sb3_hds.errors import EnvironmentMismatchError, TrajectoryError
 from sb3_hds.experiments.returns import FIRST_START
 from sb3_hds.wrappers import Perturb
+from sb3_hds.wrappers.step_limit import step_limit_of
 
 #: arguments of :class:`~sb3_hds.wrappers.Perturb` by the name that a table shows
 PERTURBATIONS: dict[str, dict[str, Any]] = {
@@ -111,7 +112,7 @@ def measure_robustness(
     :param progress: whether a bar shows how far it is
     :raises TrajectoryError: for fewer than one episode, or without the perturbation ``"none"``
     :raises EnvironmentMismatchError: where observations cannot be perturbed at all, or are not what
-        the model observes
+        the model observes, or where nothing says after how many steps an episode ends
     """
     if n_episodes < 1 or "none" not in perturbations or encoders not in ("own", "observation"):
         raise TrajectoryError(
@@ -146,7 +147,13 @@ def _perturbed(
 
 
 def _check_fits(model: BaseAlgorithm, env: gymnasium.Env) -> None:
+    limit = step_limit_of(env)
     env.close()
+    if limit is None:
+        raise EnvironmentMismatchError(
+            f"Nothing says after how many steps an episode of {env} ends, so the first one might "
+            "never: put gymnasium.wrappers.TimeLimit around it, or make it with max_episode_steps."
+        )
     ours = model.observation_space, model.action_space
     for mine, given in zip(ours, (env.observation_space, env.action_space), strict=True):
         if type(mine) is not type(given) or mine.shape != given.shape:

@@ -8,9 +8,12 @@ from jaxtyping import Float, Int
 
 from sb3_hds.errors import EnvironmentMismatchError
 
-# mjTRN_JOINT, mjJNT_SLIDE and mjJNT_HINGE of MuJoCo's enumerations.
+# mjTRN_JOINT, mjJNT_SLIDE, mjJNT_HINGE and mjBIAS_AFFINE of MuJoCo's enumerations.
 _JOINT_TRANSMISSION = 0
 _ONE_AXIS = (2, 3)
+_AFFINE = 1
+#: attribute of an environment whose commands are positions of its joints already
+COMMANDS_POSITIONS = "commands_positions"
 
 Angles = Float[np.ndarray, "*batch act"]
 
@@ -49,7 +52,7 @@ def actuated_joints(model: Any) -> ActuatedJoints:
     """
     :param model: an ``MjModel``
     :raises EnvironmentMismatchError: if an actuator drives something else than one joint with one
-        axis: a tendon, a ball, a site
+        axis (a tendon, a ball, a site)
     """
     joints = np.asarray(model.actuator_trnid)[:, 0]
     by_joint = np.asarray(model.actuator_trntype) == _JOINT_TRANSMISSION
@@ -74,6 +77,26 @@ def actuated_joints(model: Any) -> ActuatedJoints:
     )
 
 
+def commands_positions(model: Any) -> bool:
+    """:return: whether an actuator is a servo, whose commands are positions"""
+    affine = np.asarray(model.actuator_biastype) == _AFFINE
+    return bool(np.any(affine & (np.asarray(model.actuator_biasprm)[:, 1] != 0.0)))
+
+
+def refuse_servos(model: Any, told: Any) -> None:
+    """
+    :param model: an ``MjModel``
+    :param told: what the environment says in its attribute ``commands_positions``
+    :raises EnvironmentMismatchError: if commands are positions, which are tracked already
+    """
+    if told or commands_positions(model):
+        raise EnvironmentMismatchError(
+            "The commands of this environment are positions: its own servos track them, and a "
+            "second loop around those would not arrive. Let the oscillators be the commands: "
+            "control='direct'."
+        )
+
+
 def joints_of(env: gymnasium.Env) -> ActuatedJoints | None:
     """:return: of the MuJoCo environment inside; None if there is none"""
     model = getattr(env.unwrapped, "model", None)
@@ -90,13 +113,3 @@ def track(
     :param kd: command per rad/s or m/s
     """
     return kp * (target - position) - kd * velocity
-
-
-def interval_of(env: gymnasium.Env) -> float | None:
-    """:return: how long a step takes [s], if the environment says so"""
-    inner = env.unwrapped
-    rate = inner.metadata.get("render_fps")
-    for found in (getattr(inner, "dt", None), getattr(inner, "tau", None), rate and 1.0 / rate):
-        if isinstance(found, float | int) and found > 0:
-            return float(found)
-    return None

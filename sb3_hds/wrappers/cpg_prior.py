@@ -10,7 +10,13 @@ from gymnasium import spaces
 from sb3_hds.core import Rhythm
 from sb3_hds.errors import EnvironmentMismatchError
 from sb3_hds.wrappers.action_layer import TransformLayer, check_bounded
-from sb3_hds.wrappers.actuated_joints import ActuatedJoints, interval_of, joints_of
+from sb3_hds.wrappers.actuated_joints import (
+    COMMANDS_POSITIONS,
+    ActuatedJoints,
+    joints_of,
+    refuse_servos,
+)
+from sb3_hds.wrappers.interval import interval_of
 
 
 class CPGPrior(TransformLayer):
@@ -24,7 +30,9 @@ class CPGPrior(TransformLayer):
 
     Actuators track their joints where these are known: from the entries of the observation that
     ``position`` and ``velocity`` name, or else, in environments of MuJoCo, from the environment
-    itself. Elsewhere, or with ``control="direct"``, targets are the commands. Commands are clipped
+    itself. Elsewhere, with ``control="direct"``, and where commands are positions (MuJoCo's
+    position servos, or an environment whose attribute ``commands_positions`` is true), targets are
+    the commands. Commands are clipped
     to the action space below. A twin is seen through the rhythm unless joints are read from MuJoCo,
     whose state it does not have: name their entries.
 
@@ -105,7 +113,7 @@ class CPGPrior(TransformLayer):
             amplitude_gain=amplitude_gain,
             position=position,
             velocity=velocity,
-            dt=_interval(env) if dt is None else float(dt),
+            dt=interval_of(env, EnvironmentMismatchError, drawn=True) if dt is None else float(dt),
             observed=observe_state,
         )
         self.rhythm = rhythm.sized(n)
@@ -147,22 +155,21 @@ def _tracked(env: gymnasium.Env, control: str, n: int, named: bool) -> ActuatedJ
         raise EnvironmentMismatchError(
             "CPGPrior(control='direct') tracks no joints, so position and velocity must be empty."
         )
-    found = None if control == "direct" or named else joints_of(env)
+    if control == "direct" or named:
+        return None
+    found, inner = joints_of(env), env.unwrapped
     fits = found is not None and len(found.names) == n
-    if control == "track" and not fits and not named:
+    if fits:
+        try:
+            refuse_servos(inner.model, getattr(inner, COMMANDS_POSITIONS, False))  # type: ignore[attr-defined]
+        except EnvironmentMismatchError:
+            if control == "track":
+                raise
+            return None
+    if control == "track" and not fits:
         raise EnvironmentMismatchError(
             "CPGPrior(control='track') needs an environment of MuJoCo with one action for each "
             f"actuator, got {env}. Say where observations have the joints (position=, velocity=), "
             "or let targets be the commands: control='direct'."
         )
     return found if fits else None
-
-
-def _interval(env: gymnasium.Env) -> float:
-    interval = interval_of(env)
-    if interval is None:
-        raise EnvironmentMismatchError(
-            f"{env.unwrapped} does not say how long a step is: it has no attribute dt. Pass "
-            "dt=SECONDS."
-        )
-    return interval

@@ -79,8 +79,14 @@ class InfiniteHorizon(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     def __init__(self, env: gymnasium.Env, max_episode_steps: int | None = None) -> None:
         gymnasium.utils.RecordConstructorArgs.__init__(self, max_episode_steps=max_episode_steps)
         gymnasium.Wrapper.__init__(self, env)
-        self.max_episode_steps = chosen_limit("InfiniteHorizon", env, max_episode_steps)
+        # As Gymnasium's TimeLimit calls it: who looks for limits finds both.
+        self._max_episode_steps = chosen_limit("InfiniteHorizon", env, max_episode_steps)
         self._elapsed = 0
+
+    @property
+    def max_episode_steps(self) -> int:
+        """After how many steps an episode is cut."""
+        return self._max_episode_steps
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

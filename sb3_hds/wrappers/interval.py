@@ -1,20 +1,42 @@
 """How long a step of an environment is."""
 
 import numbers
+import warnings
+from collections.abc import Callable
+from typing import Any
 
 import gymnasium
 
 
-def interval_of(env: gymnasium.Env, error: type[Exception]) -> float:
+def interval_of(env: gymnasium.Env, error: type[Exception], *, drawn: bool = False) -> float:
     """
     :param error: raised where the environment does not tell
+    :param drawn: whether the rate at which it is drawn will do, with a warning
     :return: the control interval [s]
     """
     inner = env.unwrapped
-    for owner in (inner, getattr(inner, "twin", None)):
-        for name in ("dt", "tau"):
-            if isinstance(value := getattr(owner, name, None), numbers.Real):
-                return float(value)
-    raise error(
-        f"{inner} does not say how long a step is: it has no attribute dt. Pass dt=SECONDS."
-    )
+    return interval_told(lambda name: getattr(inner, name, None), str(inner), error, drawn=drawn)
+
+
+def interval_told(
+    attribute: Callable[[str], Any], env: str, error: type[Exception], *, drawn: bool
+) -> float:
+    """
+    As :func:`interval_of`.
+
+    :param attribute: of the environment, by name; None where there is none
+    :param env: what to call it
+    """
+    twin = attribute("twin")
+    for told in (*map(attribute, ("dt", "tau")), *(getattr(twin, n, None) for n in ("dt", "tau"))):
+        if isinstance(told, numbers.Real) and (seconds := float(told)) > 0.0:
+            return seconds
+    rate = (attribute("metadata") or {}).get("render_fps")
+    if drawn and rate:
+        warnings.warn(
+            f"{env} does not say how long a step is; it is drawn {rate} times a second, so a step "
+            f"is taken for {1.0 / rate:.4g} s. Pass dt=SECONDS where that is wrong.",
+            stacklevel=3,
+        )
+        return 1.0 / rate
+    raise error(f"{env} does not say how long a step is: it has no attribute dt. Pass dt=SECONDS.")

@@ -51,14 +51,15 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     The first command after a reset begins the ticks, so none passes between the end of an episode
     and that command: train there (``train_freq=(1, "episode")``; vectorised environments reset
     first), or beside the loop with :class:`sb3_hds.algos.TrainBeside`. Where ``step`` is
-    interrupted or raises, the watchdog goes on with the safe action until ``reset`` or ``close``. A general-purpose operating system wakes a process a little
-    late, on a busy machine by milliseconds: this is no hard real time, and no substitute for a
-    watchdog in the drive.
+    interrupted or raises, the watchdog goes on with the safe action until ``reset`` or ``close``.
+
+    A general-purpose operating system wakes a process a little late, on a busy machine by
+    milliseconds: this is no hard real time, and no substitute for a watchdog in the drive.
 
     Times are no part of ``info``, which is a function of seed and actions: they are attributes,
-    ``timing``, ``latency`` (of the latest command, from observation to command [s]; 0 for the first of an
-    episode, which is on time whenever it comes), ``overrun``
-    (whether that came late) and :meth:`latencies`.
+    ``timing``, ``latency`` (of the latest command, from observation to command [s]; 0 for the first
+    of an episode, which is on time whenever it comes), ``overrun`` (whether that came late) and
+    :meth:`latencies`.
 
     :param env: of any kind; simulated ones wait for the clock, real ones must return promptly
     :param period: :math:`T` [s]

@@ -6,13 +6,17 @@ from sb3_hds.errors import ParameterError
 
 
 def step_limit_of(env: gymnasium.Env) -> int | None:
-    """:return: that of the outermost ``TimeLimit``, or what the environment is registered with"""
-    layer = env
+    """
+    :return: the least of all layers (``TimeLimit``, ``InfiniteHorizon``), or without those what the
+        environment is registered with
+    """
+    layer, limits = env, []
     while isinstance(layer, gymnasium.Wrapper):
-        limit = layer.__dict__.get("_max_episode_steps")
-        if isinstance(limit, int):
-            return limit
+        if isinstance(limit := vars(layer).get("_max_episode_steps"), int):
+            limits.append(limit)
         layer = layer.env
+    if limits:
+        return min(limits)
     spec = env.spec
     # Gymnasium writes -1 for "none, whatever is registered".
     return (
