@@ -1,5 +1,5 @@
 """
-A small range of actions learns faster, a large one ends better: a car on an oval.
+Does a small range of actions learn faster, and a large one end better? A car on an oval.
 
     python benchmarks/action_scale.py [--seeds 5] [--steps 6000] [--figure]
 

@@ -126,12 +126,14 @@ def draw(table: pd.DataFrame) -> None:
 
     figure = Figure(figsize=(8.0, 3.5), layout="constrained")
     shown = [env_id for env_id in RHYTHMS if (table.env == env_id).any()]
+    priors = [prior for prior in PRIORS if (table.prior == prior).any()]
     for axes, env_id in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
         for shift, learner in zip((-0.12, 0.12), LEARNERS, strict=True):
             rows = table[(table.env == env_id) & (table.learner == learner)]
-            places = [PRIORS.index(prior) + shift for prior in rows.prior]
+            places = [priors.index(prior) + shift for prior in rows.prior]
             axes.plot(places, rows["return"], "o", alpha=0.7, label=learner)
-        axes.set_xticks(range(len(PRIORS)), PRIORS)
+        axes.set_xticks(range(len(priors)), priors)
+        axes.set_xlim(-0.5, len(priors) - 0.5)
         axes.set_title(env_id)
         axes.spines[["top", "right"]].set_visible(False)
     figure.axes[0].set_ylabel(f"return after {table.steps.max():,} steps")
