@@ -354,10 +354,12 @@ def test_actions_have_the_shape_of_the_action_space(name, shape):
 
 def test_models_that_were_given_the_same_dictionary_do_not_share_it():
     kwargs = {"net_arch": [8]}
+    of_buffer = {"handle_timeout_termination": True}
     exploring = GSDESAC("Pendulum-v1", policy_kwargs=kwargs)
-    DroQ("Pendulum-v1", policy_kwargs=kwargs)
+    DroQ("Pendulum-v1", policy_kwargs=kwargs, n_steps=3, replay_buffer_kwargs=of_buffer)
 
     assert kwargs == {"net_arch": [8]} and exploring.policy_kwargs["use_sde"]
+    assert of_buffer == {"handle_timeout_termination": True}
 
 
 def test_images_are_refused():
