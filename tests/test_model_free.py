@@ -14,7 +14,7 @@ import pytest
 import sbx
 import torch as th
 from gymnasium import spaces
-from small_models import OFF_POLICY, PLANNERS, SMALL, logged, small
+from small_models import OFF_POLICY, PLANNERS, SMALL, logged, saved, small
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.distributions import (
@@ -707,6 +707,67 @@ def test_td7_loaded_with_several_environments_assesses_no_policy(tmp_path):
     loaded = TD7.load(tmp_path / "model", env=make_vec_env("Pendulum-v1", 2))
 
     assert not loaded.assesses and loaded.learn(40)._n_updates > 0
+
+
+STATES = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, -2.0]], np.float32)
+
+
+def actions_of(model) -> tuple[np.ndarray, np.ndarray]:
+    """:return: of two states, as the policy is now, and where nothing is explored"""
+    exploring, greedy = (
+        model.policy.predict(STATES, deterministic=way)[0] for way in (False, True)
+    )
+    return exploring, greedy
+
+
+def test_td7_trained_with_several_environments_acts_as_it_learned_when_loaded_with_one():
+    model = small("td7", make_vec_env("Pendulum-v1", 2), use_checkpoints=None, train_freq=None)
+    model.learn(60)
+    assert not model.assesses and model._n_updates > 0
+    expected, _ = actions_of(model)
+
+    loaded = TD7.load(saved(model), env=gymnasium.make("Pendulum-v1"))
+
+    assert loaded.assesses
+    np.testing.assert_array_equal(actions_of(loaded), [expected, expected])
+    other = small("td7", use_checkpoints=True, train_freq=None, seed=5)
+    other.set_parameters(model.get_parameters())
+    np.testing.assert_array_equal(actions_of(other), [expected, expected])
+
+
+def test_td7_acts_by_its_checkpoint_with_several_environments_until_it_learns_on():
+    model = small("td7", use_checkpoints=None, train_freq=None)
+    model.policy.keep_checkpoint()
+    model.best_worst_return = -150.0
+    _, checkpoint = actions_of(model)
+    model._restart(seed=1)
+
+    loaded = TD7.load(saved(model), env=make_vec_env("Pendulum-v1", 2))
+
+    exploring, greedy = actions_of(loaded)
+    np.testing.assert_array_equal(greedy, checkpoint)
+    assert np.abs(exploring - checkpoint).min() > 1e-3
+    np.testing.assert_array_equal(*actions_of(loaded.learn(40)))
+    assert loaded._n_updates > 0 and loaded.best_worst_return == -np.inf
+
+
+@pytest.mark.parametrize("was_kept", [True, False])
+def test_checkpoints_of_files_without_the_mark_act_if_they_were_worth_something(was_kept):
+    model = small("td7", use_checkpoints=True, train_freq=None)
+    if was_kept:
+        model.policy.keep_checkpoint()
+        model.best_worst_return = -150.0
+    model._restart(seed=1)
+    expected = actions_of(model)
+    state_dict = model.policy.state_dict
+    model.policy.state_dict = lambda: {
+        name: tensor for name, tensor in state_dict().items() if name != "checkpoint.kept"
+    }
+
+    loaded = TD7.load(saved(model), env=gymnasium.make("Pendulum-v1"))
+
+    assert loaded.policy.has_checkpoint == was_kept
+    np.testing.assert_array_equal(actions_of(loaded), expected)
 
 
 def test_uniform_draws_give_td7_the_gradient_of_prioritised_ones():

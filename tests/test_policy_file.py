@@ -36,8 +36,10 @@ def test_a_policy_alone_acts_as_its_model_and_nothing_is_unpickled(name, tmp_pat
 
 def test_checkpoints_of_td7_act_in_the_policy_alone(no_pickle):
     model = small("td7", use_checkpoints=True, train_freq=None)
+    model.policy.keep_checkpoint()
     learner = model.policy.learner
-    other = jax.tree.map(lambda weight: weight + 0.1, learner.checkpoint)
+    actor = jax.tree.map(lambda weight: weight + 0.1, learner.checkpoint.actor)
+    other = learner.checkpoint._replace(actor=actor)
     model.policy.learner = learner._replace(checkpoint=other)
     obs = model.observation_space.sample()
 
@@ -45,7 +47,7 @@ def test_checkpoints_of_td7_act_in_the_policy_alone(no_pickle):
 
     expected, _ = model.predict(obs, deterministic=True)
     np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], expected)
-    model.policy.uses_checkpoints = False
+    model.policy.drop_checkpoint()
     assert (model.predict(obs, deterministic=True)[0] != expected).any()
 
 

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
@@ -38,21 +39,16 @@ from sb3_hds.algos.td7_update import (
     update,
 )
 
-# Of the policy's constructor: what is no argument, or is kept as state.
-_NO_ARGUMENTS = (
-    "self",
-    "observation_space",
-    "action_space",
-    "__class__",
-    "use_sde",
-    "uses_checkpoints",
-)
+# Of the policy's constructor: what is no argument.
+_NO_ARGUMENTS = ("self", "observation_space", "action_space", "__class__", "use_sde")
+# The name of ``Checkpoint.kept`` among the tensors of a policy.
+_KEPT = "checkpoint.kept"
 
 
 class TD7Policy(LearningPolicy):
     """
     ``"MlpPolicy"`` of TD7: encoder, actor and two critics. Where nothing is explored, the policy
-    of the last checkpoint acts.
+    of the last checkpoint acts, once one was kept.
 
     :param observation_space: a Box, or choices, which become one-hot
     :param action_space: a bounded Box of any shape
@@ -66,7 +62,6 @@ class TD7Policy(LearningPolicy):
         of torch
     :param optimizer_kwargs: besides the learning rate
     :param use_sde: accepted for SB3's sake; the policy is deterministic
-    :param uses_checkpoints: whether that of the last checkpoint acts; its algorithm says so
     """
 
     held = ("copies", "checkpoint")
@@ -85,7 +80,6 @@ class TD7Policy(LearningPolicy):
         optimizer_class: str | Callable[..., Any] = "adam",
         optimizer_kwargs: Mapping[str, Any] | None = None,
         use_sde: bool = False,
-        uses_checkpoints: bool = False,
     ) -> None:
         self.arguments = {
             name: value for name, value in locals().items() if name not in _NO_ARGUMENTS
@@ -106,7 +100,6 @@ class TD7Policy(LearningPolicy):
             "qf_optimizer": optimizer,
         }
         self.flatten = flattener(observation_space)
-        self.uses_checkpoints = uses_checkpoints
 
     def build_plain(self) -> None:
         """That of the paper."""
@@ -123,27 +116,41 @@ class TD7Policy(LearningPolicy):
         self.learner = jax.device_put(begin(recipe, self.n_obs, self.n_act, key), device)
 
     @property
-    def plain_state(self) -> dict[str, bool]:  # type: ignore[override]
-        return {"uses_checkpoints": self.uses_checkpoints}
+    def plain_state(self) -> Mapping[str, bool]:  # type: ignore[override]
+        """Empty; of older files, it says what their tensors do not: whether a checkpoint acts."""
+        return {}
 
     @plain_state.setter
     def plain_state(self, state: Mapping[str, bool]) -> None:
-        self.uses_checkpoints = bool(state["uses_checkpoints"])
+        if state.get("uses_checkpoints", False):
+            self.keep_checkpoint()
 
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return super()._get_constructor_parameters() | self.plain_state
+    def load_state_dict(self, state_dict: dict, strict: bool = True, assign: bool = False) -> None:
+        """Tensors that do not say whether a checkpoint was kept leave that as it is."""
+        own = {_KEPT: th.as_tensor(self.has_checkpoint)}
+        super().load_state_dict(own | state_dict, strict, assign)
+
+    @property
+    def has_checkpoint(self) -> bool:
+        """Whether a checkpoint was kept, which then acts where nothing is explored."""
+        return bool(self.learner.checkpoint.kept)
 
     def keep_checkpoint(self) -> None:
-        """The policy as it is acts where nothing is explored."""
+        """The policy as it is acts from now on where nothing is explored."""
         learner = self.learner
-        checkpoint = Checkpoint(learner.copies.encoder, learner.actor.weights)
+        checkpoint = Checkpoint(learner.copies.encoder, learner.actor.weights, jnp.asarray(True))
         self.learner = learner._replace(checkpoint=checkpoint)
+
+    def drop_checkpoint(self) -> None:
+        """The policy as it is at the time acts, explored or not."""
+        checkpoint = self.learner.checkpoint._replace(kept=jnp.asarray(False))
+        self.learner = self.learner._replace(checkpoint=checkpoint)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
         learner = self.learner
         weights = learner.copies.encoder, learner.actor.weights
-        if deterministic and self.uses_checkpoints:
-            weights = learner.checkpoint
+        if deterministic and self.has_checkpoint:
+            weights = learner.checkpoint.encoder, learner.checkpoint.actor
         return np.asarray(_act(self.recipe, *weights, self.flatten(observation)))
 
     def critic(self, obs: Any, actions: Any) -> tuple[np.ndarray, ...]:
@@ -169,8 +176,9 @@ class TD7(ModelFreeAlgorithm):
     With checkpoints, as in the paper, a policy acts for whole episodes and is assessed by the worst
     of them, in rewards of the environment itself; only then it is updated, once for each step that
     it made. That needs one environment, and ``gradient_steps`` is not looked at. Networks that
-    start afresh (``param_resets``) leave the checkpoint and its assessment as they are. SBX has no
-    TD7.
+    start afresh (``param_resets``) leave the checkpoint and its assessment as they are. Where a
+    model with a checkpoint goes on learning without assessments, the first update drops it. Without
+    a checkpoint, the policy as it is acts. SBX has no TD7.
 
     Prioritised replay draws from SB3's plain buffer. With ``n_steps`` above 1, Dict observations,
     ``optimize_memory_usage`` or a buffer of one's own (``HerReplayBuffer``), transitions are drawn
@@ -303,7 +311,9 @@ class TD7(ModelFreeAlgorithm):
         if self._chosen_freq is None:
             self.train_freq = (1, "episode") if self.assesses else 1  # type: ignore[assignment]
         super()._setup_model()
-        self.policy.uses_checkpoints = self.assesses
+        if self.best_worst_return > -np.inf:
+            # ``load`` comes by here; older files say only what their checkpoint was worth.
+            self.policy.keep_checkpoint()
         if self.action_noise is None and self.exploration_noise:
             # SB3 adds it to actions of the space's shape.
             size = np.full(self.policy.action_shape, self.exploration_noise, np.float32)
@@ -317,15 +327,27 @@ class TD7(ModelFreeAlgorithm):
         before = self.policy.learner
         self._build(seed)
         kept: dict[str, Any] = {"n_updates": before.n_updates}
-        if self.assesses:
+        if before.checkpoint.kept:
             kept["checkpoint"] = before.checkpoint
         self.policy.learner = self.policy.learner._replace(**kept)
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         if self.assesses:
             gradient_steps = self._assessed()
+        elif gradient_steps > 0:
+            self._forget_assessments()
         if gradient_steps > 0:
             super().train(gradient_steps, batch_size)
+
+    def _forget_assessments(self) -> None:
+        """What is updated without being assessed has left the checkpoint behind."""
+        if self.policy.has_checkpoint:
+            self.policy.drop_checkpoint()
+        self._finished, self.best_worst_return = [], -np.inf
+        self._begin_assessment()
+
+    def _begin_assessment(self) -> None:
+        self.assessed_episodes, self.assessed_steps, self.worst_return = 0, 0, np.inf
 
     def _assessed(self) -> int:
         """
@@ -349,7 +371,7 @@ class TD7(ModelFreeAlgorithm):
         due = self.assessed_steps
         if not late and self._n_updates + due >= self.updates_before_checkpointing:
             self.best_worst_return *= self.reset_weight
-        self.assessed_episodes, self.assessed_steps, self.worst_return = 0, 0, np.inf
+        self._begin_assessment()
         return due
 
     def _updates(self, n: int, batch_size: int) -> dict[str, float]:
