@@ -720,6 +720,28 @@ def actions_of(model) -> tuple[np.ndarray, np.ndarray]:
     return exploring, greedy
 
 
+@pytest.mark.parametrize("goes_on", ["counted anew", "saved and loaded"])
+def test_an_interrupted_episode_of_td7_is_no_part_of_the_next_one(goes_on):
+    # Ten steps that earn 1 each.
+    env = Constant(spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (1,)))
+    model = small("td7", env, use_checkpoints=True, train_freq=None, learning_starts=0)
+    model.learn(100, callback=lambda *_: model.num_timesteps < 15)
+
+    if goes_on == "saved and loaded":
+        model = TD7.load(saved(model), env=env)
+    judged = []
+    model._assessed = lambda: judged.extend(model._finished) or 0
+    model.learn(10, reset_num_timesteps=goes_on == "counted anew")
+
+    assert judged == [(10.0, 10)]
+
+
+def test_td7_keeps_no_account_of_episodes_where_it_assesses_no_policy():
+    env = Constant(spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (1,)))
+
+    assert small("td7", env, use_checkpoints=False).learn(40)._finished == []
+
+
 def test_td7_trained_with_several_environments_acts_as_it_learned_when_loaded_with_one():
     model = small("td7", make_vec_env("Pendulum-v1", 2), use_checkpoints=None, train_freq=None)
     model.learn(60)

@@ -10,9 +10,10 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_hds.algos.call_forms import between, is_count, jax_device
 from sb3_hds.algos.gaussian_policy import optimizer_of, widths
@@ -244,8 +245,8 @@ class TD7(ModelFreeAlgorithm):
         self.reset_weight = reset_weight
         self.assessed_episodes, self.assessed_steps = 0, 0
         self.worst_return, self.best_worst_return = np.inf, -np.inf
-        self._episode_return, self._episode_length = 0.0, 0
         self._finished: list[tuple[float, int]] = []
+        self._begin_episode()
         self._chosen_freq = train_freq
         super().__init__(
             policy,
@@ -410,6 +411,8 @@ class TD7(ModelFreeAlgorithm):
         infos: list[dict[str, Any]],
     ) -> None:
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        if not self.assesses:
+            return
         normalizer = self.get_vec_normalize_env()
         # The scale of normalised rewards drifts, and an assessment may be compared much later.
         earned = reward if normalizer is None else normalizer.get_original_reward()
@@ -419,7 +422,24 @@ class TD7(ModelFreeAlgorithm):
             # What random actions earned says nothing of a policy.
             if self.num_timesteps - self._episode_length >= self.learning_starts:
                 self._finished.append((self._episode_return, self._episode_length))
-            self._episode_return, self._episode_length = 0.0, 0
+            self._begin_episode()
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if reset_num_timesteps or self._last_obs is None:  # SB3 resets the environment
+            self._begin_episode()
+        return super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+
+    def _begin_episode(self) -> None:
+        self._episode_return, self._episode_length = 0.0, 0
 
 
 @partial(jax.jit, static_argnums=0)
