@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rl_zoo_plugin.lazy import parameters_of
 from sb3_hds import GSDESAC, TD7, CrossQ, DroQ, SimbaSAC, algos
-from sb3_hds.algos import td7_update
+from sb3_hds.algos import soft_actor_critic, td7_update
 from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp, SimbaBody
 from sb3_hds.algos.gaussian_policy import optimizer_of
 from sb3_hds.algos.heads import ExploringActor
@@ -581,6 +581,36 @@ def test_schedules_of_both_learning_rates_act(algorithm):
     for key, tensor in model.get_parameters()["policy"].items():
         if key.startswith(("actor", "critic")) and "statistics" not in key:
             np.testing.assert_array_equal(tensor, before[key], err_msg=key)
+
+
+@pytest.mark.parametrize("name", ["crossq_jax", pytest.param("td7", marks=pytest.mark.expensive)])
+def test_losses_of_the_actor_are_logged_where_it_was_updated(name):
+    model = small(name, policy_delay=3, gradient_steps=1, train_freq=1)
+    logged(model)
+    model.learn(15)
+    told, begun = [], model._n_updates
+
+    for _ in range(6):
+        model.logger.name_to_value.clear()
+        model.train(1, 16)
+        told.append(model.logger.name_to_value.get("train/actor_loss"))
+        assert "train/critic_loss" in model.logger.name_to_value
+
+    expected = [(begun + i) % 3 == 0 for i in range(1, 7)]
+    assert [loss is not None for loss in told] == expected and 0.0 not in told
+
+
+def test_a_call_of_many_updates_logs_the_last_one_of_the_actor(monkeypatch):
+    monkeypatch.setattr(soft_actor_critic, "_MOST_UPDATES", 2)
+    model = small("droq", policy_delay=4, learning_starts=0).learn(5)
+    lines = logged(model)
+    assert model._n_updates == 2
+
+    model.train(3, 16)  # up to the fifth; the fourth is made in another call of the program
+    model.logger.dump()
+
+    assert lines.column("train/ent_coef") == [pytest.approx(1.0)]
+    assert lines.column("train/actor_loss") != [0.0]
 
 
 def test_simba_sees_observations_in_units_of_what_it_saw():

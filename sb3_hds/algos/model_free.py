@@ -18,6 +18,10 @@ from sb3_hds.algos.tensor_algorithm import TensorAlgorithm
 from sb3_hds.errors import EnvironmentMismatchError
 
 
+# What is logged of updates of the actor, which not every call of ``train`` makes.
+_OF_ACTOR = ("actor_loss", "ent_coef", "ent_coef_loss")
+
+
 class ModelFreeAlgorithm(TensorAlgorithm):
     """
     Abstract: off-policy learning from transitions.
@@ -152,7 +156,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     def _updates(self, n: int, batch_size: int) -> dict[str, float]:
         """
         :param n: of the critics
-        :return: of the last one, by name, what is logged
+        :return: by name, what is logged: of the last one; the actor's of its last one among them
         """
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
@@ -165,14 +169,21 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         """
         self._maybe_reset_params()
         rate, qf_rate = self.learning_rates()
+        n_improved = self._n_improved()
         report = self._updates(gradient_steps, batch_size)
+        silent = _OF_ACTOR if self._n_improved() == n_improved else ()
         self._n_updates += gradient_steps
         self.logger.record("train/learning_rate", rate)
         if self.critic_learning_rate is not None:
             self.logger.record("train/qf_learning_rate", qf_rate)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, value in report.items():
-            self.logger.record(f"train/{name}", value)
+            if name not in silent:
+                self.logger.record(f"train/{name}", value)
+
+    def _n_improved(self) -> int:
+        """:return: updates of the actor so far"""
+        return int(self.policy.learner.n_updates) // self.policy_delay
 
     def learning_rates(self) -> tuple[float, float]:
         """:return: of the actor and of the critics, at this point of the training"""

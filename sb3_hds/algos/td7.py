@@ -379,8 +379,7 @@ class TD7(ModelFreeAlgorithm):
         """One after the other: what is drawn depends on the errors of the update before."""
         buffer: Any = self.replay_buffer
         rates, policy = self.learning_rates(), self.policy
-        zero = jnp.zeros(())
-        report, found = {}, Report(zero, zero, zero)
+        report, found = {}, Report.nothing()
         for i in range(n):
             batch, drawn = self._drawn(batch_size)
             learner, found, priorities = update(policy.recipe, policy.learner, batch, *rates, found)

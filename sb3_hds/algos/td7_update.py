@@ -199,6 +199,11 @@ class Report(NamedTuple):
     actor_loss: Float[Array, ""]
     encoder_loss: Float[Array, ""]
 
+    @classmethod
+    def nothing(cls) -> "Report":
+        """:return: before any update"""
+        return cls(*(jnp.zeros(()) for _ in cls._fields))
+
 
 def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
     """:return: fresh networks and optimisers"""
