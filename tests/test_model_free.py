@@ -442,6 +442,32 @@ def test_what_cannot_work_is_refused_at_the_door(arguments, message):
         DroQ("Pendulum-v1", **arguments)
 
 
+@pytest.mark.parametrize(
+    ("name", "policy", "argument"),
+    [
+        ("droq", "SimbaPolicy", {"renorm_warmup_steps": 100}),
+        ("simba", "MlpPolicy", {"batch_norm_momentum": 0.9}),
+        ("bro", "MlpPolicy", {"renorm_warmup_steps": 100}),
+        ("bro", "MlpPolicy", {"dropout_rate": 0.1}),
+        ("gsde_sac", "MlpPolicy", {"batch_norm_momentum": 0.9}),
+    ],
+)
+def test_arguments_that_the_networks_do_not_use_are_refused(name, policy, argument):
+    with pytest.raises(ValueError, match=f"do not use {next(iter(argument))}"):
+        small(name, policy=policy, policy_kwargs={"net_arch": [8], **argument})
+
+
+def test_batch_normalisation_of_crossq_begins_where_it_is_told_to():
+    steps = {}
+    for told in (None, 7):
+        kwargs = {"net_arch": [8], "renorm_warmup_steps": told}
+        steps[told] = small("crossq_jax", policy_kwargs=kwargs).policy.renorm_warmup_steps
+
+    assert steps == {None: 100_000, 7: 7}
+    with pytest.raises(ValueError, match="renorm_warmup_steps must be a whole number"):
+        small("crossq_jax", policy_kwargs={"renorm_warmup_steps": -1})
+
+
 @every_algorithm
 def test_the_default_number_of_steps_goes_beyond_the_random_ones(name):
     algorithm = algos.ALL[name]

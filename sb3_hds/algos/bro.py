@@ -54,6 +54,7 @@ class BroPolicy(GaussianPolicy):
         "optimizer_kwargs": {"weight_decay": 1e-4},
         "normalize_observations": False,
     }
+    unused = ("renorm_warmup_steps", "dropout_rate")
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
         return BroBody(net_arch, self.activation_fn)
