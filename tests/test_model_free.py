@@ -505,6 +505,19 @@ def test_a_torch_class_means_what_it_does_in_torch(make, arguments):
         np.testing.assert_allclose(trained.weights["params"], theirs.detach(), rtol=1e-6)
 
 
+def test_an_optimiser_of_ones_own_may_have_a_known_name():
+    def adam(learning_rate):
+        return optax.sgd(learning_rate)
+
+    class Adam(th.optim.Adam):
+        pass
+
+    assert optimizer_of(adam, {}).make is adam
+    assert optimizer_of(optax.adam, {}).make is optax.adam
+    with pytest.raises(ValueError, match="use optimizer_class='adam'"):
+        optimizer_of(Adam, {})
+
+
 def test_torch_classes_are_understood():
     kwargs = {
         "activation_fn": th.nn.ELU,

@@ -82,6 +82,23 @@ def test_a_function_of_jax_is_taken_as_it_is_and_anything_else_is_refused():
             activation(wrong)
 
 
+def test_a_function_of_ones_own_may_have_a_known_name():
+    def softplus(x):
+        return jnp.log1p(jnp.exp(2.0 * x))
+
+    assert activation(softplus) is softplus
+    assert activation(th.nn.functional.softplus) is nn.softplus
+    assert activation(th.tanh) is nn.tanh
+
+
+def test_a_torch_module_without_settings_stands_for_its_class():
+    assert activation(th.nn.ReLU()) is nn.relu
+    assert activation(th.nn.ELU()) is nn.elu
+    for own in (th.nn.ELU(alpha=0.5), th.nn.LeakyReLU(0.2), type("ReLU", (th.nn.ReLU,), {})):
+        with pytest.raises(ValueError, match="a JAX function, which may have settings of its own"):
+            activation(own)
+
+
 def test_the_actor_starts_near_zero_and_stays_within_one():
     actor = Actor(2, (16,), nn.tanh)
     obs = jax.random.normal(jax.random.key(0), (100, 3))

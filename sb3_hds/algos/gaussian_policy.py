@@ -340,13 +340,15 @@ def optimizer_of(make: str | Callable[..., Any], arguments: Mapping[str, Any]) -
     if "alpha" in arguments:
         arguments["decay"] = arguments.pop("alpha")
     name = make if isinstance(make, str) else getattr(make, "__name__", "")
-    found = _OPTIMIZERS.get(name.lower())
-    if isinstance(make, type) and issubclass(make, th.optim.Optimizer):
-        if name.lower() not in _TORCH:
+    of_torch = isinstance(make, type) and issubclass(make, th.optim.Optimizer)
+    # A function is taken as it is, whatever its name.
+    found = _OPTIMIZERS.get(name.lower()) if isinstance(make, str) or of_torch else None
+    if of_torch:
+        if name.lower() not in _TORCH or getattr(th.optim, name) is not make:
             other = f"optimizer_class='{name.lower()}'" if found else "one of these names"
             raise ValueError(
-                f"optimizer_class={name} of torch has no equal in optax, as "
-                f"{', '.join(_TORCH)} have: use {other}."
+                f"optimizer_class={name} of {make.__module__} has no equal in optax, as "
+                f"{', '.join(_TORCH)} of torch have: use {other}."
             )
         arguments = _TORCH[name.lower()] | arguments
     if found is None and (isinstance(make, str | type) or not callable(make)):

@@ -6,7 +6,9 @@ from typing import Any, cast
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import torch as th
 from jaxtyping import Array, Float
+from torch.nn import functional
 
 Activation = Callable[[jax.Array], jax.Array]
 
@@ -19,6 +21,26 @@ ACTIVATIONS: dict[str, Activation] = {
     "leaky_relu": nn.leaky_relu,
     "softplus": nn.softplus,
 }
+
+_TORCH_MODULES: dict[type, str] = {
+    th.nn.Tanh: "tanh",
+    th.nn.ReLU: "relu",
+    th.nn.ELU: "elu",
+    th.nn.GELU: "gelu",
+    th.nn.SiLU: "silu",
+    th.nn.LeakyReLU: "leaky_relu",
+    th.nn.Softplus: "softplus",
+}
+# Functions of the same names: torch has some of them twice.
+_OF_TORCH: list[tuple[Any, str]] = [
+    *_TORCH_MODULES.items(),
+    *(
+        (getattr(home, name), name)
+        for home in (th, functional)
+        for name in ACTIVATIONS
+        if hasattr(home, name)
+    ),
+]
 
 # Width around zero where the value is linear rather than a square root, in units of the scaled
 # reward.
@@ -33,21 +55,29 @@ _SMALL = nn.initializers.variance_scaling(1e-4, "fan_in", "uniform")
 
 def activation(choice: str | Activation | type) -> Activation:
     """
-    :param choice: a name ("relu", any case), a JAX function, or a torch module class of the same
-        name
-    :raises ValueError: for a name without an equal here
+    :param choice: a name ("relu", any case), a JAX function, which is taken as it is, or of torch a
+        function, a module class, or a module without settings of its own
+    :raises ValueError: for a name, or something of torch, without an equal here
     """
-    name = choice if isinstance(choice, str) else getattr(choice, "__name__", "")
+    name = choice if isinstance(choice, str) else _torch_name(choice)
     known = {key.replace("_", ""): function for key, function in ACTIVATIONS.items()}
     found = known.get(name.lower().replace("_", ""))
     if found is not None:
         return found
-    if isinstance(choice, str | type) or not callable(choice):
+    if isinstance(choice, str | type | th.nn.Module) or not callable(choice):
         raise ValueError(
-            f"activation_fn must be one of {', '.join(ACTIVATIONS)}, or a JAX function, "
-            f"got {choice!r}."
+            f"activation_fn must be one of {', '.join(ACTIVATIONS)}, a torch class of such a name, "
+            f"or a JAX function, which may have settings of its own, got {choice!r}."
         )
     return choice
+
+
+def _torch_name(choice: Any) -> str:
+    """:return: of an activation of torch itself; of anything else, the empty string"""
+    kind = type(choice)
+    if kind in _TORCH_MODULES and choice.extra_repr() == kind().extra_repr():
+        choice = kind
+    return next((name for ours, name in _OF_TORCH if ours is choice), "")
 
 
 class Actor(nn.Module):
