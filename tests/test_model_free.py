@@ -23,6 +23,7 @@ from stable_baselines3.common.distributions import (
 )
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rl_zoo_plugin.lazy import parameters_of
@@ -859,6 +860,32 @@ def test_checkpoints_of_files_without_the_mark_act_if_they_were_worth_something(
 
     assert loaded.policy.has_checkpoint == was_kept
     np.testing.assert_array_equal(actions_of(loaded), expected)
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_what_td7_is_loaded_with_counts(n_envs):
+    model = small("td7", make_vec_env("Pendulum-v1", n_envs), use_checkpoints=None, train_freq=None)
+    file = saved(model.learn(4))
+    one = gymnasium.make("Pendulum-v1")
+
+    loaded = TD7.load(file, env=one, exploration_noise=0.7, train_freq=4)
+
+    np.testing.assert_allclose(loaded.action_noise._sigma, [0.7], rtol=1e-6)
+    assert loaded.train_freq.frequency == 4 and loaded.train_freq.unit.value == "step"
+    again = TD7.load(saved(loaded), env=one)
+    np.testing.assert_allclose(again.action_noise._sigma, [0.7], rtol=1e-6)
+    assert again.train_freq == loaded.train_freq
+    file.seek(0)
+    assert TD7.load(file, env=one).train_freq.unit.value == "episode"
+
+
+def test_noise_that_td7_was_passed_is_saved():
+    noise = NormalActionNoise(np.zeros(1), np.array([0.3]))
+    model = small("td7", action_noise=noise)
+
+    loaded = TD7.load(saved(model), exploration_noise=0.7)
+
+    np.testing.assert_array_equal(loaded.action_noise._sigma, [0.3])
 
 
 def test_uniform_draws_give_td7_the_gradient_of_prioritised_ones():

@@ -13,7 +13,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 
 from sb3_hds.algos.call_forms import between, is_count, jax_device
 from sb3_hds.algos.gaussian_policy import optimizer_of, widths
@@ -176,10 +176,11 @@ class TD7(ModelFreeAlgorithm):
 
     With checkpoints, as in the paper, a policy acts for whole episodes and is assessed by the worst
     of them, in rewards of the environment itself; only then it is updated, once for each step that
-    it made. That needs one environment, and ``gradient_steps`` is not looked at. Networks that
-    start afresh (``param_resets``) leave the checkpoint and its assessment as they are. Where a
-    model with a checkpoint goes on learning without assessments, the first update drops it. Without
-    a checkpoint, the policy as it is acts. SBX has no TD7.
+    it made. That needs one environment, and ``gradient_steps`` is not looked at; nor, ever, is
+    ``tau``: target networks are copied whole. Networks that start afresh (``param_resets``) leave
+    the checkpoint and its assessment as they are. Where a model with a checkpoint goes on learning
+    without assessments, the first update drops it. Without a checkpoint, the policy as it is acts.
+    SBX has no TD7.
 
     Prioritised replay draws from SB3's plain buffer. With ``n_steps`` above 1, Dict observations,
     ``optimize_memory_usage`` or a buffer of one's own (``HerReplayBuffer``), transitions are drawn
@@ -189,6 +190,8 @@ class TD7(ModelFreeAlgorithm):
     :param policy: ``"MlpPolicy"``, a policy class, or the environment itself
     :param env: an environment, its id, or a vectorised environment
     :param learning_starts: steps with random actions before learning starts
+    :param train_freq: steps between two calls of ``train``, or ``(n, "episode")``; None: one
+        episode where policies are assessed, one step where not
     :param policy_delay: updates of the critics for each of the actor
     :param target_update_interval: updates between two copies into the target networks
     :param target_policy_noise: standard deviation of the noise on the target policy's actions,
@@ -248,11 +251,12 @@ class TD7(ModelFreeAlgorithm):
         self._finished: list[tuple[float, int]] = []
         self._begin_episode()
         self._chosen_freq = train_freq
+        self._derived_noise: ActionNoise | None = None
         super().__init__(
             policy,
             env,
             learning_starts=learning_starts,
-            train_freq=1 if train_freq is None else train_freq,
+            train_freq=train_freq,
             policy_delay=policy_delay,
             action_noise=action_noise,
             replay_buffer_class=replay_buffer_class,
@@ -309,8 +313,7 @@ class TD7(ModelFreeAlgorithm):
         plain = self.n_steps == 1 and not self.optimize_memory_usage and not is_dict
         if plain and self.replay_buffer_class is None:
             self.replay_buffer_class = LapReplayBuffer
-        if self._chosen_freq is None:
-            self.train_freq = (1, "episode") if self.assesses else 1  # type: ignore[assignment]
+        self._choose_train_freq()
         super()._setup_model()
         if self.best_worst_return > -np.inf:
             # ``load`` comes by here; older files say only what their checkpoint was worth.
@@ -319,6 +322,22 @@ class TD7(ModelFreeAlgorithm):
             # SB3 adds it to actions of the space's shape.
             size = np.full(self.policy.action_shape, self.exploration_noise, np.float32)
             self.action_noise = NormalActionNoise(np.zeros_like(size), size)
+            self._derived_noise = self.action_noise
+
+    def _choose_train_freq(self) -> None:
+        """What ``load`` was passed counts; what it read, only where it was passed before."""
+        given: Any = self.train_freq
+        if given is not None and not isinstance(given, TrainFreq):
+            self._chosen_freq = given
+        elif self._chosen_freq is None or given is None:
+            self.train_freq = (1, "episode") if self.assesses else 1  # type: ignore[assignment]
+
+    def _excluded_save_params(self) -> list[str]:
+        """The noise that ``exploration_noise`` means is derived from it again."""
+        excluded = [*super()._excluded_save_params(), "_derived_noise"]
+        # With several environments, SB3 has one for each of them.
+        noise = getattr(self.action_noise, "base_noise", self.action_noise)
+        return excluded if noise is not self._derived_noise else [*excluded, "action_noise"]
 
     def _build(self, seed: int) -> None:
         self.policy.build(self.recipe(), seed, jax_device(self._device_name))
