@@ -358,7 +358,12 @@ def test_models_that_were_given_the_same_dictionary_do_not_share_it():
     exploring = GSDESAC("Pendulum-v1", policy_kwargs=kwargs)
     DroQ("Pendulum-v1", policy_kwargs=kwargs)
 
+    buffer = {"handle_timeout_termination": False}
+    longer = DroQ("Pendulum-v1", n_steps=3, replay_buffer_kwargs=buffer, buffer_size=10)
+
     assert kwargs == {"net_arch": [8]} and exploring.policy_kwargs["use_sde"]
+    assert buffer == {"handle_timeout_termination": False}
+    assert longer.replay_buffer_kwargs["n_steps"] == 3
 
 
 def test_images_are_refused():

@@ -117,10 +117,10 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             gradient_steps=gradient_steps,
             action_noise=action_noise,
             replay_buffer_class=replay_buffer_class,
-            replay_buffer_kwargs=replay_buffer_kwargs,
+            # SB3 writes into both: two models that were given the same ones are still two.
+            replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
-            # SB3 writes into it: two models that were given the same one are still two.
             policy_kwargs=dict(policy_kwargs or {}),
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
