@@ -474,6 +474,34 @@ def test_batch_normalisation_of_crossq_begins_where_it_is_told_to():
         small("crossq_jax", policy_kwargs={"renorm_warmup_steps": -1})
 
 
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("droq", {"param_resets": 50}),
+        ("droq", {"param_resets": ["a", -3]}),
+        ("droq", {"param_resets": [500, 100]}),
+        ("droq", {"sde_sample_freq": 2.5}),
+        ("tqc_jax", {"top_quantiles_to_drop_per_net": 1.5}),
+        ("tqc_jax", {"policy_kwargs": {"n_quantiles": None}}),
+        ("gsde_sac", {"policy_kwargs": {"n_quantiles": 2.0}}),
+        ("gsde_sac", {"policy_kwargs": {"n_critics": 0}}),
+        ("td7", {"policy_kwargs": {"n_critics": 0}}),
+        ("td7", {"policy_kwargs": {"embedding_size": 0}}),
+        ("bro", {"kl_target": -1}),
+        ("bro", {"std_multiplier": -2}),
+        ("simba", {"clipped_double_q": "no"}),
+    ],
+    ids=str,
+)
+def test_an_argument_out_of_range_is_refused_by_name(name, arguments):
+    [(argument, value)] = (arguments.get("policy_kwargs") or arguments).items()
+
+    with pytest.raises(ValueError, match=rf"{argument} must be .*") as caught:
+        small(name, **arguments)
+
+    assert repr(value) in str(caught.value)
+
+
 @every_algorithm
 def test_the_default_number_of_steps_goes_beyond_the_random_ones(name):
     algorithm = algos.ALL[name]

@@ -14,6 +14,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_hds.algos.bodies import BroBody
+from sb3_hds.algos.call_forms import between
 from sb3_hds.algos.gaussian_policy import GaussianPolicy
 from sb3_hds.algos.off_policy import (
     Batch,
@@ -125,6 +126,12 @@ class BRO(SoftActorCritic):
             policy_kwargs={"n_quantiles": 100, **(policy_kwargs or {})},
             **arguments,
         )
+
+    def check_arguments(self) -> None:
+        super().check_arguments()
+        for name in ("kl_target", "std_multiplier"):
+            fine = between(getattr(self, name), 0.0, math.inf)
+            self.refuse_unless(fine, name, "a number of at least 0")
 
     def auto_target_entropy(self) -> float:
         return -0.5 * self.policy.n_act

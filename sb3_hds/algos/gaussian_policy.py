@@ -132,6 +132,8 @@ class GaussianPolicy(LearningPolicy):
             name: self.defaults.get(name) if value is None else value
             for name, value in self.arguments.items()
         }
+        check_count("n_critics", n_critics)
+        check_count("n_quantiles", n_quantiles)
         if chosen["renorm_warmup_steps"] is not None:
             check_count("renorm_warmup_steps", chosen["renorm_warmup_steps"], 0)
         self._refuse_unused(has_batch_norm=chosen["renorm_warmup_steps"] is not None)

@@ -1,5 +1,6 @@
 """What model-free algorithms share: SB3 collects steps and calls ``train``, which updates."""
 
+import itertools
 import math
 import warnings
 from abc import abstractmethod
@@ -201,6 +202,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             "policy_delay": 1,
             "gradient_steps": -1,
             "n_steps": 1,
+            "sde_sample_freq": -1,
         }
         for name, fewest in counts.items():
             fine = is_count(getattr(self, name), fewest)
@@ -213,6 +215,11 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             self.refuse_unless(fine, name, "a number of at least 0, or a schedule", rate)
         if self.critic_learning_rate is not None:
             schedule_of(self.critic_learning_rate)
+        self.refuse_unless(
+            _are_rising_steps(self.param_resets or []),
+            "param_resets",
+            "None or a rising list of steps, such as [15_000, 50_000]",
+        )
         usual_buffer = self.replay_buffer_class is None
         if usual_buffer and self.n_steps > 1 and isinstance(self.observation_space, spaces.Dict):
             raise EnvironmentMismatchError(
@@ -247,6 +254,12 @@ class ModelFreeAlgorithm(TensorAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor", "critic"]
+
+
+def _are_rising_steps(given: Any) -> bool:
+    if not isinstance(given, list | tuple) or not all(is_count(step, 1) for step in given):
+        return False
+    return all(before < after for before, after in itertools.pairwise(given))
 
 
 def finite(report: dict[str, float]) -> dict[str, float]:

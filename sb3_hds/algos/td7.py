@@ -15,7 +15,7 @@ from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 
-from sb3_hds.algos.call_forms import between, is_count, jax_device
+from sb3_hds.algos.call_forms import between, check_count, is_count, jax_device
 from sb3_hds.algos.gaussian_policy import optimizer_of, widths
 from sb3_hds.algos.lap import LapReplayBuffer
 from sb3_hds.algos.learner import GENERATOR
@@ -63,6 +63,7 @@ class TD7Policy(LearningPolicy):
         of torch
     :param optimizer_kwargs: besides the learning rate
     :param use_sde: accepted for SB3's sake; the policy is deterministic
+    :raises ValueError: for arguments out of range
     """
 
     held = ("copies", "checkpoint")
@@ -86,6 +87,8 @@ class TD7Policy(LearningPolicy):
             name: value for name, value in locals().items() if name not in _NO_ARGUMENTS
         }
         super().__init__(observation_space, action_space, squash_output=True)
+        check_count("n_critics", n_critics)
+        check_count("embedding_size", embedding_size)
         pi, qf = widths(net_arch, "qf")
         of_values = activation(qf_activation_fn)
         self.n_obs = size_of(observation_space)
