@@ -775,6 +775,11 @@ def test_what_td7_cannot_do_is_refused(arguments):
         TD7("Pendulum-v1", **arguments)
 
 
+def test_bro_explores_by_its_optimistic_actor_alone():
+    with pytest.raises(ValueError, match=r"BRO\(use_sde=True\).*optimistic actor explores"):
+        small("bro", use_sde=True)
+
+
 def test_td7_keeps_its_checkpoint_and_what_that_is_worth_when_networks_start_afresh():
     model = small("td7", use_checkpoints=True, train_freq=None)
     model.policy.keep_checkpoint()

@@ -132,6 +132,9 @@ class BRO(SoftActorCritic):
         for name in ("kl_target", "std_multiplier"):
             fine = between(getattr(self, name), 0.0, math.inf)
             self.refuse_unless(fine, name, "a number of at least 0")
+        self.refuse_unless(
+            not self.use_sde, "use_sde", "False: a second, optimistic actor explores in its place"
+        )
 
     def auto_target_entropy(self) -> float:
         return -0.5 * self.policy.n_act
