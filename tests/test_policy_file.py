@@ -100,6 +100,22 @@ def test_names_and_torch_classes_of_activations_are_plain(no_pickle):
     assert sb3_hds.load_policy(file).arguments["activation_fn"] == "tanh"
 
 
+@pytest.mark.parametrize("name", ["bro", "td7", "pods"])
+def test_numbers_of_numpy_are_plain(name, no_pickle):
+    kwargs = {"net_arch": [np.int64(8)]}
+    if name == "bro":
+        kwargs |= {"n_quantiles": np.int64(5), "net_arch": {"pi": np.array([8]), "qf": [8]}}
+    if name == "td7":
+        kwargs |= {"n_critics": np.int32(2), "embedding_size": np.int64(4)}
+    model = small(name, policy_kwargs=kwargs)
+    obs = np.array([[1.0, 0.0, 0.5]], np.float32)
+
+    policy = sb3_hds.load_policy(saved(model))
+
+    expected, _ = model.predict(obs, deterministic=True)
+    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], expected)
+
+
 def test_a_function_of_ones_own_is_no_plain_data():
     kwargs = {"net_arch": [8], "activation_fn": lambda x: jnp.sin(x)}
     file = saved(small("gsde_sac", policy_kwargs=kwargs))

@@ -19,7 +19,7 @@ from sb3_hds.algos.call_forms import check_count
 from sb3_hds.algos.heads import Critic, ExploringActor, GaussianActor, noise_std
 from sb3_hds.algos.learner import GENERATOR
 from sb3_hds.algos.learning_policy import LearningPolicy
-from sb3_hds.algos.networks import Activation, activation
+from sb3_hds.algos.networks import Activation, activation, widths_of
 from sb3_hds.algos.observations import Seen, flattener, seen, size_of
 from sb3_hds.algos.off_policy import (
     Learner,
@@ -318,16 +318,13 @@ def widths(
     :raises ValueError: for other keys than ``pi`` and that one, or widths that are no counts
     """
     given = net_arch if isinstance(net_arch, Mapping) else {"pi": net_arch, critic: net_arch}
-    fits = given.keys() == {"pi", critic} and all(
-        isinstance(some, Sequence) and all(isinstance(w, int) and w > 0 for w in some)
-        for some in given.values()
-    )
-    if not fits:
+    pi, qf = (widths_of(given.get(name)) for name in ("pi", critic))
+    if given.keys() != {"pi", critic} or pi is None or qf is None:
         raise ValueError(
             f"net_arch must be a list of widths such as [256, 256], or {{'pi': [256], '{critic}': "
             f"[256, 256]}}, got {net_arch!r}."
         )
-    return tuple(given["pi"]), tuple(given[critic])
+    return pi, qf
 
 
 def optimizer_of(make: str | Callable[..., Any], arguments: Mapping[str, Any]) -> Optimizer:

@@ -18,7 +18,6 @@ from sb3_hds.algos.observations import check_observations
 from sb3_hds.algos.tensor_algorithm import TensorAlgorithm
 from sb3_hds.errors import EnvironmentMismatchError
 
-
 # What is logged of updates of the actor, which not every call of ``train`` makes.
 _OF_ACTOR = ("actor_loss", "ent_coef", "ent_coef_loss")
 

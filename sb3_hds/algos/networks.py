@@ -6,6 +6,7 @@ from typing import Any, cast
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 import torch as th
 from jaxtyping import Array, Float
 from torch.nn import functional
@@ -78,6 +79,17 @@ def _torch_name(choice: Any) -> str:
     if kind in _TORCH_MODULES and choice.extra_repr() == kind().extra_repr():
         choice = kind
     return next((name for ours, name in _OF_TORCH if ours is choice), "")
+
+
+def widths_of(given: Any) -> tuple[int, ...] | None:
+    """:return: widths of layers as Python has them; None unless all are whole numbers above 0"""
+    if isinstance(given, np.ndarray):
+        given = given.tolist()
+    if not isinstance(given, Sequence):
+        return None
+    if not all(isinstance(width, int | np.integer) and width > 0 for width in given):
+        return None
+    return tuple(map(int, given))
 
 
 class Actor(nn.Module):
