@@ -366,8 +366,9 @@ def test_models_that_were_given_the_same_dictionary_do_not_share_it():
     assert longer.replay_buffer_kwargs["n_steps"] == 3
 
 
-def test_images_are_refused():
-    env = Constant(spaces.Box(0, 255, (3, 36, 36), np.uint8), spaces.Box(-1, 1, (1,)))
+@pytest.mark.parametrize("shape", [(3, 36, 36), (36, 36)])
+def test_images_are_refused(shape):
+    env = Constant(spaces.Box(0, 255, shape, np.uint8), spaces.Box(-1, 1, (1,)))
 
     with pytest.raises(EnvironmentMismatchError, match="is an image"):
         DroQ("MlpPolicy", env)
