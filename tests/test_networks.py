@@ -63,12 +63,23 @@ def test_an_activation_is_known_by_name_in_any_spelling(name):
 
 
 @pytest.mark.parametrize(
-    "module", [th.nn.Tanh, th.nn.ReLU, th.nn.ELU, th.nn.SiLU, th.nn.LeakyReLU, th.nn.Softplus]
+    "module",
+    [
+        th.nn.Tanh,
+        th.nn.ReLU,
+        th.nn.ELU,
+        th.nn.SiLU,
+        th.nn.LeakyReLU,
+        th.nn.Softplus,
+        th.nn.GELU,
+        lambda: th.nn.GELU(approximate="tanh"),
+        lambda: th.nn.functional.gelu,
+    ],
 )
 def test_a_torch_module_stands_for_the_same_function(module):
     x = np.linspace(-3.0, 3.0, 13, dtype=np.float32)
 
-    ours = activation(module)(jnp.asarray(x))
+    ours = activation(module if isinstance(module, type) else module())(jnp.asarray(x))
 
     # Single precision, and torch's own approximations.
     np.testing.assert_allclose(ours, module()(th.as_tensor(x)).numpy(), atol=1e-6)

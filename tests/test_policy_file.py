@@ -2,6 +2,7 @@
 
 import zipfile
 
+import flax.linen as nn
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -93,11 +94,14 @@ def test_spaces_come_back_from_plain_data(space):
     assert space_from_plain(space_to_plain(space)) == space
 
 
-def test_names_and_torch_classes_of_activations_are_plain(no_pickle):
-    kwargs = {"net_arch": [8], "activation_fn": th.nn.Tanh}
+@pytest.mark.parametrize(
+    ("module", "name"), [(th.nn.Tanh, "tanh"), (th.nn.GELU, "gelu_exact"), (nn.gelu, "gelu")]
+)
+def test_names_and_torch_classes_of_activations_are_plain(module, name, no_pickle):
+    kwargs = {"net_arch": [8], "activation_fn": module}
     file = saved(small("gsde_sac", policy_kwargs=kwargs))
 
-    assert sb3_hds.load_policy(file).arguments["activation_fn"] == "tanh"
+    assert sb3_hds.load_policy(file).arguments["activation_fn"] == name
 
 
 @pytest.mark.parametrize("name", ["bro", "td7", "pods"])

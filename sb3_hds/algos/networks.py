@@ -1,6 +1,7 @@
 """Policy and value networks of the algorithms that learn through a twin."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, cast
 
 import flax.linen as nn
@@ -18,6 +19,7 @@ ACTIVATIONS: dict[str, Activation] = {
     "relu": nn.relu,
     "elu": nn.elu,
     "gelu": nn.gelu,
+    "gelu_exact": partial(nn.gelu, approximate=False),
     "silu": nn.silu,
     "leaky_relu": nn.leaky_relu,
     "softplus": nn.softplus,
@@ -27,14 +29,15 @@ _TORCH_MODULES: dict[type, str] = {
     th.nn.Tanh: "tanh",
     th.nn.ReLU: "relu",
     th.nn.ELU: "elu",
-    th.nn.GELU: "gelu",
+    th.nn.GELU: "gelu_exact",
     th.nn.SiLU: "silu",
     th.nn.LeakyReLU: "leaky_relu",
     th.nn.Softplus: "softplus",
 }
-# Functions of the same names: torch has some of them twice.
+# Functions of the same names, of which torch has some twice; the first entry counts.
 _OF_TORCH: list[tuple[Any, str]] = [
     *_TORCH_MODULES.items(),
+    (functional.gelu, "gelu_exact"),
     *(
         (getattr(home, name), name)
         for home in (th, functional)
@@ -56,7 +59,8 @@ _SMALL = nn.initializers.variance_scaling(1e-4, "fan_in", "uniform")
 
 def activation(choice: str | Activation | type) -> Activation:
     """
-    :param choice: a name ("relu", any case), a JAX function, which is taken as it is, or of torch a
+    :param choice: a name ("relu", any case; "gelu" is JAX's approximation by tanh, "gelu_exact"
+        what torch means by ``GELU``), a JAX function, which is taken as it is, or of torch a
         function, a module class, or a module without settings of its own
     :raises ValueError: for a name, or something of torch, without an equal here
     """
@@ -75,6 +79,8 @@ def activation(choice: str | Activation | type) -> Activation:
 
 def _torch_name(choice: Any) -> str:
     """:return: of an activation of torch itself; of anything else, the empty string"""
+    if isinstance(choice, th.nn.GELU) and choice.approximate == "tanh":
+        return "gelu"
     kind = type(choice)
     if kind in _TORCH_MODULES and choice.extra_repr() == kind().extra_repr():
         choice = kind
