@@ -795,6 +795,14 @@ def test_td7_keeps_its_checkpoint_and_what_that_is_worth_when_networks_start_afr
     assert model.best_worst_return == -150.0
 
 
+def test_td7_draws_by_priority_where_the_environment_is_normalised():
+    env = VecNormalize(DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")]))
+
+    model = small("td7", env).learn(30)
+
+    assert model.prioritised and model.replay_buffer.highest > 1.0
+
+
 def test_td7_judges_policies_by_the_rewards_of_the_environment_itself():
     space = spaces.Box(-1, 1, (3,))
     # Ten steps that earn 1 each; normalised, the same ten earn less and less.

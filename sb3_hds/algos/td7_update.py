@@ -178,7 +178,8 @@ class Learner(NamedTuple):
     Everything that an update changes.
 
     :param clip: range of values to which next values are clipped
-    :param range: of targets since the last copy
+    :param range: of all targets so far, as in the authors' code, which never begins it anew;
+        ``clip`` becomes it with each copy
     """
 
     encoder: Trained
