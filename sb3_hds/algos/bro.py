@@ -76,12 +76,13 @@ class BRO(SoftActorCritic):
     Source: Nauman et al., *Bigger, Regularized, Optimistic: scaling for compute and
     sample-efficient continuous control*, NeurIPS 2024: replay ratio 10 (``gradient_steps=2`` is
     their fast variant), batches of 128, AdamW with 3e-4, target entropy of minus half the number of
-    controls, Adam with b1 = 0.5 for the temperature and the multipliers. As in the authors' code
-    (MIT licence), fresh starts include the temperature, the multipliers and all optimisers, and the
-    logarithms of multipliers and of the deviation of actions are squashed into their limits by
-    :math:`\tanh`: actions start with a deviation near :math:`e^{-4}`, not near 1 as with SAC. Its
-    quantile loss is a sum over quantiles where this is their mean, a factor that Adam takes out
-    again. SBX has no BRO.
+    controls, Adam with b1 = 0.5 for the temperature and the multipliers. No arguments are, of the
+    multipliers, the learning rate (3e-5, without a schedule) and the first values (optimism 1,
+    regulariser 0.25). As in the authors' code (MIT licence), fresh starts include the temperature,
+    the multipliers and all optimisers, and the logarithms of multipliers and of the deviation of
+    actions are squashed into their limits by :math:`\tanh`: actions start with a deviation near
+    :math:`e^{-4}`, not near 1 as with SAC. Its quantile loss is a sum over quantiles where this is
+    their mean, a factor that Adam takes out again. SBX has no BRO.
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
