@@ -259,7 +259,7 @@ class TD7(ModelFreeAlgorithm):
             policy,
             env,
             learning_starts=learning_starts,
-            train_freq=train_freq,
+            train_freq=train_freq,  # type: ignore[arg-type]  # None until it is derived
             policy_delay=policy_delay,
             action_noise=action_noise,
             replay_buffer_class=replay_buffer_class,
