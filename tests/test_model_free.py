@@ -14,7 +14,7 @@ import pytest
 import sbx
 import torch as th
 from gymnasium import spaces
-from small_models import OFF_POLICY, PLANNERS, SMALL, logged, small
+from small_models import OFF_POLICY, PLANNERS, SMALL, logged, saved, small
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.distributions import (
@@ -23,11 +23,12 @@ from stable_baselines3.common.distributions import (
 )
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rl_zoo_plugin.lazy import parameters_of
 from sb3_hds import GSDESAC, TD7, CrossQ, DroQ, SimbaSAC, algos
-from sb3_hds.algos import td7_update
+from sb3_hds.algos import soft_actor_critic, td7_update
 from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp, SimbaBody
 from sb3_hds.algos.gaussian_policy import optimizer_of
 from sb3_hds.algos.heads import ExploringActor
@@ -354,16 +355,20 @@ def test_actions_have_the_shape_of_the_action_space(name, shape):
 
 def test_models_that_were_given_the_same_dictionary_do_not_share_it():
     kwargs = {"net_arch": [8]}
-    of_buffer = {"handle_timeout_termination": True}
     exploring = GSDESAC("Pendulum-v1", policy_kwargs=kwargs)
-    DroQ("Pendulum-v1", policy_kwargs=kwargs, n_steps=3, replay_buffer_kwargs=of_buffer)
+    DroQ("Pendulum-v1", policy_kwargs=kwargs)
+
+    buffer = {"handle_timeout_termination": False}
+    longer = DroQ("Pendulum-v1", n_steps=3, replay_buffer_kwargs=buffer, buffer_size=10)
 
     assert kwargs == {"net_arch": [8]} and exploring.policy_kwargs["use_sde"]
-    assert of_buffer == {"handle_timeout_termination": True}
+    assert buffer == {"handle_timeout_termination": False}
+    assert longer.replay_buffer_kwargs["n_steps"] == 3
 
 
-def test_images_are_refused():
-    env = Constant(spaces.Box(0, 255, (3, 36, 36), np.uint8), spaces.Box(-1, 1, (1,)))
+@pytest.mark.parametrize("shape", [(3, 36, 36), (36, 36)])
+def test_images_are_refused(shape):
+    env = Constant(spaces.Box(0, 255, shape, np.uint8), spaces.Box(-1, 1, (1,)))
 
     with pytest.raises(EnvironmentMismatchError, match="is an image"):
         DroQ("MlpPolicy", env)
@@ -444,6 +449,60 @@ def test_what_cannot_work_is_refused_at_the_door(arguments, message):
         DroQ("Pendulum-v1", **arguments)
 
 
+@pytest.mark.parametrize(
+    ("name", "policy", "argument"),
+    [
+        ("droq", "SimbaPolicy", {"renorm_warmup_steps": 100}),
+        ("simba", "MlpPolicy", {"batch_norm_momentum": 0.9}),
+        ("bro", "MlpPolicy", {"renorm_warmup_steps": 100}),
+        ("bro", "MlpPolicy", {"dropout_rate": 0.1}),
+        ("gsde_sac", "MlpPolicy", {"batch_norm_momentum": 0.9}),
+    ],
+)
+def test_arguments_that_the_networks_do_not_use_are_refused(name, policy, argument):
+    with pytest.raises(ValueError, match=f"do not use {next(iter(argument))}"):
+        small(name, policy=policy, policy_kwargs={"net_arch": [8], **argument})
+
+
+def test_batch_normalisation_of_crossq_begins_where_it_is_told_to():
+    steps = {}
+    for told in (None, 7):
+        kwargs = {"net_arch": [8], "renorm_warmup_steps": told}
+        steps[told] = small("crossq_jax", policy_kwargs=kwargs).policy.renorm_warmup_steps
+
+    assert steps == {None: 100_000, 7: 7}
+    with pytest.raises(ValueError, match="renorm_warmup_steps must be a whole number"):
+        small("crossq_jax", policy_kwargs={"renorm_warmup_steps": -1})
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("droq", {"param_resets": 50}),
+        ("droq", {"param_resets": ["a", -3]}),
+        ("droq", {"param_resets": [500, 100]}),
+        ("droq", {"sde_sample_freq": 2.5}),
+        ("tqc_jax", {"top_quantiles_to_drop_per_net": 1.5}),
+        ("tqc_jax", {"policy_kwargs": {"n_quantiles": None}}),
+        ("gsde_sac", {"policy_kwargs": {"n_quantiles": 2.0}}),
+        ("gsde_sac", {"policy_kwargs": {"n_critics": 0}}),
+        ("td7", {"policy_kwargs": {"n_critics": 0}}),
+        ("td7", {"policy_kwargs": {"embedding_size": 0}}),
+        ("bro", {"kl_target": -1}),
+        ("bro", {"std_multiplier": -2}),
+        ("simba", {"clipped_double_q": "no"}),
+    ],
+    ids=str,
+)
+def test_an_argument_out_of_range_is_refused_by_name(name, arguments):
+    [(argument, value)] = (arguments.get("policy_kwargs") or arguments).items()
+
+    with pytest.raises(ValueError, match=rf"{argument} must be .*") as caught:
+        small(name, **arguments)
+
+    assert repr(value) in str(caught.value)
+
+
 @every_algorithm
 def test_the_default_number_of_steps_goes_beyond_the_random_ones(name):
     algorithm = algos.ALL[name]
@@ -479,6 +538,19 @@ def test_a_torch_class_means_what_it_does_in_torch(make, arguments):
             torch_optimizer.step()
 
         np.testing.assert_allclose(trained.weights["params"], theirs.detach(), rtol=1e-6)
+
+
+def test_an_optimiser_of_ones_own_may_have_a_known_name():
+    def adam(learning_rate):
+        return optax.sgd(learning_rate)
+
+    class Adam(th.optim.Adam):
+        pass
+
+    assert optimizer_of(adam, {}).make is adam
+    assert optimizer_of(optax.adam, {}).make is optax.adam
+    with pytest.raises(ValueError, match="use optimizer_class='adam'"):
+        optimizer_of(Adam, {})
 
 
 def test_torch_classes_are_understood():
@@ -585,6 +657,36 @@ def test_schedules_of_both_learning_rates_act(algorithm):
             np.testing.assert_array_equal(tensor, before[key], err_msg=key)
 
 
+@pytest.mark.parametrize("name", ["crossq_jax", pytest.param("td7", marks=pytest.mark.expensive)])
+def test_losses_of_the_actor_are_logged_where_it_was_updated(name):
+    model = small(name, policy_delay=3, gradient_steps=1, train_freq=1)
+    logged(model)
+    model.learn(15)
+    told, begun = [], model._n_updates
+
+    for _ in range(6):
+        model.logger.name_to_value.clear()
+        model.train(1, 16)
+        told.append(model.logger.name_to_value.get("train/actor_loss"))
+        assert "train/critic_loss" in model.logger.name_to_value
+
+    expected = [(begun + i) % 3 == 0 for i in range(1, 7)]
+    assert [loss is not None for loss in told] == expected and 0.0 not in told
+
+
+def test_a_call_of_many_updates_logs_the_last_one_of_the_actor(monkeypatch):
+    monkeypatch.setattr(soft_actor_critic, "_MOST_UPDATES", 2)
+    model = small("droq", policy_delay=4, learning_starts=0).learn(5)
+    lines = logged(model)
+    assert model._n_updates == 2
+
+    model.train(3, 16)  # up to the fifth; the fourth is made in another call of the program
+    model.logger.dump()
+
+    assert lines.column("train/ent_coef") == [pytest.approx(1.0)]
+    assert lines.column("train/actor_loss") != [0.0]
+
+
 def test_simba_sees_observations_in_units_of_what_it_saw():
     model = small("simba").learn(60)
     assert isinstance(model, SimbaSAC)
@@ -674,6 +776,11 @@ def test_what_td7_cannot_do_is_refused(arguments):
         TD7("Pendulum-v1", **arguments)
 
 
+def test_bro_explores_by_its_optimistic_actor_alone():
+    with pytest.raises(ValueError, match=r"BRO\(use_sde=True\).*optimistic actor explores"):
+        small("bro", use_sde=True)
+
+
 def test_td7_keeps_its_checkpoint_and_what_that_is_worth_when_networks_start_afresh():
     model = small("td7", use_checkpoints=True, train_freq=None)
     model.policy.keep_checkpoint()
@@ -686,6 +793,14 @@ def test_td7_keeps_its_checkpoint_and_what_that_is_worth_when_networks_start_afr
     assert np.abs(model.predict(obs)[0] - exploring).min() > 1e-3
     np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], kept)
     assert model.best_worst_return == -150.0
+
+
+def test_td7_draws_by_priority_where_the_environment_is_normalised():
+    env = VecNormalize(DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")]))
+
+    model = small("td7", env).learn(30)
+
+    assert model.prioritised and model.replay_buffer.highest > 1.0
 
 
 def test_td7_judges_policies_by_the_rewards_of_the_environment_itself():
@@ -709,6 +824,115 @@ def test_td7_loaded_with_several_environments_assesses_no_policy(tmp_path):
     loaded = TD7.load(tmp_path / "model", env=make_vec_env("Pendulum-v1", 2))
 
     assert not loaded.assesses and loaded.learn(40)._n_updates > 0
+
+
+STATES = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, -2.0]], np.float32)
+
+
+def actions_of(model) -> tuple[np.ndarray, np.ndarray]:
+    """:return: of two states, as the policy is now, and where nothing is explored"""
+    exploring, greedy = (
+        model.policy.predict(STATES, deterministic=way)[0] for way in (False, True)
+    )
+    return exploring, greedy
+
+
+@pytest.mark.parametrize("goes_on", ["counted anew", "saved and loaded"])
+def test_an_interrupted_episode_of_td7_is_no_part_of_the_next_one(goes_on):
+    # Ten steps that earn 1 each.
+    env = Constant(spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (1,)))
+    model = small("td7", env, use_checkpoints=True, train_freq=None, learning_starts=0)
+    model.learn(100, callback=lambda *_: model.num_timesteps < 15)
+
+    if goes_on == "saved and loaded":
+        model = TD7.load(saved(model), env=env)
+    judged = []
+    model._assessed = lambda: judged.extend(model._finished) or 0
+    model.learn(10, reset_num_timesteps=goes_on == "counted anew")
+
+    assert judged == [(10.0, 10)]
+
+
+def test_td7_keeps_no_account_of_episodes_where_it_assesses_no_policy():
+    env = Constant(spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (1,)))
+
+    assert small("td7", env, use_checkpoints=False).learn(40)._finished == []
+
+
+def test_td7_trained_with_several_environments_acts_as_it_learned_when_loaded_with_one():
+    model = small("td7", make_vec_env("Pendulum-v1", 2), use_checkpoints=None, train_freq=None)
+    model.learn(60)
+    assert not model.assesses and model._n_updates > 0
+    expected, _ = actions_of(model)
+
+    loaded = TD7.load(saved(model), env=gymnasium.make("Pendulum-v1"))
+
+    assert loaded.assesses
+    np.testing.assert_array_equal(actions_of(loaded), [expected, expected])
+    other = small("td7", use_checkpoints=True, train_freq=None, seed=5)
+    other.set_parameters(model.get_parameters())
+    np.testing.assert_array_equal(actions_of(other), [expected, expected])
+
+
+def test_td7_acts_by_its_checkpoint_with_several_environments_until_it_learns_on():
+    model = small("td7", use_checkpoints=None, train_freq=None)
+    model.policy.keep_checkpoint()
+    model.best_worst_return = -150.0
+    _, checkpoint = actions_of(model)
+    model._restart(seed=1)
+
+    loaded = TD7.load(saved(model), env=make_vec_env("Pendulum-v1", 2))
+
+    exploring, greedy = actions_of(loaded)
+    np.testing.assert_array_equal(greedy, checkpoint)
+    assert np.abs(exploring - checkpoint).min() > 1e-3
+    np.testing.assert_array_equal(*actions_of(loaded.learn(40)))
+    assert loaded._n_updates > 0 and loaded.best_worst_return == -np.inf
+
+
+@pytest.mark.parametrize("was_kept", [True, False])
+def test_checkpoints_of_files_without_the_mark_act_if_they_were_worth_something(was_kept):
+    model = small("td7", use_checkpoints=True, train_freq=None)
+    if was_kept:
+        model.policy.keep_checkpoint()
+        model.best_worst_return = -150.0
+    model._restart(seed=1)
+    expected = actions_of(model)
+    state_dict = model.policy.state_dict
+    model.policy.state_dict = lambda: {
+        name: tensor for name, tensor in state_dict().items() if name != "checkpoint.kept"
+    }
+
+    loaded = TD7.load(saved(model), env=gymnasium.make("Pendulum-v1"))
+
+    assert loaded.policy.has_checkpoint == was_kept
+    np.testing.assert_array_equal(actions_of(loaded), expected)
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_what_td7_is_loaded_with_counts(n_envs):
+    model = small("td7", make_vec_env("Pendulum-v1", n_envs), use_checkpoints=None, train_freq=None)
+    file = saved(model.learn(4))
+    one = gymnasium.make("Pendulum-v1")
+
+    loaded = TD7.load(file, env=one, exploration_noise=0.7, train_freq=4)
+
+    np.testing.assert_allclose(loaded.action_noise._sigma, [0.7], rtol=1e-6)
+    assert loaded.train_freq.frequency == 4 and loaded.train_freq.unit.value == "step"
+    again = TD7.load(saved(loaded), env=one)
+    np.testing.assert_allclose(again.action_noise._sigma, [0.7], rtol=1e-6)
+    assert again.train_freq == loaded.train_freq
+    file.seek(0)
+    assert TD7.load(file, env=one).train_freq.unit.value == "episode"
+
+
+def test_noise_that_td7_was_passed_is_saved():
+    noise = NormalActionNoise(np.zeros(1), np.array([0.3]))
+    model = small("td7", action_noise=noise)
+
+    loaded = TD7.load(saved(model), exploration_noise=0.7)
+
+    np.testing.assert_array_equal(loaded.action_noise._sigma, [0.3])
 
 
 def test_uniform_draws_give_td7_the_gradient_of_prioritised_ones():

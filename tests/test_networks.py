@@ -63,12 +63,23 @@ def test_an_activation_is_known_by_name_in_any_spelling(name):
 
 
 @pytest.mark.parametrize(
-    "module", [th.nn.Tanh, th.nn.ReLU, th.nn.ELU, th.nn.SiLU, th.nn.LeakyReLU, th.nn.Softplus]
+    "module",
+    [
+        th.nn.Tanh,
+        th.nn.ReLU,
+        th.nn.ELU,
+        th.nn.SiLU,
+        th.nn.LeakyReLU,
+        th.nn.Softplus,
+        th.nn.GELU,
+        lambda: th.nn.GELU(approximate="tanh"),
+        lambda: th.nn.functional.gelu,
+    ],
 )
 def test_a_torch_module_stands_for_the_same_function(module):
     x = np.linspace(-3.0, 3.0, 13, dtype=np.float32)
 
-    ours = activation(module)(jnp.asarray(x))
+    ours = activation(module if isinstance(module, type) else module())(jnp.asarray(x))
 
     # Single precision, and torch's own approximations.
     np.testing.assert_allclose(ours, module()(th.as_tensor(x)).numpy(), atol=1e-6)
@@ -80,6 +91,23 @@ def test_a_function_of_jax_is_taken_as_it_is_and_anything_else_is_refused():
     for wrong in ("sigmoids", th.nn.Conv1d, 3, None):
         with pytest.raises(ValueError, match=r"activation_fn must be one of tanh, relu"):
             activation(wrong)
+
+
+def test_a_function_of_ones_own_may_have_a_known_name():
+    def softplus(x):
+        return jnp.log1p(jnp.exp(2.0 * x))
+
+    assert activation(softplus) is softplus
+    assert activation(th.nn.functional.softplus) is nn.softplus
+    assert activation(th.tanh) is nn.tanh
+
+
+def test_a_torch_module_without_settings_stands_for_its_class():
+    assert activation(th.nn.ReLU()) is nn.relu
+    assert activation(th.nn.ELU()) is nn.elu
+    for own in (th.nn.ELU(alpha=0.5), th.nn.LeakyReLU(0.2), type("ReLU", (th.nn.ReLU,), {})):
+        with pytest.raises(ValueError, match="a JAX function, which may have settings of its own"):
+            activation(own)
 
 
 def test_the_actor_starts_near_zero_and_stays_within_one():

@@ -2,6 +2,7 @@
 
 import zipfile
 
+import flax.linen as nn
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -36,8 +37,10 @@ def test_a_policy_alone_acts_as_its_model_and_nothing_is_unpickled(name, tmp_pat
 
 def test_checkpoints_of_td7_act_in_the_policy_alone(no_pickle):
     model = small("td7", use_checkpoints=True, train_freq=None)
+    model.policy.keep_checkpoint()
     learner = model.policy.learner
-    other = jax.tree.map(lambda weight: weight + 0.1, learner.checkpoint)
+    actor = jax.tree.map(lambda weight: weight + 0.1, learner.checkpoint.actor)
+    other = learner.checkpoint._replace(actor=actor)
     model.policy.learner = learner._replace(checkpoint=other)
     obs = model.observation_space.sample()
 
@@ -45,7 +48,7 @@ def test_checkpoints_of_td7_act_in_the_policy_alone(no_pickle):
 
     expected, _ = model.predict(obs, deterministic=True)
     np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], expected)
-    model.policy.uses_checkpoints = False
+    model.policy.drop_checkpoint()
     assert (model.predict(obs, deterministic=True)[0] != expected).any()
 
 
@@ -91,11 +94,30 @@ def test_spaces_come_back_from_plain_data(space):
     assert space_from_plain(space_to_plain(space)) == space
 
 
-def test_names_and_torch_classes_of_activations_are_plain(no_pickle):
-    kwargs = {"net_arch": [8], "activation_fn": th.nn.Tanh}
+@pytest.mark.parametrize(
+    ("module", "name"), [(th.nn.Tanh, "tanh"), (th.nn.GELU, "gelu_exact"), (nn.gelu, "gelu")]
+)
+def test_names_and_torch_classes_of_activations_are_plain(module, name, no_pickle):
+    kwargs = {"net_arch": [8], "activation_fn": module}
     file = saved(small("gsde_sac", policy_kwargs=kwargs))
 
-    assert sb3_hds.load_policy(file).arguments["activation_fn"] == "tanh"
+    assert sb3_hds.load_policy(file).arguments["activation_fn"] == name
+
+
+@pytest.mark.parametrize("name", ["bro", "td7", "pods"])
+def test_numbers_of_numpy_are_plain(name, no_pickle):
+    kwargs = {"net_arch": [np.int64(8)]}
+    if name == "bro":
+        kwargs |= {"n_quantiles": np.int64(5), "net_arch": {"pi": np.array([8]), "qf": [8]}}
+    if name == "td7":
+        kwargs |= {"n_critics": np.int32(2), "embedding_size": np.int64(4)}
+    model = small(name, policy_kwargs=kwargs)
+    obs = np.array([[1.0, 0.0, 0.5]], np.float32)
+
+    policy = sb3_hds.load_policy(saved(model))
+
+    expected, _ = model.predict(obs, deterministic=True)
+    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], expected)
 
 
 def test_a_function_of_ones_own_is_no_plain_data():

@@ -35,7 +35,7 @@ from sb3_hds import algos
 from sb3_hds.algos import td7_update
 from sb3_hds.algos.bodies import Dropout
 from sb3_hds.algos.observations import Seen
-from sb3_hds.algos.off_policy import Batch, Knobs, Optimizer, Trained, update
+from sb3_hds.algos.off_policy import Batch, Knobs, Optimizer, Report, Trained, update
 
 pytestmark = pytest.mark.usefixtures("x64", "quick_compilation")
 
@@ -204,7 +204,7 @@ def check(
 ) -> Any:
     """:return: the learner after as many updates as the reference makes, which agree with it"""
     given = batches(n, seed)
-    learner, report = update(recipe, learner, given, n, KNOBS)
+    learner, report = update(recipe, learner, given, n, KNOBS, Report.nothing())
     for i in range(n):
         batch = jax.tree.map(lambda x, i=i: np.array(x[i]), given)
         said = expected.update(batch._replace(obs=seen(batch.obs), next_obs=seen(batch.next_obs)))
@@ -623,8 +623,8 @@ def test_td7_learns_embeddings_clips_targets_and_copies_them_late():
         *(getattr(learner, n).weights for n in ("encoder", "actor", "critic", "encoder"))
     )
     learner = learner._replace(copies=fixed)
-    expected, zero = Sale(recipe, learner), jnp.zeros(())
-    report, given = td7_update.Report(zero, zero, zero), batches(4)
+    expected = Sale(recipe, learner)
+    report, given = td7_update.Report.nothing(), batches(4)
     rates = KNOBS.learning_rate, KNOBS.qf_learning_rate
 
     # The third update is the first one by copied networks, within the range of targets.

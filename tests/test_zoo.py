@@ -14,6 +14,7 @@ import pytest
 import yaml
 from stable_baselines3.common.env_util import make_vec_env
 
+from rl_zoo_plugin.tables import ALGORITHMS
 from sb3_hds import HDS
 
 pytestmark = pytest.mark.skipif(find_spec("rl_zoo3") is None, reason="needs the extra 'zoo'")
@@ -229,6 +230,53 @@ def test_a_gait_is_searched_and_replayed(zoo):
     run = zoo.folder / "gaits" / "openloop" / "Pendulum-v1_1"
     assert {"Pendulum-v1.zip", "best_model.zip"} <= {path.name for path in run.iterdir()}
     assert "2 Episodes" in output and "Mean reward" in output
+
+
+_SMALL_NETWORKS = "policy_kwargs:dict(net_arch=[8])"
+_FEW_UPDATES = ("learning_starts:50", "train_freq:50", "gradient_steps:2", "batch_size:16")
+#: by id, what makes a run short; the searched gait has a test of its own
+BRIEF = {
+    "pods": QUICK,
+    "hds": QUICK,
+    **dict.fromkeys(
+        ("gsde_sac", "droq", "crossq_jax", "tqc_jax", "simba", "bro"),
+        (*_FEW_UPDATES, _SMALL_NETWORKS),
+    ),
+    "td7": (*_FEW_UPDATES, "policy_kwargs:dict(net_arch=[8],embedding_size=8)"),
+}
+_QUICK_IDS = ("droq",)
+
+
+def test_every_algorithm_is_tried_by_the_commands():
+    assert {*BRIEF, "openloop"} == set(ALGORITHMS)
+
+
+@pytest.mark.parametrize(
+    "algo",
+    [
+        algo if algo in _QUICK_IDS else pytest.param(algo, marks=pytest.mark.expensive)
+        for algo in BRIEF
+    ],
+)
+def test_every_algorithm_is_trained_and_replayed(zoo, algo):
+    agent = ("--algo", algo, "--env", "Pendulum-v1", "-f", "brief")
+    budget = ("--seed", "0", "-n", "200", "--eval-freq", "-1")
+
+    zoo.succeeds(*CONSOLE, "train", *agent, *budget, "-params", *BRIEF[algo])
+    output = zoo.succeeds(*CONSOLE, "enjoy", *agent, "--no-render", "-n", "200")
+
+    assert (zoo.folder / "brief" / algo / "Pendulum-v1_1" / "Pendulum-v1.zip").is_file()
+    assert "1 Episodes" in output and "Mean reward" in output
+
+
+@pytest.mark.expensive
+def test_what_a_model_free_algorithm_is_sampled_with_can_be_trained(zoo):
+    agent = ("--algo", "gsde_sac", "--env", "Pendulum-v1", "--seed", "0", "-f", "tuned")
+    budget = ("-n", "200", "--n-trials", "1", "--n-evaluations", "1", "--eval-episodes", "1")
+
+    output = zoo.succeeds(*CONSOLE, "train", *agent, "-optimize", *budget, "--no-optim-plots")
+
+    assert "Number of finished trials:  1" in output and "Value:" in output
 
 
 def test_an_unknown_key_in_a_yml_file_is_named_with_the_one_that_was_meant(zoo):

@@ -14,6 +14,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_hds.algos.bodies import BroBody
+from sb3_hds.algos.call_forms import between
 from sb3_hds.algos.gaussian_policy import GaussianPolicy
 from sb3_hds.algos.off_policy import (
     Batch,
@@ -54,6 +55,7 @@ class BroPolicy(GaussianPolicy):
         "optimizer_kwargs": {"weight_decay": 1e-4},
         "normalize_observations": False,
     }
+    unused = ("renorm_warmup_steps", "dropout_rate")
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
         return BroBody(net_arch, self.activation_fn)
@@ -74,12 +76,13 @@ class BRO(SoftActorCritic):
     Source: Nauman et al., *Bigger, Regularized, Optimistic: scaling for compute and
     sample-efficient continuous control*, NeurIPS 2024: replay ratio 10 (``gradient_steps=2`` is
     their fast variant), batches of 128, AdamW with 3e-4, target entropy of minus half the number of
-    controls, Adam with b1 = 0.5 for the temperature and the multipliers. As in the authors' code
-    (MIT licence), fresh starts include the temperature, the multipliers and all optimisers, and the
-    logarithms of multipliers and of the deviation of actions are squashed into their limits by
-    :math:`\tanh`: actions start with a deviation near :math:`e^{-4}`, not near 1 as with SAC. Its
-    quantile loss is a sum over quantiles where this is their mean, a factor that Adam takes out
-    again. SBX has no BRO.
+    controls, Adam with b1 = 0.5 for the temperature and the multipliers. No arguments are, of the
+    multipliers, the learning rate (3e-5, without a schedule) and the first values (optimism 1,
+    regulariser 0.25). As in the authors' code (MIT licence), fresh starts include the temperature,
+    the multipliers and all optimisers, and the logarithms of multipliers and of the deviation of
+    actions are squashed into their limits by :math:`\tanh`: actions start with a deviation near
+    :math:`e^{-4}`, not near 1 as with SAC. Its quantile loss is a sum over quantiles where this is
+    their mean, a factor that Adam takes out again. SBX has no BRO.
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
@@ -123,6 +126,15 @@ class BRO(SoftActorCritic):
             param_resets=param_resets,
             policy_kwargs={"n_quantiles": 100, **(policy_kwargs or {})},
             **arguments,
+        )
+
+    def check_arguments(self) -> None:
+        super().check_arguments()
+        for name in ("kl_target", "std_multiplier"):
+            fine = between(getattr(self, name), 0.0, math.inf)
+            self.refuse_unless(fine, name, "a number of at least 0")
+        self.refuse_unless(
+            not self.use_sde, "use_sde", "False: a second, optimistic actor explores in its place"
         )
 
     def auto_target_entropy(self) -> float:

@@ -168,6 +168,14 @@ def is_count(value: Any, least: int, may_be_none: bool = False) -> bool:
     return isinstance(value, int | np.integer) and int(value) >= least
 
 
+def check_count(name: str, value: Any, least: int = 1) -> None:
+    """
+    :raises ValueError: unless it is a whole number of at least ``least``
+    """
+    if not is_count(value, least):
+        raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}.")
+
+
 def between(value: Any, low: float, high: float) -> bool:
     """:return: whether it is a finite number from ``low`` to ``high``"""
     if not isinstance(value, numbers.Real):

@@ -136,9 +136,8 @@ def run_rounds(loop: Loop, params: Params, runs: Run, rounds: Round) -> tuple[Ru
     axes = runs_axes()
 
     def one(run: Run) -> tuple[Run, Step, Report]:
-        zero = jnp.zeros(())
-        report = Report(zero, zero, zero, zero)
-        (run, report), steps = jax.lax.scan(partial(_round, loop, params), (run, report), rounds)
+        before = run, Report.nothing()
+        (run, report), steps = jax.lax.scan(partial(_round, loop, params), before, rounds)
         return run, steps, report
 
     return jax.vmap(one, in_axes=(axes,), out_axes=(axes, 0, 0))(runs)

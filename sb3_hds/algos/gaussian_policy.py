@@ -1,5 +1,6 @@
 """The policies of the SAC family, as SB3 sees them: a Gaussian actor and an ensemble of critics."""
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
@@ -14,10 +15,11 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_hds.algos.bodies import Mlp, SimbaBody
+from sb3_hds.algos.call_forms import check_count
 from sb3_hds.algos.heads import Critic, ExploringActor, GaussianActor, noise_std
 from sb3_hds.algos.learner import GENERATOR
 from sb3_hds.algos.learning_policy import LearningPolicy
-from sb3_hds.algos.networks import Activation, activation
+from sb3_hds.algos.networks import Activation, activation, widths_of
 from sb3_hds.algos.observations import Seen, flattener, seen, size_of
 from sb3_hds.algos.off_policy import (
     Learner,
@@ -68,9 +70,9 @@ class GaussianPolicy(LearningPolicy):
     :param n_critics: members of the ensemble
     :param n_quantiles: values of each of them
     :param dropout_rate: of the critics
-    :param layer_norm: in the critics
+    :param layer_norm: in the critics; the networks of SimBa and BRO have it in any case
     :param renorm_warmup_steps: batch normalisation in actor and critics, which becomes batch
-        renormalisation after so many updates; None: neither
+        renormalisation after so many updates; None: neither, but 100,000 with ``CrossQPolicy``
     :param batch_norm_momentum: the share of its running statistics that stays at an update
     :param use_sde: generalised state-dependent exploration (Raffin et al., CoRL 2021)
     :param log_std_init: gSDE: where the logarithm of the noise matrix's deviation starts
@@ -83,6 +85,7 @@ class GaussianPolicy(LearningPolicy):
     :param optimizer_kwargs: besides the learning rate; torch's ``betas`` and ``alpha`` are
         understood
     :param qf_optimizer_kwargs: of the critics, where they differ
+    :raises ValueError: for arguments out of range, and those that these networks do not use
     """
 
     held = ("target", "seen")
@@ -93,6 +96,8 @@ class GaussianPolicy(LearningPolicy):
         "normalize_observations": False,
         "renorm_warmup_steps": None,
     }
+    #: arguments that these networks do not use
+    unused: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
         self,
@@ -127,6 +132,11 @@ class GaussianPolicy(LearningPolicy):
             name: self.defaults.get(name) if value is None else value
             for name, value in self.arguments.items()
         }
+        check_count("n_critics", n_critics)
+        check_count("n_quantiles", n_quantiles)
+        if chosen["renorm_warmup_steps"] is not None:
+            check_count("renorm_warmup_steps", chosen["renorm_warmup_steps"], 0)
+        self._refuse_unused(has_batch_norm=chosen["renorm_warmup_steps"] is not None)
         net: Any = chosen["net_arch"]
         self.widths = widths(net, "qf")
         self.activation_fn = activation(activation_fn)
@@ -156,6 +166,16 @@ class GaussianPolicy(LearningPolicy):
         self.flatten = flattener(observation_space)
         self.matrices: np.ndarray | None = None
         self._noise = np.random.default_rng(0)
+
+    def _refuse_unused(self, has_batch_norm: bool) -> None:
+        unused = self.unused if has_batch_norm else (*self.unused, "batch_norm_momentum")
+        usual = inspect.signature(GaussianPolicy).parameters
+        for name in unused:
+            if self.arguments[name] != usual[name].default:
+                raise ValueError(
+                    f"policy_kwargs={{'{name}': {self.arguments[name]!r}}}: the networks of "
+                    f"{type(self).__name__} do not use {name} here; leave it out."
+                )
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
         return Mlp(
@@ -266,6 +286,7 @@ class SimbaPolicy(GaussianPolicy):
         "optimizer_kwargs": {"weight_decay": 1e-2},
         "normalize_observations": True,
     }
+    unused = ("renorm_warmup_steps",)
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
         return SimbaBody(net_arch, self.activation_fn)
@@ -297,16 +318,13 @@ def widths(
     :raises ValueError: for other keys than ``pi`` and that one, or widths that are no counts
     """
     given = net_arch if isinstance(net_arch, Mapping) else {"pi": net_arch, critic: net_arch}
-    fits = given.keys() == {"pi", critic} and all(
-        isinstance(some, Sequence) and all(isinstance(w, int) and w > 0 for w in some)
-        for some in given.values()
-    )
-    if not fits:
+    pi, qf = (widths_of(given.get(name)) for name in ("pi", critic))
+    if given.keys() != {"pi", critic} or pi is None or qf is None:
         raise ValueError(
             f"net_arch must be a list of widths such as [256, 256], or {{'pi': [256], '{critic}': "
             f"[256, 256]}}, got {net_arch!r}."
         )
-    return tuple(given["pi"]), tuple(given[critic])
+    return pi, qf
 
 
 def optimizer_of(make: str | Callable[..., Any], arguments: Mapping[str, Any]) -> Optimizer:
@@ -321,13 +339,15 @@ def optimizer_of(make: str | Callable[..., Any], arguments: Mapping[str, Any]) -
     if "alpha" in arguments:
         arguments["decay"] = arguments.pop("alpha")
     name = make if isinstance(make, str) else getattr(make, "__name__", "")
-    found = _OPTIMIZERS.get(name.lower())
-    if isinstance(make, type) and issubclass(make, th.optim.Optimizer):
-        if name.lower() not in _TORCH:
+    of_torch = isinstance(make, type) and issubclass(make, th.optim.Optimizer)
+    # A function is taken as it is, whatever its name.
+    found = _OPTIMIZERS.get(name.lower()) if isinstance(make, str) or of_torch else None
+    if of_torch:
+        if name.lower() not in _TORCH or getattr(th.optim, name) is not make:
             other = f"optimizer_class='{name.lower()}'" if found else "one of these names"
             raise ValueError(
-                f"optimizer_class={name} of torch has no equal in optax, as "
-                f"{', '.join(_TORCH)} have: use {other}."
+                f"optimizer_class={name} of {make.__module__} has no equal in optax, as "
+                f"{', '.join(_TORCH)} of torch have: use {other}."
             )
         arguments = _TORCH[name.lower()] | arguments
     if found is None and (isinstance(make, str | type) or not callable(make)):

@@ -1,5 +1,6 @@
 """What model-free algorithms share: SB3 collects steps and calls ``train``, which updates."""
 
+import itertools
 import math
 import warnings
 from abc import abstractmethod
@@ -16,6 +17,9 @@ from sb3_hds.algos.learning_policy import LearningPolicy
 from sb3_hds.algos.observations import check_observations
 from sb3_hds.algos.tensor_algorithm import TensorAlgorithm
 from sb3_hds.errors import EnvironmentMismatchError
+
+# What is logged of updates of the actor, which not every call of ``train`` makes.
+_OF_ACTOR = ("actor_loss", "ent_coef", "ent_coef_loss")
 
 
 class ModelFreeAlgorithm(TensorAlgorithm):
@@ -41,7 +45,8 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     :param replay_buffer_kwargs: as in SB3
     :param optimize_memory_usage: as in SB3
     :param n_steps: of the returns that critics are regressed on
-    :param use_sde: explore by gSDE instead of independent noise at each step
+    :param use_sde: explore by gSDE instead of independent noise at each step; not with TD7, which
+        adds noise to its actions, and BRO, which explores by an actor of its own
     :param sde_sample_freq: steps after which its noise matrix is drawn again; -1: at the start of
         each collection (``train_freq``)
     :param use_sde_at_warmup: whether it also acts before ``learning_starts``
@@ -152,7 +157,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     def _updates(self, n: int, batch_size: int) -> dict[str, float]:
         """
         :param n: of the critics
-        :return: of the last one, by name, what is logged
+        :return: by name, what is logged: of the last one; the actor's of its last one among them
         """
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
@@ -165,14 +170,21 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         """
         self._maybe_reset_params()
         rate, qf_rate = self.learning_rates()
+        n_improved = self._n_improved()
         report = self._updates(gradient_steps, batch_size)
+        silent = _OF_ACTOR if self._n_improved() == n_improved else ()
         self._n_updates += gradient_steps
         self.logger.record("train/learning_rate", rate)
         if self.critic_learning_rate is not None:
             self.logger.record("train/qf_learning_rate", qf_rate)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, value in report.items():
-            self.logger.record(f"train/{name}", value)
+            if name not in silent:
+                self.logger.record(f"train/{name}", value)
+
+    def _n_improved(self) -> int:
+        """:return: updates of the actor so far"""
+        return int(self.policy.learner.n_updates) // self.policy_delay
 
     def learning_rates(self) -> tuple[float, float]:
         """:return: of the actor and of the critics, at this point of the training"""
@@ -190,6 +202,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             "policy_delay": 1,
             "gradient_steps": -1,
             "n_steps": 1,
+            "sde_sample_freq": -1,
         }
         for name, fewest in counts.items():
             fine = is_count(getattr(self, name), fewest)
@@ -202,6 +215,11 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             self.refuse_unless(fine, name, "a number of at least 0, or a schedule", rate)
         if self.critic_learning_rate is not None:
             schedule_of(self.critic_learning_rate)
+        self.refuse_unless(
+            _are_rising_steps(self.param_resets or []),
+            "param_resets",
+            "None or a rising list of steps, such as [15_000, 50_000]",
+        )
         usual_buffer = self.replay_buffer_class is None
         if usual_buffer and self.n_steps > 1 and isinstance(self.observation_space, spaces.Dict):
             raise EnvironmentMismatchError(
@@ -236,6 +254,12 @@ class ModelFreeAlgorithm(TensorAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor", "critic"]
+
+
+def _are_rising_steps(given: Any) -> bool:
+    if not isinstance(given, list | tuple) or not all(is_count(step, 1) for step in given):
+        return False
+    return all(before < after for before, after in itertools.pairwise(given))
 
 
 def finite(report: dict[str, float]) -> dict[str, float]:

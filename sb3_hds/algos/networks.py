@@ -1,12 +1,16 @@
 """Policy and value networks of the algorithms that learn through a twin."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, cast
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
+import torch as th
 from jaxtyping import Array, Float
+from torch.nn import functional
 
 Activation = Callable[[jax.Array], jax.Array]
 
@@ -15,10 +19,32 @@ ACTIVATIONS: dict[str, Activation] = {
     "relu": nn.relu,
     "elu": nn.elu,
     "gelu": nn.gelu,
+    "gelu_exact": partial(nn.gelu, approximate=False),
     "silu": nn.silu,
     "leaky_relu": nn.leaky_relu,
     "softplus": nn.softplus,
 }
+
+_TORCH_MODULES: dict[type, str] = {
+    th.nn.Tanh: "tanh",
+    th.nn.ReLU: "relu",
+    th.nn.ELU: "elu",
+    th.nn.GELU: "gelu_exact",
+    th.nn.SiLU: "silu",
+    th.nn.LeakyReLU: "leaky_relu",
+    th.nn.Softplus: "softplus",
+}
+# Functions of the same names, of which torch has some twice; the first entry counts.
+_OF_TORCH: list[tuple[Any, str]] = [
+    *_TORCH_MODULES.items(),
+    (functional.gelu, "gelu_exact"),
+    *(
+        (getattr(home, name), name)
+        for home in (th, functional)
+        for name in ACTIVATIONS
+        if hasattr(home, name)
+    ),
+]
 
 # Width around zero where the value is linear rather than a square root, in units of the scaled
 # reward.
@@ -33,21 +59,43 @@ _SMALL = nn.initializers.variance_scaling(1e-4, "fan_in", "uniform")
 
 def activation(choice: str | Activation | type) -> Activation:
     """
-    :param choice: a name ("relu", any case), a JAX function, or a torch module class of the same
-        name
-    :raises ValueError: for a name without an equal here
+    :param choice: a name ("relu", any case; "gelu" is JAX's approximation by tanh, "gelu_exact"
+        what torch means by ``GELU``), a JAX function, which is taken as it is, or of torch a
+        function, a module class, or a module without settings of its own
+    :raises ValueError: for a name, or something of torch, without an equal here
     """
-    name = choice if isinstance(choice, str) else getattr(choice, "__name__", "")
+    name = choice if isinstance(choice, str) else _torch_name(choice)
     known = {key.replace("_", ""): function for key, function in ACTIVATIONS.items()}
     found = known.get(name.lower().replace("_", ""))
     if found is not None:
         return found
-    if isinstance(choice, str | type) or not callable(choice):
+    if isinstance(choice, str | type | th.nn.Module) or not callable(choice):
         raise ValueError(
-            f"activation_fn must be one of {', '.join(ACTIVATIONS)}, or a JAX function, "
-            f"got {choice!r}."
+            f"activation_fn must be one of {', '.join(ACTIVATIONS)}, a torch class of such a name, "
+            f"or a JAX function, which may have settings of its own, got {choice!r}."
         )
     return choice
+
+
+def _torch_name(choice: Any) -> str:
+    """:return: of an activation of torch itself; of anything else, the empty string"""
+    if isinstance(choice, th.nn.GELU) and choice.approximate == "tanh":
+        return "gelu"
+    kind = type(choice)
+    if kind in _TORCH_MODULES and choice.extra_repr() == kind().extra_repr():
+        choice = kind
+    return next((name for ours, name in _OF_TORCH if ours is choice), "")
+
+
+def widths_of(given: Any) -> tuple[int, ...] | None:
+    """:return: widths of layers as Python has them; None unless all are whole numbers above 0"""
+    if isinstance(given, np.ndarray):
+        given = given.tolist()
+    if not isinstance(given, Sequence):
+        return None
+    if not all(isinstance(width, int | np.integer) and width > 0 for width in given):
+        return None
+    return tuple(map(int, given))
 
 
 class Actor(nn.Module):

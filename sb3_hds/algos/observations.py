@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
 from jaxtyping import Array, Float
-from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_hds.errors import EnvironmentMismatchError
 
@@ -58,7 +57,7 @@ def check_observations(space: spaces.Space) -> None:
     parts = space.spaces.items() if isinstance(space, spaces.Dict) else [("", space)]
     for name, part in parts:
         what = f"Observation '{name}'" if name else "The observation"
-        if isinstance(part, spaces.Box) and (is_image_space(part) or len(part.shape) > 2):
+        if isinstance(part, spaces.Box) and (len(part.shape) > 2 or _is_gray_image(part)):
             raise EnvironmentMismatchError(
                 f"{what} is an image ({part}), and the networks here have no convolutions. Use "
                 "SBX's or SB3's CnnPolicy, or observe features of it."
@@ -71,6 +70,12 @@ def check_observations(space: spaces.Space) -> None:
                 "MultiDiscrete, MultiBinary, and Dict of these: "
                 "gymnasium.wrappers.FlattenObservation makes one of most others."
             )
+
+
+def _is_gray_image(space: spaces.Box) -> bool:
+    """Without an axis of channels, which SB3 expects of an image."""
+    of_bytes = space.dtype == np.uint8 and bool((space.low == 0).all() & (space.high == 255).all())
+    return len(space.shape) == 2 and of_bytes
 
 
 def size_of(space: spaces.Space) -> int:

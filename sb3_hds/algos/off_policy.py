@@ -94,6 +94,11 @@ class Report(NamedTuple):
     ent_coef: Loss
     ent_coef_loss: Loss
 
+    @classmethod
+    def nothing(cls) -> "Report":
+        """:return: before any update"""
+        return cls(*(jnp.zeros(()) for _ in cls._fields))
+
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
@@ -319,20 +324,25 @@ def begin(recipe: Recipe, n_obs: int, n_act: int, ent_coef: float, key: PRNGKeyA
 
 @partial(jax.jit, static_argnums=0)
 def update(
-    recipe: Recipe, learner: Learner, batches: Batch, n: int | Array, knobs: Knobs
+    recipe: Recipe,
+    learner: Learner,
+    batches: Batch,
+    n: int | Array,
+    knobs: Knobs,
+    report: Report,
 ) -> tuple[Learner, Report]:
     """
     :param batches: with a leading axis of at least ``n`` batches; the rest is not looked at, so
         that different ``n`` share a compiled program
     :param n: how many updates, at least 1
+    :param report: of the updates before
     """
 
     def one(i: Array, carry: tuple[Learner, Report]) -> tuple[Learner, Report]:
         learner, report = carry
         return update_once(recipe, learner, jax.tree.map(lambda x: x[i], batches), knobs, report)
 
-    zero = jnp.zeros(())
-    before = learner, Report(zero, zero, zero, zero)
+    before = learner, report
     if len(batches.reward) == 1:  # without a loop, whose carry would be copied
         return one(jnp.zeros((), jnp.int32), before)
     return jax.lax.fori_loop(0, n, one, before)

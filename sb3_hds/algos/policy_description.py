@@ -35,7 +35,7 @@ def described(policy: TensorPolicy) -> dict[str, Any] | None:
             "arguments": arguments,
             "state": dict(policy.plain_state),
         }
-        return json.loads(json.dumps(description))
+        return json.loads(json.dumps(description, default=_plain))
     except TypeError:
         return None
 
@@ -83,6 +83,16 @@ def space_from_plain(plain: Mapping[str, Any]) -> spaces.Space:
             # Sorted names would be another order of a flat observation.
             return spaces.Dict(list(parts.items()))  # type: ignore[arg-type]
     raise KeyError(plain["kind"])
+
+
+def _plain(value: Any) -> Any:
+    """
+    :return: a number or an array of NumPy as Python has it
+    :raises TypeError: for anything else
+    """
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} is no plain data.")
 
 
 def _name_of(choice: Any) -> Any:

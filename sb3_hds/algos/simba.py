@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any, ClassVar
 
+import numpy as np
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
@@ -59,6 +60,11 @@ class SimbaSAC(SoftActorCritic):
             ent_coef=ent_coef,
             **arguments,
         )
+
+    def check_arguments(self) -> None:
+        super().check_arguments()
+        fine = isinstance(self.clipped_double_q, bool | np.bool_)
+        self.refuse_unless(fine, "clipped_double_q", "True or False")
 
     def auto_target_entropy(self) -> float:
         return -0.5 * self.policy.n_act

@@ -91,11 +91,11 @@ class SoftActorCritic(ModelFreeAlgorithm):
         self.policy.learner = self.policy.learner._replace(**kept)
 
     def _updates(self, n: int, batch_size: int) -> dict[str, float]:
-        policy, knobs, report = self.policy, self.knobs(), {}
+        policy, knobs, report, found = self.policy, self.knobs(), {}, Report.nothing()
         for done in range(0, n, _MOST_UPDATES):
             now = min(_MOST_UPDATES, n - done)
             batches = batches_of(self, now, batch_size, _capacity(now))
-            learner, found = update(policy.recipe, policy.learner, batches, now, knobs)
+            learner, found = update(policy.recipe, policy.learner, batches, now, knobs, found)
             report = finite(_plain(found))
             policy.learner = learner
         return report

@@ -7,13 +7,15 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 
-from sb3_hds.algos.call_forms import between, is_count, jax_device
+from sb3_hds.algos.call_forms import between, check_count, is_count, jax_device
 from sb3_hds.algos.gaussian_policy import optimizer_of, widths
 from sb3_hds.algos.lap import LapReplayBuffer
 from sb3_hds.algos.learner import GENERATOR
@@ -38,21 +40,16 @@ from sb3_hds.algos.td7_update import (
     update,
 )
 
-# Of the policy's constructor: what is no argument, or is kept as state.
-_NO_ARGUMENTS = (
-    "self",
-    "observation_space",
-    "action_space",
-    "__class__",
-    "use_sde",
-    "uses_checkpoints",
-)
+# Of the policy's constructor: what is no argument.
+_NO_ARGUMENTS = ("self", "observation_space", "action_space", "__class__", "use_sde")
+# The name of ``Checkpoint.kept`` among the tensors of a policy.
+_KEPT = "checkpoint.kept"
 
 
 class TD7Policy(LearningPolicy):
     """
     ``"MlpPolicy"`` of TD7: encoder, actor and two critics. Where nothing is explored, the policy
-    of the last checkpoint acts.
+    of the last checkpoint acts, once one was kept.
 
     :param observation_space: a Box, or choices, which become one-hot
     :param action_space: a bounded Box of any shape
@@ -66,7 +63,7 @@ class TD7Policy(LearningPolicy):
         of torch
     :param optimizer_kwargs: besides the learning rate
     :param use_sde: accepted for SB3's sake; the policy is deterministic
-    :param uses_checkpoints: whether that of the last checkpoint acts; its algorithm says so
+    :raises ValueError: for arguments out of range
     """
 
     held = ("copies", "checkpoint")
@@ -85,12 +82,13 @@ class TD7Policy(LearningPolicy):
         optimizer_class: str | Callable[..., Any] = "adam",
         optimizer_kwargs: Mapping[str, Any] | None = None,
         use_sde: bool = False,
-        uses_checkpoints: bool = False,
     ) -> None:
         self.arguments = {
             name: value for name, value in locals().items() if name not in _NO_ARGUMENTS
         }
         super().__init__(observation_space, action_space, squash_output=True)
+        check_count("n_critics", n_critics)
+        check_count("embedding_size", embedding_size)
         pi, qf = widths(net_arch, "qf")
         of_values = activation(qf_activation_fn)
         self.n_obs = size_of(observation_space)
@@ -106,7 +104,6 @@ class TD7Policy(LearningPolicy):
             "qf_optimizer": optimizer,
         }
         self.flatten = flattener(observation_space)
-        self.uses_checkpoints = uses_checkpoints
 
     def build_plain(self) -> None:
         """That of the paper."""
@@ -123,27 +120,41 @@ class TD7Policy(LearningPolicy):
         self.learner = jax.device_put(begin(recipe, self.n_obs, self.n_act, key), device)
 
     @property
-    def plain_state(self) -> dict[str, bool]:  # type: ignore[override]
-        return {"uses_checkpoints": self.uses_checkpoints}
+    def plain_state(self) -> Mapping[str, bool]:  # type: ignore[override]
+        """Empty; of older files, it says what their tensors do not: whether a checkpoint acts."""
+        return {}
 
     @plain_state.setter
     def plain_state(self, state: Mapping[str, bool]) -> None:
-        self.uses_checkpoints = bool(state["uses_checkpoints"])
+        if state.get("uses_checkpoints", False):
+            self.keep_checkpoint()
 
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return super()._get_constructor_parameters() | self.plain_state
+    def load_state_dict(self, state_dict: dict, strict: bool = True, assign: bool = False) -> None:
+        """Tensors that do not say whether a checkpoint was kept leave that as it is."""
+        own = {_KEPT: th.as_tensor(self.has_checkpoint)}
+        super().load_state_dict(own | state_dict, strict, assign)
+
+    @property
+    def has_checkpoint(self) -> bool:
+        """Whether a checkpoint was kept, which then acts where nothing is explored."""
+        return bool(self.learner.checkpoint.kept)
 
     def keep_checkpoint(self) -> None:
-        """The policy as it is acts where nothing is explored."""
+        """The policy as it is acts from now on where nothing is explored."""
         learner = self.learner
-        checkpoint = Checkpoint(learner.copies.encoder, learner.actor.weights)
+        checkpoint = Checkpoint(learner.copies.encoder, learner.actor.weights, jnp.asarray(True))
         self.learner = learner._replace(checkpoint=checkpoint)
+
+    def drop_checkpoint(self) -> None:
+        """The policy as it is at the time acts, explored or not."""
+        checkpoint = self.learner.checkpoint._replace(kept=jnp.asarray(False))
+        self.learner = self.learner._replace(checkpoint=checkpoint)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
         learner = self.learner
         weights = learner.copies.encoder, learner.actor.weights
-        if deterministic and self.uses_checkpoints:
-            weights = learner.checkpoint
+        if deterministic and self.has_checkpoint:
+            weights = learner.checkpoint.encoder, learner.checkpoint.actor
         return np.asarray(_act(self.recipe, *weights, self.flatten(observation)))
 
     def critic(self, obs: Any, actions: Any) -> tuple[np.ndarray, ...]:
@@ -168,9 +179,11 @@ class TD7(ModelFreeAlgorithm):
 
     With checkpoints, as in the paper, a policy acts for whole episodes and is assessed by the worst
     of them, in rewards of the environment itself; only then it is updated, once for each step that
-    it made. That needs one environment, and ``gradient_steps`` is not looked at. Networks that
-    start afresh (``param_resets``) leave the checkpoint and its assessment as they are. SBX has no
-    TD7.
+    it made. That needs one environment, and ``gradient_steps`` is not looked at; nor, ever, is
+    ``tau``: target networks are copied whole. Networks that start afresh (``param_resets``) leave
+    the checkpoint and its assessment as they are. Where a model with a checkpoint goes on learning
+    without assessments, the first update drops it. Without a checkpoint, the policy as it is acts.
+    SBX has no TD7.
 
     Prioritised replay draws from SB3's plain buffer. With ``n_steps`` above 1, Dict observations,
     ``optimize_memory_usage`` or a buffer of one's own (``HerReplayBuffer``), transitions are drawn
@@ -180,6 +193,8 @@ class TD7(ModelFreeAlgorithm):
     :param policy: ``"MlpPolicy"``, a policy class, or the environment itself
     :param env: an environment, its id, or a vectorised environment
     :param learning_starts: steps with random actions before learning starts
+    :param train_freq: steps between two calls of ``train``, or ``(n, "episode")``; None: one
+        episode where policies are assessed, one step where not
     :param policy_delay: updates of the critics for each of the actor
     :param target_update_interval: updates between two copies into the target networks
     :param target_policy_noise: standard deviation of the noise on the target policy's actions,
@@ -236,14 +251,15 @@ class TD7(ModelFreeAlgorithm):
         self.reset_weight = reset_weight
         self.assessed_episodes, self.assessed_steps = 0, 0
         self.worst_return, self.best_worst_return = np.inf, -np.inf
-        self._episode_return, self._episode_length = 0.0, 0
         self._finished: list[tuple[float, int]] = []
+        self._begin_episode()
         self._chosen_freq = train_freq
+        self._derived_noise: ActionNoise | None = None
         super().__init__(
             policy,
             env,
             learning_starts=learning_starts,
-            train_freq=1 if train_freq is None else train_freq,
+            train_freq=train_freq,  # type: ignore[arg-type]  # None until it is derived
             policy_delay=policy_delay,
             action_noise=action_noise,
             replay_buffer_class=replay_buffer_class,
@@ -300,14 +316,31 @@ class TD7(ModelFreeAlgorithm):
         plain = self.n_steps == 1 and not self.optimize_memory_usage and not is_dict
         if plain and self.replay_buffer_class is None:
             self.replay_buffer_class = LapReplayBuffer
-        if self._chosen_freq is None:
-            self.train_freq = (1, "episode") if self.assesses else 1  # type: ignore[assignment]
+        self._choose_train_freq()
         super()._setup_model()
-        self.policy.uses_checkpoints = self.assesses
+        if self.best_worst_return > -np.inf:
+            # ``load`` comes by here; older files say only what their checkpoint was worth.
+            self.policy.keep_checkpoint()
         if self.action_noise is None and self.exploration_noise:
             # SB3 adds it to actions of the space's shape.
             size = np.full(self.policy.action_shape, self.exploration_noise, np.float32)
             self.action_noise = NormalActionNoise(np.zeros_like(size), size)
+            self._derived_noise = self.action_noise
+
+    def _choose_train_freq(self) -> None:
+        """What ``load`` was passed counts; what it read, only where it was passed before."""
+        given: Any = self.train_freq
+        if given is not None and not isinstance(given, TrainFreq):
+            self._chosen_freq = given
+        elif self._chosen_freq is None or given is None:
+            self.train_freq = (1, "episode") if self.assesses else 1  # type: ignore[assignment]
+
+    def _excluded_save_params(self) -> list[str]:
+        """The noise that ``exploration_noise`` means is derived from it again."""
+        excluded = [*super()._excluded_save_params(), "_derived_noise"]
+        # With several environments, SB3 has one for each of them.
+        noise = getattr(self.action_noise, "base_noise", self.action_noise)
+        return excluded if noise is not self._derived_noise else [*excluded, "action_noise"]
 
     def _build(self, seed: int) -> None:
         self.policy.build(self.recipe(), seed, jax_device(self._device_name))
@@ -317,15 +350,27 @@ class TD7(ModelFreeAlgorithm):
         before = self.policy.learner
         self._build(seed)
         kept: dict[str, Any] = {"n_updates": before.n_updates}
-        if self.assesses:
+        if before.checkpoint.kept:
             kept["checkpoint"] = before.checkpoint
         self.policy.learner = self.policy.learner._replace(**kept)
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         if self.assesses:
             gradient_steps = self._assessed()
+        elif gradient_steps > 0:
+            self._forget_assessments()
         if gradient_steps > 0:
             super().train(gradient_steps, batch_size)
+
+    def _forget_assessments(self) -> None:
+        """What is updated without being assessed has left the checkpoint behind."""
+        if self.policy.has_checkpoint:
+            self.policy.drop_checkpoint()
+        self._finished, self.best_worst_return = [], -np.inf
+        self._begin_assessment()
+
+    def _begin_assessment(self) -> None:
+        self.assessed_episodes, self.assessed_steps, self.worst_return = 0, 0, np.inf
 
     def _assessed(self) -> int:
         """
@@ -349,15 +394,14 @@ class TD7(ModelFreeAlgorithm):
         due = self.assessed_steps
         if not late and self._n_updates + due >= self.updates_before_checkpointing:
             self.best_worst_return *= self.reset_weight
-        self.assessed_episodes, self.assessed_steps, self.worst_return = 0, 0, np.inf
+        self._begin_assessment()
         return due
 
     def _updates(self, n: int, batch_size: int) -> dict[str, float]:
         """One after the other: what is drawn depends on the errors of the update before."""
         buffer: Any = self.replay_buffer
         rates, policy = self.learning_rates(), self.policy
-        zero = jnp.zeros(())
-        report, found = {}, Report(zero, zero, zero)
+        report, found = {}, Report.nothing()
         for i in range(n):
             batch, drawn = self._drawn(batch_size)
             learner, found, priorities = update(policy.recipe, policy.learner, batch, *rates, found)
@@ -388,6 +432,8 @@ class TD7(ModelFreeAlgorithm):
         infos: list[dict[str, Any]],
     ) -> None:
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        if not self.assesses:
+            return
         normalizer = self.get_vec_normalize_env()
         # The scale of normalised rewards drifts, and an assessment may be compared much later.
         earned = reward if normalizer is None else normalizer.get_original_reward()
@@ -397,7 +443,24 @@ class TD7(ModelFreeAlgorithm):
             # What random actions earned says nothing of a policy.
             if self.num_timesteps - self._episode_length >= self.learning_starts:
                 self._finished.append((self._episode_return, self._episode_length))
-            self._episode_return, self._episode_length = 0.0, 0
+            self._begin_episode()
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if reset_num_timesteps or self._last_obs is None:  # SB3 resets the environment
+            self._begin_episode()
+        return super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+
+    def _begin_episode(self) -> None:
+        self._episode_return, self._episode_length = 0.0, 0
 
 
 @partial(jax.jit, static_argnums=0)

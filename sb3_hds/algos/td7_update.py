@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, cast
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sb3_hds.algos.networks import Activation
 from sb3_hds.algos.off_policy import Batch, Optimizer, Trained, Weights
@@ -162,10 +162,15 @@ class Copies(NamedTuple):
 
 
 class Checkpoint(NamedTuple):
-    """What acts where nothing is explored."""
+    """
+    What acts where nothing is explored.
+
+    :param kept: whether there is one; before, its weights mean nothing
+    """
 
     encoder: Weights
     actor: Weights
+    kept: Bool[Array, ""]
 
 
 class Learner(NamedTuple):
@@ -173,7 +178,8 @@ class Learner(NamedTuple):
     Everything that an update changes.
 
     :param clip: range of values to which next values are clipped
-    :param range: of targets since the last copy
+    :param range: of all targets so far, as in the authors' code, which never begins it anew;
+        ``clip`` becomes it with each copy
     """
 
     encoder: Trained
@@ -194,6 +200,11 @@ class Report(NamedTuple):
     actor_loss: Float[Array, ""]
     encoder_loss: Float[Array, ""]
 
+    @classmethod
+    def nothing(cls) -> "Report":
+        """:return: before any update"""
+        return cls(*(jnp.zeros(()) for _ in cls._fields))
+
 
 def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
     """:return: fresh networks and optimisers"""
@@ -210,7 +221,7 @@ def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
         actor=Trained(actor, recipe.optimizer.init(actor["params"])),
         critic=Trained(critic, recipe.qf_optimizer.init(critic["params"])),
         copies=Copies(encoder, actor, critic, encoder),
-        checkpoint=Checkpoint(encoder, actor),
+        checkpoint=Checkpoint(encoder, actor, jnp.asarray(False)),
         clip=Range(zero, zero),
         range=Range(infinite, -infinite),
         key=key,

@@ -6,6 +6,7 @@ from typing import Any
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
+from sb3_hds.algos.call_forms import check_count, is_count
 from sb3_hds.algos.off_policy import Recipe, Truncated, mean, quantile_huber
 from sb3_hds.algos.soft_actor_critic import SoftActorCritic
 
@@ -52,8 +53,10 @@ class TQC(SoftActorCritic):
     def check_arguments(self) -> None:
         super().check_arguments()
         n, n_quantiles = self.top_quantiles_to_drop_per_net, self.policy_kwargs["n_quantiles"]
-        if not 0 <= n < n_quantiles:
+        check_count("n_quantiles", n_quantiles)
+        if not (is_count(n, 0) and n < n_quantiles):
             raise ValueError(
-                f"top_quantiles_to_drop_per_net must be at least 0 and below the {n_quantiles} "
-                f"quantiles of a critic (policy_kwargs={{'n_quantiles': ...}}), got {n!r}."
+                "top_quantiles_to_drop_per_net must be a whole number of at least 0 and below the "
+                f"{n_quantiles} quantiles of a critic (policy_kwargs={{'n_quantiles': ...}}), got "
+                f"{n!r}."
             )

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_hds.algos.learner import GENERATOR, Networks, Progress, fresh_networks
-from sb3_hds.algos.networks import Activation, Actor, Value, activation
+from sb3_hds.algos.networks import Activation, Actor, Value, activation, widths_of
 from sb3_hds.algos.persistence import TensorPolicy, TrainingTensors
 
 _POLICY_WIDTHS, _VALUE_WIDTHS = (96, 96), (64, 64)
@@ -132,13 +132,10 @@ def _widths(
     given = net_arch if isinstance(net_arch, dict) else {"pi": net_arch, "vf": net_arch}
     usual = {"pi": _POLICY_WIDTHS, "vf": _VALUE_WIDTHS}
     widths = usual | {name: some for name, some in given.items() if some is not None}
-    if widths.keys() != usual.keys() or not all(map(_are_widths, widths.values())):
+    pi, vf = (widths_of(widths[name]) for name in usual)
+    if widths.keys() != usual.keys() or pi is None or vf is None:
         raise ValueError(
             "net_arch must be a list of widths such as [64, 64], or {'pi': [64, 64], 'vf': [64]}, "
             f"got {net_arch!r}."
         )
-    return tuple(widths["pi"]), tuple(widths["vf"])
-
-
-def _are_widths(some: Any) -> bool:
-    return isinstance(some, Sequence) and all(isinstance(w, int) and w > 0 for w in some)
+    return pi, vf
