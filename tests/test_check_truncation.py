@@ -362,3 +362,11 @@ def test_other_things_are_refused():
 def test_failures_that_are_told_as_time_outs_pass_for_time_outs():
     # What an end means cannot be seen from outside.
     assert check_truncation(TerminateToTruncate(Drawn(0.1))).ok
+
+
+def test_a_vector_environment_whose_copies_cannot_be_reset_alone_is_a_problem():
+    copies = gymnasium.make_vec("CartPole-v1", 2, "sync")
+
+    report = check_truncation(gymnasium.wrappers.vector.NormalizeObservation(copies))
+
+    assert not report.ok and "VecNormalize" in report.problems[0]

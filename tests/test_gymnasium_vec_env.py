@@ -325,3 +325,27 @@ def test_gymnasiums_own_statistics_are_kept():
 
     assert dones.tolist() == [length_of(copy, 0) == 1 for copy in range(N)]
     assert float(infos[0]["episode"]["l"]) == 1.0 and "episode" not in infos[1]
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
+def test_statistics_that_begin_anew_in_all_copies_are_not_those_that_are_logged(mode):
+    counted = gymnasium.wrappers.vector.RecordEpisodeStatistics(sync(mode))
+    with_theirs, with_ours = GymnasiumVecEnv(counted), GymnasiumVecEnv(sync(mode))
+    with_theirs.reset(), with_ours.reset()
+
+    for _ in range(30):
+        _, _, dones, infos = with_theirs.step(np.zeros((N, 1), np.float32))
+        expected = with_ours.step(np.zeros((N, 1), np.float32))[3]
+        for i in np.flatnonzero(dones):
+            assert infos[i]["episode"]["l"] == expected[i]["episode"]["l"]
+            assert infos[i]["episode"]["r"] == pytest.approx(expected[i]["episode"]["r"])
+
+
+def test_normalisation_of_gymnasium_that_cannot_reset_single_copies_says_so():
+    copies = gymnasium.make_vec("CartPole-v1", 2, "sync")
+    env = GymnasiumVecEnv(gymnasium.wrappers.vector.NormalizeObservation(copies))
+    env.reset()
+
+    with pytest.raises(RuntimeError, match="VecNormalize above this adapter"):
+        for _ in range(500):
+            env.step(np.zeros(2, int))

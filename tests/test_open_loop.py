@@ -11,7 +11,14 @@ from small_models import logged, same, saved, small
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecExtractDictObs,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+)
 
 from sb3_hds import OpenLoop, twins
 from sb3_hds.algos import gait_search
@@ -420,6 +427,45 @@ def test_where_single_copies_cannot_be_reset_whole_episodes_are_run(kind):
 
     assert int(model.policy.search.generation) == 1
     assert model.num_timesteps == 2 * steps + 2
+
+
+def test_episodes_that_were_cut_off_are_not_added_up_in_a_monitor_above():
+    env = VecMonitor(DummyVecEnv([Tune, Tune]))
+    # The last of three resets leaves one copy to itself until its episode ends.
+    model = OpenLoop("MlpPolicy", env, seed=0, population_size=3, n_resets=1, horizon=30)
+
+    model.learn(1000)
+
+    told = [episode["l"] for episode in model.ep_info_buffer]
+    assert told and max(told) <= 40
+
+
+class Labelled(gymnasium.ObservationWrapper):
+    """A dictionary around what is observed."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = spaces.Dict({"state": env.observation_space})
+
+    def observation(self, observation):
+        return {"state": observation}
+
+
+def test_commands_come_from_where_joints_are_below_a_chosen_entry(monkeypatch):
+    env = DummyVecEnv([lambda: Labelled(gymnasium.make("Swimmer-v5", max_episode_steps=30))])
+    settings = {"seed": 0, "population_size": 3, "n_resets": 1, "joints": "observation"}
+    model = OpenLoop("MlpPolicy", VecExtractDictObs(env, "state"), horizon=20, **settings)
+    command, stale = model.policy.command, []
+
+    def watched(targets, observations, kp, kd):
+        true = env.envs[0].unwrapped.data.qpos[2:5]
+        stale.append(np.abs(observations[0, :3] - true).max() > 1e-6)
+        return command(targets, observations, kp, kd)
+
+    monkeypatch.setattr(model.policy, "command", watched)
+    model.learn(200)
+
+    assert len(stale) == 200 and not any(stale)
 
 
 def test_a_reward_that_is_not_finite_is_an_error_and_no_result():

@@ -11,7 +11,10 @@ from stable_baselines3.common.vec_env import (
     SubprocVecEnv,
     VecEnv,
     VecEnvWrapper,
+    VecExtractDictObs,
     VecFrameStack,
+    VecMonitor,
+    VecNormalize,
 )
 
 from sb3_hds.algos.gait_space import Constants
@@ -96,6 +99,7 @@ class Trials:
         trial = waiting.popleft()
         if self._one_by_one:
             [(obs, _)] = self._env.env_method("reset", seed=trial.seed, indices=[copy])
+            _forget_episode(self._env, copy)
             seen = self._model._last_obs
             if isinstance(seen, np.ndarray) and np.shape(obs) == seen.shape[1:]:
                 seen[copy] = obs
@@ -132,10 +136,20 @@ class Trials:
 def can_reset_one(env: VecEnv) -> bool:
     """:return: whether a single copy can be reset, with a seed, and nothing above it minds"""
     while isinstance(env, VecEnvWrapper):
-        if isinstance(env, VecFrameStack):
+        if isinstance(env, VecFrameStack | VecExtractDictObs):
             return False
         env = env.venv
     return isinstance(env, DummyVecEnv | SubprocVecEnv)
+
+
+def _forget_episode(env: VecEnv, copy: int) -> None:
+    """What wrappers above have added up of an episode that was cut off is none of the next one."""
+    while isinstance(env, VecEnvWrapper):
+        if isinstance(env, VecMonitor):
+            env.episode_returns[copy], env.episode_lengths[copy] = 0.0, 0
+        elif isinstance(env, VecNormalize):
+            env.returns[copy] = 0.0
+        env = env.venv
 
 
 def _owned(observation: Any) -> Any:

@@ -39,7 +39,7 @@ class GymnasiumVecEnv(VecEnv):
     ``reset(options={"reset_mask": ...})``. Whether the other copies stand still is checked.
 
     ``infos[i]["episode"]`` is return, length and time of an ended episode, as from SB3's
-    ``Monitor``, unless the environment gives its own. As in Gymnasium, asking the copies of an
+    ``Monitor``, unless the environment gives its own, of the same length. As in Gymnasium, asking the copies of an
     ``AsyncVectorEnv`` for an attribute that they do not have ends their processes.
 
     :param env: as from ``gymnasium.make_vec``
@@ -107,7 +107,7 @@ class GymnasiumVecEnv(VecEnv):
             info["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
             if dones[i]:
                 info["terminal_observation"] = last[i]
-                info.setdefault("episode", self._episode(i))
+                info["episode"] = self._episode(i, info.get("episode"))
         self._returns[dones], self._lengths[dones] = 0.0, 0
         return obs, rewards, dones, infos
 
@@ -146,9 +146,22 @@ class GymnasiumVecEnv(VecEnv):
         return copied(obs)
 
     def _reset_by_mask(self, which: np.ndarray) -> tuple[Any, Any]:
-        return self.env.reset(options={"reset_mask": which})
+        try:
+            return self.env.reset(options={"reset_mask": which})
+        except ValueError as error:
+            raise RuntimeError(
+                f"{self.env} does not let some of its copies be reset alone ({error}). Normalise "
+                "with SB3's VecNormalize above this adapter instead, or use "
+                "autoreset_mode=SAME_STEP, or pass partial_reset=."
+            ) from error
 
-    def _episode(self, i: int) -> dict[str, float]:
+    def _episode(self, i: int, told: Any) -> dict[str, float]:
+        """
+        :param told: what the environment says of the episode; Gymnasium's vectorised
+            ``RecordEpisodeStatistics`` begins to count anew in all copies where one is reset
+        """
+        if isinstance(told, dict) and told.get("l") == self._lengths[i]:
+            return told
         elapsed = round(time.time() - self._started, 6)
         return {"r": round(float(self._returns[i]), 6), "l": int(self._lengths[i]), "t": elapsed}
 
