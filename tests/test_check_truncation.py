@@ -224,6 +224,15 @@ def test_a_step_of_four_values_is_found():
     assert "With a single 'done', a time-out cannot be told from a failure" in text
 
 
+class OldReset(OldStyle):
+    def reset(self):
+        return super().reset(seed=0)[0]
+
+
+def test_a_reset_without_a_seed_is_found():
+    assert "(obs, info) from reset(seed=..., options=...)" in problem(OldReset(limit=LIMIT))
+
+
 def test_where_nothing_ends_it_says_so():
     text = problem(Drawn())
 

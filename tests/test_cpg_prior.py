@@ -405,6 +405,12 @@ def test_a_push_is_a_force_on_the_torso_in_some_steps_only():
     assert abs(pushed.mean() - 0.25) < 3.0 * np.sqrt(0.25 * 0.75 / 400)
 
 
+@pytest.mark.parametrize("name", ["noise", "constant", "push", "push_probability"])
+def test_a_disturbance_that_is_no_number_is_refused(name):
+    with pytest.raises(ParameterError, match=f"{name}=nan"):
+        perturbed(**{name: np.nan})
+
+
 @pytest.mark.parametrize("settings", [{"noise": 0.1}, {"failing": "zero"}, {"push": 5.0}], ids=str)
 def test_the_checkers_accept_perturbed_environments(settings):
     gymnasium_check(perturbed(**settings), skip_render_check=True)

@@ -299,6 +299,30 @@ def test_the_progress_of_a_schedule_can_be_set_from_outside():
     assert infos[0]["correction"] == pytest.approx(0.0, abs=1e-6)
 
 
+def test_a_schedule_may_begin_where_training_ended():
+    env = ActionScale(joints(1), schedule=[[0, 0.2], [4, 1.0]], progress=1.0)
+
+    for seed in (0, None):
+        env.reset(seed=seed)
+        assert env.step(np.array([5.0], np.float32))[-1]["safe_action"] == pytest.approx(5.0)
+
+
+class InDictionary(gymnasium.ObservationWrapper):
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = spaces.Dict({"joints": env.observation_space})
+
+    def observation(self, observation):
+        return {"joints": observation}
+
+
+def test_layers_that_need_a_vector_say_what_helps():
+    with pytest.raises(ParameterError, match=r"FlattenObservation\)\.$"):
+        HistoryObservation(InDictionary(joints(1)))
+    with pytest.raises(ParameterError, match="FlattenObservation"):
+        JointLimitBarrier(InDictionary(joints(1)), -1.0, 1.0)
+
+
 def test_a_history_holds_what_was_seen_and_done_the_latest_first():
     env = HistoryObservation(joints(1), n_observations=2, n_actions=2)
     obs, _ = env.reset(seed=0, options={"q": [0.0]})
@@ -329,7 +353,7 @@ def test_a_continuity_cost_is_the_squared_change_of_the_action():
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda env: ActionRateLimit(env, -1.0), "max_change must be positive"),
+        (lambda env: ActionRateLimit(env, -1.0), "max_rate must be above 0"),
         (lambda env: ActionRateLimit(env, [1.0, 1.0, 1.0]), "3 values of max_change"),
         (lambda env: LowPassAction(env, 10.0), "below 10 Hz"),
         (lambda env: LowPassAction(env, 1.0, 9), "whole number from 1 to 8"),
@@ -338,6 +362,8 @@ def test_a_continuity_cost_is_the_squared_change_of_the_action():
         (lambda env: ActionScale(env), "either a scale or a schedule"),
         (lambda env: ActionScale(env, 1.5), "at most 1"),
         (lambda env: ActionScale(env, schedule=[[5, 0.1]]), "growing from 0"),
+        (lambda env: ActionScale(env, schedule=[[0, 0.2], [10]]), "list of pairs"),
+        (lambda env: ActionScale(env, schedule=[[0, 0.2]], progress=2.0), "from 0 to 1"),
         (lambda env: HistoryObservation(env, 0, 0), "must be positive"),
         (lambda env: ContinuityCost(env, -1.0), "at least 0"),
         (lambda env: ActionRateLimit(env, 1.0, store="both"), "store must be one of"),
@@ -559,6 +585,11 @@ def test_an_episode_that_begins_outside_is_reported_as_asked(on_breach):
         ({"low": -1.0, "high": 1.0, "share": 0.0}, "share must be above 0"),
         ({"low": -4.0, "high": 1.0, "position": [[0, 0]]}, "half a turn"),
         ({"low": -1.0, "high": 1.0, "tolerance": 0.6}, "high must be above low by more than 2.4"),
+        ({"low": -1.0, "high": 1.0, "position": []}, "position is a list"),
+        ({"low": -1.0, "high": 1.0, "position": 0}, "position is a list"),
+        ({"low": -1.0, "high": 1.0, "position": [[0, 0, 0]]}, "position is a list"),
+        ({"low": [-1.0, -1.0], "high": 1.0}, "one for each of the 1 joints"),
+        ({"low": -1.0, "high": 1.0, "gain": [1.0, 2.0]}, "one number for all joints"),
         ({"low": -1.0, "high": 1.0, "on_breach": "pray"}, "on_breach must be one of"),
     ],
 )
@@ -719,6 +750,10 @@ def test_a_mapping_may_depend_on_the_observation():
         ([Phase("a", np.eye(2), offset=[1.0])], "offset"),
         ([Phase("a", np.eye(2), transitions=[{"to": "b", "when": distances}])], "leads to"),
         ([Phase("a", np.eye(2), transitions=[{"to": "a", "when": {"channel": 9}}])], "condition"),
+        ([Phase("a", np.eye(2), transitions=[{"when": distances}])], "needs 'to'"),
+        ([Phase("a", np.eye(2), constraints=([[1.0, 0.0]], [-9.0]))], "No command between"),
+        ([{"name": "a", "map": np.eye(2)}], "A phase is a dictionary"),
+        ("ab", "A phase is a dictionary"),
     ],
 )
 def test_phases_that_do_not_fit_are_refused_at_the_door(phases, says):

@@ -142,7 +142,7 @@ def can_reset_one(env: VecEnv) -> bool:
     return isinstance(env, DummyVecEnv | SubprocVecEnv)
 
 
-def _forget_episode(env: VecEnv, copy: int) -> None:
+def _forget_episode(env: Any, copy: int) -> None:
     """What wrappers above have added up of an episode that was cut off is none of the next one."""
     while isinstance(env, VecEnvWrapper):
         if isinstance(env, VecMonitor):

@@ -145,7 +145,7 @@ class OpenLoop(SavesTensors):
         self.ranking_share = ranking_share
         self.kp, self.kd, self.gain_factor = kp, kd, gain_factor
         self.amplitude, self.offset = amplitude, offset
-        self.frequency = [float(f) for f in frequency]
+        self.frequency = np.atleast_1d(np.asarray(frequency, float)).tolist()
         self.same_frequency, self.phases = same_frequency, phases
         self.control, self.joints, self.dt = control, joints, dt
         self.body: dict[str, Any] | None = None

@@ -79,6 +79,11 @@ class Barrier(StatefulTransform):
                     f"Barrier needs speeds that can be zero and of either sign; command {i} is not "
                     f"among those with such limits: {low.tolist()} to {high.tolist()}."
                 )
+        if not below.channels:
+            raise ParameterError(
+                "A barrier reads positions from observations that are a Box with one axis: flatten "
+                "them below (gymnasium.wrappers.FlattenObservation)."
+            )
         indices = [i for place in self.position for i in _indices(place)]
         if not all(0 <= i < len(below.channels) for i in indices):
             raise ParameterError(

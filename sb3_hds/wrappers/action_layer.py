@@ -1,6 +1,7 @@
 """What all layers between a policy and the commands of an environment have in common."""
 
 import abc
+import inspect
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -256,10 +257,11 @@ def with_channels(
     :raises ParameterError: unless observations are a Box with one axis
     """
     if not isinstance(space, spaces.Box) or not is_vector(space):
+        switch = "observe_state" in inspect.signature(type(env).__init__).parameters
+        or_else = ", or pass observe_state=False: then the task is no longer Markov" * switch
         raise ParameterError(
             f"{type(env).__name__} adds to observations that are a Box with one axis, got {space}. "
-            "Flatten them below (gymnasium.wrappers.FlattenObservation), or pass "
-            "observe_state=False: then the task is no longer Markov."
+            f"Flatten them below (gymnasium.wrappers.FlattenObservation){or_else}."
         )
     dtype = np.result_type(space.dtype, np.float32) if space.dtype.kind == "f" else np.float32
     low = np.concatenate([space.low, [c.low for c in added]]).astype(dtype)

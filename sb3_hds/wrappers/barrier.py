@@ -79,8 +79,8 @@ class JointLimitBarrier(TransformLayer):
         }
         refuse_layers_below(type(self), env)
         self._on_breach = check_on_breach(type(self), on_breach)
-        n = len(position)
-        lows, highs = (np.broadcast_to(np.asarray(x, float), (n,)) for x in (low, high))
+        n = _count(position)
+        lows, highs = _one_each("low", low, n), _one_each("high", high, n)
         if tolerance is None:
             tolerance = _ROUNDING * float(np.max(np.abs([lows, highs])))
         self._barrier = Barrier(
@@ -88,9 +88,9 @@ class JointLimitBarrier(TransformLayer):
             high=highs.tolist(),
             position=position,
             action=list(range(n)) if action is None else action,
-            gain=float(gain),
-            share=float(share),
-            tolerance=float(tolerance),
+            gain=_number("gain", gain),
+            share=_number("share", share),
+            tolerance=_number("tolerance", tolerance),
             dt=interval_of(env, ParameterError) if dt is None else float(dt),
         )
         super().__init__(env, self._barrier, store, arguments)
@@ -129,6 +129,46 @@ class JointLimitBarrier(TransformLayer):
 
     def _breach(self, message: str) -> None:
         report_breach(self._on_breach, message)
+
+
+def _count(position: Any) -> int:
+    """
+    :return: how many joints are guarded
+    :raises ParameterError: unless each has an index, or those of its cosine and sine
+    """
+    places = position if isinstance(position, Sequence) and not isinstance(position, str) else []
+    if not places or not all(isinstance(p, int) or _is_pair(p) for p in places):
+        raise ParameterError(
+            f"JointLimitBarrier(position={position!r}): position is a list with, for each guarded "
+            "joint, the index of its position in the observation, or the two indices of its cosine "
+            "and sine, such as [0, [1, 2]]."
+        )
+    return len(places)
+
+
+def _is_pair(place: Any) -> bool:
+    return (
+        isinstance(place, Sequence) and len(place) == 2 and all(isinstance(i, int) for i in place)
+    )
+
+
+def _one_each(name: str, value: Any, n: int) -> np.ndarray:
+    try:
+        return np.broadcast_to(np.asarray(value, float), (n,))
+    except ValueError:
+        raise ParameterError(
+            f"JointLimitBarrier({name}={value!r}): {name} is one number, or one for each of the "
+            f"{n} joints that position names."
+        ) from None
+
+
+def _number(name: str, value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise ParameterError(
+            f"JointLimitBarrier({name}={value!r}): {name} is one number for all joints."
+        ) from None
 
 
 def report_breach(on_breach: str, message: str) -> None:

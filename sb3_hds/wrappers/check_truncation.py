@@ -21,6 +21,8 @@ _USUAL = 2_000
 # those after any number of steps in the last fifth before, and those after any other number.
 _FEWEST = 3
 _THAN_BEFORE, _THAN_ANY = 3.0, 1.5
+# What Python says where an environment keeps to Gym before 0.26.
+_OLD_SIGNS = ("values to unpack", "unexpected keyword argument 'seed'")
 
 
 class TruncationReport(Report):
@@ -67,13 +69,13 @@ def _of_env(env: gymnasium.Env, n_steps: int | None, seed: int) -> tuple[list, l
     limit = step_limit_of(env)
     try:
         seen = ends_of_env(env, n_steps or 4 * (limit or _USUAL // 4), seed)
-    except ValueError as error:
-        if "values to unpack" not in str(error):
+    except (ValueError, TypeError) as error:
+        if not any(sign in str(error) for sign in _OLD_SIGNS):
             raise
         old = (
             f"{env}.step() or reset() does not return what Gymnasium's do ({error}). With a single "
             "'done', a time-out cannot be told from a failure. Return (obs, reward, terminated, "
-            "truncated, info), and (obs, info) from reset()."
+            "truncated, info), and (obs, info) from reset(seed=..., options=...)."
         )
         return [old], [], Seen([], 0, False)
     problems = _only_in_info(seen) + _looks_like_a_limit(seen, limit)

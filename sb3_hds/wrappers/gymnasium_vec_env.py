@@ -39,8 +39,8 @@ class GymnasiumVecEnv(VecEnv):
     ``reset(options={"reset_mask": ...})``. Whether the other copies stand still is checked.
 
     ``infos[i]["episode"]`` is return, length and time of an ended episode, as from SB3's
-    ``Monitor``, unless the environment gives its own, of the same length. As in Gymnasium, asking the copies of an
-    ``AsyncVectorEnv`` for an attribute that they do not have ends their processes.
+    ``Monitor``, unless the environment gives its own, of the same length. As in Gymnasium, asking
+    the copies of an ``AsyncVectorEnv`` for an attribute that they do not have ends their processes.
 
     :param env: as from ``gymnasium.make_vec``
     :param autoreset_mode: ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``; None: what the

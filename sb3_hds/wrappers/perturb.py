@@ -49,11 +49,12 @@ class Perturb(gymnasium.Wrapper, RecordConstructorArgs):
         space = env.observation_space
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
             raise EnvironmentMismatchError(f"Perturb takes a Box with one axis, got {space}.")
-        if failing not in _FAILURES or noise < 0.0 or not 0.0 <= push_probability <= 1.0:
+        in_range = 0.0 <= noise < np.inf and 0.0 <= push_probability <= 1.0
+        if failing not in _FAILURES or not in_range or not np.isfinite([constant, push]).all():
             raise ParameterError(
-                f"Perturb(noise={noise}, failing={failing!r}, push_probability={push_probability}):"
-                " noise must be at least 0, failing None, 'zero' or 'constant', and the probability"
-                " from 0 to 1."
+                f"Perturb(noise={noise}, failing={failing!r}, constant={constant}, push={push}, "
+                f"push_probability={push_probability}): noise must be at least 0, failing None, "
+                "'zero' or 'constant', the probability from 0 to 1, and every number finite."
             )
         if sensor is not None and not 0 <= sensor < space.shape[0]:
             raise ParameterError(f"Sensor {sensor} is none of the {space.shape[0]} that there are.")

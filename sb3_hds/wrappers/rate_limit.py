@@ -33,7 +33,13 @@ class ActionRateLimit(TransformLayer):
         store: str = "raw",
     ) -> None:
         interval = interval_of(env, ParameterError) if dt is None else dt
-        most = (np.asarray(max_rate, float) * interval).tolist()
+        rates = np.asarray(max_rate, float)
+        if not (rates > 0.0).all():
+            raise ParameterError(
+                f"ActionRateLimit(max_rate={max_rate}): max_rate must be above 0, in units of the "
+                "action per second, one number or one for each."
+            )
+        most = (rates * interval).tolist()
         arguments = {
             "max_rate": max_rate,
             "dt": dt,

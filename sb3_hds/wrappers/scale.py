@@ -18,12 +18,14 @@ class ActionScale(TransformLayer):
 
     The action space stays as it is. With a schedule, its progress from 0 to 1 is appended to
     observations, and goes on over resets; a reset with a seed begins anew. An environment for
-    evaluation has a progress of its own: see :meth:`set_progress`.
+    evaluation has a progress of its own, which begins at 0 as well: pass ``progress=1.0`` there, or
+    see :meth:`set_progress`.
 
     :param env: its actions are a bounded Box with one axis
     :param scale: the share, above 0 and at most 1
     :param schedule: ``[[0, 0.3], [10_000, 1.0]]``: shares at step 0 and from step 10,000 on, linear
         between; instead of ``scale``
+    :param progress: where in the schedule it begins, from 0 to 1: 1 to act with what was trained
     :param observe_state: whether the progress is appended
     :param store: ``"executed"``: learners store the action that stands for what was executed below
     :raises ParameterError: for a share or a schedule out of range, or both
@@ -35,6 +37,7 @@ class ActionScale(TransformLayer):
         scale: float | None = None,
         schedule: Sequence[Sequence[float]] | None = None,
         *,
+        progress: float = 0.0,
         observe_state: bool = True,
         store: str = "raw",
     ) -> None:
@@ -46,13 +49,17 @@ class ActionScale(TransformLayer):
         arguments = {
             "scale": scale,
             "schedule": schedule,
+            "progress": progress,
             "observe_state": observe_state,
             "store": store,
         }
-        points = np.asarray([[0.0, scale]] if schedule is None else schedule, float)
-        self._scale = Scale(schedule=points.tolist(), observed=observe_state)
+        if not 0.0 <= progress <= 1.0:
+            raise ParameterError(f"ActionScale(progress={progress}): progress is from 0 to 1.")
+        points = [[0.0, scale]] if schedule is None else schedule
+        self._scale = Scale(schedule=_pairs(points), observed=observe_state)
         super().__init__(env, self._scale, store, arguments)
         self._begin_at = self._memory
+        self.set_progress(progress)
         self._share = float(np.squeeze(self._scale.share(self._memory)))
 
     def reset(
@@ -86,3 +93,17 @@ class ActionScale(TransformLayer):
     @property
     def _middle(self) -> np.ndarray:
         return 0.5 * (self.commands.low.astype(float) + self.commands.high)
+
+
+def _pairs(schedule: Any) -> list[list[float]]:
+    """
+    :return: steps and shares
+    :raises ParameterError: for anything but pairs of numbers
+    """
+    try:
+        return [[float(step), float(share)] for step, share in schedule]
+    except (TypeError, ValueError):
+        raise ParameterError(
+            f"ActionScale(schedule={schedule!r}): a schedule is a list of pairs of a step and a "
+            "share, such as [[0, 0.3], [10_000, 1.0]]."
+        ) from None

@@ -75,7 +75,7 @@ class SharedControlTemplate(ActionLayer):
         arguments = {"phases": phases, "observe_state": observe_state, "store": store}
         refuse_layers_below(type(self), env)
         super().__init__(env, store, arguments)
-        self.phases = [p if isinstance(p, Phase) else Phase(**p) for p in phases]
+        self.phases = [_phase_of(phase) for phase in phases]
         self._observes, self._index, self._seen = observe_state, 0, None
         self._violated = 0.0
         self._phase_of = {phase.name: i for i, phase in enumerate(self.phases)}
@@ -151,6 +151,20 @@ class SharedControlTemplate(ActionLayer):
                 return
 
 
+def _phase_of(given: Any) -> Phase:
+    """:raises ParameterError: for arguments that a phase does not have"""
+    if isinstance(given, Phase):
+        return given
+    names = [field.name for field in dataclasses.fields(Phase)]
+    found = set(given) if isinstance(given, Mapping) else set()
+    if not {"name", "mapping"} <= found <= set(names):
+        raise ParameterError(
+            f"A phase is a dictionary with 'name' and 'mapping' and, if needed, "
+            f"{', '.join(map(repr, names[2:]))}, got {given!r}."
+        )
+    return Phase(**given)
+
+
 class _Compiled:
     """A phase whose names have become functions and indices."""
 
@@ -172,8 +186,15 @@ class _Compiled:
         if phase.constraints is not None:
             label = f"Phase '{phase.name}'"
             self.constraints = ConstraintSet(label, phase.constraints, self._n)
+            self._refuse_what_nothing_satisfies(env.action_space)
         seen = env.observation_space
         n_obs = seen.shape[0] if isinstance(seen, spaces.Box) and is_vector(seen) else 0
+        for transition in phase.transitions:
+            if not isinstance(transition, Mapping) or set(transition) != {"to", "when"}:
+                raise ParameterError(
+                    f"Phase '{phase.name}' has the transition {transition!r}: it needs 'to', the "
+                    "name of a phase, and 'when', a condition, and nothing else."
+                )
         unknown = [t["to"] for t in phase.transitions if t["to"] not in phases]
         if unknown:
             raise ParameterError(
@@ -182,6 +203,17 @@ class _Compiled:
         self.transitions = [
             (condition_of(t["when"], n_obs), phases[t["to"]]) for t in phase.transitions
         ]
+
+    def _refuse_what_nothing_satisfies(self, commands: spaces.Space) -> None:
+        assert isinstance(commands, spaces.Box) and self.constraints is not None
+        if not self.constraints.is_constant:
+            return
+        ends = commands.low.astype(float), commands.high.astype(float)
+        if nearest(np.zeros(self._n), *self.constraints.at(None), *ends) is None:
+            raise ParameterError(
+                f"No command between {ends[0].tolist()} and {ends[1].tolist()} satisfies the "
+                f"constraints of phase '{self._phase}'."
+            )
 
     def matrix(self, obs: Any) -> np.ndarray:
         """:return: from inputs to commands, shape ``(n_commands, n_inputs)``"""
