@@ -345,6 +345,31 @@ def test_a_search_starts_from_the_constants_that_were_set_and_keeps_them_until_i
     assert model.constants["phase"] == SWIMMER["phase"]
 
 
+def test_legs_that_do_the_same_are_searched_as_one_each_ahead_by_its_lead():
+    env_id = "sb3_hds/ElasticQuadruped-v0"
+    model = OpenLoop("MlpPolicy", env_id, gait="trot", seed=0)
+    space = model.gait_space
+    point = np.random.default_rng(1).normal(size=space.dim)
+    gait = space.decode(point)
+
+    # Two joints in a leg: amplitudes, offsets, one phase between them, two frequencies.
+    assert space.dim == 2 + 2 + 1 + 2
+    np.testing.assert_allclose(gait.amplitude, np.tile(gait.amplitude[:2], 4))
+    np.testing.assert_allclose(gait.offset, np.tile(gait.offset[:2], 4))
+    cycle = np.pi / gait.omega_swing + np.pi / gait.omega_stance
+    ahead = target_at(Gait(*(jnp.asarray(part) for part in gait[:5])), 0.5 * cycle)
+    now = target_at(Gait(*(jnp.asarray(part) for part in gait[:5])), 0.0)
+    np.testing.assert_allclose(now[2:4], ahead[:2], atol=1e-4)
+    np.testing.assert_allclose(now[6:8], now[:2], atol=1e-4)
+    again = space.decode(space.encode(gait))
+    np.testing.assert_allclose(again.phase, gait.phase, atol=1e-4)
+
+
+def test_a_gait_of_legs_needs_joints_of_legs():
+    with pytest.raises(EnvironmentMismatchError, match="4 legs needs as many joints in each"):
+        OpenLoop("MlpPolicy", "HalfCheetah-v5", gait="trot")
+
+
 def test_points_and_gaits_are_two_names_of_the_same():
     space = GaitSpace(
         amplitude=np.array([1.0, 2.0]),
@@ -376,7 +401,7 @@ def test_the_ablations_of_the_paper_search_fewer_numbers():
     "settings",
     [{"horizon": None}, {"population_size": 1}, {"n_resets": 0}, {"frequency": [2.0, 1.0]},
      {"frequency": 3.0}, {"gain_factor": 0.5}, {"control": "maybe"}, {"kp": -1.0}, {"dt": 0.0},
-     {"amplitude": 0.0}],
+     {"gait": "gallop"}, {"gait": []}, {"amplitude": 0.0}],
     ids=str,
 )  # fmt: skip
 def test_an_argument_out_of_range_is_named_with_its_range(settings):

@@ -144,6 +144,7 @@ def space_of(
     gain_factor: float,
     same_frequency: bool,
     phases: bool,
+    leads: tuple[float, ...],
 ) -> GaitSpace:
     """
     :param amplitude: largest one: of a joint [rad] or [m]; where commands are direct, in shares of
@@ -162,6 +163,7 @@ def space_of(
         gain_factor=gain_factor if body.control == "track" else 1.0,
         same_frequency=same_frequency,
         phases=phases,
+        leads=leads,
     )
 
 

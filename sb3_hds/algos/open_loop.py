@@ -30,6 +30,7 @@ from sb3_hds.algos.gait_space import Constants, GaitSpace
 from sb3_hds.algos.gait_trials import Trial, Trials
 from sb3_hds.algos.oscillator_policy import OscillatorPolicy
 from sb3_hds.algos.saving import SavesTensors
+from sb3_hds.core.oscillators import LEADS
 from sb3_hds.errors import EnvironmentMismatchError, ParameterError
 
 
@@ -82,6 +83,9 @@ class OpenLoop(SavesTensors):
     :param frequency: smallest and largest [Hz]
     :param same_frequency: one for swing and stance
     :param phases: False: all joints move together
+    :param gait: all legs do the same, each with a lead of its own: ``"trot"``, ``"pace"``,
+        ``"bound"`` or ``"walk"`` of the legs front left, front right, hind left, hind right, or a
+        lead for each leg [rad]. Joints come leg by leg, of the same sense. None: each for itself
     :param control: ``"track"`` joints, ``"direct"`` commands, or ``"auto"``
     :param joints: read from the ``"observation"``, from the ``"env"``, or ``"auto"``
     :param dt: how long a step takes [s]; None: as the environment says
@@ -121,6 +125,7 @@ class OpenLoop(SavesTensors):
         frequency: Sequence[float] = (0.4, 4.0),
         same_frequency: bool = False,
         phases: bool = True,
+        gait: str | Sequence[float] | None = None,
         control: str = "auto",
         joints: str = "auto",
         dt: float | None = None,
@@ -147,6 +152,7 @@ class OpenLoop(SavesTensors):
         self.amplitude, self.offset = amplitude, offset
         self.frequency = np.atleast_1d(np.asarray(frequency, float)).tolist()
         self.same_frequency, self.phases = same_frequency, phases
+        self.gait = gait if gait is None or isinstance(gait, str) else list(gait)
         self.control, self.joints, self.dt = control, joints, dt
         self.body: dict[str, Any] | None = None
         super().__init__(
@@ -217,6 +223,12 @@ class OpenLoop(SavesTensors):
         if self.dt is not None:
             fine = between(self.dt, 0.0, math.inf) and self.dt > 0.0
             self._refuse_unless(fine, "dt", "a finite number above 0, or None")
+        if isinstance(self.gait, list):
+            fine = bool(self.gait) and all(between(x, -math.inf, math.inf) for x in self.gait)
+        else:
+            fine = self.gait is None or self.gait in LEADS
+        named = ", ".join(map(repr, LEADS))
+        self._refuse_unless(fine, "gait", f"one of {named}, a lead [rad] for each leg, or None")
         choices = {"control": ("auto", "track", "direct"), "joints": ("auto", "observation", "env")}
         for name, allowed in choices.items():
             fine = getattr(self, name) in allowed
@@ -241,7 +253,14 @@ class OpenLoop(SavesTensors):
             gain_factor=self.gain_factor,
             same_frequency=self.same_frequency,
             phases=self.phases,
+            leads=self._leads,
         )
+
+    @property
+    def _leads(self) -> tuple[float, ...]:
+        if self.gait is None:
+            return (0.0,)
+        return LEADS[self.gait] if isinstance(self.gait, str) else tuple(self.gait)
 
     @property
     def constants(self) -> dict[str, Any]:
@@ -467,13 +486,23 @@ class OpenLoop(SavesTensors):
         )
 
     def _meet(self, env: VecEnv) -> None:
-        """Find out what there is to know of an environment."""
+        """
+        Find out what there is to know of an environment.
+
+        :raises EnvironmentMismatchError: if its joints do not come in as many legs as the gait has
+        """
         body = body_of(env, self.control, self.joints, self.dt)
         normalises = getattr(self.get_vec_normalize_env(), "norm_obs", False)
         if body.control == "track" and self.joints != "env" and normalises:
             raise ValueError(
                 "OpenLoop reads joints from observations, which VecNormalize scales: use "
                 "VecNormalize(norm_obs=False), or joints='env'."
+            )
+        n_legs = len(self._leads)
+        if len(body.names) % n_legs:
+            raise EnvironmentMismatchError(
+                f"A gait of {n_legs} legs needs as many joints in each, leg by leg; there are "
+                f"{len(body.names)}: {', '.join(body.names)}."
             )
         self.body = body.to_dict()
 
