@@ -23,6 +23,7 @@ from independent_rigs import (
     SYSTEMS,
     TRANSMISSIONS,
     DivergedError,
+    Moment,
     Planted,
     System,
     can_change,
@@ -317,6 +318,14 @@ def _outside(case: Case, kind: str, rng: np.random.Generator) -> Planted:
         found = limits.get(f"{effect}.{joints[index].name}", {}).get(name) or np.nan
         return case.factor * found
 
+    def met(edge: str, share: float) -> dict[str, float]:
+        """An edge that joints are beyond in the rest of the time, and what it adds to a spring."""
+        q = _positions(case.system)[:, index]
+        at = float(np.quantile(np.abs(q) if edge == "slack" else q, share))
+        moments = (Moment(x, 0.0, 0.0, 0.0, 0.0, {}) for x in q)
+        force = np.array([FORCES[kind](moment, **{"k": 1.0, edge: at}) for moment in moments])
+        return {"k": size("stiffness", "k") / _above_a_spring(q, force), edge: at}
+
     wide = spread(case.system)[index]
     values = {
         "position_dependent_friction": lambda: {
@@ -328,10 +337,24 @@ def _outside(case: Case, kind: str, rng: np.random.Generator) -> Planted:
             "stiffness": size("coulomb_friction", "tau_c") / (0.3 * wide),
         },
         "thermal_drift": lambda: {"rate": -size("viscous_friction", "b")},
-        "soft_impact": lambda: {"k": 4.0 * size("stiffness", "k"), "wall": 0.7 * wide},
-        "cable_spring": lambda: {"k": 4.0 * size("stiffness", "k"), "slack": 0.7 * wide},
+        "soft_impact": lambda: met("wall", 0.75),
+        "cable_spring": lambda: met("slack", 0.6),
     }[kind]()
     return Planted(kind, index, {name: float(value) for name, value in values.items()})
+
+
+def _above_a_spring(q: np.ndarray, force: np.ndarray) -> float:
+    """What a spring and a constant leave of a force, in units of a spring of 1 N m/rad."""
+    known = np.stack([np.ones_like(q), q], axis=1)
+    remainder = force - known @ np.linalg.lstsq(known, force, rcond=None)[0]
+    return float(remainder.std() / q.std())
+
+
+@functools.cache
+def _positions(system: str) -> np.ndarray:
+    """:return: of all joints, where nothing is wrong"""
+    obs, _ = simulate(RIGS[system], [], n_recordings=8, n_steps=N_STEPS, seed=1)
+    return np.concatenate(obs)[:, : RIGS[system].dof]
 
 
 @functools.cache
