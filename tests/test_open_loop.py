@@ -370,6 +370,15 @@ def test_a_gait_of_legs_needs_joints_of_legs():
         OpenLoop("MlpPolicy", "HalfCheetah-v5", gait="trot")
 
 
+def test_a_generation_more_does_not_take_the_steps_of_the_ranking():
+    settings = {"seed": 0, "population_size": 4, "n_resets": 2, "n_elites": 2}
+    # A generation has 320 steps, a round of the ranking 160: the third would end in the ranking.
+    model = OpenLoop("MlpPolicy", Tune(), ranking_share=0.3, **settings).learn(1150)
+
+    assert int(model.policy.search.generation) == 2
+    assert int(model.policy.search.n_rounds) >= 2 and bool(model.policy.search.ranked)
+
+
 def test_points_and_gaits_are_two_names_of_the_same():
     space = GaitSpace(
         amplitude=np.array([1.0, 2.0]),

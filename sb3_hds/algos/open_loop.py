@@ -372,9 +372,12 @@ class OpenLoop(SavesTensors):
         callback.on_training_start(locals(), globals())
         search_until = total_timesteps - self.ranking_share * total
         trials = Trials(self, callback, total_timesteps)
-        going = True
-        while going and self.num_timesteps < search_until:
+        going, latest = True, 0
+        # A generation more must not take the steps of the ranking.
+        while going and self.num_timesteps + max(latest, 1) <= search_until:
+            before = self.num_timesteps
             going = self._generation(trials, callback, log_interval)
+            latest = self.num_timesteps - before
         if going and self.num_timesteps < total_timesteps:
             self._rank(trials, log_interval)
         callback.on_training_end()
