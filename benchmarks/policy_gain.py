@@ -1,0 +1,135 @@
+"""
+What a diagnosis buys: policies from the believed, the extended and the true twin, in reality.
+
+    python benchmarks/policy_gain.py                # three hidden causes, five seeds
+    python benchmarks/policy_gain.py --figure       # draw the figure again from the table
+
+The real system is `sb3_hds/PendulumReal-v1` with something planted that the twin does not have, and
+sensors with noise. Each seed records ten trajectories of torques that wander, diagnoses them, and
+trains HDS in each twin without a real step, with the defaults of `measure_policy_gain`: all three
+policies act from the same 20 start states. Each run is a process of its own; runs that are in the
+table are not done again.
+"""
+
+import argparse
+import json
+
+import numpy as np
+import pandas as pd
+from intervals import of_iqm
+from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+
+ROBOT = "sb3_hds/PendulumReal-v1"
+NOISE = 0.01
+#: what is planted, by the name of what should be found
+HIDDEN = {
+    "quadratic_drag": {"drag": 0.06},
+    "coulomb_friction": {"friction": 0.6},
+    "torque_gain": {"gain": 0.6},
+}
+SIMULATIONS = ("believed", "extended", "true")
+N_RECORDINGS, N_STEPS = 10, 200
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument("--hidden", nargs="*", default=list(HIDDEN), choices=HIDDEN)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--figure", action="store_true")
+    parser.add_argument("--worker", nargs=2, metavar=("HIDDEN", "SEED"))
+    arguments = parser.parse_args()
+    if arguments.worker:
+        hidden, seed = arguments.worker
+        print(json.dumps({"rows": worker(hidden, int(seed))}))
+        return
+    if not arguments.figure:
+        wanted = [(h, seed) for seed in range(arguments.seeds) for h in arguments.hidden]
+        work = lambda *run: fresh_process(__file__, *run, cache=CACHE / "programs")["rows"]  # noqa: E731
+        resume("policy_gain", ("hidden", "seed"), wanted, work, arguments.jobs)
+    report()
+
+
+def worker(hidden: str, seed: int) -> list[dict]:
+    """Record, diagnose, train: one row for each twin."""
+    import gymnasium
+
+    from sb3_hds import Trajectories, diagnose, twins
+    from sb3_hds.experiments import measure_policy_gain
+
+    real = gymnasium.make(ROBOT, max_episode_steps=N_STEPS, noise=NOISE, **HIDDEN[hidden])
+    data = Trajectories.from_arrays(*recorded(real, seed), dt=real.unwrapped.dt)
+    found = diagnose(twins.make(ROBOT), data, progress=False)
+    diagnosed = seconds_since_start()
+    gain = measure_policy_gain(found, real, seeds=1, progress=False)
+    told = {
+        "verdict": found.verdict,
+        "named": " ".join(f"{f.effect}.{f.where['name']}" for f in found.findings),
+        "diagnosed": diagnosed,
+        "seconds": seconds_since_start(),
+    }
+    return [{"twin": s, "return": gain.of(s).mean} | told for s in SIMULATIONS]
+
+
+def recorded(real, seed: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """:return: observations and actions of each recording"""
+    rng, seen, done = np.random.default_rng(seed), [], []
+    for episode in range(N_RECORDINGS):
+        wander = 0.7 * rng.standard_normal(N_STEPS).cumsum() + rng.uniform(0.0, 6.0)
+        torques = (1.6 * np.sin(wander))[:, None]
+        obs = [real.reset(seed=N_RECORDINGS * seed + episode)[0]]
+        obs += [real.step(torque)[0] for torque in torques]
+        seen.append(np.array(obs))
+        done.append(torques)
+    return seen, done
+
+
+def report() -> None:
+    """Print, keep and draw what the seeds say."""
+    table = pd.read_csv(RESULTS / "policy_gain.csv")
+    rows = [summary(hidden, own) for hidden, own in table.groupby("hidden", sort=False)]
+    gains = pd.DataFrame(rows)
+    gains.to_csv(RESULTS / "policy_gain_intervals.csv", index=False)
+    print(gains.to_string(index=False))
+    draw(table)
+
+
+def summary(hidden: str, own: pd.DataFrame) -> dict:
+    """:return: interquartile means over seeds with 95 % intervals, and the gain, paired by seed"""
+    by = own.pivot(index="seed", columns="twin", values="return")
+    believed, extended, true = (by[s].to_numpy() for s in SIMULATIONS)
+    right = own[own.twin == "extended"].named.astype(str).str.startswith(hidden)
+    gap = of_iqm([true - believed])[0]
+    return {
+        "hidden": hidden,
+        "named": f"{int(right.sum())} of {len(right)}",
+        **{s: _told(by[s].to_numpy()) for s in SIMULATIONS},
+        "gain": _told(extended - believed),
+        "share of the gap": f"{of_iqm([extended - believed])[0] / gap:.2f}" if gap > 0 else "-",
+    }
+
+
+def _told(values: np.ndarray) -> str:
+    middle, low, high = of_iqm([values])
+    return f"{middle:.1f} [{low:.1f}, {high:.1f}]"
+
+
+def draw(table: pd.DataFrame) -> None:
+    """For each hidden cause the three twins, a line for each seed."""
+    from matplotlib.figure import Figure
+
+    shown = list(dict.fromkeys(table.hidden))
+    figure = Figure(figsize=(2.6 * len(shown) + 0.6, 3.0), layout="constrained")
+    panels = figure.subplots(1, len(shown), squeeze=False)[0]
+    for axes, hidden in zip(panels, shown, strict=True):
+        by = table[table.hidden == hidden].pivot(index="seed", columns="twin", values="return")
+        for _, returns in by[list(SIMULATIONS)].iterrows():
+            axes.plot(SIMULATIONS, returns, "o-", color="#27496d", alpha=0.5, lw=1)
+        axes.set_title(hidden.replace("_", " "), fontsize=10)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("return on the real system")
+    figure.savefig(RESULTS / "policy_gain.png", dpi=150)
+
+
+if __name__ == "__main__":
+    main()
