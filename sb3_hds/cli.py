@@ -9,6 +9,7 @@
 """
 
 import argparse
+import dataclasses
 import functools
 import importlib
 import io
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sb3_hds.core import Effect, Twin
+    from sb3_hds.core import Twin
     from sb3_hds.experiments import PolicyGain
     from sb3_hds.sysid import Diagnosis
 
@@ -131,6 +132,7 @@ def parser() -> argparse.ArgumentParser:
 def _diagnose(given: argparse.Namespace) -> None:
     from sb3_hds.core.storage import write_bytes
     from sb3_hds.data import Trajectories, audit
+    from sb3_hds.effects import ALL
     from sb3_hds.sysid import diagnose
     from sb3_hds.twins import make
 
@@ -139,17 +141,20 @@ def _diagnose(given: argparse.Namespace) -> None:
     measure = None if given.env is None else _policy_question(given, twin)
     files = given.data[0] if len(given.data) == 1 else given.data
     data = Trajectories.load(files, columns=given.columns)
+    corrections: tuple[str, ...] = ()
     if given.correct:
-        data = audit(data, channels=twin.channels).corrected(data)
+        checked = audit(data, channels=twin.channels)
+        corrections, data = checked.corrections, checked.corrected(data)
     found = diagnose(
         twin,
         data,
-        effects=_chosen(given.effects),
+        effects=ALL if given.effects is None else given.effects,
         calibrate=given.calibrate,
         seed=given.seed,
         budget=given.budget,
         progress=sys.stderr.isatty(),
     )
+    found = dataclasses.replace(found, caveats=(*corrections, *found.caveats))
     print(found)
     plain, gain = found.to_dict(), None
     if measure is not None and found.twin.values == found.believed.values:
@@ -176,19 +181,6 @@ def _check_targets(given: argparse.Namespace) -> None:
         from sb3_hds.sysid.report import check_installed
 
         check_installed()
-
-
-def _chosen(names: Sequence[str] | None) -> "tuple[type[Effect], ...]":
-    from sb3_hds.effects import ALL
-    from sb3_hds.errors import EffectError
-
-    known = {effect.name: effect for effect in ALL}
-    unknown = [name for name in names or () if name not in known]
-    if unknown:
-        raise EffectError(
-            f"There is no effect {', '.join(unknown)}. There are: {', '.join(known)}."
-        )
-    return tuple(ALL) if names is None else tuple(known[name] for name in names)
 
 
 def _policy_question(

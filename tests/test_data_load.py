@@ -548,3 +548,74 @@ def test_a_data_set_of_minari_is_read(tmp_path, monkeypatch):
         Trajectories.load("minari:test/pendulum-v0")
     with pytest.raises(TrajectoryError, match="no data set 'nobody/nothing-v0' on this machine"):
         Trajectories.load("minari:nobody/nothing-v0", columns={"dt": 0.05})
+
+
+def test_a_sign_before_the_names_is_no_column(tmp_path):
+    t = 0.01 * np.arange(50)
+    path = tmp_path / "log.txt"
+    np.savetxt(path, np.c_[t, np.sin(t), np.cos(t), 0.5 + 0.0 * t], header="t q v u")
+
+    data = Trajectories.load(path, columns={"time": "t", "obs": ["q", "v"], "actions": ["u"]})
+
+    np.testing.assert_allclose(data.obs[0], np.c_[np.sin(t), np.cos(t)], atol=1e-7)
+    np.testing.assert_allclose(data.actions[0], 0.5)
+
+
+def test_decimal_commas_between_commas_are_refused(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,q,u\n" + "".join(f"0,0{i},1,5,0,0\n" for i in range(1, 9)))
+
+    with pytest.raises(TrajectoryError, match="3 names in its first line and 6 fields"):
+        Trajectories.load(path, columns={"time": "t", "obs": ["q"], "actions": ["u"]})
+
+
+def test_a_log_without_rows_says_so(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,q,u\n")
+
+    with pytest.raises(TrajectoryError, match="no row"):
+        Trajectories.load(path, columns={"time": "t", "obs": ["q"], "actions": ["u"]})
+
+
+def test_vectors_in_records_are_refused(tmp_path):
+    path = tmp_path / "log.json"
+    path.write_text(json.dumps([{"t": 0.1 * i, "obs": [0.1, 0.2], "u": 0} for i in range(9)]))
+
+    with pytest.raises(TrajectoryError, match="one number in each row, got 2"):
+        Trajectories.load(path, columns={"time": "t", "obs": ["obs"], "actions": ["u"]})
+
+
+@pytest.mark.parametrize("kind", ["datetime64[ns]", "timedelta64[us]"])
+def test_dates_and_durations_count_seconds(kind):
+    from sb3_hds.data.columns import columns_from
+    from sb3_hds.data.rows import rows_of
+
+    stamps = (np.arange(5) * 10_000_000).astype("timedelta64[ns]")
+    stamps = np.datetime64("2026-01-01T00:00:00", "ns") + stamps if "date" in kind else stamps
+    table = {"t": stamps.astype(kind), "q": np.arange(5.0), "u": np.zeros(5)}
+
+    [rows] = rows_of(
+        table, columns_from({"time": "t", "obs": ["q"], "actions": ["u"]}), "log", "log"
+    )
+
+    np.testing.assert_allclose(rows.times, 0.01 * np.arange(5), atol=1e-12)
+
+
+def test_stamps_in_milliseconds_are_not_filled_up(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,q,u\n" + "".join(f"{10 * i},{i},0\n" for i in range(50)))
+    columns = {"time": "t", "obs": ["q"], "actions": ["u"], "dt": 0.01}
+
+    with pytest.raises(TrajectoryError, match=r"nothing is known of 1000 steps.*scale: 0.001"):
+        Trajectories.load(path, columns=columns)
+
+
+def test_a_recording_is_no_evidence_twice(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,q,u\n" + "".join(f"{0.1 * i},{i},0\n" for i in range(50)))
+
+    with pytest.raises(TrajectoryError, match="2 times: a recording is evidence only once"):
+        Trajectories.load(
+            [path, str(tmp_path / "*.csv")],
+            columns={"time": "t", "obs": ["q"], "actions": ["u"]},
+        )

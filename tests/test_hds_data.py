@@ -19,10 +19,12 @@ from sb3_hds import HDS, PODS, effects, twins
 from sb3_hds.algos.arguments import knobs_of
 from sb3_hds.algos.correction import Correction, Wishes, correct
 from sb3_hds.algos.epoch import plan_ahead
+from sb3_hds.algos.hds import _effects_of
 from sb3_hds.algos.log import record_correction
 from sb3_hds.core import Trajectories
 from sb3_hds.effects import force_of
 from sb3_hds.errors import CalibrationError, EffectError, TrajectoryError
+from sb3_hds.sysid import Finding
 from sb3_hds.wrappers import ManualReset
 
 REAL = "sb3_hds/PendulumReal-v1"
@@ -380,6 +382,33 @@ def test_what_the_data_name_is_attached_and_estimated_from_then_on(tmp_path):
     model.learn(0)
     model.save(tmp_path / "model")
     assert HDS.load(tmp_path / "model", env=model.get_env()).twin == model.twin
+
+
+def test_less_of_what_the_twin_has_is_less_of_it():
+    """An effect that the twin has as a parameter cannot be attached with a negative size."""
+    data = measured(twins.make("PendulumReal"), n=10, n_steps=100, noise=0.01)
+    believed = twins.make("PendulumReal", damping=0.05)
+    model = small("hds", REAL, twin=believed, pretrain_data=data, residual=False, calibrated=None)
+
+    model.extend_model(effects=[effects.ViscousFriction])
+
+    assert not getattr(model.twin, "attached", ())
+    assert model.twin.values["damping"] == pytest.approx(0.0, abs=2e-3)
+    assert model.nominal["damping"] == model.twin.values["damping"]
+
+
+def test_a_joint_that_is_measured_the_wrong_way_round_is_turned():
+    pushed = twins.make("FreePendulum", driven=True, dt=0.02)
+    found = Finding(
+        "sign_flip", {"slot": "joint", "index": 0, "name": "hinge"}, {}, (), 0.0, 0.0, 1.0, ""
+    )
+
+    flips = _effects_of(found, pushed)
+
+    assert {a.key for a in pushed.extend(*flips).attached} == {
+        "sign_flip.hinge_position",
+        "sign_flip.hinge_velocity",
+    }
 
 
 def test_diagnoses_come_as_often_as_asked_for():

@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_hds import HDS, effects, twins
 from sb3_hds.envs import TwinEnv
@@ -177,6 +178,21 @@ def test_a_system_that_the_twins_do_not_describe_is_refused(real, message):
 def test_an_argument_that_the_algorithm_does_not_have_is_refused():
     with pytest.raises(ParameterError, match=r"HDS cannot be made.*'speed'"):
         measure_policy_gain(a_diagnosis(), ROBOT, speed=1)
+
+
+def test_a_system_that_never_ends_is_cut_off_as_the_twin_is():
+    endless = gymnasium.make(ROBOT, max_episode_steps=20).unwrapped
+
+    gain = measure_policy_gain(
+        a_diagnosis(), endless, seeds=1, n_episodes=1, ceiling=False, progress=False, **SMALL
+    )
+
+    assert np.isfinite(gain.returns["believed"]).all()
+
+
+def test_vectorised_systems_are_refused():
+    with pytest.raises(ParameterError, match="got DummyVecEnv"):
+        measure_policy_gain(a_diagnosis(), DummyVecEnv([robot]))
 
 
 @pytest.mark.parametrize("wrong", [{"seeds": 0}, {"n_episodes": 0}, {"budget": -1}])

@@ -257,3 +257,15 @@ def test_a_step_is_on_its_way_to_the_disk_when_it_returns_and_costs_little(tmp_p
         "obs": [999.0] * 2,
     }
     assert seconds < 1e-3  # a loop of 1 kHz; some 15 us on an idle machine
+
+
+def test_what_has_no_actuator_is_read_again(tmp_path):
+    path = tmp_path / "free.jsonl"
+    with Recorder(path, 0.01, obs=["q", "v"], actions=[]) as recorder:
+        recorder.start([0.5, 0.0])
+        for k in range(20):
+            recorder.step([], [0.5 - 0.01 * k, -1.0])
+
+    data = Trajectories.load(path)
+
+    assert (data.n_obs, data.n_act, data.n_steps) == (2, 0, 20)

@@ -17,7 +17,8 @@ from sb3_hds.algos.measured import Measured, data_from
 from sb3_hds.algos.model import check_known, missing_effects, nulls_of, required
 from sb3_hds.algos.twin_algorithm import TwinAlgorithm
 from sb3_hds.core import Effect, Params, Trajectories, Twin
-from sb3_hds.effects import ALL, force_of
+from sb3_hds.core.layers import plant_of
+from sb3_hds.effects import ALL, SignFlip, force_of, reversed_joint
 from sb3_hds.errors import TrajectoryError
 from sb3_hds.sysid import Diagnosis, Finding, diagnose
 
@@ -372,14 +373,18 @@ class HDS(TwinAlgorithm):
         nuisances = names_to_estimate(self.twin, self.calibrated)
         own = {"budget": "quick", "progress": False, "calibrate": nuisances} | arguments
         found = self.diagnose(**own)
-        causes = [
-            _effect_of(f)
+        new = [
+            f
             for f in found.findings
             if f.effect in _CATALOGUE and not self._estimates(f"{f.effect}.{f.where['name']}")
         ]
-        if causes:
-            self.twin = self.twin.extend(*causes)
-            self.nominal |= nulls_of(causes)
+        own = {name: value for f in new for name, value in _native_of(f, found.twin).items()}
+        foreign = [f for f in new if not _native_of(f, found.twin)]
+        causes = [effect for f in foreign for effect in _effects_of(f, self.twin)]
+        if causes or own:
+            self.twin = self.twin.with_parameters(**own) if own else self.twin
+            self.twin = self.twin.extend(*causes) if causes else self.twin
+            self.nominal |= nulls_of(causes) | own
             self.twin_spec, self._workspace = self.twin.to_spec(), None
             self._steps_at_force = 0
         return found
@@ -440,7 +445,16 @@ class HDS(TwinAlgorithm):
         return [*super()._excluded_save_params(), "measured"]
 
 
-def _effect_of(finding: Finding) -> Effect:
-    """:return: the named effect as the data have it"""
+def _native_of(finding: Finding, found: Twin) -> dict[str, float]:
+    """:return: values of the twin's own parameters that stand for the effect, if it has any"""
+    place = finding.effect, int(finding.where["index"])
+    names = plant_of(found).native_effects.get(place, {}).values()
+    return {name: found.values[name] for name in names}
+
+
+def _effects_of(finding: Finding, twin: Twin) -> list[Effect]:
+    """:return: the named effect as the data have it; of a joint the wrong way round, several"""
+    if finding.effect == SignFlip.name and finding.where["slot"] == "joint":
+        return list(reversed_joint(twin, int(finding.where["index"])))
     values = {name: found.estimate for name, found in finding.parameters.items()}
-    return _CATALOGUE[finding.effect](finding.where["name"], **values)
+    return [_CATALOGUE[finding.effect](finding.where["name"], **values)]

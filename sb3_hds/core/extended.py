@@ -1,6 +1,7 @@
 """A twin with effects attached is again a twin."""
 
 import dataclasses
+import inspect
 import math
 from collections import Counter
 from typing import Any
@@ -46,6 +47,11 @@ class ExtendedTwin(Twin):
             )
         if isinstance(base, ExtendedTwin):
             base, effects = base._base_with_values(), (*base.effects_with_values(), *effects)
+        if effects and "effects" not in inspect.signature(base.step).parameters:
+            raise EffectError(
+                f"{base.name} cannot be extended: its step takes no effects. Write "
+                "step(self, state, action, params, effects=NO_EFFECTS), and use them there."
+            )
         self.base = base
         self.attached = tuple(_attach(effect, base) for effect in effects)
         self.effects = tuple(a.effect for a in self.attached)

@@ -4,6 +4,7 @@ import abc
 import copy
 import math
 from collections.abc import Mapping
+from numbers import Integral, Real
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
@@ -90,15 +91,15 @@ class Twin(abc.ABC):
     def __init__(
         self, *, dt: float | None = None, substeps: int | None = None, **settings: Any
     ) -> None:
-        if dt is not None:
-            self.dt = float(dt)
-        if substeps is not None:
-            self.substeps = int(substeps)
-        if not (0.0 < self.dt < math.inf and self.substeps >= 1):
+        dt = self.dt if dt is None else dt
+        substeps = self.substeps if substeps is None else substeps
+        whole = isinstance(substeps, Integral) and substeps >= 1
+        if not (whole and isinstance(dt, Real) and 0.0 < dt < math.inf):
             raise ParameterError(
-                f"{self.name} needs a finite dt > 0 s and at least one sub-step, "
-                f"got dt={self.dt}, substeps={self.substeps}."
+                f"{self.name} needs a finite dt > 0 s and a whole number of sub-steps, at least "
+                f"one, got dt={dt!r}, substeps={substeps!r}."
             )
+        self.dt, self.substeps = float(dt), int(substeps)
         for option, default in self.options.items():
             setattr(self, option, settings.pop(option, default))
         self.values: dict[str, float] = {

@@ -7,6 +7,7 @@ import numpy as np
 
 from sb3_hds.data.finding import Place
 from sb3_hds.data.findings import (
+    DeadChannel,
     ReinitialisedState,
     RepeatedSamples,
     SaturatedChannel,
@@ -104,8 +105,8 @@ def stuck(
     stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
 ) -> list[StuckChannel]:
     """
-    Channels that never change, or that stop anywhere with speed, or jump when they are free again,
-    while others move. A system that comes to rest does none of it.
+    Channels that never change, in one recording or in all, or that stop anywhere with speed, or
+    jump when they are free again, while others move. A system that comes to rest does none of it.
     """
     found = []
     usual = _usual_steps(stretches)
@@ -115,13 +116,15 @@ def stuck(
         if extremes[0] == extremes[1]:
             if np.ptp(np.delete(everything, j, axis=1), axis=0).any():
                 whole = tuple(_place(s, 0, len(s.obs) - 1) for s in stretches)
-                found.append(StuckChannel(name, whole, float(extremes[0])))
+                found.append(DeadChannel(name, whole, float(extremes[0])))
             continue
         fast = max(_MOVES * usual[j], 3.0 * resolution[j])
         for stretch in stretches:
             x = stretch.obs[:, j]
             for a, b in _runs(np.diff(x) == 0.0):
-                long = b - a >= _STUCK and x[a] not in extremes and _abrupt(x, a, b, fast)
+                throughout = b - a == len(x) - 1 and usual[j] > 3.0 * resolution[j]
+                abrupt = x[a] not in extremes and _abrupt(x, a, b, fast)
+                long = b - a >= _STUCK and (throughout or abrupt)
                 if long and _others_move(stretch.obs[a : b + 1], j, usual):
                     found.append(StuckChannel(name, (_place(stretch, a, b),), float(x[a])))
     return found

@@ -98,6 +98,14 @@ class StuckChannel(Finding):
 
 
 @dataclasses.dataclass(frozen=True)
+class DeadChannel(StuckChannel):
+    """In all recordings: whatever the twin has to predict of it, a wrong cause would do."""
+
+    blocks = True
+    remedy = "Check cable and driver of this sensor, or leave the channel out."
+
+
+@dataclasses.dataclass(frozen=True)
 class SaturatedChannel(Finding):
     """
     :param value: that the channel does not exceed, in its unit

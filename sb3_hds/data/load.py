@@ -86,6 +86,12 @@ def _paths(files: Files) -> list[str]:
         found += matching
     if not found:
         raise TrajectoryError("files names no file.")
+    twice = sorted({path for path in found if found.count(path) > 1})
+    if twice:
+        raise TrajectoryError(
+            f"files names '{twice[0]}' {found.count(twice[0])} times: a recording is evidence "
+            "only once."
+        )
     return found
 
 

@@ -84,7 +84,11 @@ class Recorder:
         """
         self._time = self._now(0.0) if time is None else float(time)
         self._write(
-            {"time": self._time, "obs": _row("obs", obs, self._obs), "condition": self.condition}
+            {
+                "time": self._time,
+                "obs": _row("obs", obs, self._obs),
+                "condition": str(self.condition),
+            }
         )
         os.fsync(self._file.fileno())
 
@@ -185,7 +189,8 @@ def _table(rows: list[dict[str, Any]], header: dict[str, Any], path: Path) -> di
     n_act = len(header["actions"])
     try:
         obs = np.array([row["obs"] for row in rows], float).reshape(len(rows), len(header["obs"]))
-        actions = np.array([row["action"] for row in rows[1:]], float).reshape(-1, n_act)
+        actions = [row["action"] for row in rows[1:]]
+        actions = np.array(actions, float).reshape(len(rows) - 1, n_act)
         columns = dict(zip(header["obs"], obs.T, strict=True))
         columns |= dict(
             zip(header["actions"], np.vstack([actions, np.full(n_act, np.nan)]).T, strict=True)

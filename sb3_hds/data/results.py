@@ -7,7 +7,7 @@ from typing import Any
 
 from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.data.corrections import cut, shifted
-from sb3_hds.data.finding import Finding, percent
+from sb3_hds.data.finding import Finding, counted, percent
 from sb3_hds.data.findings import ReinitialisedState, VelocityShift
 from sb3_hds.errors import TrajectoryError
 
@@ -94,6 +94,16 @@ class Audit:
         shifts = [f for f in self.findings if isinstance(f, VelocityShift)]
         lags = {names.index(shift.channel): shift.samples for shift in shifts}
         return shifted(data, lags) if lags else data
+
+    @property
+    def corrections(self) -> tuple[str, ...]:
+        """Sentences on what :meth:`corrected` does to the data."""
+        jumps = sum(len(f.places) for f in self.findings if isinstance(f, ReinitialisedState))
+        cuts = (f"The data were cut at {counted(jumps, 'jump')} of the state.",) if jumps else ()
+        return cuts + tuple(
+            f"'{channel}' was shifted by {-1e3 * seconds:+.3g} ms."
+            for channel, seconds in self.velocity_shift.items()
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """:return: plain data for JSON"""

@@ -88,7 +88,10 @@ def _length(table: Table, columns: Columns, source: str) -> int:
     if len(set(lengths.values())) != 1:
         listed = ", ".join(f"{name} {n}" for name, n in lengths.items()) or "single values only"
         raise TrajectoryError(f"The columns of '{source}' must have the same length, got {listed}.")
-    return next(iter(lengths.values()))
+    n = next(iter(lengths.values()))
+    if n == 0:
+        raise TrajectoryError(f"'{source}' has names of columns and no row: nothing was logged.")
+    return n
 
 
 def _values(table: Table, entry: Entry, n: int, source: str) -> np.ndarray:
@@ -96,6 +99,15 @@ def _values(table: Table, entry: Entry, n: int, source: str) -> np.ndarray:
     if entry.column is None:
         return np.full(n, entry.offset)
     column = table[entry.column]
+    if column.ndim > 1:
+        raise TrajectoryError(
+            f"Column '{entry.column}' of '{source}' must hold one number in each row, got "
+            f"{column.shape[1]}: write each into a column of its own."
+        )
+    if column.dtype.kind in "mM":
+        # Dates and durations, of whatever resolution, count from the first row.
+        passed = (column - column.ravel()[0]) / np.timedelta64(1, "s")
+        return np.broadcast_to(entry.scale * passed + entry.offset, n)
     try:
         numbers = column.astype(np.float64)
     except (TypeError, ValueError) as error:

@@ -16,6 +16,7 @@ from sb3_hds.errors import TrajectoryError
 _REGULAR = 0.01  # of one interval: stamps that are closer to a grid than this are on it
 _UNEVEN = 0.1  # of the median interval
 _GAP = 5.0  # intervals
+_FAR = 10.0  # intervals between two measurements that nobody can fill in
 
 
 class Steps(NamedTuple):
@@ -41,10 +42,13 @@ def at_one_interval(episodes: Sequence[Rows], columns: Columns) -> tuple[Steps, 
     :param episodes: at least one
     :param columns: for ``dt``, ``gap``, names, and which channels are angles
     :return: the steps, and what was changed
-    :raises TrajectoryError: if nothing is left that is as long as one step
+    :raises TrajectoryError: if nothing is left that is as long as one step, or for steps that are
+        far shorter than the intervals of the log
     """
     cuts = [_cut(rows, columns.gap) for rows in episodes]
-    dt = columns.dt or _interval([part.times for cut in cuts for part in cut.parts])
+    stamps = [part.times for cut in cuts for part in cut.parts]
+    dt = columns.dt or _interval(stamps)
+    _check_interval(dt, stamps)
     angles = [i for i, entry in enumerate(columns.obs or ()) if entry.angle]
     steps, samplings = Steps([], [], [], []), []
     parts = []
@@ -115,6 +119,20 @@ def _interval(stamps: Sequence[np.ndarray]) -> float:
         if all(_on_grid(times, guess) for times in spans):
             return guess
     return round_number
+
+
+def _check_interval(dt: float, stamps: Sequence[np.ndarray]) -> None:
+    """
+    :raises TrajectoryError: for an interval far below that of the log: its time is in other units
+    """
+    intervals = np.concatenate([np.diff(times) for times in stamps])
+    median = float(np.median(intervals)) if len(intervals) else dt
+    if median > _FAR * dt:
+        raise TrajectoryError(
+            f"Rows are {median:.4g} s apart, and dt is {dt:.4g} s: between two measurements "
+            f"nothing is known of {median / dt:.0f} steps. If time stamps are not in seconds, say "
+            "so: 'time: {column: NAME, scale: 0.001}'."
+        )
 
 
 def _rounded(interval: float) -> float:

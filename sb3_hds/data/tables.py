@@ -1,5 +1,6 @@
 """Files as named columns: CSV, Parquet, npz, MATLAB and JSON."""
 
+import csv
 import json
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -65,19 +66,41 @@ def _read_csv(path: Path, wanted: frozenset[str]) -> Log:
     import pandas
 
     with path.open(encoding="utf-8-sig") as file:
-        head = next((line for line in file if line.strip()), "").strip()
+        lines = (line.strip() for line in file if line.strip())
+        head, first = next(lines, ""), next(lines, "")
     separator = max((",", ";", "\t"), key=head.count)
     separator = separator if separator in head else r"\s+"
-    names = head.lstrip("#").split(None if separator == r"\s+" else separator)
+    names, fields = (_fields_of(line, separator) for line in (head.lstrip("#"), first))
     if names and all(_is_number(name) for name in names):
         raise TrajectoryError(
             f"'{path}' begins with numbers: its first line must hold the names of the columns, "
             f"got '{head[:60]}'."
         )
+    if len(fields) > len(names):
+        raise TrajectoryError(
+            f"'{path}' has {len(names)} names in its first line and {len(fields)} fields in the "
+            f"next one, '{first[:60]}'. Decimal commas cannot be told from commas between fields: "
+            "export the log with decimal points."
+        )
     exactly: dict[str, Any] = {"float_precision": "round_trip", "skipinitialspace": True}
-    table = pandas.read_csv(path, sep=separator, encoding="utf-8-sig", index_col=False, **exactly)
-    table.columns = [str(name).lstrip("#").strip() for name in table.columns]
+    with path.open(encoding="utf-8-sig") as file:
+        for _ in range(len(head) - len(head.lstrip("#"))):
+            # Otherwise a sign that stands alone would be the name of a column.
+            while file.read(1) != "#":
+                pass
+        table = pandas.read_csv(file, sep=separator, index_col=False, **exactly)
+    table.columns = [str(name).strip() for name in table.columns]
     return Log([{name: table[name].to_numpy() for name in table.columns}])
+
+
+def _fields_of(line: str, separator: str) -> list[str]:
+    """:return: of one line, without empty ones at its end"""
+    if separator == r"\s+":
+        return line.split()
+    fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+    while fields and not fields[-1].strip():
+        fields.pop()
+    return fields
 
 
 def _read_parquet(path: Path, wanted: frozenset[str]) -> Log:

@@ -4,6 +4,7 @@ import dataclasses
 import inspect
 import os
 from collections.abc import Callable, Mapping
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from sb3_hds.errors import EnvironmentMismatchError, ParameterError, TrajectoryE
 from sb3_hds.experiments.returns import returns_of
 from sb3_hds.sysid import Diagnosis
 from sb3_hds.sysid.plots import as_png, plot_policy_gain
+from sb3_hds.wrappers.step_limit import step_limit_of
 
 _N_RESAMPLES = 2000
 _LEVEL = 0.9
@@ -128,7 +130,8 @@ def measure_policy_gain(
     the ceiling.
 
     :param diagnosis: whose ``believed`` and extended ``twin`` are compared
-    :param env: the real system, its id, or a function that makes it
+    :param env: the real system, its id, or a function that makes it; one that has no limit of steps
+        gets the believed twin's
     :param algorithm: trained in the simulations only
     :param budget: steps of the simulated environment; 0 is enough for PODS and HDS, which plan in
         their twin before they act
@@ -144,8 +147,11 @@ def measure_policy_gain(
     :raises ParameterError: for an argument that the algorithm does not have
     :raises EnvironmentMismatchError: if the real system has other observations or actions
     """
-    real = _made(env)
-    check_question(diagnosis.believed, real, algorithm, budget, seeds, n_episodes, arguments)
+    made = _made(env)
+    check_question(diagnosis.believed, made, algorithm, budget, seeds, n_episodes, arguments)
+    real = made
+    if step_limit_of(made) is None:
+        real = TimeLimit(made, diagnosis.believed.max_episode_steps)  # type: ignore[arg-type]
     simulations = {"believed": diagnosis.believed, "extended": diagnosis.twin}
     if (truth := _truth(real, ceiling)) is not None:
         simulations["true"] = truth
@@ -155,8 +161,8 @@ def measure_policy_gain(
         model = algorithm("MlpPolicy", _task(simulations[name]), seed=seed, **arguments)
         model.learn(budget)
         returns[name].append(returns_of(model, real, n_episodes))
-    if real is not env:
-        real.close()
+    if made is not env:
+        made.close()
     found = {name: np.stack(rows) for name, rows in returns.items()}
     return PolicyGain(found, _summarised(found["extended"] - found["believed"]))
 
@@ -179,10 +185,11 @@ def check_question(
     :raises ParameterError: as there
     :raises EnvironmentMismatchError: as there
     """
-    if min(seeds, n_episodes) < 1 or budget < 0:
+    counts = (seeds, n_episodes, budget)
+    if not all(isinstance(n, Integral) for n in counts) or min(counts) < 0 or 0 in counts[:2]:
         raise TrajectoryError(
-            f"seeds and n_episodes must be at least 1 and budget at least 0, got seeds={seeds}, "
-            f"n_episodes={n_episodes}, budget={budget}."
+            "seeds and n_episodes must be whole numbers of at least 1 and budget one of at least "
+            f"0, got seeds={seeds}, n_episodes={n_episodes}, budget={budget}."
         )
     try:
         inspect.signature(algorithm).bind_partial("MlpPolicy", real, seed=0, **arguments)
@@ -205,7 +212,13 @@ def check_question(
 def _made(env: gymnasium.Env | str | Callable[[], gymnasium.Env]) -> gymnasium.Env:
     if isinstance(env, str):
         return gymnasium.make(env)
-    return env if isinstance(env, gymnasium.Env) else env()
+    made = env() if callable(env) else env
+    if not isinstance(made, gymnasium.Env):
+        raise ParameterError(
+            "env is the real system, its id, or a function that makes it: one gymnasium.Env, got "
+            f"{type(made).__name__}."
+        )
+    return made
 
 
 def _check_same_signals(real: gymnasium.Env, believed: Twin) -> None:

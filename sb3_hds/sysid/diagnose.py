@@ -1,11 +1,12 @@
 """Find out what a simulation gets wrong: propose on some recordings, confirm once on others."""
 
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Literal
 
 from sb3_hds.core import Effect, Trajectories, Twin
 from sb3_hds.effects import ALL
-from sb3_hds.errors import CalibrationError
+from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.calibrate import check_fits
 from sb3_hds.sysid.diagnosis import Diagnosis
 from sb3_hds.sysid.inquiry import EFFORTS, Inquiry
@@ -15,7 +16,7 @@ def diagnose(
     twin: Twin,
     data: Trajectories,
     *,
-    effects: Sequence[type[Effect]] = ALL,
+    effects: Sequence[type[Effect] | str] = ALL,
     calibrate: Sequence[str] = (),
     seed: int = 0,
     budget: Literal["full", "quick"] = "full",
@@ -36,7 +37,7 @@ def diagnose(
 
     :param twin: as it is believed
     :param data: measured, sampled at the twin's ``dt``
-    :param effects: classes of the catalogue, or of your own
+    :param effects: classes of the catalogue, their names, or classes of your own
     :param calibrate: parameters of the twin that are not believed: they are refitted under every
         hypothesis, and are never a finding
     :param seed: of the split
@@ -45,11 +46,42 @@ def diagnose(
     :return: verdict, findings, what was rejected, what cannot be told apart, the extended twin
     :raises CalibrationError: for other channels or another interval than the twin's, or an unknown
         name in ``calibrate``
+    :raises EffectError: for an unknown effect, or a twin whose step does not use effects
     :raises TrajectoryError: if no recording is long enough
     """
+    if not isinstance(twin, Twin) or not isinstance(data, Trajectories):
+        raise CalibrationError(
+            f"diagnose(twin, data) takes a twin, as from twins.make(...), and Trajectories, got "
+            f"{type(twin).__name__} and {type(data).__name__}."
+        )
     check_fits(twin, data)
     if budget not in EFFORTS:
         raise CalibrationError(f"budget must be 'full' or 'quick', got {budget!r}.")
-    inquiry = Inquiry(twin, data, tuple(effects), tuple(calibrate), seed, budget, progress)
+    if not isinstance(seed, Integral) or seed < 0:
+        raise CalibrationError(f"seed must be a whole number of at least 0, got {seed!r}.")
+    kinds = classes_of(effects)
+    inquiry = Inquiry(twin, data, kinds, tuple(calibrate), int(seed), budget, progress)
     reason = inquiry.poor()
     return inquiry.refused(reason) if reason else inquiry.run()
+
+
+def classes_of(effects: Sequence[type[Effect] | str]) -> tuple[type[Effect], ...]:
+    """
+    :param effects: classes, or names of the catalogue
+    :raises EffectError: for anything else
+    """
+    known = {effect.name: effect for effect in ALL}
+    given = [effects] if isinstance(effects, str | type) else list(effects)
+    unknown = [one for one in given if isinstance(one, str) and one not in known]
+    if unknown:
+        raise EffectError(
+            f"There is no effect {', '.join(unknown)}. There are: {', '.join(known)}."
+        )
+    found = [known[one] if isinstance(one, str) else one for one in given]
+    wrong = [one for one in found if not (isinstance(one, type) and issubclass(one, Effect))]
+    if wrong:
+        raise EffectError(
+            f"effects are classes, such as sb3_hds.effects.CoulombFriction, or their names, got "
+            f"{wrong[0]!r}."
+        )
+    return tuple(found)

@@ -6,11 +6,14 @@ import textwrap
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from sb3_hds.core import Params, Twin
 from sb3_hds.sysid.pictures import Pictures
 from sb3_hds.sysid.results import Estimate, plain
+
+if TYPE_CHECKING:
+    from sb3_hds.experiments import PolicyGain
 
 Verdict = Literal["named", "ambiguous", "none", "unknown", "not_identifiable"]
 
@@ -203,19 +206,22 @@ class Diagnosis:
         return plain(found | twins | {"params": self.twin.values})
 
     def to_html(
-        self, path: str | os.PathLike[str], policy_gain: Mapping[str, Any] | None = None
+        self,
+        path: str | os.PathLike[str],
+        policy_gain: "Mapping[str, Any] | PolicyGain | None" = None,
     ) -> Path:
         """
         Write one self-contained page: the verdict, its evidence, pictures, caveats.
 
         :param path: of the file; one of that name is replaced as a whole
-        :param policy_gain: ``measure_policy_gain(...).to_dict()``, where that was measured
+        :param policy_gain: what ``measure_policy_gain`` returned, where it was measured
         :return: its path
         :raises ImportError: without matplotlib and jinja2 (extra ``report``)
         """
         from sb3_hds.sysid.report import write_report
 
-        return write_report(self, path, policy_gain)
+        plain = policy_gain if isinstance(policy_gain, Mapping | None) else policy_gain.to_dict()
+        return write_report(self, path, plain)
 
     def save_pictures(self, folder: str | os.PathLike[str]) -> list[Path]:
         """
@@ -241,7 +247,8 @@ def _of_finding(finding: Finding) -> list[str]:
     lines += _wrapped(finding.explanation, "  ")
     for name, e in finding.parameters.items():
         unit = "" if e.unit == "1" else f" {e.unit}"
-        lines.append(f"  {name} = {e.estimate:.4g} [{e.low:.4g}, {e.high:.4g}]{unit}")
+        beside = f", added to the twin's own {e.added_to:.4g}" if e.added_to else ""
+        lines.append(f"  {name} = {e.estimate:.4g} [{e.low:.4g}, {e.high:.4g}]{unit}{beside}")
     lines.append(f"  held-out gain {finding.gain:.1%}, p = {finding.p_value:.2g}")
     if finding.alternatives:
         lines += _wrapped(f"cannot be told from: {', '.join(finding.alternatives)}", "  ")

@@ -113,10 +113,11 @@ class Hypotheses:
         if pushed:
             found = [c for c in found if c.parameters[0] not in pushes]
         native = _native_targets(twin, found)
+        there = {name for c in found for name in c.parameters}
         candidates = [
             Candidate(f"parameter.{name}", PARAMETER, name, i, (name,), _OF_PARAMETER.format(name))
             for i, name in enumerate(own)
-            if name not in calibrate and name not in native.values()
+            if name not in {*calibrate, *native.values(), *there}
         ]
         candidates += [
             c
@@ -189,6 +190,11 @@ class Hypotheses:
 
     def indices(self, candidate: Candidate) -> tuple[int, ...]:
         return tuple(self.names.index(name) for name in candidate.parameters)
+
+    def added_to(self, name: str) -> float:
+        """:return: what the twin as it came has already of an effect's parameter"""
+        target = _native_targets(self.believed, self.candidates).get(name)
+        return 0.0 if target is None else self.believed.values[target]
 
     def extended_by(self, causes: Sequence[str], theta: Float[np.ndarray, " p"]) -> Twin:
         """

@@ -25,6 +25,7 @@ class Estimate:
     :param unit: of all of these
     :param before: value with which the search began
     :param at_bound: whether the estimate lies on a physical bound; standard errors mean little then
+    :param added_to: what the twin has of it already, to which the estimate is added, in ``unit``
     """
 
     name: str
@@ -35,6 +36,7 @@ class Estimate:
     unit: str
     before: float
     at_bound: bool
+    added_to: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

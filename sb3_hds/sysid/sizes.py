@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from sb3_hds.core import AnalyticTwin, Trajectories, Twin
 from sb3_hds.core.layers import plant_of
+from sb3_hds.errors import EffectError
 from sb3_hds.sysid.evidence import Evidence
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.motion import motion_of
@@ -36,12 +37,20 @@ class _Moved(NamedTuple):
 def sized(evidence: Evidence, data: Trajectories) -> Hypotheses:
     """
     :param evidence: windows, with the spread of each channel as its noise
+    :raises EffectError: if the twin does not listen to effects
     :return: the hypotheses, with a scale for each parameter that these windows can see, and with
         starts for searches that need several
     """
     h = evidence.hypotheses
     point = evidence.fit(h.null, ())
     curvature = np.diag(evidence.slopes(point).curvature.sum(0))
+    if not np.any(curvature[list(h.pushes)] > 0.0):
+        raise EffectError(
+            f"A force at {', '.join(joint.name for joint in h.twin.joints)} moves nothing in "
+            f"{h.believed.name}: its step(state, action, params, effects) does not use the effects "
+            "that it is given, so nothing that they do could be found. sb3_hds.core.AnalyticTwin "
+            "has a step that does."
+        )
     seen = curvature > _NOTHING * point.raw.size
     moved = _motion(h, data)
     scale = np.where(seen, h.scale, _unseen(h, data, moved))

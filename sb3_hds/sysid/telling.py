@@ -58,7 +58,8 @@ def finding(
     candidate, parameters = one.tried.candidate, {}
     for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
         low, high = _interval(half, point, free, i, float(reach[i]), profiles)
-        parameters[name.rpartition(".")[2]] = Estimate(
+        short = name.rpartition(".")[2]
+        parameters[name.split(".", 1)[1] if short in parameters else short] = Estimate(
             name=name,
             estimate=float(theta[i]),
             stderr=float(stderr[i]),
@@ -67,6 +68,7 @@ def finding(
             unit=h.twin.parameters[name].unit,
             before=float(h.null[i]),
             at_bound=bool(theta[i] <= h.lower[i] or theta[i] >= h.upper[i]),
+            added_to=h.added_to(name),
         )
     return Finding(
         candidate.name,

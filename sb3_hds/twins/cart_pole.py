@@ -46,7 +46,7 @@ class CartPole(Rig):
             - 0.01\,\big(\dot x^2 + \omega^2 + (u / 10\,\mathrm{N})^2\big)
 
     :param observe: ``"task"`` for the environment's observations and its integrator; ``"q"`` or
-        ``"qv"`` for a rig in continuous time
+        ``"qv"`` for a rig in continuous time, which takes any force
     """
 
     name = "CartPole"
@@ -100,7 +100,9 @@ class CartPole(Rig):
         return jnp.concatenate([state.q[:1], jnp.cos(angle), jnp.sin(angle), state.v])
 
     def actuate(self, state: State, action: Action, params: Params) -> Force:
-        force = jnp.clip(action[0], -_MAX_FORCE, _MAX_FORCE)
+        force = action[0]
+        if self.observed == "task":
+            force = jnp.clip(force, -_MAX_FORCE, _MAX_FORCE)
         return jnp.stack([force, jnp.zeros_like(force)])
 
     def mass_matrix(self, q: Position, params: Params) -> MassMatrix:

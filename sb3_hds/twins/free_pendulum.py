@@ -65,6 +65,8 @@ class FreePendulum(Rig):
         if self.zero not in _ZEROS:
             raise ParameterError(f"zero must be 'down' or 'up', got {self.zero!r}.")
         check_length(self.name, "tip", self.tip)
+        if self.driven not in (True, False):
+            raise ParameterError(f"driven must be True or False, got {self.driven!r}.")
         self.actuators = (_MOTOR,) if self.driven else ()
 
     def actuate(self, state: State, action: Action, params: Params) -> Force:

@@ -1,0 +1,190 @@
+"""What `diagnose` is given by mistake, or for a second time: a clear answer each."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from measuring import measured
+
+from sb3_hds import diagnose, effects, twins
+from sb3_hds.core import NO_EFFECTS, Channel, Joint, Parameter, State, Trajectories, Twin
+from sb3_hds.errors import CalibrationError, EffectError, ParameterError
+
+FRICTION = (effects.ViscousFriction, effects.CoulombFriction)
+
+
+def swinging(*hidden, **parameters):
+    """:return: a driven pendulum without what is hidden, and recordings of it with that"""
+    pushed = twins.make("FreePendulum", driven=True, dt=0.02)
+    wander = np.random.default_rng(0).standard_normal((8, 100, 1)).cumsum(1)
+    commands = 0.05 * np.sin(0.7 * wander)
+    system = pushed.with_parameters(**parameters) if parameters else pushed
+    return pushed, measured(
+        system.extend(*hidden) if hidden else system,
+        n=8,
+        n_steps=100,
+        noise=0.005,
+        commands=commands,
+    )
+
+
+def asked(twin, data, kinds=FRICTION):
+    return diagnose(twin, data, effects=kinds, budget="quick", progress=False)
+
+
+def changed(data, change):
+    obs, actions = (list(leaves) for leaves in zip(*map(data.episode, range(len(data)))))  # noqa: B905
+    return Trajectories.from_arrays([change(o) for o in obs], actions, dt=data.dt)
+
+
+def test_a_sensor_that_reports_nothing_gets_no_name():
+    twin, data = swinging()
+
+    found = asked(twin, changed(data, lambda obs: obs * [1.0, 0.0]))
+
+    assert found.verdict == "not_identifiable" and not found.findings
+    assert any("'hinge_velocity' stays at exactly 0" in caveat for caveat in found.caveats)
+
+
+def test_an_extended_twin_is_asked_again_by_one_name_for_each_cause():
+    twin, data = swinging(effects.CoulombFriction(0, tau_c=0.02))
+
+    found = asked(twin.extend(effects.CoulombFriction(0, tau_c=0.01)), data)
+
+    assert found.verdict == "named"
+    [finding] = found.findings
+    assert (finding.effect, finding.alternatives) == ("coulomb_friction", ())
+    assert finding.parameters["tau_c"].estimate == pytest.approx(0.02, rel=0.05)
+    assert found.twin.values["coulomb_friction.hinge.tau_c"] == pytest.approx(0.02, rel=0.05)
+
+
+def test_less_of_what_the_twin_has_is_told_as_what_is_added_to_it():
+    twin, data = swinging()
+
+    found = asked(twin.with_parameters(damping=0.003), data)
+
+    estimate = found.findings[0].parameters["b"]
+    assert estimate.estimate == pytest.approx(-0.003, rel=0.05)
+    assert estimate.added_to == pytest.approx(0.003)
+    assert "added to the twin's own 0.003" in str(found)
+    assert found.to_dict()["findings"][0]["parameters"]["b"]["added_to"] == pytest.approx(0.003)
+
+
+def test_a_joint_the_wrong_way_round_keeps_both_of_its_parameters():
+    twin, data = swinging()
+
+    found = asked(twin, changed(data, lambda obs: -obs), (*FRICTION, effects.SignFlip))
+
+    names = {estimate.name for estimate in found.findings[0].parameters.values()}
+    assert names == {"sign_flip.hinge_position.flipped", "sign_flip.hinge_velocity.flipped"}
+
+
+class Deaf(Twin):
+    """A pendulum of one's own, whose step takes effects and does nothing with them."""
+
+    name = "Deaf"
+    dt = 0.02
+    joints = (Joint("hinge", "rad"),)
+    actuators = ()
+    channels = (Channel("angle", "rad"), Channel("rate", "rad/s"))
+    parameters = {"pull": Parameter(null=9.0, scale=1.0, unit="1/s2", lower=0.0)}
+
+    def initial(self, key, params):
+        return State(jnp.ones(1), jnp.zeros(1), {})
+
+    def infer(self, obs, params):
+        return State(obs[:1], obs[1:], {})
+
+    def observe(self, state, params):
+        return jnp.concatenate([state.q, state.v])
+
+    def step(self, state, action, params, effects=NO_EFFECTS):
+        v = state.v - self.dt * params["pull"] * jnp.sin(state.q)
+        return State(state.q + self.dt * v, v, state.memory)
+
+
+class Mute(Deaf):
+    name = "Mute"
+
+    def step(self, state, action, params):
+        return super().step(state, action, params)
+
+
+def test_a_twin_that_does_not_listen_to_effects_gets_no_verdict():
+    obs = [np.stack([np.sin(0.02 * np.arange(101) + i), np.cos(0.02 * np.arange(101) + i)], 1)
+           for i in range(8)]  # fmt: skip
+    data = Trajectories.from_arrays(obs, [np.zeros((100, 0))] * 8, dt=0.02)
+
+    with pytest.raises(EffectError, match="A force at hinge moves nothing in Deaf"):
+        asked(Deaf(), data)
+    with pytest.raises(EffectError, match="Mute cannot be extended: its step takes no effects"):
+        asked(Mute(), data)
+
+
+def test_names_of_effects_are_as_good_as_their_classes():
+    twin, data = swinging(effects.CoulombFriction(0, tau_c=0.02))
+
+    found = asked(twin, data, ["coulomb_friction", "viscous_friction"])
+
+    assert [finding.effect for finding in found.findings] == ["coulomb_friction"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "says"),
+    [
+        ({"effects": ["rubbing"]}, EffectError, "no effect rubbing. There are: viscous_friction"),
+        ({"effects": [effects.CoulombFriction(0)]}, EffectError, "effects are classes"),
+        ({"seed": -1}, CalibrationError, "seed must be a whole number of at least 0"),
+        ({"twin": "FreePendulum"}, CalibrationError, "takes a twin"),
+        ({"data": np.zeros(3)}, CalibrationError, "got FreePendulum and ndarray"),
+    ],
+)
+def test_mistakes_are_named_at_the_door(changes, error, says):
+    twin, data = swinging()
+    given = {"twin": twin, "data": data, "progress": False} | changes
+
+    with pytest.raises(error, match=says):
+        diagnose(given.pop("twin"), given.pop("data"), **given)
+
+
+def test_an_option_that_is_neither_true_nor_false_is_refused():
+    with pytest.raises(ParameterError, match="driven must be True or False, got 'no'"):
+        twins.make("FreePendulum", driven="no")
+
+
+def test_a_rig_is_pushed_as_hard_as_it_was():
+    rig = twins.make("CartPole", observe="qv")
+    state = State(jnp.zeros(2), jnp.zeros(2), {})
+
+    weak, strong = (rig.step(state, jnp.array([force]), rig.params).v[0] for force in (10.0, 30.0))
+
+    assert float(strong) == pytest.approx(3.0 * float(weak), rel=0.05)
+
+
+def test_a_channel_that_is_stuck_in_one_recording_is_found():
+    from sb3_hds.data import audit
+
+    twin, data = swinging()
+    obs, actions = (list(leaves) for leaves in zip(*map(data.episode, range(len(data)))))  # noqa: B905
+    obs[3] = np.stack([obs[3][:, 0], np.full(len(obs[3]), obs[3][0, 1])], 1)
+
+    found = audit(Trajectories.from_arrays(obs, actions, dt=data.dt), channels=twin.channels)
+
+    [stuck] = [f for f in found.findings if type(f).__name__ == "StuckChannel"]
+    assert stuck.channel == "hinge_velocity" and [p.trajectory for p in stuck.places] == [3]
+    assert found.usable
+
+
+def test_what_is_corrected_is_said():
+    from sb3_hds.data import audit
+
+    twin, data = swinging()
+    pairs = [data.episode(i) for i in range(len(data))]
+    late = Trajectories.from_arrays(
+        [np.stack([o[2:, 0], o[:-2, 1]], 1) for o, _ in pairs],
+        [a[2:] for _, a in pairs],
+        dt=data.dt,
+    )
+
+    said = audit(late, channels=twin.channels).corrections
+
+    assert len(said) == 1 and "'hinge_velocity' was shifted by -40 ms" in said[0]
