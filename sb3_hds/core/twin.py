@@ -96,8 +96,8 @@ class Twin(abc.ABC):
         whole = isinstance(substeps, Integral) and substeps >= 1
         if not (whole and isinstance(dt, Real) and 0.0 < dt < math.inf):
             raise ParameterError(
-                f"{self.name} needs a finite dt > 0 s and a whole number of sub-steps, at least "
-                f"one, got dt={dt!r}, substeps={substeps!r}."
+                f"{self.name} needs a finite dt > 0 s and at least one sub-step, got dt={dt!r}, "
+                f"substeps={substeps!r}."
             )
         self.dt, self.substeps = float(dt), int(substeps)
         for option, default in self.options.items():

@@ -6,14 +6,11 @@ import textwrap
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, Protocol
 
 from sb3_hds.core import Params, Twin
 from sb3_hds.sysid.pictures import Pictures
 from sb3_hds.sysid.results import Estimate, plain
-
-if TYPE_CHECKING:
-    from sb3_hds.experiments import PolicyGain
 
 Verdict = Literal["named", "ambiguous", "none", "unknown", "not_identifiable"]
 
@@ -26,6 +23,12 @@ SENTENCES = {
     "unknown": "Something is there that none of the candidates explains.",
     "not_identifiable": "These data cannot support a verdict.",
 }
+
+
+class _Plain(Protocol):
+    """What can be told as plain data, as what ``measure_policy_gain`` returns."""
+
+    def to_dict(self) -> dict[str, Any]: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,7 +211,7 @@ class Diagnosis:
     def to_html(
         self,
         path: str | os.PathLike[str],
-        policy_gain: "Mapping[str, Any] | PolicyGain | None" = None,
+        policy_gain: "Mapping[str, Any] | _Plain | None" = None,
     ) -> Path:
         """
         Write one self-contained page: the verdict, its evidence, pictures, caveats.
