@@ -508,7 +508,7 @@ def test_what_is_missing_for_parquet_and_minari_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     monkeypatch.setattr("importlib.import_module", without)
 
-    with pytest.raises(TrajectoryError, match="Install it: pip install pyarrow"):
+    with pytest.raises(TrajectoryError, match=r"pip install sb3-hds\[parquet\]"):
         Trajectories.load(tmp_path / "log.parquet", columns=COLUMNS)
     with pytest.raises(TrajectoryError, match=r"pip install sb3-hds\[minari\]"):
         Trajectories.load("minari:any/set-v0", columns={"dt": 0.05})
@@ -619,3 +619,18 @@ def test_a_recording_is_no_evidence_twice(tmp_path):
             [path, str(tmp_path / "*.csv")],
             columns={"time": "t", "obs": ["q"], "actions": ["u"]},
         )
+
+
+@pytest.mark.parametrize("lowest", [-np.pi, 0.0])
+def test_angles_that_wrap_are_not_interpolated_unless_they_are_named(tmp_path, lowest):
+    rng = np.random.default_rng(0)
+    times = 0.01 * np.arange(600) + 0.003 * rng.random(600)
+    turning = 5.0 * times + 0.01 * rng.standard_normal(600)
+    table = {"t": times, "q": (turning - lowest) % (2.0 * np.pi) + lowest, "u": 0.0 * times}
+    path, columns = write_csv(tmp_path / "log.csv", table), {"time": "t", "actions": ["u"]}
+
+    with pytest.raises(TrajectoryError, match=r"jumps by a whole turn after row .*angle: true"):
+        Trajectories.load(path, columns=columns | {"obs": ["q"]})
+    with pytest.warns(SamplingWarning):
+        data = Trajectories.load(path, columns=columns | {"obs": [{"column": "q", "angle": True}]})
+    assert data.n_steps > 500

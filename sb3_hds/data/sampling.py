@@ -16,6 +16,10 @@ from sb3_hds.errors import TrajectoryError
 _REGULAR = 0.01  # of one interval: stamps that are closer to a grid than this are on it
 _UNEVEN = 0.1  # of the median interval
 _GAP = 5.0  # intervals
+_TURNS, _FEW = (
+    6.0,
+    0.2,
+)  # usual steps around a whole turn, and the largest that is told from it [rad]
 _FAR = 10.0  # intervals between two measurements that nobody can fill in
 
 
@@ -160,6 +164,7 @@ def _resampled(rows: Rows, dt: float, angles: Sequence[int]) -> _Resampled | Non
     if n_steps < 1:
         return None
     grid = np.minimum(begin + dt * np.arange(n_steps + 1), times[-1])
+    _refuse_turns(rows, angles)
     turns = obs.copy()
     turns[:, list(angles)] = np.unwrap(turns[:, list(angles)], axis=0)
     new = _at(grid, times, turns)
@@ -172,6 +177,28 @@ def _resampled(rows: Rows, dt: float, angles: Sequence[int]) -> _Resampled | Non
     inside = (times >= grid[0]) & (times <= grid[-1])
     moved = _farthest(times, grid)
     return _Resampled(float(rows.times[0]) + begin, new, actions, False, moved, error[inside])
+
+
+def _refuse_turns(rows: Rows, angles: Sequence[int]) -> None:
+    """
+    :raises TrajectoryError: where a channel jumps by a whole turn: between its ends there is no
+        motion to interpolate
+    """
+    for i in set(range(rows.obs.shape[1])) - set(angles):
+        x = rows.obs[:, i]
+        steps = np.abs(np.diff(x))
+        usual = float(np.median(steps)) if len(steps) else 0.0
+        near = _TURNS * min(usual, _FEW)
+        # Between -pi and pi, or between 0 and two pi.
+        ends = np.abs(x[1:] + x[:-1] - (2.0 * np.pi if x.min() >= 0.0 else 0.0))
+        wraps = (np.abs(steps - 2.0 * np.pi) < near) & (ends < near)
+        if wraps.any():
+            row = int(rows.numbers[np.flatnonzero(wraps)[0]])
+            raise TrajectoryError(
+                f"Channel {i} of '{rows.source}' jumps by a whole turn after row {row}, and its "
+                "rows have to be resampled. If it is an angle that wraps, say so: {column: NAME, "
+                "angle: true}."
+            )
 
 
 def _phase(times: np.ndarray, dt: float) -> float:

@@ -111,7 +111,7 @@ def _read_parquet(path: Path, wanted: frozenset[str]) -> Log:
     except ImportError as error:
         raise TrajectoryError(
             f"'{path}': Parquet files are read by pyarrow, which is not installed. "
-            "Install it: pip install pyarrow."
+            "Install it: pip install sb3-hds[parquet]."
         ) from error
     return Log([{str(name): table[name].to_numpy() for name in table.columns}])
 

@@ -178,7 +178,7 @@ class Diagnosis:
         if self.unexplained:
             lines += _wrapped(f"Unexplained: {self.unexplained}")
         if self.gain:
-            lines.append("Held-out error, in units of the noise, by steps ahead:")
+            lines.append("Held-out error, in units of what the best fit leaves, by steps ahead:")
             lines += [
                 f"  {g.steps:5d}: {g.before:9.3g} -> {g.after:9.3g}   "
                 f"(90 % interval of the gain {g.low:.0%} to {g.high:.0%})"

@@ -91,7 +91,7 @@ def plot_horizons(d: "Diagnosis", p: "Pictures", narrow: bool = False) -> Any:
     for gain in d.gain.values():
         ends = [gain.before * np.sqrt(max(1.0 - end, 0.0)) for end in (gain.low, gain.high)]
         axes.plot([gain.steps] * 2, ends, color=_AFTER, lw=4.0, alpha=0.3)
-    axes.axhline(1.0, color=_QUIET, lw=1.0, ls="--", label="noise")
+    axes.axhline(1.0, color=_QUIET, lw=1.0, ls="--", label="what the best fit leaves")
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("steps from the start of a window", fontsize=8)
     axes.set_ylabel("error / noise", fontsize=8)

@@ -270,8 +270,9 @@ def _pictures(d: Diagnosis) -> list[_Picture]:
         ),
         _Picture(
             "Error against horizon",
-            "Root mean square over all held-out windows and channels, in units of the noise. Bars: "
-            "90 % interval of the gain.",
+            "Root mean square over all held-out windows and channels, in units of what the best "
+            "fit of any candidate leaves: the noise, where one of them is right. Bars: 90 % "
+            "interval of the gain.",
             lambda narrow: plots.plot_horizons(d, p, narrow),
         ),
         _Picture(
