@@ -5,8 +5,9 @@ Does a small range of actions learn faster, and a large one end better? A car on
 
 Raffin reports it for the steering range of a racing car (*Learning to race in an hour*, 2022).
 Here, ``ActionScale`` shrinks the range of steering and target speed of a car that understeers,
-around straight ahead at 7 m/s. An episode ends after 20 s or off the track; its return is the
-distance covered [m]. The learner is CrossQ with the same settings for all; the policy's mean is
+around straight ahead at 7 m/s. With ``--wheelbase 0.4``, steering turns the car two and a half
+times as sharply, in a table of its own. An episode ends after 20 s or off the track; its return is
+the distance covered [m]. The learner is CrossQ with the same settings for all; the policy's mean is
 evaluated for three episodes.
 """
 
@@ -45,7 +46,8 @@ class Oval(gymnasium.Env):
 
     dt = _DT
 
-    def __init__(self) -> None:
+    def __init__(self, wheelbase: float = _WHEELBASE) -> None:
+        self.wheelbase = wheelbase
         self.observation_space = spaces.Box(-5.0, 5.0, (3 + len(_SIGHT),))
         self.action_space = spaces.Box(-1.0, 1.0, (2,))
 
@@ -62,7 +64,7 @@ class Oval(gymnasium.Env):
         wanted = np.mean(_SPEEDS) + throttle * 0.5 * (_SPEEDS[1] - _SPEEDS[0])
         most = _ACCELERATION * _DT
         speed += np.clip(wanted - speed, -most, most)
-        turn = speed * math.tan(steering) / (_WHEELBASE * (1.0 + _UNDERSTEER * speed**2))
+        turn = speed * math.tan(steering) / (self.wheelbase * (1.0 + _UNDERSTEER * speed**2))
         bend = curvature(place)
         progress = speed * math.cos(heading) / (1.0 - offset * bend)
         offset += speed * math.sin(heading) * _DT
@@ -95,29 +97,38 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=6_000)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=2, metavar=("SEED", "STEPS"))
+    parser.add_argument("--wheelbase", type=float, default=_WHEELBASE, help="of the car [m]")
+    parser.add_argument("--worker", nargs=3, metavar=("SEED", "STEPS", "WHEELBASE"))
     arguments = parser.parse_args()
     if arguments.worker:
-        seed, steps = map(int, arguments.worker)
-        rows = [row for scale in SCALES for row in learn(str(scale), seed, steps)]
+        seed, steps, wheelbase = arguments.worker
+        given = int(seed), int(steps), float(wheelbase)
+        rows = [row for scale in SCALES for row in learn(str(scale), *given)]
         print(json.dumps({"rows": rows}))
         return
     if not arguments.figure:
         wanted = [(seed, arguments.steps) for seed in range(arguments.seeds)]
-        work = lambda *run: fresh_process(__file__, *run, cache=CACHE)["rows"]  # noqa: E731
-        resume("action_scale", ["seed", "steps"], wanted, work, arguments.jobs)
-    report(arguments.steps)
+        given = arguments.wheelbase
+        work = lambda *run: fresh_process(__file__, *run, given, cache=CACHE)["rows"]  # noqa: E731
+        resume(table_of(given), ["seed", "steps"], wanted, work, arguments.jobs)
+    report(arguments.steps, table_of(arguments.wheelbase))
 
 
-def learn(scale: str, seed: int, steps: int) -> list[dict]:
+def table_of(wheelbase: float) -> str:
+    """:return: its name"""
+    usual = wheelbase == _WHEELBASE
+    return "action_scale" if usual else f"action_scale_wheelbase_{wheelbase:g}"
+
+
+def learn(scale: str, seed: int, steps: int, wheelbase: float = _WHEELBASE) -> list[dict]:
     """:return: one row for each evaluation"""
     from sb3_hds import CrossQ
     from sb3_hds.wrappers import ActionScale
 
     def wrapped():
         if scale != "schedule":
-            return ActionScale(Oval(), float(scale))
-        return ActionScale(Oval(), schedule=[[0, 0.4], [SCHEDULE_SHARE * steps, 1.0]])
+            return ActionScale(Oval(wheelbase), float(scale))
+        return ActionScale(Oval(wheelbase), schedule=[[0, 0.4], [SCHEDULE_SHARE * steps, 1.0]])
 
     model = CrossQ(
         "MlpPolicy",
@@ -155,21 +166,21 @@ def evaluate(model, env, seed: int, n_episodes: int = 3) -> tuple[float, float]:
     return covered / n_episodes, finished / n_episodes
 
 
-def report(steps: int) -> None:
+def report(steps: int, name: str = "action_scale") -> None:
     """Print and draw the runs of so many steps: those of other lengths have another schedule."""
     import pandas as pd
 
-    table = pd.read_csv(RESULTS / "action_scale.csv", dtype={"scale": str})
+    table = pd.read_csv(RESULTS / f"{name}.csv", dtype={"scale": str})
     table = table[table.steps == steps]
     if table.empty:
-        print(f"{RESULTS / 'action_scale.csv'} has no runs of {steps} steps.")
+        print(f"{RESULTS / name}.csv has no runs of {steps} steps.")
         return
     grouped = table.groupby(["scale", "timestep"]).distance.agg(["mean", "std", "count"])
     print(grouped.round(1).to_string())
-    draw(table)
+    draw(table, name)
 
 
-def draw(table) -> None:
+def draw(table, name: str) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.0, 3.6), layout="constrained")
@@ -186,7 +197,7 @@ def draw(table) -> None:
     axes.set_ylabel("distance in 20 s [m]")
     axes.set_title(f"Share of the action range, {table.seed.nunique()} seeds, mean and its error")
     axes.legend(frameon=False, title="ActionScale")
-    figure.savefig(RESULTS / "action_scale.png", dpi=150)
+    figure.savefig(RESULTS / f"{name}.png", dpi=150)
 
 
 if __name__ == "__main__":

@@ -9,14 +9,16 @@ A quadruped with springs: RL alone, an optimised rhythm, and both, in which orde
 - ``rl, position`` and ``rl, force``: gSDE-SAC alone, an action being the angles of the motors, or
   the torques that springs shall pass on
 - ``plain rhythm``: a trot that nobody optimised, and no learning
+- ``plain rhythm, torque``: the same targets, tracked by torques at the 50 Hz of the policy
 - ``rhythm``: the trot that ``OpenLoop`` finds from there, all legs doing the same
+- ``rhythm, free legs``: every joint for itself, 25 numbers instead of seven
 - ``rhythm, then rl``: half the steps for the search, the rest for gSDE-SAC, which adds offsets to
   the targets of the gait that was found
 - ``rl over a plain rhythm``: the same offsets, over the plain trot
 - ``rl sets the rhythm``: gSDE-SAC sets amplitudes and frequency of the plain trot while it walks
 
-Rhythms command the angles of the motors, which the drives hold at 500 Hz. Tracking them by torques
-at the 50 Hz of the policy does not walk: a rotor on 15 N m/rad swings faster than that.
+Other rhythms command the angles of the motors, which the drives hold at 500 Hz: a rotor on
+15 N m/rad swings faster than a loop at 50 Hz can hold.
 
 Each run is a process of its own; what acts at the end is evaluated on 20 episodes, the same resets
 for every run. Runs that are in the table are not done again.
@@ -34,7 +36,9 @@ METHODS = (
     "rl, position",
     "rl, force",
     "plain rhythm",
+    "plain rhythm, torque",
     "rhythm",
+    "rhythm, free legs",
     "rhythm, then rl",
     "rl over a plain rhythm",
     "rl sets the rhythm",
@@ -48,7 +52,6 @@ PLAIN = {
 }
 # A search of few episodes: one each, cut off after 5 s, and a third of the steps to rank the best.
 SEARCH = {
-    "gait": "trot",
     "horizon": 250,
     "n_resets": 1,
     "initial_sigma": 0.5,
@@ -97,10 +100,13 @@ def worker(method: str, seed: int, steps: int) -> dict:
 
 def learned(method: str, seed: int, steps: int):
     """:return: model, and environment that it acts in"""
-    if method == "plain rhythm":
-        return plain(seed), make("position")
-    if method == "rhythm":
-        return plain(seed).learn(steps), make("position")
+    if method == "plain rhythm, torque":
+        # Angles of the motors are not observed: the model reads those of its own environment.
+        env = make("torque")
+        return by_torques(env, seed), env
+    if method in ("plain rhythm", "rhythm", "rhythm, free legs"):
+        model = plain(seed, gait=None if method == "rhythm, free legs" else "trot")
+        return model if method == "plain rhythm" else model.learn(steps), make("position")
     if method == "rhythm, then rl":
         gait = plain(seed).learn(steps // 2).constants
         env = over(gait, "offset", action_range=0.3)
@@ -129,11 +135,20 @@ def over(gait: dict, mode: str, **settings):
     return CPGPrior(make("position"), mode=mode, **gait, **settings)
 
 
-def plain(seed: int):
+def plain(seed: int, gait: str | None = "trot"):
     """:return: the plain trot, from which a search can go on"""
     from sb3_hds import OpenLoop
 
-    return OpenLoop("MlpPolicy", make("position"), seed=seed, **SEARCH).set_constants(**PLAIN)
+    model = OpenLoop("MlpPolicy", make("position"), seed=seed, gait=gait, **SEARCH)
+    return model.set_constants(**PLAIN)
+
+
+def by_torques(env, seed: int):
+    """:return: the plain trot, its targets in rad and the gains of the drive in its commands"""
+    from sb3_hds import OpenLoop
+
+    angles = PLAIN | {"amplitude": [0.4] * 8, "kp": 6.0, "kd": 0.14}
+    return OpenLoop("MlpPolicy", env, seed=seed).set_constants(**angles)
 
 
 def with_rl(env, seed: int, steps: int):
@@ -159,11 +174,11 @@ def draw(table: pd.DataFrame) -> None:
     shown = [method for method in METHODS if (table.method == method).any()]
     for place, method in enumerate(shown):
         returns = table[table.method == method]["return"]
-        axes.plot(np.full(len(returns), place), returns, "o", color="#27496d", alpha=0.6)
-        axes.plot([place - 0.25, place + 0.25], [returns.median()] * 2, color="#27496d", lw=2)
-    axes.set_xticks(range(len(shown)), [method.replace(" rhythm", "\nrhythm") for method in shown])
-    axes.tick_params(axis="x", labelsize=8)
-    axes.set_ylabel(f"return after {table.steps.max():,} steps")
+        axes.plot(returns, np.full(len(returns), place), "o", color="#27496d", alpha=0.6)
+        axes.plot([returns.median()] * 2, [place - 0.25, place + 0.25], color="#27496d", lw=2)
+    axes.set_yticks(range(len(shown)), shown)
+    axes.invert_yaxis()
+    axes.set_xlabel(f"return after {table.steps.max():,} steps")
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(RESULTS / "elastic_quadruped.png", dpi=150)
 

@@ -17,7 +17,7 @@ import json
 import numpy as np
 import pandas as pd
 from intervals import of_iqm
-from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+from runs import CACHE, RESULTS, fresh_process, resume, save, seconds_since_start
 
 ROBOT = "sb3_hds/PendulumReal-v1"
 NOISE = 0.01
@@ -88,9 +88,7 @@ def report() -> None:
     """Print, keep and draw what the seeds say."""
     table = pd.read_csv(RESULTS / "policy_gain.csv")
     rows = [summary(hidden, own) for hidden, own in table.groupby("hidden", sort=False)]
-    gains = pd.DataFrame(rows)
-    gains.to_csv(RESULTS / "policy_gain_intervals.csv", index=False)
-    print(gains.to_string(index=False))
+    print(save(rows, "policy_gain_intervals").to_string(index=False))
     draw(table)
 
 

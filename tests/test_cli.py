@@ -8,6 +8,7 @@ from measuring import measured
 
 from sb3_hds import Trajectories, cli, effects, twins
 from sb3_hds.errors import CalibrationError
+from sb3_hds.sysid import Diagnosis
 
 
 @pytest.fixture(scope="module")
@@ -121,13 +122,13 @@ def test_a_twin_is_set_by_numbers_words_and_truth_values(tmp_path, monkeypatch, 
     assert len(servo.actuators) == 2
 
 
-def test_what_the_audit_proposes_is_done_if_wanted(tmp_path, monkeypatch):
+def test_what_the_audit_proposes_is_done_if_wanted_and_said(tmp_path, monkeypatch, capsys):
     """A filter in the drive: the speed comes four samples late."""
     asked = []
 
     def diagnose(twin, data, **_):
         asked.append(data)
-        raise CalibrationError("enough")
+        return Diagnosis("none", twin, twin, data_hash="", seed=0)
 
     monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
     time = 0.01 * np.arange(2000)
@@ -136,7 +137,13 @@ def test_what_the_audit_proposes_is_done_if_wanted(tmp_path, monkeypatch):
     log = Trajectories.from_arrays([obs], [commands], dt=0.01).save(tmp_path / "log")
     words = ["--twin", "LinearAxis", "--data", log]
 
-    assert ask(*words) == ask(*words, "--correct") == 1
+    told = tmp_path / "out.json"
+
+    assert ask(*words) == 0
+    assert "shifted" not in capsys.readouterr().out
+    assert ask(*words, "--correct", "--json", told) == 0
+    assert "Caveat: 'axis_velocity' was shifted by -40 ms." in capsys.readouterr().out
+    assert json.loads(told.read_text())["caveats"] == ["'axis_velocity' was shifted by -40 ms."]
 
     plain, corrected = asked
     np.testing.assert_array_equal(plain.obs[0], obs)

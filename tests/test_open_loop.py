@@ -410,7 +410,7 @@ def test_the_ablations_of_the_paper_search_fewer_numbers():
     "settings",
     [{"horizon": None}, {"population_size": 1}, {"n_resets": 0}, {"frequency": [2.0, 1.0]},
      {"frequency": 3.0}, {"gain_factor": 0.5}, {"control": "maybe"}, {"kp": -1.0}, {"dt": 0.0},
-     {"gait": "gallop"}, {"gait": []}, {"amplitude": 0.0}],
+     {"gait": "gallop"}, {"gait": []}, {"gait": 3}, {"amplitude": 0.0}],
     ids=str,
 )  # fmt: skip
 def test_an_argument_out_of_range_is_named_with_its_range(settings):

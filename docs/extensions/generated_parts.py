@@ -49,6 +49,9 @@ PARTS: dict[str, Callable[[], str]] = {
     ),
     "robustness_share": summaries.crossed("robustness", "perturbation", ("env", "policy"), "share"),
     "action_scale": summaries.crossed("action_scale", "scale", ("timestep",), "distance"),
+    "action_scale_short": summaries.crossed(
+        "action_scale_wheelbase_0.4", "scale", ("timestep",), "distance"
+    ),
     "safe_swing_up": summaries.over_seeds(
         "safe_swing_up", "without", "return", "violations", "continuity"
     ),

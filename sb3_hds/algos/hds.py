@@ -378,13 +378,15 @@ class HDS(TwinAlgorithm):
             for f in found.findings
             if f.effect in _CATALOGUE and not self._estimates(f"{f.effect}.{f.where['name']}")
         ]
-        own = {name: value for f in new for name, value in _native_of(f, found.twin).items()}
-        foreign = [f for f in new if not _native_of(f, found.twin)]
-        causes = [effect for f in foreign for effect in _effects_of(f, self.twin)]
-        if causes or own:
-            self.twin = self.twin.with_parameters(**own) if own else self.twin
-            self.twin = self.twin.extend(*causes) if causes else self.twin
-            self.nominal |= nulls_of(causes) | own
+        values, causes = {}, []
+        for f in new:
+            native = _native_of(f, found.twin)
+            values |= native
+            causes += [] if native else _effects_of(f, self.twin)
+        if new:
+            twin = self.twin.with_parameters(**values)
+            self.twin = twin.extend(*causes) if causes else twin
+            self.nominal |= nulls_of(causes) | values
             self.twin_spec, self._workspace = self.twin.to_spec(), None
             self._steps_at_force = 0
         return found

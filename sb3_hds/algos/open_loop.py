@@ -152,7 +152,9 @@ class OpenLoop(SavesTensors):
         self.amplitude, self.offset = amplitude, offset
         self.frequency = np.atleast_1d(np.asarray(frequency, float)).tolist()
         self.same_frequency, self.phases = same_frequency, phases
-        self.gait = gait if gait is None or isinstance(gait, str) else list(gait)
+        self.gait: Any = gait
+        if isinstance(gait, Sequence) and not isinstance(gait, str):
+            self.gait = list(gait)
         self.control, self.joints, self.dt = control, joints, dt
         self.body: dict[str, Any] | None = None
         super().__init__(

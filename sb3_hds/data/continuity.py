@@ -14,6 +14,7 @@ from sb3_hds.data.findings import (
     StuckChannel,
 )
 from sb3_hds.data.stretches import Stretch
+from sb3_hds.data.turns import whole_turns
 
 _STEPS = 8.0  # smallest steps per sample: slower motion repeats values because of quantisation
 _ROUGH = 3.0  # typical changes of the step from sample to sample: slower motion does so by chance
@@ -150,7 +151,7 @@ def reinitialised(
     for stretch in stretches:
         jumps = np.diff(stretch.obs, axis=0)
         large = np.abs(jumps) > np.maximum(_LARGE * usual.spread, 10.0 * resolution)
-        large &= ~_turns(jumps, usual.step)
+        large &= ~whole_turns(jumps, usual.step)
         isolated = large & _isolated(jumps, usual.step)
         sharp = np.pad(_bends(stretch.obs, usual.spread) > usual.bend, (1, 0))
         for k in np.flatnonzero(large.any(axis=1)):
@@ -251,12 +252,6 @@ def _isolated(jumps: np.ndarray, usual: np.ndarray) -> np.ndarray:
     padded = np.pad(size, ((2, 2), (0, 0)))
     around = np.max([padded[i : i + len(size)] for i in (0, 1, 3, 4)], axis=0)
     return size > _ISOLATED * np.maximum(around, usual)
-
-
-def _turns(jumps: np.ndarray, usual: np.ndarray) -> np.ndarray:
-    """Which jumps are whole turns of a wrapped angle [rad]."""
-    turns = np.round(np.abs(jumps) / (2.0 * np.pi))
-    return (turns > 0) & (np.abs(np.abs(jumps) - 2.0 * np.pi * turns) < 5.0 * usual)
 
 
 def _place(stretch: Stretch, first: int, last: int) -> Place:

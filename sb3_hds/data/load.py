@@ -4,6 +4,7 @@ import dataclasses
 import glob
 import os
 import warnings
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -86,12 +87,10 @@ def _paths(files: Files) -> list[str]:
         found += matching
     if not found:
         raise TrajectoryError("files names no file.")
-    twice = sorted({path for path in found if found.count(path) > 1})
-    if twice:
-        raise TrajectoryError(
-            f"files names '{twice[0]}' {found.count(twice[0])} times: a recording is evidence "
-            "only once."
-        )
+    times = Counter(path if path.startswith(PREFIX) else os.path.realpath(path) for path in found)
+    (path, n), *_ = times.most_common(1)
+    if n > 1:
+        raise TrajectoryError(f"files names '{path}' {n} times: a recording is evidence only once.")
     return found
 
 

@@ -11,15 +11,14 @@ from sb3_hds.data.columns import Columns
 from sb3_hds.data.report import Part, Reading, Sampling
 from sb3_hds.data.resolution import resolutions
 from sb3_hds.data.rows import Rows
+from sb3_hds.data.turns import whole_turns
 from sb3_hds.errors import TrajectoryError
 
 _REGULAR = 0.01  # of one interval: stamps that are closer to a grid than this are on it
 _UNEVEN = 0.1  # of the median interval
 _GAP = 5.0  # intervals
-_TURNS, _FEW = (
-    6.0,
-    0.2,
-)  # usual steps around a whole turn, and the largest that is told from it [rad]
+_LARGEST = 0.2  # usual step from which a whole turn is told [rad]
+_ENDS = 6.0  # usual steps: how near to its ends an angle wraps
 _FAR = 10.0  # intervals between two measurements that nobody can fill in
 
 
@@ -186,12 +185,11 @@ def _refuse_turns(rows: Rows, angles: Sequence[int]) -> None:
     """
     for i in set(range(rows.obs.shape[1])) - set(angles):
         x = rows.obs[:, i]
-        steps = np.abs(np.diff(x))
-        usual = float(np.median(steps)) if len(steps) else 0.0
-        near = _TURNS * min(usual, _FEW)
+        steps = np.diff(x)
+        usual = min(float(np.median(np.abs(steps))) if len(steps) else 0.0, _LARGEST)
         # Between -pi and pi, or between 0 and two pi.
         ends = np.abs(x[1:] + x[:-1] - (2.0 * np.pi if x.min() >= 0.0 else 0.0))
-        wraps = (np.abs(steps - 2.0 * np.pi) < near) & (ends < near)
+        wraps = whole_turns(steps, np.array(usual)) & (ends < _ENDS * usual)
         if wraps.any():
             row = int(rows.numbers[np.flatnonzero(wraps)[0]])
             raise TrajectoryError(

@@ -94,7 +94,7 @@ def plot_horizons(d: "Diagnosis", p: "Pictures", narrow: bool = False) -> Any:
     axes.axhline(1.0, color=_QUIET, lw=1.0, ls="--", label="what the best fit leaves")
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("steps from the start of a window", fontsize=8)
-    axes.set_ylabel("error / noise", fontsize=8)
+    axes.set_ylabel("error / what the best fit leaves", fontsize=8)
     axes.legend(fontsize=8, frameon=False)
     return figure
 

@@ -56,10 +56,13 @@ def finding(
     stderr = standard_errors(half, point, free)
     reach = margin(len(np.unique(half.unit)), stderr)
     candidate, parameters = one.tried.candidate, {}
+    shorts = [name.rpartition(".")[2] for name in candidate.parameters]
     for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
         low, high = _interval(half, point, free, i, float(reach[i]), profiles)
         short = name.rpartition(".")[2]
-        parameters[name.split(".", 1)[1] if short in parameters else short] = Estimate(
+        # Of several places, each has its own.
+        own = short if shorts.count(short) == 1 else name.partition(".")[2]
+        parameters[own] = Estimate(
             name=name,
             estimate=float(theta[i]),
             stderr=float(stderr[i]),

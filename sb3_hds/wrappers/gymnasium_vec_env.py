@@ -150,9 +150,9 @@ class GymnasiumVecEnv(VecEnv):
             return self.env.reset(options={"reset_mask": which})
         except ValueError as error:
             raise RuntimeError(
-                f"{self.env} does not let some of its copies be reset alone ({error}). Normalise "
-                "with SB3's VecNormalize above this adapter instead, or use "
-                "autoreset_mode=SAME_STEP, or pass partial_reset=."
+                f"{self.env} could not reset some of its copies alone ({error}). If a wrapper of "
+                "Gymnasium normalises there, put SB3's VecNormalize above this adapter instead; "
+                "otherwise use autoreset_mode=SAME_STEP, or pass partial_reset=."
             ) from error
 
     def _episode(self, i: int, told: Any) -> dict[str, float]:
