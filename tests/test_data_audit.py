@@ -270,6 +270,52 @@ def test_a_jump_in_resampled_rows_is_cut_without_the_sample_between(tmp_path):
 # --- velocities
 
 
+@pytest.mark.parametrize("first, last", [(0, 0), (80, 80), (80, 90), (200, 200)])
+def test_values_beyond_all_measure_are_refused_by_name_and_cut_out(data, first, last):
+    def spoil(i, obs, actions):
+        if i == 3:
+            obs[first : last + 1, 2] = 1e6
+        return obs, actions
+
+    spoiled = changed(data, spoil)
+    found = audit(spoiled, channels_of("PendulumReal"))
+    better = found.corrected(spoiled)
+
+    assert kinds(found) == {"Outliers"} and not found.usable
+    assert f"'{channels_of('PendulumReal')[2].name}' jumps to 1e+06 and back" in found.reason
+    assert [(p.trajectory, p.first, p.last) for p in found.findings[0].places] == [(3, first, last)]
+    assert audit(better).findings == () and np.abs(better.obs).max() < 100.0
+    lost = {(0, 0): 1, (80, 80): 2, (80, 90): 12, (200, 200): 1}[first, last]
+    assert better.n_steps == data.n_steps - lost
+
+
+@pytest.mark.parametrize("what", ["a blow", "it runs away", "a rest with an encoder's steps"])
+def test_what_is_large_and_real_is_no_outlier(data, what):
+    t = np.arange(60)
+
+    def shape(i, obs, actions):
+        if what == "a blow" and i == 3:
+            obs[80:140, 2] += 1e3 * np.exp(-t / 5.0)
+        if what == "it runs away" and i == 3:
+            obs[-60:, 2] += 1e3 * np.exp((t - 59.0) / 5.0)
+        if what == "a rest with an encoder's steps":
+            obs[:] = obs[0]
+            obs[80:82, 2] += 1e-3
+        return obs, actions
+
+    assert "Outliers" not in kinds(audit(changed(data, shape)))
+
+
+def test_a_single_channel_that_is_cut_off_where_it_began_was_not_put_back(data):
+    only = [np.minimum(data.episode(i)[0][:, 2:], 0.3) for i in range(len(data))]
+    only[0][0] = 0.3
+    actions = [data.episode(i)[1] for i in range(len(data))]
+
+    found = audit(Trajectories.from_arrays(only, actions, dt=data.dt))
+
+    assert "SaturatedChannel" in kinds(found) and "ReinitialisedState" not in kinds(found)
+
+
 def late(data, channel, lag):
     """A channel that comes late by a whole number of samples; the ends are cut off."""
 

@@ -11,11 +11,13 @@ from sb3_hds.data.excitation import excitation
 from sb3_hds.data.finding import Finding, Place
 from sb3_hds.data.findings import (
     Gaps,
+    Outliers,
     RepeatedStamps,
     StandingStill,
     UnevenSampling,
     WithinNoise,
 )
+from sb3_hds.data.outliers import outliers
 from sb3_hds.data.report import Reading
 from sb3_hds.data.resolution import resolutions
 from sb3_hds.data.results import Audit, ChannelSummary
@@ -30,11 +32,11 @@ def audit(data: Trajectories, channels: Sequence[str | Channel] | None = None) -
     Look for defects of the recording, which physics would have to explain otherwise.
 
     Uneven, repeated and missing samples; channels that are stuck or cut off; a state that was put
-    back inside a recording; a velocity that comes late or early; the noise while standing still;
-    too little motion. Where the data were read from logs, rows are checked as they were measured.
-    It is *not* told which channels are velocities: it finds them by their correlation with the
-    derivatives of others, and finds none in data that hardly move. What is judged by its motion is
-    not judged in data without any.
+    back inside a recording; values beyond all measure; a velocity that comes late or early; the
+    noise while standing still; too little motion. Where the data were read from logs, rows are
+    checked as they were measured. It is *not* told which channels are velocities: it finds them by
+    their correlation with the derivatives of others, and finds none in data that hardly move. What
+    is judged by its motion is not judged in data without any, nor beside values beyond all measure.
 
     :param data: of any kind
     :param channels: names of the observation channels, or a twin's ``channels``; default: those
@@ -50,8 +52,13 @@ def audit(data: Trajectories, channels: Sequence[str | Channel] | None = None) -
     known = report and np.array(report.resolution)
     resolution = resolutions([stretch.obs for stretch in rows]) if known is None else known
     still = stillness_of(rows, resolution)
-    found = [*excitation(data, still, names, actions), *_sampling(data, report)]
-    if not any(isinstance(finding, StandingStill | WithinNoise) for finding in found):
+    # Where values are beyond all measure, so are the spreads that everything else is compared with.
+    found: list[Finding] = list(outliers(rows, names))
+    if not found:
+        found += excitation(data, still, names, actions)
+    unfit = any(isinstance(finding, Outliers | StandingStill | WithinNoise) for finding in found)
+    found += _sampling(data, report)
+    if not unfit:
         found += [
             *continuity.reinitialised(rows, names, resolution),
             *velocity_shifts(data, names),

@@ -1,6 +1,6 @@
 """Values that no motion gives: repeated, stuck, cut off, put back."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ from sb3_hds.data.findings import (
     SaturatedChannel,
     StuckChannel,
 )
-from sb3_hds.data.stretches import Stretch
+from sb3_hds.data.stretches import Stretch, runs
 from sb3_hds.data.turns import whole_turns
 
 _STEPS = 8.0  # smallest steps per sample: slower motion repeats values because of quantisation
@@ -64,10 +64,10 @@ def _repeats(stretches: Sequence[Stretch], j: int, resolution: float) -> tuple[l
     for stretch in stretches:
         x = stretch.obs[:, j]
         moving += int((np.abs(np.diff(x)) > (fast if resolution else 0.0)).sum())
-        for a, b in _runs(np.diff(x) == 0.0):
+        for a, b in runs(np.diff(x) == 0.0):
             inside = a >= 1 and b < len(x) - 1 and b - a <= _LONGEST_REPEAT
             if inside and (_moves_on(x, a, b, fast) if resolution else x[a] not in natural):
-                places.append(_place(stretch, a + 1, b))
+                places.append(stretch.place(a + 1, b))
     n = sum(place.last - place.first + 1 for place in places)
     return places, n / max(moving + n, 1)
 
@@ -92,10 +92,10 @@ def saturated(
             places, n = [], 0
             for stretch in stretches:
                 x = stretch.obs[:, j]
-                for a, b in _runs((x[1:] == value) & (x[:-1] == value)):
+                for a, b in runs((x[1:] == value) & (x[:-1] == value)):
                     arrives = b - a + 1 >= shortest and _abrupt(x, a, b, fast)
                     if arrives and _others_move(stretch.obs[a : b + 1], j, usual):
-                        places.append(_place(stretch, a, b))
+                        places.append(stretch.place(a, b))
                         n += b - a + 1
             if n >= _PLATEAU and np.ptp(everything[:, j]) > 0.0:
                 found.append(SaturatedChannel(name, tuple(places), value, n / len(everything)))
@@ -116,18 +116,18 @@ def stuck(
         extremes = everything[:, j].min(), everything[:, j].max()
         if extremes[0] == extremes[1]:
             if np.ptp(np.delete(everything, j, axis=1), axis=0).any():
-                whole = tuple(_place(s, 0, len(s.obs) - 1) for s in stretches)
+                whole = tuple(s.place(0, len(s.obs) - 1) for s in stretches)
                 found.append(DeadChannel(name, whole, float(extremes[0])))
             continue
         fast = max(_MOVES * usual[j], 3.0 * resolution[j])
         for stretch in stretches:
             x = stretch.obs[:, j]
-            for a, b in _runs(np.diff(x) == 0.0):
+            for a, b in runs(np.diff(x) == 0.0):
                 throughout = b - a == len(x) - 1 and usual[j] > 3.0 * resolution[j]
                 abrupt = x[a] not in extremes and _abrupt(x, a, b, fast)
                 long = b - a >= _STUCK and (throughout or abrupt)
                 if long and _others_move(stretch.obs[a : b + 1], j, usual):
-                    found.append(StuckChannel(name, (_place(stretch, a, b),), float(x[a])))
+                    found.append(StuckChannel(name, (stretch.place(a, b),), float(x[a])))
     return found
 
 
@@ -136,8 +136,8 @@ def reinitialised(
 ) -> list[ReinitialisedState]:
     """
     Steps that are many times those before and after them, in several channels or back to where a
-    recording begins; and, however large other steps are, those that lead back there exactly, which
-    quantised values do by chance.
+    recording begins; and, however large other steps are, those that lead back there exactly and on
+    from there. Quantised values do so by chance, and one that is cut off stays there.
 
     A single channel may jump for other reasons: a velocity at an impact, an outlier. Whole turns of
     an angle are no jumps.
@@ -154,13 +154,14 @@ def reinitialised(
         large &= ~whole_turns(jumps, usual.step)
         isolated = large & _isolated(jumps, usual.step)
         sharp = np.pad(_bends(stretch.obs, usual.spread) > usual.bend, (1, 0))
+        goes_on = np.append(jumps[1:].any(axis=1), True)
         for k in np.flatnonzero(large.any(axis=1)):
             away = np.abs(stretch.obs[k + 1] - usual.starts)
             back = bool((away <= _NEAR_START * usual.spread + 2.0 * usual.step).all(1).any())
-            exactly = bool((away <= at_start).all(1).any()) and bool(sharp[k])
+            exactly = bool((away <= at_start).all(1).any() and sharp[k] and goes_on[k])
             if exactly or isolated[k].sum() > (not back and len(names) > 1):
                 to_start = back or exactly
-                places[to_start].append(_place(stretch, int(k) + 1, int(k) + 1))
+                places[to_start].append(stretch.place(int(k) + 1, int(k) + 1))
                 sizes[to_start] = np.maximum(sizes[to_start], np.abs(jumps[k]) * large[k])
     return [
         ReinitialisedState(
@@ -206,12 +207,6 @@ def _bends(x: np.ndarray, spread: np.ndarray) -> np.ndarray:
     return np.max(np.abs(np.diff(x, 2, axis=0)) / np.where(spread > 0.0, spread, np.inf), axis=1)
 
 
-def _runs(flags: np.ndarray) -> Iterator[tuple[int, int]]:
-    """First and last row of each run of equal values, from the flags of the steps between rows."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
-
-
 def _moves_on(x: np.ndarray, a: int, b: int, fast: float) -> bool:
     """Whether x moves fast and steadily up to row a and from row b on."""
     reach = 2 * _LONGEST_REPEAT
@@ -252,14 +247,3 @@ def _isolated(jumps: np.ndarray, usual: np.ndarray) -> np.ndarray:
     padded = np.pad(size, ((2, 2), (0, 0)))
     around = np.max([padded[i : i + len(size)] for i in (0, 1, 3, 4)], axis=0)
     return size > _ISOLATED * np.maximum(around, usual)
-
-
-def _place(stretch: Stretch, first: int, last: int) -> Place:
-    return Place(
-        stretch.source,
-        int(stretch.numbers[first]),
-        int(stretch.numbers[last]),
-        stretch.trajectory,
-        float(stretch.times[first]),
-        float(stretch.times[max(first - 1, 0)]),
-    )

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
+from itertools import accumulate
 
 import numpy as np
 
@@ -44,7 +45,8 @@ def shifted(data: Trajectories, shifts: Mapping[int, float]) -> Trajectories:
 
 def cut(data: Trajectories, places: Sequence[tuple[int, float, float]]) -> Trajectories:
     """
-    Episodes cut where a new one begins inside them; pieces without a step are left out.
+    Episodes cut where a new one begins inside them, or where samples have to go; pieces without a
+    step are left out.
 
     :param data: at one interval
     :param places: trajectory, and the times of the last sample before and the first one after [s],
@@ -55,7 +57,7 @@ def cut(data: Trajectories, places: Sequence[tuple[int, float, float]]) -> Traje
         x, u = data.episode(i)
         here = sorted((last, first) for trajectory, last, first in places if trajectory == i)
         ends = [math.floor(last / data.dt + _ON_GRID) + 1 for last, _ in here]
-        begins = [math.ceil(first / data.dt - _ON_GRID) for _, first in here]
+        begins = list(accumulate((math.ceil(first / data.dt - _ON_GRID) for _, first in here), max))
         for a, b in zip([0, *begins], [*ends, int(n) + 1], strict=True):
             if b - a > 1:  # the action before the cut led nowhere that was measured
                 obs.append(x[a:b])

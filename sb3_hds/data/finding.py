@@ -17,7 +17,8 @@ class Place(NamedTuple):
     :param last: last one
     :param trajectory: its number in the data
     :param time: of the first sample, since the beginning of the trajectory [s]
-    :param before: time of the sample before it [s]
+    :param before: time of the sample before the first one [s]
+    :param after: time of the sample after the last one [s]
     """
 
     source: str
@@ -26,6 +27,7 @@ class Place(NamedTuple):
     trajectory: int
     time: float = 0.0
     before: float = 0.0
+    after: float = 0.0
 
     def __str__(self) -> str:
         samples = f"sample {self.first}" if self.first == self.last else f"samples {self.first}"

@@ -129,6 +129,31 @@ class SaturatedChannel(Finding):
 
 
 @dataclasses.dataclass(frozen=True)
+class Outliers(Finding):
+    """
+    They outweigh all else in a mean square.
+
+    :param value: farthest one, in the unit of the channel
+    :param low: lower end of the range that 98 % of the channel's samples fill
+    :param high: upper end
+    """
+
+    blocks = True
+    value: float
+    low: float
+    high: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' jumps to {self.value:.4g} and back, where 98 % of its samples are "
+            f"between {self.low:.4g} and {self.high:.4g} ({listed(self.places)})."
+        )
+
+    remedy = "Look at sensor and cable. audit.corrected(data) cuts these samples out."
+
+
+@dataclasses.dataclass(frozen=True)
 class ReinitialisedState(Finding):
     """
     :param to_start: whether the state jumps to where a recording begins

@@ -8,7 +8,7 @@ from typing import Any
 from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.data.corrections import cut, shifted
 from sb3_hds.data.finding import Finding, counted, percent
-from sb3_hds.data.findings import ReinitialisedState, VelocityShift
+from sb3_hds.data.findings import Outliers, ReinitialisedState, VelocityShift
 from sb3_hds.errors import TrajectoryError
 
 _WIDTH = 80
@@ -78,7 +78,8 @@ class Audit:
 
     def corrected(self, data: Trajectories) -> Trajectories:
         """
-        Cut where the state was put back, and shift velocities to where they belong.
+        Cut where the state was put back, cut outliers out, and shift velocities to where they
+        belong. What outliers hid is found when the result is audited.
 
         :param data: those that were audited
         :return: new trajectories; the same ones if there is nothing to correct
@@ -88,6 +89,8 @@ class Audit:
             raise TrajectoryError("These are not the data of this audit: call audit(data) first.")
         jumps = [f for f in self.findings if isinstance(f, ReinitialisedState)]
         places = [(p.trajectory, p.before, p.time) for jump in jumps for p in jump.places]
+        far = [f for f in self.findings if isinstance(f, Outliers)]
+        places += [(p.trajectory, p.before, p.after) for outlier in far for p in outlier.places]
         if places:
             data = cut(data, places)
         names = [channel.name for channel in self.channels]
@@ -100,6 +103,8 @@ class Audit:
         """Sentences on what :meth:`corrected` does to the data."""
         jumps = sum(len(f.places) for f in self.findings if isinstance(f, ReinitialisedState))
         cuts = (f"The data were cut at {counted(jumps, 'jump')} of the state.",) if jumps else ()
+        far = sum(len(f.places) for f in self.findings if isinstance(f, Outliers))
+        cuts += (f"Samples were cut out at {counted(far, 'place')} with outliers.",) if far else ()
         return cuts + tuple(
             f"'{channel}' was shifted by {-1e3 * seconds:+.3g} ms."
             for channel, seconds in self.velocity_shift.items()

@@ -1,11 +1,13 @@
 """Uninterrupted rows, as measured: what the checks of the audit look at."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int
+from jaxtyping import Bool, Float64, Int
 
 from sb3_hds.core.trajectories import Trajectories
+from sb3_hds.data.finding import Place
 from sb3_hds.data.report import Part
 
 
@@ -31,6 +33,18 @@ class Stretch(NamedTuple):
         """Median interval [s]."""
         return float(np.median(np.diff(self.times)))
 
+    def place(self, first: int, last: int) -> Place:
+        """:return: its rows ``first`` to ``last``, by their numbers in the recording"""
+        return Place(
+            self.source,
+            int(self.numbers[first]),
+            int(self.numbers[last]),
+            self.trajectory,
+            float(self.times[first]),
+            float(self.times[max(first - 1, 0)]),
+            float(self.times[min(last + 1, len(self.times) - 1)]),
+        )
+
 
 def stretches_of(data: Trajectories) -> list[Stretch]:
     """:return: the rows of the log that each trajectory was read from, or else its samples"""
@@ -45,6 +59,15 @@ def stretches_of(data: Trajectories) -> list[Stretch]:
         Stretch(f"trajectory {i}", i, k, data.dt * k, data.obs[i, : len(k)])
         for i, k in enumerate(numbers)
     ]
+
+
+def runs(flags: Bool[np.ndarray, " steps"]) -> Iterator[tuple[int, int]]:
+    """
+    :param flags: of rows, or of the steps between rows
+    :return: where each run of set flags begins, and where the next flag is not set
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
 
 
 def _parts_of(data: Trajectories) -> list[Part]:
