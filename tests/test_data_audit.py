@@ -306,12 +306,12 @@ def test_what_is_large_and_real_is_no_outlier(data, what):
     assert "Outliers" not in kinds(audit(changed(data, shape)))
 
 
-def test_a_single_channel_that_is_cut_off_where_it_began_was_not_put_back(data):
-    only = [np.minimum(data.episode(i)[0][:, 2:], 0.3) for i in range(len(data))]
-    only[0][0] = 0.3
-    actions = [data.episode(i)[1] for i in range(len(data))]
+def test_a_single_channel_that_is_cut_off_where_it_began_was_not_put_back():
+    starts, t = np.linspace(1.0, 2.0, 8), 0.4 * np.arange(201)
+    only = [np.minimum(np.sin(t + start), 0.3)[:, None] for start in starts]
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (8, 200, 1))
 
-    found = audit(Trajectories.from_arrays(only, actions, dt=data.dt))
+    found = audit(Trajectories.from_arrays(only, actions, dt=0.05))
 
     assert "SaturatedChannel" in kinds(found) and "ReinitialisedState" not in kinds(found)
 
