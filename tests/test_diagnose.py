@@ -13,13 +13,14 @@ from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import JointEffect, Parameter, Trajectories, rollout
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.comparison import Comparison, compare, confirm, split
+from sb3_hds.sysid.diagnosis import HorizonGain
 from sb3_hds.sysid.evidence import Evidence, Point
 from sb3_hds.sysid.guesses import newton
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.remainder import MissingForce, remainder
 from sb3_hds.sysid.search import Half, Search
 from sb3_hds.sysid.shooting import shots_of
-from sb3_hds.sysid.telling import out_of_reach
+from sb3_hds.sysid.telling import errs_more, out_of_reach
 
 CATALOGUE = (
     effects.ViscousFriction,
@@ -123,6 +124,16 @@ def test_what_the_data_cannot_tell_apart_is_said():
         "look alike where the mass scales" in c and "would tell them apart" in c
         for c in found.caveats
     ), found.caveats
+
+
+def test_horizons_at_which_a_named_cause_makes_it_worse_are_told():
+    better = HorizonGain(10, 2.0, 1.0, 0.4, 0.6)
+    unsure = HorizonGain(5, 1.0, 1.1, -0.2, 0.01)
+    worse = HorizonGain(1, 1.0, 1.2, -0.3, -0.1)
+
+    assert errs_more({5: unsure, 10: better}) == []
+    (told,) = errs_more({1: worse, 5: unsure, 10: better})
+    assert "1 (+20%)" in told and "5" not in told
 
 
 def test_causes_look_alike_at_one_place_only():

@@ -36,6 +36,7 @@ from sb3_hds.sysid.sizes import sized
 from sb3_hds.sysid.telling import (
     NO_CONSTANT,
     Accepted,
+    errs_more,
     finding,
     in_words,
     look_alike,
@@ -307,12 +308,13 @@ class Inquiry:
             verdict = "ambiguous" if findings[0].alternatives else "named"
         elif unexplained:
             verdict = "unknown"
+        gain = by_horizon(confirm, start.kept, base.kept, self.every)
         return Diagnosis(
             verdict=verdict,
             believed=self.believed,
             findings=findings,
             unexplained=unexplained,
-            gain=by_horizon(confirm, start.kept, base.kept, self.every),
+            gain=gain,
             explained=self._explained(found, start, base, before, left) if findings else 0.0,
             detectable=detectable(select, start.point),
             rejected=tuple(
@@ -325,6 +327,7 @@ class Inquiry:
                 *to_tell_apart(found, self.hypotheses),
                 *look_alike(found, select, base),
                 *out_of_reach(confirm, base.kept, self.origin[self.parts.confirm]),
+                *(errs_more(gain) if findings else ()),
             ),
             twin=self.hypotheses.extended_by(keys_of(found), point.theta).at_interval(
                 self.believed.dt, self.believed.substeps

@@ -1,6 +1,6 @@
 """How what was found is told."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +10,7 @@ from scipy import stats
 from sb3_hds.sysid.account import standard_errors
 from sb3_hds.sysid.comparison import Comparison
 from sb3_hds.sysid.constancy import Change
-from sb3_hds.sysid.diagnosis import Finding
+from sb3_hds.sysid.diagnosis import Finding, HorizonGain
 from sb3_hds.sysid.evidence import Point
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.imitation import imitators
@@ -144,6 +144,21 @@ def out_of_reach(half: Half, kept: Point, origin: Int[np.ndarray, " n"]) -> list
         f"The simulation is off by more than ten times the noise in {lost.sum()} of {len(lost)} "
         f"windows that nothing was fitted to ({where}). What happens there is not in the other "
         "recordings: look at them, and record more of it."
+    ]
+
+
+def errs_more(gain: Mapping[int, HorizonGain]) -> list[str]:
+    """
+    :param gain: of all that is named, by horizon
+    :return: a sentence on the horizons at which the extended twin is worse, if there are any
+    """
+    worse = [g for g in gain.values() if g.high < 0.0]
+    if not worse:
+        return []
+    steps = " and ".join(f"{g.steps} (+{g.after / g.before - 1.0:.0%})" for g in worse)
+    return [
+        f"The extended twin errs more than before, steps ahead: {steps}. Over whole windows it "
+        "gains; but what is named may stand in for something else there."
     ]
 
 
