@@ -280,6 +280,16 @@ def test_a_scale_shrinks_commands_around_the_middle_of_their_range():
     np.testing.assert_allclose(told.ravel(), [2.5, 1.5, 2.0])
 
 
+def test_a_scale_may_leave_actions_alone():
+    fixed = ActionScale(joints(), 0.4, axes=[1])
+    growing = ActionScale(joints(), schedule=[[0, 0.2], [4, 1.0]], axes=(0,))
+
+    np.testing.assert_allclose(commands_of(fixed, [[5.0, 5.0]]), [[5.0, 2.0]])
+    expected = [[1.0, -5.0], [2.0, -5.0], [3.0, -5.0]]
+    np.testing.assert_allclose(commands_of(growing, [[5.0, -5.0]] * 3), expected, rtol=1e-6)
+    assert fixed.step(np.array([5.0, 5.0], np.float32))[-1]["correction"] == pytest.approx(0.0)
+
+
 def test_a_schedule_of_scales_counts_steps_over_episodes():
     env = ActionScale(joints(1), schedule=[[0, 0.2], [4, 1.0]])
 
@@ -361,6 +371,8 @@ def test_a_continuity_cost_is_the_squared_change_of_the_action():
         (lambda env: ActionDelay(env, 1, store="executed"), "store must be one of"),
         (lambda env: ActionScale(env), "either a scale or a schedule"),
         (lambda env: ActionScale(env, 1.5), "at most 1"),
+        (lambda env: ActionScale(env, 0.5, axes=[2]), "numbers of the 2 actuators, from 0 to 1"),
+        (lambda env: ActionScale(env, 0.5, axes=[]), "numbers of the 2 actuators"),
         (lambda env: ActionScale(env, schedule=[[5, 0.1]]), "growing from 0"),
         (lambda env: ActionScale(env, schedule=[[0, 0.2], [10]]), "list of pairs"),
         (lambda env: ActionScale(env, schedule=[[0, 0.2]], progress=2.0), "from 0 to 1"),

@@ -46,6 +46,7 @@ LAYERS = {
     "low_pass": lambda env: LowPassAction(env, cutoff=4.0, order=3),
     "delay": lambda env: ActionDelay(env, steps=3),
     "scale": lambda env: ActionScale(env, schedule=[[0, 0.3], [150, 1.0]]),
+    "scale_of_some": lambda env: ActionScale(env, schedule=[[0, 0.3], [150, 1.0]], axes=[0]),
     "history": lambda env: HistoryObservation(env, n_observations=2, n_actions=2),
     "continuity": lambda env: ContinuityCost(env, weight=0.3),
     # No speed is commanded here: what the twin does beyond its assumptions has to agree, too.

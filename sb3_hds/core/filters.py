@@ -199,18 +199,20 @@ class Scale(StatefulTransform):
 
     .. math:: u = m + s\,(a - m)
 
-    The share follows a schedule, linear between its points and constant outside. Where it changes,
+    Those of other actuators than ``axes`` reach all of theirs. The share follows a schedule, linear between its points and constant outside. Where it changes,
     it remembers how much of the schedule has passed, from 0 to 1, over all episodes; an episode of
     a twin begins anywhere in it. Without ``observed``, a twin infers the beginning of the schedule.
 
     :param schedule: ``((steps, share), ...)``, steps growing from 0, shares above 0 and at most 1
-    :raises ParameterError: for any other schedule
+    :param axes: numbers of the actuators concerned, from 0; None: all
+    :raises ParameterError: for any other schedule, or actuators that there are not
     """
 
     name: ClassVar[str] = "scale"
     persists: ClassVar[bool] = True
 
     schedule: Sequence[Sequence[float]]
+    axes: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -227,6 +229,9 @@ class Scale(StatefulTransform):
         return float(self.schedule[-1][0])
 
     def remembers(self, below: Signals) -> tuple[Channel, ...]:
+        n = len(below.actuators)
+        fine = self.axes is None or (len(self.axes) > 0 and set(self.axes) <= set(range(n)))
+        refuse_unless(self, "axes", fine, f"numbers of the {n} actuators, from 0 to {n - 1}")
         return (Channel("progress of the scale", "1", 0.0, 1.0),) if self.length else ()
 
     def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
@@ -245,16 +250,20 @@ class Scale(StatefulTransform):
         below: Signals,
     ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
         middle = _like(action, 0.5 * np.sum(below.limits(), 0))
-        command = middle + self.share(memory) * (clipped(action, below) - middle)
+        share = self.share(memory, len(below.actuators))
+        command = middle + share * (clipped(action, below) - middle)
         return command, (memory + 1.0 / self.length).clip(0.0, 1.0) if self.length else memory
 
-    def share(self, memory: Float[Any, " memory"]) -> Any:
-        """:return: the share of the range that commands reach now"""
-        if not self.length:
-            return self.schedule[0][1]
-        steps, shares = np.array(self.schedule).T
-        at = _like(memory, steps), _like(memory, shares)
-        return namespace(memory).interp(memory * self.length, *at)
+    def share(self, memory: Float[Any, " memory"], n: int) -> Any:
+        """:return: of the range that each of ``n`` commands reaches now, or one for all"""
+        share = self.schedule[0][1]
+        if self.length:
+            steps, shares = np.array(self.schedule).T
+            at = _like(memory, steps), _like(memory, shares)
+            share = namespace(memory).interp(memory * self.length, *at)
+        if self.axes is None:
+            return share
+        return 1.0 + _like(memory, np.isin(np.arange(n), self.axes)) * (share - 1.0)
 
 
 def clipped(command: Float[Any, " act"], below: Signals) -> Float[Any, " act"]:

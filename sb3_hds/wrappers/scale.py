@@ -25,10 +25,13 @@ class ActionScale(TransformLayer):
     :param scale: the share, above 0 and at most 1
     :param schedule: ``[[0, 0.3], [10_000, 1.0]]``: shares at step 0 and from step 10,000 on, linear
         between; instead of ``scale``
+    :param axes: numbers of the actions concerned, from 0, such as ``[0]`` for steering alone; None:
+        all
     :param progress: where in the schedule it begins, from 0 to 1: 1 to act with what was trained
     :param observe_state: whether the progress is appended
     :param store: ``"executed"``: learners store the action that stands for what was executed below
-    :raises ParameterError: for a share or a schedule out of range, or both
+    :raises ParameterError: for a share or a schedule out of range, or both, or for axes that the
+        actions do not have
     """
 
     def __init__(
@@ -37,6 +40,7 @@ class ActionScale(TransformLayer):
         scale: float | None = None,
         schedule: Sequence[Sequence[float]] | None = None,
         *,
+        axes: Sequence[int] | None = None,
         progress: float = 0.0,
         observe_state: bool = True,
         store: str = "raw",
@@ -49,6 +53,7 @@ class ActionScale(TransformLayer):
         arguments = {
             "scale": scale,
             "schedule": schedule,
+            "axes": axes,
             "progress": progress,
             "observe_state": observe_state,
             "store": store,
@@ -56,11 +61,11 @@ class ActionScale(TransformLayer):
         if not 0.0 <= progress <= 1.0:
             raise ParameterError(f"ActionScale(progress={progress}): progress is from 0 to 1.")
         points = [[0.0, scale]] if schedule is None else schedule
-        self._scale = Scale(schedule=_pairs(points), observed=observe_state)
+        self._scale = Scale(schedule=_pairs(points), axes=axes, observed=observe_state)
         super().__init__(env, self._scale, store, arguments)
         self._begin_at = self._memory
         self.set_progress(progress)
-        self._share = float(np.squeeze(self._scale.share(self._memory)))
+        self._share = self._shares()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -80,7 +85,7 @@ class ActionScale(TransformLayer):
             self._memory = self._begin_at = np.array([np.clip(progress, 0.0, 1.0)])
 
     def decide(self, action: np.ndarray) -> np.ndarray:
-        self._share = float(np.squeeze(self._scale.share(self._memory)))
+        self._share = self._shares()
         return super().decide(action)
 
     def nominal(self, action: np.ndarray) -> np.ndarray:
@@ -89,6 +94,9 @@ class ActionScale(TransformLayer):
     def meant_by(self, command: np.ndarray) -> np.ndarray:
         wanted = self._middle + (command - self._middle) / self._share
         return np.clip(wanted, self.commands.low, self.commands.high)
+
+    def _shares(self) -> np.ndarray:
+        return np.asarray(self._scale.share(self._memory, self.commands.shape[0]))
 
     @property
     def _middle(self) -> np.ndarray:
