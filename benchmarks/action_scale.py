@@ -2,13 +2,17 @@
 Does a small range of actions learn faster, and a large one end better? A car on an oval.
 
     python benchmarks/action_scale.py [--seeds 5] [--steps 6000] [--figure]
+    python benchmarks/action_scale.py --steering        # and all of the speed's range
+    python benchmarks/action_scale.py --wheelbase 0.4   # a car that turns more sharply
+    python benchmarks/action_scale.py --steering --wheelbase 0.25 --sde   # noise that persists
 
 Raffin reports it for the steering range of a racing car (*Learning to race in an hour*, 2022).
-Here, ``ActionScale`` shrinks the range of steering and target speed of a car that understeers,
-around straight ahead at 7 m/s. With ``--wheelbase 0.4``, steering turns the car two and a half
-times as sharply, in a table of its own. An episode ends after 20 s or off the track; its return is
-the distance covered [m]. The learner is CrossQ with the same settings for all; the policy's mean is
-evaluated for three episodes.
+Here, ``ActionScale`` shrinks the range of steering, and unless ``--steering`` is given that of the
+target speed, of a car that understeers, around straight ahead at 7 m/s. Each way of asking has a
+table of its own. Noise is drawn at every step, or with ``--sde`` for 16 steps at a time (gSDE, as
+the racing car had it). An episode ends after 20 s or off the track; its return is the distance
+covered [m]. The learner is CrossQ with the same settings for all; the policy's mean is evaluated
+for three episodes.
 """
 
 import argparse
@@ -23,7 +27,7 @@ from runs import CACHE, RESULTS, fresh_process, resume
 SCALES = (0.4, 0.7, 1.0, "schedule")
 #: from 0.4 of the range to the whole over two thirds of the steps
 SCHEDULE_SHARE = 2.0 / 3.0
-N_EVALUATIONS = 6
+_EVERY = 500  # steps, from one evaluation to the next
 
 _DT = 0.1  # [s]
 _STEPS = 200
@@ -98,38 +102,54 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
     parser.add_argument("--wheelbase", type=float, default=_WHEELBASE, help="of the car [m]")
-    parser.add_argument("--worker", nargs=3, metavar=("SEED", "STEPS", "WHEELBASE"))
+    parser.add_argument("--steering", action="store_true", help="shrink only its range")
+    parser.add_argument("--sde", action="store_true", help="noise that lasts for 16 steps")
+    parser.add_argument("--worker", nargs=5, metavar=("SEED", "STEPS", "WHEELBASE", "AXES", "SDE"))
     arguments = parser.parse_args()
     if arguments.worker:
-        seed, steps, wheelbase = arguments.worker
-        given = int(seed), int(steps), float(wheelbase)
+        seed, steps, wheelbase, axes, sde = arguments.worker
+        given = int(seed), int(steps), float(wheelbase), json.loads(axes), json.loads(sde)
         rows = [row for scale in SCALES for row in learn(str(scale), *given)]
         print(json.dumps({"rows": rows}))
         return
+    axes = [0] if arguments.steering else None
+    table = table_of(arguments.wheelbase, arguments.steering, arguments.sde)
     if not arguments.figure:
         wanted = [(seed, arguments.steps) for seed in range(arguments.seeds)]
-        given = arguments.wheelbase
-        work = lambda *run: fresh_process(__file__, *run, given, cache=CACHE)["rows"]  # noqa: E731
-        resume(table_of(given), ["seed", "steps"], wanted, work, arguments.jobs)
-    report(arguments.steps, table_of(arguments.wheelbase))
+        given = arguments.wheelbase, json.dumps(axes), json.dumps(arguments.sde)
+        work = lambda *run: fresh_process(__file__, *run, *given, cache=CACHE)["rows"]  # noqa: E731
+        resume(table, ["seed", "steps"], wanted, work, arguments.jobs)
+    report(arguments.steps, table)
 
 
-def table_of(wheelbase: float) -> str:
+def table_of(wheelbase: float, steering: bool, sde: bool) -> str:
     """:return: its name"""
-    usual = wheelbase == _WHEELBASE
-    return "action_scale" if usual else f"action_scale_wheelbase_{wheelbase:g}"
+    parts = ["action_scale"]
+    parts += ["steering"] * steering
+    parts += [f"wheelbase_{wheelbase:g}"] * (wheelbase != _WHEELBASE)
+    return "_".join(parts + ["sde"] * sde)
 
 
-def learn(scale: str, seed: int, steps: int, wheelbase: float = _WHEELBASE) -> list[dict]:
+def learn(
+    scale: str,
+    seed: int,
+    steps: int,
+    wheelbase: float = _WHEELBASE,
+    axes: list[int] | None = None,
+    sde: bool = False,
+) -> list[dict]:
     """:return: one row for each evaluation"""
     from sb3_hds import CrossQ
     from sb3_hds.wrappers import ActionScale
 
     def wrapped():
         if scale != "schedule":
-            return ActionScale(Oval(wheelbase), float(scale))
-        return ActionScale(Oval(wheelbase), schedule=[[0, 0.4], [SCHEDULE_SHARE * steps, 1.0]])
+            return ActionScale(Oval(wheelbase), float(scale), axes=axes)
+        schedule = [[0, 0.4], [SCHEDULE_SHARE * steps, 1.0]]
+        return ActionScale(Oval(wheelbase), schedule=schedule, axes=axes)
 
+    noise = {"use_sde": True, "sde_sample_freq": 16, "use_sde_at_warmup": True} if sde else {}
+    log_std = {"log_std_init": -1.0} if sde else {}
     model = CrossQ(
         "MlpPolicy",
         wrapped(),
@@ -138,13 +158,14 @@ def learn(scale: str, seed: int, steps: int, wheelbase: float = _WHEELBASE) -> l
         gradient_steps=25,
         batch_size=128,
         policy_delay=3,
-        policy_kwargs={"net_arch": {"pi": [64, 64], "qf": [128, 128]}},
+        policy_kwargs={"net_arch": {"pi": [64, 64], "qf": [128, 128]}} | log_std,
         gamma=0.97,
         seed=seed,
+        **noise,
     )
     rows, env = [], wrapped()
-    for block in range(1, N_EVALUATIONS + 1):
-        model.learn(steps // N_EVALUATIONS, reset_num_timesteps=block == 1)
+    while model.num_timesteps < steps:
+        model.learn(_EVERY, reset_num_timesteps=not rows)
         env.set_progress(model.num_timesteps / (SCHEDULE_SHARE * steps))
         distance, finished = evaluate(model, env, 1000 + seed)
         point = {"timestep": model.num_timesteps, "distance": distance, "finished": finished}

@@ -124,11 +124,11 @@ def multiarm() -> Question:
     return Question(twin, data, ("inertia", "damping"))
 
 
-def dfki(parameters: str = "params_design_A.0_model_2.0.yml") -> Question:
+def dfki(torques: str = "tau_meas") -> Question:
     """
     A double pendulum whose friction somebody set to zero.
 
-    Torques are those that the drives report.
+    :param torques: ``"tau_meas"``, which the drives report, or ``"tau_con"``, as commanded
     """
     folder = Path(os.environ["SB3_HDS_DATA"]) / "dfki_double_pendulum"
     data = load(
@@ -136,10 +136,10 @@ def dfki(parameters: str = "params_design_A.0_model_2.0.yml") -> Question:
         {
             "time": "time",
             "obs": ["pos_meas1", "pos_meas2", "vel_meas1", "vel_meas2"],
-            "actions": ["tau_meas1", "tau_meas2"],
+            "actions": [f"{torques}1", f"{torques}2"],
         },
     )
-    published = yaml.safe_load((folder / parameters).read_text())
+    published = yaml.safe_load((folder / "params_design_A.0_model_2.0.yml").read_text())
     theirs = {
         "gravity": "g",
         "mass1": "m1",
