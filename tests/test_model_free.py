@@ -490,6 +490,7 @@ def test_batch_normalisation_of_crossq_begins_where_it_is_told_to():
         ("td7", {"policy_kwargs": {"embedding_size": 0}}),
         ("bro", {"kl_target": -1}),
         ("bro", {"std_multiplier": -2}),
+        ("bro", {"multiplier_rate": -1}),
         ("simba", {"clipped_double_q": "no"}),
     ],
     ids=str,

@@ -352,7 +352,7 @@ class Optimistic(Soft):
         self.raw_optimism, self.raw_regularizer = (
             np.arctanh((np.log(start) + 10.0) / 8.75 - 1.0) for start in (1.0, 0.25)
         )
-        self.adams = Adam(3e-5, 0.5), Adam(3e-5, 0.5)
+        self.adams = tuple(Adam(0.1 * KNOBS.learning_rate, 0.5) for _ in range(2))
 
     @staticmethod
     def multiplier(raw: Any) -> Any:

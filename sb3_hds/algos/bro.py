@@ -38,7 +38,6 @@ from sb3_hds.algos.squashed import Gaussian
 _RESETS = (15_000, 50_000, 250_000, 500_000, 750_000, 1_000_000, 1_500_000, 2_000_000)
 _FAST, _FAST_RESETS = 2, _RESETS[:1]
 _INITIAL_OPTIMISM, _INITIAL_REGULARIZER = 1.0, 0.25
-_MULTIPLIER_RATE = 3e-5
 # Of the logarithms of the multipliers and of the deviation of actions.
 _MULTIPLIER_LIMITS, _STD_LIMITS = (-10.0, 7.5), (-10.0, 2.0)
 
@@ -76,13 +75,12 @@ class BRO(SoftActorCritic):
     Source: Nauman et al., *Bigger, Regularized, Optimistic: scaling for compute and
     sample-efficient continuous control*, NeurIPS 2024: replay ratio 10 (``gradient_steps=2`` is
     their fast variant), batches of 128, AdamW with 3e-4, target entropy of minus half the number of
-    controls, Adam with b1 = 0.5 for the temperature and the multipliers. No arguments are, of the
-    multipliers, the learning rate (3e-5, without a schedule) and the first values (optimism 1,
-    regulariser 0.25). As in the authors' code (MIT licence), fresh starts include the temperature,
-    the multipliers and all optimisers, and the logarithms of multipliers and of the deviation of
-    actions are squashed into their limits by :math:`\tanh`: actions start with a deviation near
-    :math:`e^{-4}`, not near 1 as with SAC. Its quantile loss is a sum over quantiles where this is
-    their mean, a factor that Adam takes out again. SBX has no BRO.
+    controls, Adam with b1 = 0.5 for the temperature and the multipliers. Their first values are no
+    arguments (optimism 1, regulariser 0.25). As in the authors' code (MIT licence), fresh starts
+    include the temperature, the multipliers and all optimisers, and the logarithms of multipliers
+    and of the deviation of actions are squashed into their limits by :math:`\tanh`: actions start
+    with a deviation near :math:`e^{-4}`, not near 1 as with SAC. Its quantile loss is a sum over
+    quantiles where this is their mean, a factor that Adam takes out again. SBX has no BRO.
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
@@ -90,6 +88,8 @@ class BRO(SoftActorCritic):
     :param batch_size: transitions per update
     :param kl_target: divergence of the optimistic actor from the other one, per control
     :param std_multiplier: its standard deviation, in units of the other one's
+    :param multiplier_rate: learning rate of the multipliers, in units of ``learning_rate``, whose
+        schedule it follows; 3e-5 by default
     :param param_resets: steps at which all networks start afresh; None: the paper's, of which only
         the first with ``gradient_steps`` of at most 2; ``[]``: never
     :param policy_kwargs: ``n_quantiles`` is 100 unless given
@@ -111,11 +111,13 @@ class BRO(SoftActorCritic):
         batch_size: int = 128,
         kl_target: float = 0.05,
         std_multiplier: float = 0.75,
+        multiplier_rate: float = 0.1,
         param_resets: list[int] | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
         self.kl_target, self.std_multiplier = kl_target, std_multiplier
+        self.multiplier_rate = multiplier_rate
         if param_resets is None:
             param_resets = list(_FAST_RESETS if 0 <= gradient_steps <= _FAST else _RESETS)
         super().__init__(
@@ -130,7 +132,7 @@ class BRO(SoftActorCritic):
 
     def check_arguments(self) -> None:
         super().check_arguments()
-        for name in ("kl_target", "std_multiplier"):
+        for name in ("kl_target", "std_multiplier", "multiplier_rate"):
             fine = between(getattr(self, name), 0.0, math.inf)
             self.refuse_unless(fine, name, "a number of at least 0")
         self.refuse_unless(
@@ -147,6 +149,7 @@ class BRO(SoftActorCritic):
             optimizer=policy.optimizers[0],
             kl_target=self.kl_target,
             std_multiplier=self.std_multiplier,
+            multiplier_rate=self.multiplier_rate,
         )
         return dataclasses.replace(
             super().recipe(),
@@ -211,12 +214,14 @@ class Optimist:
     :param optimizer: of the shift
     :param kl_target: divergence, per control
     :param std_multiplier: its standard deviation, in units of the other one's
+    :param multiplier_rate: learning rate of the multipliers, in units of the actor's
     """
 
     network: nn.Module
     optimizer: Optimizer
     kl_target: float
     std_multiplier: float
+    multiplier_rate: float
 
     def init(self, actor: Weights, obs: Array, key: PRNGKeyArray) -> Any:
         n_act = cast(Any, self.network).n_act
@@ -249,10 +254,11 @@ class Optimist:
         gradient = jax.value_and_grad(loss, has_aux=True)
         (_, divergence), slope = gradient(state["actor"].weights["params"])
         excess = divergence / gaussian.mean.shape[-1] - self.kl_target
+        rate = self.multiplier_rate * knobs.learning_rate
         return {
             "actor": self.optimizer.apply(slope, state["actor"], knobs.learning_rate),
-            "optimism": _following(state["optimism"], excess),
-            "regularizer": _following(state["regularizer"], -excess),
+            "optimism": _following(state["optimism"], excess, rate),
+            "regularizer": _following(state["regularizer"], -excess, rate),
         }
 
     def explore(self, state: Any, obs: Array, gaussian: Gaussian, noise: Array) -> Array:
@@ -276,9 +282,9 @@ def _before(log: float) -> Array:
     return jnp.asarray(math.atanh(2.0 * (log - low) / (high - low) - 1.0), jnp.float32)
 
 
-def _following(multiplier: Trained, excess: Array) -> Trained:
+def _following(multiplier: Trained, excess: Array, rate: Array | float) -> Trained:
     slope = jax.grad(lambda raw: excess * _value(raw))(multiplier.weights["params"])
-    return _MULTIPLIER.apply(slope, multiplier, _MULTIPLIER_RATE)
+    return _MULTIPLIER.apply(slope, multiplier, rate)
 
 
 _MULTIPLIER = Optimizer(optax.adam, (("b1", 0.5),))

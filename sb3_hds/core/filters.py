@@ -199,9 +199,10 @@ class Scale(StatefulTransform):
 
     .. math:: u = m + s\,(a - m)
 
-    Those of other actuators than ``axes`` reach all of theirs. The share follows a schedule, linear between its points and constant outside. Where it changes,
-    it remembers how much of the schedule has passed, from 0 to 1, over all episodes; an episode of
-    a twin begins anywhere in it. Without ``observed``, a twin infers the beginning of the schedule.
+    Those of other actuators than ``axes`` reach all of theirs. The share follows a schedule, linear
+    between its points and constant outside. Where it changes, it remembers how much of the schedule
+    has passed, from 0 to 1, over all episodes; an episode of a twin begins anywhere in it. Without
+    ``observed``, a twin infers the beginning of the schedule.
 
     :param schedule: ``((steps, share), ...)``, steps growing from 0, shares above 0 and at most 1
     :param axes: numbers of the actuators concerned, from 0; None: all
