@@ -22,11 +22,13 @@ import math
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from runs import CACHE, RESULTS, fresh_process, resume
+from runs import CACHE, RESULTS, fresh_process, resume, save
 
 SCALES = (0.4, 0.7, 1.0, "schedule")
 #: from 0.4 of the range to the whole over two thirds of the steps
 SCHEDULE_SHARE = 2.0 / 3.0
+#: that are asked for [m]
+DISTANCES = (100, 140, 160, 180, 200, 220)
 _EVERY = 500  # steps, from one evaluation to the next
 
 _DT = 0.1  # [s]
@@ -120,6 +122,26 @@ def main() -> None:
         work = lambda *run: fresh_process(__file__, *run, *given, cache=CACHE)["rows"]  # noqa: E731
         resume(table, ["seed", "steps"], wanted, work, arguments.jobs)
     report(arguments.steps, table)
+    for scale in SCALES[:-1]:
+        steps = steps_at_random(float(scale), arguments.wheelbase, axes)
+        print(f"random actions, {scale} of the range: on the track for {steps:.1f} steps")
+
+
+def steps_at_random(
+    scale: float, wheelbase: float, axes: list[int] | None, n_episodes: int = 200
+) -> float:
+    """:return: mean length of episodes with actions that are drawn anew at every step"""
+    from sb3_hds.wrappers import ActionScale
+
+    env, steps = ActionScale(Oval(wheelbase), scale, axes=axes), 0
+    env.action_space.seed(0)
+    for episode in range(n_episodes):
+        env.reset(seed=episode)
+        done = False
+        while not done:
+            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            steps, done = steps + 1, terminated or truncated
+    return steps / n_episodes
 
 
 def table_of(wheelbase: float, steering: bool, sde: bool) -> str:
@@ -198,7 +220,24 @@ def report(steps: int, name: str = "action_scale") -> None:
         return
     grouped = table.groupby(["scale", "timestep"]).distance.agg(["mean", "std", "count"])
     print(grouped.round(1).to_string())
+    rows = reached(table)
+    print(save(rows, f"{name}_reached").to_string(index=False))
     draw(table, name)
+
+
+def reached(table) -> list[dict]:
+    """:return: for each range, the steps until distances are first reached, and the last one"""
+    rows, farthest = [], table.distance.max()
+    for scale, own in table.groupby("scale"):
+        row = {"scale": scale, "seeds": own.seed.nunique()}
+        for distance in (d for d in DISTANCES if d < farthest):
+            first = own[own.distance >= distance].groupby("seed").timestep.min()
+            all_did = len(first) == row["seeds"]
+            row[f"steps to {distance} m"] = f"{first.mean():.0f}" if all_did else "-"
+        last = own[own.timestep == own.timestep.max()].distance
+        row["distance at the end [m]"] = f"{last.mean():.0f} +- {last.std():.0f}"
+        rows.append(row)
+    return rows
 
 
 def draw(table, name: str) -> None:

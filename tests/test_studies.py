@@ -3,6 +3,7 @@
 import action_scale
 import numpy as np
 import pytest
+import runs
 import safe_swing_up
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -44,8 +45,9 @@ def test_the_safe_swing_up_writes_a_table_and_a_figure(tmp_path, monkeypatch, ca
 
 def test_runs_of_another_length_are_no_part_of_the_picture_of_scales(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(action_scale, "RESULTS", tmp_path)
+    monkeypatch.setattr(runs, "RESULTS", tmp_path)
     lines = ["scale,seed,steps,timestep,distance,finished"]
-    for steps, distance in ((60, 10.0), (90, 1000.0)):
+    for steps, distance in ((60, 110.0), (90, 1000.0)):
         for seed in range(2):
             lines += [f"0.4,{seed},{steps},{k},{distance + seed},1" for k in (30, 60)]
     (tmp_path / "action_scale.csv").write_text("\n".join(lines) + "\n")
@@ -53,7 +55,12 @@ def test_runs_of_another_length_are_no_part_of_the_picture_of_scales(tmp_path, m
     action_scale.report(60)
 
     said = capsys.readouterr().out.split()
-    assert said.count("10.5") == 2 and "1000.5" not in said
+    assert said.count("110.5") == 2 and "1000.5" not in said
+    kept = (tmp_path / "action_scale_reached.csv").read_text()
+    assert kept.splitlines() == [
+        "scale,seeds,steps to 100 m,distance at the end [m]",
+        "0.4,2,30,110 +- 1",
+    ]
     assert (tmp_path / "action_scale.png").read_bytes().startswith(b"\x89PNG")
     action_scale.report(6_000)
     assert "has no runs of 6000 steps" in capsys.readouterr().out

@@ -48,10 +48,11 @@ PARTS: dict[str, Callable[[], str]] = {
         "robustness", "perturbation", ("env", "policy"), "return"
     ),
     "robustness_share": summaries.crossed("robustness", "perturbation", ("env", "policy"), "share"),
-    "action_scale": summaries.crossed("action_scale", "scale", ("timestep",), "distance"),
-    "action_scale_short": summaries.crossed(
-        "action_scale_wheelbase_0.4", "scale", ("timestep",), "distance"
-    ),
+    "action_scale": summaries.whole("action_scale_reached"),
+    "action_scale_short": summaries.whole("action_scale_wheelbase_0.4_reached"),
+    "action_scale_steering": summaries.whole("action_scale_steering_reached"),
+    "action_scale_sharp": summaries.whole("action_scale_steering_wheelbase_0.25_reached"),
+    "action_scale_racing": summaries.whole("action_scale_steering_wheelbase_0.25_sde_reached"),
     "safe_swing_up": summaries.over_seeds(
         "safe_swing_up", "without", "return", "violations", "continuity"
     ),
