@@ -29,6 +29,7 @@ sys.path.insert(0, str(DOCS / "extensions"))
 
 import benchmark_results  # noqa: E402
 import catalogue  # noqa: E402
+import generated_parts  # noqa: E402
 import import_picture  # noqa: E402
 import summaries  # noqa: E402
 
@@ -59,6 +60,13 @@ _PLACEHOLDER = re.compile(r"<[^>]*>")
 
 def name_of(page: Path) -> str:
     return page.relative_to(ROOT).as_posix()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_no_page_shows_a_picture_twice(page):
+    pictures = re.findall(r"!\[[^]]*\]\((.*?)\)", generated_parts.fill_in(page.read_text()))
+
+    assert len(pictures) == len(set(pictures))
 
 
 def blocks(page: Path, language: str) -> list[str]:

@@ -54,10 +54,20 @@ PARTS: dict[str, Callable[[], str]] = {
     "action_scale_sharp": summaries.whole("action_scale_steering_wheelbase_0.25_reached"),
     "action_scale_racing": summaries.whole("action_scale_steering_wheelbase_0.25_sde_reached"),
     "safe_swing_up": summaries.over_seeds(
-        "safe_swing_up", "without", "return", "violations", "continuity"
+        "safe_swing_up",
+        "without",
+        "return",
+        "violations",
+        "continuity",
+        shows="return, hits of the rail's ends and continuity cost, with all and without each",
     ),
     "cpg_prior": summaries.crossed("cpg_prior", "prior", ("env", "learner"), "return"),
-    "elastic_quadruped": summaries.over_seeds("elastic_quadruped", "method", "return"),
+    "elastic_quadruped": summaries.over_seeds(
+        "elastic_quadruped",
+        "method",
+        "return",
+        shows="return after 50,000 steps with each method, a dot for each seed",
+    ),
     **{
         f"hidden_effects_{part}": summaries.whole(f"hidden_effects_{part}")
         for part in ("targets", "kinds", "difficulty", "causes", "systems", "outside", "rules")
