@@ -167,7 +167,7 @@ def draw(both: pd.DataFrame, rows: list[dict[str, Any]], steps: int) -> None:
                 continue
             place, score = places[row["env"]] + shift, row[f"score of {learner}"]
             low, high = map(float, row[f"95 % interval of {learner}"].split(" to "))
-            label = learner if place < 1.0 else None
+            label = learner if row is rows[0] else None
             axes.plot(place + np.array([-0.1, 0.1]), [score] * 2, color=colour, lw=2.5, label=label)
             axes.plot([place] * 2, [low, high], color=colour, lw=1)
     axes.axhline(1.0, color="0.6", lw=0.8, ls="--", zorder=0)

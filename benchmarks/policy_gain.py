@@ -7,7 +7,8 @@ What a diagnosis buys: policies from the believed, the extended and the true twi
 The real system is `sb3_hds/PendulumReal-v1` with something planted that the twin does not have, and
 sensors with noise. Each seed records ten trajectories of torques that wander, diagnoses them, and
 trains HDS in each twin without a real step, with the defaults of `measure_policy_gain`: all three
-policies act from the same 20 start states. Each run is a process of its own; runs that are in the
+policies act from the same 20 start states. Trainings share their seed, so what differs between
+seeds is what the data said. Each run is a process of its own; runs that are in the
 table are not done again.
 """
 
@@ -26,6 +27,12 @@ HIDDEN = {
     "quadratic_drag": {"drag": 0.06},
     "coulomb_friction": {"friction": 0.6},
     "torque_gain": {"gain": 0.6},
+}
+#: and where
+HIDDEN_AS = {
+    "quadratic_drag": "quadratic_drag.hinge",
+    "coulomb_friction": "coulomb_friction.hinge",
+    "torque_gain": "torque_gain.torque",
 }
 SIMULATIONS = ("believed", "extended", "true")
 N_RECORDINGS, N_STEPS = 10, 200
@@ -64,7 +71,8 @@ def worker(hidden: str, seed: int) -> list[dict]:
     gain = measure_policy_gain(found, real, seeds=1, progress=False)
     told = {
         "verdict": found.verdict,
-        "named": " ".join(f"{f.effect}.{f.where['name']}" for f in found.findings),
+        "named": " ".join(f.key for f in found.findings),
+        "within": any(HIDDEN_AS[hidden] in (f.key, *f.alternatives) for f in found.findings),
         "diagnosed": diagnosed,
         "seconds": seconds_since_start(),
     }
@@ -96,11 +104,13 @@ def summary(hidden: str, own: pd.DataFrame) -> dict:
     """:return: interquartile means over seeds with 95 % intervals, and the gain, paired by seed"""
     by = own.pivot(index="seed", columns="twin", values="return")
     believed, extended, true = (by[s].to_numpy() for s in SIMULATIONS)
-    right = own[own.twin == "extended"].named.astype(str).str.startswith(hidden)
+    told = own[own.twin == "extended"]
+    first = told.named.astype(str).str.startswith(HIDDEN_AS[hidden]).sum()
     gap = of_iqm([true - believed])[0]
     return {
         "hidden": hidden,
-        "named": f"{int(right.sum())} of {len(right)}",
+        "named first": f"{first} of {len(told)}",
+        "within the set": f"{int(told.within.sum())} of {len(told)}",
         **{s: _told(by[s].to_numpy()) for s in SIMULATIONS},
         "gain": _told(extended - believed),
         "share of the gap": f"{of_iqm([extended - believed])[0] / gap:.2f}" if gap > 0 else "-",
