@@ -75,6 +75,10 @@ PARTS: dict[str, Callable[[], str]] = {
     "hidden_effects_picture": summaries.picture(
         "hidden_effects", "rates with intervals beside their targets, right names against size"
     ),
+    "policy_gain": summaries.whole("policy_gain_intervals"),
+    "policy_gain_picture": summaries.picture(
+        "policy_gain", "return on the real system of policies from each twin, a line for each seed"
+    ),
     "diagnosis_cost": summaries.whole("diagnosis_cost"),
     "diagnosis_cost_lines": summaries.whole("diagnosis_cost_lines"),
     "diagnosis_cost_picture": summaries.picture(
