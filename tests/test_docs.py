@@ -326,7 +326,7 @@ def test_episodes_after_the_first_are_shown_together(tmp_path, monkeypatch):
 
 def test_results_are_turned_into_the_tables_of_the_pages(tmp_path, monkeypatch):
     monkeypatch.setattr(summaries, "RESULTS", tmp_path)
-    turned = summaries.crossed("shares", "kind", ("env", "policy"), "share")
+    turned = summaries.crossed("shares", ("kind",), ("env", "policy"), "share")
     assert turned() == summaries.gaits() == "Not measured yet in this checkout.\n\n"
     rows = [["kind", "env", "policy", "seed", "share"]]
     rows += [["push", "A", "gait", "0", "0.2"], ["push", "A", "gait", "1", "0.4"]]

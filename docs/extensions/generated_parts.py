@@ -45,9 +45,11 @@ PARTS: dict[str, Callable[[], str]] = {
         "open_loop_scores", "scores of open loop and PPO in each environment and over all of them"
     ),
     "robustness_return": summaries.crossed(
-        "robustness", "perturbation", ("env", "policy"), "return"
+        "robustness", ("env", "policy"), ("perturbation",), "return"
     ),
-    "robustness_share": summaries.crossed("robustness", "perturbation", ("env", "policy"), "share"),
+    "robustness_share": summaries.crossed(
+        "robustness", ("env", "policy"), ("perturbation",), "share"
+    ),
     "action_scale": summaries.whole("action_scale_reached"),
     "action_scale_short": summaries.whole("action_scale_wheelbase_0.4_reached"),
     "action_scale_steering": summaries.whole("action_scale_steering_reached"),
@@ -61,7 +63,7 @@ PARTS: dict[str, Callable[[], str]] = {
         "continuity",
         shows="return, hits of the rail's ends and continuity cost, with all and without each",
     ),
-    "cpg_prior": summaries.crossed("cpg_prior", "prior", ("env", "learner"), "return"),
+    "cpg_prior": summaries.crossed("cpg_prior", ("prior",), ("env", "learner"), "return"),
     "elastic_quadruped": summaries.over_seeds(
         "elastic_quadruped",
         "method",

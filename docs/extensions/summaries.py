@@ -85,25 +85,27 @@ def whole(name: str, shows: str = "") -> Callable[[], str]:
     return lambda: _shown(name, as_it_is, shows)
 
 
-def crossed(name: str, row: str, columns: tuple[str, ...], value: str) -> Callable[[], str]:
+def crossed(
+    name: str, row: tuple[str, ...], columns: tuple[str, ...], value: str
+) -> Callable[[], str]:
     """
     :param name: of the table, without its ending
-    :param row: column whose entries are the rows
+    :param row: columns whose entries together are the rows
     :param columns: columns whose entries together are the columns
     :param value: column that is shown, the mean over whatever else there is
     :return: what makes the Markdown
     """
 
     def turned(titles: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
-        place, shown = titles.index(row), titles.index(value)
-        across = [titles.index(column) for column in columns]
+        shown = titles.index(value)
+        down, across = ([titles.index(column) for column in own] for own in (row, columns))
         cells: dict[tuple[str, str], list[float]] = {}
         for one in rows:
-            at = one[place], ", ".join(one[i] for i in across)
+            at = ", ".join(one[i] for i in down), ", ".join(one[i] for i in across)
             cells.setdefault(at, []).append(float(one[shown]))
         left, top = (dict.fromkeys(at[i] for at in cells) for i in (0, 1))
         lines = [[one, *(_mean(cells.get((one, other), [])) for other in top)] for one in left]
-        return [row, *top], lines
+        return [", ".join(row), *top], lines
 
     return lambda: _shown(name, turned)
 
