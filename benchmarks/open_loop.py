@@ -7,8 +7,8 @@ Open-loop gaits from scratch: return and wall time in five environments of MuJoC
 
 Each run is a process of its own with the hyperparameters of ``hyperparams/openloop.yml``, which are
 for 200,000 steps, and longer rollouts where there are more steps for them; the time counts from the
-start of its interpreter. What acts at the end of the search is evaluated on 20
-episodes, the same resets for every seed. Runs that are in the table are not done again.
+start of its interpreter. What acts at the end of the search is evaluated on 20 episodes, the same
+resets for every seed. Runs that are in the table are not done again.
 """
 
 import argparse

@@ -373,6 +373,7 @@ def test_a_continuity_cost_is_the_squared_change_of_the_action():
         (lambda env: ActionScale(env, 1.5), "at most 1"),
         (lambda env: ActionScale(env, 0.5, axes=[2]), "numbers of the 2 actuators, from 0 to 1"),
         (lambda env: ActionScale(env, 0.5, axes=[]), "numbers of the 2 actuators"),
+        (lambda env: ActionScale(env, 0.5, axes=1), "axes is a list of numbers"),
         (lambda env: ActionScale(env, schedule=[[5, 0.1]]), "growing from 0"),
         (lambda env: ActionScale(env, schedule=[[0, 0.2], [10]]), "list of pairs"),
         (lambda env: ActionScale(env, schedule=[[0, 0.2]], progress=2.0), "from 0 to 1"),

@@ -60,6 +60,8 @@ class ActionScale(TransformLayer):
         }
         if not 0.0 <= progress <= 1.0:
             raise ParameterError(f"ActionScale(progress={progress}): progress is from 0 to 1.")
+        if axes is not None and np.ndim(axes) != 1:
+            raise ParameterError(f"ActionScale(axes={axes!r}): axes is a list of numbers: [0].")
         points = [[0.0, scale]] if schedule is None else schedule
         self._scale = Scale(schedule=_pairs(points), axes=axes, observed=observe_state)
         super().__init__(env, self._scale, store, arguments)
