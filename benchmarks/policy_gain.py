@@ -28,12 +28,6 @@ HIDDEN = {
     "coulomb_friction": {"friction": 0.6},
     "torque_gain": {"gain": 0.6},
 }
-#: and where
-HIDDEN_AS = {
-    "quadratic_drag": "quadratic_drag.hinge",
-    "coulomb_friction": "coulomb_friction.hinge",
-    "torque_gain": "torque_gain.torque",
-}
 SIMULATIONS = ("believed", "extended", "true")
 N_RECORDINGS, N_STEPS = 10, 200
 
@@ -69,10 +63,11 @@ def worker(hidden: str, seed: int) -> list[dict]:
     found = diagnose(twins.make(ROBOT), data, progress=False)
     diagnosed = seconds_since_start()
     gain = measure_policy_gain(found, real, seeds=1, progress=False)
+    keys = [key for f in found.findings for key in (f.key, *f.alternatives)]
     told = {
         "verdict": found.verdict,
         "named": " ".join(f.key for f in found.findings),
-        "within": any(HIDDEN_AS[hidden] in (f.key, *f.alternatives) for f in found.findings),
+        "within": any(key.startswith(f"{hidden}.") for key in keys),
         "diagnosed": diagnosed,
         "seconds": seconds_since_start(),
     }
@@ -105,7 +100,7 @@ def summary(hidden: str, own: pd.DataFrame) -> dict:
     by = own.pivot(index="seed", columns="twin", values="return")
     believed, extended, true = (by[s].to_numpy() for s in SIMULATIONS)
     told = own[own.twin == "extended"]
-    first = told.named.astype(str).str.startswith(HIDDEN_AS[hidden]).sum()
+    first = told.named.astype(str).str.startswith(f"{hidden}.").sum()
     gap = of_iqm([true - believed])[0]
     return {
         "hidden": hidden,

@@ -2,7 +2,7 @@
 What noise, failed sensors and pushes leave of a return: open-loop gaits, and what learned a task.
 
     python benchmarks/robustness.py                                 # published gaits
-    python benchmarks/robustness.py --learners sac --steps 200000   # and what they learn, for hours
+    python benchmarks/robustness.py --learners sac --steps 200000   # and what is learned there
 
 The gaits are those that the authors of the open-loop paper published. Twice: with encoders of their
 own, as on a robot, and with the loop that tracks joints looking at the observation. Learners are
