@@ -289,6 +289,19 @@ def test_values_beyond_all_measure_are_refused_by_name_and_cut_out(data, first, 
     assert better.n_steps == data.n_steps - lost
 
 
+def test_outliers_of_two_channels_at_once_are_cut_out_together(data):
+    def spoil(i, obs, actions):
+        if i == 3:
+            obs[80:91, 2] = 1e6
+            obs[84:86, 0] = -1e6
+        return obs, actions
+
+    spoiled = changed(data, spoil)
+    better = audit(spoiled).corrected(spoiled)
+
+    assert np.abs(better.obs).max() < 100.0 and better.n_steps == data.n_steps - 12
+
+
 @pytest.mark.parametrize("what", ["a blow", "it runs away", "a rest with an encoder's steps"])
 def test_what_is_large_and_real_is_no_outlier(data, what):
     t = np.arange(60)

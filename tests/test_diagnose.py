@@ -12,6 +12,7 @@ from measuring import jumping, measured
 from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import JointEffect, Parameter, Trajectories, rollout
 from sb3_hds.errors import CalibrationError
+from sb3_hds.sysid import inquiry
 from sb3_hds.sysid.comparison import Comparison, compare, confirm, split
 from sb3_hds.sysid.diagnosis import HorizonGain
 from sb3_hds.sysid.evidence import Evidence, Point
@@ -134,6 +135,15 @@ def test_horizons_at_which_a_named_cause_makes_it_worse_are_told():
     assert errs_more({5: unsure, 10: better}) == []
     (told,) = errs_more({1: worse, 5: unsure, 10: better})
     assert "1 (+20%)" in told and "5" not in told
+
+
+def test_a_diagnosis_tells_them_among_its_caveats(monkeypatch):
+    worse = HorizonGain(1, 1.0, 1.2, -0.3, -0.1)
+    monkeypatch.setattr(inquiry, "by_horizon", lambda *_: {1: worse})
+
+    found = asked(on_engine(friction=0.1))
+
+    assert found.findings and any("errs more than before" in said for said in found.caveats)
 
 
 def test_causes_look_alike_at_one_place_only():
