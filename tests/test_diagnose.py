@@ -521,6 +521,26 @@ def test_a_fit_stays_within_physical_bounds():
         np.testing.assert_array_equal(found[others], hypotheses.null[others])
 
 
+def test_what_is_null_and_does_not_move_is_not_computed():
+    twin = twins.make("LinearAxis", dt=0.02).extend(effects.Stiffness(0, k=2.0))
+    kinds = (effects.Stiffness, effects.CoulombFriction, effects.Backlash, effects.TorqueGain)
+    hypotheses = Hypotheses.about(twin, kinds, ())
+    place = hypotheses.names.index
+
+    def computed(theta, *index):
+        on = hypotheses.chosen(theta, np.array(index)).on
+        return {key.partition(".")[0] for key in on if on[key]}
+
+    there = place("coulomb_friction.axis.tau_c")
+    nothing = len(hypotheses.names)
+    assert computed(hypotheses.null, nothing) == {"stiffness"}, "which the twin had already"
+    assert computed(hypotheses.null, there, nothing) == {"stiffness", "coulomb_friction"}
+    theta = hypotheses.null.copy()
+    theta[place("backlash.axis.gap")] = 0.01
+    theta[place("stiffness.axis.k")] = 0.0
+    assert computed(theta, nothing) == {"backlash"}
+
+
 @pytest.mark.parametrize(
     ("kind", "values"),
     [

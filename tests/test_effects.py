@@ -13,6 +13,7 @@ from free_mass import Mass
 from sb3_hds import effects, twins
 from sb3_hds.core import (
     ActionEffect,
+    EffectChain,
     ForceEffect,
     JointEffect,
     Parameter,
@@ -455,6 +456,46 @@ def test_forces_of_several_effects_add_up(x64):
 
     # At 4 m/s the sign of dry friction is saturated to 1 - 2e-348.
     assert float(after.v[0]) == pytest.approx(4.0 + 0.1 / 2.0 * (1.0 - 0.5 * 4.0 - 0.3), rel=1e-14)
+
+
+FORCES = (
+    effects.CoulombFriction(0, tau_c=0.1),
+    effects.Cogging(0, amplitude=0.2, period=0.5, phase=0.1),
+    effects.Stiffness(1, k=0.3, q0=0.2),
+    effects.JointElasticity(0, k=30.0, d=0.1),
+    effects.Backlash(1, gap=0.05),
+)
+
+
+def with_forces(*forces):
+    return twins.make("DoublePendulum", dt=0.02).extend(*forces, effects.TorqueGain(0, gain=0.8))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def pushed(twin, params, chosen=None):
+    """Where some pushes lead, and its slopes by all parameters."""
+    chain, actions = EffectChain((), {}, chosen), jnp.sin(jnp.arange(25.0))[:, None]
+
+    def end(params):
+        start = twin.infer(jnp.array([0.5, -0.3, 0.0, 0.0]), params)
+        go = lambda state, action: (twin.step(state, action, params, chain), None)  # noqa: E731
+        return twin.observe(jax.lax.scan(go, start, actions)[0], params)
+
+    return end(params), jax.jacfwd(end)(params)
+
+
+@pytest.mark.parametrize("kept", [(), (2,), (0, 1, 2), (3,), (3, 4), (0, 1, 2, 3, 4)], ids=str)
+def test_only_chosen_forces_act_and_slopes_are_theirs(x64, kept):
+    """One program, told which of its forces to compute, is the twin that has these alone."""
+    whole, alone = with_forces(*FORCES), with_forces(*(FORCES[i] for i in kept))
+
+    chosen = whole.choose([whole.attached[i].key for i in kept])
+    found, slopes = pushed(whole, whole.params, chosen)
+    wanted, wanted_slopes = pushed(alone, alone.params)
+
+    np.testing.assert_allclose(found, wanted, rtol=1e-11, atol=1e-13)
+    for name, slope in slopes.items():
+        np.testing.assert_allclose(slope, wanted_slopes.get(name, 0.0), rtol=1e-8, atol=1e-10)
 
 
 def test_extending_an_extended_twin_flattens_and_keeps_order_and_values():

@@ -10,12 +10,14 @@ memory from one to the next.
 import abc
 import copy
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from sb3_hds.core.linear import solve_spd
 from sb3_hds.core.parameter import Parameter
@@ -299,25 +301,61 @@ class Attached:
         return {name: params[f"{self.key}.{name}"] for name in names}
 
 
+class Chosen(NamedTuple):
+    """
+    Which of an extended twin's force effects are computed; the others are taken to be null. It may
+    change from call to call of a compiled program, which then costs what these cost, not what all
+    do. Derivatives can be taken forwards only.
+
+    :param free: positions of those evaluated at every stage, among all that are, first those that
+        are chosen; and their number
+    :param held: likewise, of those that are held
+    :param on: by key, whether an effect is chosen
+    """
+
+    free: tuple[Any, Any]
+    held: tuple[Any, Any]
+    on: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, attached: tuple[Attached, ...], keys: Collection[str]) -> "Chosen":
+        """
+        :param attached: all effects of the twin that are simulated
+        :param keys: of those to compute
+        """
+        forces = {a.key: a.effect for a in attached if isinstance(a.effect, ForceEffect)}
+        on = {key: np.array(key in keys) for key in forces}
+
+        def first(held: bool) -> tuple[np.ndarray, np.ndarray]:
+            chosen = np.array([on[key] for key in forces if forces[key].held == held], bool)
+            return np.argsort(~chosen, kind="stable"), np.asarray(chosen.sum())
+
+        return cls(first(False), first(True), on)
+
+
 class EffectChain:
     """
     The attached effects with their values, as a twin's ``step`` meets them at each sub-step.
 
     :param attached: the effects, in the order in which the signal meets them; sensors are left out
     :param params: full parameters of the extended twin
+    :param chosen: which forces are computed; None: all
     """
 
-    def __init__(self, attached: tuple[Attached, ...], params: Params) -> None:
+    def __init__(
+        self, attached: tuple[Attached, ...], params: Params, chosen: Chosen | None = None
+    ) -> None:
         self._actions = [
             (a, a.effect, a.own(params)) for a in attached if isinstance(a.effect, ActionEffect)
         ]
         self._forces = [
             (a, a.effect, a.own(params)) for a in attached if isinstance(a.effect, ForceEffect)
         ]
+        self._chosen = chosen
 
     def __add__(self, other: "EffectChain") -> "EffectChain":
         """:return: the effects of both; commands meet ``other`` last"""
-        both = EffectChain((), {})
+        both = EffectChain((), {}, self._chosen or other._chosen)
         both._actions = self._actions + other._actions
         both._forces = self._forces + other._forces
         return both
@@ -334,10 +372,18 @@ class EffectChain:
     def force(self, moment: Moment, memory: dict[str, Memory], held: bool = False) -> Force:
         """:return: the sum of all force effects that are held, or of all others, ``(dof,)``"""
         total = jnp.zeros_like(moment.v)
-        for attached, effect, params in self._forces:
-            if effect.held == held:
-                total = total + effect.force(moment, attached.index, memory[attached.key], params)
-        return total
+        forces = [
+            partial(effect.force, moment, attached.index, memory[attached.key], params)
+            for attached, effect, params in self._forces
+            if effect.held == held
+        ]
+        if self._chosen is None:
+            return sum((force() for force in forces), total)
+        if not forces:
+            return total
+        order, n = map(jnp.asarray, self._chosen.held if held else self._chosen.free)
+        add = lambda i, total: total + jax.lax.switch(order[i], forces)  # noqa: E731
+        return jax.lax.fori_loop(0, n, add, total)
 
     def held(
         self,
@@ -364,17 +410,31 @@ class EffectChain:
             total = there.actuator + force - there.load
             return (force, solve_spd(there.mass_matrix, total)), place
 
-        ahead = jnp.array([0.0, 0.5], v.dtype) * h
-        # One loop: written out, it takes twice as long to compile.
-        still = jnp.zeros_like(v)
-        (force, _), (places, speeds) = jax.lax.scan(towards, (still, still), ahead)
-        return force, moment(places[-1], speeds[-1])
+        def middle() -> tuple[Force, Position, Velocity]:
+            ahead = jnp.array([0.0, 0.5], v.dtype) * h
+            # One loop: written out, it takes twice as long to compile.
+            still = jnp.zeros_like(v)
+            (force, _), (places, speeds) = jax.lax.scan(towards, (still, still), ahead)
+            return force, places[-1], speeds[-1]
+
+        if self._chosen is None:
+            force, *place = middle()
+        else:
+            nothing = lambda: (jnp.zeros_like(v), q, v)  # noqa: E731
+            force, *place = jax.lax.cond(self._chosen.held[1] > 0, middle, nothing)
+        return force, moment(*place)
 
     def advance(self, middle: Moment, end: Moment, memory: dict[str, Memory]) -> dict[str, Memory]:
         """:return: the memory of the force effects after the sub-step with this middle and end"""
         for attached, effect, params in self._forces:
-            moment = middle if effect.held else end
-            after = effect.advance(moment, attached.index, memory[attached.key], params)
+            moment, before = middle if effect.held else end, memory[attached.key]
+            advanced = partial(effect.advance, moment, attached.index, before, params)
+            if self._chosen is None:
+                after = advanced()
+            elif jax.tree.leaves(before):
+                after = jax.lax.cond(self._chosen.on[attached.key], advanced, lambda: before)  # noqa: B023
+            else:
+                after = before
             memory = memory | {attached.key: after}
         return memory
 

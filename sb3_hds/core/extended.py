@@ -4,6 +4,7 @@ import dataclasses
 import inspect
 import math
 from collections import Counter
+from collections.abc import Collection
 from typing import Any
 
 import jax
@@ -14,6 +15,7 @@ from sb3_hds.core.effect import (
     NO_EFFECTS,
     ActionEffect,
     Attached,
+    Chosen,
     Effect,
     EffectChain,
     ForceEffect,
@@ -146,6 +148,14 @@ class ExtendedTwin(Twin):
 
     def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
         return self.base.sketch(state, self._base_params(params))
+
+    def choose(self, keys: Collection[str]) -> Chosen:
+        """
+        :param keys: of effects, such as ``"viscous_friction.hinge"``
+        :return: what computes the forces of these alone, in ``EffectChain((), {}, chosen)`` as an
+            argument of ``step``
+        """
+        return Chosen.of(self._simulated, keys)
 
     def effects_with_values(self) -> tuple[Effect, ...]:
         """:return: the effects, holding the values that the extended twin has for them now"""

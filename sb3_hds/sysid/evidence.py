@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sb3_hds.core import Effect, Params, Twin
+from sb3_hds.core import Effect, EffectChain, Params, Twin
 from sb3_hds.core.compilation import QUICK_COMPILATION
+from sb3_hds.core.effect import Chosen
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.motion import first_offsets
 from sb3_hds.sysid.shooting import Shots, n_steps_of, simulate, with_slopes
@@ -240,10 +241,19 @@ class Evidence:
         filled = np.zeros((self.portion, offsets.shape[1]))
         filled[:n] = offsets
         slopes = []
-        for chosen in _in_groups(index, self._width_for(index), len(theta)):
+        for own in _in_groups(index, self._width_for(index), len(theta)):
             with jax.enable_x64(True):
                 found = _look(
-                    h.twin, h.names, h.fixed, shots, theta, chosen, filled, h.scale, n_lead
+                    h.twin,
+                    h.names,
+                    h.fixed,
+                    shots,
+                    theta,
+                    own,
+                    filled,
+                    h.scale,
+                    n_lead,
+                    h.chosen(theta, own),
                 )
             raw, by_start, by_theta = (np.asarray(leaf)[:n] for leaf in found)
             slopes.append(by_theta)
@@ -280,13 +290,15 @@ def _look(
     offsets: Float[Array, "n free"],
     scale: Float[Array, " p"],
     n_lead: Array,
+    chosen: Chosen,
 ) -> tuple[Array, Array, Array]:
     """
     :param n_lead: steps before each window that matter to what is remembered
+    :param chosen: the effects that may do something under these parameters
     :return: simulated minus measured, and its slopes by start state and by the parameters that
         ``index`` names (in units of their scale)
     """
-    n = offsets.shape[1]
+    n, effects = offsets.shape[1], EffectChain((), {}, chosen)
 
     def one(offset: Array, shot: Shots) -> tuple[Array, Array, Array]:
         def of(both: Array) -> Array:
@@ -294,7 +306,7 @@ def _look(
             step = jnp.zeros(len(names) + 1, theta.dtype).at[index].set(both[n:])
             values = theta + scale * step[:-1]
             params = fixed | {name: values[i] for i, name in enumerate(names)}
-            return simulate(twin, params, shot, offset + both[:n], n_lead) - shot.obs
+            return simulate(twin, params, shot, offset + both[:n], n_lead, effects) - shot.obs
 
         error, slopes = with_slopes(of, jnp.zeros(n + index.shape[0], theta.dtype))
         return error, slopes[..., :n], slopes[..., n:]

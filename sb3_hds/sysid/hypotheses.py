@@ -7,7 +7,7 @@ from functools import cached_property
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from sb3_hds.core import (
     ActionEffect,
@@ -18,6 +18,7 @@ from sb3_hds.core import (
     SensorEffect,
     Twin,
 )
+from sb3_hds.core.effect import Attached, Chosen
 from sb3_hds.core.layers import layers_of, plant_of
 from sb3_hds.effects import ConstantForce, NeuralForce, SignFlip, reversed_joint
 from sb3_hds.errors import CalibrationError, EffectError
@@ -164,6 +165,24 @@ class Hypotheses:
         }
         return np.array([found.get(name, 0.0) for name in self.names])
 
+    def chosen(self, theta: Float[np.ndarray, " p"], index: Int[np.ndarray, " k"]) -> Chosen:
+        """
+        :param theta: all parameters, shape ``(p,)``
+        :param index: of those by which slopes are taken; others than parameters name nothing
+        :return: the effects that are not null, or whose slopes are asked for
+        """
+        layer, moving = _extended_of(self.twin), {self.names[i] for i in index if i < len(theta)}
+        if layer is None:
+            return Chosen.of((), ())
+        value = layer.values | dict(zip(self.names, theta, strict=True))
+
+        def silent(a: Attached) -> bool:
+            nulls = {f"{a.key}.{name}": p.null for name, p in a.effect.parameters.items()}
+            still = all(value[name] == null for name, null in nulls.items())
+            return still and not a.effect.tensors and moving.isdisjoint(nulls)
+
+        return layer.choose([a.key for a in layer.attached if not silent(a)])
+
     @cached_property
     def always(self) -> float:
         """:return: the same for what the twin as it came remembers [s]"""
@@ -290,8 +309,12 @@ def _remembers(effect: Effect, twin: Twin) -> bool:
 
 
 def _attached_of(twin: Twin) -> tuple:
-    extended = [layer for layer in layers_of(twin) if isinstance(layer, ExtendedTwin)]
-    return extended[0].attached if extended else ()
+    layer = _extended_of(twin)
+    return layer.attached if layer else ()
+
+
+def _extended_of(twin: Twin) -> ExtendedTwin | None:
+    return next((layer for layer in layers_of(twin) if isinstance(layer, ExtendedTwin)), None)
 
 
 def _native_targets(twin: Twin, candidates: Sequence[Candidate]) -> dict[str, str]:

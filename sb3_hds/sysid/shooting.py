@@ -14,7 +14,17 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from sb3_hds.core import Effect, ExtendedTwin, Obs, Params, State, Trajectories, Twin
+from sb3_hds.core import (
+    NO_EFFECTS,
+    Effect,
+    EffectChain,
+    ExtendedTwin,
+    Obs,
+    Params,
+    State,
+    Trajectories,
+    Twin,
+)
 from sb3_hds.core.layers import layers_of
 from sb3_hds.errors import TrajectoryError
 
@@ -131,7 +141,12 @@ def _chosen(n_windows: int, n_rows: int, seed: int | None) -> np.ndarray:
 
 
 def simulate(
-    twin: Twin, params: Params, shot: Shots, offset: Offset, n_lead: Array | None = None
+    twin: Twin,
+    params: Params,
+    shot: Shots,
+    offset: Offset,
+    n_lead: Array | None = None,
+    effects: EffectChain = NO_EFFECTS,
 ) -> Float[Array, "rows obs"]:
     """
     Commands before the window fill what the twin remembers: the motion is measured there.
@@ -141,6 +156,7 @@ def simulate(
         positions and velocities
     :param n_lead: how many of the steps before the window are simulated, the last ones; default:
         all. Where it is given, only forward derivatives can be taken.
+    :param effects: besides those of the twin, or which of them are computed
     :return: what the twin's sensors would have reported, shape ``(steps + 1, n_obs)``
     """
     lead, steps = shot.lead_actions.shape[0], shot.actions.shape[0]
@@ -155,7 +171,7 @@ def simulate(
         seen = _moved(twin, seen, jnp.where(place == 0, offset, 0.0))
         q, v = (jnp.where(place > 0, *pair) for pair in zip(state[:2], seen[:2], strict=True))
         state = State(q, v, state.memory)
-        after = twin.step(state, actions[i], params)
+        after = twin.step(state, actions[i], params, effects)
         memory = jax.tree.map(
             lambda new, old: jnp.where(known[i], new, old), after.memory, state.memory
         )
