@@ -303,6 +303,20 @@ def test_play_is_found_although_the_first_bit_of_it_explains_nothing(gap, streng
     assert found.findings[0].parameters["gap"].estimate == pytest.approx(gap, rel=0.05)
 
 
+@pytest.mark.parametrize("v_s", [0.2, 0.6, 1.0])
+def test_friction_that_falls_is_found_however_far_its_hump_reaches(v_s):
+    """Dry friction of one level is a local optimum: a fit that begins there finds no hump."""
+    friction = effects.StribeckFriction("hinge", tau_c=0.01, tau_s=0.03, v_s=v_s)
+    pushed, data = swinging(friction, n_steps=150)
+    found = asked(
+        data, pushed, effects=[effects.StribeckFriction, effects.CoulombFriction], budget="quick"
+    )
+
+    assert [finding.effect for finding in found.findings] == ["stribeck_friction"], found
+    sizes = {name: one.estimate for name, one in found.findings[0].parameters.items()}
+    assert sizes == pytest.approx({"tau_c": 0.01, "tau_s": 0.03, "v_s": v_s}, rel=0.1)
+
+
 @pytest.mark.expensive
 def test_what_looks_alike_is_said_and_how_sure_predictions_are_is_drawn():
     """Two dry frictions, one for each direction, can be one; they have more freedom."""

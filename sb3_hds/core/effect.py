@@ -133,9 +133,10 @@ class Effect(abc.ABC):
         """:return: the same effect, with whatever depends on the twin that it is attached to"""
         return self
 
-    def starts(self, excursion: float) -> tuple[Mapping[str, float], ...]:
+    def starts(self, excursion: float, speed: float) -> tuple[Mapping[str, float], ...]:
         """
         :param excursion: how far the joint moves in the data [rad] or [m], a turn at most
+        :param speed: how fast it moves there [rad/s] or [m/s]
         :return: where a search may begin, for parameters that have no slope where nothing is wrong
             and many optima elsewhere: values by name; empty for effects that one start serves
         """

@@ -7,6 +7,8 @@ from sb3_hds.effects.shapes import dry_friction
 
 # Smallest speed at which friction can be said to fall [rad/s] or [m/s]: there it is smoothed.
 _SLOWEST = 0.01
+# Of the speed of a motion: up to where its friction may fall.
+_SHARES = (0.03, 0.1, 0.3, 1.0)
 
 
 class ViscousFriction(JointEffect):
@@ -158,6 +160,10 @@ class StribeckFriction(JointEffect):
     explanation = "The joint resists most just as it begins to move, and less once it slides."
     source = "Olsson et al. 1998, section 2"
     equivalents = {"coulomb_friction": "while the joint moves several times faster than v_s"}
+
+    def starts(self, excursion: float, speed: float) -> tuple[dict[str, float], ...]:
+        """From a hump that is narrower than any motion, nothing leads to a wider one."""
+        return tuple({"v_s": max(share * speed, _SLOWEST)} for share in _SHARES)
 
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
         sticking = jnp.exp(-((joint.v / params["v_s"]) ** 2))

@@ -89,7 +89,7 @@ class Cogging(JointEffect):
     explanation = "The joint snaps to equally spaced positions, as motors with magnets do."
     source = "MuJoCo DC motor model 2026, section 1.2"
 
-    def starts(self, excursion: float) -> tuple[dict[str, float], ...]:
+    def starts(self, excursion: float, speed: float) -> tuple[dict[str, float], ...]:
         periods = [excursion / n for n in _CYCLES]
         return tuple(
             {"period": period, "phase": turn * period} for period in periods for turn in _TURNS

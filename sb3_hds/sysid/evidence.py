@@ -173,16 +173,22 @@ class Evidence:
         step = _eliminated(self._blocks(point.theta, every, point.offsets), 0.0)
         return Slopes(step.curvature, step.scores)
 
-    def nearer(
-        self, theta: Float[np.ndarray, " p"], offsets: Float[np.ndarray, "n free"]
-    ) -> Float[np.ndarray, "n free"]:
+    def nearest(
+        self,
+        theta: Float[np.ndarray, " p"],
+        offsets: Sequence[Float[np.ndarray, "n free"]],
+        measured: bool = False,
+    ) -> tuple[Float[np.ndarray, "n free"], float]:
         """
-        :param offsets: of the start states under other parameters
-        :return: of each window, what explains it better: that start state, or the measured one
+        :param offsets: of the start states under other parameters, one or several
+        :param measured: whether the measured start states are to choose from, too
+        :return: of each window, the start state that explains it best; and the cost of that
         """
-        both = offsets, self._measured(theta)
-        here, there = (self._blocks(theta, np.array([], int), each).cost for each in both)
-        return np.where((here <= there)[:, None], *both)
+        every = [*offsets, self._measured(theta)] if measured else offsets
+        costs = [self._blocks(theta, np.array([], int), each).cost for each in every]
+        best = np.argmin(costs, 0)[None]
+        chosen = np.take_along_axis(np.stack(every), best[..., None], 0)[0]
+        return chosen, float(np.take_along_axis(np.stack(costs), best, 0).sum())
 
     def _measured(self, theta: np.ndarray) -> np.ndarray:
         h = self.hypotheses

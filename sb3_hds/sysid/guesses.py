@@ -13,6 +13,8 @@ from sb3_hds.sysid.hypotheses import Candidate
 _AWAY = 3.0
 # Where else it may be better, in the same units.
 _DISTANCES = (0.1, 0.3, 1.0, 3.0)
+# Of several starts, so many that promise most are fitted.
+_FITTED = 3
 # A Newton step promises nothing beyond, in the same units.
 _FARTHEST = 10.0
 # Curvature, per measurement, below which there is no slope; directions below this share of the
@@ -27,12 +29,14 @@ class Guess(NamedTuple):
     """
     :param gain: by which the cost would fall
     :param theta: where to begin a fit, shape ``(p,)``
+    :param offsets: and with which start states, shape ``(n, free)``
     :param blind: what the slope says where nothing is wrong is no guide: it is none, or it leads
         nowhere although things are better farther away
     """
 
     gain: float
     theta: Float[np.ndarray, " p"]
+    offsets: Float[np.ndarray, "n free"]
     blind: bool
 
 
@@ -67,10 +71,9 @@ def guesses(here: Here, candidates: Sequence[Candidate], known: Places) -> list[
     def guess(candidate: Candidate) -> Guess:
         if candidate.key in h.starts:
             starts = known.get(candidate.key, h.starts[candidate.key])
-            tried = [_from_start(here, candidate, start) for start in starts]
-            best = int(np.argmax([guess.gain for guess in tried]))
-            known[candidate.key] = (starts[best],)
-            return tried[best]
+            best, found = _from_starts(here, candidate, starts)
+            known[candidate.key] = (best,)
+            return found
         own = list(h.indices(candidate))
         step, gain = newton(curvature, score, [*here.free, *own], room)
         theta, blind = point.theta + h.scale * step, bool(flat[own].any())
@@ -79,7 +82,7 @@ def guesses(here: Here, candidates: Sequence[Candidate], known: Places) -> list[
         elif h.remembers(candidate):
             place = _farther(here, candidate, gain)
             theta, blind = (theta, False) if place is None else (place, True)
-        return Guess(gain, theta, blind)
+        return Guess(gain, theta, point.offsets, blind)
 
     return list(in_threads(guess, candidates))
 
@@ -125,17 +128,39 @@ def _farther(here: Here, candidate: Candidate, gain: float) -> Float[np.ndarray,
     return places[int(np.argmin(costs))] if min(costs) < point.cost - gain else None
 
 
-def _from_start(here: Here, candidate: Candidate, start: Mapping[str, float]) -> Guess:
-    """What one Newton step of what has a slope there promises."""
-    h, theta = here.evidence.hypotheses, here.point.theta.copy()
-    theta[[h.names.index(name) for name in start]] = list(start.values())
-    index = [*here.free, *(i for i in h.indices(candidate) if h.names[i] not in start)]
+def _from_starts(
+    here: Here, candidate: Candidate, starts: Sequence[Mapping[str, float]]
+) -> tuple[Mapping[str, float], Guess]:
+    """
+    What fits of the others promise where some parameters stay at one of several values.
+
+    :return: the best of these, and where a fit of all may begin
+    """
+    h = here.evidence.hypotheses
+    fixed = {h.names.index(name) for name in starts[0]}
+    index = [*here.free, *(i for i in h.indices(candidate) if i not in fixed)]
+    promising = sorted(starts, key=lambda start: -_promised(here, _at(here, start), index))
+    fits = [
+        here.evidence.fit(_at(here, start), index, here.point.offsets, here.steps)
+        for start in promising[:_FITTED]
+    ]
+    best = int(np.argmin([fitted.cost for fitted in fits]))
+    there = fits[best]
+    return promising[best], Guess(here.point.cost - there.cost, there.theta, there.offsets, False)
+
+
+def _at(here: Here, start: Mapping[str, float]) -> Float[np.ndarray, " p"]:
+    theta = here.point.theta.copy()
+    theta[[here.evidence.hypotheses.names.index(name) for name in start]] = list(start.values())
+    return theta
+
+
+def _promised(here: Here, theta: Float[np.ndarray, " p"], index: list[int]) -> float:
+    """:return: by how much the cost would fall by one Newton step of these parameters"""
     slopes = here.evidence.slopes(here.point._replace(theta=theta), index)
-    low, high = (bound[index] for bound in _room(here, theta))
+    room = tuple(bound[index] for bound in _room(here, theta))
     every = list(range(len(index)))
-    step, gain = newton(slopes.curvature.sum(0), slopes.scores.sum(0), every, (low, high))
-    theta[index] += h.scale[index] * step
-    return Guess(gain, theta, False)
+    return newton(slopes.curvature.sum(0), slopes.scores.sum(0), every, room)[1]
 
 
 def _away(here: Here, candidate: Candidate, distance: float) -> Float[np.ndarray, " p"]:

@@ -59,15 +59,26 @@ class Naming:
         :param alone: the cause beside which no second one was confirmed
         :param base: what is believed with it
         :param firsts: candidates beside what is believed at first, best first
-        :return: the pair that selection prefers, and what is believed with it, if both causes are
-            confirmed beside each other and predict better than the one alone
+        :return: the pair that selection prefers among those of which both causes are confirmed
+            beside each other and predict better than the one alone, and what is believed with it
         """
-        chosen = self.search.pair(firsts, self.start, alone.tried.candidate)
-        if chosen is None:
-            return None
-        first, tried = chosen
+        chosen = self.search.pairs(firsts, self.start, alone.tried.candidate)
+        for looks, (first, tried) in enumerate(chosen):
+            confirmed = self._confirmed(first, tried, looks, base, firsts)
+            if confirmed is not None:
+                return confirmed
+        return None
+
+    def _confirmed(
+        self, first: Tried, tried: Sequence[Tried], looks: int, base: Base, firsts: Sequence[Tried]
+    ) -> tuple[list[Accepted], Base] | None:
+        """
+        :param first: of a pair
+        :param tried: beside it, best first
+        :param looks: at pairs that were not confirmed: each makes the next harder to confirm
+        """
         belief = self.search.believing(first, self.start)
-        second = self._next(tried, belief, [first.candidate.key])
+        second = self._next(tried, belief, [first.candidate.key], looks)
         if second is None:
             return None
         both = self.search.believing(second.tried, belief)
@@ -82,16 +93,18 @@ class Naming:
             return None
         return found, both
 
-    def _next(self, tried: Sequence[Tried], base: Base, known: Sequence[str]) -> Accepted | None:
+    def _next(
+        self, tried: Sequence[Tried], base: Base, known: Sequence[str], looks: int = 0
+    ) -> Accepted | None:
         """:return: the best of what was tried, if it is a cause beside those that are known"""
         sure = [t for t in tried if self._determined(t, base)]
-        best = self.search.best(sure, base, len(known))
+        best = self.search.best(sure, base, len(known) + looks)
         if best is None:
             return None
         if self._is_leftover(best, base):
             self.turned_down[best.candidate.key] = SMALL
             return None
-        if (chance := self._chance(best, base, known)) >= _FAMILY_LEVEL / (1 + len(known)):
+        if (chance := self._chance(best, base, known)) >= _FAMILY_LEVEL / (1 + len(known) + looks):
             self.turned_down[best.candidate.key] = CHANCE
             return None
         return self._accepted(best, tried, base, chance)

@@ -100,6 +100,20 @@ class Effort(NamedTuple):
     profiles: bool
 
 
+class _Reached(NamedTuple):
+    """
+    How far the fit of a candidate has come.
+
+    :param theta: all parameters, shape ``(p,)``
+    :param offsets: of the start states of the windows that it was fitted to, shape ``(n, free)``
+    :param free: what was believed beside it
+    """
+
+    theta: np.ndarray
+    offsets: np.ndarray
+    free: tuple[int, ...]
+
+
 class Search:
     """
     Candidates on two halves of the evidence.
@@ -112,7 +126,7 @@ class Search:
 
     def __init__(self, select: Half, confirm: Half, effort: Effort, progress: bool) -> None:
         self.select, self.confirm, self.effort, self.progress = select, confirm, effort, progress
-        self._reached: dict[str, np.ndarray] = {}
+        self._reached: dict[str, _Reached] = {}
         self._far: set[str] = set()
         # Of searches with several starts, the best one, by what is believed.
         self._known: dict[tuple[str, ...], Places] = {}
@@ -179,8 +193,10 @@ class Search:
 
         known = self._known.setdefault(tuple(accepted), {})
         guessed = guesses(Here(evidence, first, base.free, self.effort.steps), left, known)
+        begin = {}
         for candidate, guess in zip(left, guessed, strict=True):
-            self._reached.setdefault(candidate.key, guess.theta)
+            begin[candidate.key] = _Reached(guess.theta, guess.offsets, base.free)
+            self._reached.setdefault(candidate.key, begin[candidate.key])
             if guess.blind:
                 self._far.add(candidate.key)
         blind = [c for c, guess in zip(left, guessed, strict=True) if guess.blind]
@@ -189,10 +205,11 @@ class Search:
         likely = [*blind, *(candidate for _, candidate in seen)]
 
         def glance(candidate: Candidate) -> Point:
-            own = list(self.hypotheses.indices(candidate))
-            theta = first.theta.copy()
-            theta[own] = self._reached[candidate.key][own]
-            offsets = self._starts(candidate, theta, first.offsets, evidence)
+            own = self.hypotheses.indices(candidate)
+            places = [begin[candidate.key]]
+            if self._reached[candidate.key] is not places[0]:
+                places.append(self._reached[candidate.key])
+            theta, offsets = self._begin(candidate, first, base.free, evidence, places)
             # The way is longer for what began elsewhere.
             steps = self.effort.steps * (2 if candidate.key in self._far else 1)
             return evidence.fit(theta, [*base.free, *own], offsets, steps)
@@ -200,7 +217,7 @@ class Search:
         points = self._each(glance, likely, f"comparing {len(likely)} causes")
         ranked = sorted(zip(likely, points, strict=True), key=lambda pair: pair[1].cost)
         for candidate, point in ranked:
-            self._reached[candidate.key] = point.theta
+            self._reached[candidate.key] = _Reached(point.theta, point.offsets, base.free)
         return ranked
 
     def finalists(self, base: Base, accepted: Sequence[str]) -> list[Tried]:
@@ -245,21 +262,21 @@ class Search:
         rest = [c for c in self.hypotheses.candidates if c.key not in done]
 
         def verdict(candidate: Candidate) -> Comparison:
-            theta, half = self._reached[candidate.key], self.confirm.evidence
+            theta, half = self._reached[candidate.key].theta, self.confirm.evidence
             offsets = self._starts(candidate, theta, base.kept.offsets, half)
             kept = half.fit(theta, (), offsets, _ROUGH_STEPS)
             return self.confirmed(kept, base.kept)
 
         return list(zip(rest, self._each(verdict, rest, "weighing the others"), strict=True))
 
-    def pair(
+    def pairs(
         self, firsts: Sequence[Tried], base: Base, known: Candidate
-    ) -> tuple[Tried, list[Tried]] | None:
+    ) -> list[tuple[Tried, list[Tried]]]:
         """
         :param firsts: what was tried beside what is believed, best first
         :param known: one of them, beside which others have been tried already
-        :return: the first cause of the pair that selection prefers, and what was tried beside it,
-            best first; None: there is none
+        :return: of each pair the first cause, and what was tried beside it, best first; the pair
+            that selection prefers comes first
         """
         likely = [t for t in firsts if t.criterion >= LEAST_BIC and t.candidate != known]
         pairs = []
@@ -269,10 +286,8 @@ class Search:
                 continue
             both = [first.candidate, seconds[0].candidate]
             pairs.append((self.criterion(both, seconds[0].point, base.point), first, seconds))
-        if not pairs:
-            return None
-        _, first, seconds = max(pairs, key=lambda pair: pair[0])
-        return first, seconds
+        pairs.sort(key=lambda pair: -pair[0])
+        return [(first, seconds) for _, first, seconds in pairs]
 
     def best(self, tried: Sequence[Tried], base: Base, n_found: int = 0) -> Tried | None:
         """
@@ -347,18 +362,47 @@ class Search:
         return verdict._replace(p_value=min(verdict.p_value, by_score))
 
     def _continued(self, candidate: Candidate, base: Base) -> Point:
-        evidence, theta = self.select.evidence, base.point.theta.copy()
+        evidence = self.select.evidence
         moving = [*base.free, *self.hypotheses.indices(candidate)]
-        theta[moving] = self._reached[candidate.key][moving]
-        offsets = self._starts(candidate, theta, base.point.offsets, evidence)
+        places = [self._reached[candidate.key]]
+        theta, offsets = self._begin(candidate, base.point, base.free, evidence, places)
         point = evidence.fit(theta, moving, offsets, _ALL_STEPS)
         return min(base.point, point, key=lambda p: p.cost)
+
+    def _begin(
+        self,
+        candidate: Candidate,
+        believed: Point,
+        free: tuple[int, ...],
+        evidence: Evidence,
+        places: Sequence[_Reached],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :param places: where the candidate is now; beside another belief, only its own values count
+        :return: the one of them that explains most, with the start states that explain each window
+            best there
+        """
+        tried = []
+        for place in places:
+            theta, moving = believed.theta.copy(), list(self.hypotheses.indices(candidate))
+            offsets = [believed.offsets]
+            if place.free == free:
+                moving += free
+                if len(place.offsets) == evidence.shots.n:
+                    offsets.append(place.offsets)
+            theta[moving] = place.theta[moving]
+            far = candidate.key in self._far
+            tried.append((theta, *evidence.nearest(theta, offsets, measured=far)))
+        theta, offsets, _ = min(tried, key=lambda one: one[2])
+        return theta, offsets
 
     def _starts(
         self, candidate: Candidate, theta: np.ndarray, offsets: np.ndarray, evidence: Evidence
     ) -> np.ndarray:
         """Far from what is believed, its start states may be those of another motion."""
-        return evidence.nearer(theta, offsets) if candidate.key in self._far else offsets
+        if candidate.key not in self._far:
+            return offsets
+        return evidence.nearest(theta, [offsets], measured=True)[0]
 
     def _sample(self) -> np.ndarray:
         n = self.select.evidence.shots.n

@@ -63,11 +63,13 @@ def sized(evidence: Evidence, data: Trajectories) -> Hypotheses:
 def _starts(h: Hypotheses, moved: _Moved) -> dict[str, tuple[dict[str, float], ...]]:
     found = {}
     for candidate in h.candidates:
-        effect, excursion = h.effect_of(candidate), 0.0
-        if candidate.slot == "joint":
-            turn = 2.0 * math.pi if h.twin.joints[candidate.index].unit == "rad" else math.inf
-            excursion = min(float(moved.excursions[candidate.index]), turn)
-        if effect is not None and excursion > 0.0 and (starts := effect.starts(excursion)):
+        effect = h.effect_of(candidate)
+        if effect is None or candidate.slot != "joint":
+            continue
+        turn = 2.0 * math.pi if h.twin.joints[candidate.index].unit == "rad" else math.inf
+        excursion = min(float(moved.excursions[candidate.index]), turn)
+        speed = float(moved.speeds[candidate.index])
+        if excursion > 0.0 and (starts := effect.starts(excursion, speed)):
             found[candidate.key] = tuple(
                 {f"{candidate.key}.{name}": value for name, value in start.items()}
                 for start in starts
