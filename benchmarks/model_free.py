@@ -6,7 +6,8 @@ The model-free family beside SB3, SB3-contrib and SBX: return against steps and 
     python benchmarks/model_free.py --figure                          # tables and figures again
 
 Ours run with their file in `hyperparams/`, the others with what RL Zoo has for SAC, TQC and CrossQ
-on that environment (those of -v4 for -v5; SBX's DroQ: that of SAC with its documented arguments).
+on that environment (those of -v4 for -v5; SBX's DroQ: that of SAC with its documented arguments;
+SB3's gSDE: that of SAC with what ours has on Pendulum-v1).
 `sac` is our GSDESAC without gSDE, `bro_fast` BRO with two updates per step. HDS, which knows a
 simulation of Pendulum-v1, stands beside them with the few steps of its own file. Each run is a
 fresh process; training stops for each evaluation, whose time does not count. On Pendulum-v1,
@@ -66,7 +67,7 @@ class Peer(NamedTuple):
 _SAC = ("sb3_sac", "sbx_sac")
 OURS = {
     "sac": Ours("gsde_sac", {"use_sde": False, "train_freq": 1, "gradient_steps": 1}, _SAC),
-    "gsde_sac": Ours("gsde_sac", {}, _SAC),
+    "gsde_sac": Ours("gsde_sac", {}, ("sb3_gsde_sac", *_SAC)),
     "droq": Ours("droq", {}, ("sbx_droq",)),
     "crossq_jax": Ours("crossq_jax", {}, ("contrib_crossq", "sbx_crossq")),
     "tqc_jax": Ours("tqc_jax", {}, ("contrib_tqc", "sbx_tqc")),
@@ -81,8 +82,15 @@ _DROQ = {
     "gradient_steps": 20,
     "policy_delay": 20,
 }
+_GSDE = {
+    "use_sde": True,
+    "train_freq": 8,
+    "gradient_steps": 8,
+    "policy_kwargs": {"log_std_init": -1},
+}
 PEERS = {
     "sb3_sac": Peer("stable_baselines3", "SAC", "sac", {}),
+    "sb3_gsde_sac": Peer("stable_baselines3", "SAC", "sac", _GSDE),
     "contrib_tqc": Peer("sb3_contrib", "TQC", "tqc", {}),
     "contrib_crossq": Peer("sb3_contrib", "CrossQ", "crossq", {}),
     "sbx_sac": Peer("sbx", "SAC", "sac", {}),

@@ -18,6 +18,7 @@ from sb3_hds.sysid.diagnosis import HorizonGain
 from sb3_hds.sysid.evidence import Evidence, Point
 from sb3_hds.sysid.guesses import newton
 from sb3_hds.sysid.hypotheses import Hypotheses
+from sb3_hds.sysid.naming import Naming
 from sb3_hds.sysid.remainder import MissingForce, remainder
 from sb3_hds.sysid.search import Half, Search
 from sb3_hds.sysid.shooting import shots_of
@@ -220,6 +221,24 @@ def test_two_causes_are_found_where_the_one_found_first_leads_nowhere(seed):
         "coulomb_friction.joint1",
         "coulomb_friction.joint2",
     }, found
+
+
+def test_the_next_pair_is_asked_about_where_the_best_is_not_confirmed(monkeypatch):
+    pairs = [("friction", ["play"]), ("lag", ["drag"]), ("bias", ["gain"])]
+    search = SimpleNamespace(pairs=lambda *_: pairs)
+    looked = []
+
+    def confirmed(self, first, tried, looks, *_):
+        looked.append((first, tried, looks))
+        return None if first == "friction" else ([first, *tried], "believed")
+
+    monkeypatch.setattr(Naming, "_confirmed", confirmed)
+    alone = SimpleNamespace(tried=SimpleNamespace(candidate=None))
+
+    found = Naming(search, None, 0).pair(alone, None, [])
+
+    assert found == (["lag", "drag"], "believed")
+    assert looked == [("friction", ["play"], 0), ("lag", ["drag"], 1)], "each harder to confirm"
 
 
 def swinging(*hidden, n_steps=120, strength=0.05):

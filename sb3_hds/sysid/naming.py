@@ -96,7 +96,10 @@ class Naming:
     def _next(
         self, tried: Sequence[Tried], base: Base, known: Sequence[str], looks: int = 0
     ) -> Accepted | None:
-        """:return: the best of what was tried, if it is a cause beside those that are known"""
+        """
+        :param looks: at pairs that were not confirmed
+        :return: the best of what was tried, if it is a cause beside those that are known
+        """
         sure = [t for t in tried if self._determined(t, base)]
         best = self.search.best(sure, base, len(known) + looks)
         if best is None:

@@ -292,7 +292,7 @@ class Search:
     def best(self, tried: Sequence[Tried], base: Base, n_found: int = 0) -> Tried | None:
         """
         :param tried: best first
-        :param n_found: causes before this one: each makes the next harder to confirm
+        :param n_found: causes and looks before this one: each makes the next harder to confirm
         :return: the candidate that selection prefers, if the other recordings confirm it; of two
             that they confirm and that predict equally well, the one with fewer parameters. Where
             they do not, the next ones may be confirmed, each at half the level of the one before.
