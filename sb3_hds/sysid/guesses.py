@@ -158,9 +158,9 @@ def _at(here: Here, start: Mapping[str, float]) -> Float[np.ndarray, " p"]:
 def _promised(here: Here, theta: Float[np.ndarray, " p"], index: list[int]) -> float:
     """:return: by how much the cost would fall by one Newton step of these parameters"""
     slopes = here.evidence.slopes(here.point._replace(theta=theta), index)
-    room = tuple(bound[index] for bound in _room(here, theta))
+    low, high = (bound[index] for bound in _room(here, theta))
     every = list(range(len(index)))
-    return newton(slopes.curvature.sum(0), slopes.scores.sum(0), every, room)[1]
+    return newton(slopes.curvature.sum(0), slopes.scores.sum(0), every, (low, high))[1]
 
 
 def _away(here: Here, candidate: Candidate, distance: float) -> Float[np.ndarray, " p"]:
