@@ -17,6 +17,17 @@ import summaries
 # Between which planning in the data sheet's twin and in the true one lie, of the worn pendulum.
 WORN = ("hds_parts", "wrong twin", "ceiling")
 
+# What is shown beside each model-free algorithm on its page.
+LEARNED = {
+    "gsde_sac": ("sb3_gsde_sac", "sac", "sb3_sac", "sbx_sac"),
+    "droq": ("sbx_droq", "sac"),
+    "crossq_jax": ("contrib_crossq", "sbx_crossq", "sac"),
+    "tqc_jax": ("contrib_tqc", "sbx_tqc", "sac"),
+    "simba": ("sac", "sb3_sac", "sbx_sac"),
+    "td7": ("sac", "sb3_sac", "sbx_sac"),
+    "bro": ("bro_fast", "sac", "sb3_sac", "sbx_sac"),
+}
+
 PARTS: dict[str, Callable[[], str]] = {
     "imports": import_picture.as_markdown,
     "twins": catalogue.twins_as_markdown,
@@ -85,6 +96,29 @@ PARTS: dict[str, Callable[[], str]] = {
     "diagnosis_cost_lines": summaries.whole("diagnosis_cost_lines"),
     "diagnosis_cost_picture": summaries.picture(
         "diagnosis_cost", "seconds of a diagnosis against the number of recordings"
+    ),
+    **{
+        f"learned_{method}": summaries.learned(method, *peers) for method, peers in LEARNED.items()
+    },
+    "learned": summaries.learned(),
+    "learned_papers": summaries.whole("model_free_papers"),
+    "learned_peers": summaries.whole("model_free_peers"),
+    "learned_fewer_steps": summaries.whole("model_free_fewer_steps"),
+    **{
+        f"learned_on_{env}": summaries.picture(
+            f"model_free_{env}-v{version}",
+            f"return on {env} against steps and against wall time: a line for each method, a band "
+            "over its seeds, what was published at the end",
+        )
+        for env, version in (("Pendulum", 1), ("Hopper", 5), ("HalfCheetah", 5))
+    },
+    "gsde_continuity": summaries.over_seeds(
+        "gsde_continuity",
+        ("env", "noise"),
+        "return",
+        "continuity",
+        "continuity_of_mean",
+        shows="return of the mean policy against the continuity cost while learning",
     ),
     "sb3_tests": summaries.whole("sb3_tests_table"),
     "speed": summaries.whole("speed_targets"),

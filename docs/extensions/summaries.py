@@ -13,14 +13,14 @@ _NONE = "Not measured yet in this checkout.\n\n"
 
 def over_seeds(
     name: str,
-    variant: str,
+    variant: str | tuple[str, ...],
     *measured: str,
     ends: tuple[str, str, str] | None = None,
     shows: str = "",
 ) -> Callable[[], str]:
     """
     :param name: of the table, without its ending
-    :param variant: column that tells variants apart
+    :param variant: column that tells variants apart, or several that do so together
     :param measured: columns that are shown
     :param ends: name of a table, and the variants in it between which there is a gap: the share of
         it that each variant's return closes is shown too, once they have been measured
@@ -29,15 +29,17 @@ def over_seeds(
     """
 
     def condensed(columns: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
-        place, shown = columns.index(variant), [columns.index(column) for column in measured]
-        gap = _gap(*ends, variant) if ends else {}
+        parts = (variant,) if isinstance(variant, str) else variant
+        places, shown = ([columns.index(c) for c in some] for some in (parts, measured))
+        name_of = lambda row: ", ".join(row[i] for i in places)  # noqa: E731
+        gap = _gap(*ends, parts[0]) if ends else {}
         lines = []
-        for one in dict.fromkeys(row[place] for row in rows):
-            own = [row for row in rows if row[place] == one]
+        for one in dict.fromkeys(map(name_of, rows)):
+            own = [row for row in rows if name_of(row) == one]
             values = [_spread([float(row[i]) for row in own]) for i in shown]
             closed = [_closed(_by_seed(columns, own), gap)] if gap else []
             lines.append([one, *values, *closed, str(len(own))])
-        return [variant, *measured, *(["closed"] if gap else []), "seeds"], lines
+        return [", ".join(parts), *measured, *(["closed"] if gap else []), "seeds"], lines
 
     return lambda: _shown(name, condensed, shows)
 
@@ -136,6 +138,33 @@ def gaits() -> str:
         return ["environment", "steps", *numbers], lines
 
     return _shown("open_loop", condensed)
+
+
+def learned(*methods: str) -> Callable[[], str]:
+    """
+    :param methods: of `model_free.py` that are shown, in this order; none: all
+    :return: what makes the Markdown of how well they learn, by environment
+    """
+
+    def condensed(titles: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
+        runs = [dict(zip(titles, row, strict=True)) for row in rows]
+        shown = methods or tuple(dict.fromkeys(run["method"] for run in runs))
+        lines = []
+        for env in dict.fromkeys(run["env"] for run in runs):
+            own = {run["method"]: run for run in runs if run["env"] == env}
+            for run in (own[method] for method in shown if method in own):
+                mean, low, high, worst = map(
+                    rounded, (run[name] for name in ("return", "low", "high", "worst"))
+                )
+                end, reached = (rounded(run[name] or "nan") for name in ("mark", "steps_to_target"))
+                at_target = "" if reached == "nan" else reached
+                spread = f"{mean} ({low} to {high})" if low != high else mean
+                numbers = [spread, worst, run["seeds"], rounded(run["seconds"]), at_target]
+                lines.append([f"{env}, {end} steps", run["method"], *numbers])
+        numbers = ["mean return", "worst seed", "seeds", "seconds", "steps to target"]
+        return ["environment", "method", *numbers], lines
+
+    return lambda: _shown("model_free_summary", condensed)
 
 
 def _mean(values: list[float]) -> str:
