@@ -303,7 +303,7 @@ class Search:
         simplest = likely[0]
         for other in likely[1:]:
             fewer = len(other.candidate.parameters) < len(simplest.candidate.parameters)
-            if fewer and self.better(simplest.kept, other.kept).p_value > _LEVEL_OF_SET:
+            if fewer and _as_good(self.better(simplest.kept, other.kept)):
                 simplest = other
         level = LEVEL / (1 + n_found)
         for one in [simplest, *(t for t in likely if t is not simplest)][:_MOST_LOOKS]:
@@ -318,9 +318,8 @@ class Search:
         for other in tried:
             if other is best or len(other.candidate.parameters) > len(best.candidate.parameters):
                 continue
-            worse = self.better(best.kept, other.kept)
-            same = worse.p_value > _LEVEL_OF_SET or worse.gain < _SAME
-            if same and passes(self.confirmed(other.kept, base.kept)):
+            as_good = _as_good(self.better(best.kept, other.kept))
+            if as_good and passes(self.confirmed(other.kept, base.kept)):
                 found.append(other.candidate.key)
         return tuple(found)
 
@@ -416,6 +415,11 @@ class Search:
         done = in_threads(work, given)
         shown = track(done, what, total=len(given), transient=True, disable=not self.progress)
         return list(shown)
+
+
+def _as_good(better: Comparison) -> bool:
+    """:return: whether what was found better than another is so neither surely nor by much"""
+    return better.p_value > _LEVEL_OF_SET or better.gain < _SAME
 
 
 def passes(verdict: Comparison, level: float = LEVEL) -> bool:
