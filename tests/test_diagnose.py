@@ -474,18 +474,29 @@ def test_every_window_may_confirm_where_few_units_gain_unequally():
     assert confirm(old * gain, old, unit).p_value > 0.025
 
 
-@pytest.mark.parametrize(("p_of_simple", "chosen"), [(0.06, "rich"), (0.01, "simple")])
-def test_what_is_confirmed_is_not_given_up_for_something_simpler_that_is_not(p_of_simple, chosen):
+@pytest.mark.parametrize(
+    ("p_of_simple", "gain_over_simple", "p_over_simple", "chosen"),
+    [
+        (0.06, 0.2, 0.2, "rich"),
+        (0.01, 0.2, 0.2, "simple"),
+        (0.01, 0.2, 0.003, "rich"),
+        # However surely: a hundredth of the error is what any model may be off by.
+        (0.01, 0.005, 0.003, "simple"),
+    ],
+)
+def test_what_is_confirmed_is_given_up_only_for_something_simpler_that_is_as_good_and_confirmed(
+    p_of_simple, gain_over_simple, p_over_simple, chosen
+):
     p_values = {"rich": 0.003, "simple": p_of_simple}
     rich, simple = (
         SimpleNamespace(kept=name, criterion=60.0, candidate=SimpleNamespace(parameters=parameters))
         for name, parameters in (("rich", ("tau_c", "mu")), ("simple", ("gain",)))
     )
-    p_values["rich", "simple"] = 0.2
 
     def confirmed(new, old):
-        p_value = p_values[new] if old == "base" else p_values[new, old]
-        return Comparison(0.5, p_value, 0.2, 0.7, 6)
+        if old == "base":
+            return Comparison(0.5, p_values[new], 0.2, 0.7, 6)
+        return Comparison(gain_over_simple, p_over_simple, 0.0, 0.3, 6)
 
     search = SimpleNamespace(confirmed=confirmed, better=confirmed)
 

@@ -97,9 +97,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "diagnosis_cost_picture": summaries.picture(
         "diagnosis_cost", "seconds of a diagnosis against the number of recordings"
     ),
-    **{
-        f"learned_{method}": summaries.learned(method, *peers) for method, peers in LEARNED.items()
-    },
+    **{f"learned_{method}": summaries.learned(method, *peers) for method, peers in LEARNED.items()},
     "learned": summaries.learned(),
     "learned_papers": summaries.whole("model_free_papers"),
     "learned_peers": summaries.whole("model_free_peers"),
