@@ -92,11 +92,10 @@ PARTS: dict[str, Callable[[], str]] = {
     "policy_gain_picture": summaries.picture(
         "policy_gain", "return on the real system of policies from each twin, a line for each seed"
     ),
-    "diagnosis_cost": summaries.whole("diagnosis_cost"),
-    "diagnosis_cost_lines": summaries.whole("diagnosis_cost_lines"),
-    "diagnosis_cost_picture": summaries.picture(
+    "diagnosis_cost": summaries.whole(
         "diagnosis_cost", "seconds of a diagnosis against the number of recordings"
     ),
+    "diagnosis_cost_lines": summaries.whole("diagnosis_cost_lines"),
     **{f"learned_{method}": summaries.learned(method, *peers) for method, peers in LEARNED.items()},
     "learned": summaries.learned(),
     "learned_papers": summaries.whole("model_free_papers"),
