@@ -20,7 +20,7 @@ from sb3_hds.sysid.guesses import newton
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.naming import Naming
 from sb3_hds.sysid.remainder import MissingForce, remainder
-from sb3_hds.sysid.search import Half, Search
+from sb3_hds.sysid.search import Half, Search, _Reached
 from sb3_hds.sysid.shooting import shots_of
 from sb3_hds.sysid.telling import errs_more, out_of_reach
 
@@ -239,6 +239,49 @@ def test_the_next_pair_is_asked_about_where_the_best_is_not_confirmed(monkeypatc
 
     assert found == (["lag", "drag"], "believed")
     assert looked == [("friction", ["play"], 0), ("lag", ["drag"], 1)], "each harder to confirm"
+
+
+def test_pairs_come_in_the_order_that_selection_prefers():
+    def tried(key, criterion):
+        return SimpleNamespace(candidate=key, criterion=criterion, point=f"with {key}")
+
+    firsts = [tried("known", 99.0), tried("lag", 90.0), tried("drag", 80.0), tried("bias", 1.0)]
+    seconds = {"lag": [tried("gain", 0.0)], "drag": [tried("play", 0.0)]}
+    worth = {"gain": 10.0, "play": 20.0}
+    for one in firsts:
+        one.candidate = SimpleNamespace(key=one.candidate)
+    search = SimpleNamespace(
+        believing=lambda first, base: first.candidate.key,
+        finalists=lambda belief, accepted: seconds[belief],
+        criterion=lambda both, point, base: worth[both[1]],
+    )
+
+    base = SimpleNamespace(point=None)
+    pairs = Search.pairs(search, firsts, base, firsts[0].candidate)
+
+    assert [first.candidate.key for first, _ in pairs] == ["drag", "lag"]
+
+
+def test_a_fit_goes_on_where_the_candidate_explains_most_with_its_start_states():
+    """Beside another belief only its own value counts, and its start states do not."""
+    asked_about = []
+
+    def nearest(theta, offsets, measured):
+        asked_about.append((list(theta), len(offsets)))
+        return offsets[-1], abs(theta[1] - 3.0)
+
+    search = SimpleNamespace(hypotheses=SimpleNamespace(indices=lambda _: (1,)), _far=set())
+    evidence = SimpleNamespace(shots=SimpleNamespace(n=2), nearest=nearest)
+    believed = Point(np.array([1.0, 0.0]), np.zeros((2, 1)), None, 0.0)
+    here = _Reached(np.array([1.2, 2.5]), np.ones((2, 1)), (0,))
+    elsewhere = _Reached(np.array([7.0, 9.0]), np.full((2, 1), 5.0), ())
+
+    candidate = SimpleNamespace(key="lag.motor")
+    theta, offsets = Search._begin(search, candidate, believed, (0,), evidence, [elsewhere, here])
+
+    assert asked_about == [([1.0, 9.0], 1), ([1.2, 2.5], 2)]
+    np.testing.assert_array_equal(theta, here.theta)
+    np.testing.assert_array_equal(offsets, here.offsets)
 
 
 def swinging(*hidden, n_steps=120, strength=0.05):

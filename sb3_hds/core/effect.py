@@ -433,7 +433,8 @@ class EffectChain:
             if self._chosen is None:
                 after = advanced()
             elif jax.tree.leaves(before):
-                after = jax.lax.cond(self._chosen.on[attached.key], advanced, lambda: before)  # noqa: B023
+                on, stay = self._chosen.on[attached.key], lambda before=before: before
+                after = jax.lax.cond(on, advanced, stay)
             else:
                 after = before
             memory = memory | {attached.key: after}

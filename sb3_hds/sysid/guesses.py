@@ -139,10 +139,13 @@ def _from_starts(
     h = here.evidence.hypotheses
     fixed = {h.names.index(name) for name in starts[0]}
     index = [*here.free, *(i for i in h.indices(candidate) if i not in fixed)]
-    promising = sorted(starts, key=lambda start: -_promised(here, _at(here, start), index))
+    promising = starts
+    if len(starts) > _FITTED:
+        ranked = sorted(starts, key=lambda start: -_promised(here, _at(here, start), index))
+        promising = ranked[:_FITTED]
     fits = [
         here.evidence.fit(_at(here, start), index, here.point.offsets, here.steps)
-        for start in promising[:_FITTED]
+        for start in promising
     ]
     best = int(np.argmin([fitted.cost for fitted in fits]))
     there = fits[best]
