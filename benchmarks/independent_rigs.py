@@ -255,9 +255,9 @@ def _sign(v: float) -> float:
 
 
 def _hysteresis(at: Moment, stiffness: float, slip: float) -> float:
-    """A bristle that bends with the motion and slips (Dahl)."""
+    """A bristle that bends with the motion, and slips the more the farther it is bent (Dahl)."""
     bent = at.memory.get("bent", 0.0)
-    at.memory["bent"] = float(np.clip(bent + at.v * _STEP, -slip, slip))
+    at.memory["bent"] = bent + _STEP * (at.v - abs(at.v) * bent / slip)
     return -stiffness * at.memory["bent"]
 
 
@@ -284,7 +284,8 @@ FORCES: dict[str, Callable[..., float]] = {
     ),
     "hysteresis": _hysteresis,
     "thermal_drift": lambda at, rate: rate * at.time * at.v,
-    "soft_impact": lambda at, k, wall: -k * max(at.q - wall, 0.0),
+    # A ball against a flat wall (Hertz).
+    "soft_impact": lambda at, k, wall: -k * max(at.q - wall, 0.0) ** 1.5,
     "cable_spring": lambda at, k, slack: -k * np.sign(at.q) * max(abs(at.q) - slack, 0.0),
 }
 OUTSIDE = (

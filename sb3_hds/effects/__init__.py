@@ -18,6 +18,7 @@ from sb3_hds.effects.joint import (
     StribeckFriction,
     ViscousFriction,
 )
+from sb3_hds.effects.nameless import ClearanceSpring, ElastoplasticFriction
 from sb3_hds.effects.neural import NeuralForce, force_of
 from sb3_hds.effects.position import Cogging, ConstantForce, CubicStiffness, Stiffness
 from sb3_hds.effects.sensor import (
@@ -57,15 +58,21 @@ ALL: tuple[type[Effect], ...] = (
     SensorDelay,
 )
 
-#: Everything that a saved twin may have attached: the catalogue, and the learned residual, which is
-#: never the name of a cause.
-KNOWN: tuple[type[Effect], ...] = (*ALL, NeuralForce)
+#: What exists and no catalogue of names can be complete of: never the name of a cause, but what
+#: causes at joints are measured against.
+NAMELESS: tuple[type[Effect], ...] = (ClearanceSpring, ElastoplasticFriction)
+
+#: Everything that a saved twin may have attached: the catalogue, and what is never the name of a
+#: cause, a learned residual among it.
+KNOWN: tuple[type[Effect], ...] = (*ALL, *NAMELESS, NeuralForce)
 
 __all__ = [
     "ALL",
     "KNOWN",
+    "NAMELESS",
     "ActionDelay",
     "Backlash",
+    "ClearanceSpring",
     "Cogging",
     "ConstantForce",
     "CoulombFriction",
@@ -74,6 +81,7 @@ __all__ = [
     "DirectionalCoulombFriction",
     "DirectionalGain",
     "DirectionalViscousFriction",
+    "ElastoplasticFriction",
     "JointElasticity",
     "LoadDependentFriction",
     "MotorLag",

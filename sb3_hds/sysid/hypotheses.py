@@ -20,7 +20,7 @@ from sb3_hds.core import (
 )
 from sb3_hds.core.effect import Attached, Chosen
 from sb3_hds.core.layers import layers_of, plant_of
-from sb3_hds.effects import ConstantForce, NeuralForce, SignFlip, reversed_joint
+from sb3_hds.effects import NAMELESS, ConstantForce, NeuralForce, SignFlip, reversed_joint
 from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.shooting import remembered_for
 
@@ -76,6 +76,7 @@ class Hypotheses:
     :param upper: largest admissible values
     :param nuisances: indices of those that are refitted under every hypothesis
     :param pushes: index of a constant force at each joint, to measure what force is missing
+    :param nameless: forces that no finding is, and that findings have to beat
     :param starts: for candidates by key, values by full name at which a search may begin
     """
 
@@ -89,6 +90,7 @@ class Hypotheses:
     upper: Float[np.ndarray, " p"]
     nuisances: tuple[int, ...]
     pushes: tuple[int, ...]
+    nameless: tuple[Candidate, ...] = ()
     starts: Mapping[str, tuple[Mapping[str, float], ...]] = dataclasses.field(default_factory=dict)
 
     @classmethod
@@ -109,7 +111,10 @@ class Hypotheses:
             )
         own = tuple(name for name in twin.parameters if not name.endswith(".share"))
         pushed = () if ConstantForce in effects else (ConstantForce,)
-        extended, found = _attached(twin, (*effects, *pushed))
+        rivals = tuple(kind for kind in NAMELESS if kind not in effects)
+        extended, found = _attached(twin, (*effects, *pushed, *rivals))
+        nameless = tuple(c for c in found if c.name in {kind.name for kind in rivals})
+        found = [c for c in found if c not in nameless]
         pushes = tuple(f"{ConstantForce.name}.{joint.name}.tau_0" for joint in twin.joints)
         if pushed:
             found = [c for c in found if c.parameters[0] not in pushes]
@@ -127,6 +132,7 @@ class Hypotheses:
         ]
         moving = (*calibrate, *dict.fromkeys(p for c in candidates for p in c.parameters))
         moving += tuple(name for name in pushes if name not in moving)
+        moving += tuple(name for c in nameless for name in c.parameters)
         every = {name: extended.parameters[name] for name in moving}
         values = np.array([extended.values[name] for name in moving], float)
         lower = np.array([every[name].lower for name in moving], float)
@@ -146,6 +152,7 @@ class Hypotheses:
             upper=np.array([every[name].upper for name in moving], float),
             nuisances=tuple(range(len(calibrate))),
             pushes=tuple(moving.index(name) for name in pushes),
+            nameless=nameless,
         )
 
     @cached_property

@@ -40,6 +40,7 @@ from sb3_hds.sysid.telling import (
     finding,
     in_words,
     look_alike,
+    nameless_in_words,
     nearest_in_words,
     out_of_reach,
     to_tell_apart,
@@ -53,6 +54,8 @@ from sb3_hds.sysid.timing import in_step
 _WINDOW, _SHORTEST, _LONGEST, _FEW = 1.0, 8, 200, 24
 # A cause that explains less than this share of what can be explained is not the cause.
 _LEAST_SHARE = 0.9
+# A size that changes so that to follow it would explain the rest of this share is no constant.
+_CONSTANT_SHARE = 0.96
 # Candidates that are fitted to the end to settle the noise.
 _FOR_NOISE = 3
 # How long to search.
@@ -168,6 +171,11 @@ class Inquiry:
             pair = naming.pair(found[0], base, firsts)
             if pair is not None and (rest := self._left_by(*pair)) is not None:
                 found, base, left = *pair, rest
+        found, base, outdone = naming.outdone(found, base)
+        if outdone is not None:
+            left = self._left(base)
+            words = nameless_in_words(*outdone, self.hypotheses)
+            nearest = " ".join(filter(None, (nearest, words)))
         self.turned_down = naming.turned_down | self.turned_down
         if found and self._explained(found, start, base, before, left) < _LEAST_SHARE:
             # Something is there, and this is not it.
@@ -239,7 +247,7 @@ class Inquiry:
         if changes is None:
             return None
         gone = max(self._gone(one, base, left), 0.0)
-        return changes if gone < _LEAST_SHARE * (gone + changes.gain) else None
+        return changes if gone < _CONSTANT_SHARE * (gone + changes.gain) else None
 
     def _left_by(self, found: Sequence[Accepted], base: Base) -> _Left | None:
         """:return: what is left beside these causes; None: the size of one of them changes"""

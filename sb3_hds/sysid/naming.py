@@ -1,13 +1,15 @@
 """Which causes are named: one after the other, or, where that leads nowhere, two at once."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from sb3_hds.sysid.account import standard_errors
+from sb3_hds.sysid.comparison import Comparison
 from sb3_hds.sysid.family import chance_of_the_best
-from sb3_hds.sysid.search import Base, Search, Tried, passes
-from sb3_hds.sysid.telling import CHANCE, SMALL, UNCERTAIN, Accepted, margin
+from sb3_hds.sysid.search import Base, Search, Tried, as_good, passes
+from sb3_hds.sysid.telling import CHANCE, NAMELESS, SMALL, UNCERTAIN, Accepted, margin
 
 # Causes that are looked for.
 _MOST = 3
@@ -16,6 +18,20 @@ _MOST = 3
 _LEAST_OF_EARLIER = 0.01
 # Family-wise level of what selection proposes.
 _FAMILY_LEVEL = 0.05
+
+
+class Outdone(NamedTuple):
+    """
+    A force without a name that predicts better than what has one.
+
+    :param tried: the force
+    :param better: how much better
+    :param causes: keys of the causes in whose place it is; none: nothing was found
+    """
+
+    tried: Tried
+    better: Comparison
+    causes: tuple[str, ...]
 
 
 class Naming:
@@ -68,6 +84,39 @@ class Naming:
             if confirmed is not None:
                 return confirmed
         return None
+
+    def outdone(
+        self, found: Sequence[Accepted], base: Base
+    ) -> tuple[list[Accepted], Base, Outdone | None]:
+        """
+        Of the causes that have a name, one is the best, right or wrong. If a force without a name
+        surely predicts better in the place of all of them, or of one, that one is not the cause.
+
+        :return: causes that stand, what is believed with them, and the force; None if none is
+            better, or, where nothing was found, none is confirmed
+        """
+        if not found:
+            return [], base, self._confirmed_nameless(base)
+        places = [tuple(found)] + [(one,) for one in found if len(found) > 1]
+        for place in places:
+            without = base
+            for one in place:
+                without = self.search.without(one.tried.candidate, without)
+            best = self.search.nameless(without)[0]
+            better = self.search.better(best.kept, base.kept)
+            if best.point.cost < base.point.cost and not as_good(better):
+                self.turned_down |= dict.fromkeys(keys_of(place), NAMELESS)
+                rest = [one for one in found if one not in place]
+                return rest, without, Outdone(best, better, tuple(keys_of(place)))
+        return list(found), base, None
+
+    def _confirmed_nameless(self, base: Base) -> Outdone | None:
+        """:return: a force without a name beside what is believed, as sure as a cause has to be"""
+        tried = self.search.nameless(base)
+        best = self.search.best([t for t in tried if self._determined(t, base)], base)
+        if best is None or self._chance(best, base, []) >= _FAMILY_LEVEL:
+            return None
+        return Outdone(best, self.search.confirmed(best.kept, base.kept), ())
 
     def _confirmed(
         self, first: Tried, tried: Sequence[Tried], looks: int, base: Base, firsts: Sequence[Tried]
@@ -147,10 +196,11 @@ class Naming:
 
     def _chance(self, best: Tried, base: Base, known: Sequence[str]) -> float:
         """:return: family-wise p-value on the half that selects"""
-        left = [c for c in self.search.hypotheses.candidates if c.key not in known]
+        h = self.search.hypotheses
+        left = [c for c in (*h.candidates, *h.nameless) if c.key not in known]
         slopes = self.search.select.evidence.slopes(best.point)
-        own = [self.search.hypotheses.indices(c) for c in left]
-        fitted = (*base.free, *self.search.hypotheses.indices(best.candidate))
+        own = [h.indices(c) for c in left]
+        fitted = (*base.free, *h.indices(best.candidate))
         gain = base.point.cost - best.point.cost
         return chance_of_the_best(slopes, own, base.free, fitted, gain, self.seed)
 

@@ -241,6 +241,14 @@ class Search:
         tried = self._each(finish, candidates, f"fitting {len(candidates)} likely causes")
         return sorted(tried, key=lambda t: -t.criterion)
 
+    def nameless(self, base: Base) -> list[Tried]:
+        """:return: what no finding is beside what is believed, fitted to the end, best first"""
+        forces = self.hypotheses.nameless
+        here = Here(self.select.evidence, base.point, base.free, self.effort.steps)
+        for candidate, guess in zip(forces, guesses(here, forces, {}), strict=True):
+            self._reached[candidate.key] = _Reached(guess.theta, guess.offsets, base.free)
+        return self.finished(forces, base)
+
     def relatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> list[Tried]:
         """
         :return: what looks like the best candidate, by declaration or in these windows, and was not
@@ -303,7 +311,7 @@ class Search:
         simplest = likely[0]
         for other in likely[1:]:
             fewer = len(other.candidate.parameters) < len(simplest.candidate.parameters)
-            if fewer and _as_good(self.better(simplest.kept, other.kept)):
+            if fewer and as_good(self.better(simplest.kept, other.kept)):
                 simplest = other
         level = LEVEL / (1 + n_found)
         for one in [simplest, *(t for t in likely if t is not simplest)][:_MOST_LOOKS]:
@@ -318,8 +326,8 @@ class Search:
         for other in tried:
             if other is best or len(other.candidate.parameters) > len(best.candidate.parameters):
                 continue
-            as_good = _as_good(self.better(best.kept, other.kept))
-            if as_good and passes(self.confirmed(other.kept, base.kept)):
+            same = as_good(self.better(best.kept, other.kept))
+            if same and passes(self.confirmed(other.kept, base.kept)):
                 found.append(other.candidate.key)
         return tuple(found)
 
@@ -417,7 +425,7 @@ class Search:
         return list(shown)
 
 
-def _as_good(better: Comparison) -> bool:
+def as_good(better: Comparison) -> bool:
     """:return: whether what was found better than another is so neither surely nor by much"""
     return better.p_value > _LEVEL_OF_SET or better.gain < _SAME
 

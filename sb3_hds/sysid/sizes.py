@@ -62,7 +62,7 @@ def sized(evidence: Evidence, data: Trajectories) -> Hypotheses:
 
 def _starts(h: Hypotheses, moved: _Moved) -> dict[str, tuple[dict[str, float], ...]]:
     found = {}
-    for candidate in h.candidates:
+    for candidate in (*h.candidates, *h.nameless):
         effect = h.effect_of(candidate)
         if effect is None or candidate.slot != "joint":
             continue
@@ -84,7 +84,7 @@ def _unseen(h: Hypotheses, data: Trajectories, moved: _Moved) -> Float[np.ndarra
     speeds, excursions, torques = moved
     with np.errstate(divide="ignore", invalid="ignore"):
         springs = torques / (_STRETCH * excursions)
-    for candidate in h.candidates:
+    for candidate in (*h.candidates, *h.nameless):
         for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
             unit = h.twin.parameters[name].unit
             if candidate.slot == "actuator":

@@ -22,6 +22,7 @@ from sb3_hds.sysid.search import LEAST_GAIN, LEVEL, Base, Half, Tried
 #: why a candidate was turned down that predicts better
 UNCERTAIN, SMALL, CHANCE = "has no certain size", "is small beside the others", "may be chance"
 NO_CONSTANT = "comes near, but its size changes"
+NAMELESS = "a nameless force is better"
 _CONFIDENCE = 0.9
 # Error of a window that a twin does not come near, in units of the noise, or of what is usual.
 _LOST = 10.0
@@ -175,7 +176,7 @@ def why(verdict: Comparison, turned_down: str | None) -> str:
 def in_words(left: Remainder) -> str:
     share = f"{left.gain:.0%}"
     return (
-        f"a force at {left.joint} goes with {' and '.join(left.goes_with)}; {share} of its "
+        f"A force at {left.joint} goes with {' and '.join(left.goes_with)}; {share} of its "
         f"variance is predictable on held-out recordings (p = {left.p_value:.2g})."
     )
 
@@ -184,6 +185,25 @@ def nearest_in_words(key: str, changes: Change) -> str:
     return (
         f"{key} comes nearest, but its size is no constant: it goes with {changes.goes_with} "
         f"(p = {changes.p_value:.2g})."
+    )
+
+
+def nameless_in_words(
+    tried: Tried, better: Comparison, causes: Sequence[str], hypotheses: Hypotheses
+) -> str:
+    """
+    :param tried: a force without a name
+    :param better: than the causes
+    :param causes: in whose place it is
+    """
+    force, values = tried.candidate, []
+    for name, i in zip(force.parameters, hypotheses.indices(force), strict=True):
+        unit = hypotheses.twin.parameters[name].unit
+        values.append(f"{name.rpartition('.')[2]} = {tried.point.theta[i]:.3g} {unit}")
+    than = " and ".join(causes) or "nothing"
+    return (
+        f"A force that is no finding does better than {than}: {force.key} ({', '.join(values)}), "
+        f"with {better.gain:.0%} less error (p = {better.p_value:.2g}). {force.explanation}"
     )
 
 
