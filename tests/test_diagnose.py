@@ -22,7 +22,7 @@ from sb3_hds.sysid.naming import Naming
 from sb3_hds.sysid.remainder import MissingForce, remainder
 from sb3_hds.sysid.search import Half, Search, _Reached
 from sb3_hds.sysid.shooting import shots_of
-from sb3_hds.sysid.telling import errs_more, out_of_reach
+from sb3_hds.sysid.telling import NAMELESS, errs_more, out_of_reach
 
 CATALOGUE = (
     effects.ViscousFriction,
@@ -377,6 +377,43 @@ def test_friction_that_falls_is_found_however_far_its_hump_reaches(v_s):
     assert [finding.effect for finding in found.findings] == ["stribeck_friction"], found
     sizes = {name: one.estimate for name, one in found.findings[0].parameters.items()}
     assert sizes == pytest.approx({"tau_c": 0.01, "tau_s": 0.03, "v_s": v_s}, rel=0.1)
+
+
+SLACK = effects.ClearanceSpring("hinge", k=0.3, low=-0.3, high=0.3)
+YIELDING = effects.Hysteresis("hinge", tau_c=0.03, slip=0.4, n=2.0)
+
+
+@pytest.mark.parametrize(
+    ("planted", "nearest"),
+    [(SLACK, effects.Stiffness), (YIELDING, effects.CoulombFriction)],
+    ids=lambda effect: effect.name,
+)
+def test_what_comes_nearest_is_no_cause_where_a_nameless_force_predicts_better(planted, nearest):
+    pushed, data = swinging(planted, n_steps=150)
+    found = asked(data, pushed, effects=[nearest, effects.ViscousFriction], budget="quick")
+
+    assert found.verdict == "unknown", found
+    assert f"{planted.name}.hinge" in found.unexplained
+    assert f"better than {nearest.name}.hinge" in found.unexplained
+    (one,) = (r for r in found.rejected if r.key == f"{nearest.name}.hinge")
+    assert one.why == NAMELESS
+
+
+def test_beside_a_nameless_force_a_cause_is_still_named():
+    friction = effects.ViscousFriction("hinge", b=0.03)
+    pushed, data = swinging(SLACK, friction, n_steps=150)
+    found = asked(data, pushed, effects=[effects.Stiffness, effects.ViscousFriction])
+
+    assert [finding.effect for finding in found.findings] == ["viscous_friction"], found
+    assert "clearance_spring.hinge" in found.unexplained
+
+
+def test_a_nameless_force_is_told_where_no_cause_comes_near():
+    pushed, data = swinging(YIELDING, n_steps=150)
+    found = asked(data, pushed, effects=[effects.SensorBias], budget="quick")
+
+    assert found.verdict == "unknown", found
+    assert "hysteresis.hinge" in found.unexplained
 
 
 @pytest.mark.expensive

@@ -18,7 +18,7 @@ from sb3_hds.effects.joint import (
     StribeckFriction,
     ViscousFriction,
 )
-from sb3_hds.effects.nameless import ClearanceSpring, ElastoplasticFriction
+from sb3_hds.effects.nameless import ClearanceSpring, Hysteresis
 from sb3_hds.effects.neural import NeuralForce, force_of
 from sb3_hds.effects.position import Cogging, ConstantForce, CubicStiffness, Stiffness
 from sb3_hds.effects.sensor import (
@@ -60,7 +60,7 @@ ALL: tuple[type[Effect], ...] = (
 
 #: What exists and no catalogue of names can be complete of: never the name of a cause, but what
 #: causes at joints are measured against.
-NAMELESS: tuple[type[Effect], ...] = (ClearanceSpring, ElastoplasticFriction)
+NAMELESS: tuple[type[Effect], ...] = (ClearanceSpring, Hysteresis)
 
 #: Everything that a saved twin may have attached: the catalogue, and what is never the name of a
 #: cause, a learned residual among it.
@@ -81,7 +81,7 @@ __all__ = [
     "DirectionalCoulombFriction",
     "DirectionalGain",
     "DirectionalViscousFriction",
-    "ElastoplasticFriction",
+    "Hysteresis",
     "JointElasticity",
     "LoadDependentFriction",
     "MotorLag",

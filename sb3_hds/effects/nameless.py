@@ -16,6 +16,10 @@ _SLACKS, _STOPS, _SLIPS = (
     (-0.2, -0.05, 0.1, 0.25, 0.4),
     (0.03, 0.08, 0.2, 0.4),
 )
+# How suddenly it slides.
+_SHARPNESS = (1.0, 4.0)
+# Of how far it may bend: what is bent less is not bent.
+_TINY = 1e-6
 # An edge that no joint reaches [rad] or [m].
 _NEVER = 1e3
 
@@ -56,39 +60,44 @@ class ClearanceSpring(JointEffect):
         return -jnp.minimum(params["k"], joint.inertia / joint.h**2) * (above + below)
 
 
-class ElastoplasticFriction(JointEffect):
+class Hysteresis(JointEffect):
     r"""
-    Dry friction that yields like a spring before it slides: hysteresis.
+    Dry friction that yields before it slides, as bristles, rolling balls and cables do.
 
     .. math::
         \tau = -\min\!\Big(\frac{\tau_c}{s},\; \frac{I}{h^2}\Big)\, z, \qquad
-        \dot z = v \ \text{ within } |z| \le s
+        \dot z = v \Big(1 - \operatorname{sign}(v z) \Big|\frac{z}{s}\Big|^n\Big)
 
-    with the travel :math:`s` after which it slides. An episode starts with :math:`z = 0`.
+    with the travel :math:`s` after which it slides. With :math:`n = 1` it yields ever more (Dahl's
+    friction), with large :math:`n` it is a spring until it slides (Prandtl's element). An episode
+    starts with :math:`z = 0`.
 
-    Source: Prandtl's element, as in Dupont et al., *Single state elastoplastic friction models*,
-    IEEE Transactions on Automatic Control 47(5), 2002, section II.
+    Source: the Bouc-Wen model of Ikhouane and Rodellar, *Systems with Hysteresis*, Wiley 2007,
+    chapter 2, without the part by which it hardens.
     """
 
-    name = "elastoplastic_friction"
+    name = "hysteresis"
     parameters = {
         "tau_c": Parameter(null=0.0, scale=0.1, unit="N m", lower=0.0),
         "slip": Parameter(null=0.1, scale=0.05, unit="rad", lower=1e-3),
+        "n": Parameter(null=1.0, scale=0.5, unit="1", lower=0.5, upper=20.0),
     }
     explanation = "Friction yields like a spring before the joint slides."
-    source = "Dupont et al. 2002, section II"
+    source = "Ikhouane and Rodellar 2007, chapter 2"
     forgets = 2.0
 
     def starts(self, excursion: float, speed: float) -> tuple[dict[str, float], ...]:
-        return tuple({"slip": share * excursion} for share in _SLIPS)
+        return tuple({"slip": s * excursion, "n": n} for s in _SLIPS for n in _SHARPNESS)
 
     def memory(self, twin: "Twin") -> Memory:
         return jnp.zeros(())
 
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
-        slip = params["slip"]
-        stiffness = jnp.minimum(params["tau_c"] / slip, joint.inertia / joint.h**2)
-        return -stiffness * jnp.clip(memory, -slip, slip)
+        stiffness = jnp.minimum(params["tau_c"] / params["slip"], joint.inertia / joint.h**2)
+        return -stiffness * memory
 
     def advance(self, moment: Moment, index: int, memory: Memory, params: Params) -> Memory:
-        return jnp.clip(memory + moment.h * moment.v[index], -params["slip"], params["slip"])
+        way, slip = moment.h * moment.v[index], params["slip"]
+        bent = jnp.maximum(jnp.abs(memory) / slip, _TINY) ** params["n"]
+        after = memory + way * (1.0 - jnp.sign(way * memory) * bent)
+        return jnp.clip(after, -slip, slip)

@@ -199,7 +199,8 @@ def nameless_in_words(
     force, values = tried.candidate, []
     for name, i in zip(force.parameters, hypotheses.indices(force), strict=True):
         unit = hypotheses.twin.parameters[name].unit
-        values.append(f"{name.rpartition('.')[2]} = {tried.point.theta[i]:.3g} {unit}")
+        size = f"{name.rpartition('.')[2]} = {tried.point.theta[i]:.3g}"
+        values.append(size if unit == "1" else f"{size} {unit}")
     than = " and ".join(causes) or "nothing"
     return (
         f"A force that is no finding does better than {than}: {force.key} ({', '.join(values)}), "
