@@ -171,10 +171,13 @@ class Inquiry:
             pair = naming.pair(found[0], base, firsts)
             if pair is not None and (rest := self._left_by(*pair)) is not None:
                 found, base, left = *pair, rest
-        found, base, outdone = naming.outdone(found, base)
-        if outdone is not None:
+        found, base, force = naming.outdone(found, base)
+        if force is not None:
             left = self._left(base)
-            words = nameless_in_words(*outdone, self.hypotheses)
+        elif not found or left.remainder is not None:
+            force = naming.nameless(base, keys_of(found))
+        if force is not None:
+            words = nameless_in_words(*force, self.hypotheses)
             nearest = " ".join(filter(None, (nearest, words)))
         self.turned_down = naming.turned_down | self.turned_down
         if found and self._explained(found, start, base, before, left) < _LEAST_SHARE:

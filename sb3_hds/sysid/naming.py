@@ -26,7 +26,7 @@ class Outdone(NamedTuple):
 
     :param tried: the force
     :param better: how much better
-    :param causes: keys of the causes in whose place it is; none: nothing was found
+    :param causes: keys of the causes in whose place it is; none: it is beside them
     """
 
     tried: Tried
@@ -93,11 +93,10 @@ class Naming:
         surely predicts better in the place of all of them, or of one, that one is not the cause.
 
         :return: causes that stand, what is believed with them, and the force; None if none is
-            better, or, where nothing was found, none is confirmed
+            better
         """
-        if not found:
-            return [], base, self._confirmed_nameless(base)
-        places = [tuple(found)] + [(one,) for one in found if len(found) > 1]
+        places = [tuple(found)] if found else []
+        places += [(one,) for one in found if len(found) > 1]
         for place in places:
             without = base
             for one in place:
@@ -110,11 +109,15 @@ class Naming:
                 return rest, without, Outdone(best, better, tuple(keys_of(place)))
         return list(found), base, None
 
-    def _confirmed_nameless(self, base: Base) -> Outdone | None:
-        """:return: a force without a name beside what is believed, as sure as a cause has to be"""
+    def nameless(self, base: Base, known: Sequence[str]) -> Outdone | None:
+        """
+        :param known: keys of causes that belong to what is believed
+        :return: a force without a name beside that, as sure as a cause has to be
+        """
         tried = self.search.nameless(base)
-        best = self.search.best([t for t in tried if self._determined(t, base)], base)
-        if best is None or self._chance(best, base, []) >= _FAMILY_LEVEL:
+        sure = [t for t in tried if self._determined(t, base)]
+        best = self.search.best(sure, base, len(known))
+        if best is None or self._chance(best, base, known) >= _FAMILY_LEVEL / (1 + len(known)):
             return None
         return Outdone(best, self.search.confirmed(best.kept, base.kept), ())
 

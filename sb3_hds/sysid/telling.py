@@ -194,16 +194,16 @@ def nameless_in_words(
     """
     :param tried: a force without a name
     :param better: than the causes
-    :param causes: in whose place it is
+    :param causes: in whose place it is; none: beside what is believed
     """
     force, values = tried.candidate, []
     for name, i in zip(force.parameters, hypotheses.indices(force), strict=True):
         unit = hypotheses.twin.parameters[name].unit
         size = f"{name.rpartition('.')[2]} = {tried.point.theta[i]:.3g}"
         values.append(size if unit == "1" else f"{size} {unit}")
-    than = " and ".join(causes) or "nothing"
+    does = f"does better than {' and '.join(causes)}" if causes else "explains what is missing"
     return (
-        f"A force that is no finding does better than {than}: {force.key} ({', '.join(values)}), "
+        f"A force that is no finding {does}: {force.key} ({', '.join(values)}), "
         f"with {better.gain:.0%} less error (p = {better.p_value:.2g}). {force.explanation}"
     )
 
