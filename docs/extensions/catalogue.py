@@ -53,6 +53,11 @@ def effects_as_markdown() -> str:
     return overview + "".join(_effect_section(effect) for effect in effects.ALL)
 
 
+def nameless_as_markdown() -> str:
+    """:return: the equations of the forces that no diagnosis names"""
+    return "".join(_effect_section(effect) for effect in effects.NAMELESS)
+
+
 def environments_as_markdown() -> str:
     """:return: one table of the ids that the package registers"""
     rows = [

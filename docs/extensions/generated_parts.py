@@ -33,6 +33,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "twins": catalogue.twins_as_markdown,
     "surrogates": catalogue.surrogates_as_markdown,
     "effects": catalogue.effects_as_markdown,
+    "nameless": catalogue.nameless_as_markdown,
     "environments": catalogue.environments_as_markdown,
     "benchmarks": benchmark_results.as_markdown,
     "sim_to_real_gap": summaries.whole(
