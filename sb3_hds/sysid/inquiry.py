@@ -55,7 +55,7 @@ _WINDOW, _SHORTEST, _LONGEST, _FEW = 1.0, 8, 200, 24
 # A cause that explains less than this share of what can be explained is not the cause.
 _LEAST_SHARE = 0.9
 # A size that changes so that to follow it would explain the rest of this share is no constant.
-_CONSTANT_SHARE = 0.96
+_CONSTANT_SHARE = 0.95
 # Candidates that are fitted to the end to settle the noise.
 _FOR_NOISE = 3
 # How long to search.
