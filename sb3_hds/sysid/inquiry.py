@@ -54,8 +54,9 @@ from sb3_hds.sysid.timing import in_step
 _WINDOW, _SHORTEST, _LONGEST, _FEW = 1.0, 8, 200, 24
 # A cause that explains less than this share of what can be explained is not the cause.
 _LEAST_SHARE = 0.9
-# A size that changes so that to follow it would explain the rest of this share is no constant.
-_CONSTANT_SHARE = 0.95
+# Of what is explained where its size may change with time. That, no form of a force that is a
+# little wrong looks like; with position or speed it does.
+_LEAST_SHARE_IN_TIME = 0.95
 # Candidates that are fitted to the end to settle the noise.
 _FOR_NOISE = 3
 # How long to search.
@@ -250,7 +251,8 @@ class Inquiry:
         if changes is None:
             return None
         gone = max(self._gone(one, base, left), 0.0)
-        return changes if gone < _CONSTANT_SHARE * (gone + changes.gain) else None
+        least = _LEAST_SHARE_IN_TIME if changes.goes_with == "time" else _LEAST_SHARE
+        return changes if gone < least * (gone + changes.gain) else None
 
     def _left_by(self, found: Sequence[Accepted], base: Base) -> _Left | None:
         """:return: what is left beside these causes; None: the size of one of them changes"""
