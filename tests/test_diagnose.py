@@ -14,6 +14,7 @@ from sb3_hds.core import JointEffect, Parameter, Trajectories, rollout
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid import inquiry
 from sb3_hds.sysid.comparison import Comparison, compare, confirm, split
+from sb3_hds.sysid.constancy import Change
 from sb3_hds.sysid.diagnosis import HorizonGain
 from sb3_hds.sysid.evidence import Evidence, Point
 from sb3_hds.sysid.guesses import newton
@@ -409,6 +410,16 @@ def test_a_nameless_force_is_told_where_no_cause_comes_near(planted):
     assert f"{planted.name}.hinge" in found.unexplained
 
 
+def test_a_force_without_a_name_is_named_for_whoever_asks_about_it():
+    pushed, data = swinging(YIELDING, n_steps=150)
+    kinds = [*effects.NAMELESS, effects.CoulombFriction]
+    found = asked(data, pushed, effects=kinds, budget="quick")
+
+    assert [finding.effect for finding in found.findings] == ["hysteresis"], found
+    assert found.findings[0].parameters["tau_c"].estimate == pytest.approx(0.03, rel=0.1)
+    assert not found.unexplained
+
+
 @pytest.mark.expensive
 def test_what_looks_alike_is_said_and_how_sure_predictions_are_is_drawn():
     """Two dry frictions, one for each direction, can be one; they have more freedom."""
@@ -601,6 +612,25 @@ def test_friction_that_changes_with_place_or_time_is_left_over(where, seed):
 
     assert found is not None
     assert {"velocity", where} <= set(found.goes_with)
+
+
+@pytest.mark.parametrize(
+    ("goes_with", "share", "steady"),
+    [("speed", 0.08, True), ("speed", 0.12, False), ("time", 0.03, True), ("time", 0.08, False)],
+)
+def test_a_size_may_change_less_with_time_than_with_speed(monkeypatch, goes_with, share, steady):
+    changes = Change(goes_with, 1e-6, gain=share)
+    monkeypatch.setattr(inquiry, "change", lambda *_: changes)
+    asking = SimpleNamespace(
+        hypotheses=SimpleNamespace(remembers=lambda _: False, indices=lambda _: (0,)),
+        _gone=lambda *_: 1.0 - share,
+    )
+    one = SimpleNamespace(tried=SimpleNamespace(candidate=None))
+    left = SimpleNamespace(short=None, missing=None)
+
+    found = inquiry.Inquiry._varies(asking, one, SimpleNamespace(free=()), left)
+
+    assert found is (None if steady else changes)
 
 
 def test_both_halves_see_every_condition():

@@ -20,9 +20,9 @@ _LEAST_OF_EARLIER = 0.01
 _FAMILY_LEVEL = 0.05
 
 
-class Outdone(NamedTuple):
+class Nameless(NamedTuple):
     """
-    A force without a name that predicts better than what has one.
+    A force without a name that predicts better than what has one, or than nothing.
 
     :param tried: the force
     :param better: how much better
@@ -87,7 +87,7 @@ class Naming:
 
     def outdone(
         self, found: Sequence[Accepted], base: Base
-    ) -> tuple[list[Accepted], Base, Outdone | None]:
+    ) -> tuple[list[Accepted], Base, Nameless | None]:
         """
         Of the causes that have a name, one is the best, right or wrong. If a force without a name
         surely predicts better in the place of all of them, or of one, that one is not the cause.
@@ -97,7 +97,7 @@ class Naming:
         """
         places = [tuple(found)] if found else []
         places += [(one,) for one in found if len(found) > 1]
-        for place in places:
+        for place in places if self.search.hypotheses.nameless else []:
             without = base
             for one in place:
                 without = self.search.without(one.tried.candidate, without)
@@ -106,10 +106,10 @@ class Naming:
             if best.point.cost < base.point.cost and not as_good(better):
                 self.turned_down |= dict.fromkeys(keys_of(place), NAMELESS)
                 rest = [one for one in found if one not in place]
-                return rest, without, Outdone(best, better, tuple(keys_of(place)))
+                return rest, without, Nameless(best, better, tuple(keys_of(place)))
         return list(found), base, None
 
-    def nameless(self, base: Base, known: Sequence[str]) -> Outdone | None:
+    def nameless(self, base: Base, known: Sequence[str]) -> Nameless | None:
         """
         :param known: keys of causes that belong to what is believed
         :return: a force without a name beside that, as sure as a cause has to be
@@ -119,7 +119,7 @@ class Naming:
         best = self.search.best(sure, base, len(known))
         if best is None or self._chance(best, base, known) >= _FAMILY_LEVEL / (1 + len(known)):
             return None
-        return Outdone(best, self.search.confirmed(best.kept, base.kept), ())
+        return Nameless(best, self.search.confirmed(best.kept, base.kept), ())
 
     def _confirmed(
         self, first: Tried, tried: Sequence[Tried], looks: int, base: Base, firsts: Sequence[Tried]
