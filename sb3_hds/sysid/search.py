@@ -185,14 +185,9 @@ class Search:
         :return: promising candidates, fitted roughly on a sample of windows, best first
         """
         left = [c for c in self.hypotheses.candidates if c.key not in accepted]
-        sample = self._sample()
-        first = base.point._replace(offsets=base.point.offsets[sample])
-        evidence = self.select.evidence
-        if len(sample) < evidence.shots.n:
-            evidence = evidence.on(type(evidence.shots)(*(x[sample] for x in evidence.shots)))
-
-        known = self._known.setdefault(tuple(accepted), {})
-        guessed = guesses(Here(evidence, first, base.free, self.effort.steps), left, known)
+        here = self._on_a_sample(base)
+        evidence, first = here.evidence, here.point
+        guessed = guesses(here, left, self._known.setdefault(tuple(accepted), {}))
         begin = {}
         for candidate, guess in zip(left, guessed, strict=True):
             begin[candidate.key] = _Reached(guess.theta, guess.offsets, base.free)
@@ -244,8 +239,8 @@ class Search:
     def nameless(self, base: Base) -> list[Tried]:
         """:return: what no finding is beside what is believed, fitted to the end, best first"""
         forces = self.hypotheses.nameless
-        here = Here(self.select.evidence, base.point, base.free, self.effort.steps)
-        for candidate, guess in zip(forces, guesses(here, forces, {}), strict=True):
+        guessed = guesses(self._on_a_sample(base), forces, {})
+        for candidate, guess in zip(forces, guessed, strict=True):
             self._reached[candidate.key] = _Reached(guess.theta, guess.offsets, base.free)
         return self.finished(forces, base)
 
@@ -411,11 +406,15 @@ class Search:
             return offsets
         return evidence.nearest(theta, [offsets], measured=True)[0]
 
-    def _sample(self) -> np.ndarray:
-        n = self.select.evidence.shots.n
-        if n <= self.effort.windows:
-            return np.arange(n)
-        return np.sort(np.random.default_rng(0).choice(n, self.effort.windows, replace=False))
+    def _on_a_sample(self, base: Base) -> Here:
+        """Of the windows that select, at most so many as the effort allows."""
+        evidence, point, most = self.select.evidence, base.point, self.effort.windows
+        if evidence.shots.n > most:
+            rng = np.random.default_rng(0)
+            sample = np.sort(rng.choice(evidence.shots.n, most, replace=False))
+            evidence = evidence.on(type(evidence.shots)(*(x[sample] for x in evidence.shots)))
+            point = point._replace(offsets=point.offsets[sample])
+        return Here(evidence, point, base.free, self.effort.steps)
 
     def _each(
         self, work: Callable[[_Given], _Told], given: Sequence[_Given], what: str
