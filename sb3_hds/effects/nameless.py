@@ -66,7 +66,7 @@ class Hysteresis(JointEffect):
 
     .. math::
         \tau = -\min\!\Big(\frac{\tau_c}{s},\; \frac{I}{h^2}\Big)\, z, \qquad
-        \dot z = v \Big(1 - \operatorname{sign}(v z) \Big|\frac{z}{s}\Big|^n\Big)
+        \dot z = v \Big(1 - \operatorname{sign}(v z) \left|\frac{z}{s}\right|^n\Big)
 
     with the travel :math:`s` after which it slides. With :math:`n = 1` it yields ever more (Dahl's
     friction), with large :math:`n` it is a spring until it slides (Prandtl's element). An episode
