@@ -33,7 +33,7 @@ class ClearanceSpring(JointEffect):
                \Big(\max(q - q_\text{high}, 0) + \min(q - q_\text{low}, 0)\Big)
 
     The bound is the same as that of :class:`Stiffness`. With both edges at zero it is a spring; an
-    edge that the joint never reaches leaves a stop on the other side.
+    edge that the joint never reaches (a diagnosis takes 1000 rad) leaves a stop on the other side.
 
     Source: Shaw and Holmes, *A periodically forced piecewise linear oscillator*, Journal of Sound
     and Vibration 90(1), 1983.

@@ -54,8 +54,8 @@ from sb3_hds.sysid.timing import in_step
 _WINDOW, _SHORTEST, _LONGEST, _FEW = 1.0, 8, 200, 24
 # A cause that explains less than this share of what can be explained is not the cause.
 _LEAST_SHARE = 0.9
-# Of what is explained where its size may change with time. That, no form of a force that is a
-# little wrong looks like; with position or speed it does.
+# The same of a cause and of how its size changes with time: a force whose form is a little wrong
+# seems to change with position or speed, but not with time.
 _LEAST_SHARE_IN_TIME = 0.95
 # Candidates that are fitted to the end to settle the noise.
 _FOR_NOISE = 3
