@@ -25,13 +25,16 @@ def standard_errors(half: Half, point: Point, free: Sequence[int]) -> Float[np.n
     cluster-robust inference*, J. Applied Econometrics 38, 2023 (CV3).
 
     :param free: indices of what was fitted
-    :return: of all parameters; infinite for what was not fitted
+    :return: of all parameters; infinite for what was not fitted, or where slopes are not finite
     """
     result = np.full(len(point.theta), np.inf)
     if not free:
         return result
     slopes, labels = half.evidence.slopes(point, free), np.unique(half.unit)
     total, variance = slopes.curvature.sum(0), np.zeros(len(free))
+    if not (np.isfinite(slopes.curvature).all() and np.isfinite(slopes.scores).all()):
+        # Simulations blow up nearby: nobody knows how well the size is known.
+        return result
     for label in labels:
         own = half.unit == label
         rest = np.linalg.pinv(total - slopes.curvature[own].sum(0), rcond=_RANK, hermitian=True)
