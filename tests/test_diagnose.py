@@ -13,6 +13,7 @@ from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import JointEffect, Parameter, Trajectories, rollout
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid import inquiry
+from sb3_hds.sysid.account import standard_errors
 from sb3_hds.sysid.comparison import Comparison, compare, confirm, split
 from sb3_hds.sysid.constancy import Change
 from sb3_hds.sysid.diagnosis import HorizonGain
@@ -722,3 +723,13 @@ def test_a_guess_stays_within_its_room():
     step, gain = newton(curvature, score, [0, 1], (-nowhere, nowhere))
     np.testing.assert_allclose(step, np.linalg.solve(curvature, -score))
     assert gain == pytest.approx(0.5 * score @ np.linalg.solve(curvature, score))
+
+
+def test_no_size_is_certain_where_simulations_blow_up_nearby():
+    slopes = SimpleNamespace(curvature=np.full((4, 1, 1), np.nan), scores=np.ones((4, 1)))
+    evidence = SimpleNamespace(slopes=lambda *_: slopes)
+    half = SimpleNamespace(evidence=evidence, unit=np.arange(4))
+
+    errors = standard_errors(half, SimpleNamespace(theta=np.zeros(1)), [0])
+
+    assert np.isposinf(errors).all()
