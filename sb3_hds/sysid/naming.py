@@ -95,9 +95,9 @@ class Naming:
         :return: causes that stand, what is believed with them, and the force; None if none is
             better
         """
-        places = [tuple(found)] if found else []
-        places += [(one,) for one in found if len(found) > 1]
-        for place in places if self.search.hypotheses.nameless else []:
+        if not found or not self.search.hypotheses.nameless:
+            return list(found), base, None
+        for place in (tuple(found), *((one,) for one in found if len(found) > 1)):
             without = base
             for one in place:
                 without = self.search.without(one.tried.candidate, without)
