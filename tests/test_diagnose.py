@@ -19,12 +19,12 @@ from sb3_hds.sysid.constancy import Change
 from sb3_hds.sysid.diagnosis import HorizonGain
 from sb3_hds.sysid.evidence import Evidence, Point
 from sb3_hds.sysid.guesses import newton
-from sb3_hds.sysid.hypotheses import Hypotheses
+from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
 from sb3_hds.sysid.naming import Naming
 from sb3_hds.sysid.remainder import MissingForce, remainder
 from sb3_hds.sysid.search import Half, Search, _Reached
 from sb3_hds.sysid.shooting import shots_of
-from sb3_hds.sysid.telling import NAMELESS, errs_more, out_of_reach
+from sb3_hds.sysid.telling import NAMELESS, contradiction, errs_more, out_of_reach
 
 CATALOGUE = (
     effects.ViscousFriction,
@@ -382,6 +382,19 @@ def test_friction_that_falls_is_found_however_far_its_hump_reaches(v_s):
 
 
 SLACK = effects.ClearanceSpring("hinge", k=0.3, low=-0.3, high=0.3)
+
+
+def test_nothing_is_not_the_verdict_where_held_out_recordings_surely_prefer_something():
+    """Of a candidate that was not proposed, no more than one in a hundred nulls may look so."""
+    late = Candidate("sensor_delay", "channel", "angle", 0, ("sensor_delay.angle.delay",), "")
+    gains = lambda gain, p: (late, Comparison(gain, p, 0.0, 1.0, 4))  # noqa: E731
+    by_chance = [gains(0.3, 0.3)] * 9
+
+    assert "sensor_delay.angle" in contradiction([*by_chance, gains(0.28, 9e-4)])
+    assert not contradiction([*by_chance, gains(0.28, 2e-3)])
+    assert not contradiction([*by_chance, gains(0.04, 1e-9)])
+
+
 YIELDING = effects.Hysteresis("hinge", tau_c=0.03, slip=0.4, n=2.0)
 
 

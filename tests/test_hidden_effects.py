@@ -357,6 +357,15 @@ def test_a_richer_relative_stays_in_the_set_where_something_remains():
 
 
 @pytest.mark.expensive
+def test_a_twin_half_a_step_off_is_not_right_because_nothing_could_be_proposed():
+    """One half of the recordings asks for a spring, the other for a delay."""
+    _, data, _ = hidden_cases.draw("pendulum_v1", 4)
+    found = diagnose(believed("pendulum_v1"), data, seed=4, progress=False)
+
+    assert found.verdict == "unknown" and "sensor_delay" in found.unexplained, found
+
+
+@pytest.mark.expensive
 def test_what_shows_only_once_the_noise_is_known_is_found():
     """
     A joint taken the wrong way round: the error of the twin as it came says nothing of the noise,

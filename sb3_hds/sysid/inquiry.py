@@ -36,6 +36,7 @@ from sb3_hds.sysid.sizes import sized
 from sb3_hds.sysid.telling import (
     NO_CONSTANT,
     Accepted,
+    contradiction,
     errs_more,
     finding,
     in_words,
@@ -188,6 +189,8 @@ class Inquiry:
         if left.remainder is not None:
             found = [one._replace(alternatives=one.alternatives + one.richer) for one in found]
         rejected = [pair for pair in rejected if pair[0].key not in keys_of(found)]
+        if not (found or nearest) and left.remainder is None:
+            nearest = contradiction(rejected)
         self._set_noise(base.point)
         start, base = map(self.search.again, (start, base))
         return self._told(found, rejected, start, base, before, left, nearest)

@@ -12,7 +12,7 @@ from sb3_hds.sysid.comparison import Comparison
 from sb3_hds.sysid.constancy import Change
 from sb3_hds.sysid.diagnosis import Finding, HorizonGain
 from sb3_hds.sysid.evidence import Point
-from sb3_hds.sysid.hypotheses import Hypotheses
+from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
 from sb3_hds.sysid.imitation import imitators
 from sb3_hds.sysid.profile import profiled
 from sb3_hds.sysid.remainder import Remainder
@@ -24,6 +24,8 @@ UNCERTAIN, SMALL, CHANCE = "has no certain size", "is small beside the others", 
 NO_CONSTANT = "comes near, but its size changes"
 NAMELESS = "a nameless force is better"
 _CONFIDENCE = 0.9
+# Family-wise level of what contradicts that nothing is wrong, though it is no finding.
+_CONTRADICTS = 0.01
 # Error of a window that a twin does not come near, in units of the noise, or of what is usual.
 _LOST = 10.0
 
@@ -205,6 +207,26 @@ def nameless_in_words(
     return (
         f"A force that is no finding {does}: {force.key} ({', '.join(values)}), "
         f"with {better.gain:.0%} less error (p = {better.p_value:.2g}). {force.explanation}"
+    )
+
+
+def contradiction(weighed: Sequence[tuple[Candidate, Comparison]]) -> str:
+    """
+    :param weighed: candidates that were not accepted, on recordings that did not propose them
+    :return: a sentence on the one that gains most there, if not all of them may be chance; else
+        empty
+    """
+    sure = [
+        (verdict.gain, verdict.p_value, candidate.key)
+        for candidate, verdict in weighed
+        if verdict.gain >= LEAST_GAIN and len(weighed) * verdict.p_value < _CONTRADICTS
+    ]
+    if not sure:
+        return ""
+    gain, p_value, key = max(sure)
+    return (
+        f"{key} lowers the error of held-out recordings by {gain:.0%} (p = {p_value:.2g}), though "
+        "the recordings that propose ask for something else."
     )
 
 
