@@ -160,21 +160,39 @@ def correct(
         return Correction(nominal, 0.0, changed=changed, error_twin=mean_error(bare[real]))
     windows, forgotten = since_change(windows, now, latest, n_new)
     windows = divided(windows, forgotten or since)
-    held, real = windows.held, windows.counted
-    if len(real) < FEWEST or not held.any():
+    real = windows.counted
+    if len(real) < FEWEST or not windows.held.any():
         return Correction(
             twin, beta, changed=False, since=forgotten, error_twin=mean_error(bare[real])
         )
-    nominal, twin, wishes, added = _with_suspects(nominal, twin, wishes)
+    found = _corrected(nominal, twin, wishes, windows, bare, now, beta, learn_force)
+    return dataclasses.replace(found, since=forgotten)
 
+
+def _corrected(
+    nominal: Twin,
+    twin: Twin,
+    wishes: Wishes,
+    windows: Windows,
+    bare: np.ndarray,
+    now: np.ndarray,
+    beta: float,
+    learn_force: bool,
+) -> Correction:
+    """
+    :param nominal: as the twin was before any data
+    :param bare: errors of that
+    :param now: errors of the twin as it is
+    """
+    nominal, twin, wishes, added = _with_suspects(nominal, twin, wishes)
     fit = _calibrated(nominal, twin, windows, wishes)
     calibrated, errors = _best(nominal, twin, fit, bare, now, windows)
     calibrated, errors, added = _cleared(calibrated, errors, added, windows)
+    held = windows.held
     found = Correction(
         calibrated,
         0.0,
         changed=False,
-        since=forgotten,
         attached=added,
         fit=fit,
         error_twin=mean_error(bare[held]),

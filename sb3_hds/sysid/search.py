@@ -305,8 +305,7 @@ class Search:
             return None
         simplest = likely[0]
         for other in likely[1:]:
-            fewer = len(other.candidate.parameters) < len(simplest.candidate.parameters)
-            if fewer and as_good(self.better(simplest.kept, other.kept)):
+            if _richer(simplest, other) and as_good(self.better(simplest.kept, other.kept)):
                 simplest = other
         level = LEVEL / (1 + n_found)
         for one in [simplest, *(t for t in likely if t is not simplest)][:_MOST_LOOKS]:
@@ -317,14 +316,9 @@ class Search:
 
     def alternatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
         """:return: what is not significantly worse than the best, without more freedom"""
-        found = []
-        for other in tried:
-            if other is best or len(other.candidate.parameters) > len(best.candidate.parameters):
-                continue
-            same = as_good(self.better(best.kept, other.kept))
-            if same and passes(self.confirmed(other.kept, base.kept)):
-                found.append(other.candidate.key)
-        return tuple(found)
+        others = [t for t in tried if t is not best and not _richer(t, best)]
+        equal = [t for t in others if as_good(self.better(best.kept, t.kept))]
+        return self._confirmed_keys(equal, base)
 
     def richer(self, best: Tried, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
         """
@@ -332,15 +326,12 @@ class Search:
             though not so surely that it is preferred
         """
         declared = {c.key for c in self.hypotheses.related(best.candidate)}
-        found = []
-        for other in tried:
-            more = len(other.candidate.parameters) > len(best.candidate.parameters)
-            if not more or other.candidate.key not in declared:
-                continue
-            gain = self.better(other.kept, best.kept).gain
-            if gain >= _SAME and passes(self.confirmed(other.kept, base.kept)):
-                found.append(other.candidate.key)
-        return tuple(found)
+        others = [t for t in tried if _richer(t, best) and t.candidate.key in declared]
+        gaining = [t for t in others if self.better(t.kept, best.kept).gain >= _SAME]
+        return self._confirmed_keys(gaining, base)
+
+    def _confirmed_keys(self, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
+        return tuple(t.candidate.key for t in tried if passes(self.confirmed(t.kept, base.kept)))
 
     def needed(self, candidate: Candidate, base: Base) -> bool:
         """:return: whether what is believed gets worse without this part of it"""
@@ -422,6 +413,10 @@ class Search:
         done = in_threads(work, given)
         shown = track(done, what, total=len(given), transient=True, disable=not self.progress)
         return list(shown)
+
+
+def _richer(one: Tried, other: Tried) -> bool:
+    return len(one.candidate.parameters) > len(other.candidate.parameters)
 
 
 def as_good(better: Comparison) -> bool:
