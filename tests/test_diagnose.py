@@ -381,9 +381,6 @@ def test_friction_that_falls_is_found_however_far_its_hump_reaches(v_s):
     assert sizes == pytest.approx({"tau_c": 0.01, "tau_s": 0.03, "v_s": v_s}, rel=0.1)
 
 
-SLACK = effects.ClearanceSpring("hinge", k=0.3, low=-0.3, high=0.3)
-
-
 def test_nothing_is_not_the_verdict_where_held_out_recordings_surely_prefer_something():
     """Of a candidate that was not proposed, no more than one in a hundred nulls may look so."""
     late = Candidate("sensor_delay", "channel", "angle", 0, ("sensor_delay.angle.delay",), "")
@@ -395,6 +392,7 @@ def test_nothing_is_not_the_verdict_where_held_out_recordings_surely_prefer_some
     assert not contradiction([*by_chance, gains(0.04, 1e-9)])
 
 
+SLACK = effects.ClearanceSpring("hinge", k=0.3, low=-0.3, high=0.3)
 YIELDING = effects.Hysteresis("hinge", tau_c=0.03, slip=0.4, n=2.0)
 
 

@@ -305,7 +305,9 @@ class Search:
             return None
         simplest = likely[0]
         for other in likely[1:]:
-            if _richer(simplest, other) and as_good(self.better(simplest.kept, other.kept)):
+            if _has_more_freedom(simplest, other) and as_good(
+                self.better(simplest.kept, other.kept)
+            ):
                 simplest = other
         level = LEVEL / (1 + n_found)
         for one in [simplest, *(t for t in likely if t is not simplest)][:_MOST_LOOKS]:
@@ -316,7 +318,7 @@ class Search:
 
     def alternatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
         """:return: what is not significantly worse than the best, without more freedom"""
-        others = [t for t in tried if t is not best and not _richer(t, best)]
+        others = [t for t in tried if t is not best and not _has_more_freedom(t, best)]
         equal = [t for t in others if as_good(self.better(best.kept, t.kept))]
         return self._confirmed_keys(equal, base)
 
@@ -326,7 +328,7 @@ class Search:
             though not so surely that it is preferred
         """
         declared = {c.key for c in self.hypotheses.related(best.candidate)}
-        others = [t for t in tried if _richer(t, best) and t.candidate.key in declared]
+        others = [t for t in tried if _has_more_freedom(t, best) and t.candidate.key in declared]
         gaining = [t for t in others if self.better(t.kept, best.kept).gain >= _SAME]
         return self._confirmed_keys(gaining, base)
 
@@ -415,7 +417,7 @@ class Search:
         return list(shown)
 
 
-def _richer(one: Tried, other: Tried) -> bool:
+def _has_more_freedom(one: Tried, other: Tried) -> bool:
     return len(one.candidate.parameters) > len(other.candidate.parameters)
 
 

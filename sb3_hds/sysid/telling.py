@@ -212,7 +212,7 @@ def nameless_in_words(
 
 def contradiction(weighed: Sequence[tuple[Candidate, Comparison]]) -> str:
     """
-    :param weighed: candidates that were not accepted, on recordings that did not propose them
+    :param weighed: candidates that were not accepted, on the half that confirms
     :return: a sentence on the one that gains most there, if not all of them may be chance; else
         empty
     """
@@ -225,8 +225,8 @@ def contradiction(weighed: Sequence[tuple[Candidate, Comparison]]) -> str:
         return ""
     gain, p_value, key = max(sure)
     return (
-        f"{key} lowers the error of held-out recordings by {gain:.0%} (p = {p_value:.2g}), though "
-        "the recordings that propose ask for something else."
+        f"{key} lowers the error of held-out recordings by {gain:.0%} (p = {p_value:.2g}), but "
+        "the other recordings do not support it as the cause."
     )
 
 
