@@ -30,6 +30,7 @@ class Motion(NamedTuple):
     """
     One joint in all recordings.
 
+    :param index: of the joint; of what a sensor does, of the channel: positions come first
     :param q: positions, shape ``(n,)``
     :param v: velocities
     :param u: commands of its motor, zero without one
@@ -37,6 +38,7 @@ class Motion(NamedTuple):
     :param wide: what its positions usually spread over
     """
 
+    index: int
     q: np.ndarray
     v: np.ndarray
     u: np.ndarray
@@ -83,6 +85,10 @@ def swings_little(motion: Motion, values: Values) -> bool:
     return bool(np.abs(motion.q).max() < _LITTLE) and rest < _AT_REST * motion.wide
 
 
+def first_angle(motion: Motion, _: Values) -> bool:
+    return motion.index == 0
+
+
 def moves(motion: Motion) -> bool:
     return bool(np.mean(np.abs(motion.v) > _STANDING * motion.v.std()) >= _MOSTLY)
 
@@ -94,7 +100,8 @@ def never(_: Motion, __: Values) -> bool:
 #: two causes, and when data cannot tell them apart. `never`: these rigs or their recordings do not
 #: admit it; their motors do not stand still under one load, no mass of theirs scales inertia and
 #: weight alike (there is some inertia or some damping besides), one channel alone is late, and no
-#: twin can be tilted.
+#: joint stays at one angle, where gravity that is tilted is a constant force. The zero of the first
+#: angle of a pendulum, from which the others are measured, is that of gravity.
 CONDITIONS: dict[frozenset[str], Condition] = {
     frozenset(pair): condition
     for *pair, condition in (
@@ -110,7 +117,7 @@ CONDITIONS: dict[frozenset[str], Condition] = {
         ("motor_lag", "action_delay", slow_commands),
         ("action_delay", "sensor_delay", never),
         ("torque_gain", "parameter.mass", never),
-        ("sensor_bias", "parameter.tilt", never),
+        ("sensor_bias", "parameter.tilt", first_angle),
         ("constant_force", "parameter.tilt", never),
         ("constant_force", "parameter.tilt_x", never),
         ("constant_force", "parameter.tilt_y", never),
@@ -142,7 +149,7 @@ def equals(
     # What is outside the catalogue has no name there.
     for truth, planted in zip(case.truths, case.planted, strict=False):
         same, joint = [], planted.index % RIGS[case.system].dof
-        here = _motion_of(joint, case, motion, commands)
+        here = _motion_of(planted.index, case, motion, commands)
         for pair, holds in CONDITIONS.items():
             if planted.effect in pair:
                 (other,) = pair - {planted.effect}
@@ -177,12 +184,13 @@ def _named_at(effect: str, joint: int, system: str) -> str:
     return f"{effect}.{places_of(effect, system)[joint].name}"
 
 
-def _motion_of(joint: int, case: Case, motion: np.ndarray, commands: np.ndarray) -> Motion:
+def _motion_of(index: int, case: Case, motion: np.ndarray, commands: np.ndarray) -> Motion:
     rig = RIGS[case.system]
+    joint = index % rig.dof
     driven = joint < commands.shape[1]
     u = commands[:, joint] if driven else np.zeros(len(commands))
     wide = float(spread(case.system)[joint])
-    return Motion(motion[:, joint], motion[:, rig.dof + joint], u, rig.dt, wide)
+    return Motion(index, motion[:, joint], motion[:, rig.dof + joint], u, rig.dt, wide)
 
 
 def right(truths: str, same: Mapping[str, Sequence[str]], names: str) -> bool:

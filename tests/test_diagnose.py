@@ -594,9 +594,39 @@ def test_what_is_confirmed_is_given_up_only_for_something_simpler_that_is_as_goo
             return Comparison(0.5, p_values[new], 0.2, 0.7, 6)
         return Comparison(gain_over_simple, p_over_simple, 0.0, 0.3, 6)
 
-    search = SimpleNamespace(confirmed=confirmed, better=confirmed)
+    search = SimpleNamespace(
+        confirmed=confirmed, better=confirmed, _preferred=lambda first, *_: first
+    )
 
     best = Search.best(search, [rich, simple], SimpleNamespace(kept="base"))
+
+    assert best.kept == chosen
+
+
+@pytest.mark.parametrize(
+    ("other", "ahead", "p_value", "chosen"),
+    [
+        ("gain", 1.0, 0.001, "gain"),
+        ("gain", -1.0, 0.001, "tau_c"),
+        ("gain", 1.0, 0.2, "tau_c"),
+        ("tau_c, mu", 5.0, 0.001, "tau_c"),
+        ("tau_c, mu", 7.0, 0.001, "tau_c, mu"),
+    ],
+)
+def test_of_what_is_confirmed_all_the_data_choose_but_more_freedom_has_to_be_surely_ahead(
+    other, ahead, p_value, chosen
+):
+    p_values = {"tau_c": 0.01, other: p_value}
+    first, second = (
+        SimpleNamespace(kept=name, candidate=SimpleNamespace(parameters=name.split(", ")))
+        for name in p_values
+    )
+    search = SimpleNamespace(
+        confirmed=lambda new, _: Comparison(0.5, p_values[new], 0.2, 0.7, 6),
+        _criterion_of_all=lambda tried, _: 50.0 + ahead * (tried is second),
+    )
+
+    best = Search._preferred(search, first, [first, second], SimpleNamespace(kept="base"))
 
     assert best.kept == chosen
 

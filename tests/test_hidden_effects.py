@@ -198,6 +198,13 @@ def test_a_lag_is_a_delay_where_commands_are_slow():
         )
 
 
+def test_the_zero_of_the_first_angle_is_a_tilt():
+    for index, same in ((0, True), (1, False), (2, False)):
+        bias = {"bias": 0.1}
+        named = ["parameter.tilt"]
+        assert judged("sensor_bias", named, BACK_AND_FORTH, index=index, values=bias) is same
+
+
 def row_of(case, kind, verdict="none", named="", **more):
     """A case of the table in which nothing was measured but the verdict."""
     nothing_else = {

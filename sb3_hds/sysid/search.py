@@ -299,6 +299,7 @@ class Search:
         :return: the candidate that selection prefers, if the other recordings confirm it; of two
             that they confirm and that predict equally well, the one with fewer parameters. Where
             they do not, the next ones may be confirmed, each at half the level of the one before.
+            Once one is, all the data say which of those that are confirmed it is.
         """
         likely = [t for t in tried if t.criterion >= LEAST_BIC]
         if not likely:
@@ -312,9 +313,23 @@ class Search:
         level = LEVEL / (1 + n_found)
         for one in [simplest, *(t for t in likely if t is not simplest)][:_MOST_LOOKS]:
             if passes(self.confirmed(one.kept, base.kept), level):
-                return one
+                return self._preferred(one, likely, base)
             level *= 0.5
         return None
+
+    def _preferred(self, first: Tried, likely: Sequence[Tried], base: Base) -> Tried:
+        """
+        :param first: confirmed
+        :return: of all that are confirmed, the one that both halves together prefer; what has more
+            freedom than the first has to be as far ahead as a cause is ahead of none
+        """
+        confirmed = [t for t in likely if t is first or passes(self.confirmed(t.kept, base.kept))]
+
+        def ahead(tried: Tried) -> float:
+            least = LEAST_BIC if _has_more_freedom(tried, first) else 0.0
+            return self._criterion_of_all(tried, base) - least
+
+        return max(confirmed, key=ahead)
 
     def alternatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
         """:return: what is not significantly worse than the best, without more freedom"""
@@ -342,8 +357,16 @@ class Search:
     def criterion(self, candidates: Sequence[Candidate], point: Point, base: Point) -> float:
         """:return: by which the information criterion is lower with these candidates"""
         n = effective_size(base.raw / self.noise)
-        ratio = np.log(self.select.total(base) / self.select.total(point))
-        return n * ratio - sum(len(c.parameters) for c in candidates) * np.log(max(n, 2.0))
+        before, after = map(self.select.total, (base, point))
+        return _information(before, after, n, sum(len(c.parameters) for c in candidates))
+
+    def _criterion_of_all(self, tried: Tried, base: Base) -> float:
+        """:return: as ``criterion``, of both halves; parameters are as they were selected"""
+        n = sum(effective_size(point.raw / self.noise) for point in (base.point, base.kept))
+        before, after = (
+            self.select.total(one.point) + self.confirm.total(one.kept) for one in (base, tried)
+        )
+        return _information(before, after, n, len(tried.candidate.parameters))
 
     def better(self, new: Point, old: Point) -> Comparison:
         """:return: whether one is better than another, both on the half that confirms"""
@@ -415,6 +438,11 @@ class Search:
         done = in_threads(work, given)
         shown = track(done, what, total=len(given), transient=True, disable=not self.progress)
         return list(shown)
+
+
+def _information(before: float, after: float, n: float, n_parameters: int) -> float:
+    """:return: by which Schwarz's criterion of ``n`` errors is lower, given their sums of squares"""
+    return n * float(np.log(before / after)) - n_parameters * float(np.log(max(n, 2.0)))
 
 
 def _has_more_freedom(one: Tried, other: Tried) -> bool:
