@@ -102,10 +102,14 @@ PARTS: dict[str, Callable[[], str]] = {
     "learned_papers": summaries.whole("model_free_papers"),
     "learned_peers": summaries.whole("model_free_peers"),
     "learned_fewer_steps": summaries.whole("model_free_fewer_steps"),
-    "learned_on_Pendulum": summaries.picture(
-        "model_free_Pendulum-v1",
-        "return against steps and against wall time: a line for each method, a band over its seeds",
-    ),
+    **{
+        f"learned_on_{env.partition('-')[0]}": summaries.picture(
+            f"model_free_{env}",
+            f"return on {env} against steps and against wall time: a line for each method, a band "
+            "over its seeds",
+        )
+        for env in ("Pendulum-v1", "HalfCheetah-v5", "Hopper-v5")
+    },
     "gsde_continuity": summaries.over_seeds(
         "gsde_continuity",
         ("env", "noise"),
