@@ -604,26 +604,28 @@ def test_what_is_confirmed_is_given_up_only_for_something_simpler_that_is_as_goo
 
 
 @pytest.mark.parametrize(
-    ("other", "ahead", "p_value", "chosen"),
+    ("other", "ahead", "error", "p_value", "chosen"),
     [
-        ("gain", 1.0, 0.001, "gain"),
-        ("gain", -1.0, 0.001, "tau_c"),
-        ("gain", 1.0, 0.2, "tau_c"),
-        ("tau_c, mu", 5.0, 0.001, "tau_c"),
-        ("tau_c, mu", 7.0, 0.001, "tau_c, mu"),
+        ("gain", 1.0, 0.99, 0.001, "gain"),
+        ("", 1.0, 0.99, 0.001, "tau_c"),
+        ("gain", -1.0, 0.99, 0.001, "tau_c"),
+        ("gain", 1.0, 0.99, 0.2, "tau_c"),
+        ("tau_c mu", 5.0, 0.9, 0.001, "tau_c"),
+        ("tau_c mu", 7.0, 0.96, 0.001, "tau_c"),
+        ("tau_c mu", 7.0, 0.9, 0.001, "tau_c mu"),
     ],
 )
 def test_of_what_is_confirmed_all_the_data_choose_but_more_freedom_has_to_be_surely_ahead(
-    other, ahead, p_value, chosen
+    other, ahead, error, p_value, chosen
 ):
     p_values = {"tau_c": 0.01, other: p_value}
     first, second = (
-        SimpleNamespace(kept=name, candidate=SimpleNamespace(parameters=name.split(", ")))
+        SimpleNamespace(kept=name, candidate=SimpleNamespace(parameters=name.split()))
         for name in p_values
     )
     search = SimpleNamespace(
         confirmed=lambda new, _: Comparison(0.5, p_values[new], 0.2, 0.7, 6),
-        _criterion_of_all=lambda tried, _: 50.0 + ahead * (tried is second),
+        _of_all=lambda tried, _: (error, 50.0 + ahead) if tried is second else (1.0, 50.0),
     )
 
     best = Search._preferred(search, first, [first, second], SimpleNamespace(kept="base"))

@@ -320,16 +320,25 @@ class Search:
     def _preferred(self, first: Tried, likely: Sequence[Tried], base: Base) -> Tried:
         """
         :param first: confirmed
-        :return: of all that are confirmed, the one that both halves together prefer; what has more
-            freedom than the first has to be as far ahead as a cause is ahead of none
+        :return: of all that are confirmed and have no fewer parameters, the one that both halves
+            together prefer; what has more has to be as far ahead as a cause has to be of none
         """
-        confirmed = [t for t in likely if t is first or passes(self.confirmed(t.kept, base.kept))]
-
-        def ahead(tried: Tried) -> float:
-            least = LEAST_BIC if _has_more_freedom(tried, first) else 0.0
-            return self._criterion_of_all(tried, base) - least
-
-        return max(confirmed, key=ahead)
+        error_of_first, ahead_of_first = self._of_all(first, base)
+        best, most = first, ahead_of_first
+        for other in likely:
+            error, ahead = self._of_all(other, base)
+            surely = (
+                error <= (1.0 - LEAST_GAIN) * error_of_first
+                and ahead >= ahead_of_first + LEAST_BIC
+            )
+            if (
+                ahead > most
+                and not _has_more_freedom(first, other)
+                and (surely or not _has_more_freedom(other, first))
+                and passes(self.confirmed(other.kept, base.kept))
+            ):
+                best, most = other, ahead
+        return best
 
     def alternatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
         """:return: what is not significantly worse than the best, without more freedom"""
@@ -360,13 +369,13 @@ class Search:
         before, after = map(self.select.total, (base, point))
         return _information(before, after, n, sum(len(c.parameters) for c in candidates))
 
-    def _criterion_of_all(self, tried: Tried, base: Base) -> float:
-        """:return: as ``criterion``, of both halves; parameters are as they were selected"""
+    def _of_all(self, tried: Tried, base: Base) -> tuple[float, float]:
+        """:return: error of both halves, parameters as they were selected; and its criterion"""
         n = sum(effective_size(point.raw / self.noise) for point in (base.point, base.kept))
         before, after = (
             self.select.total(one.point) + self.confirm.total(one.kept) for one in (base, tried)
         )
-        return _information(before, after, n, len(tried.candidate.parameters))
+        return after, _information(before, after, n, len(tried.candidate.parameters))
 
     def better(self, new: Point, old: Point) -> Comparison:
         """:return: whether one is better than another, both on the half that confirms"""
