@@ -328,8 +328,7 @@ class Search:
         for other in likely:
             error, ahead = self._of_all(other, base)
             surely = (
-                error <= (1.0 - LEAST_GAIN) * error_of_first
-                and ahead >= ahead_of_first + LEAST_BIC
+                error <= (1.0 - LEAST_GAIN) * error_of_first and ahead >= ahead_of_first + LEAST_BIC
             )
             if (
                 ahead > most
@@ -450,7 +449,7 @@ class Search:
 
 
 def _information(before: float, after: float, n: float, n_parameters: int) -> float:
-    """:return: by which Schwarz's criterion of ``n`` errors is lower, given their sums of squares"""
+    """:return: by which Schwarz's criterion is lower; ``before`` and ``after``: sums of squares"""
     return n * float(np.log(before / after)) - n_parameters * float(np.log(max(n, 2.0)))
 
 
