@@ -186,8 +186,6 @@ class Inquiry:
             # Something is there, and this is not it.
             found, base = [], start
             left = before if before.remainder is not None else left
-        if left.remainder is not None:
-            found = [one._replace(alternatives=one.alternatives + one.richer) for one in found]
         rejected = [pair for pair in rejected if pair[0].key not in keys_of(found)]
         if not (found or nearest) and left.remainder is None:
             nearest = contradiction(rejected)

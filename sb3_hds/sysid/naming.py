@@ -168,14 +168,13 @@ class Naming:
         """:param base: what is believed without it"""
         rivals = [*tried, *self.search.relatives(best, tried, base)]
         others = self.search.alternatives(best, rivals, base)
-        richer = self.search.richer(best, rivals, base)
         verdict = self.search.confirmed(best.kept, base.kept)
-        return Accepted(best, verdict, others, richer, chance)
+        return Accepted(best, verdict, others, chance)
 
     def _asked_again(self, one: Accepted, base: Base) -> Accepted:
         """A cause beside what looks like it, now that the other causes are known."""
         without = self.search.without(one.tried.candidate, base)
-        names = (one.tried.candidate.key, *one.alternatives, *one.richer)
+        names = (one.tried.candidate.key, *one.alternatives)
         named = [c for c in self.search.hypotheses.candidates if c.key in names]
         named = [c for c in named if not self.search.part_of(c, without)]
         tried = self.search.finished(named, without)

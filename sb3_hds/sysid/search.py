@@ -343,20 +343,7 @@ class Search:
         """:return: what is not significantly worse than the best, without more freedom"""
         others = [t for t in tried if t is not best and not _has_more_freedom(t, best)]
         equal = [t for t in others if as_good(self.better(best.kept, t.kept))]
-        return self._confirmed_keys(equal, base)
-
-    def richer(self, best: Tried, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
-        """
-        :return: what is declared to look like the best, has more freedom and predicts better,
-            though not so surely that it is preferred
-        """
-        declared = {c.key for c in self.hypotheses.related(best.candidate)}
-        others = [t for t in tried if _has_more_freedom(t, best) and t.candidate.key in declared]
-        gaining = [t for t in others if self.better(t.kept, best.kept).gain >= _SAME]
-        return self._confirmed_keys(gaining, base)
-
-    def _confirmed_keys(self, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
-        return tuple(t.candidate.key for t in tried if passes(self.confirmed(t.kept, base.kept)))
+        return tuple(t.candidate.key for t in equal if passes(self.confirmed(t.kept, base.kept)))
 
     def needed(self, candidate: Candidate, base: Base) -> bool:
         """:return: whether what is believed gets worse without this part of it"""

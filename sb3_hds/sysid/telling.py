@@ -35,14 +35,12 @@ class Accepted(NamedTuple):
     A cause that was confirmed.
 
     :param alternatives: what the data cannot tell from it
-    :param richer: what may be in its place if something remains
     :param chance: that the best of all candidates would gain as much if nothing were wrong
     """
 
     tried: Tried
     verdict: Comparison
     alternatives: tuple[str, ...]
-    richer: tuple[str, ...]
     chance: float
 
 
