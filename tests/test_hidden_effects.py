@@ -352,8 +352,11 @@ def table(tmp_path_factory):
 
 
 @pytest.mark.expensive
-def test_all_the_data_say_which_of_two_confirmed_causes_it_is():
-    """A coloured disturbance hides from either half alone that friction grows with the load."""
+def test_all_the_data_say_which_of_the_confirmed_causes_it_is():
+    """
+    Load-dependent friction behind a coloured torque: the half that selects prefers another cause,
+    and dry friction, which is simpler, is as good as that one.
+    """
     case, data, _ = hidden_cases.draw("linear_axis", 26)
     found = diagnose(
         believed("linear_axis"), data, calibrate=case.nuisances, seed=26, progress=False

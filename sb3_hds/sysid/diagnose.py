@@ -30,10 +30,11 @@ def diagnose(
     own. On one half of the recordings every candidate is fitted; the best is then confirmed on the
     other half, by at least 5 % less mean square error, a one-sided test on the logarithms of error
     ratios (one for each recording) or on scores, and an information criterion that counts
-    correlated errors as fewer. What is not significantly worse than the best there stays as an
-    alternative. After each cause that is accepted, everything is tested again. What remains is
-    looked for in the force that is missing; a cause that leaves too much of it is not believed. In
-    the end, causes are fitted to all recordings.
+    correlated errors as fewer. Of those that are confirmed, both halves together choose. What is
+    not significantly worse than that on the other half stays as an alternative. After each cause
+    that is accepted, everything is tested again. What remains is looked for in the force that is
+    missing; a cause that leaves too much of it is not believed. In the end, causes are fitted to
+    all recordings.
 
     :param twin: as it is believed
     :param data: measured, sampled at the twin's ``dt``
