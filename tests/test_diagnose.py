@@ -633,6 +633,35 @@ def test_of_what_is_confirmed_all_the_data_choose_but_more_freedom_has_to_be_sur
     assert best.kept == chosen
 
 
+def test_windows_of_both_halves_count_alike_where_all_the_data_choose():
+    rng = np.random.default_rng(0)
+    noise, nobody_minds = np.array([0.1, 0.2]), np.array([0.01, 0.0])
+    halves = [Half(SimpleNamespace(noise=noise), np.arange(n), nobody_minds) for n in (5, 8)]
+    before, after = (
+        [SimpleNamespace(raw=size * rng.standard_normal((n, 40, 2))) for n in (5, 8)]
+        for size in (0.3, 0.2)
+    )
+
+    def chosen(order, parameters):
+        search = Search(*(halves[i] for i in order), effort=None, progress=False)
+        base, tried = (
+            SimpleNamespace(point=points[order[0]], kept=points[order[1]])
+            for points in (before, after)
+        )
+        tried.candidate = SimpleNamespace(parameters=parameters)
+        return search._of_all(tried, base)
+
+    def summed(points):
+        windows = np.concatenate([(point.raw / noise) ** 2 for point in points])
+        return float((windows.mean((1, 2)) + np.mean((nobody_minds / noise) ** 2)).sum())
+
+    error, ahead = chosen((0, 1), ["tau_c"])
+    assert error == pytest.approx(summed(after))
+    assert chosen((1, 0), ["tau_c"]) == pytest.approx((error, ahead))
+    price = ahead - chosen((0, 1), ["tau_c", "mu"])[1]
+    assert np.exp(price) * np.log(summed(before) / error) == pytest.approx(ahead + price)
+
+
 @pytest.mark.parametrize(("where", "seed"), [("position", 4), ("time", 0)])
 def test_friction_that_changes_with_place_or_time_is_left_over(where, seed):
     rng, n = np.random.default_rng(seed), 200
