@@ -24,7 +24,7 @@ from sb3_hds.sysid.naming import Naming
 from sb3_hds.sysid.remainder import MissingForce, remainder
 from sb3_hds.sysid.search import Half, Search, _Reached
 from sb3_hds.sysid.shooting import shots_of
-from sb3_hds.sysid.telling import NAMELESS, contradiction, errs_more, out_of_reach
+from sb3_hds.sysid.telling import ANOTHER, NAMELESS, contradiction, errs_more, out_of_reach
 
 CATALOGUE = (
     effects.ViscousFriction,
@@ -379,6 +379,15 @@ def test_friction_that_falls_is_found_however_far_its_hump_reaches(v_s):
     assert [finding.effect for finding in found.findings] == ["stribeck_friction"], found
     sizes = {name: one.estimate for name, one in found.findings[0].parameters.items()}
     assert sizes == pytest.approx({"tau_c": 0.01, "tau_s": 0.03, "v_s": v_s}, rel=0.1)
+
+
+def test_friction_that_rises_is_not_named_after_friction_that_falls():
+    rising = effects.StribeckFriction("hinge", tau_c=0.03, tau_s=0.01, v_s=0.6)
+    pushed, data = swinging(rising, n_steps=150)
+    found = asked(data, pushed, effects=[effects.StribeckFriction], budget="quick")
+
+    assert "stribeck_friction" not in [finding.effect for finding in found.findings]
+    assert [one.why for one in found.rejected if "stribeck" in one.name] == [ANOTHER]
 
 
 def test_nothing_is_not_the_verdict_where_held_out_recordings_surely_prefer_something():

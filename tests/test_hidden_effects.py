@@ -243,6 +243,22 @@ def test_a_name_given_to_a_null_is_an_alarm_and_a_wrong_name():
     assert score(rows, "right name: white noise up to 1 %").value == 1.0
 
 
+def test_a_later_finding_may_be_the_wrong_name_and_none_is_not_what_was_expected_outside():
+    truth, also = "backlash.axis", "joint_elasticity.axis"
+    rows = [
+        row_of(0, "effect", "named", truth, truth=truth),
+        row_of(1, "effect", "named", truth, truth=truth, more=also),
+        row_of(2, "pair", "named", truth, truth=f"{truth};{also}", more=also),
+        row_of(3, "outside", truth="hysteresis"),
+        row_of(4, "outside", "unknown", truth="hysteresis"),
+    ]
+
+    assert score(rows, "right among named verdicts").value == 2 / 3
+    assert score(rows, "a wrong name, all data").value == 1 / 5
+    assert score(rows, "refused: outside the catalogue").value == 1.0
+    assert score(rows, "called unknown: outside the catalogue").value == 0.5
+
+
 def test_euler_s_twin_may_be_late_or_unknown_and_rubs_nowhere():
     late, friction = "sensor_delay.cos", "coulomb_friction.hinge"
     rows = [

@@ -14,7 +14,7 @@ import pytest
 from measuring import measured
 
 from sb3_hds import diagnose, effects, twins
-from sb3_hds.sysid import plots
+from sb3_hds.sysid import plots, telling
 from sb3_hds.sysid.diagnosis import SENTENCES, Rejected
 
 TWIN = twins.make("PendulumReal")
@@ -75,6 +75,27 @@ def test_a_diagnosis_prints_itself_in_80_columns(which, request):
     )
 
 
+REASONS = ("UNCERTAIN", "SMALL", "CHANCE", "NO_CONSTANT", "NAMELESS", "ANOTHER")
+
+
+@pytest.mark.parametrize("why", [getattr(telling, name) for name in REASONS])
+def test_a_reason_to_turn_something_down_is_printed_as_a_whole(rubbing, why):
+    rejected = (Rejected("sign_flip.hinge_velocity", -50.0, 1.0, why),)
+    lines = str(dataclasses.replace(rubbing, rejected=rejected)).splitlines()
+
+    assert any(line.endswith(why) for line in lines) and max(map(len, lines)) <= 80
+
+
+def test_who_is_told_that_nothing_is_wrong_is_told_what_would_have_shown(rubbing):
+    nothing = dataclasses.replace(rubbing, verdict="none", findings=())
+    size = rubbing.detectable["coulomb_friction.hinge"]["tau_c"]
+
+    assert f"  coulomb_friction.hinge: tau_c {size:.2g} N m" in str(nothing).replace("\xa0", " ")
+    many = {f"coulomb_friction.hinge{i}": {"tau_c": 0.1} for i in range(15)}
+    crowd = dataclasses.replace(nothing, detectable=many | {"sign_flip.hinge": {"flipped": np.inf}})
+    assert "and 3 more, in the report" in str(crowd)
+
+
 def changed(diagnosis, where, names, **finding):
     """The same with a finding elsewhere, whose parameters have these full names."""
     (first,) = diagnosis.findings
@@ -101,6 +122,12 @@ def test_the_verdict_is_one_sentence(rubbing, crowded):
     assert crowded.sentence == (
         "The simulation is wrong about Coulomb friction at hinge or directional viscous friction "
         "at pendulum0 or directional viscous friction at pendulum1: the data cannot tell which."
+    )
+    first, second = both.findings
+    doubted = (first, dataclasses.replace(second, alternatives=("torque_gain.torque",)))
+    assert dataclasses.replace(both, findings=doubted).sentence == (
+        "The simulation lacks Coulomb friction at hinge and is wrong about either mass or torque "
+        "gain at torque."
     )
     nothing = dataclasses.replace(rubbing, verdict="none", findings=())
     assert nothing.sentence == SENTENCES["none"]

@@ -104,6 +104,9 @@ class Effect(abc.ABC):
     #: names of causes that data cannot tell from this one -> the condition under which they cannot;
     #: a cause is an effect, or a parameter of the twin: ``"parameter.mass"``
     equivalents: ClassVar[Mapping[str, str]] = {}
+    #: parameters of which none may be smaller than the one before, or a diagnosis does not give the
+    #: effect's name to what it fitted
+    ascending: ClassVar[tuple[str, ...]] = ()
     #: after how long its memory, if it has one, no longer tells how it began [s]
     forgets: ClassVar[float] = 0.4
     #: learned arrays by name, pytrees that travel with the parameters; most effects have none

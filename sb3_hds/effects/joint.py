@@ -145,7 +145,8 @@ class StribeckFriction(JointEffect):
     It is smoothed over :math:`w` as :class:`CoulombFriction` is, at the same cost, so what is left
     of breaking away is a hump of friction at speeds between :math:`w` and :math:`v_s`; a
     :math:`v_s` below :math:`w` does not show. Without friction, :math:`v_s` has no derivative.
-    :math:`\tau_s < \tau_c` is admitted: friction that rises as the joint begins to move.
+    :math:`\tau_s < \tau_c` can be simulated, friction that rises as the joint begins to move, but a
+    diagnosis never calls that by this name.
 
     Source: Olsson et al., *Friction models and friction compensation*, European Journal of Control
     4(3), 1998, section 2 (exponent 2).
@@ -160,6 +161,7 @@ class StribeckFriction(JointEffect):
     explanation = "The joint resists most just as it begins to move, and less once it slides."
     source = "Olsson et al. 1998, section 2"
     equivalents = {"coulomb_friction": "while the joint moves several times faster than v_s"}
+    ascending = ("tau_c", "tau_s")
 
     def starts(self, excursion: float, speed: float) -> tuple[dict[str, float], ...]:
         """From a hump that is narrower than any motion, nothing leads to a wider one."""

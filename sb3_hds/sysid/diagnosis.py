@@ -11,10 +11,13 @@ from typing import Any, Literal, Protocol
 from sb3_hds.core import Params, Twin
 from sb3_hds.sysid.pictures import Pictures
 from sb3_hds.sysid.results import Estimate, plain
+from sb3_hds.sysid.units import sizes_in_words
 
 Verdict = Literal["named", "ambiguous", "none", "unknown", "not_identifiable"]
 
 _WIDTH = 80
+# Candidates whose smallest sizes are printed; all are in the report.
+_MOST_SHOWN = 12
 #: what each verdict means
 SENTENCES = {
     "named": "The data name what is missing.",
@@ -40,7 +43,8 @@ class Finding:
     :param where: ``slot``, ``index`` and ``name`` of its place
     :param parameters: estimates with intervals and units, by short name
     :param alternatives: what the data cannot tell from it, by name and place
-    :param p_value: that held-out recordings would gain as much by chance
+    :param p_value: that held-out recordings would gain as much by chance, by the test that
+        confirmed it; where others were asked about before it, it had to pass a stricter level
     :param family_p_value: that the best of all candidates would gain as much on the recordings that
         proposed it if nothing were wrong
     :param gain: share by which it lowers the mean square error of held-out recordings
@@ -107,7 +111,8 @@ class Diagnosis:
     Result of :func:`~sb3_hds.sysid.diagnose`. Prints itself.
 
     :param verdict: ``"named"``, ``"ambiguous"``, ``"none"``, ``"unknown"`` or
-        ``"not_identifiable"``
+        ``"not_identifiable"``; the first two are about the first finding, and a later one may have
+        alternatives all the same
     :param believed: the twin as it came
     :param twin: extended, ready to train in
     :param data_hash: of the data
@@ -117,7 +122,9 @@ class Diagnosis:
     :param gain: by horizon in steps
     :param explained: share that the findings explain of the force that is missing and can be
         predicted, or 0
-    :param detectable: by effect and place, the smallest size that these data would have shown
+    :param detectable: by effect and place, the smallest size that these data would have shown, to
+        first order; infinite where the first bit of an effect makes no difference, as of a limit
+        that no command reaches, of a stiff spring in the drive, or of what has no size (a sign)
     :param rejected: the other candidates, with numbers
     :param caveats: what to keep in mind, in words
     :param versions: of the libraries that computed this
@@ -152,16 +159,14 @@ class Diagnosis:
         if self.verdict == "ambiguous":
             first, *others = self.findings
             choice = " or ".join(map(_spoken, (first.key, *first.alternatives)))
-            also = f", and {' and '.join(_spoken(f.key) for f in others)}" if others else ""
+            also = f", and {' and '.join(map(_choice, others))}" if others else ""
             return f"The simulation is wrong about {choice}{also}: the data cannot tell which."
         if self.verdict != "named":
             return SENTENCES[self.verdict]
         new = [f for f in self.findings if self._is_new(f)]
         said = {"lacks": new, "is wrong about": [f for f in self.findings if f not in new]}
         parts = [
-            f"{verb} {' and '.join(_spoken(f.key) for f in found)}"
-            for verb, found in said.items()
-            if found
+            f"{verb} {' and '.join(map(_choice, found))}" for verb, found in said.items() if found
         ]
         return f"The simulation {' and '.join(parts)}."
 
@@ -175,6 +180,8 @@ class Diagnosis:
         lines = [*_wrapped(f"{self.verdict}: {self.sentence}"), "=" * _WIDTH]
         for finding in self.findings:
             lines += _of_finding(finding)
+        if self.verdict == "none":
+            lines += self._would_have_shown()
         if self.unexplained:
             lines += _wrapped(f"Unexplained: {self.unexplained}")
         if self.gain:
@@ -187,12 +194,25 @@ class Diagnosis:
         if self.rejected:
             lines.append(f"{'Not accepted, best first:':<37} {'gain':>6} {'p':>7}  why")
             lines += [
-                f"  {r.name:<35.35} {max(r.gain, -9.99):6.0%} {r.p_value:7.2g}  {r.why}"[:_WIDTH]
+                f"  {r.name:<35.35} {max(r.gain, -9.99):6.0%} {r.p_value:7.2g}  {r.why}"
                 for r in self.rejected[:5]
             ]
         for caveat in self.caveats:
             lines += _wrapped(f"Caveat: {caveat}")
         return "\n".join(lines)
+
+    def _would_have_shown(self) -> list[str]:
+        shown = [
+            f"  {key}: {words}"
+            for key, sizes in self.detectable.items()
+            if (words := sizes_in_words(self.twin, key, sizes))
+        ]
+        lines = ["They would have shown, if it were no smaller than:"] if shown else []
+        lines += [line for each in shown[:_MOST_SHOWN] for line in _wrapped(each)]
+        more = len(shown) - _MOST_SHOWN
+        return (
+            [*lines, f"  and {more} more, in the report and in `detectable`"] if more > 0 else lines
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """
@@ -264,6 +284,12 @@ def _spoken(key: str) -> str:
     for person in ("coulomb", "stribeck"):
         name = name.replace(person, person.title())
     return place if name == "parameter" else f"{name.replace('_', ' ')} at {place}"
+
+
+def _choice(finding: Finding) -> str:
+    """With what cannot be told from it."""
+    names = [_spoken(key) for key in (finding.key, *finding.alternatives)]
+    return names[0] if len(names) == 1 else f"either {' or '.join(names)}"
 
 
 def _wrapped(text: str, indent: str = "") -> list[str]:

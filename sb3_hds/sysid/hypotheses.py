@@ -40,6 +40,7 @@ class Candidate:
     :param parameters: full names in the extended twin
     :param explanation: one sentence for people
     :param equivalents: names of effects that data may not tell from this one, and when
+    :param ascending: those of the parameters that may not fall from one to the next
     """
 
     name: str
@@ -49,6 +50,7 @@ class Candidate:
     parameters: tuple[str, ...]
     explanation: str
     equivalents: tuple[tuple[str, str], ...] = ()
+    ascending: tuple[str, ...] = ()
 
     @property
     def key(self) -> str:
@@ -286,6 +288,7 @@ def _attached(twin: Twin, effects: Sequence[type[Effect]]) -> tuple[Twin, list[C
                 tuple(f"{a.key}.{name}" for name in a.effect.parameters),
                 a.effect.explanation,
                 tuple(a.effect.equivalents.items()),
+                tuple(f"{a.key}.{name}" for name in a.effect.ascending),
             )
         )
     if SignFlip in effects:

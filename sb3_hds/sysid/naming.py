@@ -9,7 +9,7 @@ from sb3_hds.sysid.account import standard_errors
 from sb3_hds.sysid.comparison import Comparison
 from sb3_hds.sysid.family import chance_of_the_best
 from sb3_hds.sysid.search import Base, Search, Tried, as_good, passes
-from sb3_hds.sysid.telling import CHANCE, NAMELESS, SMALL, UNCERTAIN, Accepted, margin
+from sb3_hds.sysid.telling import ANOTHER, CHANCE, NAMELESS, SMALL, UNCERTAIN, Accepted, margin
 
 # Causes that are looked for.
 _MOST = 3
@@ -115,7 +115,7 @@ class Naming:
         :return: a force without a name beside that, as sure as a cause has to be
         """
         tried = self.search.nameless(base)
-        sure = [t for t in tried if self._determined(t, base)]
+        sure = [t for t in tried if self._is_meant(t) and self._determined(t, base)]
         best = self.search.best(sure, base, len(known))
         if best is None or self._chance(best, base, known) >= _FAMILY_LEVEL / (1 + len(known)):
             return None
@@ -152,7 +152,7 @@ class Naming:
         :param looks: at pairs that were not confirmed
         :return: the best of what was tried, if it is a cause beside those that are known
         """
-        sure = [t for t in tried if self._determined(t, base)]
+        sure = [t for t in tried if self._is_meant(t) and self._determined(t, base)]
         best = self.search.best(sure, base, len(known) + looks)
         if best is None:
             return None
@@ -190,6 +190,14 @@ class Naming:
         if not (sure := bool((moved > margin(len(np.unique(half.unit)), stderr)).any())):
             self.turned_down[tried.candidate.key] = UNCERTAIN
         return sure
+
+    def _is_meant(self, tried: Tried) -> bool:
+        """Whether what was fitted is what its name says."""
+        names = self.search.hypotheses.names
+        sizes = tried.point.theta[[names.index(name) for name in tried.candidate.ascending]]
+        if not (meant := bool(np.all(np.diff(sizes) >= 0.0))):
+            self.turned_down[tried.candidate.key] = ANOTHER
+        return meant
 
     def _is_leftover(self, best: Tried, base: Base) -> bool:
         """Whether an imperfect model of the causes before explains as much as this one."""

@@ -9,12 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_hds.core import Effect
 from sb3_hds.core.storage import write_bytes
-from sb3_hds.effects import ALL
-from sb3_hds.errors import EffectError
 from sb3_hds.sysid import plots
 from sb3_hds.sysid.diagnosis import Diagnosis
+from sb3_hds.sysid.units import sizes_in_words, with_unit
 
 _INSTALL = "A report needs matplotlib and jinja2: pip install 'sb3-hds[report]'."
 _COLOURS = {"named": "#27496d", "ambiguous": "#8a6d1d", "unknown": "#d1495b"}
@@ -163,7 +161,7 @@ def _content(d: Diagnosis) -> dict[str, Any]:
             "rows": [
                 (
                     name,
-                    _with_unit(f"{e.estimate:.4g}", e.unit),
+                    with_unit(f"{e.estimate:.4g}", e.unit),
                     f"{e.stderr:.2g}",
                     f"{e.low:.4g} to {e.high:.4g}",
                 )
@@ -185,7 +183,8 @@ def _content(d: Diagnosis) -> dict[str, Any]:
         "explained": f"{d.explained:.0%}",
         "parameters": _parameters(d),
         "detectable": [
-            (key, _sizes(d, key, sizes) or "none") for key, sizes in d.detectable.items()
+            (key, sizes_in_words(d.twin, key, sizes) or "none")
+            for key, sizes in d.detectable.items()
         ],
     }
 
@@ -199,39 +198,11 @@ def _parameters(d: Diagnosis) -> list[tuple[str, str, str]]:
         rows.append(
             (
                 name,
-                "" if before is None else _with_unit(f"{before:.4g}", unit),
-                _with_unit(f"{value:.4g}", unit),
+                "" if before is None else with_unit(f"{before:.4g}", unit),
+                with_unit(f"{value:.4g}", unit),
             )
         )
     return rows
-
-
-def _with_unit(number: str, unit: str) -> str:
-    """Without a break between them."""
-    return number if unit == "1" else f"{number} {unit}".strip().replace(" ", "\N{NO-BREAK SPACE}")
-
-
-def _sizes(d: Diagnosis, key: str, sizes: Mapping[str, float]) -> str:
-    shown = [
-        f"{name} {_with_unit(f'{value:.2g}', _unit(d, key, name))}"
-        for name, value in sizes.items()
-        if np.isfinite(value)
-    ]
-    return ", ".join(shown)
-
-
-def _unit(d: Diagnosis, key: str, name: str) -> str:
-    """Unit of a candidate's parameter; empty for an effect that is not of the catalogue."""
-    effect, _, place = key.partition(".")
-    full = place if effect == "parameter" else f"{key}.{name}"
-    kinds: dict[str, type[Effect]] = {kind.name: kind for kind in ALL}
-    twin = d.twin
-    if full not in twin.parameters and effect in kinds:
-        try:
-            twin = twin.extend(kinds[effect](place))
-        except EffectError:
-            return ""
-    return twin.parameters[full].unit if full in twin.parameters else ""
 
 
 def _policy(gain: Mapping[str, Any] | None) -> dict[str, Any] | None:

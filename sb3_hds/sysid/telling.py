@@ -19,10 +19,11 @@ from sb3_hds.sysid.remainder import Remainder
 from sb3_hds.sysid.results import Estimate
 from sb3_hds.sysid.search import LEAST_GAIN, LEVEL, Base, Half, Tried
 
-#: why a candidate was turned down that predicts better
+#: why a candidate was turned down that predicts better; a line of a printed table has 26 letters
 UNCERTAIN, SMALL, CHANCE = "has no certain size", "is small beside the others", "may be chance"
-NO_CONSTANT = "comes near, but its size changes"
+NO_CONSTANT = "near, but no constant size"
 NAMELESS = "a nameless force is better"
+ANOTHER = "its sizes mean another"
 _CONFIDENCE = 0.9
 # Family-wise level of what contradicts that nothing is wrong, though it is no finding.
 _CONTRADICTS = 0.01
