@@ -2,6 +2,7 @@
 ``sb3-hds``: what is wrong with a simulation, and how robust a policy is, from the command line.
 
     sb3-hds diagnose --twin PendulumReal --data 'logs/*.csv' --columns map.yml --report out.html
+    sb3-hds diagnose --twin my_module:MyTwin --data 'logs/*.csv' --columns map.yml
     sb3-hds diagnose --twin LinearAxis --set observe:q mass:95 --data log.mat --columns map.yml
     sb3-hds robustness --algo openloop --model model.zip --env Swimmer-v5
     sb3-hds effects
@@ -75,7 +76,11 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = every.add_subparsers(dest="command", required=True)
     ask = commands.add_parser("diagnose", help="name the cause, from measured data")
-    ask.add_argument("--twin", required=True, help="name or environment id, see 'sb3-hds twins'")
+    ask.add_argument(
+        "--twin",
+        required=True,
+        help="name or environment id, see 'sb3-hds twins'; module:Name for one of your own",
+    )
     ask.add_argument("--data", required=True, nargs="+", help="files, or patterns in quotes")
     ask.add_argument("--columns", help="yml file: what the columns of a log mean")
     ask.add_argument(
@@ -134,10 +139,9 @@ def _diagnose(given: argparse.Namespace) -> None:
     from sb3_hds.data import Trajectories, audit
     from sb3_hds.effects import ALL
     from sb3_hds.sysid import diagnose
-    from sb3_hds.twins import make
 
     _check_targets(given)
-    twin = make(given.twin, **_settings("--set", given.set))
+    twin = _twin(given.twin, _settings("--set", given.set))
     measure = None if given.env is None else _policy_question(given, twin)
     files = given.data[0] if len(given.data) == 1 else given.data
     data = Trajectories.load(files, columns=given.columns)
@@ -168,6 +172,26 @@ def _diagnose(given: argparse.Namespace) -> None:
         write_bytes(given.json, text.encode())
     if given.report:
         print(f"The report is {found.to_html(given.report, gain)}.")
+
+
+def _twin(name: str, settings: dict[str, Any]) -> "Twin":
+    """A module that registers it may lie in the current folder."""
+    from sb3_hds.errors import NoTwinError
+    from sb3_hds.twins import get
+
+    if ":" in name and "" not in sys.path:
+        sys.path.insert(0, "")
+    try:
+        kind = get(name)
+    except NoTwinError as error:
+        if ":" in name:
+            raise
+        told = str(error).partition("\n")[0]
+        raise NoTwinError(
+            f"{told} 'sb3-hds twins' lists what there is. One of your own is --twin module:Name, "
+            "where module.py in this folder registers Name."
+        ) from None
+    return kind(**settings)
 
 
 def _check_targets(given: argparse.Namespace) -> None:

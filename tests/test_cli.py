@@ -1,6 +1,7 @@
 """The command line: what it prints, what it writes, how it fails."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from measuring import measured
 from sb3_hds import Trajectories, cli, effects, twins
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid import Diagnosis
+from sb3_hds.twins import registry
 
 
 @pytest.fixture(scope="module")
@@ -120,6 +122,34 @@ def test_a_twin_is_set_by_numbers_words_and_truth_values(tmp_path, monkeypatch, 
     assert (free.observed, free.zero, free.driven, free.substeps) == ("q", "up", True, 4)
     assert free.values["mass"] == 0.2
     assert len(servo.actuators) == 2
+
+
+def test_a_twin_of_ones_own_is_taken_from_a_module_in_the_folder(tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def diagnose(twin, data, **_):
+        asked.append(twin)
+        raise CalibrationError("enough")
+
+    monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
+    monkeypatch.setattr("sys.path", [path for path in sys.path if path])
+    monkeypatch.setattr(registry, "_TWINS", dict(registry._TWINS))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rigs_in_a_folder.py").write_text(
+        "from sb3_hds import twins\n\n\n@twins.register\n"
+        "class Swing(twins.FreePendulum):\n    name = 'SwingInAFolder'\n"
+    )
+    data = Trajectories.from_arrays([np.zeros((9, 2))], [np.zeros((8, 0))], dt=0.01)
+    log = data.save(tmp_path / "log")
+
+    assert ask("--twin", "rigs_in_a_folder:SwingInAFolder", "--data", log) == 1
+    assert asked[0].name == "SwingInAFolder"
+
+    capsys.readouterr()
+    assert ask("--twin", "FreePendulun", "--data", log) == 1
+    told = capsys.readouterr().err
+    assert "Did you mean 'FreePendulum'? " in told and "--twin module:Name" in told
+    assert told.count("\n") == 1 and len(told) < 300
 
 
 def test_what_the_audit_proposes_is_done_if_wanted_and_said(tmp_path, monkeypatch, capsys):
