@@ -151,7 +151,8 @@ def _check(rows: Rows, columns: Columns) -> None:
                 f"Column '{entry.column if entry else 'time'}' of '{rows.source}' must be finite, "
                 f"got {values[row, channel]} in row {rows.numbers[row]}, counted from 0 "
                 f"({len(bad)} such values in all). Cut the log before it, or leave those rows out: "
-                "the gap then ends the episode."
+                "a gap of up to five intervals is interpolated, a longer one ends the episode "
+                "(gap: SECONDS in columns says when)."
             )
     back = np.flatnonzero(np.diff(rows.times) < 0.0)
     if len(back):
