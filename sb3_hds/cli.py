@@ -17,7 +17,6 @@ import io
 import json
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -196,11 +195,10 @@ def _twin(name: str, settings: dict[str, Any]) -> "Twin":
 
 def _check_targets(given: argparse.Namespace) -> None:
     """What would fail after minutes fails now."""
+    from sb3_hds.core.storage import check_target
+
     for target in filter(None, (given.report, given.json)):
-        if not Path(target).parent.is_dir():
-            raise FileNotFoundError(f"{target} cannot be written: there is no such folder.")
-        if Path(target).is_dir():
-            raise IsADirectoryError(f"{target} is a folder. Name a file.")
+        check_target(target)
     if given.report:
         from sb3_hds.sysid.report import check_installed
 

@@ -14,6 +14,7 @@ from sb3_hds import Trajectories
 from sb3_hds.core import Trajectories as CoreTrajectories
 from sb3_hds.core import trajectories
 from sb3_hds.data import SamplingWarning
+from sb3_hds.data.load import _paths
 from sb3_hds.errors import TrajectoryError
 
 DT = 0.01
@@ -608,6 +609,12 @@ def test_stamps_in_milliseconds_are_not_filled_up(tmp_path):
 
     with pytest.raises(TrajectoryError, match=r"nothing is known of 1000 steps.*scale: 0.001"):
         Trajectories.load(path, columns=columns)
+
+
+@pytest.mark.parametrize("files", [None, 3])
+def test_what_names_no_file_is_refused(files):
+    with pytest.raises(TrajectoryError, match=f"files must be paths or patterns, got {files}"):
+        _paths(files)  # types are checked before, where tests run
 
 
 def test_a_recording_is_no_evidence_twice(tmp_path):

@@ -16,6 +16,17 @@ from sb3_hds.errors import TrajectoryError
 _SUFFIX = ".npz"
 
 
+def check_target(path: str | os.PathLike[str]) -> None:
+    """:raises OSError: if there is no folder to write that file in, or a folder of its name"""
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise FileNotFoundError(
+            f"{target} cannot be written: there is no such folder (in {Path.cwd()}). Make it first."
+        )
+    if target.is_dir():
+        raise IsADirectoryError(f"{target} is a folder. Name a file.")
+
+
 def write_bytes(path: str | os.PathLike[str], content: bytes) -> Path:
     """
     Write under a temporary name in the same folder, then rename: a reader never sees half a file.

@@ -70,9 +70,11 @@ def load(files: Files, columns: Any = None) -> Trajectories:
     return dataclasses.replace(data, origin=np.array(steps.origin), report=report)
 
 
-def _paths(files: Files) -> list[str]:
+def _paths(files: Any) -> list[str]:
     """Every file that is meant, patterns expanded."""
     several = not isinstance(files, str | os.PathLike)
+    if several and not isinstance(files, Iterable):
+        raise TrajectoryError(f"files must be paths or patterns, got {files!r}.")
     found: list[str] = []
     for item in files if several else [files]:
         if not isinstance(item, str | os.PathLike):

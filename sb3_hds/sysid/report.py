@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_hds.core import Effect
-from sb3_hds.core.storage import write_bytes
+from sb3_hds.core.storage import check_target, write_bytes
 from sb3_hds.effects import ALL
 from sb3_hds.errors import EffectError
 from sb3_hds.sysid import plots
@@ -124,7 +124,9 @@ def write_report(
     :param path: of the page; a file of that name is replaced as a whole
     :param policy_gain: as plain data
     :raises ImportError: without matplotlib and jinja2
+    :raises OSError: if there is no folder to write it in
     """
+    check_target(path)
     check_installed()
     import jinja2
 
