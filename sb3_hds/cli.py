@@ -16,11 +16,12 @@ import importlib
 import io
 import json
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sb3_hds.core import Twin
+    from sb3_hds.core import Trajectories, Twin
     from sb3_hds.experiments import PolicyGain
     from sb3_hds.sysid import Diagnosis
 
@@ -40,6 +41,12 @@ _THEIRS = {
     "trpo": "sb3_contrib.TRPO",
 }
 
+_COLUMNS = """Say what the columns mean in a yml file, --columns map.yml:
+
+    time: NAME                               # or {column: NAME, scale: 0.001}, or dt: SECONDS
+    obs: [NAME, {column: NAME, scale: 1.0}]  # in the order of 'sb3-hds twins'
+    actions: [NAME]"""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """
@@ -50,12 +57,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from sb3_hds.errors import SB3HDSError
 
     try:
-        {
-            "diagnose": _diagnose,
-            "robustness": _robustness,
-            "effects": _effects,
-            "twins": _twins,
-        }[given.command](given)
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            {
+                "diagnose": _diagnose,
+                "robustness": _robustness,
+                "effects": _effects,
+                "twins": _twins,
+            }[given.command](given)
     except BrokenPipeError:
         return 0
     except (SB3HDSError, OSError, ImportError) as error:
@@ -65,6 +74,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("sb3-hds: interrupted", file=sys.stderr)
         return 130
     return 0
+
+
+def _warn(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: Any = None,
+    line: str | None = None,
+) -> None:
+    """One line, without the code that warns."""
+    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -135,7 +156,7 @@ def parser() -> argparse.ArgumentParser:
 
 def _diagnose(given: argparse.Namespace) -> None:
     from sb3_hds.core.storage import write_bytes
-    from sb3_hds.data import Trajectories, audit
+    from sb3_hds.data import audit
     from sb3_hds.effects import ALL
     from sb3_hds.sysid import diagnose
 
@@ -143,7 +164,7 @@ def _diagnose(given: argparse.Namespace) -> None:
     twin = _twin(given.twin, _settings("--set", given.set))
     measure = None if given.env is None else _policy_question(given, twin)
     files = given.data[0] if len(given.data) == 1 else given.data
-    data = Trajectories.load(files, columns=given.columns)
+    data = _loaded(files, given.columns)
     corrections: tuple[str, ...] = ()
     if given.correct:
         checked = audit(data, channels=twin.channels)
@@ -151,8 +172,8 @@ def _diagnose(given: argparse.Namespace) -> None:
     found = diagnose(
         twin,
         data,
-        effects=ALL if given.effects is None else given.effects,
-        calibrate=given.calibrate,
+        effects=ALL if given.effects is None else _names(given.effects),
+        calibrate=_names(given.calibrate),
         seed=given.seed,
         budget=given.budget,
         progress=sys.stderr.isatty(),
@@ -171,6 +192,28 @@ def _diagnose(given: argparse.Namespace) -> None:
         write_bytes(given.json, text.encode())
     if given.report:
         print(f"The report is {found.to_html(given.report, gain)}.")
+
+
+def _loaded(files: str | Sequence[str], columns: str | None) -> "Trajectories":
+    """What is wrong with the map of columns is said in yml."""
+    from sb3_hds.data import Trajectories
+    from sb3_hds.data.columns import FORM
+    from sb3_hds.data.load import WITHOUT_COLUMNS
+    from sb3_hds.errors import TrajectoryError
+
+    try:
+        return Trajectories.load(files, columns=columns)
+    except TrajectoryError as error:
+        told = str(error)
+        for python in (FORM, WITHOUT_COLUMNS):
+            if python in told:
+                told = told.replace(python, _COLUMNS)
+        raise TrajectoryError(told) from error
+
+
+def _names(words: Sequence[str]) -> list[str]:
+    """Words that blanks or commas separate."""
+    return [name for word in words for name in word.split(",") if name]
 
 
 def _twin(name: str, settings: dict[str, Any]) -> "Twin":

@@ -2,6 +2,7 @@
 
 import json
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -122,6 +123,48 @@ def test_a_twin_is_set_by_numbers_words_and_truth_values(tmp_path, monkeypatch, 
     assert (free.observed, free.zero, free.driven, free.substeps) == ("q", "up", True, 4)
     assert free.values["mass"] == 0.2
     assert len(servo.actuators) == 2
+
+
+def test_a_log_without_a_map_of_columns_is_told_how_to_write_one(tmp_path, capsys):
+    log, empty = tmp_path / "log.csv", tmp_path / "map.yml"
+    log.write_text("t,q\n0.0,0.1\n")
+    empty.write_text("[]")
+
+    for words in ([], ["--columns", empty]):
+        assert ask("--twin", "FreePendulum", "--data", log, *words) == 1
+        told = capsys.readouterr().err
+        assert "--columns map.yml:" in told and "    actions: [NAME]" in told
+        assert "{'time'" not in told and "columns={" not in told
+
+
+def test_a_warning_is_one_line_without_code(tmp_path, monkeypatch, capsys):
+    def diagnose(twin, data, **_):
+        warnings.warn("Rows are\nuneven.", UserWarning, stacklevel=2)
+        raise CalibrationError("enough")
+
+    monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
+    data = Trajectories.from_arrays([np.zeros((9, 2))], [np.zeros((8, 0))], dt=0.01)
+
+    ask("--twin", "FreePendulum", "--data", data.save(tmp_path / "log"))
+
+    assert capsys.readouterr().err == "warning: Rows are uneven.\nsb3-hds: enough\n"
+
+
+def test_commas_separate_names_as_blanks_do(tmp_path, monkeypatch):
+    asked = []
+
+    def diagnose(twin, data, *, calibrate, effects, **_):
+        asked.append((calibrate, effects))
+        raise CalibrationError("enough")
+
+    monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
+    data = Trajectories.from_arrays([np.zeros((9, 2))], [np.zeros((8, 0))], dt=0.01)
+    log = data.save(tmp_path / "log")
+    words = ["--calibrate", "mass,com", "damping", "--effects", "stiffness,", "cogging"]
+
+    ask("--twin", "FreePendulum", "--data", log, *words)
+
+    assert asked == [(["mass", "com", "damping"], ["stiffness", "cogging"])]
 
 
 def test_a_twin_of_ones_own_is_taken_from_a_module_in_the_folder(tmp_path, monkeypatch, capsys):
