@@ -100,7 +100,8 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
         with archive:
             return {name: np.asarray(archive[name]) for name in archive.files}
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        reason = "it holds no arrays of numbers" if "pickle" in str(error) else error
         raise TrajectoryError(
-            f"'{source}' is damaged or was not written by Trajectories.save ({error}). "
+            f"'{source}' is damaged or was not written by Trajectories.save ({reason}). "
             "Restore it from a copy, or record it again."
         ) from error
