@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sb3_hds.core import Trajectories, Twin
+    from sb3_hds.core import Parameter, Trajectories, Twin
     from sb3_hds.experiments import PolicyGain
     from sb3_hds.sysid import Diagnosis
 
@@ -46,6 +46,12 @@ _COLUMNS = """Say what the columns mean in a yml file, --columns map.yml:
     time: NAME                               # or {column: NAME, scale: 0.001}, or dt: SECONDS
     obs: [NAME, {column: NAME, scale: 1.0}]  # in the order of 'sb3-hds twins'
     actions: [NAME]"""
+
+_FURTHER = {"sign_flip": " So may all of a joint: the direction of position and velocity at once."}
+_OF_A_TWIN = (
+    "A parameter of the twin has another value than believed: each one of 'sb3-hds twins' that "
+    "--calibrate does not name. Always a candidate; --effects does not take it."
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -421,12 +427,23 @@ def _effects(given: argparse.Namespace) -> None:
             (
                 effect.name,
                 effect.slot,
-                ", ".join(f"{name} [{p.unit}]" for name, p in effect.parameters.items()),
-                effect.explanation,
+                ", ".join(map(_sized, effect.parameters.items())),
+                effect.explanation + _FURTHER.get(effect.name, ""),
             )
             for effect in ALL
-        ],
+        ]
+        + [("parameter.NAME", "twin", "its own [unit]", _OF_A_TWIN)],
     )
+    print(
+        "Units at joints are those of a rotary joint; for a slider, read N and m in place of N m "
+        "and rad."
+    )
+
+
+def _sized(parameter: "tuple[str, Parameter]") -> str:
+    name, known = parameter
+    switch = (known.unit, known.null, known.upper) == ("1", 0.0, 1.0) and known.scale == 1.0
+    return "on or off" if switch else f"{name} [{known.unit}]"
 
 
 def _twins(given: argparse.Namespace) -> None:

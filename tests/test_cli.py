@@ -89,9 +89,11 @@ def test_what_exists_is_listed_with_units_and_explanations(capsys):
     shown = capsys.readouterr().out.replace("│", " ").split()
     for effect in effects.ALL:
         assert effect.name in shown
-        units = [f"{name} [{p.unit}]" for name, p in effect.parameters.items()]
+        units = [f"{name} [{p.unit}]" for name, p in effect.parameters.items() if name != "flipped"]
         words = [*", ".join(units).split(), *effect.explanation.split()]
         assert set(words) <= set(shown), effect.name
+
+    assert {"parameter.NAME", "slider,", "direction"} <= set(shown) and "flipped" not in shown
 
     assert cli.main(["twins"]) == 0
     shown = capsys.readouterr().out
