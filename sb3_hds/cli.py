@@ -65,6 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
+            # Meant for programmers.
+            warnings.simplefilter("ignore", DeprecationWarning)
             {
                 "diagnose": _diagnose,
                 "robustness": _robustness,
