@@ -2,6 +2,7 @@
 ``sb3-hds``: what is wrong with a simulation, and how robust a policy is, from the command line.
 
     sb3-hds diagnose --twin PendulumReal --data 'logs/*.csv' --columns map.yml --report out.html
+    sb3-hds diagnose --twin my_module:MyTwin --data 'logs/*.csv' --columns map.yml
     sb3-hds diagnose --twin LinearAxis --set observe:q mass:95 --data log.mat --columns map.yml
     sb3-hds robustness --algo openloop --model model.zip --env Swimmer-v5
     sb3-hds effects
@@ -15,12 +16,12 @@ import importlib
 import io
 import json
 import sys
+import warnings
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sb3_hds.core import Twin
+    from sb3_hds.core import Parameter, Trajectories, Twin
     from sb3_hds.experiments import PolicyGain
     from sb3_hds.sysid import Diagnosis
 
@@ -40,6 +41,18 @@ _THEIRS = {
     "trpo": "sb3_contrib.TRPO",
 }
 
+_COLUMNS = """Say what the columns mean in a yml file, --columns map.yml:
+
+    time: NAME                               # or {column: NAME, scale: 0.001}, or dt: SECONDS
+    obs: [NAME, {column: NAME, scale: 1.0}]  # in the order of 'sb3-hds twins'
+    actions: [NAME]"""
+
+_FURTHER = {"sign_flip": " So may all of a joint: the direction of position and velocity at once."}
+_OF_A_TWIN = (
+    "A parameter of the twin has another value than believed: each one of 'sb3-hds twins' that "
+    "--calibrate does not name. Always a candidate; --effects does not take it."
+)
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """
@@ -50,12 +63,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from sb3_hds.errors import SB3HDSError
 
     try:
-        {
-            "diagnose": _diagnose,
-            "robustness": _robustness,
-            "effects": _effects,
-            "twins": _twins,
-        }[given.command](given)
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            # Meant for programmers.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            {
+                "diagnose": _diagnose,
+                "robustness": _robustness,
+                "effects": _effects,
+                "twins": _twins,
+            }[given.command](given)
     except BrokenPipeError:
         return 0
     except (SB3HDSError, OSError, ImportError) as error:
@@ -67,6 +84,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _warn(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: Any = None,
+    line: str | None = None,
+) -> None:
+    """One line, without the code that warns."""
+    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
 def parser() -> argparse.ArgumentParser:
     """:return: what the command understands"""
     every = argparse.ArgumentParser(
@@ -75,7 +104,11 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = every.add_subparsers(dest="command", required=True)
     ask = commands.add_parser("diagnose", help="name the cause, from measured data")
-    ask.add_argument("--twin", required=True, help="name or environment id, see 'sb3-hds twins'")
+    ask.add_argument(
+        "--twin",
+        required=True,
+        help="name or environment id, see 'sb3-hds twins'; module:Name for one of your own",
+    )
     ask.add_argument("--data", required=True, nargs="+", help="files, or patterns in quotes")
     ask.add_argument("--columns", help="yml file: what the columns of a log mean")
     ask.add_argument(
@@ -131,16 +164,15 @@ def parser() -> argparse.ArgumentParser:
 
 def _diagnose(given: argparse.Namespace) -> None:
     from sb3_hds.core.storage import write_bytes
-    from sb3_hds.data import Trajectories, audit
+    from sb3_hds.data import audit
     from sb3_hds.effects import ALL
     from sb3_hds.sysid import diagnose
-    from sb3_hds.twins import make
 
     _check_targets(given)
-    twin = make(given.twin, **_settings("--set", given.set))
+    twin = _twin(given.twin, _settings("--set", given.set))
     measure = None if given.env is None else _policy_question(given, twin)
     files = given.data[0] if len(given.data) == 1 else given.data
-    data = Trajectories.load(files, columns=given.columns)
+    data = _loaded(files, given.columns)
     corrections: tuple[str, ...] = ()
     if given.correct:
         checked = audit(data, channels=twin.channels)
@@ -148,8 +180,8 @@ def _diagnose(given: argparse.Namespace) -> None:
     found = diagnose(
         twin,
         data,
-        effects=ALL if given.effects is None else given.effects,
-        calibrate=given.calibrate,
+        effects=ALL if given.effects is None else _names(given.effects),
+        calibrate=_names(given.calibrate),
         seed=given.seed,
         budget=given.budget,
         progress=sys.stderr.isatty(),
@@ -170,13 +202,54 @@ def _diagnose(given: argparse.Namespace) -> None:
         print(f"The report is {found.to_html(given.report, gain)}.")
 
 
+def _loaded(files: str | Sequence[str], columns: str | None) -> "Trajectories":
+    """What is wrong with the map of columns is said in yml."""
+    from sb3_hds.data import Trajectories
+    from sb3_hds.data.columns import FORM
+    from sb3_hds.data.load import WITHOUT_COLUMNS
+    from sb3_hds.errors import TrajectoryError
+
+    try:
+        return Trajectories.load(files, columns=columns)
+    except TrajectoryError as error:
+        told = str(error)
+        for python in (FORM, WITHOUT_COLUMNS):
+            if python in told:
+                told = told.replace(python, _COLUMNS)
+        raise TrajectoryError(told) from error
+
+
+def _names(words: Sequence[str]) -> list[str]:
+    """Words that blanks or commas separate."""
+    return [name for word in words for name in word.split(",") if name]
+
+
+def _twin(name: str, settings: dict[str, Any]) -> "Twin":
+    """A module that registers it may lie in the current folder."""
+    from sb3_hds.errors import NoTwinError
+    from sb3_hds.twins import get
+
+    if ":" in name and "" not in sys.path:
+        sys.path.insert(0, "")
+    try:
+        kind = get(name)
+    except NoTwinError as error:
+        if ":" in name:
+            raise
+        told = str(error).partition("\n")[0]
+        raise NoTwinError(
+            f"{told} 'sb3-hds twins' lists what there is. One of your own is --twin module:Name, "
+            "where module.py in this folder registers Name."
+        ) from None
+    return kind(**settings)
+
+
 def _check_targets(given: argparse.Namespace) -> None:
     """What would fail after minutes fails now."""
+    from sb3_hds.core.storage import check_target
+
     for target in filter(None, (given.report, given.json)):
-        if not Path(target).parent.is_dir():
-            raise FileNotFoundError(f"{target} cannot be written: there is no such folder.")
-        if Path(target).is_dir():
-            raise IsADirectoryError(f"{target} is a folder. Name a file.")
+        check_target(target)
     if given.report:
         from sb3_hds.sysid.report import check_installed
 
@@ -356,12 +429,23 @@ def _effects(given: argparse.Namespace) -> None:
             (
                 effect.name,
                 effect.slot,
-                ", ".join(f"{name} [{p.unit}]" for name, p in effect.parameters.items()),
-                effect.explanation,
+                ", ".join(map(_sized, effect.parameters.items())),
+                effect.explanation + _FURTHER.get(effect.name, ""),
             )
             for effect in ALL
-        ],
+        ]
+        + [("parameter.NAME", "twin", "its own [unit]", _OF_A_TWIN)],
     )
+    print(
+        "Units at joints are those of a rotary joint; for a slider, read N and m in place of N m "
+        "and rad."
+    )
+
+
+def _sized(parameter: "tuple[str, Parameter]") -> str:
+    name, known = parameter
+    switch = (known.unit, known.null, known.upper) == ("1", 0.0, 1.0) and known.scale == 1.0
+    return "on or off" if switch else f"{name} [{known.unit}]"
 
 
 def _twins(given: argparse.Namespace) -> None:

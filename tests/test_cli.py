@@ -1,6 +1,8 @@
 """The command line: what it prints, what it writes, how it fails."""
 
 import json
+import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from measuring import measured
 from sb3_hds import Trajectories, cli, effects, twins
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid import Diagnosis
+from sb3_hds.twins import registry
 
 
 @pytest.fixture(scope="module")
@@ -86,9 +89,11 @@ def test_what_exists_is_listed_with_units_and_explanations(capsys):
     shown = capsys.readouterr().out.replace("│", " ").split()
     for effect in effects.ALL:
         assert effect.name in shown
-        units = [f"{name} [{p.unit}]" for name, p in effect.parameters.items()]
+        units = [f"{name} [{p.unit}]" for name, p in effect.parameters.items() if name != "flipped"]
         words = [*", ".join(units).split(), *effect.explanation.split()]
         assert set(words) <= set(shown), effect.name
+
+    assert {"parameter.NAME", "slider,", "direction"} <= set(shown) and "flipped" not in shown
 
     assert cli.main(["twins"]) == 0
     shown = capsys.readouterr().out
@@ -120,6 +125,76 @@ def test_a_twin_is_set_by_numbers_words_and_truth_values(tmp_path, monkeypatch, 
     assert (free.observed, free.zero, free.driven, free.substeps) == ("q", "up", True, 4)
     assert free.values["mass"] == 0.2
     assert len(servo.actuators) == 2
+
+
+def test_a_log_without_a_map_of_columns_is_told_how_to_write_one(tmp_path, capsys):
+    log, empty = tmp_path / "log.csv", tmp_path / "map.yml"
+    log.write_text("t,q\n0.0,0.1\n")
+    empty.write_text("[]")
+
+    for words in ([], ["--columns", empty]):
+        assert ask("--twin", "FreePendulum", "--data", log, *words) == 1
+        told = capsys.readouterr().err
+        assert "--columns map.yml:" in told and "    actions: [NAME]" in told
+        assert "{'time'" not in told and "columns={" not in told
+
+
+def test_a_warning_is_one_line_without_code(tmp_path, monkeypatch, capsys):
+    def diagnose(twin, data, **_):
+        warnings.warn("Rows are\nuneven.", UserWarning, stacklevel=2)
+        raise CalibrationError("enough")
+
+    monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
+    data = Trajectories.from_arrays([np.zeros((9, 2))], [np.zeros((8, 0))], dt=0.01)
+
+    ask("--twin", "FreePendulum", "--data", data.save(tmp_path / "log"))
+
+    assert capsys.readouterr().err == "warning: Rows are uneven.\nsb3-hds: enough\n"
+
+
+def test_commas_separate_names_as_blanks_do(tmp_path, monkeypatch):
+    asked = []
+
+    def diagnose(twin, data, *, calibrate, effects, **_):
+        asked.append((calibrate, effects))
+        raise CalibrationError("enough")
+
+    monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
+    data = Trajectories.from_arrays([np.zeros((9, 2))], [np.zeros((8, 0))], dt=0.01)
+    log = data.save(tmp_path / "log")
+    words = ["--calibrate", "mass,com", "damping", "--effects", "stiffness,", "cogging"]
+
+    ask("--twin", "FreePendulum", "--data", log, *words)
+
+    assert asked == [(["mass", "com", "damping"], ["stiffness", "cogging"])]
+
+
+def test_a_twin_of_ones_own_is_taken_from_a_module_in_the_folder(tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def diagnose(twin, data, **_):
+        asked.append(twin)
+        raise CalibrationError("enough")
+
+    monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
+    monkeypatch.setattr("sys.path", [path for path in sys.path if path])
+    monkeypatch.setattr(registry, "_TWINS", dict(registry._TWINS))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rigs_in_a_folder.py").write_text(
+        "from sb3_hds import twins\n\n\n@twins.register\n"
+        "class Swing(twins.FreePendulum):\n    name = 'SwingInAFolder'\n"
+    )
+    data = Trajectories.from_arrays([np.zeros((9, 2))], [np.zeros((8, 0))], dt=0.01)
+    log = data.save(tmp_path / "log")
+
+    assert ask("--twin", "rigs_in_a_folder:SwingInAFolder", "--data", log) == 1
+    assert asked[0].name == "SwingInAFolder"
+
+    capsys.readouterr()
+    assert ask("--twin", "FreePendulun", "--data", log) == 1
+    told = capsys.readouterr().err
+    assert "Did you mean 'FreePendulum'? " in told and "--twin module:Name" in told
+    assert told.count("\n") == 1 and len(told) < 300
 
 
 def test_what_the_audit_proposes_is_done_if_wanted_and_said(tmp_path, monkeypatch, capsys):

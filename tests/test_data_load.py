@@ -14,6 +14,7 @@ from sb3_hds import Trajectories
 from sb3_hds.core import Trajectories as CoreTrajectories
 from sb3_hds.core import trajectories
 from sb3_hds.data import SamplingWarning
+from sb3_hds.data.load import _paths
 from sb3_hds.errors import TrajectoryError
 
 DT = 0.01
@@ -608,6 +609,40 @@ def test_stamps_in_milliseconds_are_not_filled_up(tmp_path):
 
     with pytest.raises(TrajectoryError, match=r"nothing is known of 1000 steps.*scale: 0.001"):
         Trajectories.load(path, columns=columns)
+
+
+@pytest.mark.parametrize("files", [None, 3])
+def test_what_names_no_file_is_refused(files):
+    with pytest.raises(TrajectoryError, match=f"files must be paths or patterns, got {files}"):
+        _paths(files)  # types are checked before, where tests run
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("# rig 3, Monday\nt,q,u\n0.0,1.0,0.0\n0.1,1.1,0.0\n", "Delete the lines before the names"),
+        ("logged by rig 3\nt,q,u\n0.0,1.0,0.0\n0.1,1.1,0.0\n", "got 'logged by rig 3' and then"),
+        ("# rig 3\n# Monday\nt,q,u\n0.0,1.0,0.0\n0.1,1.1,0.0\n", "Delete the lines before"),
+        ("t,q,u\ns,rad,N m\n0.0,1.0,0.0\n0.1,1.1,0.0\n", "row of units below the names (line 2"),
+        ("t,q,u\ns,rad,1\n0.0,1.0,0.0\n0.1,1.1,0.0\n", "row of units below the names (line 2"),
+        ("t,q,u\n2024-05-01 12:00:00.1,1,0\n2024-05-01 12:00:00.2,1,0\n", "to seconds before"),
+        ("t,q,u\n12:00:00.1,1.0,0.0\n12:00:00.2,1.1,0.0\n", "Convert dates and times of day"),
+    ],
+)
+def test_lines_that_do_not_belong_into_a_log_are_told_apart(text, says, tmp_path):
+    (tmp_path / "log.csv").write_text(text)
+
+    with pytest.raises(TrajectoryError) as refusal:
+        Trajectories.load(tmp_path / "log.csv", {"time": "t", "obs": ["q"], "actions": ["u"]})
+
+    assert says in str(refusal.value)
+
+
+def test_an_archive_that_is_none_is_refused_without_a_word_of_pickles(tmp_path):
+    (tmp_path / "log.npz").write_bytes(b"nothing of the kind")
+
+    with pytest.raises(TrajectoryError, match="it holds no arrays of numbers"):
+        Trajectories.load(tmp_path / "log.npz")
 
 
 def test_a_recording_is_no_evidence_twice(tmp_path):

@@ -6,7 +6,16 @@ import pytest
 from measuring import measured
 
 from sb3_hds import diagnose, effects, twins
-from sb3_hds.core import NO_EFFECTS, Channel, Joint, Parameter, State, Trajectories, Twin
+from sb3_hds.core import (
+    NO_EFFECTS,
+    Channel,
+    Joint,
+    JointEffect,
+    Parameter,
+    State,
+    Trajectories,
+    Twin,
+)
 from sb3_hds.errors import CalibrationError, EffectError, ParameterError
 
 FRICTION = (effects.ViscousFriction, effects.CoulombFriction)
@@ -128,11 +137,23 @@ def test_names_of_effects_are_as_good_as_their_classes():
     assert [finding.effect for finding in found.findings] == ["coulomb_friction"]
 
 
+class Nondescript(JointEffect):
+    name = "nondescript"
+    parameters = {"a": Parameter(null=0.0, scale=0.1, unit="N m", lower=0.0)}
+
+    def torque(self, joint, memory, params):
+        return -params["a"] * joint.v
+
+
 @pytest.mark.parametrize(
     ("changes", "error", "says"),
     [
         ({"effects": ["rubbing"]}, EffectError, "no effect rubbing. There are: viscous_friction"),
         ({"effects": [effects.CoulombFriction(0)]}, EffectError, "effects are classes"),
+        ({"effects": None}, EffectError, "got None. Leave them out to try the whole catalogue"),
+        ({"effects": [Nondescript]}, EffectError, "Nondescript lacks explanation"),
+        ({"calibrate": None}, CalibrationError, r"such as \['mass'\], got None"),
+        ({"calibrate": "weight"}, CalibrationError, "weight"),
         ({"seed": -1}, CalibrationError, "seed must be a whole number of at least 0"),
         ({"twin": "FreePendulum"}, CalibrationError, "takes a twin"),
         ({"data": np.zeros(3)}, CalibrationError, "got FreePendulum and ndarray"),
@@ -188,3 +209,31 @@ def test_what_is_corrected_is_said():
     said = audit(late, channels=twin.channels).corrections
 
     assert len(said) == 1 and "'hinge_velocity' was shifted by -40 ms" in said[0]
+
+
+@pytest.mark.parametrize(
+    ("factor", "says"),
+    [
+        (2.0, "Use data.resample(dt=0.01) (in the map of columns, dt: 0.01), or make the twin"),
+        (2.0, "with dt=0.02 (on the command line, --set dt:0.02)"),
+        (1e3, "may be in milliseconds: then say so in the map of columns, time: {column: NAME, s"),
+        (1.2e3, "scale: 0.001}"),
+        (1e6, "in microseconds: then say so in the map of columns, time: {column: NAME, scale: 1e"),
+    ],
+)
+def test_another_interval_says_how_to_change_it_and_which_unit_it_may_be_in(factor, says):
+    data = Trajectories.from_arrays([np.zeros((9, 2))], [np.zeros((8, 0))], dt=0.01 * factor)
+
+    with pytest.raises(CalibrationError) as refusal:
+        diagnose(twins.make("FreePendulum"), data, progress=False)
+
+    assert says in str(refusal.value)
+    assert ("seconds:" in str(refusal.value)) == (factor > 100.0)
+
+
+def test_a_single_parameter_to_calibrate_may_stand_alone():
+    twin, data = swinging(effects.CoulombFriction(0, tau_c=0.02))
+
+    found = diagnose(twin, data, effects=FRICTION, calibrate="mass", budget="quick", progress=False)
+
+    assert found.findings[0].effect == "coulomb_friction"

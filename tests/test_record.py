@@ -53,6 +53,12 @@ def recorder(path, **settings):
     return Recorder(path, 0.1, **({"obs": ["q", "v"], "actions": ["u"]} | settings))
 
 
+def begun(path):
+    robot = recorder(path)
+    robot.start([0.0, 0.0])
+    return robot
+
+
 def test_an_environment_is_recorded_as_it_was_seen(tmp_path):
     env = Record(gymnasium.make("Pendulum-v1", max_episode_steps=7), tmp_path / "run")
     obs, actions = [], []
@@ -207,6 +213,12 @@ def test_recordings_with_other_channels_are_not_mixed(tmp_path):
             lambda path: recorder(path / "f").start([0.0]),
             "obs must have 2 numbers (q, v), got shape",
         ),
+        (lambda path: begun(path / "j").step(["a"], [0.0, 0.0]), "action must hold numbers (u)"),
+        (lambda path: begun(path / "k").step([0.0], [0.0, np.nan]), "obs must be finite (q, v)"),
+        (lambda path: begun(path / "l").step(None, [0.0, 0.0]), "action must be finite (u)"),
+        (lambda path: begun(path / "m").step([0.0], [0.0, 0.0], time=np.nan), "time must be fin"),
+        (lambda path: begun(path / "n").step([0.0], [0.0, 0.0], time=-0.5), "must not decrease"),
+        (lambda path: recorder(path / "o").start([0.0, np.inf]), "obs must be finite"),
         (lambda path: Recorder(path / "g", 0.0, obs=["q"], actions=[]), "dt must be the sampling"),
         (lambda path: Record(Counter(), path / "h"), "does not say how long a step is"),
         (
@@ -269,3 +281,18 @@ def test_what_has_no_actuator_is_read_again(tmp_path):
     data = Trajectories.load(path)
 
     assert (data.n_obs, data.n_act, data.n_steps) == (2, 0, 20)
+
+
+def test_what_is_refused_costs_nothing_that_was_recorded(tmp_path):
+    with begun(tmp_path / "a") as robot:
+        robot.step([1.0], [1.0, 1.0])
+        with pytest.raises(TrajectoryError, match="what was before it is kept"):
+            robot.step([2.0], [np.nan, 2.0])
+        with pytest.raises(TrajectoryError, match="must not decrease"):
+            robot.step([2.0], [2.0, 2.0], time=0.0)
+        robot.step([3.0], [3.0, 3.0])
+
+    data = Trajectories.load(robot.path)
+
+    np.testing.assert_array_equal(data.obs[0], [[0.0, 0.0], [1.0, 1.0], [3.0, 3.0]])
+    np.testing.assert_array_equal(data.actions[0], [[1.0], [3.0]])

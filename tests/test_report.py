@@ -192,6 +192,11 @@ def test_the_report_is_one_page_that_needs_no_network(rubbing, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 
+def test_a_report_without_a_folder_is_refused_at_once(rubbing, tmp_path):
+    with pytest.raises(FileNotFoundError, match="cannot be written: there is no such folder"):
+        rubbing.to_html(tmp_path / "nowhere" / "report.html")
+
+
 def test_the_report_says_sizes_with_units_and_errors(rubbing, tmp_path):
     text = rubbing.to_html(tmp_path / "report.html").read_text().replace("\N{NO-BREAK SPACE}", " ")
     size = rubbing.findings[0].parameters["tau_c"]

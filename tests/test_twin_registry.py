@@ -9,6 +9,7 @@ import pytest
 from sb3_hds import envs, twins
 from sb3_hds.core import AnalyticTwin
 from sb3_hds.errors import NoTwinError, ParameterError
+from sb3_hds.twins import registry
 
 
 def test_the_registry_finds_twins_by_name_and_by_id():
@@ -103,3 +104,45 @@ def test_an_environment_made_of_a_twin_hands_it_back():
 
     assert twin.goal == "stop_at_origin"
     assert twin.values["mass"] == 0.5
+
+
+_MODULE = """
+from sb3_hds import twins
+
+
+@twins.register
+class Swing(twins.FreePendulum):
+    name = "{name}"
+"""
+
+
+def test_a_twin_of_ones_own_is_found_by_its_module(tmp_path, monkeypatch):
+    (tmp_path / "rigs_of_a_user.py").write_text(_MODULE.format(name="SwingOfAUser"))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(registry, "_TWINS", dict(registry._TWINS))
+
+    twin = twins.make("rigs_of_a_user:SwingOfAUser", mass=0.4)
+
+    assert (twin.name, twin.values["mass"]) == ("SwingOfAUser", 0.4)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "message"),
+    [
+        ("rigs_of_nobody:Swing", "No module named 'rigs_of_nobody'"),
+        ("other_rigs_of_a_user:Swing", "registers OtherSwingOfAUser, not 'Swing'"),
+        ("json:Swing", "module 'json' registers no twin"),
+        (":Swing", "module:Name, got ':Swing'"),
+        ("rigs/swing.py:Swing", "module:Name, got"),
+    ],
+)
+def test_what_a_module_does_not_register_is_refused(tmp_path, monkeypatch, wanted, message):
+    text = _MODULE.format(name="OtherSwingOfAUser")
+    (tmp_path / "other_rigs_of_a_user.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(registry, "_TWINS", dict(registry._TWINS))
+
+    with pytest.raises(NoTwinError) as refusal:
+        twins.make(wanted)
+
+    assert message in str(refusal.value)

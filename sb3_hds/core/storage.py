@@ -16,6 +16,17 @@ from sb3_hds.errors import TrajectoryError
 _SUFFIX = ".npz"
 
 
+def check_target(path: str | os.PathLike[str]) -> None:
+    """:raises OSError: if there is no folder to write that file in, or a folder of its name"""
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise FileNotFoundError(
+            f"{target} cannot be written: there is no such folder (in {Path.cwd()}). Make it first."
+        )
+    if target.is_dir():
+        raise IsADirectoryError(f"{target} is a folder. Name a file.")
+
+
 def write_bytes(path: str | os.PathLike[str], content: bytes) -> Path:
     """
     Write under a temporary name in the same folder, then rename: a reader never sees half a file.
@@ -89,7 +100,8 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
         with archive:
             return {name: np.asarray(archive[name]) for name in archive.files}
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        reason = "it holds no arrays of numbers" if "pickle" in str(error) else error
         raise TrajectoryError(
-            f"'{source}' is damaged or was not written by Trajectories.save ({error}). "
+            f"'{source}' is damaged or was not written by Trajectories.save ({reason}). "
             "Restore it from a copy, or record it again."
         ) from error

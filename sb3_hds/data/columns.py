@@ -14,7 +14,7 @@ import yaml
 from sb3_hds.core.episodes import check_dt
 from sb3_hds.errors import TrajectoryError
 
-_FORM = (
+FORM = (
     "columns names what a log holds: {'time': NAME, 'obs': [{'column': NAME, 'scale': 1.0}, ...], "
     "'actions': [{'column': NAME, 'scale': 1.0}, ...]}, or is the path of a yml file with that."
 )
@@ -91,7 +91,7 @@ class Columns:
             merged = dataclasses.replace(self, **left)
         missing = [name for name in ("obs", "actions") if getattr(merged, name) is None]
         if missing:
-            raise TrajectoryError(f"columns does not say which are the {missing[0]}. {_FORM}")
+            raise TrajectoryError(f"columns does not say which are the {missing[0]}. {FORM}")
         if merged.time is None and merged.dt is None:
             raise TrajectoryError(
                 "columns must name the column of time stamps, as time: NAME, or say how far rows "
@@ -112,7 +112,7 @@ def columns_from(source: Any) -> Columns:
         where = f"'{source}'"
         source = _read_yml(Path(source).expanduser())
     if not isinstance(source, Mapping):
-        raise TrajectoryError(f"{where} holds a {type(source).__name__}. {_FORM}")
+        raise TrajectoryError(f"{where} holds a {type(source).__name__}. {FORM}")
     _check_keys(where, source, [field.name for field in dataclasses.fields(Columns)])
     seconds = {key: source[key] for key in ("dt", "gap") if source.get(key) is not None}
     return Columns(
@@ -152,7 +152,7 @@ def _entries(where: str, key: str, given: Any) -> tuple[Entry, ...] | None:
     if given is None:
         return None
     if isinstance(given, str | Mapping) or not isinstance(given, Iterable):
-        raise TrajectoryError(f"{where}: {key} must be a list of columns, got {given!r}. {_FORM}")
+        raise TrajectoryError(f"{where}: {key} must be a list of columns, got {given!r}. {FORM}")
     entries = tuple(
         _entry(f"{where}: {key}[{i}]", item, f"{key}[{i}]") for i, item in enumerate(given)
     )
@@ -163,7 +163,7 @@ def _entries(where: str, key: str, given: Any) -> tuple[Entry, ...] | None:
             "{column: NAME, name: OTHER}."
         )
     if key == "obs" and not entries:
-        raise TrajectoryError(f"{where}: obs must name at least one column. {_FORM}")
+        raise TrajectoryError(f"{where}: obs must name at least one column. {FORM}")
     return entries
 
 

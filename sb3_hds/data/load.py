@@ -21,6 +21,9 @@ from sb3_hds.data.tables import READERS, Log, read_log
 from sb3_hds.errors import TrajectoryError
 
 _SUFFIX = ".npz"  # of what Trajectories.save writes
+WITHOUT_COLUMNS = (
+    "Say what its columns mean: columns={'time': NAME, 'obs': [NAME, ...], 'actions': [NAME, ...]}."
+)
 
 Files = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
@@ -70,9 +73,11 @@ def load(files: Files, columns: Any = None) -> Trajectories:
     return dataclasses.replace(data, origin=np.array(steps.origin), report=report)
 
 
-def _paths(files: Files) -> list[str]:
+def _paths(files: Any) -> list[str]:
     """Every file that is meant, patterns expanded."""
     several = not isinstance(files, str | os.PathLike)
+    if several and not isinstance(files, Iterable):
+        raise TrajectoryError(f"files must be paths or patterns, got {files!r}.")
     found: list[str] = []
     for item in files if several else [files]:
         if not isinstance(item, str | os.PathLike):
@@ -104,8 +109,8 @@ def _log(path: str, said: Columns | None) -> Log:
     if said is None and Path(path).suffix in READERS and Path(path).suffix != recording.SUFFIX:
         raise TrajectoryError(
             f"'{path}' cannot be read without columns: files that end in {_SUFFIX} can, not those "
-            f"that end in '{Path(path).suffix}'. Say what its columns mean: "
-            "columns={'time': NAME, 'obs': [NAME, ...], 'actions': [NAME, ...]}."
+            f"that end in '{Path(path).suffix}'. "
+            f"{WITHOUT_COLUMNS}"
         )
     return read_log(Path(path), frozenset() if said is None else said.wanted)
 

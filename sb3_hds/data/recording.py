@@ -14,6 +14,7 @@ from sb3_hds.errors import TrajectoryError
 
 _FORMAT, _VERSION, SUFFIX = "sb3_hds.Recording", 1, ".jsonl"
 _RESERVED = ("time", "condition")
+_KEPT = "This is not recorded; what was before it is kept."
 
 
 class Recorder:
@@ -80,16 +81,13 @@ class Recorder:
 
         :param obs: the first observation, shape ``(n_obs,)``
         :param time: when it was measured [s]; default: the clock, or 0
-        :raises TrajectoryError: for another shape, or after :meth:`close`
+        :raises TrajectoryError: for another shape, for numbers that are not finite, or after
+            :meth:`close`
         """
-        self._time = self._now(0.0) if time is None else float(time)
-        self._write(
-            {
-                "time": self._time,
-                "obs": _row("obs", obs, self._obs),
-                "condition": str(self.condition),
-            }
-        )
+        now = self._stamp(0.0, time)
+        begun = {"time": now, "obs": _row("obs", obs, self._obs), "condition": str(self.condition)}
+        self._write(begun)
+        self._time = now
         os.fsync(self._file.fileno())
 
     def step(self, action: Any, obs: Any, time: float | None = None) -> None:
@@ -97,13 +95,20 @@ class Recorder:
         :param action: the command, shape ``(n_act,)``
         :param obs: what was measured after it, shape ``(n_obs,)``
         :param time: when that was measured [s]; default: the clock, or ``dt`` after the last one
-        :raises TrajectoryError: for another shape, before :meth:`start`, or after :meth:`close`
+        :raises TrajectoryError: for another shape, for numbers that are not finite, for time that
+            decreases, before :meth:`start`, or after :meth:`close`; the step is not recorded then
         """
         if self._time is None:
             raise TrajectoryError("No episode has begun: call start(obs) with the first one.")
-        self._time = self._now(self._time + self.dt) if time is None else float(time)
+        now = self._stamp(self._time + self.dt, time)
+        if now < self._time:
+            raise TrajectoryError(
+                f"time must not decrease within an episode, got {now:g} s after {self._time:g} s. "
+                f"If a new episode begins here, call start(obs). {_KEPT}"
+            )
         taken = _row("action", action, self._actions)
-        self._write({"time": self._time, "action": taken, "obs": _row("obs", obs, self._obs)})
+        self._write({"time": now, "action": taken, "obs": _row("obs", obs, self._obs)})
+        self._time = now
 
     def close(self) -> None:
         """Leave the file on the disk. A second call does nothing."""
@@ -117,8 +122,11 @@ class Recorder:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _now(self, otherwise: float) -> float:
-        return otherwise if self._clock is None else float(self._clock())
+    def _stamp(self, otherwise: float, given: float | None) -> float:
+        """The time that is given, or that of the clock."""
+        if given is None:
+            given = otherwise if self._clock is None else self._clock()
+        return _row("time", given, ["time"])[0]
 
     def _write(self, line: dict[str, Any]) -> None:
         if self._file.closed:
@@ -235,10 +243,21 @@ def _names(obs: Sequence[str], actions: Sequence[str]) -> tuple[list[str], list[
 
 
 def _row(argument: str, values: Any, names: list[str]) -> list[float]:
-    row = np.asarray(values, float).ravel()
+    try:
+        row = np.asarray(values, float).ravel()
+    except (TypeError, ValueError) as error:
+        raise TrajectoryError(
+            f"{argument} must hold numbers ({', '.join(names)}), got {values!r}. {_KEPT}"
+        ) from error
     if len(row) != len(names):
         raise TrajectoryError(
             f"{argument} must have {len(names)} numbers ({', '.join(names)}), got shape "
             f"{np.shape(values)}."
+        )
+    if not np.isfinite(row).all():
+        raise TrajectoryError(
+            f"{argument} must be finite ({', '.join(names)}), got {values!r}: the file could not "
+            f"be loaded. Where a measurement is missing, begin a new episode after it: start(obs). "
+            f"{_KEPT}"
         )
     return row.tolist()

@@ -2,6 +2,7 @@
 
 import difflib
 import itertools
+import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -112,7 +113,8 @@ def _values(table: Table, entry: Entry, n: int, source: str) -> np.ndarray:
         numbers = column.astype(np.float64)
     except (TypeError, ValueError) as error:
         raise TrajectoryError(
-            f"Column '{entry.column}' of '{source}' must hold numbers, got {_first_text(column)}."
+            f"Column '{entry.column}' of '{source}' must hold numbers, got {_first_text(column)}. "
+            f"{_way_out(column)}"
         ) from error
     return np.broadcast_to(entry.scale * numbers + entry.offset, n)
 
@@ -124,6 +126,23 @@ def _first_text(column: np.ndarray) -> str:
         except (TypeError, ValueError):
             return f"{value!r} in row {row}, counted from 0"
     return f"the type {column.dtype}"
+
+
+def _way_out(column: np.ndarray) -> str:
+    values = [str(value) for value in column.ravel()[:2]]
+    if any(re.search(r"\d[-/.:]\d+[-/.:]\d", value) for value in values):
+        return "Convert dates and times of day to seconds before."
+    if not all(map(_is_number, values[:1])) and all(map(_is_number, values[1:])):
+        return "If that is the row of units below the names (line 2 of the file), delete it."
+    return "Correct it, or delete that row."
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _labels(table: Table, column: str | None, n: int, constant: str) -> np.ndarray:
@@ -151,7 +170,8 @@ def _check(rows: Rows, columns: Columns) -> None:
                 f"Column '{entry.column if entry else 'time'}' of '{rows.source}' must be finite, "
                 f"got {values[row, channel]} in row {rows.numbers[row]}, counted from 0 "
                 f"({len(bad)} such values in all). Cut the log before it, or leave those rows out: "
-                "the gap then ends the episode."
+                "a gap of up to five intervals is interpolated, a longer one ends the episode "
+                "(gap: SECONDS in columns says when)."
             )
     back = np.flatnonzero(np.diff(rows.times) < 0.0)
     if len(back):

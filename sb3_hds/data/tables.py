@@ -68,8 +68,8 @@ def _read_csv(path: Path, wanted: frozenset[str]) -> Log:
     with path.open(encoding="utf-8-sig") as file:
         lines = (line.strip() for line in file if line.strip())
         head, first = next(lines, ""), next(lines, "")
-    separator = max((",", ";", "\t"), key=head.count)
-    separator = separator if separator in head else r"\s+"
+    separator = _separator(head)
+    _refuse_comment(path, head, first)
     names, fields = (_fields_of(line, separator) for line in (head.lstrip("#"), first))
     if names and all(_is_number(name) for name in names):
         raise TrajectoryError(
@@ -91,6 +91,22 @@ def _read_csv(path: Path, wanted: frozenset[str]) -> Log:
         table = pandas.read_csv(file, sep=separator, index_col=False, **exactly)
     table.columns = [str(name).strip() for name in table.columns]
     return Log([{name: table[name].to_numpy() for name in table.columns}])
+
+
+def _separator(line: str) -> str:
+    separator = max((",", ";", "\t"), key=line.count)
+    return separator if separator in line else r"\s+"
+
+
+def _refuse_comment(path: Path, head: str, first: str) -> None:
+    """:raises TrajectoryError: where the names of columns are not in the first line, but below"""
+    names, below = (_fields_of(x.lstrip("#"), _separator(x)) for x in (head, first))
+    text = len(below) > 1 and not any(_is_number(field) for field in below)
+    if first.startswith("#") or (text and len(below) != len(names)):
+        raise TrajectoryError(
+            f"'{path}' must begin with the names of its columns, and what follows must be numbers, "
+            f"got '{head[:60]}' and then '{first[:60]}'. Delete the lines before the names."
+        )
 
 
 def _fields_of(line: str, separator: str) -> list[str]:

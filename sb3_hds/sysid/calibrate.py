@@ -26,6 +26,8 @@ _FIRST_NOISE, _LEAST_NOISE = 0.05, 1e-7
 # Huber's threshold, in units of the noise: 95 % as efficient as least squares on Gaussian noise.
 _HUBER = 1.345
 _PASSES = 3
+# Beyond this ratio of two intervals, one is taken to be in another unit.
+_OTHER_UNIT = 100.0
 
 
 def calibrate(
@@ -160,9 +162,23 @@ def check_fits(twin: Twin, data: Trajectories) -> None:
         )
     if not np.isclose(data.dt, twin.dt, rtol=1e-6):
         raise CalibrationError(
-            f"{twin.name} steps by {twin.dt} s and the data are sampled at {data.dt} s. "
-            f"Use data.resample(dt={twin.dt}), or make the twin with dt={data.dt}."
+            f"{twin.name} steps by {twin.dt:g} s and the data are sampled every {data.dt:g} s. "
+            f"{_other_unit(data.dt / twin.dt)}Use data.resample(dt={twin.dt:g}) (in the map of "
+            f"columns, dt: {twin.dt:g}), or make the twin with dt={data.dt:g} (on the command "
+            f"line, --set dt:{data.dt:g})."
         )
+
+
+def _other_unit(ratio: float) -> str:
+    """What to do where stamps were taken for seconds that are thousands of times shorter."""
+    if ratio < _OTHER_UNIT:
+        return ""
+    order = int(np.clip(round(np.log10(ratio) / 3.0), 1, 3))
+    unit = ("milliseconds", "microseconds", "nanoseconds")[order - 1]
+    return (
+        f"The column of time may be in {unit}: then say so in the map of columns, "
+        f"time: {{column: NAME, scale: {10.0 ** (-3 * order):g}}}. Otherwise: "
+    )
 
 
 def every_name(twin: Twin) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
 """Find out what a simulation gets wrong: propose on some recordings, confirm once on others."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from numbers import Integral
 from typing import Literal
 
@@ -11,13 +11,15 @@ from sb3_hds.sysid.calibrate import check_fits
 from sb3_hds.sysid.diagnosis import Diagnosis
 from sb3_hds.sysid.inquiry import EFFORTS, Inquiry
 
+_DESCRIBED = ("name", "slot", "parameters", "explanation")  # what a finding is told with
+
 
 def diagnose(
     twin: Twin,
     data: Trajectories,
     *,
-    effects: Sequence[type[Effect] | str] = ALL,
-    calibrate: Sequence[str] = (),
+    effects: type[Effect] | str | Sequence[type[Effect] | str] = ALL,
+    calibrate: str | Sequence[str] = (),
     seed: int = 0,
     budget: Literal["full", "quick"] = "full",
     progress: bool = True,
@@ -60,19 +62,35 @@ def diagnose(
         raise CalibrationError(f"budget must be 'full' or 'quick', got {budget!r}.")
     if not isinstance(seed, Integral) or seed < 0:
         raise CalibrationError(f"seed must be a whole number of at least 0, got {seed!r}.")
-    kinds = classes_of(effects)
-    inquiry = Inquiry(twin, data, kinds, tuple(calibrate), int(seed), budget, progress)
+    kinds, nuisances = classes_of(effects), _names_of(calibrate)
+    inquiry = Inquiry(twin, data, kinds, nuisances, int(seed), budget, progress)
     reason = inquiry.poor()
     return inquiry.refused(reason) if reason else inquiry.run()
 
 
-def classes_of(effects: Sequence[type[Effect] | str]) -> tuple[type[Effect], ...]:
+def _names_of(calibrate: str | Iterable[str]) -> tuple[str, ...]:
+    """:return: names of parameters, of which a single one may stand alone"""
+    if isinstance(calibrate, str):
+        return (calibrate,)
+    names = tuple(calibrate) if isinstance(calibrate, Iterable) else (calibrate,)
+    if not all(isinstance(name, str) for name in names):
+        raise CalibrationError(
+            f"calibrate is a list of names of parameters, such as ['mass'], got {calibrate!r}. "
+            "Leave it out where all of them are believed."
+        )
+    return names
+
+
+def classes_of(
+    effects: type[Effect] | str | Iterable[type[Effect] | str],
+) -> tuple[type[Effect], ...]:
     """
-    :param effects: classes, or names of the catalogue
+    :param effects: classes, or names of the catalogue, of which a single one may stand alone
     :raises EffectError: for anything else
     """
     known = {effect.name: effect for effect in ALL}
-    given = [effects] if isinstance(effects, str | type) else list(effects)
+    single = isinstance(effects, str | type) or not isinstance(effects, Iterable)
+    given = [effects] if single else list(effects)
     unknown = [one for one in given if isinstance(one, str) and one not in known]
     if unknown:
         raise EffectError(
@@ -83,6 +101,18 @@ def classes_of(effects: Sequence[type[Effect] | str]) -> tuple[type[Effect], ...
     if wrong:
         raise EffectError(
             f"effects are classes, such as sb3_hds.effects.CoulombFriction, or their names, got "
-            f"{wrong[0]!r}."
+            f"{wrong[0]!r}. Leave them out to try the whole catalogue."
         )
+    for kind in found:
+        _check_described(kind)
     return tuple(found)
+
+
+def _check_described(kind: type[Effect]) -> None:
+    missing = [name for name in _DESCRIBED if not hasattr(kind, name)]
+    if missing:
+        raise EffectError(
+            f"The effect {kind.__name__} lacks {', '.join(missing)}: an effect that is looked for "
+            "says what it is called, where it acts, what its parameters are, and what it is, in "
+            f"one sentence. Write it into the class: {missing[0]} = ..."
+        )

@@ -240,6 +240,7 @@ class Diagnosis:
         :param policy_gain: what ``measure_policy_gain`` returned, where it was measured
         :return: its path
         :raises ImportError: without matplotlib and jinja2 (extra ``report``)
+        :raises OSError: if there is no folder to write it in
         """
         from sb3_hds.sysid.report import write_report
 

@@ -320,6 +320,8 @@ def _look(
     return jax.vmap(one)(offsets, shots)
 
 
+# States that grow beyond any bound are counted as errors of a fixed size: they need no warning.
+@np.errstate(over="ignore", invalid="ignore")
 def _normal(
     raw: np.ndarray,
     by_start: np.ndarray,
@@ -353,6 +355,7 @@ def _normal(
     )
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _eliminated(blocks: _Blocks, damping: float) -> _Step:
     free = blocks.own.shape[1]
     diagonal = np.einsum("nff->nf", blocks.own)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_hds.core.storage import write_bytes
+from sb3_hds.core.storage import check_target, write_bytes
 from sb3_hds.sysid import plots
 from sb3_hds.sysid.diagnosis import Diagnosis
 from sb3_hds.sysid.units import sizes_in_words, with_unit
@@ -122,7 +122,9 @@ def write_report(
     :param path: of the page; a file of that name is replaced as a whole
     :param policy_gain: as plain data
     :raises ImportError: without matplotlib and jinja2
+    :raises OSError: if there is no folder to write it in
     """
+    check_target(path)
     check_installed()
     import jinja2
 

@@ -1,6 +1,7 @@
 """Which twins exist, by name and by environment id."""
 
 import difflib
+import importlib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -47,18 +48,25 @@ def all_ids() -> list[str]:
 
 def get(name_or_env_id: str) -> type[Twin]:
     """
+    :param name_or_env_id: also ``"module:Name"``, as in ``gymnasium.make``: the module, which
+        registers the twin, is imported first
     :return: the class registered under a name or an environment id
     :raises NoTwinError: if there is none; the message lists what exists and how to add one's own
     """
+    name = str(name_or_env_id)
+    module, colon, inner = name.rpartition(":")
+    if colon:
+        return _imported(module, inner)
     try:
-        return _TWINS[name_or_env_id]
+        return _TWINS[name]
     except KeyError:
-        raise NoTwinError(_how_to_add_one(str(name_or_env_id))) from None
+        raise NoTwinError(_how_to_add_one(name)) from None
 
 
 def make(name_or_env_id: str, **settings: Any) -> Twin:
     """
-    :param name_or_env_id: ``"Pendulum"`` or ``"Pendulum-v1"``
+    :param name_or_env_id: ``"Pendulum"``, ``"Pendulum-v1"``, or ``"module:MyTwin"``, which imports
+        the module that registers it
     :param settings: values of parameters, options of the twin, ``dt`` [s], ``substeps``
     :raises NoTwinError: if there is no such twin
     :raises ParameterError: for a setting that the twin does not have, or a value out of bounds
@@ -102,6 +110,28 @@ def from_spec(spec: Mapping[str, Any], effects: Iterable[type[Effect]] = ()) -> 
     ]
     twin = twin.extend(*attached) if attached else twin
     return seen_through(twin, spec.get("transforms", ()))
+
+
+def _imported(module: str, name: str) -> type[Twin]:
+    """:return: the twin that is registered under the name once the module is imported"""
+    wanted = f"{module}:{name}"
+    if not (name and all(part.isidentifier() for part in module.split("."))):
+        raise NoTwinError(f"A twin of one's own is asked for as module:Name, got '{wanted}'.")
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        raise NoTwinError(
+            f"There is no twin for '{wanted}': the module cannot be imported ({error}). It has to "
+            "be installed, or its folder on the path of Python (PYTHONPATH)."
+        ) from error
+    if name in _TWINS:
+        return _TWINS[name]
+    theirs = [key for key, twin in _TWINS.items() if twin.__module__ == module]
+    raise NoTwinError(
+        f"There is no twin for '{wanted}': module '{module}' registers "
+        f"{', '.join(sorted(theirs)) or 'no twin'}, not '{name}'. What counts is the 'name' or "
+        "'env_id' of a class that is decorated with @twins.register."
+    )
 
 
 def _how_to_add_one(wanted: str) -> str:
