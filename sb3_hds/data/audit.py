@@ -23,7 +23,7 @@ from sb3_hds.data.resolution import resolutions
 from sb3_hds.data.results import Audit, ChannelSummary
 from sb3_hds.data.stillness import stillness_of
 from sb3_hds.data.stretches import stretches_of
-from sb3_hds.data.velocity import velocity_shifts
+from sb3_hds.data.velocity import matches_of, velocity_shifts
 from sb3_hds.errors import TrajectoryError
 
 
@@ -59,9 +59,10 @@ def audit(data: Trajectories, channels: Sequence[str | Channel] | None = None) -
     unfit = any(isinstance(finding, Outliers | StandingStill | WithinNoise) for finding in found)
     found += _sampling(data, report)
     if not unfit:
+        matches = matches_of(data, names)
         found += [
             *continuity.reinitialised(rows, names, resolution),
-            *velocity_shifts(data, names),
+            *velocity_shifts(data, names, matches),
             *continuity.stuck(rows, names, resolution),
             *continuity.saturated(rows, names, resolution),
             *continuity.repeated_samples(rows, names, resolution),
