@@ -7,6 +7,7 @@ from measuring import measured
 
 from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import NO_EFFECTS, Channel, Joint, Parameter, State, Trajectories, Twin
+from sb3_hds.data import SamplingWarning
 from sb3_hds.errors import CalibrationError, EffectError, ParameterError
 
 FRICTION = (effects.ViscousFriction, effects.CoulombFriction)
@@ -43,6 +44,22 @@ def test_a_sensor_that_reports_nothing_gets_no_name():
 
     assert found.verdict == "not_identifiable" and not found.findings
     assert any("'hinge_velocity' stays at exactly 0" in caveat for caveat in found.caveats)
+
+
+def test_one_recording_of_rest_is_refused_because_nothing_moves_with_all_other_caveats(tmp_path):
+    rng = np.random.default_rng(0)
+    t = np.cumsum(0.02 * rng.uniform(0.7, 1.3, 200))
+    rows = np.column_stack([t, 0.01 * rng.standard_normal((200, 2)), np.zeros(200)])
+    np.savetxt(tmp_path / "rest.csv", rows, delimiter=",", header="t,q,v,u", comments="")
+    columns = {"time": "t", "obs": ["q", "v"], "actions": ["u"], "dt": 0.02}
+    with pytest.warns(SamplingWarning):
+        data = Trajectories.load(tmp_path / "rest.csv", columns=columns)
+
+    found = asked(swinging()[0], data)
+
+    assert found.verdict == "not_identifiable"
+    assert "stands still" in found.caveats[0] and "pieces of evidence" not in str(found)
+    assert any("Time stamps jitter" in caveat for caveat in found.caveats[1:])
 
 
 def test_an_extended_twin_is_asked_again_by_one_name_for_each_cause():
