@@ -46,6 +46,22 @@ def test_a_sensor_that_reports_nothing_gets_no_name():
     assert any("'hinge_velocity' stays at exactly 0" in caveat for caveat in found.caveats)
 
 
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda obs: obs * [180.0 / np.pi, 1.0], "as if 'hinge_position' were in degrees"),
+        (lambda obs: obs[:, ::-1], "They are swapped"),
+    ],
+)
+def test_columns_that_are_not_what_the_twin_takes_them_for_get_no_name(change, says):
+    twin, data = swinging()
+
+    found = asked(twin, changed(data, change))
+
+    assert found.verdict == "not_identifiable" and not found.findings
+    assert says in found.caveats[0]
+
+
 def test_one_recording_of_rest_is_refused_because_nothing_moves_with_all_other_caveats(tmp_path):
     rng = np.random.default_rng(0)
     t = np.cumsum(0.02 * rng.uniform(0.7, 1.3, 200))

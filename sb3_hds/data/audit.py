@@ -23,6 +23,7 @@ from sb3_hds.data.resolution import resolutions
 from sb3_hds.data.results import Audit, ChannelSummary
 from sb3_hds.data.stillness import stillness_of
 from sb3_hds.data.stretches import stretches_of
+from sb3_hds.data.units import other_units, swapped
 from sb3_hds.data.velocity import matches_of, velocity_shifts
 from sb3_hds.errors import TrajectoryError
 
@@ -32,11 +33,13 @@ def audit(data: Trajectories, channels: Sequence[str | Channel] | None = None) -
     Look for defects of the recording, which physics would have to explain otherwise.
 
     Uneven, repeated and missing samples; channels that are stuck or cut off; a state that was put
-    back inside a recording; values beyond all measure; a velocity that comes late or early; the
-    noise while standing still; too little motion. Where the data were read from logs, rows are
-    checked as they were measured. It is *not* told which channels are velocities: it finds them by
-    their correlation with the derivatives of others, and finds none in data that hardly move. What
-    is judged by its motion is not judged in data without any, nor beside values beyond all measure.
+    back inside a recording; values beyond all measure; a velocity that comes late or early, or in
+    other units than its position; the noise while standing still; too little motion. Where the
+    data were read from logs, rows are checked as they were measured. Velocities are found by their
+    correlation with the derivatives of others, none in data that hardly move; where channels have
+    units, these say which may be one, and positions and velocities that are swapped are found.
+    What is judged by its motion is not judged in data without any, nor beside values beyond all
+    measure.
 
     :param data: of any kind
     :param channels: names of the observation channels, or a twin's ``channels``; default: those
@@ -62,6 +65,8 @@ def audit(data: Trajectories, channels: Sequence[str | Channel] | None = None) -
         matches = matches_of(data, names)
         found += [
             *continuity.reinitialised(rows, names, resolution),
+            *other_units(data, named, matches),
+            *swapped(data, named, matches),
             *velocity_shifts(data, names, matches),
             *continuity.stuck(rows, names, resolution),
             *continuity.saturated(rows, names, resolution),

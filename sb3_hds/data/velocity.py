@@ -171,9 +171,12 @@ def _positions(
 
 
 def _unwrapped(x: np.ndarray) -> np.ndarray:
-    """With turns counted, where the values look like a wrapped angle [rad]."""
-    wraps = np.abs(np.abs(np.diff(x)) - 2.0 * np.pi) < 1.0
-    return np.unwrap(x) if wraps.any() and np.ptp(x) < 2.1 * np.pi else x
+    """With turns counted, where the values look like a wrapped angle [rad] or [deg]."""
+    for turn in (2.0 * np.pi, 360.0):
+        wraps = np.abs(np.abs(np.diff(x)) - turn) < turn / (2.0 * np.pi)
+        if wraps.any() and np.ptp(x) < 1.05 * turn:
+            return np.unwrap(x, period=turn)
+    return x
 
 
 def _stderr(pairs: Pairs, dt: float, reach: int, width: int) -> float:
