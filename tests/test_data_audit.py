@@ -670,3 +670,47 @@ def test_units_that_nobody_says_are_not_swapped():
     data = changed(pendulum_data(), lambda _, obs, actions: (obs[:, ::-1], actions))
 
     assert audit(data, ["a", "b"]).findings == ()
+
+
+# --- single samples
+
+
+@pytest.mark.parametrize("channel", [0, 1])
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_single_sample_that_jumps_away_and_back_is_refused_and_cut_out(channel, noise):
+    clean = pendulum_data(noise=noise)
+
+    def spoil(i, obs, actions):
+        obs[100 + 10 * i, channel] += 3.0 * np.ptp(obs[:, channel])
+        return obs, actions
+
+    data = changed(clean, spoil)
+    found = audit(data, KNOWN)
+    better = found.corrected(data)
+
+    [finding] = found.findings
+    assert type(finding).__name__ == "Glitches" and not found.usable
+    assert [(p.trajectory, p.first) for p in finding.places] == [
+        (i, 100 + 10 * i) for i in range(8)
+    ]
+    assert f"'{KNOWN[channel].name}' jumps to" in found.reason and "cuts" in found.reason
+    assert audit(better, KNOWN).findings == () and len(better) == 16
+    assert found.corrections == ("Samples were cut out at 8 places with outliers.",)
+
+
+@pytest.mark.parametrize("what", ["an impact", "a tick at rest", "a wrapped angle", "a blow"])
+def test_a_jump_that_motion_makes_is_no_glitch(what):
+    def shape(i, obs, actions):
+        if what == "an impact":
+            obs[200:, 1] *= -1.0
+        if what == "a blow" and i == 3:
+            obs[200:260, 1] += 100.0 * np.exp(-np.arange(60) / 2.0)
+        if what == "a tick at rest":
+            obs[:] = obs[0]
+            obs[200, 0] += 1e-3
+        if what == "a wrapped angle":
+            obs[:, 0] = np.pi - 0.01 * np.abs(obs[:, 0])
+            obs[200, 0] -= 2.0 * np.pi
+        return obs, actions
+
+    assert "Glitches" not in kinds(audit(changed(pendulum_data(), shape), KNOWN))

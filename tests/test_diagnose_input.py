@@ -51,6 +51,7 @@ def test_a_sensor_that_reports_nothing_gets_no_name():
     [
         (lambda obs: obs * [180.0 / np.pi, 1.0], "as if 'hinge_position' were in degrees"),
         (lambda obs: obs[:, ::-1], "They are swapped"),
+        (lambda obs: obs + 50.0 * (np.arange(len(obs)) == 50)[:, None], "in a single sample"),
     ],
 )
 def test_columns_that_are_not_what_the_twin_takes_them_for_get_no_name(change, says):

@@ -17,12 +17,13 @@ from sb3_hds.data.findings import (
     UnevenSampling,
     WithinNoise,
 )
+from sb3_hds.data.glitches import glitches
 from sb3_hds.data.outliers import outliers
 from sb3_hds.data.report import Reading
 from sb3_hds.data.resolution import resolutions
 from sb3_hds.data.results import Audit, ChannelSummary
 from sb3_hds.data.stillness import stillness_of
-from sb3_hds.data.stretches import stretches_of
+from sb3_hds.data.stretches import Stretch, stretches_of
 from sb3_hds.data.units import other_units, swapped
 from sb3_hds.data.velocity import matches_of, velocity_shifts
 from sb3_hds.errors import TrajectoryError
@@ -56,7 +57,7 @@ def audit(data: Trajectories, channels: Sequence[str | Channel] | None = None) -
     resolution = resolutions([stretch.obs for stretch in rows]) if known is None else known
     still = stillness_of(rows, resolution)
     # Where values are beyond all measure, so are the spreads that everything else is compared with.
-    found: list[Finding] = list(outliers(rows, names))
+    found: list[Finding] = _beyond(rows, names, resolution)
     if not found:
         found += excitation(data, still, names, actions)
     unfit = any(isinstance(finding, Outliers | StandingStill | WithinNoise) for finding in found)
@@ -107,6 +108,13 @@ def _channels(
             f"channels, got {[channel.name for channel in named]}."
         )
     return named
+
+
+def _beyond(rows: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray) -> list[Finding]:
+    """Outliers, and glitches of channels without any."""
+    found: list[Finding] = [*outliers(rows, names)]
+    far = {finding.channel for finding in found}
+    return [*found, *(f for f in glitches(rows, names, resolution) if f.channel not in far)]
 
 
 def _sampling(data: Trajectories, report: Reading | None) -> list[Finding]:

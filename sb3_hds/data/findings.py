@@ -154,6 +154,25 @@ class Outliers(Finding):
 
 
 @dataclasses.dataclass(frozen=True)
+class Glitches(Outliers):
+    """
+    Single samples, far from those around them.
+
+    :param step: largest from one sample to the next elsewhere in these recordings
+    """
+
+    step: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' jumps to {self.value:.4g} and back in a single sample, where it "
+            f"moves by {self.step:.3g} at most from one sample to the next "
+            f"({listed(self.places)})."
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class ReinitialisedState(Finding):
     """
     :param to_start: whether the state jumps to where a recording begins
