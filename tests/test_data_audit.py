@@ -8,6 +8,7 @@ import pytest
 from measuring import measured
 
 from sb3_hds import Trajectories, audit, twins
+from sb3_hds.core import Channel
 from sb3_hds.data import Finding, SamplingWarning
 from sb3_hds.errors import TrajectoryError
 
@@ -591,3 +592,125 @@ def test_short_recordings_are_no_error(n):
     data = Trajectories.from_arrays([obs], [np.sin(3.0 * time[:-1, None])], dt=0.05)
 
     assert audit(data).velocity_shift == {}
+
+
+# --- channels that are not what they are taken for
+
+
+def pendulum_data(dt=0.01, noise=0.0, n=400):
+    """Angle and speed of eight swings that differ in amplitude and frequency."""
+    rng = np.random.default_rng(0)
+    t = dt * np.arange(n + 1)
+    recordings = []
+    for w in np.linspace(3.0, 6.0, 8):
+        angle = 0.8 * np.sin(w * t) + 0.4 * np.sin(0.37 * w * t + 1.0)
+        speed = 0.8 * w * np.cos(w * t) + 0.4 * 0.37 * w * np.cos(0.37 * w * t + 1.0)
+        both = np.stack([angle, speed], axis=1)
+        recordings.append(both + noise * both.std(0) * rng.standard_normal(both.shape))
+    actions = [rng.standard_normal((n, 1)) for _ in recordings]
+    return Trajectories.from_arrays(recordings, actions, dt=dt)
+
+
+KNOWN = (Channel("angle", "rad"), Channel("speed", "rad/s"))
+
+
+@pytest.mark.parametrize("channels", [("angle", "speed"), KNOWN])
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+@pytest.mark.parametrize(
+    ("scales", "says"),
+    [
+        ((180.0 / np.pi, 1.0), "as if 'angle' were in degrees"),
+        ((1.0, 180.0 / np.pi), "as if 'speed' were in degrees"),
+        ((1000.0, 1.0), "as if 'angle' were in millimetres"),
+        ((1.0, 30.0), "one of them is in other units."),
+    ],
+)
+def test_a_position_in_other_units_than_its_velocity_is_refused(channels, noise, scales, says):
+    data = changed(pendulum_data(noise=noise), lambda _, obs, actions: (obs * scales, actions))
+
+    found = audit(data, channels)
+
+    assert kinds(found) == {"OtherUnits"} and not found.usable
+    assert found.findings[0].factor == pytest.approx(scales[0] / scales[1], rel=0.1)
+    assert says in found.reason and "Give that one its scale in columns" in found.reason
+
+
+def test_a_wrapped_angle_in_degrees_is_in_other_units_than_its_velocity():
+    t = 0.01 * np.arange(401)
+    obs = [
+        np.stack([np.degrees(w * t + np.sin(w * t)) % 360.0, w + w * np.cos(w * t)], axis=1)
+        for w in np.linspace(3.0, 6.0, 8)
+    ]
+    actions = [np.random.default_rng(0).standard_normal((400, 1))] * 8
+
+    found = audit(Trajectories.from_arrays(obs, actions, dt=0.01), KNOWN)
+
+    assert "as if 'angle' were in degrees" in found.reason
+
+
+@pytest.mark.parametrize("factor", [0.2, 0.8, 1.25, 8.0])
+@pytest.mark.parametrize("dt", [0.01, 0.05, 0.2])
+def test_a_factor_that_a_scale_of_the_sensor_explains_is_left_to_it(factor, dt):
+    data = changed(pendulum_data(dt), lambda _, obs, actions: (obs * [factor, 1.0], actions))
+
+    assert "OtherUnits" not in kinds(audit(data, KNOWN)) | kinds(audit(data))
+
+
+def test_a_position_and_a_velocity_that_are_swapped_are_refused():
+    data = changed(pendulum_data(), lambda _, obs, actions: (obs[:, ::-1], actions))
+
+    found = audit(data, KNOWN)
+
+    assert kinds(found) == {"Swapped"} and not found.usable
+    assert "'angle' should be a position and is the derivative of 'speed'" in found.reason
+    assert "in the order of the twin's channels" in found.reason
+
+
+def test_units_that_nobody_says_are_not_swapped():
+    data = changed(pendulum_data(), lambda _, obs, actions: (obs[:, ::-1], actions))
+
+    assert audit(data, ["a", "b"]).findings == ()
+
+
+# --- single samples
+
+
+@pytest.mark.parametrize("channel", [0, 1])
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_single_sample_that_jumps_away_and_back_is_refused_and_cut_out(channel, noise):
+    clean = pendulum_data(noise=noise)
+
+    def spoil(i, obs, actions):
+        obs[100 + 10 * i, channel] += 3.0 * np.ptp(obs[:, channel])
+        return obs, actions
+
+    data = changed(clean, spoil)
+    found = audit(data, KNOWN)
+    better = found.corrected(data)
+
+    [finding] = found.findings
+    assert type(finding).__name__ == "Glitches" and not found.usable
+    assert [(p.trajectory, p.first) for p in finding.places] == [
+        (i, 100 + 10 * i) for i in range(8)
+    ]
+    assert f"'{KNOWN[channel].name}' jumps to" in found.reason and "cuts" in found.reason
+    assert audit(better, KNOWN).findings == () and len(better) == 16
+    assert found.corrections == ("Samples were cut out at 8 places with outliers.",)
+
+
+@pytest.mark.parametrize("what", ["an impact", "a tick at rest", "a wrapped angle", "a blow"])
+def test_a_jump_that_motion_makes_is_no_glitch(what):
+    def shape(i, obs, actions):
+        if what == "an impact":
+            obs[200:, 1] *= -1.0
+        if what == "a blow" and i == 3:
+            obs[200:260, 1] += 100.0 * np.exp(-np.arange(60) / 2.0)
+        if what == "a tick at rest":
+            obs[:] = obs[0]
+            obs[200, 0] += 1e-3
+        if what == "a wrapped angle":
+            obs[:, 0] = np.pi - 0.01 * np.abs(obs[:, 0])
+            obs[200, 0] -= 2.0 * np.pi
+        return obs, actions
+
+    assert "Glitches" not in kinds(audit(changed(pendulum_data(), shape), KNOWN))

@@ -16,6 +16,7 @@ from sb3_hds.core import (
     Trajectories,
     Twin,
 )
+from sb3_hds.data import SamplingWarning
 from sb3_hds.errors import CalibrationError, EffectError, ParameterError
 
 FRICTION = (effects.ViscousFriction, effects.CoulombFriction)
@@ -52,6 +53,39 @@ def test_a_sensor_that_reports_nothing_gets_no_name():
 
     assert found.verdict == "not_identifiable" and not found.findings
     assert any("'hinge_velocity' stays at exactly 0" in caveat for caveat in found.caveats)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda obs: obs * [180.0 / np.pi, 1.0], "as if 'hinge_position' were in degrees"),
+        (lambda obs: obs[:, ::-1], "They are swapped"),
+        (lambda obs: obs + 50.0 * (np.arange(len(obs)) == 50)[:, None], "in a single sample"),
+    ],
+)
+def test_columns_that_are_not_what_the_twin_takes_them_for_get_no_name(change, says):
+    twin, data = swinging()
+
+    found = asked(twin, changed(data, change))
+
+    assert found.verdict == "not_identifiable" and not found.findings
+    assert says in found.caveats[0]
+
+
+def test_one_recording_of_rest_is_refused_because_nothing_moves_with_all_other_caveats(tmp_path):
+    rng = np.random.default_rng(0)
+    t = np.cumsum(0.02 * rng.uniform(0.7, 1.3, 200))
+    rows = np.column_stack([t, 0.01 * rng.standard_normal((200, 2)), np.zeros(200)])
+    np.savetxt(tmp_path / "rest.csv", rows, delimiter=",", header="t,q,v,u", comments="")
+    columns = {"time": "t", "obs": ["q", "v"], "actions": ["u"], "dt": 0.02}
+    with pytest.warns(SamplingWarning):
+        data = Trajectories.load(tmp_path / "rest.csv", columns=columns)
+
+    found = asked(swinging()[0], data)
+
+    assert found.verdict == "not_identifiable"
+    assert "stands still" in found.caveats[0] and "pieces of evidence" not in str(found)
+    assert any("Time stamps jitter" in caveat for caveat in found.caveats[1:])
 
 
 def test_an_extended_twin_is_asked_again_by_one_name_for_each_cause():

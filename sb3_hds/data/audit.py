@@ -17,13 +17,15 @@ from sb3_hds.data.findings import (
     UnevenSampling,
     WithinNoise,
 )
+from sb3_hds.data.glitches import glitches
 from sb3_hds.data.outliers import outliers
 from sb3_hds.data.report import Reading
 from sb3_hds.data.resolution import resolutions
 from sb3_hds.data.results import Audit, ChannelSummary
 from sb3_hds.data.stillness import stillness_of
-from sb3_hds.data.stretches import stretches_of
-from sb3_hds.data.velocity import velocity_shifts
+from sb3_hds.data.stretches import Stretch, stretches_of
+from sb3_hds.data.units import other_units, swapped
+from sb3_hds.data.velocity import matches_of, velocity_shifts
 from sb3_hds.errors import TrajectoryError
 
 
@@ -32,11 +34,13 @@ def audit(data: Trajectories, channels: Sequence[str | Channel] | None = None) -
     Look for defects of the recording, which physics would have to explain otherwise.
 
     Uneven, repeated and missing samples; channels that are stuck or cut off; a state that was put
-    back inside a recording; values beyond all measure; a velocity that comes late or early; the
-    noise while standing still; too little motion. Where the data were read from logs, rows are
-    checked as they were measured. It is *not* told which channels are velocities: it finds them by
-    their correlation with the derivatives of others, and finds none in data that hardly move. What
-    is judged by its motion is not judged in data without any, nor beside values beyond all measure.
+    back inside a recording; values beyond all measure; a velocity that comes late or early, or in
+    other units than its position; the noise while standing still; too little motion. Where the
+    data were read from logs, rows are checked as they were measured. Velocities are found by their
+    correlation with the derivatives of others, none in data that hardly move; where channels have
+    units, these say which may be one, and positions and velocities that are swapped are found.
+    What is judged by its motion is not judged in data without any, nor beside values beyond all
+    measure.
 
     :param data: of any kind
     :param channels: names of the observation channels, or a twin's ``channels``; default: those
@@ -53,15 +57,18 @@ def audit(data: Trajectories, channels: Sequence[str | Channel] | None = None) -
     resolution = resolutions([stretch.obs for stretch in rows]) if known is None else known
     still = stillness_of(rows, resolution)
     # Where values are beyond all measure, so are the spreads that everything else is compared with.
-    found: list[Finding] = list(outliers(rows, names))
+    found: list[Finding] = _beyond(rows, names, resolution)
     if not found:
         found += excitation(data, still, names, actions)
     unfit = any(isinstance(finding, Outliers | StandingStill | WithinNoise) for finding in found)
     found += _sampling(data, report)
     if not unfit:
+        matches = matches_of(data, names)
         found += [
             *continuity.reinitialised(rows, names, resolution),
-            *velocity_shifts(data, names),
+            *other_units(data, named, matches),
+            *swapped(data, named, matches),
+            *velocity_shifts(data, names, matches),
             *continuity.stuck(rows, names, resolution),
             *continuity.saturated(rows, names, resolution),
             *continuity.repeated_samples(rows, names, resolution),
@@ -101,6 +108,13 @@ def _channels(
             f"channels, got {[channel.name for channel in named]}."
         )
     return named
+
+
+def _beyond(rows: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray) -> list[Finding]:
+    """Outliers, and glitches of channels without any."""
+    found: list[Finding] = [*outliers(rows, names)]
+    far = {finding.channel for finding in found}
+    return [*found, *(f for f in glitches(rows, names, resolution) if f.channel not in far)]
 
 
 def _sampling(data: Trajectories, report: Reading | None) -> list[Finding]:

@@ -154,6 +154,25 @@ class Outliers(Finding):
 
 
 @dataclasses.dataclass(frozen=True)
+class Glitches(Outliers):
+    """
+    Single samples, far from those around them.
+
+    :param step: largest from one sample to the next elsewhere in these recordings
+    """
+
+    step: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' jumps to {self.value:.4g} and back in a single sample, where it "
+            f"moves by {self.step:.3g} at most from one sample to the next "
+            f"({listed(self.places)})."
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class ReinitialisedState(Finding):
     """
     :param to_start: whether the state jumps to where a recording begins
@@ -204,6 +223,62 @@ class VelocityShift(Finding):
         "Shift it: audit.corrected(data). A filter in the drive is the usual cause; uncorrected, "
         "it passes for a delay or for friction."
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class OtherUnits(Finding):
+    """
+    A velocity follows the derivative of a position, but for a factor that no sensor is off by.
+
+    :param position: name of the channel whose derivative it is
+    :param factor: by which that changes faster than the velocity says
+    """
+
+    blocks = True
+    position: str
+    factor: float
+
+    @property
+    def sentence(self) -> str:
+        fast = f"changes {self.factor:.3g} times as fast as '{self.channel}' says"
+        return (
+            f"'{self.position}' {fast} ({recordings(self.places)}): one of them is in other units"
+            f"{self._likely}."
+        )
+
+    @property
+    def _likely(self) -> str:
+        for unit, factor in _UNITS.items():
+            for name, ratio in ((self.position, factor), (self.channel, 1.0 / factor)):
+                if abs(self.factor / ratio - 1.0) < _NEAR:
+                    return f", as if '{name}' were in {unit}"
+        return ""
+
+    remedy = (
+        "Give that one its scale in columns: 0.0174533 if it is in degrees, 0.001 if it is in "
+        "millimetres."
+    )
+
+
+_UNITS = {"degrees": 57.29578, "millimetres": 1000.0, "centimetres": 100.0}
+_NEAR = 0.15  # what a central difference and noise may change of the factor
+
+
+@dataclasses.dataclass(frozen=True)
+class Swapped(Finding):
+    """:param derivative_of: name of the channel whose derivative this one is, and not vice versa"""
+
+    blocks = True
+    derivative_of: str
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' should be a position and is the derivative of "
+            f"'{self.derivative_of}', which should be its velocity ({recordings(self.places)})."
+        )
+
+    remedy = "They are swapped: name the columns of obs in the order of the twin's channels."
 
 
 @dataclasses.dataclass(frozen=True)

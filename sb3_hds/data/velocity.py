@@ -45,10 +45,44 @@ class Lag(NamedTuple):
     better: float
 
 
-def velocity_shifts(data: Trajectories, names: Sequence[str]) -> list[VelocityShift]:
+class Match(NamedTuple):
+    """
+    A channel that follows the derivative of another one, whatever the factor.
+
+    :param velocity: channel
+    :param position: name of what it follows the derivative of
+    :param parts: channels of that: one, or those of a cosine and a sine
+    :param pairs: both, per episode
+    :param scores: of these
+    :param width: of the moving average [samples]
+    """
+
+    velocity: int
+    position: str
+    parts: tuple[int, ...]
+    pairs: Pairs
+    scores: "_Scores"
+    width: int
+
+    @property
+    def agrees(self) -> bool:
+        """Whether both are in the same unit."""
+        return abs(self.scores.slope_there - 1.0) < _SAME
+
+    def slopes(self, dt: float) -> Float64[np.ndarray, " blocks"]:
+        """:return: of the velocity on the derivative, in blocks of the data, at the same lag"""
+        reach, there = len(self.scores.slope) // 2, int(self.scores.correlation.argmax())
+        blocks = _blocks(self.pairs, reach, self.width)
+        return np.array([_Scores.of([b], dt, reach, self.width).slope[there] for b in blocks])
+
+
+def velocity_shifts(
+    data: Trajectories, names: Sequence[str], matches: Sequence[Match]
+) -> list[VelocityShift]:
     """
     :param data: at one interval
     :param names: of the observation channels
+    :param matches: of the data
     :return: the lags that are longer than a backward difference has, beyond doubt, and either long
         or the cause of half of what the derivative leaves unexplained
     """
@@ -62,7 +96,7 @@ def velocity_shifts(data: Trajectories, names: Sequence[str]) -> list[VelocitySh
             seconds=lag.samples * data.dt,
             stderr=lag.stderr,
         )
-        for lag in lags_of(data, names)
+        for lag in _lags(matches, data.dt)
         if abs(lag.samples) >= max(_VISIBLE, _SIGMAS * lag.stderr)
         and (lag.better >= _BETTER or abs(lag.samples) >= _LONG)
     ]
@@ -70,7 +104,17 @@ def velocity_shifts(data: Trajectories, names: Sequence[str]) -> list[VelocitySh
 
 def lags_of(data: Trajectories, names: Sequence[str]) -> list[Lag]:
     """
-    Pairs of a position and its velocity, found by their correlation, and the lag between them.
+    Pairs of a position and its velocity in the same unit, and the lag between them.
+
+    :param data: at one interval
+    :param names: of the observation channels
+    """
+    return _lags(matches_of(data, names), data.dt)
+
+
+def matches_of(data: Trajectories, names: Sequence[str]) -> list[Match]:
+    """
+    Pairs of a position and its velocity, found by their correlation.
 
     The velocity is compared with the central difference of the position, which has no delay, both
     smoothed by the same symmetric window. A parabola through the correlations around the best shift
@@ -86,45 +130,68 @@ def lags_of(data: Trajectories, names: Sequence[str]) -> list[Lag]:
     reach = min(wanted, *(len(x) // _PER_REACH for x in episodes))
     found = []
     for v in range(data.n_obs):
-        scored = []
-        for name, positions in _positions(episodes, names, v):
+        for parts, positions in _positions(episodes, v):
             pairs = [(q, x[:, v]) for q, x in zip(positions, episodes, strict=True)]
             for width in _WIDTHS:
                 if any(len(x) <= 4 * reach + width for x in episodes):
                     continue
                 scores = _Scores.of(pairs, data.dt, reach, width)
                 if scores.highest > _CLEAR:
-                    scored.append((scores.highest, name, pairs, scores, width))
+                    name = ", ".join(names[j] for j in parts)
+                    found.append(Match(v, name, parts, pairs, scores, width))
                     break
-        matching = [s for s in scored if abs(s[3].slope_there - 1.0) < _SAME]
-        if matching:
-            _, name, pairs, scores, width = max(matching, key=lambda s: s[0])
-            stderr = _stderr(pairs, data.dt, reach, width)
-            found.append(Lag(v, name, scores.lag, stderr, scores.better))
+    return found
+
+
+def _lags(matches: Sequence[Match], dt: float) -> list[Lag]:
+    """Of each velocity, that to the position that it fits best."""
+    found = []
+    for v in dict.fromkeys(match.velocity for match in matches if match.agrees):
+        own = [match for match in matches if match.velocity == v and match.agrees]
+        best = max(own, key=lambda match: match.scores.highest)
+        scores = best.scores
+        stderr = _stderr(best.pairs, dt, len(scores.slope) // 2, best.width)
+        found.append(Lag(v, best.position, scores.lag, stderr, scores.better))
     return found
 
 
 def _positions(
-    episodes: Sequence[np.ndarray], names: Sequence[str], v: int
-) -> list[tuple[str, list[np.ndarray]]]:
+    episodes: Sequence[np.ndarray], v: int
+) -> list[tuple[tuple[int, ...], list[np.ndarray]]]:
     """Everything that channel v may be the derivative of, per episode; turns are counted."""
-    others = [j for j in range(len(names)) if j != v]
-    found = [(names[j], [_unwrapped(x[:, j]) for x in episodes]) for j in others]
+    others = [j for j in range(episodes[0].shape[1]) if j != v]
+    found: list[tuple[tuple[int, ...], list[np.ndarray]]]
+    found = [((j,), [_unwrapped(x[:, j]) for x in episodes]) for j in others]
     joined = np.concatenate(episodes)
     for c, s in itertools.permutations(others, 2):
         if np.sqrt(np.mean((joined[:, c] ** 2 + joined[:, s] ** 2 - 1.0) ** 2)) < _CIRCLE:
             angles = [np.unwrap(np.arctan2(x[:, s], x[:, c])) for x in episodes]
-            found.append((f"{names[c]}, {names[s]}", angles))
+            found.append(((c, s), angles))
     return found
 
 
 def _unwrapped(x: np.ndarray) -> np.ndarray:
-    """With turns counted, where the values look like a wrapped angle [rad]."""
-    wraps = np.abs(np.abs(np.diff(x)) - 2.0 * np.pi) < 1.0
-    return np.unwrap(x) if wraps.any() and np.ptp(x) < 2.1 * np.pi else x
+    """With turns counted, where the values look like a wrapped angle [rad] or [deg]."""
+    for turn in (2.0 * np.pi, 360.0):
+        wraps = np.abs(np.abs(np.diff(x)) - turn) < turn / (2.0 * np.pi)
+        if wraps.any() and np.ptp(x) < 1.05 * turn:
+            return np.unwrap(x, period=turn)
+    return x
 
 
 def _stderr(pairs: Pairs, dt: float, reach: int, width: int) -> float:
+    blocks = _blocks(pairs, reach, width)
+    scores = [_Scores.of([block], dt, reach, width) for block in blocks]
+    lags = np.array([s.lag for s in scores if s.highest > 0.5 * _CLEAR])
+    if len(lags) < 3:
+        return 0.0 if len(lags) else np.inf
+    # Robust, because a block in which hardly anything moves says little.
+    spread = 1.4826 * float(np.median(np.abs(lags - np.median(lags))))
+    return float(spread / np.sqrt(len(lags)))
+
+
+def _blocks(pairs: Pairs, reach: int, width: int) -> Pairs:
+    """Parts of the episodes, or these if parts are too short."""
     n_blocks = max(1, _BLOCKS // len(pairs))
     blocks = [
         block
@@ -132,13 +199,7 @@ def _stderr(pairs: Pairs, dt: float, reach: int, width: int) -> float:
         for block in zip(np.array_split(q, n_blocks), np.array_split(v, n_blocks), strict=True)
         if len(block[0]) > 4 * reach + width
     ]
-    scores = [_Scores.of([block], dt, reach, width) for block in blocks or pairs]
-    lags = np.array([s.lag for s in scores if s.highest > 0.5 * _CLEAR])
-    if len(lags) < 3:
-        return 0.0 if len(lags) else np.inf
-    # Robust, because a block in which hardly anything moves says little.
-    spread = 1.4826 * float(np.median(np.abs(lags - np.median(lags))))
-    return float(spread / np.sqrt(len(lags)))
+    return blocks or pairs
 
 
 class _Scores(NamedTuple):

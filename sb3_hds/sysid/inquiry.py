@@ -127,6 +127,8 @@ class Inquiry:
 
     def poor(self) -> str:
         """:return: why these data cannot support a verdict; empty if they may"""
+        if self.audit.reason:
+            return self.audit.reason
         rows = ~self.parts.confirm, self.parts.confirm
         units = [len(np.unique(self.parts.unit[own])) for own in rows]
         if min(units) < _FEWEST_UNITS // 2:
@@ -134,7 +136,7 @@ class Inquiry:
                 f"{sum(units)} pieces of evidence are too few to propose on some and confirm on "
                 "others. Record at least four times as long, or several recordings."
             )
-        return self.audit.reason
+        return ""
 
     def prepare(self) -> None:
         """Two halves of the evidence, and sizes of parameters that suit the machine."""
@@ -202,7 +204,10 @@ class Inquiry:
         return Diagnosis(
             verdict="not_identifiable",
             believed=self.believed,
-            caveats=(reason,),
+            caveats=(
+                reason,
+                *(str(found) for found in self.audit.findings if not found.blocks),
+            ),
             twin=self.believed,
             data_hash=self.data_hash,
             seed=self.seed,
@@ -336,7 +341,7 @@ class Inquiry:
                 for one, c in sorted(rejected, key=lambda pair: -pair[1].gain)
             ),
             caveats=(
-                *(f"{found.sentence} {found.remedy}" for found in self.audit.findings),
+                *map(str, self.audit.findings),
                 *self.moved,
                 *to_tell_apart(found, self.hypotheses),
                 *look_alike(found, select, base),
