@@ -107,7 +107,8 @@ def parser() -> argparse.ArgumentParser:
     ask.add_argument(
         "--twin",
         required=True,
-        help="name or environment id, see 'sb3-hds twins'; module:Name for one of your own",
+        help="name or environment id, see 'sb3-hds twins'; module:Name for one of your own; or the "
+        "file that --json wrote, for the twin that was extended there",
     )
     ask.add_argument("--data", required=True, nargs="+", help="files, or patterns in quotes")
     ask.add_argument("--columns", help="yml file: what the columns of a log mean")
@@ -225,10 +226,12 @@ def _names(words: Sequence[str]) -> list[str]:
 
 
 def _twin(name: str, settings: dict[str, Any]) -> "Twin":
-    """A module that registers it may lie in the current folder."""
+    """A module that registers it, or the file of a diagnosis, may lie in the current folder."""
     from sb3_hds.errors import NoTwinError
     from sb3_hds.twins import get
 
+    if name.endswith(".json"):
+        return _extended(name).with_parameters(**settings)
     if ":" in name and "" not in sys.path:
         sys.path.insert(0, "")
     try:
@@ -242,6 +245,22 @@ def _twin(name: str, settings: dict[str, Any]) -> "Twin":
             "where module.py in this folder registers Name."
         ) from None
     return kind(**settings)
+
+
+def _extended(path: str) -> "Twin":
+    """The twin that a diagnosis has extended, from the file that ``--json`` wrote."""
+    from sb3_hds.effects import ALL
+    from sb3_hds.errors import NoTwinError
+    from sb3_hds.twins import from_spec
+
+    with open(path, encoding="utf-8") as file:
+        text = file.read()
+    try:
+        return from_spec(json.loads(text)["twin"], ALL)
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise NoTwinError(
+            f"{path} holds no twin: it has to be what 'sb3-hds diagnose --json' wrote."
+        ) from error
 
 
 def _check_targets(given: argparse.Namespace) -> None:

@@ -197,6 +197,20 @@ def test_a_twin_of_ones_own_is_taken_from_a_module_in_the_folder(tmp_path, monke
     assert told.count("\n") == 1 and len(told) < 300
 
 
+def test_the_twin_that_was_extended_is_asked_again(log, tmp_path, capsys):
+    extended = twins.make("PendulumReal").extend(effects.CoulombFriction(0, tau_c=0.1))
+    told = tmp_path / "out.json"
+    told.write_text(json.dumps({"twin": extended.to_spec()}))
+    about = ["--data", log, "--effects", "viscous_friction", "--budget", "quick"]
+
+    assert ask("--twin", told, *about) == 0
+    assert capsys.readouterr().out.startswith("none:")
+
+    told.write_text("[1, 2")
+    assert ask("--twin", told, *about) == 1
+    assert "holds no twin: it has to be what" in capsys.readouterr().err
+
+
 def test_what_the_audit_proposes_is_done_if_wanted_and_said(tmp_path, monkeypatch, capsys):
     """A filter in the drive: the speed comes four samples late."""
     asked = []
