@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from numbers import Integral
-from typing import Literal
+from typing import Any, Literal
 
 from sb3_hds.core import Effect, Trajectories, Twin
 from sb3_hds.effects import ALL
@@ -89,8 +89,9 @@ def classes_of(
     :raises EffectError: for anything else
     """
     known = {effect.name: effect for effect in ALL}
-    single = isinstance(effects, str | type) or not isinstance(effects, Iterable)
-    given = [effects] if single else list(effects)
+    given: list[Any] = [effects]
+    if isinstance(effects, Iterable) and not isinstance(effects, str | type):
+        given = list(effects)
     unknown = [one for one in given if isinstance(one, str) and one not in known]
     if unknown:
         raise EffectError(
