@@ -55,7 +55,7 @@ DRAWING = {"plots.py", "rendering.py", "report.py"}
 
 
 def layer_of(path: str) -> str:
-    """:return: ``"core"`` of ``"sb3_hds/core/twin.py"``, ``"cli"`` of ``"sb3_hds/cli.py"``"""
+    """:return: ``"core"`` of ``"sb3_hds/core/twin.py"``, ``"errors"`` of ``"sb3_hds/errors.py"``"""
     package, *inside = path.removesuffix(".py").split("/")
     return package if package == "rl_zoo_plugin" else inside[0]
 
@@ -178,7 +178,7 @@ def test_the_rule_forbids(path, source):
         ("sb3_hds/effects/neural.py", "import flax.linen as nn"),
         ("sb3_hds/envs/twin_vec_env.py", "from stable_baselines3.common.vec_env import VecEnv"),
         ("sb3_hds/sysid/plots.py", "def draw():\n    from matplotlib import pyplot"),
-        ("sb3_hds/cli.py", "def main():\n    from sb3_hds.experiments import gain"),
+        ("sb3_hds/cli/diagnose.py", "def main():\n    from sb3_hds.experiments import gain"),
         ("rl_zoo_plugin/tables.py", "import sb3_hds"),
     ],
 )

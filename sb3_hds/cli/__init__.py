@@ -1,0 +1,126 @@
+"""
+``sb3-hds``: what is wrong with a simulation, and how robust a policy is, from the command line.
+
+    sb3-hds diagnose --twin PendulumReal --data 'logs/*.csv' --columns map.yml --report out.html
+    sb3-hds diagnose --twin my_module:MyTwin --data 'logs/*.csv' --columns map.yml
+    sb3-hds diagnose --twin LinearAxis --set observe:q mass:95 --data log.mat --columns map.yml
+    sb3-hds robustness --algo openloop --model model.zip --env Swimmer-v5
+    sb3-hds effects
+    sb3-hds twins
+"""
+
+import argparse
+import sys
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """
+    :param arguments: as on the command line; default: those of this process
+    :return: 0 on any verdict; 1 where the question makes no sense, with one line on why
+    """
+    given = parser().parse_args(arguments)
+    from sb3_hds.cli import diagnose, listing, robustness
+    from sb3_hds.errors import SB3HDSError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            # Meant for programmers.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            {
+                "diagnose": diagnose.run,
+                "robustness": robustness.run,
+                "effects": listing.effects,
+                "twins": listing.twins,
+            }[given.command](given)
+    except BrokenPipeError:
+        return 0
+    except (SB3HDSError, OSError, ImportError) as error:
+        print(f"sb3-hds: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("sb3-hds: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _warn(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: Any = None,
+    line: str | None = None,
+) -> None:
+    """One line, without the code that warns."""
+    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
+def parser() -> argparse.ArgumentParser:
+    """:return: what the command understands"""
+    every = argparse.ArgumentParser(
+        prog="sb3-hds",
+        description="What a simulation gets wrong, and what a policy endures.",
+    )
+    commands = every.add_subparsers(dest="command", required=True)
+    ask = commands.add_parser("diagnose", help="name the cause, from measured data")
+    ask.add_argument(
+        "--twin",
+        required=True,
+        help="name or environment id, see 'sb3-hds twins'; module:Name for one of your own; or the "
+        "file that --json wrote, for the twin that was extended there",
+    )
+    ask.add_argument("--data", required=True, nargs="+", help="files, or patterns in quotes")
+    ask.add_argument("--columns", help="yml file: what the columns of a log mean")
+    ask.add_argument(
+        "--correct", action="store_true", help="cut and shift the data where their audit says so"
+    )
+    ask.add_argument(
+        "--set",
+        nargs="*",
+        default=[],
+        metavar="NAME:VALUE",
+        help="parameters and options of the twin: mass:0.3 observe:q driven:true",
+    )
+    ask.add_argument("--calibrate", nargs="*", default=[], help="parameters that are not believed")
+    ask.add_argument("--effects", nargs="*", help="candidates; default: all, see 'sb3-hds effects'")
+    ask.add_argument("--budget", choices=("full", "quick"), default="full")
+    ask.add_argument("--seed", type=int, default=0)
+    ask.add_argument("--report", help="HTML page to write")
+    ask.add_argument("--json", help="JSON file to write")
+    worth = ask.add_argument_group("what it buys", "policies from both twins, on the real system")
+    worth.add_argument("--env", help="id of the real system")
+    worth.add_argument("--env-kwargs", nargs="*", default=[], metavar="NAME:VALUE", help="of it")
+    worth.add_argument("--algo", default="hds", help="id in the zoo; default: hds")
+    worth.add_argument("--policies", type=int, default=5, help="trained in each twin; default: 5")
+    worth.add_argument("--policy-budget", type=int, default=0, help="steps of training in a twin")
+    worth.add_argument("--episodes", type=int, default=20, help="for each policy; default: 20")
+    worth.add_argument(
+        "--hyperparams", nargs="*", default=[], metavar="NAME:VALUE", help="of the algorithm"
+    )
+    shake = commands.add_parser("robustness", help="return under noise, failed sensors, pushes")
+    shake.add_argument(
+        "--algo", required=True, help="id in the zoo, ours or rl_zoo3's, or a class: sbx.SAC"
+    )
+    shake.add_argument("--model", required=True, help="file that the algorithm saved")
+    shake.add_argument("--env", required=True, help="environment id")
+    shake.add_argument("--env-kwargs", nargs="*", default=[], metavar="NAME:VALUE")
+    shake.add_argument(
+        "--env-wrapper",
+        nargs="*",
+        default=[],
+        metavar="CLASS",
+        help="as trained, the one next to the environment first: package.Wrapper, or with "
+        "arguments as in yml, 'package.Wrapper: {cutoff: 4.0}'",
+    )
+    shake.add_argument("--episodes", type=int, default=20, help="for each perturbation")
+    shake.add_argument("--encoders", choices=("own", "observation"), default="own")
+    shake.add_argument("--vecnormalize", help="vecnormalize.pkl of the training")
+    shake.add_argument("--push", type=float, default=5.0, help="force on the torso [N]")
+    shake.add_argument("--csv", help="table to write")
+    commands.add_parser("effects", help="list the candidates, with units and explanations")
+    commands.add_parser("twins", help="list the simulations, with their parameters")
+    return every

@@ -1,0 +1,5 @@
+import sys
+
+from sb3_hds.cli import main
+
+sys.exit(main())
