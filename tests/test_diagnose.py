@@ -612,6 +612,37 @@ def test_what_is_confirmed_is_given_up_only_for_something_simpler_that_is_as_goo
     assert best.kept == chosen
 
 
+@pytest.mark.parametrize(("by_all", "chosen"), [(True, "gain"), (False, "tau_c")])
+def test_all_the_data_have_a_say_only_where_they_are_asked(by_all, chosen):
+    first, second = (
+        SimpleNamespace(kept=name, criterion=60.0, candidate=SimpleNamespace(parameters=[name]))
+        for name in ("tau_c", "gain")
+    )
+    sure = lambda new, old: Comparison(0.5, 0.001, 0.2, 0.7, 6)  # noqa: E731
+    search = SimpleNamespace(confirmed=sure, better=sure, _preferred=lambda *_: second)
+
+    best = Search.best(search, [first, second], SimpleNamespace(kept="base"), by_all=by_all)
+
+    assert best.kept == chosen
+
+
+def test_where_one_cause_leaves_something_each_is_once_more_the_one_confirmed_first(monkeypatch):
+    asked_all = []
+
+    def one_by_one(self, firsts):
+        asked_all.append(self.by_all)
+        return list(firsts), "believed"
+
+    monkeypatch.setattr(Naming, "one_by_one", one_by_one)
+    monkeypatch.setattr(Naming, "pair", lambda self, alone, base, firsts: ([alone, "lag"], base))
+    naming = Naming(None, None, 0)
+
+    assert naming.several_as_confirmed(["drag", "gain"]) == (["drag", "gain"], "believed")
+    assert naming.several_as_confirmed(["drag"]) == (["drag", "lag"], "believed")
+    assert naming.several_as_confirmed([]) is None
+    assert naming.by_all and asked_all == [False] * 3
+
+
 @pytest.mark.parametrize(
     ("other", "ahead", "error", "p_value", "chosen"),
     [

@@ -39,10 +39,12 @@ class Naming:
     :param search: candidates on two halves of the evidence
     :param start: what is believed at first
     :param seed: of the bootstrap
+    :param by_all: whether all the data say which of several confirmed candidates is the cause, or
+        it is the one that was confirmed first
     """
 
-    def __init__(self, search: Search, start: Base, seed: int) -> None:
-        self.search, self.start, self.seed = search, start, seed
+    def __init__(self, search: Search, start: Base, seed: int, by_all: bool = True) -> None:
+        self.search, self.start, self.seed, self.by_all = search, start, seed, by_all
         self.turned_down: dict[str, str] = {}
 
     def one_by_one(self, firsts: Sequence[Tried]) -> tuple[list[Accepted], Base]:
@@ -85,6 +87,20 @@ class Naming:
                 return confirmed
         return None
 
+    def several_as_confirmed(self, firsts: Sequence[Tried]) -> tuple[list[Accepted], Base] | None:
+        """
+        What all the data prefer as a single cause may take on so much of a second one that no pair
+        is surely better. So each cause is once more the one that was confirmed first.
+
+        :param firsts: candidates beside what is believed at first, best first
+        :return: causes, if that makes them several, and what is believed with them
+        """
+        plain = Naming(self.search, self.start, self.seed, by_all=False)
+        found, base = plain.one_by_one(firsts)
+        if len(found) == 1:
+            return plain.pair(found[0], base, firsts)
+        return (found, base) if found else None
+
     def outdone(
         self, found: Sequence[Accepted], base: Base
     ) -> tuple[list[Accepted], Base, Nameless | None]:
@@ -115,7 +131,7 @@ class Naming:
         :return: a force without a name beside that, as sure as a cause has to be
         """
         tried = self.search.nameless(base)
-        sure = [t for t in tried if self._is_meant(t) and self._determined(t, base)]
+        sure = [t for t in tried if self._determined(t, base)]
         best = self.search.best(sure, base, len(known))
         if best is None or self._chance(best, base, known) >= _FAMILY_LEVEL / (1 + len(known)):
             return None
@@ -153,7 +169,7 @@ class Naming:
         :return: the best of what was tried, if it is a cause beside those that are known
         """
         sure = [t for t in tried if self._is_meant(t) and self._determined(t, base)]
-        best = self.search.best(sure, base, len(known) + looks)
+        best = self.search.best(sure, base, len(known) + looks, self.by_all)
         if best is None:
             return None
         if self._is_leftover(best, base):

@@ -292,10 +292,13 @@ class Search:
         pairs.sort(key=lambda pair: -pair[0])
         return [(first, seconds) for _, first, seconds in pairs]
 
-    def best(self, tried: Sequence[Tried], base: Base, n_found: int = 0) -> Tried | None:
+    def best(
+        self, tried: Sequence[Tried], base: Base, n_found: int = 0, by_all: bool = True
+    ) -> Tried | None:
         """
         :param tried: best first
         :param n_found: causes and looks before this one: each makes the next harder to confirm
+        :param by_all: whether all the data have a say, once one is confirmed
         :return: the candidate that selection prefers, if the other recordings confirm it; of two
             that they confirm and that predict equally well, the one with fewer parameters. Where
             they do not, the next ones may be confirmed, each at half the level of the one before.
@@ -313,7 +316,7 @@ class Search:
         level = LEVEL / (1 + n_found)
         for one in [simplest, *(t for t in likely if t is not simplest)][:_MOST_LOOKS]:
             if passes(self.confirmed(one.kept, base.kept), level):
-                return self._preferred(one, likely, base)
+                return self._preferred(one, likely, base) if by_all else one
             level *= 0.5
         return None
 
