@@ -271,3 +271,17 @@ def test_a_single_parameter_to_calibrate_may_stand_alone():
     found = diagnose(twin, data, effects=FRICTION, calibrate="mass", budget="quick", progress=False)
 
     assert found.findings[0].effect == "coulomb_friction"
+
+
+def test_a_glitch_is_cut_out_and_said_and_hides_nothing():
+    twin, data = swinging(effects.CoulombFriction(0, tau_c=0.02))
+    obs = np.array(data.obs)
+    obs[2, 40, 0] += 3.0
+    glitched = Trajectories.from_arrays(list(obs), list(np.array(data.actions)), dt=data.dt)
+
+    found = asked(twin, glitched)
+
+    assert [finding.effect for finding in found.findings] == ["coulomb_friction"]
+    assert found.findings[0].parameters["tau_c"].estimate == pytest.approx(0.02, rel=0.2)
+    [said] = [caveat for caveat in found.caveats if caveat.endswith("Cut out.")]
+    assert "'hinge_position' jumps" in said

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_hds.core import Effect, Trajectories, Twin
-from sb3_hds.data import audit
+from sb3_hds.data import Audit, audit
+from sb3_hds.data.findings import Glitches, Outliers
 from sb3_hds.sysid.account import (
     by_horizon,
     detectable,
@@ -115,8 +116,10 @@ class Inquiry:
         progress: bool,
     ) -> None:
         self.believed, self.seed = twin, seed
-        self.audit, self.data_hash = audit(data, channels=twin.channels), _hash(data)
-        data, self.moved = in_step(twin, data)
+        self.data_hash = _hash(data)
+        data, self.audit, corrected = _without_glitches(twin, data)
+        data, moved = in_step(twin, data)
+        self.corrected = (*corrected, *moved)
         coarse, self.data, self.every = thinned(twin, data)
         self.hypotheses = Hypotheses.about(coarse, effects, calibrate)
         self.spread = spread_of(self.data)
@@ -207,6 +210,7 @@ class Inquiry:
             caveats=(
                 reason,
                 *(str(found) for found in self.audit.findings if not found.blocks),
+                *self.corrected,
             ),
             twin=self.believed,
             data_hash=self.data_hash,
@@ -342,7 +346,7 @@ class Inquiry:
             ),
             caveats=(
                 *map(str, self.audit.findings),
-                *self.moved,
+                *self.corrected,
                 *to_tell_apart(found, self.hypotheses),
                 *look_alike(found, select, base),
                 *out_of_reach(confirm, base.kept, self.origin[self.parts.confirm]),
@@ -357,6 +361,19 @@ class Inquiry:
                 confirm, start.kept, base.kept, self.every, before.missing, left.missing
             ),
         )
+
+
+def _without_glitches(
+    twin: Twin, data: Trajectories
+) -> tuple[Trajectories, Audit, tuple[str, ...]]:
+    """:return: the data without single samples far off, what is found in these, what was cut out"""
+    found = audit(data, channels=twin.channels)
+    far = [finding for finding in found.findings if isinstance(finding, Outliers)]
+    if not far or not all(isinstance(finding, Glitches) for finding in far):
+        return data, found, ()
+    data = found.corrected(data)
+    words = tuple(f"{finding.sentence} Cut out." for finding in far)
+    return data, audit(data, channels=twin.channels), words
 
 
 def _share(before: _Left, left: _Left) -> float:
