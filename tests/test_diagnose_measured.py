@@ -18,6 +18,7 @@ from sb3_hds.sysid.shooting import shots_of
 pytestmark = [
     pytest.mark.measured,
     pytest.mark.expensive,
+    pytest.mark.timeout(1800),
     pytest.mark.skipif("SB3_HDS_DATA" not in os.environ, reason="data outside the repository"),
 ]
 
