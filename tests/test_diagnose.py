@@ -603,9 +603,7 @@ def test_what_is_confirmed_is_given_up_only_for_something_simpler_that_is_as_goo
             return Comparison(0.5, p_values[new], 0.2, 0.7, 6)
         return Comparison(gain_over_simple, p_over_simple, 0.0, 0.3, 6)
 
-    search = SimpleNamespace(
-        confirmed=confirmed, better=confirmed, _preferred=lambda first, *_: first
-    )
+    search = SimpleNamespace(confirmed=confirmed, better=confirmed)
 
     best = Search.best(search, [rich, simple], SimpleNamespace(kept="base"))
 
@@ -614,16 +612,11 @@ def test_what_is_confirmed_is_given_up_only_for_something_simpler_that_is_as_goo
 
 @pytest.mark.parametrize(("by_all", "chosen"), [(True, "gain"), (False, "tau_c")])
 def test_all_the_data_have_a_say_only_where_they_are_asked(by_all, chosen):
-    first, second = (
-        SimpleNamespace(kept=name, criterion=60.0, candidate=SimpleNamespace(parameters=[name]))
-        for name in ("tau_c", "gain")
-    )
-    sure = lambda new, old: Comparison(0.5, 0.001, 0.2, 0.7, 6)  # noqa: E731
-    search = SimpleNamespace(confirmed=sure, better=sure, _preferred=lambda *_: second)
+    search = SimpleNamespace(best=lambda *_: "tau_c", preferred=lambda *_: "gain")
+    naming = Naming(search, None, 0, by_all=by_all)
 
-    best = Search.best(search, [first, second], SimpleNamespace(kept="base"), by_all=by_all)
-
-    assert best.kept == chosen
+    assert naming._best(["tau_c", "gain"], None, 0) == chosen
+    assert naming._overruled == by_all
 
 
 def test_where_one_cause_leaves_something_each_is_once_more_the_one_confirmed_first(monkeypatch):
@@ -637,6 +630,9 @@ def test_where_one_cause_leaves_something_each_is_once_more_the_one_confirmed_fi
     monkeypatch.setattr(Naming, "pair", lambda self, alone, base, firsts: ([alone, "lag"], base))
     naming = Naming(None, None, 0)
 
+    # Nobody was overruled: it would be the same once more.
+    assert naming.several_as_confirmed(["drag", "gain"]) is None and asked_all == []
+    naming._overruled = True
     assert naming.several_as_confirmed(["drag", "gain"]) == (["drag", "gain"], "believed")
     assert naming.several_as_confirmed(["drag"]) == (["drag", "lag"], "believed")
     assert naming.several_as_confirmed([]) is None
@@ -660,7 +656,9 @@ def test_of_what_is_confirmed_all_the_data_choose_but_more_freedom_has_to_be_sur
 ):
     p_values = {"tau_c": 0.01, other: p_value}
     first, second = (
-        SimpleNamespace(kept=name, candidate=SimpleNamespace(parameters=name.split()))
+        SimpleNamespace(
+            kept=name, criterion=60.0, candidate=SimpleNamespace(parameters=name.split())
+        )
         for name in p_values
     )
     search = SimpleNamespace(
@@ -668,7 +666,7 @@ def test_of_what_is_confirmed_all_the_data_choose_but_more_freedom_has_to_be_sur
         _of_all=lambda tried, _: (error, 50.0 + ahead) if tried is second else (1.0, 50.0),
     )
 
-    best = Search._preferred(search, first, [first, second], SimpleNamespace(kept="base"))
+    best = Search.preferred(search, first, [first, second], SimpleNamespace(kept="base"))
 
     assert best.kept == chosen
 

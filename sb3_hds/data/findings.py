@@ -225,6 +225,10 @@ class VelocityShift(Finding):
     )
 
 
+_UNITS = {"degrees": 57.29578, "millimetres": 1000.0, "centimetres": 100.0}
+_NEAR = 0.15  # what a central difference and noise may change of the factor
+
+
 @dataclasses.dataclass(frozen=True)
 class OtherUnits(Finding):
     """
@@ -258,10 +262,6 @@ class OtherUnits(Finding):
         "Give that one its scale in columns: 0.0174533 if it is in degrees, 0.001 if it is in "
         "millimetres."
     )
-
-
-_UNITS = {"degrees": 57.29578, "millimetres": 1000.0, "centimetres": 100.0}
-_NEAR = 0.15  # what a central difference and noise may change of the factor
 
 
 @dataclasses.dataclass(frozen=True)

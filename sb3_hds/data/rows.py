@@ -132,12 +132,13 @@ def _way_out(column: np.ndarray) -> str:
     values = [str(value) for value in column.ravel()[:2]]
     if any(re.search(r"\d[-/.:]\d+[-/.:]\d", value) for value in values):
         return "Convert dates and times of day to seconds before."
-    if not all(map(_is_number, values[:1])) and all(map(_is_number, values[1:])):
+    if not all(map(is_number, values[:1])) and all(map(is_number, values[1:])):
         return "If that is the row of units below the names (line 2 of the file), delete it."
     return "Correct it, or delete that row."
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """:return: whether a field of a text file is one"""
     try:
         float(text)
     except ValueError:

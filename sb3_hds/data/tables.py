@@ -12,7 +12,7 @@ import numpy as np
 from sb3_hds.core.storage import read_npz
 from sb3_hds.data.columns import Columns
 from sb3_hds.data.recording import read_recording
-from sb3_hds.data.rows import Table
+from sb3_hds.data.rows import Table, is_number
 from sb3_hds.errors import TrajectoryError
 
 _DAMAGED = (ValueError, EOFError, LookupError, TypeError, NotImplementedError, zlib.error)
@@ -71,7 +71,7 @@ def _read_csv(path: Path, wanted: frozenset[str]) -> Log:
     separator = _separator(head)
     _refuse_comment(path, head, first)
     names, fields = (_fields_of(line, separator) for line in (head.lstrip("#"), first))
-    if names and all(_is_number(name) for name in names):
+    if names and all(is_number(name) for name in names):
         raise TrajectoryError(
             f"'{path}' begins with numbers: its first line must hold the names of the columns, "
             f"got '{head[:60]}'."
@@ -101,7 +101,7 @@ def _separator(line: str) -> str:
 def _refuse_comment(path: Path, head: str, first: str) -> None:
     """:raises TrajectoryError: where the names of columns are not in the first line, but below"""
     names, below = (_fields_of(x.lstrip("#"), _separator(x)) for x in (head, first))
-    text = len(below) > 1 and not any(_is_number(field) for field in below)
+    text = len(below) > 1 and not any(is_number(field) for field in below)
     if first.startswith("#") or (text and len(below) != len(names)):
         raise TrajectoryError(
             f"'{path}' must begin with the names of its columns, and what follows must be numbers, "
@@ -229,14 +229,6 @@ def columns_of(name: str, array: np.ndarray) -> list[tuple[str, np.ndarray]]:
         by_column = array.T if array.shape[0] >= array.shape[1] else array
         return [(f"{name}[{i}]", column) for i, column in enumerate(by_column)]
     return [(name, array)] if array.ndim == 1 else []
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 READERS: dict[str, Callable[[Path, frozenset[str]], Log]] = {

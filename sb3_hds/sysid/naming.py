@@ -46,6 +46,8 @@ class Naming:
     def __init__(self, search: Search, start: Base, seed: int, by_all: bool = True) -> None:
         self.search, self.start, self.seed, self.by_all = search, start, seed, by_all
         self.turned_down: dict[str, str] = {}
+        # Whether all the data ever said something else than what was confirmed first.
+        self._overruled = False
 
     def one_by_one(self, firsts: Sequence[Tried]) -> tuple[list[Accepted], Base]:
         """
@@ -95,6 +97,8 @@ class Naming:
         :param firsts: candidates beside what is believed at first, best first
         :return: causes, if that makes them several, and what is believed with them
         """
+        if not self._overruled:
+            return None
         plain = Naming(self.search, self.start, self.seed, by_all=False)
         found, base = plain.one_by_one(firsts)
         if len(found) == 1:
@@ -132,7 +136,7 @@ class Naming:
         """
         tried = self.search.nameless(base)
         sure = [t for t in tried if self._determined(t, base)]
-        best = self.search.best(sure, base, len(known))
+        best = self._best(sure, base, len(known))
         if best is None or self._chance(best, base, known) >= _FAMILY_LEVEL / (1 + len(known)):
             return None
         return Nameless(best, self.search.confirmed(best.kept, base.kept), ())
@@ -169,7 +173,7 @@ class Naming:
         :return: the best of what was tried, if it is a cause beside those that are known
         """
         sure = [t for t in tried if self._is_meant(t) and self._determined(t, base)]
-        best = self.search.best(sure, base, len(known) + looks, self.by_all)
+        best = self._best(sure, base, len(known) + looks)
         if best is None:
             return None
         if self._is_leftover(best, base):
@@ -179,6 +183,15 @@ class Naming:
             self.turned_down[best.candidate.key] = CHANCE
             return None
         return self._accepted(best, tried, base, chance)
+
+    def _best(self, sure: Sequence[Tried], base: Base, looks: int) -> Tried | None:
+        """:return: what is confirmed, or what all the data prefer to that"""
+        first = self.search.best(sure, base, looks)
+        if first is None or not self.by_all:
+            return first
+        best = self.search.preferred(first, sure, base)
+        self._overruled |= best is not first
+        return best
 
     def _accepted(self, best: Tried, tried: Sequence[Tried], base: Base, chance: float) -> Accepted:
         """:param base: what is believed without it"""

@@ -292,17 +292,13 @@ class Search:
         pairs.sort(key=lambda pair: -pair[0])
         return [(first, seconds) for _, first, seconds in pairs]
 
-    def best(
-        self, tried: Sequence[Tried], base: Base, n_found: int = 0, by_all: bool = True
-    ) -> Tried | None:
+    def best(self, tried: Sequence[Tried], base: Base, n_found: int = 0) -> Tried | None:
         """
         :param tried: best first
         :param n_found: causes and looks before this one: each makes the next harder to confirm
-        :param by_all: whether all the data have a say, once one is confirmed
         :return: the candidate that selection prefers, if the other recordings confirm it; of two
             that they confirm and that predict equally well, the one with fewer parameters. Where
             they do not, the next ones may be confirmed, each at half the level of the one before.
-            Once one is, all the data say which of those that are confirmed it is.
         """
         likely = [t for t in tried if t.criterion >= LEAST_BIC]
         if not likely:
@@ -316,19 +312,20 @@ class Search:
         level = LEVEL / (1 + n_found)
         for one in [simplest, *(t for t in likely if t is not simplest)][:_MOST_LOOKS]:
             if passes(self.confirmed(one.kept, base.kept), level):
-                return self._preferred(one, likely, base) if by_all else one
+                return one
             level *= 0.5
         return None
 
-    def _preferred(self, first: Tried, likely: Sequence[Tried], base: Base) -> Tried:
+    def preferred(self, first: Tried, tried: Sequence[Tried], base: Base) -> Tried:
         """
         :param first: confirmed
+        :param tried: it, and what else may be
         :return: of all that are confirmed and have no fewer parameters, the one that both halves
             together prefer; what has more has to be as far ahead as a cause has to be of none
         """
         error_of_first, ahead_of_first = self._of_all(first, base)
         best, most = first, ahead_of_first
-        for other in likely:
+        for other in (t for t in tried if t.criterion >= LEAST_BIC):
             error, ahead = self._of_all(other, base)
             surely = (
                 error <= (1.0 - LEAST_GAIN) * error_of_first and ahead >= ahead_of_first + LEAST_BIC
