@@ -10,12 +10,12 @@ on that environment (those of -v4 for -v5; SBX's DroQ: that of SAC with its docu
 SB3's gSDE: that of SAC with what ours has on Pendulum-v1).
 `sac` is our GSDESAC without gSDE, `bro_fast` BRO with two updates per step. HDS, which knows a
 simulation of Pendulum-v1, stands beside them with the few steps of its own file. Each run is a
-fresh process; training stops for each evaluation, whose time does not count. On Pendulum-v1,
+fresh process; training stops for each evaluation, whose time does not count. `seconds` of the runs
+are those of their days: the tables have what `model_free_pace.py` makes of them. On Pendulum-v1,
 policies start from the 500 states whose best return is known (SB3_HDS_DATA); elsewhere, ten
 episodes with the same seeds. Learners that only stop at the end of an episode may have made more
-steps than the mark at which they are compared. One run at a time (`--jobs`), or wall times would
-be those of runs that share the machine. Finished runs are kept: an interrupted benchmark goes on
-where it stopped.
+steps than the mark at which they are compared. Finished runs are kept: an interrupted benchmark
+goes on where it stopped.
 """
 
 import argparse

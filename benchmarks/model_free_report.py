@@ -43,6 +43,8 @@ def report() -> None:
         print("Nothing has been measured yet.")
         return
     runs = pd.read_csv(path)
+    if (paces := RESULTS / "model_free_pace.csv").exists():
+        runs["seconds"] = wall_seconds(runs, pd.read_csv(paces))
     tables = {
         "summary": summary(runs),
         "peers": beside_peers(runs),
@@ -55,6 +57,16 @@ def report() -> None:
             print(f"\n{name.replace('_', ' ')}\n{shown(table)}")
     for env, some in runs.groupby("env"):
         figure(some, str(env))
+
+
+def wall_seconds(runs: pd.DataFrame, paces: pd.DataFrame) -> pd.Series:
+    """
+    :param paces: of the methods, from ``model_free_pace.py``
+    :return: of each row, seconds that training takes up to there, all on one day; nan: no pace
+    """
+    rows = runs[["env", "method", "steps"]].merge(paces, "left", ["env", "method"])
+    later = (rows["steps"] - rows["first_steps"]).clip(lower=0.0) * rows["step_s"]
+    return pd.Series((rows["first_s"] + later).to_numpy(), runs.index)
 
 
 def shown(table: pd.DataFrame) -> str:

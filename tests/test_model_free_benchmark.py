@@ -88,6 +88,15 @@ def test_learners_that_stop_at_the_ends_of_episodes_are_compared_at_their_marks(
     assert model_free_report.first_mark(runs, -800.0) == 1000.0
 
 
+def test_wall_times_are_steps_times_what_one_takes_on_the_same_day():
+    runs = table(td7={0: [(300, -900.0), (1000, -300.0)]}, bro={0: [(1000, -700.0)]})
+    pace = {"env": PENDULUM, "method": "td7", "first_steps": 400, "first_s": 20.0, "step_s": 0.05}
+
+    seconds = model_free_report.wall_seconds(runs, pd.DataFrame([pace]))
+
+    np.testing.assert_allclose(seconds, [20.0, 20.0 + 600 * 0.05, np.nan])
+
+
 def test_a_method_below_the_interval_of_its_peer_is_named_at_the_last_mark_of_both():
     low, high = [(1000, -900.0), (2000, -310.0)], [(1000, -800.0), (2000, -290.0), (3000, -140.0)]
     runs = table(
