@@ -12,6 +12,9 @@ start-up is that of a fresh process each, from the interpreter to the first upda
 program kept.
 
 Beside them, `learn_compiled`: environment and updates in one program, several seeds side by side.
+What no code around them can save: `products` are the matrix products of SAC's update with these
+networks and this batch, and nothing else, compiled and timed by turns with the whole.
+
 A second table says what SBX gains over SB3, both measured beside ours; it is said to be up to
 twenty times, and depends on how many updates there are for each step in the environment.
 """
@@ -81,6 +84,7 @@ def rows() -> list[tuple[str, int, str]]:
     pairs = [(name, ratio, "sbx") for name in PAIRS for ratio in RATIOS]
     pairs += [(name, ratio, "sb3") for name in IN_SB3 for ratio in RATIOS]
     pairs += [(name, ratio, "none") for name in ALONE for ratio in RATIOS]
+    pairs += [("sac", ratio, "products") for ratio in RATIOS]
     compiled = [("sac", n_seeds, "compiled") for n_seeds in SEEDS]
     starts = [(name, 1, f"start-up of {who}") for name in PAIRS for who in ("ours", "sbx")]
     return pairs + compiled + starts
@@ -140,7 +144,9 @@ def ours(name: str, ratio: int):
 
 
 def other(name: str, ratio: int, library: str):
-    """:param library: ``"sbx"``, or ``"sb3"`` for SB3 and SB3-contrib"""
+    """:param library: ``"sbx"``, ``"sb3"`` for SB3 and SB3-contrib, or ``"products"``"""
+    if library == "products":
+        return Products(ratio)
     _, _, algorithm, arguments = PAIRS[name]
     settings = common(name, ratio) | {"policy": "MlpPolicy"} | arguments
     if library == "sbx":
@@ -154,6 +160,47 @@ def other(name: str, ratio: int, library: str):
     torch.set_num_threads(2)
     found = getattr(stable_baselines3, algorithm, None) or getattr(sb3_contrib, algorithm)
     return found(**settings, device="cpu")
+
+
+class Products:
+    """
+    The matrix products of SAC's updates and nothing else, called as a model is.
+
+    Of a layer from 256 units to as many, for a batch of as many: twice forward in the actor and
+    once back, to its input and to its weights; in both critics, forward in the targets, forward
+    and back twice, once of these to the weights. Layers of few inputs or outputs are left out.
+    Matrices are orthogonal, so that numbers keep their size.
+    """
+
+    def __init__(self, ratio: int) -> None:
+        import jax
+        from jax import lax
+
+        normal = np.random.default_rng(0).normal(size=(3, BATCH, BATCH))
+        one, *two = np.linalg.qr(normal)[0].astype(np.float32)
+        pair = np.stack(two)
+
+        def update(_, carry):
+            actor, critics = carry
+            actor = actor @ one
+            critics = critics @ pair
+            critics = critics @ pair
+            critics = critics @ pair.swapaxes(1, 2)
+            critics = critics.swapaxes(1, 2) @ pair
+            actor = actor @ one
+            critics = critics @ pair
+            critics = critics @ pair.swapaxes(1, 2)
+            actor = actor @ one.T
+            actor = actor.T @ one
+            return actor, critics
+
+        self._carry = (one, pair)
+        self._updates = jax.jit(lambda carry: lax.fori_loop(0, ratio, update, carry))
+
+    def learn(self, total_timesteps: int, **_) -> None:
+        for _ in range(total_timesteps):
+            self._carry = self._updates(self._carry)
+        self._carry[0].block_until_ready()
 
 
 def common(name: str, ratio: int) -> dict:
@@ -192,6 +239,7 @@ def report() -> None:
         "speed_targets": beside_targets(measured),
         "speed_sbx_sb3": sbx_beside_sb3(measured),
         "speed_start_up": start_ups(measured),
+        "speed_products": products(measured),
         "speed_alone": alone(measured),
     }
     print(measured.to_string(index=False, float_format="%.3g"))
@@ -224,6 +272,14 @@ def sbx_beside_sb3(measured: pd.DataFrame) -> pd.DataFrame:
     )
     found = (wide["sb3"] / wide["sbx"]).dropna()
     return found.rename("sbx_times_sb3").reset_index()
+
+
+def products(measured: pd.DataFrame) -> pd.DataFrame:
+    """:return: what share of the time of a whole step its matrix products alone would take"""
+    rows = measured[measured["peer"] == "products"]
+    return rows[["name", "ratio", "speed_up", "low", "high"]].rename(
+        columns={"speed_up": "share_of_products"}
+    )
 
 
 def start_ups(measured: pd.DataFrame) -> pd.DataFrame:

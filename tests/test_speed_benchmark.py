@@ -1,5 +1,6 @@
 """What the benchmark of speed makes of what it measured."""
 
+import numpy as np
 import pandas as pd
 import pytest
 import speed
@@ -30,3 +31,15 @@ def test_what_sbx_gains_over_sb3_is_the_ratio_of_what_ours_gains_over_both():
     shown = speed.sbx_beside_sb3(measured()).set_index(["name", "ratio"])["sbx_times_sb3"]
 
     assert shown.to_dict() == pytest.approx({("sac", 1): 4.0, ("sac", 20): 7.5})
+
+
+def test_matrix_products_take_a_share_of_the_whole():
+    rows = pd.DataFrame([("sac", 20, "products", 0.9, 0.8, 0.95)])
+    rows.columns = ["name", "ratio", "peer", "speed_up", "low", "high"]
+
+    [row] = speed.products(pd.concat([measured(), rows])).to_dict("records")
+
+    assert row == {"name": "sac", "ratio": 20, "share_of_products": 0.9, "low": 0.8, "high": 0.95}
+    alone = speed.Products(ratio=2)
+    alone.learn(3)
+    assert all(np.isfinite(part).all() for part in alone._carry)
