@@ -15,12 +15,15 @@ are those of their days: the tables have what `model_free_pace.py` makes of them
 policies start from the 500 states whose best return is known (SB3_HDS_DATA); elsewhere, ten
 episodes with the same seeds. Learners that only stop at the end of an episode may have made more
 steps than the mark at which they are compared. Finished runs are kept: an interrupted benchmark
-goes on where it stopped.
+goes on where it stopped. Of the long runs, which are not those of Pendulum-v1, model and replay
+buffer are kept at every mark; one that is interrupted goes on from its last mark, with a new
+episode and random numbers other than those it would have had.
 """
 
 import argparse
 import importlib
 import json
+import shutil
 import time
 from functools import cache
 from pathlib import Path
@@ -133,9 +136,11 @@ def main() -> None:
 
 def worker(env: str, method: str, seed: int) -> list[dict]:
     """Train; stop the clock and evaluate at every mark."""
-    model, evaluate = learner(env, method, seed), evaluation(env)
-    rows, seconds = [], 0.0
-    for mark in marks(env, method):
+    run = InterruptedRun(CACHE / "model_free" / f"{env}_{method}_{seed}")
+    rows, evaluate = run.rows(), evaluation(env)
+    model = run.model(made_of(env, method)[0], env) if rows else learner(env, method, seed)
+    seconds = rows[-1]["seconds"] if rows else 0.0
+    for mark in marks(env, method)[len(rows) :]:
         begin = time.perf_counter()
         if model.num_timesteps < mark:
             model.learn(mark - model.num_timesteps, reset_num_timesteps=False)
@@ -143,8 +148,48 @@ def worker(env: str, method: str, seed: int) -> list[dict]:
         returns = evaluate(model)
         stderr = returns.std() / np.sqrt(len(returns))
         now = {"mark": mark, "steps": model.num_timesteps, "seconds": seconds}
-        rows.append(now | {"return": returns.mean(), "stderr": stderr})
+        rows.append(now | {"return": float(returns.mean()), "stderr": float(stderr)})
+        if env != PENDULUM:
+            run.keep(model, rows)
+    run.forget()
     return rows
+
+
+class InterruptedRun:
+    """What a run leaves at each mark, until it is through."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def rows(self) -> list[dict[str, Any]]:
+        """:return: of the marks that it came to; empty: of none"""
+        path = self.folder / "rows.json"
+        return json.loads(path.read_text()) if path.exists() else []
+
+    def model(self, algorithm: type, env: str) -> Any:
+        """:return: as it was at its last mark"""
+        import gymnasium
+
+        at = self._at(self.rows())
+        model = algorithm.load(at / "model.zip", env=gymnasium.make(env))
+        model.load_replay_buffer(at / "buffer.pkl")
+        return model
+
+    def keep(self, model: Any, rows: list[dict[str, Any]]) -> None:
+        at, before = self._at(rows), self._at(rows[:-1]) if rows[:-1] else None
+        model.save(at / "model.zip")
+        model.save_replay_buffer(at / "buffer.pkl")
+        temporary = self.folder / "rows.tmp"
+        temporary.write_text(json.dumps(rows))
+        temporary.replace(self.folder / "rows.json")
+        if before is not None:
+            shutil.rmtree(before, ignore_errors=True)
+
+    def forget(self) -> None:
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _at(self, rows: list[dict[str, Any]]) -> Path:
+        return self.folder / str(rows[-1]["mark"])
 
 
 def marks(env: str, method: str) -> range:

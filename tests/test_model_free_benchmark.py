@@ -74,6 +74,41 @@ def test_every_setting_of_a_method_is_an_argument_of_its_class(method):
         assert len(model_free.marks(env, method)) > 1
 
 
+def test_a_long_run_goes_on_from_its_last_mark(tmp_path, monkeypatch):
+    env, method = "InvertedPendulum-v5", "td7"
+    monkeypatch.setattr(model_free, "LENGTHS", {env: (300, 100)})
+    monkeypatch.setattr(model_free, "CACHE", tmp_path)
+    made_of = model_free.made_of
+    small = {"learning_starts": 50, "buffer_size": 1000, "batch_size": 16}
+    monkeypatch.setattr(model_free, "made_of", lambda *run: (made_of(*run)[0], small))
+
+    def interrupted_after(mark):
+        def evaluate(model):
+            if model.num_timesteps > mark:
+                raise KeyboardInterrupt
+            return np.array([float(model.num_timesteps)])
+
+        return evaluate
+
+    monkeypatch.setattr(model_free, "evaluation", lambda env: interrupted_after(290))
+    with pytest.raises(KeyboardInterrupt):
+        model_free.worker(env, method, 0)
+    kept = model_free.InterruptedRun(tmp_path / "model_free" / f"{env}_{method}_0")
+    before = kept.rows()
+    model = kept.model(made_of(env, method)[0], env)
+
+    monkeypatch.setattr(model_free, "evaluation", lambda env: interrupted_after(1e9))
+    rows = model_free.worker(env, method, 0)
+
+    assert len(before) == 2
+    assert model.num_timesteps == model.replay_buffer.size() == before[-1]["steps"] < 290
+    assert model._n_updates > 0
+    assert rows[:2] == before
+    assert [row["mark"] for row in rows] == [100, 200, 300]
+    assert 300 <= rows[-1]["steps"] <= 330
+    assert not kept.folder.exists()
+
+
 def test_learners_that_stop_at_the_ends_of_episodes_are_compared_at_their_marks():
     runs = table(
         td7={
