@@ -28,6 +28,12 @@ USUAL = {
 }
 # DroQ's paper has a target entropy for it.
 FURTHER = {"droq": {"Humanoid-v5"}}
+# What papers, or their authors' code where these are silent, have on tasks of 1000 steps.
+PUBLISHED = [
+    # Configs of SonyResearch/simba; where no episode ends early, one critic.
+    ("simba", "HalfCheetah-v5", {"gamma": 0.995, "policy_kwargs": {"n_critics": 1}}),
+    ("simba", "Hopper-v5", {"gamma": 0.995, "clipped_double_q": None, "policy_kwargs": None}),
+]
 # Keys of a zoo entry that the zoo itself consumes, see ExperimentManager._preprocess_hyperparams.
 CONSUMED_BY_THE_ZOO = {"n_timesteps", "n_envs", "normalize", "env_wrapper", "frame_stack"}
 
@@ -132,6 +138,13 @@ def test_every_key_of_a_yml_file_is_an_argument_of_the_algorithm(algo):
 
     for env_id, entry in load_yml(algo).items():
         assert set(entry) <= known, env_id
+
+
+@pytest.mark.parametrize("algo, env_id, published", PUBLISHED)
+def test_settings_of_the_benchmarks_are_the_published_ones(algo, env_id, published):
+    entry = load_yml(algo)[env_id]
+
+    assert {name: entry.get(name) for name in published} == published
 
 
 @pytest.mark.parametrize("algo", tables.ALGORITHMS)
