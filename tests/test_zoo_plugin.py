@@ -33,6 +33,9 @@ PUBLISHED = [
     # Configs of SonyResearch/simba; where no episode ends early, one critic.
     ("simba", "HalfCheetah-v5", {"gamma": 0.995, "policy_kwargs": {"n_critics": 1}}),
     ("simba", "Hopper-v5", {"gamma": 0.995, "clipped_double_q": None, "policy_kwargs": None}),
+    # SamsungLabs/tqc_pytorch, main.py: training begins with the first full batch.
+    ("tqc_jax", "HalfCheetah-v5", {"learning_starts": 256, "top_quantiles_to_drop_per_net": 0}),
+    ("tqc_jax", "Hopper-v5", {"learning_starts": 256, "top_quantiles_to_drop_per_net": 5}),
 ]
 # Keys of a zoo entry that the zoo itself consumes, see ExperimentManager._preprocess_hyperparams.
 CONSUMED_BY_THE_ZOO = {"n_timesteps", "n_envs", "normalize", "env_wrapper", "frame_stack"}
