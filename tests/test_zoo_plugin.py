@@ -33,6 +33,9 @@ PUBLISHED = [
     # Configs of SonyResearch/simba; where no episode ends early, one critic.
     ("simba", "HalfCheetah-v5", {"gamma": 0.995, "policy_kwargs": {"n_critics": 1}}),
     ("simba", "Hopper-v5", {"gamma": 0.995, "clipped_double_q": None, "policy_kwargs": None}),
+    # Hiraoka et al. 2022, appendix; HalfCheetah: their code, after MBPO.
+    ("droq", "HalfCheetah-v5", {"learning_starts": 5000, "target_entropy": -3.0}),
+    ("droq", "Hopper-v5", {"learning_starts": 5000, "target_entropy": -1.0}),
     # SamsungLabs/tqc_pytorch, main.py: training begins with the first full batch.
     ("tqc_jax", "HalfCheetah-v5", {"learning_starts": 256, "top_quantiles_to_drop_per_net": 0}),
     ("tqc_jax", "Hopper-v5", {"learning_starts": 256, "top_quantiles_to_drop_per_net": 5}),
