@@ -36,6 +36,9 @@ PUBLISHED = [
     # Hiraoka et al. 2022, appendix; HalfCheetah: their code, after MBPO.
     ("droq", "HalfCheetah-v5", {"learning_starts": 5000, "target_entropy": -3.0}),
     ("droq", "Hopper-v5", {"learning_starts": 5000, "target_entropy": -1.0}),
+    # adityab/CrossQ, train.py.
+    ("crossq_jax", "HalfCheetah-v5", {"learning_starts": 5000, "gamma": None}),
+    ("crossq_jax", "Swimmer-v5", {"learning_starts": 5000, "gamma": 0.9999}),
     # SamsungLabs/tqc_pytorch, main.py: training begins with the first full batch.
     ("tqc_jax", "HalfCheetah-v5", {"learning_starts": 256, "top_quantiles_to_drop_per_net": 0}),
     ("tqc_jax", "Hopper-v5", {"learning_starts": 256, "top_quantiles_to_drop_per_net": 5}),
