@@ -961,5 +961,17 @@ def test_a_policy_of_td7_is_kept_only_if_it_did_no_worse():
     assert model.best_worst_return == -100.0
     assert model.policy.learner.checkpoint is not before
 
-    model._n_updates, model._finished = model.updates_before_checkpointing, [(-50.0, 200)]
+    model._n_updates = model.updates_before_checkpointing + 1
+    model._finished = [(-50.0, 200)]
     assert model._assessed() == 0 and model.assessed_episodes == 1
+
+
+def test_td7_assesses_by_more_episodes_once_it_has_gone_beyond_the_mark():
+    model = small("td7", use_checkpoints=True, train_freq=None, updates_before_checkpointing=400)
+    accounts = []
+    for n_updates, earned in ((200, -100.0), (400, -100.0), (600, -50.0)):
+        model._n_updates, model._finished = n_updates, [(earned, 200)]
+        accounts.append((model._assessed(), model.best_worst_return))
+
+    # As in the authors' code: the update that would be the 401st scales the best assessment.
+    assert accounts == [(200, -100.0), (200, -90.0), (0, -90.0)]

@@ -28,6 +28,21 @@ USUAL = {
 }
 # DroQ's paper has a target entropy for it.
 FURTHER = {"droq": {"Humanoid-v5"}}
+# What papers, or their authors' code where these are silent, have on tasks of 1000 steps.
+PUBLISHED = [
+    # Configs of SonyResearch/simba; where no episode ends early, one critic.
+    ("simba", "HalfCheetah-v5", {"gamma": 0.995, "policy_kwargs": {"n_critics": 1}}),
+    ("simba", "Hopper-v5", {"gamma": 0.995, "clipped_double_q": None, "policy_kwargs": None}),
+    # Hiraoka et al. 2022, appendix; HalfCheetah: their code, after MBPO.
+    ("droq", "HalfCheetah-v5", {"learning_starts": 5000, "target_entropy": -3.0}),
+    ("droq", "Hopper-v5", {"learning_starts": 5000, "target_entropy": -1.0}),
+    # adityab/CrossQ, train.py.
+    ("crossq_jax", "HalfCheetah-v5", {"learning_starts": 5000, "gamma": None}),
+    ("crossq_jax", "Swimmer-v5", {"learning_starts": 5000, "gamma": 0.9999}),
+    # SamsungLabs/tqc_pytorch, main.py: training begins with the first full batch.
+    ("tqc_jax", "HalfCheetah-v5", {"learning_starts": 256, "top_quantiles_to_drop_per_net": 0}),
+    ("tqc_jax", "Hopper-v5", {"learning_starts": 256, "top_quantiles_to_drop_per_net": 5}),
+]
 # Keys of a zoo entry that the zoo itself consumes, see ExperimentManager._preprocess_hyperparams.
 CONSUMED_BY_THE_ZOO = {"n_timesteps", "n_envs", "normalize", "env_wrapper", "frame_stack"}
 
@@ -132,6 +147,13 @@ def test_every_key_of_a_yml_file_is_an_argument_of_the_algorithm(algo):
 
     for env_id, entry in load_yml(algo).items():
         assert set(entry) <= known, env_id
+
+
+@pytest.mark.parametrize("algo, env_id, published", PUBLISHED)
+def test_settings_of_the_benchmarks_are_the_published_ones(algo, env_id, published):
+    entry = load_yml(algo)[env_id]
+
+    assert {name: entry.get(name) for name in published} == published
 
 
 @pytest.mark.parametrize("algo", tables.ALGORITHMS)

@@ -442,9 +442,12 @@ def update_actor(
     r"""
     Climb what the critics think of the actor's own actions, and follow the target entropy.
 
-    The loss of the entropy coefficient is :math:`\log\alpha\,(H - \bar{H})`, as in SB3 and SBX;
-    the papers have :math:`\alpha` in the place of its logarithm, a factor on the slope that Adam
-    takes out again.
+    The loss of the entropy coefficient is :math:`\log\alpha\,(H - \bar{H})`, as in SB3, SBX and
+    the authors' code of DroQ and TQC. Equation 18 of Haarnoja et al. and the authors of CrossQ,
+    SimBa and BRO have :math:`\alpha` in the place of its logarithm, a factor on the slope that Adam
+    takes out where it does not change. Where :math:`\alpha` steadily falls, theirs falls at
+    :math:`\sqrt{1 + k^2} - k` of the speed, with :math:`k` the learning rate in units of 1e-3, as
+    Adam remembers squares for 1000 updates: 0.9, 0.74 and 0.41 at 1e-4, 3e-4 and 1e-3.
     """
     act_key, judge_key, extra_key = jax.random.split(key, 3)
     ent_coef = jnp.exp(learner.log_ent_coef.weights["params"])

@@ -13,17 +13,24 @@ from sb3_hds.algos.soft_actor_critic import SoftActorCritic
 
 
 class SimbaSAC(SoftActorCritic):
-    """
+    r"""
     SAC with SimBa's networks: a running normalisation of observations inside the policy, residual
     blocks with layer norm, weight decay.
 
     Source: Lee et al., *SimBa: Simplicity Bias for Scaling Up Parameters in Deep Reinforcement
     Learning*, ICLR 2025: replay ratio 2, learning rate 1e-4, weight decay 1e-2, initial temperature
-    0.01, target entropy of minus half the number of controls; two critics, of which the least
-    counts only in tasks that end early (``clipped_double_q``), otherwise the mean. SBX's variant is
-    ``learning_rate=3e-4, ent_coef="auto", target_entropy=-n_act, gradient_steps=1`` with
-    ``policy_kwargs={"net_arch": [256, 256], "normalize_observations": False, "optimizer_kwargs":
-    {"weight_decay": 1e-4}}``.
+    0.01, target entropy of minus half the number of controls; the least of two critics only in
+    tasks that end early. In others, the authors have one critic: ``clipped_double_q=False`` with
+    ``policy_kwargs={"n_critics": 1}``; of more, it takes the mean. Their discount, 1 - 5 / T with
+    episodes of T steps, within 0.95 and 0.995, is for ``gamma`` to say. Unlike their code, which
+    squashes the logarithm of the deviation of actions into [-10, 2] by tanh, the actor clips it to
+    [-20, 2], as SAC and SBX do: actions start with a deviation near 1, not :math:`e^{-4}`. The
+    entropy coefficient learns by its logarithm's slope, as in SB3 and SBX: it falls up to 1.1 times
+    as fast as theirs.
+
+    SBX's variant is ``learning_rate=3e-4, ent_coef="auto", target_entropy=-n_act,
+    gradient_steps=1`` with ``policy_kwargs={"net_arch": [256, 256], "normalize_observations":
+    False, "optimizer_kwargs": {"weight_decay": 1e-4}}``.
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise

@@ -175,7 +175,9 @@ class TD7(ModelFreeAlgorithm):
     Source: Fujimoto et al., *For SALE: State-Action Representation Learning for Deep Reinforcement
     Learning*, NeurIPS 2023, with its constants (appendix): target networks are copied every 250
     updates, noise of 0.1 explores, 25,000 steps are random, priorities are errors to the power of
-    0.4, and 20 episodes assess a policy from 750,000 updates on, one before.
+    0.4, and 20 episodes assess a policy from 750,000 updates on, one before. Unlike the authors'
+    code, layers start as flax has them, not torch: first actions and values scatter about four
+    times as much; and noise is added to random actions, too, as SB3 does it.
 
     With checkpoints, as in the paper, a policy acts for whole episodes and is assessed by the worst
     of them, in rewards of the environment itself; only then it is updated, once for each step that
@@ -204,9 +206,9 @@ class TD7(ModelFreeAlgorithm):
         passed
     :param priority_exponent: how much priorities depend on errors; 0: not at all
     :param use_checkpoints: whether policies are assessed; None: where there is one environment
-    :param max_episodes_per_checkpoint: episodes that assess a policy, from
-        ``updates_before_checkpointing`` on
-    :param updates_before_checkpointing: until then, one episode does
+    :param max_episodes_per_checkpoint: episodes that assess a policy, after
+        ``updates_before_checkpointing``
+    :param updates_before_checkpointing: after as many or fewer, one episode does
     :param reset_weight: factor on the best assessment at that moment
     :param arguments: those of :class:`~sb3_hds.algos.model_free.ModelFreeAlgorithm`
     """
@@ -383,7 +385,7 @@ class TD7(ModelFreeAlgorithm):
             self.assessed_steps += length
             self.worst_return = min(self.worst_return, reward)
         self._finished = []
-        late = self._n_updates >= self.updates_before_checkpointing
+        late = self._n_updates > self.updates_before_checkpointing
         enough = self.max_episodes_per_checkpoint if late else 1
         good = self.worst_return >= self.best_worst_return
         if good and self.assessed_episodes < enough:
@@ -392,7 +394,7 @@ class TD7(ModelFreeAlgorithm):
             self.best_worst_return = self.worst_return
             self.policy.keep_checkpoint()
         due = self.assessed_steps
-        if not late and self._n_updates + due >= self.updates_before_checkpointing:
+        if not late and self._n_updates + due > self.updates_before_checkpointing:
             self.best_worst_return *= self.reset_weight
         self._begin_assessment()
         return due

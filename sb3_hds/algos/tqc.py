@@ -18,8 +18,9 @@ class TQC(SoftActorCritic):
     Source: Kuznetsov et al., *Controlling Overestimation Bias with Truncated Mixture of Continuous
     Distributional Quantile Critics*, ICML 2020: 25 quantiles, five networks of three layers of 512
     (``policy_kwargs={"n_critics": 5, "net_arch": {"pi": [256, 256], "qf": [512, 512, 512]}}``), of
-    which 2 quantiles are dropped for each network, none on HalfCheetah, 5 on Hopper. SB3-contrib
-    and SBX use two networks; so does the default here.
+    which 2 quantiles are dropped for each network, none on HalfCheetah, 5 on Hopper; learning
+    starts with the first full batch (``learning_starts=256``). SB3-contrib and SBX use two
+    networks; so does the default here.
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
