@@ -25,7 +25,7 @@ from runs import RESULTS, fresh_process, save
 
 #: steps of a block: a whole episode of Pendulum-v1, since some learn when one has ended
 BLOCK = 200
-N_BLOCKS = 3
+N_BLOCKS = 5
 
 
 def main() -> None:

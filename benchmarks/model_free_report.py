@@ -196,7 +196,9 @@ def figure(table: pd.DataFrame, env: str) -> None:
             at, colour = middle.index[-1] * beside, style["color"]
             panels[0].errorbar(at, mean, deviation, fmt="_", color=colour, alpha=0.6, capsize=2)
     panels[0].set(xlabel="steps in the environment", ylabel=f"return on {env}")
-    panels[1].set(xlabel="wall time of training [s]", xscale="log")
+    panels[1].set_xlabel("wall time of training [s]")
+    if table["seconds"].notna().any():
+        panels[1].set_xscale("log")
     panels[1].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     drawing.savefig(RESULTS / f"model_free_{env}.png", dpi=150)
 
