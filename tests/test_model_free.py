@@ -658,6 +658,35 @@ def test_schedules_of_both_learning_rates_act(algorithm):
             np.testing.assert_array_equal(tensor, before[key], err_msg=key)
 
 
+def test_learning_rates_of_every_form_may_be_changed_while_loading():
+    model = small("droq", learning_rate=1e-4, qf_learning_rate=2e-4)
+    assert model.qf_learning_rate == 2e-4
+    pendulum = gymnasium.make("Pendulum-v1")
+
+    as_saved = DroQ.load(saved(model), env=pendulum)
+    changed = DroQ.load(
+        saved(model), env=pendulum, learning_rate="lin_3e-4", qf_learning_rate="lin_5e-4"
+    )
+
+    assert as_saved.learning_rates() == (1e-4, 2e-4)
+    assert changed.learning_rates() == pytest.approx((3e-4, 5e-4))
+    changed._current_progress_remaining = 0.5
+    assert changed.learning_rates() == pytest.approx((1.5e-4, 2.5e-4))
+    assert DroQ.load(saved(changed), env=pendulum).qf_learning_rate == "lin_5e-4"
+
+
+@pytest.mark.parametrize("held", [None, 2e-4])
+def test_the_rate_of_the_critics_is_read_from_older_files(held):
+    model = small("droq", learning_rate=1e-4)
+    # Beside SBX's number, which was the first one of the other rate.
+    model.critic_learning_rate, model.qf_learning_rate = held, 1e-4
+
+    loaded = DroQ.load(saved(model))
+    changed = DroQ.load(saved(model), qf_learning_rate=5e-4)
+
+    assert loaded.qf_learning_rate == held and changed.qf_learning_rate == 5e-4
+
+
 @pytest.mark.parametrize("name", ["crossq_jax", pytest.param("td7", marks=pytest.mark.expensive)])
 def test_losses_of_the_actor_are_logged_where_it_was_updated(name):
     model = small(name, policy_delay=3, gradient_steps=1, train_freq=1)

@@ -20,6 +20,7 @@ from sb3_hds.errors import EnvironmentMismatchError
 
 # What is logged of updates of the actor, which not every call of ``train`` makes.
 _OF_ACTOR = ("actor_loss", "ent_coef", "ent_coef_loss")
+_NOT_THERE = object()
 
 
 class ModelFreeAlgorithm(TensorAlgorithm):
@@ -64,6 +65,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
 
     default_timesteps: ClassVar[int] = 20_000
     policy: LearningPolicy
+    qf_learning_rate: Any
 
     def __init__(
         self,
@@ -105,9 +107,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         super().__init__(
             policy=policy_class,
             env=made_env,
-            learning_rate=schedule_of(learning_rate)
-            if isinstance(learning_rate, str)
-            else learning_rate,
+            learning_rate=learning_rate,  # type: ignore[arg-type]  # a name until it is set up
             qf_learning_rate=None,
             buffer_size=buffer_size,
             learning_starts=learning_starts,
@@ -141,7 +141,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
                 f"{replay_buffer_class.__name__}: use SB3's NStepReplayBuffer with "
                 f"replay_buffer_kwargs={{'n_steps': {n_steps}, 'gamma': {gamma}}}."
             )
-        self.critic_learning_rate = qf_learning_rate
+        self.qf_learning_rate = qf_learning_rate
         self.policy_delay = policy_delay
         self._constructed(device, _init_setup_model)
 
@@ -175,7 +175,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         silent = _OF_ACTOR if self._n_improved() == n_improved else ()
         self._n_updates += gradient_steps
         self.logger.record("train/learning_rate", rate)
-        if self.critic_learning_rate is not None:
+        if self.qf_learning_rate is not None:
             self.logger.record("train/qf_learning_rate", qf_rate)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, value in report.items():
@@ -190,9 +190,9 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         """:return: of the actor and of the critics, at this point of the training"""
         remaining = self._current_progress_remaining
         rate = float(self.lr_schedule(remaining))
-        if self.critic_learning_rate is None:
+        if self.qf_learning_rate is None:
             return rate, rate
-        return rate, float(schedule_of(self.critic_learning_rate)(remaining))
+        return rate, float(schedule_of(self.qf_learning_rate)(remaining))
 
     def check_arguments(self) -> None:
         counts = {
@@ -209,12 +209,12 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             self.refuse_unless(fine, name, f"a whole number of at least {fewest}")
         for name in ("tau", "gamma"):
             self.refuse_unless(between(getattr(self, name), 0.0, 1.0), name, "from 0 to 1")
-        rates = {"learning_rate": self.learning_rate, "qf_learning_rate": self.critic_learning_rate}
-        for name, rate in rates.items():
+        for name in ("learning_rate", "qf_learning_rate"):
+            rate = getattr(self, name)
             fine = not isinstance(rate, int | float) or between(rate, 0.0, math.inf)
-            self.refuse_unless(fine, name, "a number of at least 0, or a schedule", rate)
-        if self.critic_learning_rate is not None:
-            schedule_of(self.critic_learning_rate)
+            self.refuse_unless(fine, name, "a number of at least 0, or a schedule")
+        if self.qf_learning_rate is not None:
+            schedule_of(self.qf_learning_rate)
         self.refuse_unless(
             _are_rising_steps(self.param_resets or []),
             "param_resets",
@@ -227,17 +227,22 @@ class ModelFreeAlgorithm(TensorAlgorithm):
                 "use n_steps=1, or gymnasium.wrappers.FlattenObservation."
             )
 
-    def refuse_unless(self, fine: bool, name: str, allowed: str, value: Any = None) -> None:
+    def refuse_unless(self, fine: bool, name: str, allowed: str) -> None:
         """
-        :param value: of the argument, where the attribute is not called like it
         :raises ValueError: unless it is fine
         """
         if not fine:
-            got = getattr(self, name) if value is None else value
+            got = getattr(self, name)
             raise ValueError(f"{type(self).__name__}({name}={got!r}): {name} must be {allowed}.")
 
     def _setup_model(self) -> None:
+        if isinstance(self.learning_rate, str):
+            self.learning_rate = schedule_of(self.learning_rate)
+        self._take_older_rate()
+        # Of None, SBX makes the first number of ``learning_rate``.
+        given = self.qf_learning_rate
         super()._setup_model()
+        self.qf_learning_rate = given
         self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
         )
@@ -245,6 +250,12 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         # SB3 draws gSDE's noise and reads its deviation from the actor.
         self.actor: Any = self.policy.actor
         self.critic: Any = self.policy.critic
+
+    def _take_older_rate(self) -> None:
+        """Older files have ``qf_learning_rate`` under another name, beside SBX's number."""
+        older = vars(self).pop("critic_learning_rate", _NOT_THERE)
+        if older is not _NOT_THERE and self.qf_learning_rate == self.lr_schedule(1.0):
+            self.qf_learning_rate = older
 
     def _maybe_reset_params(self) -> None:
         resets = self.param_resets or []
