@@ -579,6 +579,29 @@ def test_returns_of_several_steps_and_compressed_buffers_are_learned_from(name):
 
 
 @pytest.mark.parametrize("name", ["droq", "td7"])
+def test_the_replay_buffer_is_that_of_the_arguments_that_a_model_is_loaded_with(name):
+    algorithm, pendulum = algos.ALL[name], gymnasium.make("Pendulum-v1")
+    plain = small(name)
+
+    longer = algorithm.load(saved(plain), env=pendulum, n_steps=3, gamma=0.9).learn(20)
+    shorter = algorithm.load(saved(longer), env=pendulum, gamma=0.8).learn(20)
+    again = algorithm.load(saved(longer), env=pendulum, n_steps=1).learn(20)
+
+    discounts = [batches_of(model, 1, 16, 1).discount.min() for model in (longer, shorter, again)]
+    assert discounts == pytest.approx([0.9**3, 0.8**3, 0.9])
+    assert type(again.replay_buffer) is type(plain.replay_buffer)
+
+
+def test_a_replay_buffer_that_was_passed_is_used_after_loading():
+    uniform = small("td7", replay_buffer_class=ReplayBuffer)
+
+    loaded = TD7.load(saved(uniform), env=gymnasium.make("Pendulum-v1"))
+    changed = TD7.load(saved(small("td7")), replay_buffer_class=ReplayBuffer)
+
+    assert type(loaded.replay_buffer) is type(changed.replay_buffer) is ReplayBuffer
+
+
+@pytest.mark.parametrize("name", ["droq", "td7"])
 def test_hindsight_replay_is_learned_from(name):
     env = BitFlippingEnv(n_bits=3, continuous=True, max_steps=3)
     model = algos.ALL[name](

@@ -7,7 +7,7 @@ from abc import abstractmethod
 from typing import Any, ClassVar
 
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
@@ -66,6 +66,8 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     default_timesteps: ClassVar[int] = 20_000
     policy: LearningPolicy
     qf_learning_rate: Any
+    #: the replay buffer that arguments led to, where none was passed
+    _derived_buffer: type[ReplayBuffer] | None = None
 
     def __init__(
         self,
@@ -241,8 +243,12 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         self._take_older_rate()
         # Of None, SBX makes the first number of ``learning_rate``.
         given = self.qf_learning_rate
+        derived = self.replay_buffer_class in (None, self._derived_buffer)
+        if derived:
+            self._derive_buffer()
         super()._setup_model()
         self.qf_learning_rate = given
+        self._derived_buffer = self.replay_buffer_class if derived else None
         self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
         )
@@ -250,6 +256,18 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         # SB3 draws gSDE's noise and reads its deviation from the actor.
         self.actor: Any = self.policy.actor
         self.critic: Any = self.policy.critic
+
+    def _derive_buffer(self) -> None:
+        """What ``load`` was passed counts, not what it read."""
+        if self._derived_buffer is NStepReplayBuffer:
+            held = self.replay_buffer_kwargs.items()
+            own = {name: value for name, value in held if name not in ("n_steps", "gamma")}
+            self.replay_buffer_kwargs = own
+        self.replay_buffer_class = self._usual_buffer()
+
+    def _usual_buffer(self) -> type[ReplayBuffer] | None:
+        """:return: what is used where none is passed; None: what SB3 uses"""
+        return None
 
     def _take_older_rate(self) -> None:
         """Older files have ``qf_learning_rate`` under another name, beside SBX's number."""

@@ -311,11 +311,12 @@ class TD7(ModelFreeAlgorithm):
                 not compressed, "optimize_memory_usage", "False with LapReplayBuffer"
             )
 
-    def _setup_model(self) -> None:
+    def _usual_buffer(self) -> type[ReplayBuffer] | None:
         is_dict = isinstance(self.observation_space, spaces.Dict)
         plain = self.n_steps == 1 and not self.optimize_memory_usage and not is_dict
-        if plain and self.replay_buffer_class is None:
-            self.replay_buffer_class = LapReplayBuffer
+        return LapReplayBuffer if plain else None
+
+    def _setup_model(self) -> None:
         self._choose_train_freq()
         super()._setup_model()
         if self.best_worst_return > -np.inf:
