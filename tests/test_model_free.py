@@ -14,7 +14,7 @@ import pytest
 import sbx
 import torch as th
 from gymnasium import spaces
-from small_models import OFF_POLICY, PLANNERS, SMALL, logged, saved, small
+from small_models import OFF_POLICY, PLANNERS, SMALL, logged, same, saved, small
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.distributions import (
@@ -590,6 +590,24 @@ def test_the_replay_buffer_is_that_of_the_arguments_that_a_model_is_loaded_with(
     discounts = [batches_of(model, 1, 16, 1).discount.min() for model in (longer, shorter, again)]
     assert discounts == pytest.approx([0.9**3, 0.8**3, 0.9])
     assert type(again.replay_buffer) is type(plain.replay_buffer)
+
+
+def test_an_entropy_coefficient_that_a_model_is_loaded_with_is_the_one_that_acts():
+    learned = small("droq", policy_delay=1).learn(20)
+    pendulum = gymnasium.make("Pendulum-v1")
+
+    fixed = DroQ.load(saved(learned), env=pendulum, ent_coef=0.3)
+    lines = logged(fixed)
+    fixed.learn(20).logger.dump()
+
+    assert lines.column("train/ent_coef")[-1] == pytest.approx(0.3)
+    as_saved = DroQ.load(saved(learned), env=pendulum)
+    assert same(as_saved.get_parameters(), learned.get_parameters())
+
+
+def test_exploration_is_that_of_the_networks_that_are_loaded():
+    with pytest.raises(ValueError, match=r"DroQ\(use_sde=True\): use_sde must be False, as when"):
+        DroQ.load(saved(small("droq")), use_sde=True)
 
 
 def test_a_replay_buffer_that_was_passed_is_used_after_loading():

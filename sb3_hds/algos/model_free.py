@@ -222,6 +222,10 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             "param_resets",
             "None or a rising list of steps, such as [15_000, 50_000]",
         )
+        made_with = self.policy_kwargs.get("use_sde", self.use_sde)
+        self.refuse_unless(
+            self.use_sde == made_with, "use_sde", f"{made_with}, as when the networks were made"
+        )
         usual_buffer = self.replay_buffer_class is None
         if usual_buffer and self.n_steps > 1 and isinstance(self.observation_space, spaces.Dict):
             raise EnvironmentMismatchError(
