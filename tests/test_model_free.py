@@ -374,6 +374,57 @@ def test_images_are_refused(shape):
         DroQ("MlpPolicy", env)
 
 
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        (spaces.MultiDiscrete([[2, 3], [3, 4]]), "MultiDiscrete with 2 axes"),
+        (spaces.Box(-1, 1, (0,)), "has no numbers"),
+        (spaces.Dict({}), "has no numbers"),
+    ],
+    ids=str,
+)
+def test_observations_that_cannot_be_learned_from_are_refused(space, message):
+    with pytest.raises(EnvironmentMismatchError, match=message):
+        DroQ(env=Constant(space, spaces.Box(-1, 1, (1,))))
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        (spaces.Box(0, 5, (2,), np.int32), "whole numbers"),
+        (spaces.Box(np.array([0.0, -1.0], "f"), np.array([0.0, 1.0], "f")), "have no range"),
+    ],
+    ids=str,
+)
+def test_actions_that_cannot_be_scaled_are_refused(space, message):
+    with pytest.raises(EnvironmentMismatchError, match=message):
+        DroQ(env=Constant(spaces.Box(-1, 1, (3,)), space))
+
+
+@pytest.mark.parametrize(
+    ("space", "obs"),
+    [
+        (spaces.Discrete(4, start=2), 1),
+        (spaces.Discrete(4, start=2), 6),
+        (spaces.MultiDiscrete([2, 3]), [2, 0]),
+        (spaces.MultiDiscrete([2, 3]), [0, -1]),
+    ],
+)
+def test_a_choice_that_there_is_not_gets_no_action(space, obs):
+    model = small("droq", Constant(space, spaces.Box(-1, 1, (1,))))
+
+    with pytest.raises(ValueError, match="none of the choices that its space has"):
+        model.predict(np.array(obs))
+
+
+def test_parts_of_an_observation_come_in_equal_numbers():
+    env = Constant(SPACES["dict"], spaces.Box(-1, 1, (1,)))
+    model = small("droq", env, policy="MultiInputPolicy")
+
+    with pytest.raises(ValueError, match=r"different numbers of observations \(a: 1, b: 2\)"):
+        model.predict({"a": np.zeros((1, 2), np.float32), "b": np.array([1, 2])})
+
+
 # --- what SB3's own tests ask for
 
 

@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_hds.algos.call_forms import between, check_policy, is_count, policy_and_env, schedule_of
 from sb3_hds.algos.learning_policy import LearningPolicy
-from sb3_hds.algos.observations import check_observations
+from sb3_hds.algos.observations import check_actions, check_observations
 from sb3_hds.algos.tensor_algorithm import TensorAlgorithm
 from sb3_hds.errors import EnvironmentMismatchError
 
@@ -197,6 +197,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         return rate, float(schedule_of(self.qf_learning_rate)(remaining))
 
     def check_arguments(self) -> None:
+        check_actions(self.action_space)  # type: ignore[arg-type]  # SB3 has refused all but Box
         counts = {
             "buffer_size": 1,
             "learning_starts": 0,
