@@ -750,6 +750,32 @@ def test_schedules_of_both_learning_rates_act(algorithm):
             np.testing.assert_array_equal(tensor, before[key], err_msg=key)
 
 
+@pytest.mark.parametrize("rate", ["lin_-1e-3", "-1e-3", "lin_nan"])
+@pytest.mark.parametrize("argument", ["learning_rate", "qf_learning_rate"])
+def test_a_negative_learning_rate_is_refused_also_as_a_string(argument, rate):
+    with pytest.raises(ValueError, match="A learning rate is a number of at least 0"):
+        small("droq", **{argument: rate})
+
+
+def test_a_schedule_ends_where_training_was_to_end():
+    model = small("droq", learning_rate=lambda left: 1e-3 * left, train_freq=20)
+    lines = logged(model)
+
+    model.learn(30).logger.dump()
+
+    assert model.num_timesteps == 40
+    assert lines.column("train/learning_rate")[-1] == 0.0
+
+
+@pytest.mark.parametrize("argument", ["learning_rate", "qf_learning_rate"])
+def test_a_schedule_that_becomes_negative_is_named_where_it_does(argument):
+    model = small("droq", **{argument: lambda left: left - 0.5})
+    model._current_progress_remaining = 0.25
+
+    with pytest.raises(ValueError, match=rf"{argument} must be .* 0\.25 of the .* says -0\.25"):
+        model.train(1, 16)
+
+
 def test_learning_rates_of_every_form_may_be_changed_while_loading():
     model = small("droq", learning_rate=1e-4, qf_learning_rate=2e-4)
     assert model.qf_learning_rate == 2e-4

@@ -190,11 +190,25 @@ class ModelFreeAlgorithm(TensorAlgorithm):
 
     def learning_rates(self) -> tuple[float, float]:
         """:return: of the actor and of the critics, at this point of the training"""
-        remaining = self._current_progress_remaining
-        rate = float(self.lr_schedule(remaining))
+        rate = self._rate("learning_rate", self.lr_schedule)
         if self.qf_learning_rate is None:
             return rate, rate
-        return rate, float(schedule_of(self.qf_learning_rate)(remaining))
+        return rate, self._rate("qf_learning_rate", schedule_of(self.qf_learning_rate))
+
+    def _rate(self, name: str, schedule: Schedule) -> float:
+        """
+        :raises ValueError: for one that is no learning rate
+        """
+        # The last collection may go beyond the steps that were asked for.
+        remaining = max(0.0, self._current_progress_remaining)
+        rate = float(schedule(remaining))
+        if not between(rate, 0.0, math.inf):
+            raise ValueError(
+                f"{type(self).__name__}({name}={getattr(self, name)!r}): {name} must be a finite "
+                f"number of at least 0 all the time; where {remaining:.3g} of the training "
+                f"remains, the schedule says {rate}."
+            )
+        return rate
 
     def check_arguments(self) -> None:
         check_actions(self.action_space)  # type: ignore[arg-type]  # SB3 has refused all but Box
