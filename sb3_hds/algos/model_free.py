@@ -224,6 +224,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         for name, fewest in counts.items():
             fine = is_count(getattr(self, name), fewest)
             self.refuse_unless(fine, name, f"a whole number of at least {fewest}")
+        self._check_collection()
         for name in ("tau", "gamma"):
             self.refuse_unless(between(getattr(self, name), 0.0, 1.0), name, "from 0 to 1")
         for name in ("learning_rate", "qf_learning_rate"):
@@ -233,7 +234,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         if self.qf_learning_rate is not None:
             schedule_of(self.qf_learning_rate)
         self.refuse_unless(
-            _are_rising_steps(self.param_resets or []),
+            self.param_resets is None or _are_rising_steps(self.param_resets),
             "param_resets",
             "None or a rising list of steps, such as [15_000, 50_000]",
         )
@@ -247,6 +248,18 @@ class ModelFreeAlgorithm(TensorAlgorithm):
                 "n_steps > 1 needs SB3's NStepReplayBuffer, which has no Dict observation spaces: "
                 "use n_steps=1, or gymnasium.wrappers.FlattenObservation."
             )
+
+    def _check_collection(self) -> None:
+        freq: Any = self.train_freq
+        fewest = freq[0] if isinstance(freq, tuple) and freq else freq
+        # SB3 refuses what is no number of steps or episodes.
+        fine = not isinstance(fewest, int) or fewest >= 1
+        self.refuse_unless(fine, "train_freq", "a number of at least 1, or (n, 'episode')")
+        fine = self.action_noise is None or isinstance(self.action_noise, ActionNoise)
+        self.refuse_unless(fine, "action_noise", "None or an ActionNoise of SB3")
+        given: Any = self.replay_buffer_class
+        fine = given is None or (isinstance(given, type) and issubclass(given, ReplayBuffer))
+        self.refuse_unless(fine, "replay_buffer_class", "None or a class of replay buffers")
 
     def refuse_unless(self, fine: bool, name: str, allowed: str) -> None:
         """
