@@ -954,6 +954,20 @@ def test_td7_keeps_its_checkpoint_and_what_that_is_worth_when_networks_start_afr
     assert model.best_worst_return == -150.0
 
 
+def test_td7_takes_no_buffer_without_the_priorities_that_it_draws_by(tmp_path):
+    small("droq").learn(20).save_replay_buffer(tmp_path / "buffer")
+    model = small("td7").learn(20)
+    before = model.replay_buffer
+
+    with pytest.raises(ValueError, match="ReplayBuffer, which has no priorities to draw by"):
+        model.load_replay_buffer(tmp_path / "buffer")
+
+    assert model.replay_buffer is before
+    uniform = small("td7", replay_buffer_class=ReplayBuffer)
+    uniform.load_replay_buffer(tmp_path / "buffer")
+    assert uniform.learn(20, reset_num_timesteps=False).replay_buffer.size() == 40
+
+
 def test_td7_draws_by_priority_where_the_environment_is_normalised():
     env = VecNormalize(DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")]))
 
