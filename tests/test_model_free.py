@@ -27,7 +27,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rl_zoo_plugin.lazy import parameters_of
-from sb3_hds import GSDESAC, TD7, CrossQ, DroQ, SimbaSAC, algos
+from sb3_hds import GSDESAC, TD7, DroQ, SimbaSAC, algos
 from sb3_hds.algos import soft_actor_critic, td7_update
 from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp, SimbaBody
 from sb3_hds.algos.gaussian_policy import optimizer_of
@@ -53,6 +53,13 @@ MODEL_FREE = [name for name in OFF_POLICY if name not in PLANNERS]
 SOFT = [name for name in MODEL_FREE if name != "td7"]
 every_algorithm = pytest.mark.parametrize("name", MODEL_FREE)
 every_soft = pytest.mark.parametrize("name", SOFT)
+
+
+def mostly_expensive(*quick: str) -> pytest.MarkDecorator:
+    """:return: every algorithm, of which only these are not among the expensive tests"""
+    mark = pytest.mark.expensive
+    names = [n if n in quick else pytest.param(n, marks=mark) for n in MODEL_FREE]
+    return pytest.mark.parametrize("name", names)
 
 
 # --- gSDE beside SB3's
@@ -681,7 +688,13 @@ def test_a_replay_buffer_that_was_passed_is_used_after_loading():
     assert type(loaded.replay_buffer) is type(changed.replay_buffer) is ReplayBuffer
 
 
-@pytest.mark.parametrize("name", ["droq", "td7"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        n if n in ("droq", "td7") else pytest.param(n, marks=pytest.mark.expensive)
+        for n in MODEL_FREE
+    ],
+)
 def test_hindsight_replay_is_learned_from(name):
     env = BitFlippingEnv(n_bits=3, continuous=True, max_steps=3)
     model = algos.ALL[name](
@@ -746,19 +759,45 @@ def test_an_update_that_diverges_is_an_error_and_leaves_the_last_good_weights():
     assert before.keys() == after.keys()
 
 
-@pytest.mark.parametrize("algorithm", [GSDESAC, CrossQ, TD7])
-def test_schedules_of_both_learning_rates_act(algorithm):
-    name = {GSDESAC: "gsde_sac", CrossQ: "crossq_jax", TD7: "td7"}[algorithm]
-    model = small(name, learning_rate=lambda left: 1e-3 * left, qf_learning_rate="lin_2e-3")
-    model.learn(40)
+def trained(learner: Any) -> dict[str, np.ndarray]:
+    """:return: all that optimisers change, whatever it belongs to"""
+    parts = jax.tree_util.tree_leaves_with_path(learner, is_leaf=lambda x: isinstance(x, Trained))
+    return {
+        jax.tree_util.keystr(path + inside): np.array(leaf)
+        for path, part in parts
+        if isinstance(part, Trained)
+        for inside, leaf in jax.tree_util.tree_leaves_with_path(part.weights["params"])
+    }
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        n if n in ("bro", "td7") else pytest.param(n, marks=pytest.mark.expensive)
+        for n in MODEL_FREE
+    ],
+)
+def test_schedules_act_on_all_that_learns(name):
+    model = small(
+        name,
+        learning_rate=lambda left: 1e-3 * left,
+        qf_learning_rate="lin_2e-3",
+        policy_delay=1,
+    ).learn(20)
+    begun = trained(model.policy.learner)
+
     model._current_progress_remaining = 0.0
-    before = model.get_parameters()["policy"]
+    model.train(2, 16)
+    ended = trained(model.policy.learner)
+    model._current_progress_remaining = 1.0
+    model.train(2, 16)
+    again = trained(model.policy.learner)
 
-    model.train(4, 16)
-
-    for key, tensor in model.get_parameters()["policy"].items():
-        if key.startswith(("actor", "critic")) and "statistics" not in key:
-            np.testing.assert_array_equal(tensor, before[key], err_msg=key)
+    further = {"bro": ".extra['optimism']", "td7": ".encoder"}.get(name, ".log_ent_coef")
+    assert any(further in key for key in begun)
+    for key, weights in begun.items():
+        np.testing.assert_array_equal(ended[key], weights, err_msg=key)
+        assert (again[key] != weights).any(), key
 
 
 @pytest.mark.parametrize("rate", ["lin_-1e-3", "-1e-3", "lin_nan"])
