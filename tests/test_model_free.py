@@ -360,6 +360,16 @@ def test_actions_have_the_shape_of_the_action_space(name, shape):
     assert model.replay_buffer.actions.shape[2:] == (int(np.prod(shape)),)
 
 
+def test_a_seed_may_be_a_number_of_numpy():
+    seeds = np.random.SeedSequence(0).generate_state(1)
+
+    one, other = small("droq", seed=seeds[0]), small("droq", seed=int(seeds[0]))
+
+    assert same(one.get_parameters(), other.get_parameters())
+    with pytest.raises(TypeError, match="'float' object cannot be interpreted as an integer"):
+        small("droq", seed=0.5)
+
+
 def test_models_that_were_given_the_same_dictionary_do_not_share_it():
     kwargs = {"net_arch": [8]}
     exploring = GSDESAC("Pendulum-v1", policy_kwargs=kwargs)

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import operator
 import warnings
 from abc import abstractmethod
 from typing import Any, ClassVar
@@ -128,7 +129,8 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
-            seed=seed,
+            # Python's own generator, which SB3 seeds as well, takes no number of NumPy.
+            seed=None if seed is None else operator.index(seed),
             use_sde=use_sde,
             sde_sample_freq=sde_sample_freq,
             use_sde_at_warmup=use_sde_at_warmup,
