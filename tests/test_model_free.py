@@ -14,7 +14,7 @@ import pytest
 import sbx
 import torch as th
 from gymnasium import spaces
-from small_models import OFF_POLICY, PLANNERS, SMALL, logged, saved, small
+from small_models import OFF_POLICY, PLANNERS, SMALL, logged, same, saved, small
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.distributions import (
@@ -27,7 +27,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rl_zoo_plugin.lazy import parameters_of
-from sb3_hds import GSDESAC, TD7, CrossQ, DroQ, SimbaSAC, algos
+from sb3_hds import GSDESAC, TD7, DroQ, SimbaSAC, algos
 from sb3_hds.algos import soft_actor_critic, td7_update
 from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp, SimbaBody
 from sb3_hds.algos.gaussian_policy import optimizer_of
@@ -53,6 +53,13 @@ MODEL_FREE = [name for name in OFF_POLICY if name not in PLANNERS]
 SOFT = [name for name in MODEL_FREE if name != "td7"]
 every_algorithm = pytest.mark.parametrize("name", MODEL_FREE)
 every_soft = pytest.mark.parametrize("name", SOFT)
+
+
+def mostly_expensive(*quick: str) -> pytest.MarkDecorator:
+    """:return: every algorithm, of which only these are not among the expensive tests"""
+    mark = pytest.mark.expensive
+    names = [n if n in quick else pytest.param(n, marks=mark) for n in MODEL_FREE]
+    return pytest.mark.parametrize("name", names)
 
 
 # --- gSDE beside SB3's
@@ -353,6 +360,16 @@ def test_actions_have_the_shape_of_the_action_space(name, shape):
     assert model.replay_buffer.actions.shape[2:] == (int(np.prod(shape)),)
 
 
+def test_a_seed_may_be_a_number_of_numpy():
+    seeds = np.random.SeedSequence(0).generate_state(1)
+
+    one, other = small("droq", seed=seeds[0]), small("droq", seed=int(seeds[0]))
+
+    assert same(one.get_parameters(), other.get_parameters())
+    with pytest.raises(TypeError, match="'float' object cannot be interpreted as an integer"):
+        small("droq", seed=0.5)
+
+
 def test_models_that_were_given_the_same_dictionary_do_not_share_it():
     kwargs = {"net_arch": [8]}
     exploring = GSDESAC("Pendulum-v1", policy_kwargs=kwargs)
@@ -372,6 +389,57 @@ def test_images_are_refused(shape):
 
     with pytest.raises(EnvironmentMismatchError, match="is an image"):
         DroQ("MlpPolicy", env)
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        (spaces.MultiDiscrete([[2, 3], [3, 4]]), "MultiDiscrete with 2 axes"),
+        (spaces.Box(-1, 1, (0,)), "has no numbers"),
+        (spaces.Dict({}), "has no numbers"),
+    ],
+    ids=str,
+)
+def test_observations_that_cannot_be_learned_from_are_refused(space, message):
+    with pytest.raises(EnvironmentMismatchError, match=message):
+        DroQ(env=Constant(space, spaces.Box(-1, 1, (1,))))
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        (spaces.Box(0, 5, (2,), np.int32), "whole numbers"),
+        (spaces.Box(np.array([0.0, -1.0], "f"), np.array([0.0, 1.0], "f")), "have no range"),
+    ],
+    ids=str,
+)
+def test_actions_that_cannot_be_scaled_are_refused(space, message):
+    with pytest.raises(EnvironmentMismatchError, match=message):
+        DroQ(env=Constant(spaces.Box(-1, 1, (3,)), space))
+
+
+@pytest.mark.parametrize(
+    ("space", "obs"),
+    [
+        (spaces.Discrete(4, start=2), 1),
+        (spaces.Discrete(4, start=2), 6),
+        (spaces.MultiDiscrete([2, 3]), [2, 0]),
+        (spaces.MultiDiscrete([2, 3]), [0, -1]),
+    ],
+)
+def test_a_choice_that_there_is_not_gets_no_action(space, obs):
+    model = small("droq", Constant(space, spaces.Box(-1, 1, (1,))))
+
+    with pytest.raises(ValueError, match="none of the choices that its space has"):
+        model.predict(np.array(obs))
+
+
+def test_parts_of_an_observation_come_in_equal_numbers():
+    env = Constant(SPACES["dict"], spaces.Box(-1, 1, (1,)))
+    model = small("droq", env, policy="MultiInputPolicy")
+
+    with pytest.raises(ValueError, match=r"different numbers of observations \(a: 1, b: 2\)"):
+        model.predict({"a": np.zeros((1, 2), np.float32), "b": np.array([1, 2])})
 
 
 # --- what SB3's own tests ask for
@@ -479,6 +547,17 @@ def test_batch_normalisation_of_crossq_begins_where_it_is_told_to():
     ("name", "arguments"),
     [
         ("droq", {"param_resets": 50}),
+        ("droq", {"param_resets": np.array([5, 10])}),
+        ("droq", {"train_freq": 0}),
+        ("droq", {"train_freq": (-1, "episode")}),
+        ("td7", {"train_freq": 0}),
+        ("droq", {"action_noise": "normal"}),
+        ("droq", {"replay_buffer_class": "HerReplayBuffer"}),
+        ("droq", {"policy_kwargs": {"dropout_rate": None}}),
+        ("gsde_sac", {"policy_kwargs": {"log_std_init": np.nan}}),
+        ("gsde_sac", {"policy_kwargs": {"clip_mean": -1.0}}),
+        ("crossq_jax", {"policy_kwargs": {"batch_norm_momentum": 1.5}}),
+        ("bro", {"gradient_steps": "many"}),
         ("droq", {"param_resets": ["a", -3]}),
         ("droq", {"param_resets": [500, 100]}),
         ("droq", {"sde_sample_freq": 2.5}),
@@ -579,6 +658,53 @@ def test_returns_of_several_steps_and_compressed_buffers_are_learned_from(name):
 
 
 @pytest.mark.parametrize("name", ["droq", "td7"])
+def test_the_replay_buffer_is_that_of_the_arguments_that_a_model_is_loaded_with(name):
+    algorithm, pendulum = algos.ALL[name], gymnasium.make("Pendulum-v1")
+    plain = small(name)
+
+    longer = algorithm.load(saved(plain), env=pendulum, n_steps=3, gamma=0.9).learn(20)
+    shorter = algorithm.load(saved(longer), env=pendulum, gamma=0.8).learn(20)
+    again = algorithm.load(saved(longer), env=pendulum, n_steps=1).learn(20)
+
+    discounts = [batches_of(model, 1, 16, 1).discount.min() for model in (longer, shorter, again)]
+    assert discounts == pytest.approx([0.9**3, 0.8**3, 0.9])
+    assert type(again.replay_buffer) is type(plain.replay_buffer)
+
+
+def test_an_entropy_coefficient_that_a_model_is_loaded_with_is_the_one_that_acts():
+    learned = small("droq", policy_delay=1).learn(20)
+    pendulum = gymnasium.make("Pendulum-v1")
+
+    fixed = DroQ.load(saved(learned), env=pendulum, ent_coef=0.3)
+    lines = logged(fixed)
+    fixed.learn(20).logger.dump()
+
+    assert lines.column("train/ent_coef")[-1] == pytest.approx(0.3)
+    as_saved = DroQ.load(saved(learned), env=pendulum)
+    assert same(as_saved.get_parameters(), learned.get_parameters())
+
+
+def test_exploration_is_that_of_the_networks_that_are_loaded():
+    with pytest.raises(ValueError, match=r"DroQ\(use_sde=True\): use_sde must be False, as when"):
+        DroQ.load(saved(small("droq")), use_sde=True)
+
+
+def test_a_replay_buffer_that_was_passed_is_used_after_loading():
+    uniform = small("td7", replay_buffer_class=ReplayBuffer)
+
+    loaded = TD7.load(saved(uniform), env=gymnasium.make("Pendulum-v1"))
+    changed = TD7.load(saved(small("td7")), replay_buffer_class=ReplayBuffer)
+
+    assert type(loaded.replay_buffer) is type(changed.replay_buffer) is ReplayBuffer
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        n if n in ("droq", "td7") else pytest.param(n, marks=pytest.mark.expensive)
+        for n in MODEL_FREE
+    ],
+)
 def test_hindsight_replay_is_learned_from(name):
     env = BitFlippingEnv(n_bits=3, continuous=True, max_steps=3)
     model = algos.ALL[name](
@@ -643,19 +769,100 @@ def test_an_update_that_diverges_is_an_error_and_leaves_the_last_good_weights():
     assert before.keys() == after.keys()
 
 
-@pytest.mark.parametrize("algorithm", [GSDESAC, CrossQ, TD7])
-def test_schedules_of_both_learning_rates_act(algorithm):
-    name = {GSDESAC: "gsde_sac", CrossQ: "crossq_jax", TD7: "td7"}[algorithm]
-    model = small(name, learning_rate=lambda left: 1e-3 * left, qf_learning_rate="lin_2e-3")
-    model.learn(40)
+def trained(learner: Any) -> dict[str, np.ndarray]:
+    """:return: all that optimisers change, whatever it belongs to"""
+    parts = jax.tree_util.tree_leaves_with_path(learner, is_leaf=lambda x: isinstance(x, Trained))
+    return {
+        jax.tree_util.keystr(path + inside): np.array(leaf)
+        for path, part in parts
+        if isinstance(part, Trained)
+        for inside, leaf in jax.tree_util.tree_leaves_with_path(part.weights["params"])
+    }
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        n if n in ("bro", "td7") else pytest.param(n, marks=pytest.mark.expensive)
+        for n in MODEL_FREE
+    ],
+)
+def test_schedules_act_on_all_that_learns(name):
+    model = small(
+        name,
+        learning_rate=lambda left: 1e-3 * left,
+        qf_learning_rate="lin_2e-3",
+        policy_delay=1,
+    ).learn(20)
+    begun = trained(model.policy.learner)
+
     model._current_progress_remaining = 0.0
-    before = model.get_parameters()["policy"]
+    model.train(2, 16)
+    ended = trained(model.policy.learner)
+    model._current_progress_remaining = 1.0
+    model.train(2, 16)
+    again = trained(model.policy.learner)
 
-    model.train(4, 16)
+    further = {"bro": ".extra['optimism']", "td7": ".encoder"}.get(name, ".log_ent_coef")
+    assert any(further in key for key in begun)
+    for key, weights in begun.items():
+        np.testing.assert_array_equal(ended[key], weights, err_msg=key)
+        assert (again[key] != weights).any(), key
 
-    for key, tensor in model.get_parameters()["policy"].items():
-        if key.startswith(("actor", "critic")) and "statistics" not in key:
-            np.testing.assert_array_equal(tensor, before[key], err_msg=key)
+
+@pytest.mark.parametrize("rate", ["lin_-1e-3", "-1e-3", "lin_nan"])
+@pytest.mark.parametrize("argument", ["learning_rate", "qf_learning_rate"])
+def test_a_negative_learning_rate_is_refused_also_as_a_string(argument, rate):
+    with pytest.raises(ValueError, match="A learning rate is a number of at least 0"):
+        small("droq", **{argument: rate})
+
+
+def test_a_schedule_ends_where_training_was_to_end():
+    model = small("droq", learning_rate=lambda left: 1e-3 * left, train_freq=20)
+    lines = logged(model)
+
+    model.learn(30).logger.dump()
+
+    assert model.num_timesteps == 40
+    assert lines.column("train/learning_rate")[-1] == 0.0
+
+
+@pytest.mark.parametrize("argument", ["learning_rate", "qf_learning_rate"])
+def test_a_schedule_that_becomes_negative_is_named_where_it_does(argument):
+    model = small("droq", **{argument: lambda left: left - 0.5})
+    model._current_progress_remaining = 0.25
+
+    with pytest.raises(ValueError, match=rf"{argument} must be .* 0\.25 of the .* says -0\.25"):
+        model.train(1, 16)
+
+
+def test_learning_rates_of_every_form_may_be_changed_while_loading():
+    model = small("droq", learning_rate=1e-4, qf_learning_rate=2e-4)
+    assert model.qf_learning_rate == 2e-4
+    pendulum = gymnasium.make("Pendulum-v1")
+
+    as_saved = DroQ.load(saved(model), env=pendulum)
+    changed = DroQ.load(
+        saved(model), env=pendulum, learning_rate="lin_3e-4", qf_learning_rate="lin_5e-4"
+    )
+
+    assert as_saved.learning_rates() == (1e-4, 2e-4)
+    assert changed.learning_rates() == pytest.approx((3e-4, 5e-4))
+    changed._current_progress_remaining = 0.5
+    assert changed.learning_rates() == pytest.approx((1.5e-4, 2.5e-4))
+    assert DroQ.load(saved(changed), env=pendulum).qf_learning_rate == "lin_5e-4"
+
+
+@pytest.mark.parametrize("held", [None, 2e-4])
+def test_the_rate_of_the_critics_is_read_from_older_files(held):
+    model = small("droq", learning_rate=1e-4)
+    # Beside SBX's number, which was the first one of the other rate.
+    model.critic_learning_rate, model.qf_learning_rate = held, 1e-4
+
+    loaded = DroQ.load(saved(model))
+    changed = DroQ.load(saved(model), qf_learning_rate=5e-4)
+
+    assert loaded.qf_learning_rate == held and changed.qf_learning_rate == 5e-4
 
 
 @pytest.mark.parametrize("name", ["crossq_jax", pytest.param("td7", marks=pytest.mark.expensive)])
@@ -794,6 +1001,20 @@ def test_td7_keeps_its_checkpoint_and_what_that_is_worth_when_networks_start_afr
     assert np.abs(model.predict(obs)[0] - exploring).min() > 1e-3
     np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], kept)
     assert model.best_worst_return == -150.0
+
+
+def test_td7_takes_no_buffer_without_the_priorities_that_it_draws_by(tmp_path):
+    small("droq").learn(20).save_replay_buffer(tmp_path / "buffer")
+    model = small("td7").learn(20)
+    before = model.replay_buffer
+
+    with pytest.raises(ValueError, match="ReplayBuffer, which has no priorities to draw by"):
+        model.load_replay_buffer(tmp_path / "buffer")
+
+    assert model.replay_buffer is before
+    uniform = small("td7", replay_buffer_class=ReplayBuffer)
+    uniform.load_replay_buffer(tmp_path / "buffer")
+    assert uniform.learn(20, reset_num_timesteps=False).replay_buffer.size() == 40
 
 
 def test_td7_draws_by_priority_where_the_environment_is_normalised():

@@ -93,6 +93,18 @@ def test_a_function_of_jax_is_taken_as_it_is_and_anything_else_is_refused():
             activation(wrong)
 
 
+@pytest.mark.parametrize("function", [np.tanh, th.sigmoid, lambda: 0.0])
+def test_a_function_that_jax_cannot_trace_is_refused(function):
+    with pytest.raises(ValueError, match=r"activation_fn=.* is no JAX function"):
+        activation(function)
+
+
+@pytest.mark.parametrize("function", [jnp.sum, lambda x: None])
+def test_a_function_that_does_not_keep_the_shape_is_refused(function):
+    with pytest.raises(ValueError, match=r"must keep the shape of an array, and makes"):
+        activation(function)
+
+
 def test_a_function_of_ones_own_may_have_a_known_name():
     def softplus(x):
         return jnp.log1p(jnp.exp(2.0 * x))

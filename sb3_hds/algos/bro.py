@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_hds.algos.bodies import BroBody
-from sb3_hds.algos.call_forms import between
+from sb3_hds.algos.call_forms import between, is_count
 from sb3_hds.algos.gaussian_policy import GaussianPolicy
 from sb3_hds.algos.off_policy import (
     Batch,
@@ -121,7 +121,8 @@ class BRO(SoftActorCritic):
         self.kl_target, self.std_multiplier = kl_target, std_multiplier
         self.multiplier_rate = multiplier_rate
         if param_resets is None:
-            param_resets = list(_FAST_RESETS if 0 <= gradient_steps <= _FAST else _RESETS)
+            fast = is_count(gradient_steps, 0) and gradient_steps <= _FAST
+            param_resets = list(_FAST_RESETS if fast else _RESETS)
         super().__init__(
             policy,
             env,

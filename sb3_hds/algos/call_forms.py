@@ -187,21 +187,20 @@ def schedule_of(rate: float | str | Schedule) -> Schedule:
     """
     :param rate: a number, a function of the remaining progress (from 1 to 0), or ``"lin_3e-3"`` as
         in the zoo
-    :raises ValueError: for any other string
+    :raises ValueError: for any other string, and for a negative number in one
     """
     if not isinstance(rate, str):
         return FloatSchedule(rate)
-    kind, _, start = rate.partition("_")
+    kind, _, after = rate.partition("_")
     try:
-        return (
-            FloatSchedule(LinearSchedule(float(start), 0.0, 1.0))
-            if kind == "lin"
-            else FloatSchedule(float(rate))
-        )
+        start = float(after if kind == "lin" else rate)
     except ValueError:
+        start = math.nan
+    if not between(start, 0.0, math.inf):
         raise ValueError(
-            f"A learning rate is a number, a schedule or 'lin_NUMBER', got {rate!r}."
-        ) from None
+            f"A learning rate is a number of at least 0, a schedule or 'lin_NUMBER', got {rate!r}."
+        )
+    return FloatSchedule(LinearSchedule(start, 0.0, 1.0) if kind == "lin" else start)
 
 
 def device_or_cpu(device: Any) -> Any:

@@ -1,6 +1,7 @@
 """The policies of the SAC family, as SB3 sees them: a Gaussian actor and an ensemble of critics."""
 
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
@@ -15,7 +16,7 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_hds.algos.bodies import Mlp, SimbaBody
-from sb3_hds.algos.call_forms import check_count
+from sb3_hds.algos.call_forms import between, check_count
 from sb3_hds.algos.heads import Critic, ExploringActor, GaussianActor, noise_std
 from sb3_hds.algos.learner import GENERATOR
 from sb3_hds.algos.learning_policy import LearningPolicy
@@ -136,11 +137,12 @@ class GaussianPolicy(LearningPolicy):
         check_count("n_quantiles", n_quantiles)
         if chosen["renorm_warmup_steps"] is not None:
             check_count("renorm_warmup_steps", chosen["renorm_warmup_steps"], 0)
+        _check_settings(self.arguments)
         self._refuse_unused(has_batch_norm=chosen["renorm_warmup_steps"] is not None)
         net: Any = chosen["net_arch"]
         self.widths = widths(net, "qf")
         self.activation_fn = activation(activation_fn)
-        self.dropout_rate, self.layer_norm = _rate(dropout_rate), layer_norm
+        self.dropout_rate, self.layer_norm = float(dropout_rate), layer_norm
         self.renorm_warmup_steps, self.batch_norm_momentum = (
             chosen["renorm_warmup_steps"],
             batch_norm_momentum,
@@ -363,10 +365,18 @@ def optimizer_of(make: str | Callable[..., Any], arguments: Mapping[str, Any]) -
     return optimizer
 
 
-def _rate(dropout_rate: float) -> float:
-    if not 0.0 <= dropout_rate < 1.0:
-        raise ValueError(f"dropout_rate must be at least 0 and below 1, got {dropout_rate!r}.")
-    return float(dropout_rate)
+def _check_settings(arguments: Mapping[str, Any]) -> None:
+    ranges = {
+        "batch_norm_momentum": (0.0, 1.0, "from 0 to 1: the share that stays at an update"),
+        "log_std_init": (-math.inf, math.inf, "a finite number"),
+        "clip_mean": (0.0, math.inf, "a number of at least 0; 0 does not clip"),
+    }
+    for name, (low, high, allowed) in ranges.items():
+        if not between(arguments[name], low, high):
+            raise ValueError(f"{name} must be {allowed}, got {arguments[name]!r}.")
+    rate = arguments["dropout_rate"]
+    if not (between(rate, 0.0, 1.0) and rate < 1.0):
+        raise ValueError(f"dropout_rate must be at least 0 and below 1, got {rate!r}.")
 
 
 @partial(jax.jit, static_argnums=0)

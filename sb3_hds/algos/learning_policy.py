@@ -73,6 +73,9 @@ class LearningPolicy(TensorPolicy):
         parts = {name: np.asarray(part) for name, part in observation.items()}
         vectorized = any(is_vectorized_observation(parts[name], space[name]) for name in parts)
         rows = {name: part.reshape(-1, *space[name].shape) for name, part in parts.items()}  # type: ignore[misc]
+        if len({len(part) for part in rows.values()}) > 1:
+            numbers = ", ".join(f"{name}: {len(part)}" for name, part in rows.items())
+            raise ValueError(f"predict() got different numbers of observations ({numbers}).")
         return rows, vectorized
 
     def forward(self, obs: Any, deterministic: bool = False) -> np.ndarray:

@@ -2,24 +2,26 @@
 
 import itertools
 import math
+import operator
 import warnings
 from abc import abstractmethod
 from typing import Any, ClassVar
 
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_hds.algos.call_forms import between, check_policy, is_count, policy_and_env, schedule_of
 from sb3_hds.algos.learning_policy import LearningPolicy
-from sb3_hds.algos.observations import check_observations
+from sb3_hds.algos.observations import check_actions, check_observations
 from sb3_hds.algos.tensor_algorithm import TensorAlgorithm
 from sb3_hds.errors import EnvironmentMismatchError
 
 # What is logged of updates of the actor, which not every call of ``train`` makes.
 _OF_ACTOR = ("actor_loss", "ent_coef", "ent_coef_loss")
+_NOT_THERE = object()
 
 
 class ModelFreeAlgorithm(TensorAlgorithm):
@@ -64,6 +66,9 @@ class ModelFreeAlgorithm(TensorAlgorithm):
 
     default_timesteps: ClassVar[int] = 20_000
     policy: LearningPolicy
+    qf_learning_rate: Any
+    #: the replay buffer that arguments led to, where none was passed
+    _derived_buffer: type[ReplayBuffer] | None = None
 
     def __init__(
         self,
@@ -105,9 +110,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         super().__init__(
             policy=policy_class,
             env=made_env,
-            learning_rate=schedule_of(learning_rate)
-            if isinstance(learning_rate, str)
-            else learning_rate,
+            learning_rate=learning_rate,  # type: ignore[arg-type]  # a name until it is set up
             qf_learning_rate=None,
             buffer_size=buffer_size,
             learning_starts=learning_starts,
@@ -126,7 +129,8 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
-            seed=seed,
+            # Python's own generator, which SB3 seeds as well, takes no number of NumPy.
+            seed=None if seed is None else operator.index(seed),
             use_sde=use_sde,
             sde_sample_freq=sde_sample_freq,
             use_sde_at_warmup=use_sde_at_warmup,
@@ -141,7 +145,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
                 f"{replay_buffer_class.__name__}: use SB3's NStepReplayBuffer with "
                 f"replay_buffer_kwargs={{'n_steps': {n_steps}, 'gamma': {gamma}}}."
             )
-        self.critic_learning_rate = qf_learning_rate
+        self.qf_learning_rate = qf_learning_rate
         self.policy_delay = policy_delay
         self._constructed(device, _init_setup_model)
 
@@ -175,7 +179,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         silent = _OF_ACTOR if self._n_improved() == n_improved else ()
         self._n_updates += gradient_steps
         self.logger.record("train/learning_rate", rate)
-        if self.critic_learning_rate is not None:
+        if self.qf_learning_rate is not None:
             self.logger.record("train/qf_learning_rate", qf_rate)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, value in report.items():
@@ -188,13 +192,28 @@ class ModelFreeAlgorithm(TensorAlgorithm):
 
     def learning_rates(self) -> tuple[float, float]:
         """:return: of the actor and of the critics, at this point of the training"""
-        remaining = self._current_progress_remaining
-        rate = float(self.lr_schedule(remaining))
-        if self.critic_learning_rate is None:
+        rate = self._rate("learning_rate", self.lr_schedule)
+        if self.qf_learning_rate is None:
             return rate, rate
-        return rate, float(schedule_of(self.critic_learning_rate)(remaining))
+        return rate, self._rate("qf_learning_rate", schedule_of(self.qf_learning_rate))
+
+    def _rate(self, name: str, schedule: Schedule) -> float:
+        """
+        :raises ValueError: for one that is no learning rate
+        """
+        # The last collection may go beyond the steps that were asked for.
+        remaining = max(0.0, self._current_progress_remaining)
+        rate = float(schedule(remaining))
+        if not between(rate, 0.0, math.inf):
+            raise ValueError(
+                f"{type(self).__name__}({name}={getattr(self, name)!r}): {name} must be a finite "
+                f"number of at least 0 all the time; where {remaining:.3g} of the training "
+                f"remains, the schedule says {rate}."
+            )
+        return rate
 
     def check_arguments(self) -> None:
+        check_actions(self.action_space)  # type: ignore[arg-type]  # SB3 has refused all but Box
         counts = {
             "buffer_size": 1,
             "learning_starts": 0,
@@ -207,18 +226,23 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         for name, fewest in counts.items():
             fine = is_count(getattr(self, name), fewest)
             self.refuse_unless(fine, name, f"a whole number of at least {fewest}")
+        self._check_collection()
         for name in ("tau", "gamma"):
             self.refuse_unless(between(getattr(self, name), 0.0, 1.0), name, "from 0 to 1")
-        rates = {"learning_rate": self.learning_rate, "qf_learning_rate": self.critic_learning_rate}
-        for name, rate in rates.items():
+        for name in ("learning_rate", "qf_learning_rate"):
+            rate = getattr(self, name)
             fine = not isinstance(rate, int | float) or between(rate, 0.0, math.inf)
-            self.refuse_unless(fine, name, "a number of at least 0, or a schedule", rate)
-        if self.critic_learning_rate is not None:
-            schedule_of(self.critic_learning_rate)
+            self.refuse_unless(fine, name, "a number of at least 0, or a schedule")
+        if self.qf_learning_rate is not None:
+            schedule_of(self.qf_learning_rate)
         self.refuse_unless(
-            _are_rising_steps(self.param_resets or []),
+            self.param_resets is None or _are_rising_steps(self.param_resets),
             "param_resets",
             "None or a rising list of steps, such as [15_000, 50_000]",
+        )
+        made_with = self.policy_kwargs.get("use_sde", self.use_sde)
+        self.refuse_unless(
+            self.use_sde == made_with, "use_sde", f"{made_with}, as when the networks were made"
         )
         usual_buffer = self.replay_buffer_class is None
         if usual_buffer and self.n_steps > 1 and isinstance(self.observation_space, spaces.Dict):
@@ -227,17 +251,38 @@ class ModelFreeAlgorithm(TensorAlgorithm):
                 "use n_steps=1, or gymnasium.wrappers.FlattenObservation."
             )
 
-    def refuse_unless(self, fine: bool, name: str, allowed: str, value: Any = None) -> None:
+    def _check_collection(self) -> None:
+        freq: Any = self.train_freq
+        fewest = freq[0] if isinstance(freq, tuple) and freq else freq
+        # SB3 refuses what is no number of steps or episodes.
+        fine = not isinstance(fewest, int) or fewest >= 1
+        self.refuse_unless(fine, "train_freq", "a number of at least 1, or (n, 'episode')")
+        fine = self.action_noise is None or isinstance(self.action_noise, ActionNoise)
+        self.refuse_unless(fine, "action_noise", "None or an ActionNoise of SB3")
+        given: Any = self.replay_buffer_class
+        fine = given is None or (isinstance(given, type) and issubclass(given, ReplayBuffer))
+        self.refuse_unless(fine, "replay_buffer_class", "None or a class of replay buffers")
+
+    def refuse_unless(self, fine: bool, name: str, allowed: str) -> None:
         """
-        :param value: of the argument, where the attribute is not called like it
         :raises ValueError: unless it is fine
         """
         if not fine:
-            got = getattr(self, name) if value is None else value
+            got = getattr(self, name)
             raise ValueError(f"{type(self).__name__}({name}={got!r}): {name} must be {allowed}.")
 
     def _setup_model(self) -> None:
+        if isinstance(self.learning_rate, str):
+            self.learning_rate = schedule_of(self.learning_rate)
+        self._take_older_rate()
+        # Of None, SBX makes the first number of ``learning_rate``.
+        given = self.qf_learning_rate
+        derived = self.replay_buffer_class in (None, self._derived_buffer)
+        if derived:
+            self._derive_buffer()
         super()._setup_model()
+        self.qf_learning_rate = given
+        self._derived_buffer = self.replay_buffer_class if derived else None
         self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
         )
@@ -245,6 +290,24 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         # SB3 draws gSDE's noise and reads its deviation from the actor.
         self.actor: Any = self.policy.actor
         self.critic: Any = self.policy.critic
+
+    def _derive_buffer(self) -> None:
+        """What ``load`` was passed counts, not what it read."""
+        if self._derived_buffer is NStepReplayBuffer:
+            held = self.replay_buffer_kwargs.items()
+            own = {name: value for name, value in held if name not in ("n_steps", "gamma")}
+            self.replay_buffer_kwargs = own
+        self.replay_buffer_class = self._usual_buffer()
+
+    def _usual_buffer(self) -> type[ReplayBuffer] | None:
+        """:return: what is used where none is passed; None: what SB3 uses"""
+        return None
+
+    def _take_older_rate(self) -> None:
+        """Older files have ``qf_learning_rate`` under another name, beside SBX's number."""
+        older = vars(self).pop("critic_learning_rate", _NOT_THERE)
+        if older is not _NOT_THERE and self.qf_learning_rate == self.lr_schedule(1.0):
+            self.qf_learning_rate = older
 
     def _maybe_reset_params(self) -> None:
         resets = self.param_resets or []

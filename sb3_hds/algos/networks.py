@@ -62,7 +62,8 @@ def activation(choice: str | Activation | type) -> Activation:
     :param choice: a name ("relu", any case; "gelu" is JAX's approximation by tanh, "gelu_exact"
         what torch means by ``GELU``), a JAX function, which is taken as it is, or of torch a
         function, a module class, or a module without settings of its own
-    :raises ValueError: for a name, or something of torch, without an equal here
+    :raises ValueError: for a name, or something of torch, without an equal here, and for a function
+        that JAX cannot trace, or that changes the shape of what it is given
     """
     name = choice if isinstance(choice, str) else _torch_name(choice)
     known = {key.replace("_", ""): function for key, function in ACTIVATIONS.items()}
@@ -74,7 +75,24 @@ def activation(choice: str | Activation | type) -> Activation:
             f"activation_fn must be one of {', '.join(ACTIVATIONS)}, a torch class of such a name, "
             f"or a JAX function, which may have settings of its own, got {choice!r}."
         )
-    return choice
+    return _checked(choice)
+
+
+def _checked(function: Activation) -> Activation:
+    given = jax.ShapeDtypeStruct((2, 3), jnp.float32)
+    try:
+        shape = getattr(jax.eval_shape(function, given), "shape", None)
+    except (TypeError, ValueError, AttributeError) as error:
+        raise ValueError(
+            f"activation_fn={function!r} is no JAX function ({str(error).splitlines()[0]}): use "
+            f"one of jax.nn or jax.numpy, or a name among {', '.join(ACTIVATIONS)}."
+        ) from error
+    if shape != given.shape:
+        raise ValueError(
+            f"activation_fn={function!r} must keep the shape of an array, and makes {shape} of "
+            f"{given.shape}."
+        )
+    return function
 
 
 def _torch_name(choice: Any) -> str:

@@ -1,4 +1,7 @@
-"""Observations as the networks see them: flat, numeric, and of running scale where asked for."""
+"""
+Observations as the networks see them: flat, numeric, and of running scale where asked for. And
+which spaces there may be.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -51,8 +54,8 @@ def seen(scales: Seen, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch 
 
 def check_observations(space: spaces.Space) -> None:
     """
-    :raises EnvironmentMismatchError: for images, and whatever else is not made of numbers and
-        choices
+    :raises EnvironmentMismatchError: for images, for observations of nothing, and whatever else is
+        not made of numbers and choices
     """
     parts = space.spaces.items() if isinstance(space, spaces.Dict) else [("", space)]
     for name, part in parts:
@@ -70,6 +73,31 @@ def check_observations(space: spaces.Space) -> None:
                 "MultiDiscrete, MultiBinary, and Dict of these: "
                 "gymnasium.wrappers.FlattenObservation makes one of most others."
             )
+        if isinstance(part, spaces.MultiDiscrete) and len(part.shape) != 1:
+            raise EnvironmentMismatchError(
+                f"{what} is a MultiDiscrete with {len(part.shape)} axes, and SB3's replay buffers "
+                "take one: gymnasium.wrappers.FlattenObservation makes numbers of it."
+            )
+    if size_of(space) == 0:
+        raise EnvironmentMismatchError(f"The observation has no numbers ({space}).")
+
+
+def check_actions(space: spaces.Box) -> None:
+    """
+    :param space: with finite limits
+    :raises EnvironmentMismatchError: for integers, which SB3's replay buffers would make of actions
+        scaled to [-1, 1], and for controls that cannot be scaled
+    """
+    if not np.issubdtype(space.dtype, np.floating):
+        raise EnvironmentMismatchError(
+            f"Actions are whole numbers here ({space}), and the algorithms act by real ones. Use "
+            "an environment whose actions are a Box of floats, and round them inside it."
+        )
+    if not (space.low < space.high).all():
+        raise EnvironmentMismatchError(
+            f"Some of the actions have no range ({space}): low must be below high. Leave them out "
+            "of the action space."
+        )
 
 
 def _is_gray_image(space: spaces.Box) -> bool:
@@ -103,6 +131,11 @@ def flattener(space: spaces.Space) -> Callable[[Any], np.ndarray]:
 
 def _one_hot(obs: np.ndarray, n: np.ndarray, start: np.ndarray) -> np.ndarray:
     choices = np.asarray(obs).reshape(-1, len(n)).astype(np.int64) - start
+    if ((choices < 0) | (choices >= n)).any():
+        raise ValueError(
+            f"An observation is none of the choices that its space has: got {np.asarray(obs)}, "
+            f"and choices go from {start} to {start + n - 1}."
+        )
     flat = np.zeros((len(choices), int(n.sum())), np.float32)
     first = np.concatenate([[0], np.cumsum(n)[:-1]])
     flat[np.arange(len(choices))[:, None], choices + first] = 1.0

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from typing import Any, ClassVar
 
+import jax.numpy as jnp
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
@@ -78,6 +79,20 @@ class SoftActorCritic(ModelFreeAlgorithm):
         fine = is_count(self.target_update_interval, 1)
         self.refuse_unless(fine, "target_update_interval", "a whole number of at least 1")
         _initial_ent_coef(self.ent_coef)
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | dict[str, Any],
+        exact_match: bool = True,
+        device: Any = "auto",
+    ) -> None:
+        super().set_parameters(load_path_or_dict, exact_match, device)
+        if not isinstance(self.ent_coef, str):
+            # What is no parameter of this model is not another one's to set; ``load`` passes here.
+            before = self.policy.learner.log_ent_coef
+            fixed = {"params": jnp.log(jnp.asarray(self.ent_coef, jnp.float32))}
+            now = before._replace(weights=fixed)
+            self.policy.learner = self.policy.learner._replace(log_ent_coef=now)
 
     def _build(self, seed: int) -> None:
         start, device = _initial_ent_coef(self.ent_coef), jax_device(self._device_name)

@@ -1,5 +1,7 @@
 """TD7: learned embeddings, prioritised replay, and policies that are kept once they proved good."""
 
+import io
+import pathlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
@@ -313,11 +315,12 @@ class TD7(ModelFreeAlgorithm):
                 not compressed, "optimize_memory_usage", "False with LapReplayBuffer"
             )
 
-    def _setup_model(self) -> None:
+    def _usual_buffer(self) -> type[ReplayBuffer] | None:
         is_dict = isinstance(self.observation_space, spaces.Dict)
         plain = self.n_steps == 1 and not self.optimize_memory_usage and not is_dict
-        if plain and self.replay_buffer_class is None:
-            self.replay_buffer_class = LapReplayBuffer
+        return LapReplayBuffer if plain else None
+
+    def _setup_model(self) -> None:
         self._choose_train_freq()
         super()._setup_model()
         if self.best_worst_return > -np.inf:
@@ -343,6 +346,25 @@ class TD7(ModelFreeAlgorithm):
         # With several environments, SB3 has one for each of them.
         noise = getattr(self.action_noise, "base_noise", self.action_noise)
         return excluded if noise is not self._derived_noise else [*excluded, "action_noise"]
+
+    def load_replay_buffer(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        truncate_last_traj: bool = True,
+    ) -> None:
+        """
+        :raises ValueError: for a buffer without priorities, where transitions are drawn by them;
+            the model then keeps the one that it has
+        """
+        before = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        found = self.replay_buffer
+        if self.prioritised and not isinstance(found, LapReplayBuffer):
+            self.replay_buffer = before
+            raise ValueError(
+                f"'{path}' holds a {type(found).__name__}, which has no priorities to draw by. "
+                "Load it into TD7(..., replay_buffer_class=ReplayBuffer), which draws uniformly."
+            )
 
     def _build(self, seed: int) -> None:
         self.policy.build(self.recipe(), seed, jax_device(self._device_name))
