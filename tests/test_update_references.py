@@ -131,13 +131,24 @@ class Soft:
     :param b1: Adam's, of the entropy coefficient
     :param policy_delay: updates of the critics for each of the actor
     :param target_every: updates of the critics for each of the target networks
+    :param linear: whether the loss of the entropy coefficient has it itself, not its logarithm
     """
 
     gaussian = staticmethod(gaussian)
 
     def __init__(
-        self, learner, body, target_of, error, worth, b1=0.9, policy_delay=1, target_every=1
+        self,
+        learner,
+        body,
+        target_of,
+        error,
+        worth,
+        b1=0.9,
+        policy_delay=1,
+        target_every=1,
+        linear=False,
     ) -> None:
+        self.linear = linear
         self.body, self.target_of, self.error, self.worth = body, target_of, error, worth
         self.policy_delay, self.target_every = policy_delay, target_every
         self.actor = plain(learner.actor.weights["params"])
@@ -184,11 +195,18 @@ class Soft:
             return self.report
         self.report |= {"actor_loss": actor_loss(self.actor), "ent_coef": ent_coef}
         excess = -self.acts(self.actor, batch.obs, noise)[1].mean() - KNOBS.target_entropy
-        self.report["ent_coef_loss"] = self.log_ent_coef * excess
+        self.report["ent_coef_loss"], rise = self.weighted(excess)
         self.actor = descend(actor_loss, self.actor, KNOBS.learning_rate)
-        self.log_ent_coef = self.adam.step(self.log_ent_coef, excess)
+        self.log_ent_coef = self.adam.step(self.log_ent_coef, rise)
         self.explore(batch, keys.extra)
         return self.report
+
+    def weighted(self, excess: float) -> tuple[float, float]:
+        """:return: loss of the entropy coefficient, and its slope in the logarithm"""
+        ent_coef = np.exp(self.log_ent_coef)
+        if self.linear:
+            return ent_coef * excess, ent_coef * excess
+        return self.log_ent_coef * excess, excess
 
     def explore(self, batch: Batch, key: Any) -> None:
         """What follows the actor."""
@@ -335,7 +353,7 @@ def test_simba_normalises_by_all_it_saw(clipped):
     check(
         recipe,
         learner,
-        Soft(learner, simba, target_of, half_square, worth),
+        Soft(learner, simba, target_of, half_square, worth, linear=True),
         lambda obs: (obs - mean) / np.sqrt(variance + 1e-8),
     )
 
@@ -345,7 +363,7 @@ class Optimistic(Soft):
 
     def __init__(self, learner) -> None:
         target_of = lambda values: values.mean(0)  # noqa: E731
-        super().__init__(learner, bro, target_of, quantile_huber, mean_worth, b1=0.5)
+        super().__init__(learner, bro, target_of, quantile_huber, mean_worth, b1=0.5, linear=True)
         self.shift = plain(learner.extra["actor"].weights["params"])
         # As NormalTanhPolicy and Adjustment of the authors have them.
         self.gaussian = partial(gaussian, log_std_of=partial(squashed_between, low=-10.0, high=2.0))
@@ -470,7 +488,12 @@ class Joint(Soft):
 
     def __init__(self, learner) -> None:
         super().__init__(
-            learner._replace(target={"params": {}}), None, least, half_square, least_worth
+            learner._replace(target={"params": {}}),
+            None,
+            least,
+            half_square,
+            least_worth,
+            linear=True,
         )
         statistics = plain(learner.critic.weights["statistics"]["body"])
         self.of_critics = [Renormed(member(statistics, i)) for i in range(2)]
@@ -514,10 +537,10 @@ class Joint(Soft):
             layer.remember(self.momentum)
         report |= {"actor_loss": actor_loss(self.actor), "ent_coef": ent_coef}
         entropy = -self.acted(self.actor, batch.obs, noise, "training")[1].mean()
-        report["ent_coef_loss"] = self.log_ent_coef * (entropy - KNOBS.target_entropy)
+        report["ent_coef_loss"], rise = self.weighted(entropy - KNOBS.target_entropy)
         self.actor = descend(actor_loss, self.actor, KNOBS.learning_rate)
         self.of_actor.remember(self.momentum)
-        self.log_ent_coef = self.adam.step(self.log_ent_coef, entropy - KNOBS.target_entropy)
+        self.log_ent_coef = self.adam.step(self.log_ent_coef, rise)
         return report
 
 

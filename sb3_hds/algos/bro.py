@@ -80,9 +80,8 @@ class BRO(SoftActorCritic):
     include the temperature, the multipliers and all optimisers, and the logarithms of multipliers
     and of the deviation of actions are squashed into their limits by :math:`\tanh`: actions start
     with a deviation near :math:`e^{-4}`, not near 1 as with SAC. Its quantile loss is a sum over
-    quantiles where this is their mean, a factor that Adam takes out again. The entropy coefficient
-    learns by its logarithm's slope, as in SB3 and SBX: it falls up to 1.3 times as fast as theirs.
-    SBX has no BRO.
+    quantiles where this is their mean, a factor that Adam takes out again. The loss of the
+    entropy coefficient has the coefficient itself, as theirs. SBX has no BRO.
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
@@ -159,6 +158,7 @@ class BRO(SoftActorCritic):
             error=quantile_huber,
             worth=mean,
             ent_coef_optimizer=_MULTIPLIER,
+            linear_ent_coef=True,
             extra=optimist,
         )
 

@@ -1,11 +1,13 @@
 """CrossQ: batch normalisation in the place of target networks."""
 
+import dataclasses
 from typing import Any, ClassVar
 
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_hds.algos.gaussian_policy import CrossQPolicy
+from sb3_hds.algos.off_policy import Recipe
 from sb3_hds.algos.soft_actor_critic import SoftActorCritic
 
 
@@ -20,8 +22,8 @@ class CrossQ(SoftActorCritic):
     Their discount is 0.99, but 0.9999 on Swimmer. Batch normalisation becomes batch
     renormalisation, in each network after 100,000 updates of its own, as in the authors' code
     (``policy_kwargs={"renorm_warmup_steps": ...}``). SBX's default width is 1024, and its
-    learning rate never changes; here, schedules act. The entropy coefficient learns by its
-    logarithm's slope, as in SB3 and SBX: at 1e-3, it falls up to 2.4 times as fast as the authors'.
+    learning rate never changes; here, schedules act. The loss of the entropy coefficient has the
+    coefficient itself, as in the authors' code, where SBX has its logarithm.
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
@@ -48,3 +50,6 @@ class CrossQ(SoftActorCritic):
         super().__init__(
             policy, env, learning_rate=learning_rate, policy_delay=policy_delay, **arguments
         )
+
+    def recipe(self) -> Recipe:
+        return dataclasses.replace(super().recipe(), linear_ent_coef=True)

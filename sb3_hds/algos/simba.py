@@ -25,8 +25,8 @@ class SimbaSAC(SoftActorCritic):
     episodes of T steps, within 0.95 and 0.995, is for ``gamma`` to say. Unlike their code, which
     squashes the logarithm of the deviation of actions into [-10, 2] by tanh, the actor clips it to
     [-20, 2], as SAC and SBX do: actions start with a deviation near 1, not :math:`e^{-4}`. The
-    entropy coefficient learns by its logarithm's slope, as in SB3 and SBX: it falls up to 1.1 times
-    as fast as theirs.
+    loss of the entropy coefficient has the coefficient itself, as theirs, where SBX has its
+    logarithm.
 
     SBX's variant is ``learning_rate=3e-4, ent_coef="auto", target_entropy=-n_act,
     gradient_steps=1`` with ``policy_kwargs={"net_arch": [256, 256], "normalize_observations":
@@ -77,7 +77,7 @@ class SimbaSAC(SoftActorCritic):
         return -0.5 * self.policy.n_act
 
     def recipe(self) -> Recipe:
-        recipe = super().recipe()
+        recipe = dataclasses.replace(super().recipe(), linear_ent_coef=True)
         if self.clipped_double_q:
             return recipe
         return dataclasses.replace(recipe, target_of=average, worth=mean)
