@@ -492,6 +492,7 @@ def test_batch_normalisation_of_crossq_begins_where_it_is_told_to():
         ("bro", {"std_multiplier": -2}),
         ("bro", {"multiplier_rate": -1}),
         ("simba", {"clipped_double_q": "no"}),
+        ("droq", {"linear_ent_coef": "yes"}),
     ],
     ids=str,
 )
@@ -629,6 +630,17 @@ def test_bro_starts_afresh_with_its_temperature_and_others_keep_theirs():
         assert counts[0] > 0 and counts[1] == (0 if afresh else counts[0]), name
 
 
+@every_soft
+def test_whether_the_loss_of_the_entropy_coefficient_is_linear_is_an_argument(name):
+    usual = small(name)
+    other = small(name, linear_ent_coef=not usual.linear_ent_coef)
+
+    assert usual.policy.recipe.linear_ent_coef == (name in ("crossq_jax", "simba", "bro"))
+    assert other.policy.recipe.linear_ent_coef != usual.policy.recipe.linear_ent_coef
+    loaded = type(other).load(saved(other))
+    assert loaded.policy.recipe.linear_ent_coef == other.policy.recipe.linear_ent_coef
+
+
 def test_an_update_that_diverges_is_an_error_and_leaves_the_last_good_weights():
     model = small("droq").learn(20)
     before = model.get_parameters()["policy"]
@@ -725,6 +737,7 @@ def test_simba_with_the_arguments_in_its_docstring_is_that_of_sbx():
     net = {"net_arch": [8, 8], "normalize_observations": False}
     kwargs = net | {"optimizer_kwargs": {"weight_decay": 1e-4}}
     how = {"ent_coef": "auto", "target_entropy": -1.0, "gradient_steps": 1, "learning_rate": 3e-4}
+    how |= {"linear_ent_coef": False}
     ours = SimbaSAC("Pendulum-v1", policy_kwargs=kwargs, buffer_size=10, **how)
     theirs = sbx.SAC(
         "SimbaPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [8, 8]}, buffer_size=10
@@ -746,6 +759,9 @@ def test_simba_with_the_arguments_in_its_docstring_is_that_of_sbx():
     assert ours.gradient_steps == theirs.gradient_steps
     [start], entropy = jax.tree.leaves(theirs.ent_coef_state.params), ours.policy.learner
     assert start == entropy.log_ent_coef.weights["params"]
+    # A logarithm of 0, times an excess of 3.
+    _, loss = theirs.update_temperature(-1.0, theirs.ent_coef_state, 2.0)
+    assert loss == 0.0 and not ours.policy.recipe.linear_ent_coef
     assert (
         inspect.signature(theirs.policy.optimizer_class).parameters["weight_decay"].default
         == (dict(ours.policy.optimizers[0].arguments)["weight_decay"])

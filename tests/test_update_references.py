@@ -259,10 +259,12 @@ def test_soft_actor_critic_with_state_dependent_noise(full_std):
     check(recipe, learner, Soft(learner, mlp, least, half_square, least_worth))
 
 
-def test_droq_climbs_the_mean_and_regresses_on_the_least():
-    recipe, learner = begun("droq", {"dropout_rate": 0.0}, policy_delay=1)
+@pytest.mark.parametrize("linear", [False, True])
+def test_droq_climbs_the_mean_and_regresses_on_the_least(linear):
+    how = {"policy_delay": 1, "ent_coef": "auto_0.3", "linear_ent_coef": linear}
+    recipe, learner = begun("droq", {"dropout_rate": 0.0}, **how)
 
-    check(recipe, learner, Soft(learner, mlp, least, half_square, mean_worth))
+    check(recipe, learner, Soft(learner, mlp, least, half_square, mean_worth, linear=linear))
 
 
 @pytest.mark.parametrize(("policy_delay", "target_every"), [(2, 1), (1, 2)])
@@ -339,9 +341,12 @@ def test_tqc_drops_the_largest_of_all_quantiles():
     check(recipe, learner, Soft(learner, mlp, kept, quantile_huber, mean_worth))
 
 
-@pytest.mark.parametrize("clipped", [True, pytest.param(False, marks=pytest.mark.expensive)])
-def test_simba_normalises_by_all_it_saw(clipped):
-    recipe, learner = begun("simba", clipped_double_q=clipped)
+@pytest.mark.parametrize(
+    ("clipped", "linear"),
+    [(True, True), (True, False), pytest.param(False, True, marks=pytest.mark.expensive)],
+)
+def test_simba_normalises_by_all_it_saw(clipped, linear):
+    recipe, learner = begun("simba", clipped_double_q=clipped, linear_ent_coef=linear)
     rows = np.random.default_rng(2).normal([3.0, -1.0, 0.0], [2.0, 0.1, 5.0], (40, N_OBS))
     learner = learner._replace(seen=Seen.nothing(N_OBS).with_more(rows[:7]).with_more(rows[7:]))
     learner = learner._replace(seen=jax.tree.map(lambda x: jnp.asarray(x, float), learner.seen))
@@ -353,7 +358,7 @@ def test_simba_normalises_by_all_it_saw(clipped):
     check(
         recipe,
         learner,
-        Soft(learner, simba, target_of, half_square, worth, linear=True),
+        Soft(learner, simba, target_of, half_square, worth, linear=linear),
         lambda obs: (obs - mean) / np.sqrt(variance + 1e-8),
     )
 

@@ -87,6 +87,7 @@ class BRO(SoftActorCritic):
     :param env: likewise
     :param gradient_steps: updates per call of ``train``
     :param batch_size: transitions per update
+    :param linear_ent_coef: whether the loss of the entropy coefficient has it itself
     :param kl_target: divergence of the optimistic actor from the other one, per control
     :param std_multiplier: its standard deviation, in units of the other one's
     :param multiplier_rate: learning rate of the multipliers, in units of ``learning_rate``, whose
@@ -110,6 +111,7 @@ class BRO(SoftActorCritic):
         *,
         gradient_steps: int = 10,
         batch_size: int = 128,
+        linear_ent_coef: bool = True,
         kl_target: float = 0.05,
         std_multiplier: float = 0.75,
         multiplier_rate: float = 0.1,
@@ -126,6 +128,7 @@ class BRO(SoftActorCritic):
             env,
             gradient_steps=gradient_steps,
             batch_size=batch_size,
+            linear_ent_coef=linear_ent_coef,
             param_resets=param_resets,
             policy_kwargs={"n_quantiles": 100, **(policy_kwargs or {})},
             **arguments,
@@ -158,7 +161,6 @@ class BRO(SoftActorCritic):
             error=quantile_huber,
             worth=mean,
             ent_coef_optimizer=_MULTIPLIER,
-            linear_ent_coef=True,
             extra=optimist,
         )
 

@@ -117,7 +117,7 @@ class Recipe:
     :param policy_delay: updates of the critics for each of the actor
     :param target_every: updates of the critics for each of the target networks
     :param learns_ent_coef: whether the entropy coefficient follows the target entropy
-    :param linear_ent_coef: whether its loss has it itself (CrossQ, SimBa, BRO), not its logarithm
+    :param linear_ent_coef: whether its loss has it itself, not its logarithm
     :param joint_pass: whether current and next values come from one pass of the critics, without
         target networks (CrossQ)
     :param normalize: whether observations are normalised by running statistics (SimBa)

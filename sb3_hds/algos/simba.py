@@ -29,14 +29,15 @@ class SimbaSAC(SoftActorCritic):
     logarithm.
 
     SBX's variant is ``learning_rate=3e-4, ent_coef="auto", target_entropy=-n_act,
-    gradient_steps=1`` with ``policy_kwargs={"net_arch": [256, 256], "normalize_observations":
-    False, "optimizer_kwargs": {"weight_decay": 1e-4}}``.
+    linear_ent_coef=False, gradient_steps=1`` with ``policy_kwargs={"net_arch": [256, 256],
+    "normalize_observations": False, "optimizer_kwargs": {"weight_decay": 1e-4}}``.
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
     :param learning_rate: of actor, entropy coefficient and critics
     :param gradient_steps: updates per call of ``train``
     :param ent_coef: a number, ``"auto"``, or ``"auto_0.1"`` to start there
+    :param linear_ent_coef: whether the loss of the entropy coefficient has it itself
     :param clipped_double_q: whether the least of the critics counts, not their mean
     :param arguments: those of ``SoftActorCritic``
     """
@@ -55,6 +56,7 @@ class SimbaSAC(SoftActorCritic):
         learning_rate: float | str | Schedule = 1e-4,
         gradient_steps: int = 2,
         ent_coef: float | str = "auto_0.01",
+        linear_ent_coef: bool = True,
         clipped_double_q: bool = True,
         **arguments: Any,
     ) -> None:
@@ -65,6 +67,7 @@ class SimbaSAC(SoftActorCritic):
             learning_rate=learning_rate,
             gradient_steps=gradient_steps,
             ent_coef=ent_coef,
+            linear_ent_coef=linear_ent_coef,
             **arguments,
         )
 
@@ -77,7 +80,7 @@ class SimbaSAC(SoftActorCritic):
         return -0.5 * self.policy.n_act
 
     def recipe(self) -> Recipe:
-        recipe = dataclasses.replace(super().recipe(), linear_ent_coef=True)
+        recipe = super().recipe()
         if self.clipped_double_q:
             return recipe
         return dataclasses.replace(recipe, target_of=average, worth=mean)
