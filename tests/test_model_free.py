@@ -768,6 +768,28 @@ def test_simba_with_the_arguments_in_its_docstring_is_that_of_sbx():
     )
 
 
+def test_layers_of_td7_start_as_those_of_torch():
+    n = 100  # of each last layer, too: its biases are as many
+    env = Constant(spaces.Box(-1, 1, (n,)), spaces.Box(-1, 1, (n,)))
+    kwargs = {"net_arch": [n, n], "embedding_size": n, "n_critics": n}
+    learner = small("td7", env, policy_kwargs=kwargs).policy.learner
+    # The ensemble's axis comes first.
+    n_inputs = lambda layer: layer["kernel"].shape[-2]  # noqa: E731
+    layers = []
+    for part in (learner.encoder, learner.actor, learner.critic):
+        is_layer = lambda tree: "kernel" in tree  # noqa: E731
+        layers += jax.tree.leaves(part.weights["params"], is_leaf=is_layer)
+
+    assert sorted(map(n_inputs, layers)) == 10 * [n] + 3 * [2 * n] + [3 * n]
+    for layer in layers:
+        assert layer.keys() == {"kernel", "bias"}
+        for drawn in layer.values():
+            share = np.asarray(drawn).ravel() * np.sqrt(n_inputs(layer))
+            assert share.size >= n and np.abs(share).max() <= 1.0 + 1e-6
+            # Five standard deviations of the second moment of as many uniform numbers.
+            assert np.mean(share**2) == pytest.approx(1 / 3, abs=5 * np.sqrt(4 / 45 / share.size))
+
+
 def test_td7_does_not_judge_a_policy_by_random_actions():
     model = small("td7", use_checkpoints=True, train_freq=None, learning_starts=250)
     judged = []
