@@ -30,7 +30,7 @@ from rl_zoo_plugin.lazy import parameters_of
 from sb3_hds import GSDESAC, TD7, CrossQ, DroQ, SimbaSAC, algos
 from sb3_hds.algos import soft_actor_critic, td7_update
 from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp, SimbaBody
-from sb3_hds.algos.gaussian_policy import optimizer_of
+from sb3_hds.algos.gaussian_policy import SimbaPolicy, optimizer_of
 from sb3_hds.algos.heads import ExploringActor
 from sb3_hds.algos.lap import LapReplayBuffer, SumTree
 from sb3_hds.algos.observations import Seen, flattener, seen
@@ -721,6 +721,29 @@ def test_networks_of_simba_serve_other_algorithms(name):
     assert model.policy.critic_network.body.dropout_rate == (0.01 if name == "droq" else 0.0)
 
 
+def test_deviations_of_actions_are_squashed_where_the_authors_of_the_algorithm_do_so():
+    squashed = lambda name, **how: small(name, **how).policy.actor_network.squash_log_std  # noqa: E731
+    told = {"net_arch": [8], "squash_log_std": True}
+
+    assert squashed("simba") and squashed("simba", policy="SimbaPolicy") and squashed("bro")
+    assert not squashed("simba", policy=SimbaPolicy)
+    for name in ("tqc_jax", "droq"):
+        assert not squashed(name, policy="SimbaPolicy")
+        assert squashed(name, policy="SimbaPolicy", policy_kwargs=told)
+    for name in ("simba", "bro"):
+        assert not squashed(name, policy_kwargs=told | {"squash_log_std": False})
+
+
+def test_state_dependent_noise_of_simba_is_not_squashed():
+    model = small("simba", use_sde=True).learn(20)
+
+    assert isinstance(model.policy.actor_network, ExploringActor) and model._n_updates > 0
+    # The noise matrix is drawn with e^-3; a squashed logarithm would not be.
+    assert model.policy.get_std() == pytest.approx(np.exp(-3.0), rel=0.1)
+    with pytest.raises(ValueError, match=r"'squash_log_std': True.*with use_sde=True"):
+        small("simba", use_sde=True, policy_kwargs={"squash_log_std": True})
+
+
 def of_sbx(params: dict[str, Any]) -> dict[str, Any]:
     """:return: weights of a SimBa network of SBX under the names that they have here"""
     n_blocks = sum(name.startswith("SimbaResidualBlock") for name in params)
@@ -734,7 +757,7 @@ def of_sbx(params: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_simba_with_the_arguments_in_its_docstring_is_that_of_sbx():
-    net = {"net_arch": [8, 8], "normalize_observations": False}
+    net = {"net_arch": [8, 8], "normalize_observations": False, "squash_log_std": False}
     kwargs = net | {"optimizer_kwargs": {"weight_decay": 1e-4}}
     how = {"ent_coef": "auto", "target_entropy": -1.0, "gradient_steps": 1, "learning_rate": 3e-4}
     how |= {"linear_ent_coef": False}

@@ -43,6 +43,8 @@ N_OBS, N_ACT, N_BATCH, N_UPDATES = 3, 2, 6, 2
 KNOBS = Knobs(learning_rate=0.03, qf_learning_rate=0.05, tau=0.1, target_entropy=-1.3)
 # Double precision, and slopes whose error is that of a central difference.
 CLOSE: dict[str, Any] = {"rtol": 1e-6, "atol": 1e-8}
+# NormalTanhPolicy of the authors of SimBa and of BRO.
+OF_AUTHORS = partial(gaussian, log_std_of=partial(squashed_between, low=-10.0, high=2.0))
 
 
 class Spaces(gymnasium.Env):
@@ -342,11 +344,12 @@ def test_tqc_drops_the_largest_of_all_quantiles():
 
 
 @pytest.mark.parametrize(
-    ("clipped", "linear"),
-    [(True, True), (True, False), pytest.param(False, True, marks=pytest.mark.expensive)],
+    ("clipped", "of_sbx"),
+    [(True, False), (True, True), pytest.param(False, False, marks=pytest.mark.expensive)],
 )
-def test_simba_normalises_by_all_it_saw(clipped, linear):
-    recipe, learner = begun("simba", clipped_double_q=clipped, linear_ent_coef=linear)
+def test_simba_normalises_by_all_it_saw(clipped, of_sbx):
+    how = {"clipped_double_q": clipped, "linear_ent_coef": not of_sbx}
+    recipe, learner = begun("simba", {"squash_log_std": False} if of_sbx else {}, **how)
     rows = np.random.default_rng(2).normal([3.0, -1.0, 0.0], [2.0, 0.1, 5.0], (40, N_OBS))
     learner = learner._replace(seen=Seen.nothing(N_OBS).with_more(rows[:7]).with_more(rows[7:]))
     learner = learner._replace(seen=jax.tree.map(lambda x: jnp.asarray(x, float), learner.seen))
@@ -354,13 +357,11 @@ def test_simba_normalises_by_all_it_saw(clipped, linear):
     np.testing.assert_allclose(learner.seen.variance, rows.var(0), rtol=1e-6)
     mean, variance = plain(learner.seen.mean), plain(learner.seen.variance)
     target_of, worth = (least, least_worth) if clipped else (lambda v: v.mean(0), mean_worth)
+    expected = Soft(learner, simba, target_of, half_square, worth, linear=not of_sbx)
+    if not of_sbx:
+        expected.gaussian = OF_AUTHORS
 
-    check(
-        recipe,
-        learner,
-        Soft(learner, simba, target_of, half_square, worth, linear=linear),
-        lambda obs: (obs - mean) / np.sqrt(variance + 1e-8),
-    )
+    check(recipe, learner, expected, lambda obs: (obs - mean) / np.sqrt(variance + 1e-8))
 
 
 class Optimistic(Soft):
@@ -370,8 +371,8 @@ class Optimistic(Soft):
         target_of = lambda values: values.mean(0)  # noqa: E731
         super().__init__(learner, bro, target_of, quantile_huber, mean_worth, b1=0.5, linear=True)
         self.shift = plain(learner.extra["actor"].weights["params"])
-        # As NormalTanhPolicy and Adjustment of the authors have them.
-        self.gaussian = partial(gaussian, log_std_of=partial(squashed_between, low=-10.0, high=2.0))
+        self.gaussian = OF_AUTHORS
+        # As Adjustment of the authors has them.
         self.raw_optimism, self.raw_regularizer = (
             np.arctanh((np.log(start) + 10.0) / 8.75 - 1.0) for start in (1.0, 0.25)
         )
@@ -410,8 +411,9 @@ class Optimistic(Soft):
         self.raw_regularizer = of_regularizer.step(self.raw_regularizer, down)
 
 
-def test_actions_of_bro_start_with_the_deviation_of_its_authors_code():
-    recipe, learner = begun("bro", {"n_quantiles": 5})
+@pytest.mark.parametrize("name", ["bro", "simba"])
+def test_actions_start_with_the_deviation_of_the_authors_code(name):
+    recipe, learner = begun(name)
     weights = jax.tree.map(jnp.zeros_like, learner.actor.weights)
     obs = np.random.default_rng(0).normal(size=(5, N_OBS))
 

@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from sb3_hds.algos.bodies import BroBody
 from sb3_hds.algos.call_forms import between
 from sb3_hds.algos.gaussian_policy import GaussianPolicy
+from sb3_hds.algos.heads import GaussianActor
 from sb3_hds.algos.off_policy import (
     Batch,
     Knobs,
@@ -31,15 +32,17 @@ from sb3_hds.algos.off_policy import (
     quantile_huber,
 )
 from sb3_hds.algos.soft_actor_critic import SoftActorCritic
-from sb3_hds.algos.squashed import Gaussian
+from sb3_hds.algos.squashed import Gaussian, squashed_between
 
 # Steps of the environment at which the authors' networks start afresh: with the full replay ratio,
 # and with the fast one of 2.
 _RESETS = (15_000, 50_000, 250_000, 500_000, 750_000, 1_000_000, 1_500_000, 2_000_000)
 _FAST, _FAST_RESETS = 2, _RESETS[:1]
 _INITIAL_OPTIMISM, _INITIAL_REGULARIZER = 1.0, 0.25
-# Of the logarithms of the multipliers and of the deviation of actions.
-_MULTIPLIER_LIMITS, _STD_LIMITS = (-10.0, 7.5), (-10.0, 2.0)
+# Of the logarithms of the multipliers.
+_MULTIPLIER_LIMITS = (-10.0, 7.5)
+# Of the last layers of the actor.
+_OF_MEAN, _OF_STD = (nn.initializers.orthogonal(scale) for scale in (math.sqrt(2), 1.0))
 
 
 class BroPolicy(GaussianPolicy):
@@ -53,6 +56,7 @@ class BroPolicy(GaussianPolicy):
         "optimizer_class": "adamw",
         "optimizer_kwargs": {"weight_decay": 1e-4},
         "normalize_observations": False,
+        "squash_log_std": True,
     }
     unused = ("renorm_warmup_steps", "dropout_rate")
 
@@ -63,7 +67,7 @@ class BroPolicy(GaussianPolicy):
         return BroBody(net_arch, self.activation_fn)
 
     def gaussian_actor(self, body: nn.Module, n_act: int) -> nn.Module:
-        return BroActor(body, n_act)
+        return GaussianActor(body, n_act, self.squash_log_std, _OF_MEAN, _OF_STD)
 
 
 class BRO(SoftActorCritic):
@@ -165,28 +169,6 @@ class BRO(SoftActorCritic):
         )
 
 
-class BroActor(nn.Module):
-    r"""
-    Observation to a Gaussian, the logarithm of whose deviation is squashed into [-10, 2].
-
-    Source: ``NormalTanhPolicy`` of the authors' code.
-
-    :param body: see ``bodies.py``
-    :param n_act: number of controls
-    """
-
-    body: nn.Module
-    n_act: int
-
-    @nn.compact
-    def __call__(self, obs: Float[Array, "*batch obs"], train: bool = False) -> Gaussian:
-        latent = self.body(obs, train)
-        of_mean, of_std = (nn.initializers.orthogonal(scale) for scale in (math.sqrt(2), 1.0))
-        mean = nn.Dense(self.n_act, kernel_init=of_mean)(latent)
-        log_std = _squashed(nn.Dense(self.n_act, kernel_init=of_std)(latent), _STD_LIMITS)
-        return Gaussian(mean, jnp.exp(log_std), latent)
-
-
 class Shift(nn.Module):
     """
     How far the optimistic actor's mean is from the other one's.
@@ -270,14 +252,9 @@ class Optimist:
         return jnp.tanh(gaussian.mean + shift + self.std_multiplier * gaussian.std * noise)
 
 
-def _squashed(raw: Array, limits: tuple[float, float]) -> Array:
-    low, high = limits
-    return low + 0.5 * (high - low) * (1.0 + jnp.tanh(raw))
-
-
 def _value(raw: Array) -> Array:
     """Of a multiplier."""
-    return jnp.exp(_squashed(raw, _MULTIPLIER_LIMITS))
+    return jnp.exp(squashed_between(raw, *_MULTIPLIER_LIMITS))
 
 
 def _before(log: float) -> Array:
