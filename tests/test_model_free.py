@@ -30,7 +30,7 @@ from rl_zoo_plugin.lazy import parameters_of
 from sb3_hds import GSDESAC, TD7, DroQ, SimbaSAC, algos
 from sb3_hds.algos import soft_actor_critic, td7_update
 from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp, SimbaBody
-from sb3_hds.algos.gaussian_policy import optimizer_of
+from sb3_hds.algos.gaussian_policy import SimbaPolicy, optimizer_of
 from sb3_hds.algos.heads import ExploringActor
 from sb3_hds.algos.lap import LapReplayBuffer, SumTree
 from sb3_hds.algos.observations import Seen, flattener, seen
@@ -571,6 +571,7 @@ def test_batch_normalisation_of_crossq_begins_where_it_is_told_to():
         ("bro", {"std_multiplier": -2}),
         ("bro", {"multiplier_rate": -1}),
         ("simba", {"clipped_double_q": "no"}),
+        ("droq", {"linear_ent_coef": "yes"}),
     ],
     ids=str,
 )
@@ -755,6 +756,17 @@ def test_bro_starts_afresh_with_its_temperature_and_others_keep_theirs():
         assert counts[0] > 0 and counts[1] == (0 if afresh else counts[0]), name
 
 
+@every_soft
+def test_whether_the_loss_of_the_entropy_coefficient_is_linear_is_an_argument(name):
+    usual = small(name)
+    other = small(name, linear_ent_coef=not usual.linear_ent_coef)
+
+    assert usual.policy.recipe.linear_ent_coef == (name in ("crossq_jax", "simba", "bro"))
+    assert other.policy.recipe.linear_ent_coef != usual.policy.recipe.linear_ent_coef
+    loaded = type(other).load(saved(other))
+    assert loaded.policy.recipe.linear_ent_coef == other.policy.recipe.linear_ent_coef
+
+
 def test_an_update_that_diverges_is_an_error_and_leaves_the_last_good_weights():
     model = small("droq").learn(20)
     before = model.get_parameters()["policy"]
@@ -916,6 +928,29 @@ def test_networks_of_simba_serve_other_algorithms(name):
     assert model.policy.critic_network.body.dropout_rate == (0.01 if name == "droq" else 0.0)
 
 
+def test_deviations_of_actions_are_squashed_where_the_authors_of_the_algorithm_do_so():
+    squashed = lambda name, **how: small(name, **how).policy.actor_network.squash_log_std  # noqa: E731
+    told = {"net_arch": [8], "squash_log_std": True}
+
+    assert squashed("simba") and squashed("simba", policy="SimbaPolicy") and squashed("bro")
+    assert not squashed("simba", policy=SimbaPolicy)
+    for name in ("tqc_jax", "droq"):
+        assert not squashed(name, policy="SimbaPolicy")
+        assert squashed(name, policy="SimbaPolicy", policy_kwargs=told)
+    for name in ("simba", "bro"):
+        assert not squashed(name, policy_kwargs=told | {"squash_log_std": False})
+
+
+def test_state_dependent_noise_of_simba_is_not_squashed():
+    model = small("simba", use_sde=True).learn(20)
+
+    assert isinstance(model.policy.actor_network, ExploringActor) and model._n_updates > 0
+    # The noise matrix is drawn with e^-3; a squashed logarithm would not be.
+    assert model.policy.get_std() == pytest.approx(np.exp(-3.0), rel=0.1)
+    with pytest.raises(ValueError, match=r"'squash_log_std': True.*with use_sde=True"):
+        small("simba", use_sde=True, policy_kwargs={"squash_log_std": True})
+
+
 def of_sbx(params: dict[str, Any]) -> dict[str, Any]:
     """:return: weights of a SimBa network of SBX under the names that they have here"""
     n_blocks = sum(name.startswith("SimbaResidualBlock") for name in params)
@@ -929,9 +964,10 @@ def of_sbx(params: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_simba_with_the_arguments_in_its_docstring_is_that_of_sbx():
-    net = {"net_arch": [8, 8], "normalize_observations": False}
+    net = {"net_arch": [8, 8], "normalize_observations": False, "squash_log_std": False}
     kwargs = net | {"optimizer_kwargs": {"weight_decay": 1e-4}}
     how = {"ent_coef": "auto", "target_entropy": -1.0, "gradient_steps": 1, "learning_rate": 3e-4}
+    how |= {"linear_ent_coef": False}
     ours = SimbaSAC("Pendulum-v1", policy_kwargs=kwargs, buffer_size=10, **how)
     theirs = sbx.SAC(
         "SimbaPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [8, 8]}, buffer_size=10
@@ -953,10 +989,35 @@ def test_simba_with_the_arguments_in_its_docstring_is_that_of_sbx():
     assert ours.gradient_steps == theirs.gradient_steps
     [start], entropy = jax.tree.leaves(theirs.ent_coef_state.params), ours.policy.learner
     assert start == entropy.log_ent_coef.weights["params"]
+    # A logarithm of 0, times an excess of 3.
+    _, loss = theirs.update_temperature(-1.0, theirs.ent_coef_state, 2.0)
+    assert loss == 0.0 and not ours.policy.recipe.linear_ent_coef
     assert (
         inspect.signature(theirs.policy.optimizer_class).parameters["weight_decay"].default
         == (dict(ours.policy.optimizers[0].arguments)["weight_decay"])
     )
+
+
+def test_layers_of_td7_start_as_those_of_torch():
+    n = 100  # of each last layer, too: its biases are as many
+    env = Constant(spaces.Box(-1, 1, (n,)), spaces.Box(-1, 1, (n,)))
+    kwargs = {"net_arch": [n, n], "embedding_size": n, "n_critics": n}
+    learner = small("td7", env, policy_kwargs=kwargs).policy.learner
+    # The ensemble's axis comes first.
+    n_inputs = lambda layer: layer["kernel"].shape[-2]  # noqa: E731
+    layers = []
+    for part in (learner.encoder, learner.actor, learner.critic):
+        is_layer = lambda tree: "kernel" in tree  # noqa: E731
+        layers += jax.tree.leaves(part.weights["params"], is_leaf=is_layer)
+
+    assert sorted(map(n_inputs, layers)) == 10 * [n] + 3 * [2 * n] + [3 * n]
+    for layer in layers:
+        assert layer.keys() == {"kernel", "bias"}
+        for drawn in layer.values():
+            share = np.asarray(drawn).ravel() * np.sqrt(n_inputs(layer))
+            assert share.size >= n and np.abs(share).max() <= 1.0 + 1e-6
+            # Five standard deviations of the second moment of as many uniform numbers.
+            assert np.mean(share**2) == pytest.approx(1 / 3, abs=5 * np.sqrt(4 / 45 / share.size))
 
 
 def test_td7_does_not_judge_a_policy_by_random_actions():

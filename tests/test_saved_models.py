@@ -5,15 +5,20 @@ What was saved by this version is loaded by every later one, and acts as it did.
 """
 
 import json
+from functools import partial
 from pathlib import Path
 
 import gymnasium
+import jax
 import numpy as np
 import pytest
-from small_models import SMALL, small
+from numpy_networks import clipped, gaussian, simba, squashed_between
+from small_models import SMALL, saved, small
 
 import sb3_hds
 from sb3_hds import algos
+from sb3_hds.algos.observations import seen
+from sb3_hds.algos.off_policy import act
 
 SAVED = Path(__file__).parent / "saved"
 OBSERVATIONS = np.array(
@@ -55,6 +60,32 @@ def test_a_model_of_an_earlier_version_learns_on(path):
     model.learn(N_STEPS.get(path.stem, 20), reset_num_timesteps=False)
 
     assert model.num_timesteps > before
+
+
+@pytest.mark.parametrize("squashed", [False, True])
+def test_actions_of_simba_scatter_as_they_did_when_it_was_saved(squashed, no_pickle):
+    file = saved(small("simba", seed=3)) if squashed else SAVED / "0.1.0" / "simba.zip"
+
+    policy = sb3_hds.load_policy(file)
+
+    learner = policy.learner
+    obs = seen(learner.seen, OBSERVATIONS)
+    weights = jax.tree.map(np.asarray, learner.actor.weights["params"])
+    log_std_of = partial(squashed_between, low=-10.0, high=2.0) if squashed else clipped
+    _, std = gaussian(weights, simba(weights["body"], obs), log_std_of)
+    found, _ = act(policy.recipe.actor, learner.actor.weights, obs)
+    np.testing.assert_allclose(found.std, std, rtol=1e-4)
+
+
+@pytest.mark.parametrize("squashed", [False, True])
+def test_simba_learns_on_with_the_deviation_that_it_was_saved_with(squashed):
+    file = saved(small("simba", seed=3)) if squashed else SAVED / "0.1.0" / "simba.zip"
+
+    model = algos.ALL["simba"].load(file, env=gymnasium.make("Pendulum-v1"))
+
+    assert model.policy.recipe.actor.squash_log_std == squashed
+    again = algos.ALL["simba"].load(saved(model))
+    assert again.policy.recipe.actor.squash_log_std == squashed
 
 
 def assert_acts(model, expected):

@@ -43,6 +43,8 @@ N_OBS, N_ACT, N_BATCH, N_UPDATES = 3, 2, 6, 2
 KNOBS = Knobs(learning_rate=0.03, qf_learning_rate=0.05, tau=0.1, target_entropy=-1.3)
 # Double precision, and slopes whose error is that of a central difference.
 CLOSE: dict[str, Any] = {"rtol": 1e-6, "atol": 1e-8}
+# NormalTanhPolicy of the authors of SimBa and of BRO.
+OF_AUTHORS = partial(gaussian, log_std_of=partial(squashed_between, low=-10.0, high=2.0))
 
 
 class Spaces(gymnasium.Env):
@@ -131,13 +133,24 @@ class Soft:
     :param b1: Adam's, of the entropy coefficient
     :param policy_delay: updates of the critics for each of the actor
     :param target_every: updates of the critics for each of the target networks
+    :param linear: whether the loss of the entropy coefficient has it itself, not its logarithm
     """
 
     gaussian = staticmethod(gaussian)
 
     def __init__(
-        self, learner, body, target_of, error, worth, b1=0.9, policy_delay=1, target_every=1
+        self,
+        learner,
+        body,
+        target_of,
+        error,
+        worth,
+        b1=0.9,
+        policy_delay=1,
+        target_every=1,
+        linear=False,
     ) -> None:
+        self.linear = linear
         self.body, self.target_of, self.error, self.worth = body, target_of, error, worth
         self.policy_delay, self.target_every = policy_delay, target_every
         self.actor = plain(learner.actor.weights["params"])
@@ -184,11 +197,18 @@ class Soft:
             return self.report
         self.report |= {"actor_loss": actor_loss(self.actor), "ent_coef": ent_coef}
         excess = -self.acts(self.actor, batch.obs, noise)[1].mean() - KNOBS.target_entropy
-        self.report["ent_coef_loss"] = self.log_ent_coef * excess
+        self.report["ent_coef_loss"], rise = self.weighted(excess)
         self.actor = descend(actor_loss, self.actor, KNOBS.learning_rate)
-        self.log_ent_coef = self.adam.step(self.log_ent_coef, excess)
+        self.log_ent_coef = self.adam.step(self.log_ent_coef, rise)
         self.explore(batch, keys.extra)
         return self.report
+
+    def weighted(self, excess: float) -> tuple[float, float]:
+        """:return: loss of the entropy coefficient, and its slope in the logarithm"""
+        ent_coef = np.exp(self.log_ent_coef)
+        if self.linear:
+            return ent_coef * excess, ent_coef * excess
+        return self.log_ent_coef * excess, excess
 
     def explore(self, batch: Batch, key: Any) -> None:
         """What follows the actor."""
@@ -241,10 +261,12 @@ def test_soft_actor_critic_with_state_dependent_noise(full_std):
     check(recipe, learner, Soft(learner, mlp, least, half_square, least_worth))
 
 
-def test_droq_climbs_the_mean_and_regresses_on_the_least():
-    recipe, learner = begun("droq", {"dropout_rate": 0.0}, policy_delay=1)
+@pytest.mark.parametrize("linear", [False, True])
+def test_droq_climbs_the_mean_and_regresses_on_the_least(linear):
+    how = {"policy_delay": 1, "ent_coef": "auto_0.3", "linear_ent_coef": linear}
+    recipe, learner = begun("droq", {"dropout_rate": 0.0}, **how)
 
-    check(recipe, learner, Soft(learner, mlp, least, half_square, mean_worth))
+    check(recipe, learner, Soft(learner, mlp, least, half_square, mean_worth, linear=linear))
 
 
 @pytest.mark.parametrize(("policy_delay", "target_every"), [(2, 1), (1, 2)])
@@ -321,9 +343,13 @@ def test_tqc_drops_the_largest_of_all_quantiles():
     check(recipe, learner, Soft(learner, mlp, kept, quantile_huber, mean_worth))
 
 
-@pytest.mark.parametrize("clipped", [True, pytest.param(False, marks=pytest.mark.expensive)])
-def test_simba_normalises_by_all_it_saw(clipped):
-    recipe, learner = begun("simba", clipped_double_q=clipped)
+@pytest.mark.parametrize(
+    ("clipped", "of_sbx"),
+    [(True, False), (True, True), pytest.param(False, False, marks=pytest.mark.expensive)],
+)
+def test_simba_normalises_by_all_it_saw(clipped, of_sbx):
+    how = {"clipped_double_q": clipped, "linear_ent_coef": not of_sbx}
+    recipe, learner = begun("simba", {"squash_log_std": False} if of_sbx else {}, **how)
     rows = np.random.default_rng(2).normal([3.0, -1.0, 0.0], [2.0, 0.1, 5.0], (40, N_OBS))
     learner = learner._replace(seen=Seen.nothing(N_OBS).with_more(rows[:7]).with_more(rows[7:]))
     learner = learner._replace(seen=jax.tree.map(lambda x: jnp.asarray(x, float), learner.seen))
@@ -331,13 +357,11 @@ def test_simba_normalises_by_all_it_saw(clipped):
     np.testing.assert_allclose(learner.seen.variance, rows.var(0), rtol=1e-6)
     mean, variance = plain(learner.seen.mean), plain(learner.seen.variance)
     target_of, worth = (least, least_worth) if clipped else (lambda v: v.mean(0), mean_worth)
+    expected = Soft(learner, simba, target_of, half_square, worth, linear=not of_sbx)
+    if not of_sbx:
+        expected.gaussian = OF_AUTHORS
 
-    check(
-        recipe,
-        learner,
-        Soft(learner, simba, target_of, half_square, worth),
-        lambda obs: (obs - mean) / np.sqrt(variance + 1e-8),
-    )
+    check(recipe, learner, expected, lambda obs: (obs - mean) / np.sqrt(variance + 1e-8))
 
 
 class Optimistic(Soft):
@@ -345,10 +369,10 @@ class Optimistic(Soft):
 
     def __init__(self, learner) -> None:
         target_of = lambda values: values.mean(0)  # noqa: E731
-        super().__init__(learner, bro, target_of, quantile_huber, mean_worth, b1=0.5)
+        super().__init__(learner, bro, target_of, quantile_huber, mean_worth, b1=0.5, linear=True)
         self.shift = plain(learner.extra["actor"].weights["params"])
-        # As NormalTanhPolicy and Adjustment of the authors have them.
-        self.gaussian = partial(gaussian, log_std_of=partial(squashed_between, low=-10.0, high=2.0))
+        self.gaussian = OF_AUTHORS
+        # As Adjustment of the authors has them.
         self.raw_optimism, self.raw_regularizer = (
             np.arctanh((np.log(start) + 10.0) / 8.75 - 1.0) for start in (1.0, 0.25)
         )
@@ -387,8 +411,9 @@ class Optimistic(Soft):
         self.raw_regularizer = of_regularizer.step(self.raw_regularizer, down)
 
 
-def test_actions_of_bro_start_with_the_deviation_of_its_authors_code():
-    recipe, learner = begun("bro", {"n_quantiles": 5})
+@pytest.mark.parametrize("name", ["bro", "simba"])
+def test_actions_start_with_the_deviation_of_the_authors_code(name):
+    recipe, learner = begun(name)
     weights = jax.tree.map(jnp.zeros_like, learner.actor.weights)
     obs = np.random.default_rng(0).normal(size=(5, N_OBS))
 
@@ -470,7 +495,12 @@ class Joint(Soft):
 
     def __init__(self, learner) -> None:
         super().__init__(
-            learner._replace(target={"params": {}}), None, least, half_square, least_worth
+            learner._replace(target={"params": {}}),
+            None,
+            least,
+            half_square,
+            least_worth,
+            linear=True,
         )
         statistics = plain(learner.critic.weights["statistics"]["body"])
         self.of_critics = [Renormed(member(statistics, i)) for i in range(2)]
@@ -514,10 +544,10 @@ class Joint(Soft):
             layer.remember(self.momentum)
         report |= {"actor_loss": actor_loss(self.actor), "ent_coef": ent_coef}
         entropy = -self.acted(self.actor, batch.obs, noise, "training")[1].mean()
-        report["ent_coef_loss"] = self.log_ent_coef * (entropy - KNOBS.target_entropy)
+        report["ent_coef_loss"], rise = self.weighted(entropy - KNOBS.target_entropy)
         self.actor = descend(actor_loss, self.actor, KNOBS.learning_rate)
         self.of_actor.remember(self.momentum)
-        self.log_ent_coef = self.adam.step(self.log_ent_coef, entropy - KNOBS.target_entropy)
+        self.log_ent_coef = self.adam.step(self.log_ent_coef, rise)
         return report
 
 

@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from sb3_hds.algos.bodies import BroBody
 from sb3_hds.algos.call_forms import between, is_count
 from sb3_hds.algos.gaussian_policy import GaussianPolicy
+from sb3_hds.algos.heads import GaussianActor
 from sb3_hds.algos.off_policy import (
     Batch,
     Knobs,
@@ -31,15 +32,17 @@ from sb3_hds.algos.off_policy import (
     quantile_huber,
 )
 from sb3_hds.algos.soft_actor_critic import SoftActorCritic
-from sb3_hds.algos.squashed import Gaussian
+from sb3_hds.algos.squashed import Gaussian, squashed_between
 
 # Steps of the environment at which the authors' networks start afresh: with the full replay ratio,
 # and with the fast one of 2.
 _RESETS = (15_000, 50_000, 250_000, 500_000, 750_000, 1_000_000, 1_500_000, 2_000_000)
 _FAST, _FAST_RESETS = 2, _RESETS[:1]
 _INITIAL_OPTIMISM, _INITIAL_REGULARIZER = 1.0, 0.25
-# Of the logarithms of the multipliers and of the deviation of actions.
-_MULTIPLIER_LIMITS, _STD_LIMITS = (-10.0, 7.5), (-10.0, 2.0)
+# Of the logarithms of the multipliers.
+_MULTIPLIER_LIMITS = (-10.0, 7.5)
+# Of the last layers of the actor.
+_OF_MEAN, _OF_STD = (nn.initializers.orthogonal(scale) for scale in (math.sqrt(2), 1.0))
 
 
 class BroPolicy(GaussianPolicy):
@@ -53,6 +56,7 @@ class BroPolicy(GaussianPolicy):
         "optimizer_class": "adamw",
         "optimizer_kwargs": {"weight_decay": 1e-4},
         "normalize_observations": False,
+        "squash_log_std": True,
     }
     unused = ("renorm_warmup_steps", "dropout_rate")
 
@@ -63,7 +67,7 @@ class BroPolicy(GaussianPolicy):
         return BroBody(net_arch, self.activation_fn)
 
     def gaussian_actor(self, body: nn.Module, n_act: int) -> nn.Module:
-        return BroActor(body, n_act)
+        return GaussianActor(body, n_act, self.squash_log_std, _OF_MEAN, _OF_STD)
 
 
 class BRO(SoftActorCritic):
@@ -80,14 +84,14 @@ class BRO(SoftActorCritic):
     include the temperature, the multipliers and all optimisers, and the logarithms of multipliers
     and of the deviation of actions are squashed into their limits by :math:`\tanh`: actions start
     with a deviation near :math:`e^{-4}`, not near 1 as with SAC. Its quantile loss is a sum over
-    quantiles where this is their mean, a factor that Adam takes out again. The entropy coefficient
-    learns by its logarithm's slope, as in SB3 and SBX: it falls up to 1.3 times as fast as theirs.
-    SBX has no BRO.
+    quantiles where this is their mean, a factor that Adam takes out again. The loss of the
+    entropy coefficient has the coefficient itself, as theirs. SBX has no BRO.
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
     :param gradient_steps: updates per call of ``train``
     :param batch_size: transitions per update
+    :param linear_ent_coef: whether the loss of the entropy coefficient has it itself
     :param kl_target: divergence of the optimistic actor from the other one, per control
     :param std_multiplier: its standard deviation, in units of the other one's
     :param multiplier_rate: learning rate of the multipliers, in units of ``learning_rate``, whose
@@ -111,6 +115,7 @@ class BRO(SoftActorCritic):
         *,
         gradient_steps: int = 10,
         batch_size: int = 128,
+        linear_ent_coef: bool = True,
         kl_target: float = 0.05,
         std_multiplier: float = 0.75,
         multiplier_rate: float = 0.1,
@@ -128,6 +133,7 @@ class BRO(SoftActorCritic):
             env,
             gradient_steps=gradient_steps,
             batch_size=batch_size,
+            linear_ent_coef=linear_ent_coef,
             param_resets=param_resets,
             policy_kwargs={"n_quantiles": 100, **(policy_kwargs or {})},
             **arguments,
@@ -162,28 +168,6 @@ class BRO(SoftActorCritic):
             ent_coef_optimizer=_MULTIPLIER,
             extra=optimist,
         )
-
-
-class BroActor(nn.Module):
-    r"""
-    Observation to a Gaussian, the logarithm of whose deviation is squashed into [-10, 2].
-
-    Source: ``NormalTanhPolicy`` of the authors' code.
-
-    :param body: see ``bodies.py``
-    :param n_act: number of controls
-    """
-
-    body: nn.Module
-    n_act: int
-
-    @nn.compact
-    def __call__(self, obs: Float[Array, "*batch obs"], train: bool = False) -> Gaussian:
-        latent = self.body(obs, train)
-        of_mean, of_std = (nn.initializers.orthogonal(scale) for scale in (math.sqrt(2), 1.0))
-        mean = nn.Dense(self.n_act, kernel_init=of_mean)(latent)
-        log_std = _squashed(nn.Dense(self.n_act, kernel_init=of_std)(latent), _STD_LIMITS)
-        return Gaussian(mean, jnp.exp(log_std), latent)
 
 
 class Shift(nn.Module):
@@ -269,14 +253,9 @@ class Optimist:
         return jnp.tanh(gaussian.mean + shift + self.std_multiplier * gaussian.std * noise)
 
 
-def _squashed(raw: Array, limits: tuple[float, float]) -> Array:
-    low, high = limits
-    return low + 0.5 * (high - low) * (1.0 + jnp.tanh(raw))
-
-
 def _value(raw: Array) -> Array:
     """Of a multiplier."""
-    return jnp.exp(_squashed(raw, _MULTIPLIER_LIMITS))
+    return jnp.exp(squashed_between(raw, *_MULTIPLIER_LIMITS))
 
 
 def _before(log: float) -> Array:

@@ -20,13 +20,15 @@ class CrossQ(SoftActorCritic):
     Their discount is 0.99, but 0.9999 on Swimmer. Batch normalisation becomes batch
     renormalisation, in each network after 100,000 updates of its own, as in the authors' code
     (``policy_kwargs={"renorm_warmup_steps": ...}``). SBX's default width is 1024, and its
-    learning rate never changes; here, schedules act. The entropy coefficient learns by its
-    logarithm's slope, as in SB3 and SBX: at 1e-3, it falls up to 2.4 times as fast as the authors'.
+    learning rate never changes; here, schedules act. The loss of the entropy coefficient has the
+    coefficient itself, as in the authors' code, where SBX has its logarithm
+    (``linear_ent_coef=False``).
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
     :param learning_rate: of actor, entropy coefficient and critics
     :param policy_delay: updates of the critics for each of the actor
+    :param linear_ent_coef: whether the loss of the entropy coefficient has it itself
     :param arguments: those of ``SoftActorCritic``; ``tau`` and ``target_update_interval`` have
         no meaning here
     """
@@ -43,8 +45,14 @@ class CrossQ(SoftActorCritic):
         *,
         learning_rate: float | str | Schedule = 1e-3,
         policy_delay: int = 3,
+        linear_ent_coef: bool = True,
         **arguments: Any,
     ) -> None:
         super().__init__(
-            policy, env, learning_rate=learning_rate, policy_delay=policy_delay, **arguments
+            policy,
+            env,
+            learning_rate=learning_rate,
+            policy_delay=policy_delay,
+            linear_ent_coef=linear_ent_coef,
+            **arguments,
         )

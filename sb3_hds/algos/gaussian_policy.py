@@ -81,6 +81,9 @@ class GaussianPolicy(LearningPolicy):
     :param use_expln: gSDE: slower growth than the exponential above 0
     :param clip_mean: gSDE: the mean is clipped to this before tanh; 0: not
     :param normalize_observations: by running mean and variance, inside the policy
+    :param squash_log_std: whether the logarithm of the deviation of actions is squashed into
+        [-10, 2] by tanh, not clipped to [-20, 2], which is not for gSDE; None: only in the policies
+        of SimbaSAC and BRO
     :param optimizer_class: name or function of optax, with its defaults, or torch class, with those
         of torch
     :param optimizer_kwargs: besides the learning rate; torch's ``betas`` and ``alpha`` are
@@ -95,6 +98,7 @@ class GaussianPolicy(LearningPolicy):
         "net_arch": (256, 256),
         "optimizer_class": "adam",
         "normalize_observations": False,
+        "squash_log_std": False,
         "renorm_warmup_steps": None,
     }
     #: arguments that these networks do not use
@@ -119,6 +123,7 @@ class GaussianPolicy(LearningPolicy):
         use_expln: bool = False,
         clip_mean: float = 2.0,
         normalize_observations: bool | None = None,
+        squash_log_std: bool | None = None,
         optimizer_class: str | Callable[..., Any] | None = None,
         optimizer_kwargs: Mapping[str, Any] | None = None,
         qf_optimizer_kwargs: Mapping[str, Any] | None = None,
@@ -139,6 +144,12 @@ class GaussianPolicy(LearningPolicy):
             check_count("renorm_warmup_steps", chosen["renorm_warmup_steps"], 0)
         _check_settings(self.arguments)
         self._refuse_unused(has_batch_norm=chosen["renorm_warmup_steps"] is not None)
+        if use_sde and squash_log_std:
+            raise ValueError(
+                f"policy_kwargs={{'squash_log_std': {squash_log_std!r}}}: with use_sde=True, the "
+                "deviation of actions is that of a noise matrix, which nothing squashes. Leave out "
+                "one of them."
+            )
         net: Any = chosen["net_arch"]
         self.widths = widths(net, "qf")
         self.activation_fn = activation(activation_fn)
@@ -148,6 +159,7 @@ class GaussianPolicy(LearningPolicy):
             batch_norm_momentum,
         )
         self.normalize_observations = bool(chosen["normalize_observations"])
+        self.squash_log_std = bool(chosen["squash_log_std"]) and not use_sde
         self.n_critics, self.use_sde = n_critics, use_sde
         n_act = int(np.prod(action_space.shape))
         pi, qf = self.widths
@@ -199,7 +211,7 @@ class GaussianPolicy(LearningPolicy):
 
     def gaussian_actor(self, body: nn.Module, n_act: int) -> nn.Module:
         """:return: the actor without gSDE"""
-        return GaussianActor(body, n_act)
+        return GaussianActor(body, n_act, self.squash_log_std)
 
     def build_plain(self) -> None:
         """That of SAC; with batch normalisation, that of CrossQ."""
@@ -280,9 +292,14 @@ class SimbaPolicy(GaussianPolicy):
     """
     ``"SimbaPolicy"``: residual networks on observations normalised by running statistics (Lee et
     al., ICLR 2025), with the widths and the weight decay of the paper.
+
+    What the algorithm samples from stays that of the algorithm: the logarithm of the deviation of
+    actions is clipped, as in SBX, and starts near 0, which is what the first entropy coefficient of
+    1 and the target entropies of TQC and DroQ are made for. ``squash_log_std=True`` makes it that
+    of SimBa's authors.
     """
 
-    defaults = {
+    defaults: ClassVar[Mapping[str, Any]] = {
         "net_arch": {"pi": (128,), "qf": (512, 512)},
         "optimizer_class": "adamw",
         "optimizer_kwargs": {"weight_decay": 1e-2},
@@ -295,6 +312,15 @@ class SimbaPolicy(GaussianPolicy):
 
     def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
         return SimbaBody(net_arch, self.activation_fn, self.dropout_rate)
+
+
+class SimbaSACPolicy(SimbaPolicy):
+    """
+    The policy of SimbaSAC: also what actions are drawn from is that of SimBa's authors, with
+    ``squash_log_std=True`` where there is no gSDE.
+    """
+
+    defaults = {**SimbaPolicy.defaults, "squash_log_std": True}
 
 
 class CrossQPolicy(GaussianPolicy):

@@ -4,27 +4,41 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sb3_hds.algos.squashed import Gaussian, exploration_std, marginal_std
+from sb3_hds.algos.squashed import Gaussian, exploration_std, marginal_std, squashed_between
 
-_LOG_STD_MIN, _LOG_STD_MAX = -20.0, 2.0
+# Of the logarithm of the deviation of actions: where it is clipped (SAC), and where it is squashed.
+_CLIPPED, _SQUASHED = (-20.0, 2.0), (-10.0, 2.0)
+_USUAL = nn.initializers.lecun_normal()
 
 
 class GaussianActor(nn.Module):
-    """
+    r"""
     Observation to a Gaussian whose spread is a layer of its own.
 
     :param body: see ``bodies.py``
     :param n_act: number of controls
+    :param squash_log_std: whether :math:`\tanh` squashes the logarithm of the deviation into
+        [-10, 2], as in ``NormalTanhPolicy`` of the authors' code of SimBa and BRO, so that it
+        starts near -4; otherwise, it is clipped to [-20, 2] and starts near 0
+    :param of_mean: draws the kernel of the mean
+    :param of_std: draws that of the logarithm of the deviation
     """
 
     body: nn.Module
     n_act: int
+    squash_log_std: bool = False
+    of_mean: nn.initializers.Initializer = _USUAL
+    of_std: nn.initializers.Initializer = _USUAL
 
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch obs"], train: bool = False) -> Gaussian:
         latent = self.body(obs, train)
-        mean = nn.Dense(self.n_act)(latent)
-        log_std = jnp.clip(nn.Dense(self.n_act)(latent), _LOG_STD_MIN, _LOG_STD_MAX)
+        mean = nn.Dense(self.n_act, kernel_init=self.of_mean)(latent)
+        raw = nn.Dense(self.n_act, kernel_init=self.of_std)(latent)
+        if self.squash_log_std:
+            log_std = squashed_between(raw, *_SQUASHED)
+        else:
+            log_std = jnp.clip(raw, *_CLIPPED)
         return Gaussian(mean, jnp.exp(log_std), latent)
 
 

@@ -117,6 +117,7 @@ class Recipe:
     :param policy_delay: updates of the critics for each of the actor
     :param target_every: updates of the critics for each of the target networks
     :param learns_ent_coef: whether the entropy coefficient follows the target entropy
+    :param linear_ent_coef: whether its loss has it itself, not its logarithm
     :param joint_pass: whether current and next values come from one pass of the critics, without
         target networks (CrossQ)
     :param normalize: whether observations are normalised by running statistics (SimBa)
@@ -135,6 +136,7 @@ class Recipe:
     policy_delay: int = 1
     target_every: int = 1
     learns_ent_coef: bool = True
+    linear_ent_coef: bool = False
     joint_pass: bool = False
     normalize: bool = False
     extra: "Extra | None" = None
@@ -443,11 +445,12 @@ def update_actor(
     Climb what the critics think of the actor's own actions, and follow the target entropy.
 
     The loss of the entropy coefficient is :math:`\log\alpha\,(H - \bar{H})`, as in SB3, SBX and
-    the authors' code of DroQ and TQC. Equation 18 of Haarnoja et al. and the authors of CrossQ,
-    SimBa and BRO have :math:`\alpha` in the place of its logarithm, a factor on the slope that Adam
-    takes out where it does not change. Where :math:`\alpha` steadily falls, theirs falls at
-    :math:`\sqrt{1 + k^2} - k` of the speed, with :math:`k` the learning rate in units of 1e-3, as
-    Adam remembers squares for 1000 updates: 0.9, 0.74 and 0.41 at 1e-4, 3e-4 and 1e-3.
+    the authors' code of DroQ and TQC; with ``linear_ent_coef``, it is
+    :math:`\alpha\,(H - \bar{H})`, as in equation 18 of Haarnoja et al. Adam takes out the factor
+    between their slopes only where it does not change. Where :math:`\alpha` steadily falls, the
+    latter falls at :math:`\sqrt{1 + k^2} - k` of the speed, with :math:`k` the learning rate in
+    units of 1e-3, as Adam remembers squares for 1000 updates: 0.9, 0.74 and 0.41 at 1e-4, 3e-4 and
+    1e-3.
     """
     act_key, judge_key, extra_key = jax.random.split(key, 3)
     ent_coef = jnp.exp(learner.log_ent_coef.weights["params"])
@@ -465,14 +468,16 @@ def update_actor(
         slope, Trained(weights, learner.actor.optimizer), knobs.learning_rate
     )
     log_ent_coef, excess = learner.log_ent_coef, entropy - knobs.target_entropy
+    linear = recipe.linear_ent_coef
     report = report._replace(
         actor_loss=value,
         ent_coef=ent_coef,
-        ent_coef_loss=log_ent_coef.weights["params"] * excess,
+        ent_coef_loss=excess * (ent_coef if linear else log_ent_coef.weights["params"]),
     )
     if recipe.learns_ent_coef:
         of_ent_coef = recipe.ent_coef_optimizer or _ADAM
-        log_ent_coef = of_ent_coef.apply(excess, log_ent_coef, knobs.learning_rate)
+        slope = excess * ent_coef if linear else excess
+        log_ent_coef = of_ent_coef.apply(slope, log_ent_coef, knobs.learning_rate)
     extra = learner.extra
     if recipe.extra is not None:
         now = learner._replace(actor=actor, log_ent_coef=log_ent_coef)

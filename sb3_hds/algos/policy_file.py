@@ -17,7 +17,12 @@ from typing import Any
 import torch as th
 
 from sb3_hds.algos.bro import BroPolicy
-from sb3_hds.algos.gaussian_policy import CrossQPolicy, GaussianPolicy, SimbaPolicy
+from sb3_hds.algos.gaussian_policy import (
+    CrossQPolicy,
+    GaussianPolicy,
+    SimbaPolicy,
+    SimbaSACPolicy,
+)
 from sb3_hds.algos.oscillator_policy import OscillatorPolicy
 from sb3_hds.algos.persistence import TensorPolicy
 from sb3_hds.algos.policy_description import space_from_plain
@@ -30,6 +35,7 @@ _CLASSES: dict[str, type[TensorPolicy]] = {
         TwinPolicy,
         GaussianPolicy,
         SimbaPolicy,
+        SimbaSACPolicy,
         CrossQPolicy,
         BroPolicy,
         TD7Policy,

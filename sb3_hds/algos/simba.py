@@ -7,7 +7,7 @@ import numpy as np
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from sb3_hds.algos.gaussian_policy import SimbaPolicy
+from sb3_hds.algos.gaussian_policy import SimbaSACPolicy
 from sb3_hds.algos.off_policy import Recipe, average, mean
 from sb3_hds.algos.soft_actor_critic import SoftActorCritic
 
@@ -22,29 +22,34 @@ class SimbaSAC(SoftActorCritic):
     0.01, target entropy of minus half the number of controls; the least of two critics only in
     tasks that end early. In others, the authors have one critic: ``clipped_double_q=False`` with
     ``policy_kwargs={"n_critics": 1}``; of more, it takes the mean. Their discount, 1 - 5 / T with
-    episodes of T steps, within 0.95 and 0.995, is for ``gamma`` to say. Unlike their code, which
-    squashes the logarithm of the deviation of actions into [-10, 2] by tanh, the actor clips it to
-    [-20, 2], as SAC and SBX do: actions start with a deviation near 1, not :math:`e^{-4}`. The
-    entropy coefficient learns by its logarithm's slope, as in SB3 and SBX: it falls up to 1.1 times
-    as fast as theirs.
+    episodes of T steps, within 0.95 and 0.995, is for ``gamma`` to say.
+
+    As in the authors' code, :math:`\tanh` squashes the logarithm of the deviation of actions into
+    [-10, 2]: actions start with a deviation near :math:`e^{-4}`, where SAC and SBX clip it to
+    [-20, 2] and start near 1. With gSDE (``use_sde=True``), the deviation is that of the noise
+    matrix, which is neither. The loss of the entropy coefficient has the coefficient itself, as
+    theirs, where SBX has its logarithm. A file of SimbaSAC that says nothing of squashing clips, as
+    it did.
 
     SBX's variant is ``learning_rate=3e-4, ent_coef="auto", target_entropy=-n_act,
-    gradient_steps=1`` with ``policy_kwargs={"net_arch": [256, 256], "normalize_observations":
-    False, "optimizer_kwargs": {"weight_decay": 1e-4}}``.
+    linear_ent_coef=False, gradient_steps=1`` with ``policy_kwargs={"net_arch": [256, 256],
+    "normalize_observations": False, "squash_log_std": False, "optimizer_kwargs": {"weight_decay":
+    1e-4}}``.
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
     :param learning_rate: of actor, entropy coefficient and critics
     :param gradient_steps: updates per call of ``train``
     :param ent_coef: a number, ``"auto"``, or ``"auto_0.1"`` to start there
+    :param linear_ent_coef: whether the loss of the entropy coefficient has it itself
     :param clipped_double_q: whether the least of the critics counts, not their mean
     :param arguments: those of ``SoftActorCritic``
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": SimbaPolicy,
-        "MultiInputPolicy": SimbaPolicy,
-        "SimbaPolicy": SimbaPolicy,
+        "MlpPolicy": SimbaSACPolicy,
+        "MultiInputPolicy": SimbaSACPolicy,
+        "SimbaPolicy": SimbaSACPolicy,
     }
 
     def __init__(
@@ -55,6 +60,7 @@ class SimbaSAC(SoftActorCritic):
         learning_rate: float | str | Schedule = 1e-4,
         gradient_steps: int = 2,
         ent_coef: float | str = "auto_0.01",
+        linear_ent_coef: bool = True,
         clipped_double_q: bool = True,
         **arguments: Any,
     ) -> None:
@@ -65,6 +71,7 @@ class SimbaSAC(SoftActorCritic):
             learning_rate=learning_rate,
             gradient_steps=gradient_steps,
             ent_coef=ent_coef,
+            linear_ent_coef=linear_ent_coef,
             **arguments,
         )
 

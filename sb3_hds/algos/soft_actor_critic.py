@@ -30,6 +30,8 @@ class SoftActorCritic(ModelFreeAlgorithm):
     :param env: an environment, its id, or a vectorised environment
     :param ent_coef: a number, ``"auto"``, or ``"auto_0.1"`` to start there
     :param target_entropy: a number, or ``"auto"``: minus the number of controls
+    :param linear_ent_coef: whether the loss of the entropy coefficient has it itself, as equation
+        18 of the paper, not its logarithm, as SB3, SBX and the authors' code of DroQ and TQC
     :param target_update_interval: updates of the critics for each of the target networks, counted
         from the first; SB3 counts anew in each call of ``train``
     :param arguments: those of :class:`~sb3_hds.algos.model_free.ModelFreeAlgorithm`
@@ -51,10 +53,12 @@ class SoftActorCritic(ModelFreeAlgorithm):
         *,
         ent_coef: float | str = "auto",
         target_entropy: float | str = "auto",
+        linear_ent_coef: bool = False,
         target_update_interval: int = 1,
         **arguments: Any,
     ) -> None:
         self.ent_coef, self.target_entropy = ent_coef, target_entropy
+        self.linear_ent_coef = linear_ent_coef
         self.target_update_interval = target_update_interval
         super().__init__(policy, env, **arguments)
 
@@ -65,6 +69,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
             policy_delay=self.policy_delay,
             target_every=self.target_update_interval,
             learns_ent_coef=isinstance(self.ent_coef, str),
+            linear_ent_coef=bool(self.linear_ent_coef),
         )
 
     def auto_target_entropy(self) -> float:
@@ -76,6 +81,8 @@ class SoftActorCritic(ModelFreeAlgorithm):
         entropy = self.target_entropy
         fine = entropy == "auto" or between(entropy, -math.inf, math.inf)
         self.refuse_unless(fine, "target_entropy", "'auto' or a number")
+        fine = isinstance(self.linear_ent_coef, bool | np.bool_)
+        self.refuse_unless(fine, "linear_ent_coef", "True or False")
         fine = is_count(self.target_update_interval, 1)
         self.refuse_unless(fine, "target_update_interval", "a whole number of at least 1")
         _initial_ent_coef(self.ent_coef)

@@ -32,6 +32,13 @@ class Gaussian(NamedTuple):
     latent: Float[Array, "*batch latent"]
 
 
+def squashed_between(
+    raw: Float[Array, "*shape"], low: float, high: float
+) -> Float[Array, "*shape"]:
+    r""":return: :math:`\tanh` of it, moved and scaled from (-1, 1) to those limits"""
+    return low + 0.5 * (high - low) * (1.0 + jnp.tanh(raw))
+
+
 def log_probability(
     gaussian: Gaussian, before: Float[Array, "*batch act"]
 ) -> Float[Array, "*batch"]:

@@ -177,9 +177,9 @@ class TD7(ModelFreeAlgorithm):
     Source: Fujimoto et al., *For SALE: State-Action Representation Learning for Deep Reinforcement
     Learning*, NeurIPS 2023, with its constants (appendix): target networks are copied every 250
     updates, noise of 0.1 explores, 25,000 steps are random, priorities are errors to the power of
-    0.4, and 20 episodes assess a policy from 750,000 updates on, one before. Unlike the authors'
-    code, layers start as flax has them, not torch: first actions and values scatter about four
-    times as much; and noise is added to random actions, too, as SB3 does it.
+    0.4, and 20 episodes assess a policy from 750,000 updates on, one before. Layers start as those
+    of the authors' code, by the defaults of torch: kernels and biases are uniform. Unlike there,
+    noise is added to random actions, too, as SB3 does it.
 
     With checkpoints, as in the paper, a policy acts for whole episodes and is assessed by the worst
     of them, in rewards of the environment itself; only then it is updated, once for each step that

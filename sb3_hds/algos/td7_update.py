@@ -7,7 +7,8 @@ Learning*, NeurIPS 2023.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple, cast
 
@@ -20,6 +21,8 @@ from sb3_hds.algos.networks import Activation
 from sb3_hds.algos.off_policy import Batch, Optimizer, Trained, Weights
 
 _EPSILON = 1e-8
+# Uniform, of variance 1 / (3 n) with n inputs.
+_KERNELS = nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")
 
 
 def average_l1_norm(x: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
@@ -66,7 +69,7 @@ class Actor(nn.Module):
     def __call__(
         self, obs: Float[Array, "*batch obs"], state: Float[Array, "*batch z"]
     ) -> Float[Array, "*batch act"]:
-        own = average_l1_norm(_first(self.net_arch)(obs))
+        own = average_l1_norm(_first(obs, self.net_arch))
         hidden = _Dense((*self.net_arch, self.n_act), self.activation_fn)
         return jnp.tanh(hidden(jnp.concatenate([own, state], -1)))
 
@@ -90,14 +93,14 @@ class Critic(nn.Module):
         both: Float[Array, "*batch z"],
         state: Float[Array, "*batch z"],
     ) -> Float[Array, "*batch"]:
-        own = _first(self.net_arch)(jnp.concatenate([obs, action], -1))
+        own = _first(jnp.concatenate([obs, action], -1), self.net_arch)
         hidden = _Dense((*self.net_arch, 1), self.activation_fn)
         return hidden(jnp.concatenate([average_l1_norm(own), both, state], -1))[..., 0]
 
 
-def _first(net_arch: Sequence[int]) -> Callable[[Array], Array]:
+def _first(x: Array, net_arch: Sequence[int]) -> Array:
     """A layer of the first width; without hidden layers, what comes in."""
-    return nn.Dense(net_arch[0]) if net_arch else lambda x: x
+    return _linear(x, net_arch[0]) if net_arch else x
 
 
 class _Dense(nn.Module):
@@ -109,8 +112,21 @@ class _Dense(nn.Module):
     @nn.compact
     def __call__(self, x: Array) -> Array:
         for size in self.sizes[:-1]:
-            x = self.activation_fn(nn.Dense(size)(x))
-        return nn.Dense(self.sizes[-1])(x)
+            x = self.activation_fn(_linear(x, size))
+        return _linear(x, self.sizes[-1])
+
+
+def _linear(x: Array, size: int) -> Array:
+    r"""
+    A layer that starts as torch's ``Linear``: weights and biases uniform within
+    :math:`\pm 1 / \sqrt{n}` of :math:`n` inputs.
+    """
+    limit = 1.0 / math.sqrt(x.shape[-1])
+
+    def biases(key: PRNGKeyArray, shape: Sequence[int], dtype: Any) -> Array:
+        return jax.random.uniform(key, shape, dtype, -limit, limit)
+
+    return nn.Dense(size, kernel_init=_KERNELS, bias_init=biases)(x)
 
 
 @dataclasses.dataclass(frozen=True)
