@@ -138,7 +138,7 @@ def worker(env: str, method: str, seed: int) -> list[dict]:
     """Train; stop the clock and evaluate at every mark."""
     run = InterruptedRun(CACHE / "model_free" / f"{env}_{method}_{seed}")
     rows, evaluate = run.rows(), evaluation(env)
-    model = run.model(made_of(env, method)[0], env) if rows else learner(env, method, seed)
+    model = run.model(class_of(env, method), env) if rows else learner(env, method, seed)
     seconds = rows[-1]["seconds"] if rows else 0.0
     for mark in marks(env, method)[len(rows) :]:
         begin = time.perf_counter()
@@ -202,8 +202,18 @@ def marks(env: str, method: str) -> range:
 
 def learner(env: str, method: str, seed: int) -> Any:
     """:return: a model that has not learned yet"""
-    algorithm, settings = made_of(env, method)
-    return algorithm("MlpPolicy", env, seed=seed, **settings)
+    return class_of(env, method)("MlpPolicy", env, seed=seed, **made_of(env, method)[1])
+
+
+def class_of(env: str, method: str) -> type:
+    """:return: that of the method; its schedules are those of the whole run, not of each part"""
+    total = marks(env, method)[-1]
+
+    class InParts(made_of(env, method)[0]):
+        def _update_current_progress_remaining(self, num_timesteps: int, _: int) -> None:
+            super()._update_current_progress_remaining(num_timesteps, total)
+
+    return InParts
 
 
 def made_of(env: str, method: str) -> tuple[type, dict[str, Any]]:

@@ -95,7 +95,7 @@ def test_a_long_run_goes_on_from_its_last_mark(tmp_path, monkeypatch):
         model_free.worker(env, method, 0)
     kept = model_free.InterruptedRun(tmp_path / "model_free" / f"{env}_{method}_0")
     before = kept.rows()
-    model = kept.model(made_of(env, method)[0], env)
+    model = kept.model(model_free.class_of(env, method), env)
 
     monkeypatch.setattr(model_free, "evaluation", lambda env: interrupted_after(1e9))
     rows = model_free.worker(env, method, 0)
@@ -107,6 +107,18 @@ def test_a_long_run_goes_on_from_its_last_mark(tmp_path, monkeypatch):
     assert [row["mark"] for row in rows] == [100, 200, 300]
     assert 300 <= rows[-1]["steps"] <= 330
     assert not kept.folder.exists()
+
+
+def test_schedules_are_those_of_the_whole_run(monkeypatch):
+    small = {"learning_starts": 4, "learning_rate": lambda remaining: 1e-3 * remaining}
+    made_of = model_free.made_of
+    monkeypatch.setattr(model_free, "made_of", lambda *run: (made_of(*run)[0], small))
+    model = model_free.learner(PENDULUM, "td7", seed=0)
+
+    for _ in range(2):
+        model.learn(10, reset_num_timesteps=False)
+
+    assert model.learning_rates()[0] == pytest.approx(1e-3 * (1.0 - 20 / 10_000))
 
 
 def test_learners_that_stop_at_the_ends_of_episodes_are_compared_at_their_marks():
