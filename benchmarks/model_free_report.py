@@ -10,7 +10,7 @@ from typing import Any
 import intervals
 import numpy as np
 import pandas as pd
-from model_free import OURS, PEERS, PENDULUM
+from model_free import LENGTHS, OURS, PEERS, PENDULUM
 from runs import RESULTS
 
 #: return that every method shall reach
@@ -42,7 +42,7 @@ def report() -> None:
     if not path.exists():
         print("Nothing has been measured yet.")
         return
-    runs = pd.read_csv(path)
+    runs = in_order(pd.read_csv(path))
     if (paces := RESULTS / "model_free_pace.csv").exists():
         runs["seconds"] = wall_seconds(runs, pd.read_csv(paces))
     tables = {
@@ -57,6 +57,13 @@ def report() -> None:
             print(f"\n{name.replace('_', ' ')}\n{shown(table)}")
     for env, some in runs.groupby("env"):
         figure(some, str(env))
+
+
+def in_order(runs: pd.DataFrame) -> pd.DataFrame:
+    """:return: the same rows, by environment and method, in whatever order they were run"""
+    for column, order in (("method", [*OURS, *PEERS]), ("env", list(LENGTHS))):
+        runs = runs.sort_values(column, key=lambda names: names.map(order.index), kind="stable")
+    return runs.reset_index(drop=True)
 
 
 def wall_seconds(runs: pd.DataFrame, paces: pd.DataFrame) -> pd.Series:
@@ -136,7 +143,10 @@ def beside_papers(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def fewer_steps(runs: pd.DataFrame) -> pd.DataFrame:
-    """How many times fewer steps one method needs for the mean return that another ends with."""
+    """
+    How many times fewer steps one method needs: for the mean return that another ends with, and for
+    the target of the environment. nan: one of them has never reached it.
+    """
     rows = []
     for env, some in runs.groupby("env", sort=False):
         for method, other in FEWER_STEPS:
@@ -145,10 +155,13 @@ def fewer_steps(runs: pd.DataFrame) -> pd.DataFrame:
             if not (len(mine) and len(theirs)):
                 continue
             end = int(theirs["mark"].max())
-            goal = float(returns_at(theirs, other, end).mean())
-            reached = first_mark(mine, goal)
-            row = {"env": env, "method": method, "than": other, "goal": goal, "steps": reached}
-            rows.append(row | {"steps_of_other": end, "times": end / reached})
+            goals = {float(returns_at(theirs, other, end).mean()): float(end)}
+            if env in TARGETS:
+                goals[TARGETS[env]] = first_mark(theirs, TARGETS[env])
+            for goal, theirs_needs in goals.items():
+                needs = first_mark(mine, goal)
+                row = {"env": env, "method": method, "than": other, "goal": goal, "steps": needs}
+                rows.append(row | {"steps_of_other": theirs_needs, "times": theirs_needs / needs})
     return pd.DataFrame(rows)
 
 

@@ -173,9 +173,10 @@ def test_steps_that_one_method_saves_are_counted_to_the_last_return_of_the_other
     sac = [(1000 * i, -1000.0 + 100.0 * i) for i in range(1, 9)]
     runs = table(sac={0: sac}, droq={0: [(1000, -900.0), (2000, -150.0), (3000, -300.0)]})
 
-    [row] = model_free_report.fewer_steps(runs).to_dict("records")
+    last, target = model_free_report.fewer_steps(runs).to_dict("records")
 
-    assert (row["goal"], row["steps"], row["times"]) == (-200.0, 2000.0, 4.0)
+    assert (last["goal"], last["steps"], last["times"]) == (-200.0, 2000.0, 4.0)
+    assert (target["goal"], target["steps"]) == (-150.0, 2000.0) and np.isnan(target["times"])
 
 
 def test_intervals_are_those_of_rliable():
