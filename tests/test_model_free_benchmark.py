@@ -118,7 +118,7 @@ def test_schedules_are_those_of_the_whole_run(monkeypatch):
     for _ in range(2):
         model.learn(10, reset_num_timesteps=False)
 
-    assert model.learning_rates()[0] == pytest.approx(1e-3 * (1.0 - 20 / 10_000))
+    assert model.learning_rates()[0] == pytest.approx(1e-3 * (1.0 - model.num_timesteps / 10_000))
 
 
 def test_learners_that_stop_at_the_ends_of_episodes_are_compared_at_their_marks():
