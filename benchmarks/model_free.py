@@ -23,7 +23,6 @@ episode and random numbers other than those it would have had.
 import argparse
 import importlib
 import json
-import shutil
 import time
 from functools import cache
 from pathlib import Path
@@ -32,7 +31,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 from pendulum import held_out_states, rollouts
-from runs import CACHE, fresh_process, resume
+from runs import CACHE, InterruptedRun, fresh_process, resume
 
 PENDULUM = "Pendulum-v1"
 #: steps of a run, and between two evaluations
@@ -153,43 +152,6 @@ def worker(env: str, method: str, seed: int) -> list[dict]:
             run.keep(model, rows)
     run.forget()
     return rows
-
-
-class InterruptedRun:
-    """What a run leaves at each mark, until it is through."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def rows(self) -> list[dict[str, Any]]:
-        """:return: of the marks that it came to; empty: of none"""
-        path = self.folder / "rows.json"
-        return json.loads(path.read_text()) if path.exists() else []
-
-    def model(self, algorithm: type, env: str) -> Any:
-        """:return: as it was at its last mark"""
-        import gymnasium
-
-        at = self._at(self.rows())
-        model = algorithm.load(at / "model.zip", env=gymnasium.make(env))
-        model.load_replay_buffer(at / "buffer.pkl")
-        return model
-
-    def keep(self, model: Any, rows: list[dict[str, Any]]) -> None:
-        at, before = self._at(rows), self._at(rows[:-1]) if rows[:-1] else None
-        model.save(at / "model.zip")
-        model.save_replay_buffer(at / "buffer.pkl")
-        temporary = self.folder / "rows.tmp"
-        temporary.write_text(json.dumps(rows))
-        temporary.replace(self.folder / "rows.json")
-        if before is not None:
-            shutil.rmtree(before, ignore_errors=True)
-
-    def forget(self) -> None:
-        shutil.rmtree(self.folder, ignore_errors=True)
-
-    def _at(self, rows: list[dict[str, Any]]) -> Path:
-        return self.folder / str(rows[-1]["mark"])
 
 
 def marks(env: str, method: str) -> range:

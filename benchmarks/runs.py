@@ -1,8 +1,9 @@
-"""Fresh processes, and tables that survive an interrupted run."""
+"""Fresh processes, and runs and tables that survive an interruption."""
 
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -68,6 +69,47 @@ def save(rows: Sequence[dict[str, Any]], name: str) -> pd.DataFrame:
     table.to_csv(temporary, index=False, float_format="%.6g")
     temporary.replace(path)
     return table
+
+
+class InterruptedRun:
+    """
+    What the training of a model of SB3 leaves at each mark, until it is through.
+
+    :param folder: of this run alone
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def rows(self) -> list[dict[str, Any]]:
+        """:return: of the marks that it came to; empty: of none"""
+        path = self.folder / "rows.json"
+        return json.loads(path.read_text()) if path.exists() else []
+
+    def model(self, algorithm: type, env: str) -> Any:
+        """:return: as it was at its last mark"""
+        import gymnasium
+
+        at = self._at(self.rows())
+        model = algorithm.load(at / "model.zip", env=gymnasium.make(env))
+        model.load_replay_buffer(at / "buffer.pkl")
+        return model
+
+    def keep(self, model: Any, rows: list[dict[str, Any]]) -> None:
+        at, before = self._at(rows), self._at(rows[:-1]) if rows[:-1] else None
+        model.save(at / "model.zip")
+        model.save_replay_buffer(at / "buffer.pkl")
+        temporary = self.folder / "rows.tmp"
+        temporary.write_text(json.dumps(rows))
+        temporary.replace(self.folder / "rows.json")
+        if before is not None:
+            shutil.rmtree(before, ignore_errors=True)
+
+    def forget(self) -> None:
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _at(self, rows: list[dict[str, Any]]) -> Path:
+        return self.folder / str(rows[-1]["mark"])
 
 
 def resume(

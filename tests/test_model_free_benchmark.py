@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from model_free import LENGTHS, ONLY_ON, OURS, PEERS, PENDULUM
+from runs import InterruptedRun
 
 from rl_zoo_plugin.lazy import parameters_of
 
@@ -93,7 +94,7 @@ def test_a_long_run_goes_on_from_its_last_mark(tmp_path, monkeypatch):
     monkeypatch.setattr(model_free, "evaluation", lambda env: interrupted_after(290))
     with pytest.raises(KeyboardInterrupt):
         model_free.worker(env, method, 0)
-    kept = model_free.InterruptedRun(tmp_path / "model_free" / f"{env}_{method}_0")
+    kept = InterruptedRun(tmp_path / "model_free" / f"{env}_{method}_0")
     before = kept.rows()
     model = kept.model(model_free.class_of(env, method), env)
 
