@@ -699,13 +699,7 @@ def test_a_replay_buffer_that_was_passed_is_used_after_loading():
     assert type(loaded.replay_buffer) is type(changed.replay_buffer) is ReplayBuffer
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        n if n in ("droq", "td7") else pytest.param(n, marks=pytest.mark.expensive)
-        for n in MODEL_FREE
-    ],
-)
+@mostly_expensive("droq", "td7")
 def test_hindsight_replay_is_learned_from(name):
     env = BitFlippingEnv(n_bits=3, continuous=True, max_steps=3)
     model = algos.ALL[name](
@@ -792,13 +786,7 @@ def trained(learner: Any) -> dict[str, np.ndarray]:
     }
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        n if n in ("bro", "td7") else pytest.param(n, marks=pytest.mark.expensive)
-        for n in MODEL_FREE
-    ],
-)
+@mostly_expensive("bro", "td7")
 def test_schedules_act_on_all_that_learns(name):
     model = small(
         name,
