@@ -34,9 +34,12 @@ from pendulum import held_out_states, rollouts
 from runs import CACHE, InterruptedRun, fresh_process, resume
 
 PENDULUM = "Pendulum-v1"
+CAR, CART_POLE = "MountainCarContinuous-v0", "InvertedPendulum-v5"
 #: steps of a run, and between two evaluations
 LENGTHS = {
     PENDULUM: (10_000, 1_000),
+    CAR: (20_000, 2_000),
+    CART_POLE: (20_000, 2_000),
     "Hopper-v5": (50_000, 5_000),
     "HalfCheetah-v5": (100_000, 10_000),
 }
@@ -100,8 +103,15 @@ PEERS = {
     "sbx_crossq": Peer("sbx", "CrossQ", "crossq", {}),
     "sbx_droq": Peer("sbx", "SAC", "sac", _DROQ),
 }
-#: it plans in the twin of the environment, and has settings for those that have one
-ONLY_ON = {"hds": (PENDULUM,)}
+#: RL Zoo has nothing for InvertedPendulum, and for SAC on MountainCarContinuous what it has is gSDE
+_IN_THE_ZOO = tuple(env for env in LENGTHS if env != CART_POLE)
+_WITHOUT_SDE = tuple(env for env in _IN_THE_ZOO if env != CAR)
+#: HDS plans in the twin of the environment, and has settings for those that have one
+ONLY_ON = (
+    {"hds": (PENDULUM,)}
+    | dict.fromkeys(PEERS, _IN_THE_ZOO)
+    | dict.fromkeys(("sb3_gsde_sac", "sbx_droq"), _WITHOUT_SDE)
+)
 N_EPISODES = 10
 KEYS = ("env", "method", "seed")
 
