@@ -200,7 +200,22 @@ def made_of(env: str, method: str) -> tuple[type, dict[str, Any]]:
         peer = PEERS[method]
         settings = entry(_zoo_file(peer.file), env) | peer.changes
         algorithm = getattr(importlib.import_module(peer.library), peer.name)
+    kind, deviation = (settings.pop(name, None) for name in ("noise_type", "noise_std"))
+    if kind is not None:
+        settings["action_noise"] = _noise(kind, deviation)
     return algorithm, {k: v for k, v in settings.items() if k not in ("n_timesteps", "policy")}
+
+
+def _noise(kind: str, deviation: float) -> Any:
+    """
+    :param kind: as RL Zoo calls it
+    :return: of a single control
+    """
+    from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
+
+    if kind != "ornstein-uhlenbeck":
+        raise ValueError(f"No file here has noise_type '{kind}'.")
+    return OrnsteinUhlenbeckActionNoise(np.zeros(1), np.full(1, deviation))
 
 
 @cache

@@ -45,6 +45,7 @@ PUBLISHED = [
 ]
 # Keys of a zoo entry that the zoo itself consumes, see ExperimentManager._preprocess_hyperparams.
 CONSUMED_BY_THE_ZOO = {"n_timesteps", "n_envs", "normalize", "env_wrapper", "frame_stack"}
+CONSUMED_BY_THE_ZOO |= {"noise_type", "noise_std"}
 
 
 class Base:
