@@ -50,8 +50,8 @@ def load_policy(path: str | os.PathLike[str] | io.BufferedIOBase) -> TensorPolic
     deterministic=True)``.
 
     Nothing is unpickled: the file may come from anywhere. It has no environment, no
-    ``VecNormalize`` (whose statistics are a file of their own) and cannot go on learning.
-    That of BRO draws from its plain actor with ``deterministic=False``, not from the optimistic one.
+    ``VecNormalize`` (whose statistics are a file of their own) and cannot go on learning. That of
+    BRO draws from its plain actor with ``deterministic=False``, not from the optimistic one.
 
     :param path: of a zip file that one of our algorithms saved; ``.zip`` may be left out
     :raises FileNotFoundError: if there is none
