@@ -202,11 +202,11 @@ def made_of(env: str, method: str) -> tuple[type, dict[str, Any]]:
         algorithm = getattr(importlib.import_module(peer.library), peer.name)
     kind, deviation = (settings.pop(name, None) for name in ("noise_type", "noise_std"))
     if kind is not None:
-        settings["action_noise"] = _noise(kind, deviation)
+        settings["action_noise"] = noise_of(kind, deviation)
     return algorithm, {k: v for k, v in settings.items() if k not in ("n_timesteps", "policy")}
 
 
-def _noise(kind: str, deviation: float) -> Any:
+def noise_of(kind: str, deviation: float) -> Any:
     """
     :param kind: as RL Zoo calls it
     :return: of a single control

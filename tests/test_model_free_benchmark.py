@@ -9,8 +9,9 @@ import model_free_report
 import numpy as np
 import pandas as pd
 import pytest
-from model_free import LENGTHS, ONLY_ON, OURS, PEERS, PENDULUM
+from model_free import CAR, LENGTHS, ONLY_ON, OURS, PEERS, PENDULUM
 from runs import InterruptedRun
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 
 from rl_zoo_plugin.lazy import parameters_of
 
@@ -120,6 +121,24 @@ def test_schedules_are_those_of_the_whole_run(monkeypatch):
         model.learn(10, reset_num_timesteps=False)
 
     assert model.learning_rates()[0] == pytest.approx(1e-3 * (1.0 - model.num_timesteps / 10_000))
+
+
+@pytest.mark.expensive
+def test_noise_that_stays_finds_a_goal_to_which_no_reward_leads():
+    model = model_free.learner(CAR, "gsde_sac", seed=0)
+
+    model.learn(6_000)
+
+    assert model_free.evaluation(CAR)(model).mean() > model_free_report.TARGETS[CAR]
+
+
+def test_noise_of_a_file_is_that_of_the_zoo():
+    noise = model_free.made_of(CAR, "bro")[1]["action_noise"]
+
+    assert isinstance(noise, OrnsteinUhlenbeckActionNoise)
+    assert noise._sigma == 0.5 and noise().shape == (1,)
+    with pytest.raises(ValueError, match="pink"):
+        model_free.noise_of("pink", 0.5)
 
 
 def test_learners_that_stop_at_the_ends_of_episodes_are_compared_at_their_marks():

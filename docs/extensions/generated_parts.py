@@ -108,7 +108,13 @@ PARTS: dict[str, Callable[[], str]] = {
             f"return on {env} against steps and against wall time: a line for each method, a band "
             "over its seeds",
         )
-        for env in ("Pendulum-v1", "HalfCheetah-v5", "Hopper-v5")
+        for env in (
+            "Pendulum-v1",
+            "MountainCarContinuous-v0",
+            "InvertedPendulum-v5",
+            "HalfCheetah-v5",
+            "Hopper-v5",
+        )
     },
     "gsde_continuity": summaries.over_seeds(
         "gsde_continuity",
