@@ -189,14 +189,23 @@ def test_runs_stand_beside_what_was_published():
     assert row["z"] == pytest.approx((4756.0 - 6156.0) / 700.0)
 
 
-def test_steps_that_one_method_saves_are_counted_to_the_last_return_of_the_other():
-    sac = [(1000 * i, -1000.0 + 100.0 * i) for i in range(1, 9)]
-    runs = table(sac={0: sac}, droq={0: [(1000, -900.0), (2000, -150.0), (3000, -300.0)]})
+def test_steps_that_one_method_saves_are_counted_in_the_median_over_seeds():
+    sac = {seed: [(1000 * i, -1000.0 + 110.0 * i) for i in range(1, 9)] for seed in range(3)}
+    fast, slow = [(1000, -900.0), (2000, -110.0)], [(1000, -900.0), (2000, -800.0)]
+    runs = table(sac=sac, droq={0: fast, 1: slow, 2: fast})
 
-    last, target = model_free_report.fewer_steps(runs).to_dict("records")
+    end, swing_up, target = model_free_report.fewer_steps(runs).to_dict("records")
 
-    assert (last["goal"], last["steps"], last["times"]) == (-200.0, 2000.0, 4.0)
-    assert (target["goal"], target["steps"]) == (-150.0, 2000.0) and np.isnan(target["times"])
+    assert (end["goal"], end["steps"], end["times"]) == (-120.0, 2000.0, 4.0)
+    assert (swing_up["goal"], swing_up["steps_of_other"]) == (-200.0, 8000.0)
+    assert (target["goal"], target["steps"], target["times"]) == (-150.0, 2000.0, 4.0)
+
+
+def test_steps_that_most_seeds_have_not_had_are_not_counted():
+    runs = table(droq={0: [(1000, -140.0)], 1: [(1000, -900.0)], 2: [(1000, -900.0)]})
+
+    assert model_free_report.median_first_mark(runs, -900.0) == 1000.0
+    assert np.isnan(model_free_report.median_first_mark(runs, -150.0))
 
 
 def test_intervals_are_those_of_rliable():
