@@ -2,7 +2,7 @@
 The model-free family beside SB3, SB3-contrib and SBX: return against steps and against wall time.
 
     python benchmarks/model_free.py                                   # Pendulum-v1, five seeds
-    python benchmarks/model_free.py --env HalfCheetah-v5 --seeds 2 --methods crossq_jax droq
+    python benchmarks/model_free.py --env MountainCarContinuous-v0 --seeds 2 --methods td7 bro
     python benchmarks/model_free.py --figure                          # tables and figures again
 
 Ours run with their file in `hyperparams/`, the others with what RL Zoo has for SAC, TQC and CrossQ
