@@ -199,6 +199,18 @@ def test_one_observation_gives_one_action_and_a_batch_gives_a_batch(name):
 
 
 @every_off_policy
+def test_any_numbers_of_the_right_shapes_can_be_parameters(name):
+    model = small(name)
+    # SB3's own tests draw them like this, which asks for floating point.
+    drawn = {key: th.rand_like(t) for key, t in model.get_parameters()["policy"].items()}
+
+    model.set_parameters({**model.get_parameters(), "policy": drawn})
+
+    now = model.get_parameters()["policy"]
+    assert all(th.equal(now[key], drawn[key]) for key in drawn)
+
+
+@every_off_policy
 def test_actions_stay_within_asymmetric_bounds_of_double_precision(name):
     # gSDE would keep the mean of its actions within this.
     unclipped = {"clip_mean": 0.0} if name == "gsde_sac" else {}

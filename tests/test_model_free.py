@@ -38,6 +38,7 @@ from sb3_hds.algos.off_policy import (
     Knobs,
     Trained,
     Truncated,
+    act,
     average,
     judge,
     least,
@@ -1033,9 +1034,18 @@ def test_what_td7_cannot_do_is_refused(arguments):
         TD7("Pendulum-v1", **arguments)
 
 
-def test_bro_explores_by_its_optimistic_actor_alone():
-    with pytest.raises(ValueError, match=r"BRO\(use_sde=True\).*optimistic actor explores"):
-        small("bro", use_sde=True)
+def test_the_optimistic_actor_of_bro_explores_by_gsde_too():
+    model = small("bro", use_sde=True, std_multiplier=0.5).learn(20)
+    policy, obs = model.policy, np.array([[0.6, 0.8, -1.0], [1.0, 0.0, 3.0]], np.float32)
+    learner, recipe = policy.learner, policy.recipe
+    gaussian, _ = act(recipe.actor, learner.actor.weights, obs)
+    shift = recipe.extra.network.apply(learner.extra["actor"].weights, obs, gaussian.mean)
+
+    explored = policy.scale_action(model.predict(obs)[0])
+
+    apart = gaussian.latent @ policy.matrices[0]
+    np.testing.assert_allclose(explored, jnp.tanh(gaussian.mean + shift + 0.5 * apart), atol=1e-5)
+    assert np.abs(shift).min() > 1e-6 and np.abs(apart).min() > 1e-4
 
 
 def test_td7_keeps_its_checkpoint_and_what_that_is_worth_when_networks_start_afresh():

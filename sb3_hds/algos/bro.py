@@ -85,7 +85,8 @@ class BRO(SoftActorCritic):
     and of the deviation of actions are squashed into their limits by :math:`\tanh`: actions start
     with a deviation near :math:`e^{-4}`, not near 1 as with SAC. Its quantile loss is a sum over
     quantiles where this is their mean, a factor that Adam takes out again. The loss of the
-    entropy coefficient has the coefficient itself, as theirs. SBX has no BRO.
+    entropy coefficient has the coefficient itself, as theirs. With ``use_sde=True``, which the
+    paper does not have, the optimistic actor explores by gSDE's noise. SBX has no BRO.
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
@@ -144,9 +145,6 @@ class BRO(SoftActorCritic):
         for name in ("kl_target", "std_multiplier", "multiplier_rate"):
             fine = between(getattr(self, name), 0.0, math.inf)
             self.refuse_unless(fine, name, "a number of at least 0")
-        self.refuse_unless(
-            not self.use_sde, "use_sde", "False: a second, optimistic actor explores in its place"
-        )
 
     def auto_target_entropy(self) -> float:
         return -0.5 * self.policy.n_act
@@ -248,9 +246,9 @@ class Optimist:
             "regularizer": _following(state["regularizer"], -excess, rate),
         }
 
-    def explore(self, state: Any, obs: Array, gaussian: Gaussian, noise: Array) -> Array:
+    def explore(self, state: Any, obs: Array, gaussian: Gaussian, apart: Array) -> Array:
         shift = cast(Array, self.network.apply(state["actor"].weights, obs, gaussian.mean))
-        return jnp.tanh(gaussian.mean + shift + self.std_multiplier * gaussian.std * noise)
+        return jnp.tanh(gaussian.mean + shift + self.std_multiplier * apart)
 
 
 def _value(raw: Array) -> Array:

@@ -22,7 +22,6 @@ from sb3_hds.algos.off_policy import (
     Learner,
     Recipe,
     Report,
-    act,
     explored,
     update_once,
 )
@@ -229,12 +228,9 @@ def _action(
     random_key, noise_key = jax.random.split(key)
     n_act = len(loop.twin.actuators)
     obs = seen(learner.seen, run.obs[None])
-    if loop.use_sde:
-        gaussian, _ = act(recipe.actor, learner.actor.weights, obs)
-        action = jnp.tanh(gaussian.mean + gaussian.latent @ matrix)
-    else:
-        noise = jax.random.normal(noise_key, (1, n_act))
-        action = explored(recipe, learner.actor.weights, learner.extra, obs, noise)
+    drawn = jax.random.normal(noise_key, (1, n_act))
+    noise = lambda g: g.latent @ matrix if loop.use_sde else g.std * drawn  # noqa: E731
+    action = explored(recipe, learner.actor.weights, learner.extra, obs, noise)
     if loop.use_sde and loop.warm:
         return action[0]
     random = jax.random.uniform(random_key, (n_act,), minval=-1.0, maxval=1.0)

@@ -278,14 +278,14 @@ class GaussianPolicy(LearningPolicy):
         obs, actor = self.flatten(observation), self.learner.actor.weights
         if deterministic:
             return np.asarray(_mean(self.actor_network, actor, self.learner.seen, obs))
+        scales, extra = self.learner.seen, self.learner.extra
         if not self.use_sde:
             noise = self._noise.standard_normal((len(obs), self.n_act), np.float32)
-            scales, extra = self.learner.seen, self.learner.extra
             return np.asarray(_scattered(self.recipe, actor, extra, scales, obs, noise))
         if self.matrices is None:
             self.reset_noise()
         matrices = self.matrices if len(self.matrices) == len(obs) else self.matrices[:1]  # type: ignore[arg-type, index]
-        return np.asarray(_explored(self.actor_network, actor, self.learner.seen, obs, matrices))
+        return np.asarray(_moved(self.recipe, actor, extra, scales, obs, matrices))
 
 
 class SimbaPolicy(GaussianPolicy):
@@ -422,18 +422,14 @@ def _mean(actor: nn.Module, weights: Weights, scales: Seen, obs: Any) -> jax.Arr
 def _scattered(
     recipe: Recipe, weights: Weights, extra: Any, scales: Seen, obs: Any, noise: Any
 ) -> jax.Array:
-    return explored(recipe, weights, extra, seen(scales, obs), noise)
+    return explored(recipe, weights, extra, seen(scales, obs), lambda g: g.std * noise)
 
 
 @partial(jax.jit, static_argnums=0)
-def _explored(
-    actor: nn.Module, weights: Weights, scales: Seen, obs: Any, matrices: Any
+def _moved(
+    recipe: Recipe, weights: Weights, extra: Any, scales: Seen, obs: Any, matrices: Any
 ) -> jax.Array:
     """Every environment has its matrix; with one matrix, it is everybody's."""
-    gaussian, _ = act(actor, weights, seen(scales, obs))
-    noise = jnp.einsum(
-        "bl,bla->ba",
-        gaussian.latent,
-        jnp.broadcast_to(matrices, (obs.shape[0], *matrices.shape[1:])),
-    )
-    return jnp.tanh(gaussian.mean + noise)
+    each = jnp.broadcast_to(matrices, (obs.shape[0], *matrices.shape[1:]))
+    noise = lambda g: jnp.einsum("bl,bla->ba", g.latent, each)  # noqa: E731
+    return explored(recipe, weights, extra, seen(scales, obs), noise)

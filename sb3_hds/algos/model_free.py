@@ -48,7 +48,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     :param optimize_memory_usage: as in SB3
     :param n_steps: of the returns that critics are regressed on
     :param use_sde: explore by gSDE instead of independent noise at each step; not with TD7, which
-        adds noise to its actions, and BRO, which explores by an actor of its own
+        adds noise to its actions
     :param sde_sample_freq: steps after which its noise matrix is drawn again; -1: at the start of
         each collection (``train_freq``)
     :param use_sde_at_warmup: whether it also acts before ``learning_starts``

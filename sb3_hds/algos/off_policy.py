@@ -182,10 +182,10 @@ class Extra(Protocol):
         """:return: its state after an update of the actor"""
         ...
 
-    def explore(self, state: Any, obs: Array, gaussian: Gaussian, noise: Array) -> Array:
+    def explore(self, state: Any, obs: Array, gaussian: Gaussian, apart: Array) -> Array:
         """
         :param gaussian: of the actor
-        :param noise: standard normal, as many numbers as controls
+        :param apart: how far from its mean actions would be, before they are squashed
         :return: actions to explore by
         """
         ...
@@ -289,18 +289,20 @@ def sample(gaussian: Gaussian, key: PRNGKeyArray) -> tuple[Array, Array]:
     return jnp.tanh(before), log_probability(gaussian, before)
 
 
-def explored(recipe: Recipe, weights: Weights, extra: Any, obs: Array, noise: Array) -> Array:
+def explored(
+    recipe: Recipe, weights: Weights, extra: Any, obs: Array, noise: Callable[[Gaussian], Array]
+) -> Array:
     """
     :param weights: of the actor
     :param extra: what only one algorithm has
     :param obs: as the networks see them
-    :param noise: standard normal, as many numbers as controls
-    :return: actions by which the algorithm explores, without gSDE
+    :param noise: how far from the Gaussian's mean actions are, before they are squashed
+    :return: actions by which the algorithm explores
     """
     gaussian, _ = act(recipe.actor, weights, obs)
     if recipe.extra is not None:
-        return recipe.extra.explore(extra, obs, gaussian, noise)
-    return jnp.tanh(gaussian.mean + gaussian.std * noise)
+        return recipe.extra.explore(extra, obs, gaussian, noise(gaussian))
+    return jnp.tanh(gaussian.mean + noise(gaussian))
 
 
 def begin(recipe: Recipe, n_obs: int, n_act: int, ent_coef: float, key: PRNGKeyArray) -> Learner:

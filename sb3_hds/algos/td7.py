@@ -133,23 +133,23 @@ class TD7Policy(LearningPolicy):
 
     def load_state_dict(self, state_dict: dict, strict: bool = True, assign: bool = False) -> None:
         """Tensors that do not say whether a checkpoint was kept leave that as it is."""
-        own = {_KEPT: th.as_tensor(self.has_checkpoint)}
+        own = {_KEPT: th.as_tensor(float(self.has_checkpoint))}
         super().load_state_dict(own | state_dict, strict, assign)
 
     @property
     def has_checkpoint(self) -> bool:
         """Whether a checkpoint was kept, which then acts where nothing is explored."""
-        return bool(self.learner.checkpoint.kept)
+        return float(self.learner.checkpoint.kept) > 0.0
 
     def keep_checkpoint(self) -> None:
         """The policy as it is acts from now on where nothing is explored."""
         learner = self.learner
-        checkpoint = Checkpoint(learner.copies.encoder, learner.actor.weights, jnp.asarray(True))
+        checkpoint = Checkpoint(learner.copies.encoder, learner.actor.weights, jnp.ones(()))
         self.learner = learner._replace(checkpoint=checkpoint)
 
     def drop_checkpoint(self) -> None:
         """The policy as it is at the time acts, explored or not."""
-        checkpoint = self.learner.checkpoint._replace(kept=jnp.asarray(False))
+        checkpoint = self.learner.checkpoint._replace(kept=jnp.zeros(()))
         self.learner = self.learner._replace(checkpoint=checkpoint)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
@@ -374,7 +374,7 @@ class TD7(ModelFreeAlgorithm):
         before = self.policy.learner
         self._build(seed)
         kept: dict[str, Any] = {"n_updates": before.n_updates}
-        if before.checkpoint.kept:
+        if before.checkpoint.kept > 0.0:
             kept["checkpoint"] = before.checkpoint
         self.policy.learner = self.policy.learner._replace(**kept)
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, cast
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sb3_hds.algos.networks import Activation
 from sb3_hds.algos.off_policy import Batch, Optimizer, Trained, Weights
@@ -181,12 +181,13 @@ class Checkpoint(NamedTuple):
     """
     What acts where nothing is explored.
 
-    :param kept: whether there is one; before, its weights mean nothing
+    :param kept: 1: there is one; 0: its weights mean nothing. A number, as all that SB3 hands out
+        as parameters.
     """
 
     encoder: Weights
     actor: Weights
-    kept: Bool[Array, ""]
+    kept: Float[Array, ""]
 
 
 class Learner(NamedTuple):
@@ -237,7 +238,7 @@ def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
         actor=Trained(actor, recipe.optimizer.init(actor["params"])),
         critic=Trained(critic, recipe.qf_optimizer.init(critic["params"])),
         copies=Copies(encoder, actor, critic, encoder),
-        checkpoint=Checkpoint(encoder, actor, jnp.asarray(False)),
+        checkpoint=Checkpoint(encoder, actor, zero),
         clip=Range(zero, zero),
         range=Range(infinite, -infinite),
         key=key,
