@@ -147,8 +147,8 @@ def beside_papers(runs: pd.DataFrame) -> pd.DataFrame:
 def fewer_steps(runs: pd.DataFrame) -> pd.DataFrame:
     """
     How many times fewer steps one method needs, in the median over seeds: for the mean return that
-    another ends with, and for some returns of the environment. nan: one of them needs more than it
-    has had.
+    another ends with, if that has learned the task, and for some returns of the environment. nan:
+    one of them needs more than it has had.
     """
     rows = []
     for env, some in runs.groupby("env", sort=False):
@@ -158,7 +158,9 @@ def fewer_steps(runs: pd.DataFrame) -> pd.DataFrame:
             if not (len(mine) and len(theirs)):
                 continue
             end = int(theirs["mark"].max())
-            goals = {float(returns_at(theirs, other, end).mean()): float(end)}
+            theirs_end = float(returns_at(theirs, other, end).mean())
+            learned = theirs_end >= TARGETS.get(env, -np.inf)
+            goals = {theirs_end: float(end)} if learned else {}
             goals |= {goal: median_first_mark(theirs, goal) for goal in GOALS.get(env, ())}
             for goal, theirs_needs in goals.items():
                 needs = median_first_mark(mine, goal)
@@ -205,6 +207,7 @@ def figure(table: pd.DataFrame, env: str) -> None:
     the end what was published, with its deviation. Peers have the colour of ours.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
     drawing = Figure(figsize=(10.0, 4.0), layout="constrained")
     panels = drawing.subplots(1, 2, sharey=True)
@@ -225,6 +228,9 @@ def figure(table: pd.DataFrame, env: str) -> None:
     panels[1].set_xlabel("wall time of training [s]")
     if table["seconds"].notna().any():
         panels[1].set_xscale("log")
+        panels[1].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        panels[1].xaxis.set_major_formatter("{x:g}")
+        panels[1].xaxis.set_minor_formatter("")
     panels[1].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     drawing.savefig(RESULTS / f"model_free_{env}.png", dpi=150)
 

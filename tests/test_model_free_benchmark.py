@@ -201,6 +201,12 @@ def test_steps_that_one_method_saves_are_counted_in_the_median_over_seeds():
     assert (target["goal"], target["steps"], target["times"]) == (-150.0, 2000.0, 4.0)
 
 
+def test_no_steps_are_saved_of_what_has_learned_nothing():
+    runs = table(sac={0: [(1000, -0.1)]}, droq={0: [(1000, 94.0)]}).assign(env=CAR)
+
+    assert model_free_report.fewer_steps(runs).empty
+
+
 def test_steps_that_most_seeds_have_not_had_are_not_counted():
     runs = table(droq={0: [(1000, -140.0)], 1: [(1000, -900.0)], 2: [(1000, -900.0)]})
 
