@@ -44,8 +44,15 @@ PUBLISHED = [
     ("tqc_jax", "Hopper-v5", {"learning_starts": 256, "top_quantiles_to_drop_per_net": 5}),
 ]
 # Keys of a zoo entry that the zoo itself consumes, see ExperimentManager._preprocess_hyperparams.
-CONSUMED_BY_THE_ZOO = {"n_timesteps", "n_envs", "normalize", "env_wrapper", "frame_stack"}
-CONSUMED_BY_THE_ZOO |= {"noise_type", "noise_std"}
+CONSUMED_BY_THE_ZOO = {
+    "n_timesteps",
+    "n_envs",
+    "normalize",
+    "env_wrapper",
+    "frame_stack",
+    "noise_type",
+    "noise_std",
+}
 
 
 class Base:
