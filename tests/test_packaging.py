@@ -178,6 +178,16 @@ def test_importing_the_package_imports_neither_jax_nor_torch_nor_pandas():
     assert succeeds(sys.executable, "-c", code).split() == []
 
 
+def test_who_learns_without_a_twin_does_not_wait_for_what_fits_one_to_data():
+    names = "BRO, GSDESAC, TD7, TQC, CrossQ, DroQ, SimbaSAC, load_policy"
+    code = (
+        f"from sb3_hds import {names}; import sys; "
+        "print(*{'optimistix', 'cmaes', 'sb3_hds.sysid', 'sb3_hds.twins'} & set(sys.modules))"
+    )
+
+    assert succeeds(sys.executable, "-c", code).split() == []
+
+
 def test_importing_the_package_registers_our_environments():
     code = "import gymnasium, sb3_hds; print(*gymnasium.registry)"
 

@@ -305,6 +305,7 @@ def explored(
     return jnp.tanh(gaussian.mean + noise(gaussian))
 
 
+@partial(jax.jit, static_argnums=(0, 1, 2))
 def begin(recipe: Recipe, n_obs: int, n_act: int, ent_coef: float, key: PRNGKeyArray) -> Learner:
     """:return: fresh networks and optimisers"""
     key, actor_key, critic_key, extra_key = jax.random.split(key, 4)

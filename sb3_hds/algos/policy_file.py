@@ -6,6 +6,7 @@ of whoever saved it. Beside that, our models describe their policy in plain JSON
 tensors, which ``torch.load(weights_only=True)`` reads.
 """
 
+import importlib
 import io
 import json
 import os
@@ -16,31 +17,19 @@ from typing import Any
 
 import torch as th
 
-from sb3_hds.algos.bro import BroPolicy
-from sb3_hds.algos.gaussian_policy import (
-    CrossQPolicy,
-    GaussianPolicy,
-    SimbaPolicy,
-    SimbaSACPolicy,
-)
-from sb3_hds.algos.oscillator_policy import OscillatorPolicy
 from sb3_hds.algos.persistence import TensorPolicy
 from sb3_hds.algos.policy_description import space_from_plain
-from sb3_hds.algos.td7 import TD7Policy
-from sb3_hds.algos.twin_policy import TwinPolicy
 
-_CLASSES: dict[str, type[TensorPolicy]] = {
-    policy.__name__: policy
-    for policy in (
-        TwinPolicy,
-        GaussianPolicy,
-        SimbaPolicy,
-        SimbaSACPolicy,
-        CrossQPolicy,
-        BroPolicy,
-        TD7Policy,
-        OscillatorPolicy,
-    )
+# Where each policy is: of the others, nothing is imported.
+_FILES = {
+    "TwinPolicy": "twin_policy",
+    "GaussianPolicy": "gaussian_policy",
+    "SimbaPolicy": "gaussian_policy",
+    "SimbaSACPolicy": "gaussian_policy",
+    "CrossQPolicy": "gaussian_policy",
+    "BroPolicy": "bro",
+    "TD7Policy": "td7",
+    "OscillatorPolicy": "oscillator_policy",
 }
 
 
@@ -75,7 +64,7 @@ def load_policy(path: str | os.PathLike[str] | io.BufferedIOBase) -> TensorPolic
 
 def _built(description: Mapping[str, Any], tensors: dict[str, th.Tensor]) -> TensorPolicy:
     try:
-        make = _CLASSES[description["class"]]
+        make = _class_named(description["class"])
         observation_space = space_from_plain(description["observation_space"])
         action_space: Any = space_from_plain(description["action_space"])
         policy = make(  # type: ignore[call-arg]
@@ -89,6 +78,13 @@ def _built(description: Mapping[str, Any], tensors: dict[str, th.Tensor]) -> Ten
         ) from error
     policy.load_state_dict(tensors)
     return policy
+
+
+def _class_named(name: str) -> type[TensorPolicy]:
+    """
+    :raises KeyError: for one that is not ours
+    """
+    return getattr(importlib.import_module(f"sb3_hds.algos.{_FILES[name]}"), name)
 
 
 def _existing(path: Any) -> Any:

@@ -223,6 +223,7 @@ class Report(NamedTuple):
         return cls(*(jnp.zeros(()) for _ in cls._fields))
 
 
+@partial(jax.jit, static_argnums=(0, 1, 2))
 def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
     """:return: fresh networks and optimisers"""
     key, encoder_key, actor_key, critic_key = jax.random.split(key, 4)
