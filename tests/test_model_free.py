@@ -28,7 +28,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rl_zoo_plugin.lazy import parameters_of
 from sb3_hds import GSDESAC, TD7, DroQ, SimbaSAC, algos
-from sb3_hds.algos import soft_actor_critic, td7_update
+from sb3_hds.algos import learn_compiled, soft_actor_critic, td7_update
 from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp, SimbaBody
 from sb3_hds.algos.gaussian_policy import SimbaPolicy, optimizer_of
 from sb3_hds.algos.heads import ExploringActor
@@ -181,6 +181,53 @@ def test_each_environment_has_its_noise_matrix_and_the_deviation_is_logged():
     assert isinstance(model.policy.actor_network, ExploringActor)
 
 
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_noise_matrix_lasts_over_as_many_collections_as_it_takes(compiled):
+    how = {"train_freq": 5, "sde_sample_freq": 20, "use_sde_at_warmup": True}
+    how |= {"learning_starts": 50, "policy_kwargs": {"net_arch": [8], "log_std_init": -3.0}}
+    model = small("gsde_sac", **how)
+    model = learn_compiled(model, 40)[0][0] if compiled else model.learn(40)
+
+    buffer, policy = model.replay_buffer, model.policy
+    gaussian, _ = act(
+        policy.actor_network, policy.learner.actor.weights, buffer.observations[:40, 0]
+    )
+    apart = np.arctanh(buffer.actions[:40, 0]) - gaussian.mean
+
+    def misfit(steps: slice) -> float:
+        """Of the one noise matrix that explains these steps best."""
+        latent = np.asarray(gaussian.latent[steps])
+        matrix, *_ = np.linalg.lstsq(latent, apart[steps], rcond=None)
+        return float(np.abs(latent @ matrix - apart[steps]).max())
+
+    assert misfit(slice(0, 20)) < 1e-5 and misfit(slice(20, 40)) < 1e-5
+    assert misfit(slice(10, 30)) > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("train_freq", "drawn"), [(1, [150, 300]), ((1, "episode"), [150, 200, 350])]
+)
+def test_a_noise_matrix_lasts_if_each_step_is_a_collection_and_ends_with_an_episode_that_is(
+    train_freq, drawn
+):
+    how = {"train_freq": train_freq, "sde_sample_freq": 150, "learning_starts": 1_000}
+    model, matrices = small("tqc_jax", use_sde=True, **how), []
+
+    def keep(*_) -> bool:
+        matrices.append(model.policy.matrices)
+        return True
+
+    model.learn(400, callback=keep)
+
+    changes = [i for i in range(1, 400) if (matrices[i] != matrices[i - 1]).any()]
+    assert changes == drawn
+
+
+def test_noise_that_is_drawn_at_each_step_is_warned_of():
+    with pytest.warns(UserWarning, match="draws a new noise matrix at each step"):
+        small("droq", use_sde=True, train_freq=1)
+
+
 @pytest.mark.parametrize("at_warmup", [True, False])
 def test_noise_acts_before_learning_starts_only_where_it_is_told_to(at_warmup):
     how = {"learning_starts": 100, "train_freq": 10, "use_sde_at_warmup": at_warmup}
@@ -210,6 +257,8 @@ def test_how_critics_become_targets_and_what_they_are_worth():
     np.testing.assert_array_equal(least(values), [[2.0, 1.0]])
     np.testing.assert_array_equal(average(values), [[3.0, 2.0]])
     np.testing.assert_array_equal(Truncated(1)(values), [[1.0, 2.0]])
+    optimist = jnp.array([[[4.0, 3.0]], [[2.0, 1.0]]])
+    np.testing.assert_array_equal(Truncated(1)(optimist), [[1.0, 2.0]])
     assert mean(values) == pytest.approx(2.5)
     assert pessimistic(values) == pytest.approx(2.5)
 
@@ -503,7 +552,10 @@ def test_returns_of_several_steps_need_a_buffer_that_has_them():
         ({"tau": 2.0}, "tau must be from 0 to 1"),
         ({"target_update_interval": 0}, "target_update_interval must be a whole number of at"),
         ({"policy_delay": 0}, "policy_delay must be a whole number of at least 1"),
-        ({"ent_coef": "automatic"}, "ent_coef must be a number above 0, 'auto'"),
+        ({"ent_coef": "automatic"}, "ent_coef must be a number of at least 0, 'auto'"),
+        ({"n_steps": 3, "optimize_memory_usage": True}, "False where n_steps > 1"),
+        ({"optimize_memory_usage": True}, "'handle_timeout_termination': False"),
+        ({"ent_coef": "auto_0"}, "ent_coef must be a number of at least 0, 'auto'"),
         ({"target_entropy": "low"}, "target_entropy must be 'auto' or a number"),
         ({"policy_kwargs": {"net_arch": {"pi": [8]}}}, "net_arch must be a list of widths"),
         ({"policy_kwargs": {"activation_fn": "swoosh"}}, "activation_fn must be one of"),
@@ -602,6 +654,9 @@ def test_the_default_number_of_steps_goes_beyond_the_random_ones(name):
         (th.optim.RMSprop, {"alpha": 0.9, "momentum": 0.5}),
         (th.optim.RAdam, {}),
         (th.optim.SGD, {"momentum": 0.9, "nesterov": True}),
+        (th.optim.Adamax, {}),
+        (th.optim.Adadelta, {"rho": 0.8}),
+        (th.optim.Adagrad, {}),
     ],
 )
 def test_a_torch_class_means_what_it_does_in_torch(make, arguments):
@@ -751,6 +806,22 @@ def test_bro_starts_afresh_with_its_temperature_and_others_keep_theirs():
         assert counts[0] > 0 and counts[1] == (0 if afresh else counts[0]), name
 
 
+def test_entropy_may_be_worth_nothing():
+    model = small("gsde_sac", ent_coef=0.0)
+    lines = logged(model)
+
+    model.learn(40, log_interval=1).logger.dump()
+
+    assert lines.column("train/ent_coef")[-1] == 0.0
+    assert np.isfinite(lines.column("train/critic_loss")[-1])
+    assert DroQ.load(saved(small("droq").learn(20)), ent_coef=0.0).get_parameters()
+
+
+@pytest.mark.parametrize(("gradient_steps", "n"), [(10, 8), (2, 1), (-1, 1)])
+def test_bro_starts_afresh_less_often_where_it_makes_few_updates(gradient_steps, n):
+    assert len(small("bro", gradient_steps=gradient_steps).param_resets) == n
+
+
 @every_soft
 def test_whether_the_loss_of_the_entropy_coefficient_is_linear_is_an_argument(name):
     usual = small(name)
@@ -835,6 +906,13 @@ def test_a_schedule_that_becomes_negative_is_named_where_it_does(argument):
 
     with pytest.raises(ValueError, match=rf"{argument} must be .* 0\.25 of the .* says -0\.25"):
         model.train(1, 16)
+
+
+def test_numbers_of_numpy_are_learning_rates():
+    model = small("droq", learning_rate=np.float32(1e-3), qf_learning_rate=np.float64(2e-3))
+
+    assert model.learning_rates() == pytest.approx((1e-3, 2e-3))
+    assert DroQ.load(saved(model)).learning_rate == pytest.approx(1e-3)
 
 
 def test_learning_rates_of_every_form_may_be_changed_while_loading():

@@ -74,10 +74,22 @@ def test_an_activation_is_known_by_name_in_any_spelling(name):
         th.nn.GELU,
         lambda: th.nn.GELU(approximate="tanh"),
         lambda: th.nn.functional.gelu,
+        th.nn.CELU,
+        th.nn.SELU,
+        th.nn.Mish,
+        th.nn.ReLU6,
+        th.nn.Sigmoid,
+        th.nn.LogSigmoid,
+        th.nn.Hardsigmoid,
+        th.nn.Hardswish,
+        th.nn.Hardtanh,
+        th.nn.Softsign,
+        lambda: th.nn.functional.softsign,
+        lambda: th.sigmoid,
     ],
 )
 def test_a_torch_module_stands_for_the_same_function(module):
-    x = np.linspace(-3.0, 3.0, 13, dtype=np.float32)
+    x = np.linspace(-8.0, 8.0, 33, dtype=np.float32)
 
     ours = activation(module if isinstance(module, type) else module())(jnp.asarray(x))
 
@@ -93,7 +105,7 @@ def test_a_function_of_jax_is_taken_as_it_is_and_anything_else_is_refused():
             activation(wrong)
 
 
-@pytest.mark.parametrize("function", [np.tanh, th.sigmoid, lambda: 0.0])
+@pytest.mark.parametrize("function", [np.tanh, th.sin, lambda: 0.0])
 def test_a_function_that_jax_cannot_trace_is_refused(function):
     with pytest.raises(ValueError, match=r"activation_fn=.* is no JAX function"):
         activation(function)

@@ -1,6 +1,10 @@
 """``sb3_hds.load_policy``: a policy from a file of which nothing is unpickled."""
 
+import re
+import traceback
 import zipfile
+from collections.abc import Callable
+from pathlib import Path
 
 import flax.linen as nn
 import gymnasium
@@ -139,15 +143,36 @@ def test_a_missing_file_and_files_of_others_are_reported(tmp_path):
         sb3_hds.load_policy(tmp_path / "sac.zip")
 
 
-def test_a_description_of_a_newer_version_is_reported(tmp_path):
-    model = small("droq")
-    model.save(tmp_path / "old.zip")
-    with zipfile.ZipFile(tmp_path / "old.zip") as old:
+def changed(folder: Path, part: str, change: Callable[[bytes], bytes]) -> Path:
+    """A saved model, of which one part was changed afterwards."""
+    small("droq").save(folder / "old.zip")
+    with zipfile.ZipFile(folder / "old.zip") as old:
         parts = {name: old.read(name) for name in old.namelist()}
-    parts["data"] = parts["data"].replace(b'"GaussianPolicy"', b'"TransformerPolicy"')
-    with zipfile.ZipFile(tmp_path / "new.zip", "w") as new:
+    with zipfile.ZipFile(folder / "new.zip", "w") as new:
         for name, content in parts.items():
-            new.writestr(name, content)
+            new.writestr(name, change(content) if name == part else content)
+    return folder / "new.zip"
+
+
+def test_a_description_of_a_newer_version_is_reported(tmp_path):
+    newer = lambda data: data.replace(b'"GaussianPolicy"', b'"TransformerPolicy"')  # noqa: E731
 
     with pytest.raises(ValueError, match=r"TransformerPolicy.*newer"):
-        sb3_hds.load_policy(tmp_path / "new.zip")
+        sb3_hds.load_policy(changed(tmp_path, "data", newer))
+
+
+@pytest.mark.parametrize(
+    ("part", "change"),
+    [
+        ("policy.pth", lambda content: b"no tensors"),
+        ("policy.pth", lambda content: content[: len(content) // 2]),
+        ("data", lambda content: b"[]"),
+        ("data", lambda content: re.sub(rb'"net_arch": \[[^]]*\]', b'"net_arch": [3]', content)),
+    ],
+    ids=["garbage", "half", "list", "other widths"],
+)
+def test_a_damaged_file_is_no_reason_to_unpickle_it(tmp_path, part, change):
+    with pytest.raises(ValueError, match="damaged, or") as caught:
+        sb3_hds.load_policy(changed(tmp_path, part, change))
+
+    assert "weights_only" not in "".join(traceback.format_exception(caught.value))

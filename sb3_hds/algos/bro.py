@@ -127,7 +127,8 @@ class BRO(SoftActorCritic):
         self.kl_target, self.std_multiplier = kl_target, std_multiplier
         self.multiplier_rate = multiplier_rate
         if param_resets is None:
-            fast = is_count(gradient_steps, 0) and gradient_steps <= _FAST
+            # -1: one for each step.
+            fast = is_count(gradient_steps, -1) and gradient_steps <= _FAST
             param_resets = list(_FAST_RESETS if fast else _RESETS)
         super().__init__(
             policy,

@@ -190,7 +190,7 @@ def schedule_of(rate: float | str | Schedule) -> Schedule:
     :raises ValueError: for any other string, and for a negative number in one
     """
     if not isinstance(rate, str):
-        return FloatSchedule(rate)
+        return FloatSchedule(float(rate) if isinstance(rate, numbers.Real) else rate)
     kind, _, after = rate.partition("_")
     try:
         start = float(after if kind == "lin" else rate)

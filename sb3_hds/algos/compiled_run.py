@@ -170,7 +170,7 @@ def _step(loop: Loop, params: Params, before: Array, run: Run, count: Array) -> 
     """One step of the environment, remembered; where an episode ends, the next one begins."""
     twin, t = loop.twin, before + count
     key, act_key, noise_key, start_key = jax.random.split(run.key, 4)
-    matrix = _noise_matrix(loop, run, count, noise_key)
+    matrix = _noise_matrix(loop, run, count, t, noise_key)
     action = _action(loop, run, matrix, t, act_key)
     low, high = jnp.array([(a.low, a.high) for a in twin.actuators]).T
     command = low + 0.5 * (action + 1.0) * (high - low)
@@ -237,11 +237,11 @@ def _action(
     return jnp.where(t < loop.learning_starts, random, action[0])
 
 
-def _noise_matrix(loop: Loop, run: Run, count: Array, key: PRNGKeyArray) -> Array:
+def _noise_matrix(loop: Loop, run: Run, count: Array, t: Array, key: PRNGKeyArray) -> Array:
     if not loop.use_sde:
         return run.matrix
     std, every = _std_of(loop, run.learner), loop.sde_sample_freq
-    due = count == 0 if every <= 0 else count % every == 0
+    due = count == 0 if every <= 0 else t % every == 0
     return jnp.where(due, std * jax.random.normal(key, std.shape), run.matrix)
 
 

@@ -16,7 +16,7 @@ class CrossQ(SoftActorCritic):
 
     Source: Bhatt et al., *CrossQ: Batch Normalization in Deep Reinforcement Learning for Greater
     Sample Efficiency and Simplicity*, ICLR 2024: critics of width 2048, Adam with b1 = 0.5,
-    learning rate 1e-3, three updates of the critics for each of the actor, 5,000 random steps.
+    learning rate 1e-3, three updates of the critics for each of the actor.
     Their discount is 0.99, but 0.9999 on Swimmer. Batch normalisation becomes batch
     renormalisation, in each network after 100,000 updates of its own, as in the authors' code
     (``policy_kwargs={"renorm_warmup_steps": ...}``). SBX's default width is 1024, and its

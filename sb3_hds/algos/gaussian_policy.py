@@ -45,6 +45,9 @@ _OPTIMIZERS = {
     "radam": optax.radam,
     "adabelief": optax.adabelief,
     "lion": optax.lion,
+    "adamax": optax.adamax,
+    "adadelta": optax.adadelta,
+    "adagrad": optax.adagrad,
 }
 # Of torch's classes: where their defaults are not those of optax. NAdam's momentum has a schedule
 # that optax does not have.
@@ -54,6 +57,9 @@ _TORCH: dict[str, dict[str, Any]] = {
     "sgd": {},
     "rmsprop": {"decay": 0.99, "eps_in_sqrt": False},
     "radam": {},
+    "adamax": {},
+    "adadelta": {},
+    "adagrad": {"initial_accumulator_value": 0.0, "eps": 1e-10},
 }
 
 
@@ -178,7 +184,7 @@ class GaussianPolicy(LearningPolicy):
         )
         self.n_obs, self.n_act = size_of(observation_space), n_act
         self.flatten = flattener(observation_space)
-        self.matrices: np.ndarray | None = None
+        self._forget_matrices()
         self._noise = np.random.default_rng(0)
 
     def _refuse_unused(self, has_batch_norm: bool) -> None:
@@ -243,7 +249,7 @@ class GaussianPolicy(LearningPolicy):
         key = jax.random.key(seed, impl=GENERATOR)
         self.learner = jax.device_put(begin(recipe, self.n_obs, self.n_act, ent_coef, key), device)
         self._noise = np.random.default_rng(seed)
-        self.matrices = None
+        self._forget_matrices()
 
     def observed(self, obs: np.ndarray | dict[str, np.ndarray]) -> None:
         """Count observations, of one step of every environment, among those seen."""
@@ -268,6 +274,22 @@ class GaussianPolicy(LearningPolicy):
             drawn = self._noise.standard_normal((batch_size, *std.shape), np.float32)
             self.matrices = drawn * std
 
+    def keep_noise(self, batch_size: int, n_steps: int) -> None:
+        """
+        Called at every step, noise matrices last ``n_steps`` steps, whatever was drawn in between.
+
+        :param batch_size: number of environments
+        """
+        if self._age % n_steps == 0 or len(self._lasting) != batch_size:
+            self.reset_noise(batch_size)
+            self._lasting, self._age = self.matrices, 0
+        self.matrices = self._lasting
+        self._age += 1
+
+    def _forget_matrices(self) -> None:
+        self.matrices: Any = None
+        self._lasting, self._age = self.matrices, 0
+
     def get_std(self) -> np.ndarray:
         """:return: standard deviation of the noise matrix's entries; 0 without gSDE"""
         if not self.use_sde:
@@ -284,7 +306,7 @@ class GaussianPolicy(LearningPolicy):
             return np.asarray(_scattered(self.recipe, actor, extra, scales, obs, noise))
         if self.matrices is None:
             self.reset_noise()
-        matrices = self.matrices if len(self.matrices) == len(obs) else self.matrices[:1]  # type: ignore[arg-type, index]
+        matrices = self.matrices if len(self.matrices) == len(obs) else self.matrices[:1]
         return np.asarray(_moved(self.recipe, actor, extra, scales, obs, matrices))
 
 

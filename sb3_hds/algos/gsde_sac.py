@@ -11,7 +11,7 @@ from sb3_hds.algos.soft_actor_critic import SoftActorCritic
 class GSDESAC(SoftActorCritic):
     r"""
     SAC that explores by :math:`a = \mu(s) + \theta^T z(s)` with a noise matrix :math:`\theta` that
-    is drawn every ``sde_sample_freq`` steps: smooth motion that depends on the state, which motors
+    is drawn anew every few steps: smooth motion that depends on the state, which motors
     stand.
 
     Source: Raffin, Kober and Stulp, *Smooth Exploration for Robotic Reinforcement Learning*, CoRL
@@ -20,7 +20,8 @@ class GSDESAC(SoftActorCritic):
     actor, the learned deviations (``log_std_init``, ``full_std``, ``use_expln``), ``clip_mean``,
     the marginal variance in the log-probability and ``use_sde_at_warmup`` are those of SB3. Unlike
     SB3, updates draw the noise of each state independently: its distribution is the same, its
-    gradient varies less. Use it with ``train_freq`` above 1: each collection begins with new noise.
+    gradient varies less. Without ``sde_sample_freq``, each collection of ``train_freq`` steps
+    begins with new noise.
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise

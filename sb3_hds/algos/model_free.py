@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import numbers
 import operator
 import warnings
 from abc import abstractmethod
@@ -35,7 +36,9 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         ``"lin_3e-4"``
     :param qf_learning_rate: of the critics, likewise; None: as ``learning_rate``
     :param buffer_size: transitions that are kept
-    :param learning_starts: steps with random actions before learning starts
+    :param learning_starts: steps with random actions before learning starts; where a paper has
+        more (DroQ, CrossQ and SimBa 5,000, BRO 2,500), the files in ``hyperparams/`` have as many
+        on the tasks of that paper
     :param batch_size: transitions per update
     :param tau: how far the target networks follow in each update
     :param gamma: discount per step
@@ -49,8 +52,9 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     :param n_steps: of the returns that critics are regressed on
     :param use_sde: explore by gSDE instead of independent noise at each step; not with TD7, which
         adds noise to its actions
-    :param sde_sample_freq: steps after which its noise matrix is drawn again; -1: at the start of
-        each collection (``train_freq``)
+    :param sde_sample_freq: steps after which its noise matrix is drawn again, in how many
+        collections (``train_freq``) they are made, where SB3 draws in each; -1: at the start of
+        each collection. Where collections are episodes, each begins with a new one
     :param use_sde_at_warmup: whether it also acts before ``learning_starts``
     :param stats_window_size: episodes in the averages that are logged
     :param tensorboard_log: folder for TensorBoard
@@ -231,7 +235,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             self.refuse_unless(between(getattr(self, name), 0.0, 1.0), name, "from 0 to 1")
         for name in ("learning_rate", "qf_learning_rate"):
             rate = getattr(self, name)
-            fine = not isinstance(rate, int | float) or between(rate, 0.0, math.inf)
+            fine = not isinstance(rate, numbers.Real) or between(rate, 0.0, math.inf)
             self.refuse_unless(fine, name, "a number of at least 0, or a schedule")
         if self.qf_learning_rate is not None:
             schedule_of(self.qf_learning_rate)
@@ -245,11 +249,25 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             self.use_sde == made_with, "use_sde", f"{made_with}, as when the networks were made"
         )
         usual_buffer = self.replay_buffer_class is None
-        if usual_buffer and self.n_steps > 1 and isinstance(self.observation_space, spaces.Dict):
+        if usual_buffer and self.n_steps > 1:
+            self._check_n_step_buffer()
+        ends = self.replay_buffer_kwargs.get("handle_timeout_termination", True)
+        self.refuse_unless(
+            not (self.optimize_memory_usage and ends),
+            "optimize_memory_usage",
+            "False, unless time limits may count as ends: "
+            "replay_buffer_kwargs={'handle_timeout_termination': False}",
+        )
+
+    def _check_n_step_buffer(self) -> None:
+        if isinstance(self.observation_space, spaces.Dict):
             raise EnvironmentMismatchError(
                 "n_steps > 1 needs SB3's NStepReplayBuffer, which has no Dict observation spaces: "
                 "use n_steps=1, or gymnasium.wrappers.FlattenObservation."
             )
+        self.refuse_unless(
+            not self.optimize_memory_usage, "optimize_memory_usage", "False where n_steps > 1"
+        )
 
     def _check_collection(self) -> None:
         freq: Any = self.train_freq
@@ -274,6 +292,8 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     def _setup_model(self) -> None:
         if isinstance(self.learning_rate, str):
             self.learning_rate = schedule_of(self.learning_rate)
+        elif isinstance(self.learning_rate, numbers.Real):
+            self.learning_rate = float(self.learning_rate)
         self._take_older_rate()
         # Of None, SBX makes the first number of ``learning_rate``.
         given = self.qf_learning_rate

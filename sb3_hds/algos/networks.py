@@ -23,6 +23,16 @@ ACTIVATIONS: dict[str, Activation] = {
     "silu": nn.silu,
     "leaky_relu": nn.leaky_relu,
     "softplus": nn.softplus,
+    "celu": jax.nn.celu,
+    "selu": jax.nn.selu,
+    "mish": jax.nn.mish,
+    "relu6": jax.nn.relu6,
+    "sigmoid": jax.nn.sigmoid,
+    "log_sigmoid": jax.nn.log_sigmoid,
+    "hard_sigmoid": jax.nn.hard_sigmoid,
+    "hard_swish": jax.nn.hard_swish,
+    "hard_tanh": jax.nn.hard_tanh,
+    "soft_sign": jax.nn.soft_sign,
 }
 
 _TORCH_MODULES: dict[type, str] = {
@@ -33,16 +43,27 @@ _TORCH_MODULES: dict[type, str] = {
     th.nn.SiLU: "silu",
     th.nn.LeakyReLU: "leaky_relu",
     th.nn.Softplus: "softplus",
+    th.nn.CELU: "celu",
+    th.nn.SELU: "selu",
+    th.nn.Mish: "mish",
+    th.nn.ReLU6: "relu6",
+    th.nn.Sigmoid: "sigmoid",
+    th.nn.LogSigmoid: "log_sigmoid",
+    th.nn.Hardsigmoid: "hard_sigmoid",
+    th.nn.Hardswish: "hard_swish",
+    th.nn.Hardtanh: "hard_tanh",
+    th.nn.Softsign: "soft_sign",
 }
 # Functions of the same names, of which torch has some twice; the first entry counts.
 _OF_TORCH: list[tuple[Any, str]] = [
     *_TORCH_MODULES.items(),
     (functional.gelu, "gelu_exact"),
     *(
-        (getattr(home, name), name)
+        (getattr(home, spelled), name)
         for home in (th, functional)
         for name in ACTIVATIONS
-        if hasattr(home, name)
+        for spelled in (name, name.replace("_", ""))
+        if hasattr(home, spelled)
     ),
 ]
 

@@ -62,8 +62,9 @@ def check_observations(space: spaces.Space) -> None:
         what = f"Observation '{name}'" if name else "The observation"
         if isinstance(part, spaces.Box) and (len(part.shape) > 2 or _is_gray_image(part)):
             raise EnvironmentMismatchError(
-                f"{what} is an image ({part}), and the networks here have no convolutions. Use "
-                "SBX's or SB3's CnnPolicy, or observe features of it."
+                f"{what} is an image, or has as many axes ({part}), and the networks here have no "
+                "convolutions. Use SBX's or SB3's CnnPolicy, or observe features of it; what is no "
+                "image is a vector with gymnasium.wrappers.FlattenObservation."
             )
         if not isinstance(
             part, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary

@@ -207,9 +207,10 @@ def average(values: Values) -> Targets:
 @dataclasses.dataclass(frozen=True)
 class Truncated:
     """
-    The quantiles of all critics together, but the ``n_dropped`` largest of each (TQC).
+    The quantiles of all critics in one pool, without its ``n_dropped * n_critics`` largest (TQC).
+    Which critic these come from does not matter.
 
-    :param n_dropped: for each critic
+    :param n_dropped: per critic that there is
     """
 
     n_dropped: int
@@ -305,6 +306,11 @@ def explored(
     return jnp.tanh(gaussian.mean + noise(gaussian))
 
 
+def log_of(ent_coef: Array | float) -> Array:
+    """:return: its logarithm; of 0, that of the least positive number, with no infinity in it"""
+    return jnp.log(jnp.maximum(jnp.asarray(ent_coef, jnp.float32), jnp.finfo(jnp.float32).tiny))
+
+
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def begin(recipe: Recipe, n_obs: int, n_act: int, ent_coef: float, key: PRNGKeyArray) -> Learner:
     """:return: fresh networks and optimisers"""
@@ -313,7 +319,7 @@ def begin(recipe: Recipe, n_obs: int, n_act: int, ent_coef: float, key: PRNGKeyA
     actor = recipe.actor.init(actor_key, obs)
     init = lambda key: recipe.critic.init({"params": key, "dropout": key}, obs, action)  # noqa: E731
     critic = jax.vmap(init)(jax.random.split(critic_key, recipe.n_critics))
-    log_ent_coef = {"params": jnp.log(jnp.asarray(ent_coef, jnp.float32))}
+    log_ent_coef = {"params": log_of(ent_coef)}
     of_ent_coef = recipe.ent_coef_optimizer or _ADAM
     return Learner(
         actor=Trained(actor, recipe.optimizer.init(actor["params"])),

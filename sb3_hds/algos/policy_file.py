@@ -49,9 +49,9 @@ def load_policy(path: str | os.PathLike[str] | io.BufferedIOBase) -> TensorPolic
     """
     try:
         with zipfile.ZipFile(_existing(path)) as file:
-            description = json.loads(file.read("data")).get("policy_description")
-            tensors = io.BytesIO(file.read("policy.pth"))
-    except (zipfile.BadZipFile, KeyError, UnicodeDecodeError, json.JSONDecodeError) as error:
+            data, tensors = json.loads(file.read("data")), io.BytesIO(file.read("policy.pth"))
+        description = data.get("policy_description")
+    except (zipfile.BadZipFile, KeyError, AttributeError, ValueError) as error:
         raise ValueError(f"'{path}' is damaged, or is no saved model: {error}.") from error
     if description is None:
         raise ValueError(
@@ -59,10 +59,19 @@ def load_policy(path: str | os.PathLike[str] | io.BufferedIOBase) -> TensorPolic
             "older version of this one, or its policy has a class or function of your own. If you "
             "trust whoever saved it, load it with its algorithm, for example HDS.load(path)."
         )
-    return _built(description, th.load(tensors, map_location="cpu", weights_only=True))
+    policy = _built(description)
+    try:
+        policy.load_state_dict(th.load(tensors, map_location="cpu", weights_only=True))
+    # What torch raises for a damaged file has many types, and recommends to unpickle it.
+    except Exception as error:
+        raise ValueError(
+            f"The weights in '{path}' are damaged, or do not fit the policy that it describes "
+            f"({type(error).__name__}): copy it once more from where it was saved."
+        ) from None
+    return policy
 
 
-def _built(description: Mapping[str, Any], tensors: dict[str, th.Tensor]) -> TensorPolicy:
+def _built(description: Mapping[str, Any]) -> TensorPolicy:
     try:
         make = _class_named(description["class"])
         observation_space = space_from_plain(description["observation_space"])
@@ -76,7 +85,6 @@ def _built(description: Mapping[str, Any], tensors: dict[str, th.Tensor]) -> Ten
             f"This file describes its policy in a way that this version does not know ({error}): "
             "was it saved by a newer one?"
         ) from error
-    policy.load_state_dict(tensors)
     return policy
 
 

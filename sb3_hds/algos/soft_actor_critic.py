@@ -2,18 +2,19 @@
 
 import dataclasses
 import math
+import warnings
 from typing import Any, ClassVar
 
-import jax.numpy as jnp
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, TrainFrequencyUnit
 
 from sb3_hds.algos.call_forms import between, is_count, jax_device
 from sb3_hds.algos.gaussian_policy import GaussianPolicy, SimbaPolicy
 from sb3_hds.algos.model_free import ModelFreeAlgorithm, finite
-from sb3_hds.algos.off_policy import Knobs, Recipe, Report, update
+from sb3_hds.algos.off_policy import Knobs, Recipe, Report, log_of, update
 from sb3_hds.algos.sampling import batches_of
 
 # Updates of one compiled call; more are made in several.
@@ -86,6 +87,12 @@ class SoftActorCritic(ModelFreeAlgorithm):
         fine = is_count(self.target_update_interval, 1)
         self.refuse_unless(fine, "target_update_interval", "a whole number of at least 1")
         _initial_ent_coef(self.ent_coef)
+        if self.use_sde and self.sde_sample_freq < 1 and self.train_freq in (1, (1, "step")):
+            warnings.warn(
+                f"{type(self).__name__}(use_sde=True, train_freq=1) draws a new noise matrix at "
+                "each step, which is not smooth: pass sde_sample_freq=8, or train_freq=8 and "
+                "gradient_steps=8."
+            )
 
     def set_parameters(
         self,
@@ -97,7 +104,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
         if not isinstance(self.ent_coef, str):
             # What is no parameter of this model is not another one's to set; ``load`` passes here.
             before = self.policy.learner.log_ent_coef
-            fixed = {"params": jnp.log(jnp.asarray(self.ent_coef, jnp.float32))}
+            fixed = {"params": log_of(self.ent_coef)}
             now = before._replace(weights=fixed)
             self.policy.learner = self.policy.learner._replace(log_ent_coef=now)
 
@@ -129,6 +136,18 @@ class SoftActorCritic(ModelFreeAlgorithm):
         wanted = self.auto_target_entropy() if entropy == "auto" else float(entropy)
         return Knobs(rate, qf_rate, self.tau, wanted)
 
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        # SB3 has drawn noise matrices at the start of the collection.
+        if self.use_sde and self.sde_sample_freq > 0 and self._collects_steps():
+            self.policy.keep_noise(n_envs, self.sde_sample_freq)
+        return super()._sample_action(learning_starts, action_noise, n_envs)
+
+    def _collects_steps(self) -> bool:
+        freq: Any = self.train_freq
+        return freq.unit == TrainFrequencyUnit.STEP
+
     def _store_transition(
         self,
         replay_buffer: ReplayBuffer,
@@ -144,7 +163,8 @@ class SoftActorCritic(ModelFreeAlgorithm):
 
 def _initial_ent_coef(ent_coef: float | str) -> float:
     """
-    :raises ValueError: for anything but a positive number, ``"auto"`` or ``"auto_NUMBER"``
+    :raises ValueError: for anything but a number of at least 0, ``"auto"`` or ``"auto_NUMBER"``,
+        which is above 0
     """
     start: Any = ent_coef
     if isinstance(ent_coef, str):
@@ -154,9 +174,10 @@ def _initial_ent_coef(ent_coef: float | str) -> float:
         value = float(start)
     except (TypeError, ValueError):
         value = math.nan
-    if not 0.0 < value < math.inf:
+    fine = 0.0 < value < math.inf or (value == 0.0 and not isinstance(ent_coef, str))
+    if not fine:
         raise ValueError(
-            f"ent_coef must be a number above 0, 'auto', or 'auto_0.1' to start there, got "
+            f"ent_coef must be a number of at least 0, 'auto', or 'auto_0.1' to start there, got "
             f"{ent_coef!r}."
         )
     return value

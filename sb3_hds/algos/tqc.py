@@ -24,7 +24,8 @@ class TQC(SoftActorCritic):
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
-    :param top_quantiles_to_drop_per_net: of each critic's next values
+    :param top_quantiles_to_drop_per_net: as many times the number of critics are left out of the
+        pool of all critics' next values, the largest of the pool
     :param policy_kwargs: ``n_quantiles`` is 25 unless given
     :param arguments: those of ``SoftActorCritic``
     """
