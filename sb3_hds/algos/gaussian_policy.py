@@ -306,7 +306,9 @@ class GaussianPolicy(LearningPolicy):
             return np.asarray(_scattered(self.recipe, actor, extra, scales, obs, noise))
         if self.matrices is None:
             self.reset_noise()
-        matrices = self.matrices if len(self.matrices) == len(obs) else self.matrices[:1]
+        matrices: Any = self.matrices
+        if len(matrices) != len(obs):
+            matrices = matrices[:1]
         return np.asarray(_moved(self.recipe, actor, extra, scales, obs, matrices))
 
 
