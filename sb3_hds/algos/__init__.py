@@ -50,7 +50,7 @@ __all__ = [
     "load_policy",
 ]
 
-_FILES = {
+_MODULES = {
     "ALL": "every",
     "BRO": "bro",
     "CrossQ": "crossq",
@@ -75,9 +75,9 @@ _FILES = {
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _FILES:
-        raise AttributeError(f"module 'sb3_hds.algos' has no attribute '{name}'")
-    return getattr(importlib.import_module(f"sb3_hds.algos.{_FILES[name]}"), name)
+    if name not in _MODULES:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -21,7 +21,7 @@ from sb3_hds.algos.persistence import TensorPolicy
 from sb3_hds.algos.policy_description import space_from_plain
 
 # Where each policy is: of the others, nothing is imported.
-_FILES = {
+_MODULES = {
     "TwinPolicy": "twin_policy",
     "GaussianPolicy": "gaussian_policy",
     "SimbaPolicy": "gaussian_policy",
@@ -92,7 +92,7 @@ def _class_named(name: str) -> type[TensorPolicy]:
     """
     :raises KeyError: for one that is not ours
     """
-    return getattr(importlib.import_module(f"sb3_hds.algos.{_FILES[name]}"), name)
+    return getattr(importlib.import_module(f"sb3_hds.algos.{_MODULES[name]}"), name)
 
 
 def _existing(path: Any) -> Any:
