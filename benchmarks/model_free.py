@@ -8,7 +8,9 @@ The model-free family beside SB3, SB3-contrib and SBX: return against steps and 
 Ours run with their file in `hyperparams/`, the others with what RL Zoo has for SAC, TQC and CrossQ
 on that environment (those of -v4 for -v5; SBX's DroQ: that of SAC with its documented arguments;
 SB3's gSDE: that of SAC with what ours has on Pendulum-v1).
-`sac` is our GSDESAC without gSDE, `bro_fast` BRO with two updates per step. HDS, which knows a
+`sac` is our GSDESAC without gSDE, `bro_fast` BRO with two updates per step; the critics of
+`crossq_jax_narrow` have an eighth of the paper's width, those of `simba_narrow` and `bro_fast_narrow` a
+quarter, which two cores can bear. HDS, which knows a
 simulation of Pendulum-v1, stands beside them with the few steps of its own file. Each run is a
 fresh process; training stops for each evaluation, whose time does not count. `seconds` of the runs
 are those of their days: the tables have what `model_free_pace.py` makes of them. On Pendulum-v1,
@@ -69,6 +71,10 @@ class Peer(NamedTuple):
     changes: dict[str, Any]
 
 
+def _widths(actor: list[int], critics: list[int]) -> dict[str, Any]:
+    return {"policy_kwargs": {"net_arch": {"pi": actor, "qf": critics}}}
+
+
 _SAC = ("sb3_sac", "sbx_sac")
 OURS = {
     "sac": Ours("gsde_sac", {"use_sde": False, "train_freq": 1, "gradient_steps": 1}, _SAC),
@@ -81,6 +87,9 @@ OURS = {
     "bro": Ours("bro", {}, _SAC),
     "bro_fast": Ours("bro", {"gradient_steps": 2}, _SAC),
     "hds": Ours("hds", {}, _SAC),
+    "crossq_jax_narrow": Ours("crossq_jax", _widths([256, 256], [256, 256]), _SAC),
+    "simba_narrow": Ours("simba", _widths([128], [128, 128]), _SAC),
+    "bro_fast_narrow": Ours("bro", {"gradient_steps": 2} | _widths([256], [128, 128]), _SAC),
 }
 _DROQ = {
     "policy_kwargs": {"dropout_rate": 0.01, "layer_norm": True},
@@ -106,9 +115,12 @@ PEERS = {
 #: RL Zoo has nothing for InvertedPendulum, and for SAC on MountainCarContinuous what it has is gSDE
 _IN_THE_ZOO = tuple(env for env in LENGTHS if env != CART_POLE)
 _WITHOUT_SDE = tuple(env for env in _IN_THE_ZOO if env != CAR)
+#: where the files have the widths of the papers
+_WIDE = ("Hopper-v5", "HalfCheetah-v5")
 #: HDS plans in the twin of the environment, and has settings for those that have one
 ONLY_ON = (
     {"hds": (PENDULUM,)}
+    | dict.fromkeys(("crossq_jax_narrow", "simba_narrow", "bro_fast_narrow"), _WIDE)
     | dict.fromkeys(PEERS, _IN_THE_ZOO)
     | dict.fromkeys(("sb3_gsde_sac", "sbx_droq"), _WITHOUT_SDE)
 )
@@ -194,7 +206,11 @@ def made_of(env: str, method: str) -> tuple[type, dict[str, Any]]:
         from sb3_hds import algos
 
         ours = OURS[method]
-        settings = entry(_own_file(ours.file), env) | ours.changes
+        settings = entry(_own_file(ours.file), env)
+        both = [given.get("policy_kwargs", {}) for given in (settings, ours.changes)]
+        settings |= ours.changes
+        if any(both):
+            settings["policy_kwargs"] = both[0] | both[1]
         algorithm = algos.ALL[ours.file]
     else:
         peer = PEERS[method]

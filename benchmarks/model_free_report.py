@@ -234,9 +234,13 @@ def figure(table: pd.DataFrame, env: str) -> None:
 
 
 def style_of(method: str) -> dict[str, Any]:
-    """:return: colour by algorithm, line by library"""
+    """:return: colour by algorithm, line by library, or for narrow critics"""
     from matplotlib import colormaps
 
-    same = next(name for name, ours in OURS.items() if method in (name, *ours.peers))
+    alike = method.removesuffix("_narrow")
+    same = next(name for name, ours in OURS.items() if alike in (name, *ours.peers))
     line = "-" if method in OURS else "--" if method.startswith("sbx") else ":"
-    return {"color": colormaps["tab10"](list(OURS).index(same)), "linestyle": line}
+    return {
+        "color": colormaps["tab10"](list(OURS).index(same)),
+        "linestyle": line if alike == method else "-.",
+    }
