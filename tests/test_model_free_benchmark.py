@@ -76,6 +76,16 @@ def test_every_setting_of_a_method_is_an_argument_of_its_class(method):
         assert len(model_free.marks(env, method)) > 1
 
 
+def test_narrow_critics_are_all_that_differs_from_the_file():
+    wide, narrow = (
+        model_free.made_of("HalfCheetah-v5", name)[1] for name in ("simba", "simba_narrow")
+    )
+
+    arch = {"net_arch": {"pi": [128], "qf": [128, 128]}}
+    assert narrow == wide | {"policy_kwargs": wide["policy_kwargs"] | arch}
+    assert "net_arch" not in wide["policy_kwargs"]
+
+
 def test_a_long_run_goes_on_from_its_last_mark(tmp_path, monkeypatch):
     env, method = "InvertedPendulum-v5", "td7"
     monkeypatch.setattr(model_free, "LENGTHS", {env: (300, 100)})
