@@ -128,13 +128,16 @@ def beside_peers(runs: pd.DataFrame) -> pd.DataFrame:
 def beside_papers(runs: pd.DataFrame) -> pd.DataFrame:
     """
     A row for each published mean. ``z``: ours minus it, in its standard deviations over seeds;
-    below -2, something is wrong.
+    below -2, something is wrong. Narrow critics stand beside what was published of wide ones.
     """
     rows = []
-    for (env, method), (mean, deviation, n) in PUBLISHED.items():
-        some = runs[(runs["env"] == env) & (runs["method"] == method)]
-        if not len(some):
+    present = runs[["env", "method"]].drop_duplicates().itertuples(index=False)
+    for env, method in present:
+        published = PUBLISHED.get((env, plain(method)))
+        if published is None:
             continue
+        mean, deviation, n = published
+        some = runs[(runs["env"] == env) & (runs["method"] == method)]
         at = some["mark"].max()
         mine, low, high = intervals.of_mean(returns_at(some, method, at))
         row = {"env": env, "method": method, "mark": at, "seeds": some["seed"].nunique()}
@@ -217,9 +220,9 @@ def figure(table: pd.DataFrame, env: str) -> None:
         for panel, x in zip(panels, (middle.index, seconds), strict=True):
             panel.plot(x, middle, label=method, linewidth=1.5, **style)
             panel.fill_between(x, low, high, color=style["color"], alpha=0.12, linewidth=0.0)
-        if (env, method) in PUBLISHED:
-            mean, deviation, _ = PUBLISHED[env, method]
-            beside = 1.03 + 0.015 * list(OURS).index(method)
+        if (env, plain(method)) in PUBLISHED:
+            mean, deviation, _ = PUBLISHED[env, plain(method)]
+            beside = 1.03 + 0.015 * list(OURS).index(plain(method))
             at, colour = middle.index[-1] * beside, style["color"]
             panels[0].errorbar(at, mean, deviation, fmt="_", color=colour, alpha=0.6, capsize=2)
     panels[0].set(xlabel="steps in the environment", ylabel=f"return on {env}")
@@ -237,10 +240,14 @@ def style_of(method: str) -> dict[str, Any]:
     """:return: colour by algorithm, line by library, or for narrow critics"""
     from matplotlib import colormaps
 
-    alike = method.removesuffix("_narrow")
-    same = next(name for name, ours in OURS.items() if alike in (name, *ours.peers))
+    same = next(name for name, ours in OURS.items() if plain(method) in (name, *ours.peers))
     line = "-" if method in OURS else "--" if method.startswith("sbx") else ":"
     return {
         "color": colormaps["tab10"](list(OURS).index(same)),
-        "linestyle": line if alike == method else "-.",
+        "linestyle": line if plain(method) == method else "-.",
     }
+
+
+def plain(method: str) -> str:
+    """:return: the method that has this one's algorithm and the widths of its paper"""
+    return method.removesuffix("_narrow")

@@ -190,13 +190,18 @@ def test_a_method_below_the_interval_of_its_peer_is_named_at_the_last_mark_of_bo
 
 
 def test_runs_stand_beside_what_was_published():
-    runs = table(sac={0: [(100_000, 5000.0)], 1: [(100_000, 4512.0)]})
+    runs = table(
+        sac={0: [(100_000, 5000.0)], 1: [(100_000, 4512.0)]},
+        simba_narrow={0: [(100_000, 5522.0)]},
+        td7={0: [(100_000, 9000.0)]},
+    )
     runs["env"], runs["mark"] = "HalfCheetah-v5", 100_000
 
-    [row] = model_free_report.beside_papers(runs).to_dict("records")
+    sac, narrow = model_free_report.beside_papers(runs).to_dict("records")
 
-    # Published: 6156 +- 700.
-    assert row["z"] == pytest.approx((4756.0 - 6156.0) / 700.0)
+    # Published: 6156 +- 700, and 5462 +- 598 with wide critics.
+    assert sac["z"] == pytest.approx((4756.0 - 6156.0) / 700.0)
+    assert narrow["z"] == pytest.approx(60.0 / 598.0)
 
 
 def test_steps_that_one_method_saves_are_counted_in_the_median_over_seeds():

@@ -21,11 +21,11 @@ WORN = ("hds_parts", "wrong twin", "ceiling")
 LEARNED = {
     "gsde_sac": ("sb3_gsde_sac", "sac", "sb3_sac", "sbx_sac"),
     "droq": ("sbx_droq", "sac"),
-    "crossq_jax": ("contrib_crossq", "sbx_crossq", "sac"),
+    "crossq_jax": ("crossq_jax_narrow", "contrib_crossq", "sbx_crossq", "sac"),
     "tqc_jax": ("contrib_tqc", "sbx_tqc", "sac"),
-    "simba": ("sac", "sb3_sac", "sbx_sac"),
+    "simba": ("simba_narrow", "sac", "sb3_sac", "sbx_sac"),
     "td7": ("sac", "sb3_sac", "sbx_sac"),
-    "bro": ("bro_fast", "sac", "sb3_sac", "sbx_sac"),
+    "bro": ("bro_fast", "bro_fast_narrow", "sac", "sb3_sac", "sbx_sac"),
 }
 
 PARTS: dict[str, Callable[[], str]] = {
