@@ -133,7 +133,9 @@ def figure(table: pd.DataFrame) -> None:
             axes.plot(runs["continuity"], runs["return"], "o", color=colour, alpha=0.4)
             middle = runs[["continuity", "return"]].mean()
             axes.plot(*middle, "X", color=colour, markersize=9, label=noise)
-        axes.set(xlabel="continuity cost while learning", title=env_id, xscale="log")
+        costs = table.loc[table["env"] == env_id, "continuity"]
+        scale = "log" if costs.max() > 3.0 * costs.min() else "linear"
+        axes.set(xlabel="continuity cost while learning", title=env_id, xscale=scale)
         axes.spines[["top", "right"]].set_visible(False)
     drawing.axes[0].set_ylabel("return of the mean policy")
     drawing.axes[0].legend(frameon=False, fontsize=8)
