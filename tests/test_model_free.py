@@ -28,7 +28,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rl_zoo_plugin.lazy import parameters_of
 from sb3_hds import GSDESAC, TD7, DroQ, SimbaSAC, algos
-from sb3_hds.algos import learn_compiled, soft_actor_critic, td7_update
+from sb3_hds.algos import learn_compiled, off_policy, soft_actor_critic, td7_update
 from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp, SimbaBody
 from sb3_hds.algos.gaussian_policy import SimbaPolicy, optimizer_of
 from sb3_hds.algos.heads import ExploringActor
@@ -497,6 +497,17 @@ def test_parts_of_an_observation_come_in_equal_numbers():
 
 @every_algorithm
 @pytest.mark.parametrize("net_arch", [[], {"pi": [8, 4], "qf": [6]}])
+def test_what_only_updates_look_at_compiles_no_networks_again():
+    compiled = []
+    for policy_delay, target_every in ((1, 1), (7, 3)):
+        for name in ("droq", "td7"):
+            small(name, policy_delay=policy_delay, target_update_interval=target_every)
+        programs = (off_policy._begin, td7_update._begin)
+        compiled.append([program._cache_size() for program in programs])
+
+    assert compiled[0] == compiled[1] and min(compiled[0]) >= 1
+
+
 def test_networks_may_have_no_hidden_layer_or_layers_of_several_widths(name, net_arch):
     kwargs = SMALL[name]["policy_kwargs"] | {"net_arch": net_arch}
 
