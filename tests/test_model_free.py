@@ -495,8 +495,6 @@ def test_parts_of_an_observation_come_in_equal_numbers():
 # --- what SB3's own tests ask for
 
 
-@every_algorithm
-@pytest.mark.parametrize("net_arch", [[], {"pi": [8, 4], "qf": [6]}])
 def test_what_only_updates_look_at_compiles_no_networks_again():
     compiled = []
     for policy_delay, target_every in ((1, 1), (7, 3)):
@@ -508,6 +506,8 @@ def test_what_only_updates_look_at_compiles_no_networks_again():
     assert compiled[0] == compiled[1] and min(compiled[0]) >= 1
 
 
+@every_algorithm
+@pytest.mark.parametrize("net_arch", [[], {"pi": [8, 4], "qf": [6]}])
 def test_networks_may_have_no_hidden_layer_or_layers_of_several_widths(name, net_arch):
     kwargs = SMALL[name]["policy_kwargs"] | {"net_arch": net_arch}
 
