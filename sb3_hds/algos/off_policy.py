@@ -313,25 +313,6 @@ def log_of(ent_coef: Array | float) -> Array:
 
 def begin(recipe: Recipe, n_obs: int, n_act: int, ent_coef: float, key: PRNGKeyArray) -> Learner:
     """:return: fresh networks and optimisers"""
-    # What only updates look at is no reason to compile again.
-    networks = Recipe(
-        actor=recipe.actor,
-        critic=recipe.critic,
-        n_critics=recipe.n_critics,
-        target_of=least,
-        error=squared,
-        worth=pessimistic,
-        optimizer=recipe.optimizer,
-        qf_optimizer=recipe.qf_optimizer,
-        ent_coef_optimizer=recipe.ent_coef_optimizer,
-        joint_pass=recipe.joint_pass,
-        extra=recipe.extra,
-    )
-    return _begin(networks, n_obs, n_act, ent_coef, key)
-
-
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _begin(recipe: Recipe, n_obs: int, n_act: int, ent_coef: float, key: PRNGKeyArray) -> Learner:
     key, actor_key, critic_key, extra_key = jax.random.split(key, 4)
     obs, action = jnp.zeros((1, n_obs)), jnp.zeros((1, n_act))
     actor = recipe.actor.init(actor_key, obs)

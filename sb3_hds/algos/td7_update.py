@@ -225,20 +225,6 @@ class Report(NamedTuple):
 
 def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
     """:return: fresh networks and optimisers"""
-    # What only updates look at is no reason to compile again.
-    networks = Recipe(
-        encoder=recipe.encoder,
-        actor=recipe.actor,
-        critic=recipe.critic,
-        n_critics=recipe.n_critics,
-        optimizer=recipe.optimizer,
-        qf_optimizer=recipe.qf_optimizer,
-    )
-    return _begin(networks, n_obs, n_act, key)
-
-
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
     key, encoder_key, actor_key, critic_key = jax.random.split(key, 4)
     obs, action = jnp.zeros((1, n_obs)), jnp.zeros((1, n_act))
     encoder = recipe.encoder.init(encoder_key, obs, action)
