@@ -5,13 +5,17 @@ Intervals are those of means over seeds (see ``intervals.py``): of five seeds th
 little more than the spread.
 """
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import intervals
 import numpy as np
 import pandas as pd
 from model_free import CAR, CART_POLE, LENGTHS, OURS, PEERS, PENDULUM
 from runs import RESULTS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 #: return that every method shall reach; Gymnasium's own of the two small tasks
 TARGETS = {PENDULUM: -150.0, CAR: 90.0, CART_POLE: 950.0}
@@ -32,6 +36,8 @@ PUBLISHED = {
     ("Hopper-v5", "bro"): (721.0, 371.0, 5),
     ("Hopper-v5", "bro_fast"): (631.0, 114.0, 5),
 }
+#: range of returns that a second row of the figure shows alone
+CLOSE_TO_THE_BEST = {PENDULUM: (-190.0, -134.0)}
 #: returns up to which steps are counted: the pendulum swings up, and it does what all shall reach
 GOALS = {PENDULUM: (-200.0, TARGETS[PENDULUM])}
 #: methods that shall need fewer steps than another one for the return that this one ends with
@@ -74,8 +80,9 @@ def wall_seconds(runs: pd.DataFrame, paces: pd.DataFrame) -> pd.Series:
     :return: of each row, seconds that training takes up to there, all on one day; nan: no pace
     """
     rows = runs[["env", "method", "steps"]].merge(paces, "left", ["env", "method"])
+    begun = (rows["steps"] / rows["first_steps"]).clip(upper=1.0) * rows["first_s"]
     later = (rows["steps"] - rows["first_steps"]).clip(lower=0.0) * rows["step_s"]
-    return pd.Series((rows["first_s"] + later).to_numpy(), runs.index)
+    return pd.Series((begun + later).to_numpy(), runs.index)
 
 
 def shown(table: pd.DataFrame) -> str:
@@ -104,7 +111,7 @@ def summary(runs: pd.DataFrame) -> pd.DataFrame:
 def beside_peers(runs: pd.DataFrame) -> pd.DataFrame:
     """
     A row for each method of ours and each of its peers, at the last mark that both have. ``worse``:
-    our mean lies below the interval of the peer's.
+    our mean lies below the interval of the peer's; nothing, where a single run has none.
     """
     rows = []
     for env, some in runs.groupby("env", sort=False):
@@ -120,7 +127,8 @@ def beside_peers(runs: pd.DataFrame) -> pd.DataFrame:
                 row |= {"return": mine.mean(), "of_peer": their_mean, "low_of_peer": their_low}
                 row |= {"difference": difference, "low": low, "high": high}
                 row |= {"chance_of_more": intervals.chance_of_more(mine, theirs)}
-                row |= {"worse": "yes" if mine.mean() < their_low else "no"}
+                worse = "yes" if mine.mean() < their_low else "no"
+                row |= {"worse": "" if np.isnan(their_low) else worse}
                 rows.append(row | {"seeds": f"{len(mine)} and {len(theirs)}"})
     return pd.DataFrame(rows)
 
@@ -205,13 +213,35 @@ def returns_at(some: pd.DataFrame, method: str, mark: int) -> np.ndarray:
 def figure(table: pd.DataFrame, env: str) -> None:
     """
     Return against steps and against wall time: a line for each method, a band over its seeds; at
-    the end what was published, with its deviation. Peers have the colour of ours.
+    the end what was published, with its deviation. Peers have the colour of ours. Where the returns
+    that matter lie close together, a second row shows the means there.
     """
     from matplotlib.figure import Figure
+
+    near = CLOSE_TO_THE_BEST.get(env)
+    n_rows = 1 if near is None else 2
+    drawing = Figure(figsize=(10.0, 0.6 + 3.4 * n_rows), layout="constrained")
+    rows = drawing.subplots(n_rows, 2, sharey="row", squeeze=False)
+    for panels, with_bands in zip(rows, (True, False), strict=False):
+        draw_curves(panels, table, env, with_bands)
+        panels[0].set_ylabel(f"return on {env}")
+    if near is not None:
+        rows[1, 0].set_ylim(near)
+        for panel in rows[1]:
+            panel.axhline(TARGETS[env], color="black", linewidth=0.8, linestyle=":")
+    rows[-1, 0].set_xlabel("steps in the environment")
+    rows[-1, 1].set_xlabel("wall time of training [s]")
+    rows[0, 1].legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.02))
+    drawing.savefig(RESULTS / f"model_free_{env}.png", dpi=150)
+
+
+def draw_curves(panels: Sequence["Axes"], table: pd.DataFrame, env: str, with_bands: bool) -> None:
+    """
+    :param panels: for returns against steps and against seconds
+    :param with_bands: over seeds
+    """
     from matplotlib.ticker import LogLocator
 
-    drawing = Figure(figsize=(10.0, 4.0), layout="constrained")
-    panels = drawing.subplots(1, 2, sharey=True)
     present = set(table["method"])
     for method in (m for m in (*OURS, *PEERS) if m in present):
         runs = table[table["method"] == method].groupby("mark")
@@ -219,21 +249,18 @@ def figure(table: pd.DataFrame, env: str) -> None:
         style, seconds = style_of(method), runs["seconds"].mean()
         for panel, x in zip(panels, (middle.index, seconds), strict=True):
             panel.plot(x, middle, label=method, linewidth=1.5, **style)
-            panel.fill_between(x, low, high, color=style["color"], alpha=0.12, linewidth=0.0)
+            if with_bands:
+                panel.fill_between(x, low, high, color=style["color"], alpha=0.12, linewidth=0.0)
         if (env, plain(method)) in PUBLISHED:
             mean, deviation, _ = PUBLISHED[env, plain(method)]
             beside = 1.03 + 0.015 * list(OURS).index(plain(method))
             at, colour = middle.index[-1] * beside, style["color"]
             panels[0].errorbar(at, mean, deviation, fmt="_", color=colour, alpha=0.6, capsize=2)
-    panels[0].set(xlabel="steps in the environment", ylabel=f"return on {env}")
-    panels[1].set_xlabel("wall time of training [s]")
     if table["seconds"].notna().any():
         panels[1].set_xscale("log")
         panels[1].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         panels[1].xaxis.set_major_formatter("{x:g}")
         panels[1].xaxis.set_minor_formatter("")
-    panels[1].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    drawing.savefig(RESULTS / f"model_free_{env}.png", dpi=150)
 
 
 def style_of(method: str) -> dict[str, Any]:

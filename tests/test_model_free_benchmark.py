@@ -171,7 +171,7 @@ def test_wall_times_are_steps_times_what_one_takes_on_the_same_day():
 
     seconds = model_free_report.wall_seconds(runs, pd.DataFrame([pace]))
 
-    np.testing.assert_allclose(seconds, [20.0, 20.0 + 600 * 0.05, np.nan])
+    np.testing.assert_allclose(seconds, [15.0, 20.0 + 600 * 0.05, np.nan])
 
 
 def test_a_method_below_the_interval_of_its_peer_is_named_at_the_last_mark_of_both():
@@ -187,6 +187,14 @@ def test_a_method_below_the_interval_of_its_peer_is_named_at_the_last_mark_of_bo
     assert shown.loc["td7", ["mark", "difference", "worse"]].tolist() == [2000, -30.0, "yes"]
     assert shown.loc["bro", ["mark", "difference", "worse"]].tolist() == [2000, -10.0, "no"]
     assert shown.loc["bro", "chance_of_more"] == 0.25
+
+
+def test_a_single_run_of_a_peer_has_no_interval_to_lie_below():
+    runs = table(td7={0: [(1000, -900.0)], 1: [(1000, -910.0)]}, sbx_sac={0: [(1000, -300.0)]})
+
+    [row] = model_free_report.beside_peers(runs).to_dict("records")
+
+    assert (row["difference"], row["worse"]) == (-605.0, "")
 
 
 def test_runs_stand_beside_what_was_published():

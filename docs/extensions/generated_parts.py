@@ -100,7 +100,7 @@ PARTS: dict[str, Callable[[], str]] = {
     **{f"learned_{method}": summaries.learned(method, *peers) for method, peers in LEARNED.items()},
     "learned": summaries.learned(),
     "learned_papers": summaries.whole("model_free_papers"),
-    "learned_peers": summaries.whole("model_free_peers"),
+    "learned_peers": summaries.whole("model_free_peers", digits=4),
     "learned_fewer_steps": summaries.whole("model_free_fewer_steps"),
     **{
         f"learned_on_{env.partition('-')[0]}": summaries.picture(

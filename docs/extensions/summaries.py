@@ -74,15 +74,16 @@ def first_and_rest(name: str, n_first: int, shows: str = "") -> Callable[[], str
     return lambda: _shown(name, condensed, shows)
 
 
-def whole(name: str, shows: str = "") -> Callable[[], str]:
+def whole(name: str, shows: str = "", digits: int = 3) -> Callable[[], str]:
     """
     :param name: of a table that is shown as it is, numbers rounded
     :param shows: what is to be seen on the picture of the same name, if there is one
+    :param digits: of a number
     :return: what makes the Markdown
     """
 
     def as_it_is(columns: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
-        return columns, [[*map(rounded, row)] for row in rows]
+        return columns, [[rounded(cell, digits) for cell in row] for row in rows]
 
     return lambda: _shown(name, as_it_is, shows)
 

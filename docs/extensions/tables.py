@@ -22,13 +22,13 @@ def read(path: Path) -> tuple[list[str], list[list[str]]]:
     return columns, rows
 
 
-def rounded(cell: float | str) -> str:
-    """Three digits of a number tell enough; words stay."""
+def rounded(cell: float | str, digits: int = 3) -> str:
+    """Three digits of a number tell enough, most often; words stay."""
     try:
         number = float(cell)
     except ValueError:
         return str(cell)
-    return f"{number:,.0f}" if abs(number) >= 100 else f"{number:.3g}"
+    return f"{number:,.0f}" if abs(number) >= 10 ** (digits - 1) else f"{number:.{digits}g}"
 
 
 def _cell(text: str) -> str:
