@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from sb3_hds.algos.networks import Activation
 
 _HE = nn.initializers.he_normal()
+_ORTHOGONAL = nn.initializers.orthogonal(math.sqrt(2))
 # BatchRenorm's limits (Ioffe 2017, section 3), and the variance's floor in SBX's CrossQ.
 _R_MAX, _D_MAX, _RENORM_EPSILON = 3.0, 5.0, 1e-3
 
@@ -27,6 +28,8 @@ class Mlp(nn.Module):
     :param renorm_warmup_steps: CrossQ's: updates of plain batch normalisation before batch
         renormalisation; None: neither of them
     :param momentum: of its running statistics
+    :param ortho_init: whether kernels start orthogonal, with a gain of the square root of 2, rather
+        than normal, with a gain of 1
     """
 
     net_arch: Sequence[int]
@@ -35,13 +38,15 @@ class Mlp(nn.Module):
     layer_norm: bool = False
     renorm_warmup_steps: int | None = None
     momentum: float = 0.99
+    ortho_init: bool = False
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch n"], train: bool) -> Float[Array, "*batch m"]:
+        kernels = _ORTHOGONAL if self.ortho_init else nn.initializers.lecun_normal()
         if self.renorm_warmup_steps is not None:
             x = BatchRenorm(self.renorm_warmup_steps, self.momentum)(x, train)
         for width in self.net_arch:
-            x = nn.Dense(width)(x)
+            x = nn.Dense(width, kernel_init=kernels)(x)
             x = Dropout(self.dropout_rate)(x)
             x = nn.LayerNorm()(x) if self.layer_norm else x
             x = self.activation_fn(x)
@@ -95,7 +100,7 @@ class BroBody(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch n"], train: bool) -> Float[Array, "*batch m"]:
-        dense = lambda width: nn.Dense(width, kernel_init=nn.initializers.orthogonal(math.sqrt(2)))  # noqa: E731
+        dense = lambda width: nn.Dense(width, kernel_init=_ORTHOGONAL)  # noqa: E731
         for i, width in enumerate(self.net_arch):
             if i == 0 or x.shape[-1] != width:
                 x = self.activation_fn(nn.LayerNorm()(dense(width)(x)))

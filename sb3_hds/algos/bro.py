@@ -58,7 +58,7 @@ class BroPolicy(GaussianPolicy):
         "normalize_observations": False,
         "squash_log_std": True,
     }
-    unused = ("renorm_warmup_steps", "dropout_rate")
+    unused = ("renorm_warmup_steps", "dropout_rate", "ortho_init")
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
         return BroBody(net_arch, self.activation_fn)

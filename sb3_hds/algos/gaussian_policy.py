@@ -81,6 +81,9 @@ class GaussianPolicy(LearningPolicy):
     :param renorm_warmup_steps: batch normalisation in actor and critics, which becomes batch
         renormalisation after so many updates; None: neither, but 100,000 with ``CrossQPolicy``
     :param batch_norm_momentum: the share of its running statistics that stays at an update
+    :param ortho_init: whether hidden layers start orthogonal, with a gain of the square root of 2,
+        as in SB3's PPO and in JAXRL's SAC, rather than as flax and SBX have it; the networks of
+        SimBa and BRO start as in their papers
     :param use_sde: generalised state-dependent exploration (Raffin et al., CoRL 2021)
     :param log_std_init: gSDE: where the logarithm of the noise matrix's deviation starts
     :param full_std: gSDE: one deviation for each feature and control, or for each feature
@@ -123,6 +126,7 @@ class GaussianPolicy(LearningPolicy):
         layer_norm: bool = False,
         renorm_warmup_steps: int | None = None,
         batch_norm_momentum: float = 0.99,
+        ortho_init: bool = False,
         use_sde: bool = False,
         log_std_init: float = -3.0,
         full_std: bool = True,
@@ -164,6 +168,7 @@ class GaussianPolicy(LearningPolicy):
             chosen["renorm_warmup_steps"],
             batch_norm_momentum,
         )
+        self.ortho_init = ortho_init
         self.normalize_observations = bool(chosen["normalize_observations"])
         self.squash_log_std = bool(chosen["squash_log_std"]) and not use_sde
         self.n_critics, self.use_sde = n_critics, use_sde
@@ -203,6 +208,7 @@ class GaussianPolicy(LearningPolicy):
             self.activation_fn,
             renorm_warmup_steps=self.renorm_warmup_steps,
             momentum=self.batch_norm_momentum,
+            ortho_init=self.ortho_init,
         )
 
     def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
@@ -213,6 +219,7 @@ class GaussianPolicy(LearningPolicy):
             self.layer_norm,
             self.renorm_warmup_steps,
             self.batch_norm_momentum,
+            self.ortho_init,
         )
 
     def gaussian_actor(self, body: nn.Module, n_act: int) -> nn.Module:
@@ -329,7 +336,7 @@ class SimbaPolicy(GaussianPolicy):
         "optimizer_kwargs": {"weight_decay": 1e-2},
         "normalize_observations": True,
     }
-    unused = ("renorm_warmup_steps",)
+    unused = ("renorm_warmup_steps", "ortho_init")
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
         return SimbaBody(net_arch, self.activation_fn)
