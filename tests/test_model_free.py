@@ -1018,6 +1018,25 @@ def test_state_dependent_noise_of_simba_is_not_squashed():
         small("simba", use_sde=True, policy_kwargs={"squash_log_std": True})
 
 
+@pytest.mark.parametrize("name", ["gsde_sac", "droq", "tqc_jax", "crossq_jax"])
+def test_hidden_layers_start_orthogonal_where_that_is_asked_for(name):
+    told = {"net_arch": [16, 16], "ortho_init": True}
+    learner = small(name, policy_kwargs=told).policy.learner
+
+    for weights in (learner.actor.weights, learner.critic.weights):
+        inner = weights["params"]["body"]["Dense_1"]["kernel"].reshape(-1, 16, 16)
+        gained = np.matmul(inner.swapaxes(-1, -2), inner)
+        np.testing.assert_allclose(
+            gained, np.broadcast_to(2.0 * np.eye(16), gained.shape), atol=1e-5
+        )
+
+
+@pytest.mark.parametrize("name", ["simba", "bro"])
+def test_networks_that_start_as_in_their_papers_refuse_another_start(name):
+    with pytest.raises(ValueError, match="'ortho_init': True.*do not use ortho_init"):
+        small(name, policy_kwargs={"ortho_init": True})
+
+
 def of_sbx(params: dict[str, Any]) -> dict[str, Any]:
     """:return: weights of a SimBa network of SBX under the names that they have here"""
     n_blocks = sum(name.startswith("SimbaResidualBlock") for name in params)
