@@ -1033,7 +1033,7 @@ def test_hidden_layers_start_orthogonal_where_that_is_asked_for(name):
 
 @pytest.mark.parametrize("name", ["simba", "bro"])
 def test_networks_that_start_as_in_their_papers_refuse_another_start(name):
-    with pytest.raises(ValueError, match="'ortho_init': True.*do not use ortho_init"):
+    with pytest.raises(ValueError, match=r"'ortho_init': True.*do not use ortho_init"):
         small(name, policy_kwargs={"ortho_init": True})
 
 

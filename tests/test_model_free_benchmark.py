@@ -212,6 +212,15 @@ def test_runs_stand_beside_what_was_published():
     assert narrow["z"] == pytest.approx(60.0 / 598.0)
 
 
+def test_runs_stand_beside_what_was_published_half_way():
+    runs = table(sac={0: [(50_000, 3714.0), (60_000, 4000.0)]})
+    runs["env"], runs["mark"] = "HalfCheetah-v5", runs["steps"]
+
+    [row] = model_free_report.beside_papers(runs).to_dict("records")
+
+    assert (row["mark"], row["z"]) == (50_000, -1.0)
+
+
 def test_steps_that_one_method_saves_are_counted_in_the_median_over_seeds():
     sac = {seed: [(1000 * i, -1000.0 + 110.0 * i) for i in range(1, 9)] for seed in range(3)}
     fast, slow = [(1000, -900.0), (2000, -110.0)], [(1000, -900.0), (2000, -800.0)]
