@@ -5,6 +5,9 @@ import inspect
 from collections.abc import Iterable
 from typing import Any
 
+#: a key that begins with it sets one of ``policy_kwargs``, and leaves the others as they are
+OF_POLICY = "policy_kwargs."
+
 
 class LazyAlgorithm:
     """
@@ -29,15 +32,20 @@ class LazyAlgorithm:
 
     def __call__(self, *args: Any, **hyperparams: Any) -> Any:
         """
+        :param hyperparams: those of the algorithm, and ``policy_kwargs.net_arch`` and the like
         :raises TypeError: for a hyperparameter that the algorithm does not have
         """
         algorithm = self.resolve()
+        hyperparams, of_policy = _apart(hyperparams)
+        if of_policy:
+            hyperparams["policy_kwargs"] = {**(hyperparams.get("policy_kwargs") or {}), **of_policy}
         _refuse_unknown(algorithm, hyperparams)
         return algorithm(*args, **hyperparams)
 
     def load(self, path: Any, *args: Any, **hyperparams: Any) -> Any:
         """
-        SB3's ``load``, which would write any keyword into the model unseen.
+        SB3's ``load``, which would write any keyword into the model unseen. A policy is loaded as
+        it is: the zoo does not hand ``policy_kwargs`` on, nor does this a single one of them.
 
         :raises TypeError: for a hyperparameter that the algorithm does not have
         """
@@ -46,6 +54,7 @@ class LazyAlgorithm:
             vars(base)["load"].__func__ for base in algorithm.__mro__ if "load" in vars(base)
         )
         known = {name for loader in loaders for name in _parameters(loader)}
+        hyperparams, _ = _apart(hyperparams)
         _refuse_unknown(algorithm, hyperparams, also=known)
         return algorithm.load(path, *args, **hyperparams)
 
@@ -56,6 +65,17 @@ class LazyAlgorithm:
 
     def __repr__(self) -> str:
         return f"<sb3_hds.{self.__name__}, imported on first use>"
+
+
+def _apart(hyperparams: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """:return: those of the algorithm, and single ones of its policy by their own names"""
+    own = {name: value for name, value in hyperparams.items() if not name.startswith(OF_POLICY)}
+    of_policy = {
+        name.removeprefix(OF_POLICY): value
+        for name, value in hyperparams.items()
+        if name not in own
+    }
+    return own, of_policy
 
 
 def _parameters(function: Any) -> dict[str, inspect.Parameter]:

@@ -3,15 +3,24 @@ What ``rl_zoo3 train -optimize`` varies.
 
 A sampler suggests plain numbers and names; its converter turns them into hyperparameters. The
 sampler returns what the converter makes of ``trial.params``, so that ``--trial-id`` gives a trial
-back exactly.
+back exactly. What a file says of ``policy_kwargs`` stays, but for what is varied: the zoo would
+replace all of them.
 """
 
 from collections.abc import Callable
 from typing import Any
 
+from rl_zoo_plugin.lazy import OF_POLICY
+
 Params = dict[str, Any]
 
 _NET_ARCHS = {"small": [64, 64], "medium": [128, 128], "big": [256, 256]}
+# Blocks of SimBa and BRO: one of the actor, two of the critics.
+_BLOCKS = {
+    "small": {"pi": [64], "qf": [64, 64]},
+    "medium": {"pi": [128], "qf": [256, 256]},
+    "big": {"pi": [256], "qf": [512, 512]},
+}
 
 
 def sample_planner_params(
@@ -40,15 +49,12 @@ def convert_planner_params(sampled_params: Params) -> Params:
     :return: hyperparameters
     """
     params = dict(sampled_params)
-    network = {
-        "net_arch": list(_NET_ARCHS[params.pop("net_arch")]),
-        "activation_fn": params.pop("activation_fn"),
-    }
     return {
         "gamma": 1 - params.pop("one_minus_gamma"),
         "batch_size": 2 ** params.pop("batch_size_pow"),
         "n_rollouts": 2 ** params.pop("n_rollouts_pow"),
-        "policy_kwargs": network,
+        OF_POLICY + "net_arch": list(_NET_ARCHS[params.pop("net_arch")]),
+        OF_POLICY + "activation_fn": params.pop("activation_fn"),
         **params,
     }
 
@@ -89,7 +95,7 @@ def convert_model_free_params(sampled_params: Params) -> Params:
     return {
         "gamma": 1 - params.pop("one_minus_gamma"),
         "batch_size": 2 ** params.pop("batch_size_pow"),
-        "policy_kwargs": {"net_arch": list(_NET_ARCHS[params.pop("net_arch")])},
+        OF_POLICY + "net_arch": list(_NET_ARCHS[params.pop("net_arch")]),
         **updates,
         **params,
     }
@@ -97,10 +103,8 @@ def convert_model_free_params(sampled_params: Params) -> Params:
 
 def _of_policy(name: str, sampled_params: Params) -> Params:
     """One of them is an argument of the policy."""
-    others = dict(sampled_params)
-    value = others.pop(name)
-    params = convert_model_free_params(others)
-    params["policy_kwargs"][name] = value
+    params = convert_model_free_params(sampled_params)
+    params[OF_POLICY + name] = params.pop(name)
     return params
 
 
@@ -108,6 +112,23 @@ def sample_soft_params(trial: Any, n_actions: int, n_envs: int, additional_args:
     """Sampler of the SAC family: also how fast target networks follow."""
     trial.suggest_float("tau", 1e-3, 0.08, log=True)
     return sample_model_free_params(trial, n_actions, n_envs, additional_args)
+
+
+def sample_block_params(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+    """Sampler of SimBa and BRO: as the SAC family, with residual blocks."""
+    sample_soft_params(trial, n_actions, n_envs, additional_args)
+    return convert_block_params(trial.params)
+
+
+def convert_block_params(sampled_params: Params) -> Params:
+    """
+    :param sampled_params: ``trial.params`` of a trial of :func:`sample_block_params`
+    :return: hyperparameters
+    """
+    blocks = _BLOCKS[sampled_params["net_arch"]]
+    params = convert_model_free_params(sampled_params)
+    params[OF_POLICY + "net_arch"] = {part: list(widths) for part, widths in blocks.items()}
+    return params
 
 
 def sample_tqc_params(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
@@ -204,7 +225,7 @@ def convert_open_loop_params(sampled_params: Params) -> Params:
     }
 
 
-_SOFT = ("droq", "simba", "bro")
+_BLOCKWISE = ("simba", "bro")
 
 SAMPLERS: dict[str, Callable[[Any, int, int, Params], Params]] = {
     "pods": sample_planner_params,
@@ -214,7 +235,8 @@ SAMPLERS: dict[str, Callable[[Any, int, int, Params], Params]] = {
     "tqc_jax": sample_tqc_params,
     "td7": sample_td7_params,
     "openloop": sample_open_loop_params,
-    **dict.fromkeys(_SOFT, sample_soft_params),
+    "droq": sample_soft_params,
+    **dict.fromkeys(_BLOCKWISE, sample_block_params),
 }
 CONVERTERS: dict[str, Callable[[Params], Params]] = {
     "pods": convert_planner_params,
@@ -224,5 +246,6 @@ CONVERTERS: dict[str, Callable[[Params], Params]] = {
     "tqc_jax": convert_tqc_params,
     "td7": convert_model_free_params,
     "openloop": convert_open_loop_params,
-    **dict.fromkeys(_SOFT, convert_model_free_params),
+    "droq": convert_model_free_params,
+    **dict.fromkeys(_BLOCKWISE, convert_block_params),
 }

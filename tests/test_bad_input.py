@@ -97,7 +97,7 @@ def test_an_algorithm_without_an_environment_says_that_it_needs_one(name):
 
 @every_algorithm
 def test_an_unknown_policy_is_refused(name):
-    with pytest.raises(ValueError, match="CnnPolicy unknown"):
+    with pytest.raises(ValueError, match="has no policy 'CnnPolicy': use MlpPolicy"):
         algos.ALL[name]("CnnPolicy", "Pendulum-v1")
 
 

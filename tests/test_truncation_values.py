@@ -242,10 +242,11 @@ class Ramp(gymnasium.Env):
 
 
 @pytest.mark.parametrize("terminates", [False, True], ids=["truncated", "terminated"])
-def test_values_learned_from_three_steps_are_those_of_the_formula(terminates):
+@pytest.mark.parametrize("name", ["gsde_sac", pytest.param("td7", marks=pytest.mark.expensive)])
+def test_values_learned_from_three_steps_are_those_of_the_formula(name, terminates):
     env, gamma = Ramp(terminates), 0.9
 
-    value = learned("gsde_sac", env, n_steps=3, gamma=gamma)
+    value = learned(name, env, n_steps=3, gamma=gamma)
 
     assert value == pytest.approx(env.value(gamma), rel=0.05)
 

@@ -36,6 +36,9 @@ PUBLISHED = [
     # Hiraoka et al. 2022, appendix; HalfCheetah: their code, after MBPO.
     ("droq", "HalfCheetah-v5", {"learning_starts": 5000, "target_entropy": -3.0}),
     ("droq", "Hopper-v5", {"learning_starts": 5000, "target_entropy": -1.0}),
+    ("droq", "Walker2d-v5", {"learning_starts": 5000, "target_entropy": -3.0}),
+    ("droq", "Ant-v5", {"learning_starts": 5000, "target_entropy": -4.0}),
+    ("droq", "Humanoid-v5", {"learning_starts": 5000, "target_entropy": -2.0}),
     # adityab/CrossQ, train.py.
     ("crossq_jax", "HalfCheetah-v5", {"learning_starts": 5000, "gamma": None}),
     ("crossq_jax", "Swimmer-v5", {"learning_starts": 5000, "gamma": 0.9999}),
@@ -108,6 +111,37 @@ def test_a_stand_in_refuses_a_hyperparameter_that_the_class_does_not_have(walker
         walker("MlpPolicy", strid=0.7)
     with pytest.raises(TypeError, match=message.replace("?", r"\?")):
         walker.load("agent.zip", strid=0.7)
+
+
+def test_a_single_argument_of_the_policy_leaves_the_others(walker, monkeypatch):
+    monkeypatch.setattr(Walker, "__init__", lambda self, **given: vars(self).update(given))
+    monkeypatch.setattr(lazy, "_refuse_unknown", lambda *_, **__: None)
+
+    made = walker(
+        policy_kwargs={"n_critics": 5, "net_arch": [8]}, **{"policy_kwargs.net_arch": [4]}
+    )
+    bare = walker(stride=0.7)
+
+    assert made.policy_kwargs == {"n_critics": 5, "net_arch": [4]}
+    assert vars(bare) == {"stride": 0.7}
+
+
+def test_a_single_argument_of_the_policy_is_not_asked_for_when_one_is_loaded(walker):
+    assert walker.load("agent.zip", **{"policy_kwargs.net_arch": [4]}).stride == 0.5
+
+
+def test_a_trial_keeps_what_the_file_says_of_the_policy():
+    optuna = pytest.importorskip("optuna")
+    entry = load_yml("tqc_jax")["HalfCheetah-v5"]
+    kept = {name: entry[name] for name in ("policy", "policy_kwargs")}
+    trial = optuna.create_study().ask()
+
+    # The zoo updates the one with the other.
+    kept.update(SAMPLERS["tqc_jax"](trial, n_actions=1, n_envs=1, additional_args={}))
+    model = LazyAlgorithm("TQC")(env="Pendulum-v1", **kept)
+
+    assert len(model.policy_kwargs["net_arch"]) == 2
+    assert model.policy.recipe.n_critics == entry["policy_kwargs"]["n_critics"] == 5
 
 
 def test_a_stand_in_does_not_pretend_to_have_special_attributes(walker):
@@ -196,7 +230,8 @@ def test_what_a_trial_means():
         "batch_size": 128,
         "n_rollouts": 32,
         "order": 2,
-        "policy_kwargs": {"net_arch": [64, 64], "activation_fn": "tanh"},
+        "policy_kwargs.net_arch": [64, 64],
+        "policy_kwargs.activation_fn": "tanh",
     }
 
 
@@ -209,7 +244,11 @@ def test_what_is_sampled_are_arguments_of_the_algorithm(algo, n_envs):
 
     sampled = SAMPLERS[algo](trial, n_actions=1, n_envs=n_envs, additional_args={})
 
-    assert set(sampled) <= set(lazy.parameters_of(algorithm))
+    arguments, of_policy = lazy._apart(sampled)
+    assert set(arguments) <= set(lazy.parameters_of(algorithm))
+    if of_policy:
+        policy = algorithm.policy_aliases["MlpPolicy"]
+        assert set(of_policy) <= set(lazy.parameters_of(policy))
 
 
 @pytest.mark.parametrize(("n_envs", "suggested"), [(1, False), (2, True)])
@@ -223,7 +262,7 @@ def test_no_trial_of_tqc_drops_all_quantiles():
     study = pytest.importorskip("optuna").create_study()
     for _ in range(20):
         sampled = SAMPLERS["tqc_jax"](study.ask(), n_actions=1, n_envs=1, additional_args={})
-        kept = sampled["policy_kwargs"]["n_quantiles"]
+        kept = sampled["policy_kwargs.n_quantiles"]
         assert 0 <= sampled["top_quantiles_to_drop_per_net"] < kept
 
 

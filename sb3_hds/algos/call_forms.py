@@ -10,7 +10,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
@@ -97,10 +97,14 @@ def check_twin_observes(space: spaces.Space) -> None:
         )
 
 
-def check_policy(algorithm: type, policy: Any) -> None:
+def check_policy(algorithm: type[BaseAlgorithm], policy: Any) -> None:
     """
-    :raises ValueError: for a policy class of another algorithm, as its saved files name it
+    :raises ValueError: for a name that the algorithm does not know, and for a policy class of
+        another algorithm, as its saved files name it
     """
+    known = algorithm.policy_aliases
+    if isinstance(policy, str) and policy not in known:
+        raise ValueError(f"{algorithm.__name__} has no policy {policy!r}: use {', '.join(known)}.")
     if isinstance(policy, type) and not issubclass(policy, TensorPolicy):
         raise ValueError(
             f"{algorithm.__name__} cannot use the policy {policy.__name__}: pass 'MlpPolicy'. "

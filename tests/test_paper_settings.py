@@ -1,0 +1,139 @@
+"""What each model-free algorithm is made with, unless told otherwise: the numbers of its paper."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy_networks import squashed_between
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+
+from sb3_hds import algos
+
+EVERY_EPISODE = TrainFreq(1, TrainFrequencyUnit.EPISODE)
+EVERY_EIGHT_STEPS = TrainFreq(8, TrainFrequencyUnit.STEP)
+
+#: by id, attributes of a model with one control
+OF_THE_MODEL: dict[str, dict[str, Any]] = {
+    # Raffin et al. 2021: noise of 8 steps.
+    "gsde_sac": {"use_sde": True, "train_freq": EVERY_EIGHT_STEPS, "gradient_steps": 8},
+    # Hiraoka et al. 2022.
+    "droq": {"gradient_steps": 20, "policy_delay": 20, "batch_size": 256, "tau": 0.005},
+    # Bhatt et al. 2024.
+    "crossq_jax": {"gradient_steps": 1, "policy_delay": 3, "batch_size": 256},
+    # Kuznetsov et al. 2020.
+    "tqc_jax": {"top_quantiles_to_drop_per_net": 2, "batch_size": 256, "tau": 0.005},
+    # Lee et al. 2025.
+    "simba": {"gradient_steps": 2, "batch_size": 256, "ent_coef": "auto_0.01", "tau": 0.005},
+    # Nauman et al. 2024.
+    "bro": {
+        "gradient_steps": 10,
+        "batch_size": 128,
+        "kl_target": 0.05,
+        "std_multiplier": 0.75,
+        "param_resets": [
+            *(15_000, 50_000, 250_000, 500_000),
+            *(750_000, 1_000_000, 1_500_000, 2_000_000),
+        ],
+    },
+    # Fujimoto et al. 2023.
+    "td7": {
+        "learning_starts": 25_000,
+        "train_freq": EVERY_EPISODE,
+        "batch_size": 256,
+        "policy_delay": 2,
+        "target_update_interval": 250,
+        "target_policy_noise": 0.2,
+        "target_noise_clip": 0.5,
+        "exploration_noise": 0.1,
+        "priority_exponent": 0.4,
+        "max_episodes_per_checkpoint": 20,
+        "updates_before_checkpointing": 750_000,
+        "reset_weight": 0.9,
+    },
+}
+#: by id: learning rate and, for one control, target entropy
+RATES = {
+    "gsde_sac": (3e-4, -1.0),
+    "droq": (3e-4, -1.0),
+    "crossq_jax": (1e-3, -1.0),
+    "tqc_jax": (3e-4, -1.0),
+    "simba": (1e-4, -0.5),
+    "bro": (3e-4, -0.5),
+}
+#: by id: widths of actor and critics, values of each critic, and optimiser
+NETWORKS = {
+    "gsde_sac": ((256, 256), (256, 256), 1, "adam", {}),
+    "droq": ((256, 256), (256, 256), 1, "adam", {}),
+    "crossq_jax": ((256, 256), (2048, 2048), 1, "adam", {"b1": 0.5}),
+    "tqc_jax": ((256, 256), (256, 256), 25, "adam", {}),
+    "simba": ((128,), (512, 512), 1, "adamw", {"weight_decay": 1e-2}),
+    "bro": ((256,), (512, 512), 100, "adamw", {"weight_decay": 1e-4}),
+}
+#: by id: attributes of the critics' body
+BODIES = {
+    "droq": {"dropout_rate": 0.01, "layer_norm": True},
+    "crossq_jax": {"renorm_warmup_steps": 100_000, "momentum": 0.99, "layer_norm": False},
+}
+
+
+@pytest.fixture(scope="module")
+def made():
+    """:return: id to model, each made once"""
+    models: dict[str, Any] = {}
+
+    def of(name: str) -> Any:
+        if name not in models:
+            models[name] = algos.ALL[name](env="Pendulum-v1", buffer_size=1000)
+        return models[name]
+
+    return of
+
+
+@pytest.mark.parametrize("name", OF_THE_MODEL)
+def test_arguments_are_those_of_the_paper(made, name):
+    expected = OF_THE_MODEL[name]
+    assert {attribute: getattr(made(name), attribute) for attribute in expected} == expected
+
+
+@pytest.mark.parametrize("name", RATES)
+def test_learning_rate_and_target_entropy_are_those_of_the_paper(made, name):
+    knobs = made(name).knobs()
+    assert (knobs.learning_rate, knobs.target_entropy) == pytest.approx(RATES[name])
+    assert knobs.qf_learning_rate == knobs.learning_rate
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_networks_and_optimisers_are_those_of_the_paper(made, name):
+    policy = made(name).policy
+    actor, critics, n_values, optimizer, arguments = NETWORKS[name]
+
+    assert policy.widths == (actor, critics)
+    assert policy.critic_network.n_values == n_values
+    assert policy.n_critics == 2
+    for used in policy.optimizers:
+        assert (used.make.__name__, dict(used.arguments)) == (optimizer, arguments)
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_layers_of_the_critics_are_those_of_the_paper(made, name):
+    body, expected = made(name).policy.critic_network.body, BODIES[name]
+    assert {attribute: getattr(body, attribute) for attribute in expected} == expected
+
+
+def test_multipliers_of_bro_start_and_are_updated_as_in_the_paper(made):
+    model = made("bro")
+    optimizer, started = model.policy.recipe.ent_coef_optimizer, model.policy.learner.extra
+
+    for name, start in (("optimism", 1.0), ("regularizer", 0.25)):
+        raw = np.asarray(started[name].weights["params"])
+        assert np.exp(squashed_between(raw, -10.0, 7.5)) == pytest.approx(start, rel=1e-4)
+    assert (optimizer.make.__name__, dict(optimizer.arguments)) == ("adam", {"b1": 0.5})
+    assert model.multiplier_rate * model.knobs().learning_rate == pytest.approx(3e-5)
+
+
+def test_networks_of_td7_are_those_of_the_paper(made):
+    arguments = made("td7").policy.arguments
+
+    assert arguments["net_arch"] == (256, 256) and arguments["embedding_size"] == 256
+    assert (arguments["activation_fn"], arguments["qf_activation_fn"]) == ("relu", "elu")
+    assert made("td7").learning_rates() == pytest.approx((3e-4, 3e-4))
