@@ -17,7 +17,7 @@ import gymnasium
 import pytest
 import yaml
 
-from rl_zoo_plugin.lazy import parameters_of
+from rl_zoo_plugin.lazy import OF_POLICY, parameters_of
 from rl_zoo_plugin.tables import ALGORITHMS
 from sb3_hds import HDS, PODS, algos, cli, effects, twins
 from sb3_hds.algos.log import record_epoch
@@ -165,6 +165,7 @@ def test_commands_that_do_not_exist_are_found():
         "rl_zoo3 train --algo hds --evaluate-freq 5",
         "rl_zoo3 train --algo hsd",
         "rl_zoo3 train --algo hds -params n_rolouts:5",
+        "rl_zoo3 train --algo tqc_jax -params policy_kwargs.n_critic:5",
         "python benchmarks/nothing.py",
         "sb3-hds diagnose --twin PendulumReal",
         "python examples/demo.py --fodler demo",
@@ -415,13 +416,20 @@ def _wrong_zoo_command(command: str, words: list[str]) -> str | None:
     wrong = _missing("option", _options(words), _declared_options(script))
     algo = words[words.index("--algo") + 1] if "--algo" in words else "hds"
     params = words[words.index("-params") + 1 :] if "-params" in words else []
-    known = {*inspect.signature(HDS).parameters, "n_envs"}
+    known = {*parameters_of(algos.ALL.get(algo, HDS)), "n_envs", *_policy_keys(algo)}
     keys = [word.partition(":")[0] for word in params if not word.startswith("-")]
     return (
         wrong
         or _missing("algorithm", [algo], {*ALGORITHMS, "sac"})
         or _missing("hyperparameter", keys, known)
     )
+
+
+def _policy_keys(algo: str) -> set[str]:
+    """Keys of single arguments of the policy of one of ours."""
+    if algo not in algos.ALL:
+        return set()
+    return {OF_POLICY + name for name in parameters_of(algos.ALL[algo].policy_aliases["MlpPolicy"])}
 
 
 def _options(words: list[str]) -> list[str]:
