@@ -149,10 +149,16 @@ def main() -> None:
             if arguments.env in ONLY_ON.get(method, LENGTHS)
         ]
         in_process = lambda *run: fresh_process(__file__, *run, cache=CACHE)["rows"]  # noqa: E731
-        resume("model_free", KEYS, wanted, in_process, arguments.jobs)
+        resume("model_free", KEYS, wanted, in_process, arguments.jobs, through)
     from model_free_report import report
 
     report()
+
+
+def through(run: tuple[Any, ...], rows: list[dict[str, Any]]) -> bool:
+    """:return: whether a run has come to its last mark, or was stopped before"""
+    env, method, _ = run
+    return max(row["mark"] for row in rows) >= marks(env, method)[-1]
 
 
 def worker(env: str, method: str, seed: int) -> list[dict]:

@@ -118,6 +118,7 @@ def resume(
     wanted: Iterable[tuple[Any, ...]],
     work: Callable[..., list[dict[str, Any]]],
     jobs: int,
+    through: Callable[[tuple[Any, ...], list[dict[str, Any]]], bool] = lambda run, rows: True,
 ) -> None:
     """
     Add to ``results/NAME.csv`` what is not in it yet. A run that fails is reported and left out.
@@ -126,10 +127,15 @@ def resume(
     :param wanted: their values, run by run
     :param work: from these values to the run's rows
     :param jobs: how many runs at a time
+    :param through: of a run and its rows that are there, whether it is at its end; what one that is
+        not comes to takes the place of its rows
     """
     path = RESULTS / f"{name}.csv"
     rows = pd.read_csv(path).to_dict("records") if path.exists() else []
-    done, lock = {tuple(row[key] for key in keys) for row in rows}, Lock()
+    before: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in rows:
+        before.setdefault(tuple(row[key] for key in keys), []).append(row)
+    done, lock = {run for run, its in before.items() if through(run, its)}, Lock()
 
     def one(run: tuple[Any, ...]) -> None:
         label = ", ".join(map(str, run))
@@ -139,6 +145,7 @@ def resume(
             print(f"{label}: {error}", file=sys.stderr, flush=True)
             return
         with lock:
+            rows[:] = [row for row in rows if tuple(row[key] for key in keys) != run]
             rows.extend(dict(zip(keys, run, strict=True)) | row for row in found)
             save(rows, name)
         print(f"{time.strftime('%H:%M:%S')} {label}", file=sys.stderr, flush=True)

@@ -134,3 +134,21 @@ def test_a_figure_shows_every_variant(table):
         for tick in (panel.get_xticklabels() if table == "beta" else panel.get_yticklabels())
     }
     assert ticks == set(variants)
+
+
+def test_a_run_that_was_stopped_before_its_end_is_made_again_in_place(monkeypatch, tmp_path):
+    monkeypatch.setattr(runs, "RESULTS", tmp_path)
+    half, whole = ({"seed": seed, "mark": mark} for seed, mark in ((0, 1), (1, 2)))
+    runs.save([half, whole], "table")
+    asked = []
+
+    def work(seed):
+        asked.append(seed)
+        return [{"mark": 1}, {"mark": 2}]
+
+    at_its_end = lambda run, rows: rows[-1]["mark"] == 2  # noqa: E731
+    runs.resume("table", ("seed",), [(0,), (1,)], work, 1, at_its_end)
+
+    assert asked == [0]
+    found = pd.read_csv(tmp_path / "table.csv")
+    assert found.to_dict("list") == {"seed": [1, 0, 0], "mark": [2, 1, 2]}

@@ -267,3 +267,9 @@ def test_intervals_are_those_of_rliable():
 def test_one_seed_has_no_interval():
     assert np.isnan(intervals.of_mean([3.0])[1:]).all()
     assert np.isnan(intervals.of_difference([3.0], [1.0, 2.0])[1:]).all()
+
+
+def test_half_a_run_is_not_through():
+    run = ("HalfCheetah-v5", "droq", 0)
+    assert not model_free.through(run, [{"mark": 10_000}, {"mark": 50_000}])
+    assert model_free.through(run, [{"mark": 50_000}, {"mark": 100_000}])
