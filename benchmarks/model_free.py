@@ -88,7 +88,8 @@ OURS = {
     "bro_fast": Ours("bro", {"gradient_steps": 2}, _SAC),
     "hds": Ours("hds", {}, _SAC),
     "crossq_jax_narrow": Ours("crossq_jax", _widths([256, 256], [256, 256]), _SAC),
-    "simba_narrow": Ours("simba", _widths([128], [128, 128]), _SAC),
+    "simba_narrow": Ours("simba", _widths([128], [128, 128]) | {"learning_rate": 4e-4}, _SAC),
+    "tqc_jax_narrow": Ours("tqc_jax", _widths([256, 256], [256, 256]), ("contrib_tqc", "sbx_tqc")),
     "bro_fast_narrow": Ours("bro", {"gradient_steps": 2} | _widths([256], [128, 128]), _SAC),
 }
 _DROQ = {
@@ -120,7 +121,7 @@ _WIDE = ("Hopper-v5", "HalfCheetah-v5")
 #: HDS plans in the twin of the environment, and has settings for those that have one
 ONLY_ON = (
     {"hds": (PENDULUM,)}
-    | dict.fromkeys(("crossq_jax_narrow", "simba_narrow", "bro_fast_narrow"), _WIDE)
+    | dict.fromkeys([method for method in OURS if method.endswith("_narrow")], _WIDE)
     | dict.fromkeys(PEERS, _IN_THE_ZOO)
     | dict.fromkeys(("sb3_gsde_sac", "sbx_droq"), _WITHOUT_SDE)
 )

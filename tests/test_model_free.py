@@ -285,6 +285,68 @@ def test_the_quantile_loss_is_least_at_the_quantiles():
     assert float(loss(0.0)) == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.parametrize("n_targets", [1, 6, 8])
+def test_the_slope_of_the_quantile_loss_is_that_of_all_pairs(n_targets):
+    rng = np.random.default_rng(0)
+    values, targets = (
+        jnp.asarray(3.0 * rng.normal(size=shape)) for shape in ((3, 5, 4), (5, n_targets))
+    )
+    level = (jnp.arange(4) + 0.5) / 4.0
+
+    def of_pairs(values):
+        delta = targets[None, :, None, :] - values[..., None]
+        loss = optax.losses.huber_loss(delta)
+        weight = jnp.where(delta < 0.0, 1.0 - level[:, None], level[:, None])
+        return jnp.sum(jnp.mean(weight * loss, (1, 2, 3)))
+
+    loss, slope = jax.value_and_grad(quantile_huber)(values, targets)
+    expected, slope_of_pairs = jax.value_and_grad(of_pairs)(values)
+
+    np.testing.assert_allclose(loss, expected, rtol=1e-5)
+    np.testing.assert_allclose(slope, slope_of_pairs, rtol=1e-5, atol=1e-7)
+    assert not jax.grad(quantile_huber, 1)(values, targets).any()
+
+
+@pytest.mark.parametrize(("n_quantiles", "n_dropped"), [(1, 0), (3, 0), (3, 1), (25, 2), (33, 5)])
+def test_the_least_quantiles_stay(n_quantiles, n_dropped):
+    values = np.random.default_rng(0).normal(size=(2, 7, n_quantiles)).astype(np.float32)
+    values[1] = values[1].round(1)  # some are equal
+
+    kept = np.asarray(Truncated(n_dropped)(jnp.asarray(values)))
+
+    pool = np.sort(np.concatenate(list(values), -1), -1)
+    np.testing.assert_array_equal(np.sort(kept, -1), pool[:, : 2 * (n_quantiles - n_dropped)])
+
+
+def test_a_quantile_that_is_no_number_makes_no_number_of_all_that_are_kept():
+    values = jnp.zeros((2, 3, 4)).at[1, 1, 2].set(jnp.nan)
+
+    kept = np.isnan(Truncated(1)(values))
+
+    assert kept[1].all() and not kept[[0, 2]].any()
+    assert np.isnan(quantile_huber(values, Truncated(1)(values)))
+
+
+def test_one_critic_is_judged_as_one_of_several():
+    policy = small("crossq_jax", policy_kwargs={"n_critics": 1, "net_arch": [4]}).learn(20).policy
+    recipe, weights = policy.recipe, policy.learner.critic.weights
+    rng = np.random.default_rng(0)
+    obs, action = (
+        jnp.asarray(rng.normal(size=(9, n)), jnp.float32) for n in (policy.n_obs, policy.n_act)
+    )
+
+    alone = judge(recipe, weights, obs, action, jax.random.key(0), train=True)
+    both = jax.tree.map(lambda x: jnp.concatenate([x, x]), weights)
+    pair = judge(
+        dataclasses.replace(recipe, n_critics=2), both, obs, action, jax.random.key(0), train=True
+    )
+
+    first = jax.tree.map(lambda x: x[:1], pair)
+    assert jax.tree.structure(alone) == jax.tree.structure(first)
+    for found, expected in zip(jax.tree.leaves(alone), jax.tree.leaves(first), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
+
+
 def test_dropout_zeroes_its_share_independently_and_keeps_the_mean():
     x = jnp.ones((400, 500))
     masks = [

@@ -163,7 +163,7 @@ class Soft:
     def values(self, critic: Weights, obs: np.ndarray, action: np.ndarray, key: Any) -> np.ndarray:
         """:param key: of dropout masks, where there are some"""
         both = np.concatenate([obs, action], -1)
-        each = [member(critic, i) for i in range(2)]
+        each = [member(critic, i) for i in range(len(critic["Dense_0"]["kernel"]))]
         return np.stack([dense(w["Dense_0"], self.body(w["body"], both)) for w in each])
 
     def acts(self, actor: Weights, obs: np.ndarray, noise: np.ndarray) -> Any:
@@ -344,12 +344,18 @@ def test_tqc_drops_the_largest_of_all_quantiles():
 
 
 @pytest.mark.parametrize(
-    ("clipped", "of_sbx"),
-    [(True, False), (True, True), pytest.param(False, False, marks=pytest.mark.expensive)],
+    ("clipped", "of_sbx", "n_critics"),
+    [
+        (True, False, 2),
+        (True, True, 2),
+        (False, False, 1),
+        pytest.param(False, False, 2, marks=pytest.mark.expensive),
+    ],
 )
-def test_simba_normalises_by_all_it_saw(clipped, of_sbx):
+def test_simba_normalises_by_all_it_saw(clipped, of_sbx, n_critics):
     how = {"clipped_double_q": clipped, "linear_ent_coef": not of_sbx}
-    recipe, learner = begun("simba", {"squash_log_std": False} if of_sbx else {}, **how)
+    kwargs = {"squash_log_std": False} if of_sbx else {}
+    recipe, learner = begun("simba", kwargs | {"n_critics": n_critics}, **how)
     rows = np.random.default_rng(2).normal([3.0, -1.0, 0.0], [2.0, 0.1, 5.0], (40, N_OBS))
     learner = learner._replace(seen=Seen.nothing(N_OBS).with_more(rows[:7]).with_more(rows[7:]))
     learner = learner._replace(seen=jax.tree.map(lambda x: jnp.asarray(x, float), learner.seen))
