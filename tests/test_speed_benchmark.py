@@ -43,3 +43,22 @@ def test_matrix_products_take_a_share_of_the_whole():
     alone = speed.Products(ratio=2)
     alone.learn(3)
     assert all(np.isfinite(part).all() for part in alone._carry)
+
+
+def test_the_speed_up_is_that_of_neighbouring_blocks(monkeypatch):
+    # The machine slows down; ours takes half the time of the peer but in one block.
+    blocks = [[0.5 * i, 1.0 * i] for i in range(1, speed.N_BLOCKS)] + [[9.0, 3.0]]
+    monkeypatch.setattr(speed, "ours", lambda name, ratio: speed.Products(ratio))
+    monkeypatch.setattr(speed, "other", lambda name, ratio, library: speed.Products(ratio))
+    monkeypatch.setattr(speed, "block_length", lambda models, ratio: 10)
+    monkeypatch.setattr(
+        speed, "turn", lambda models, steps, backwards, left=iter(blocks): next(left)
+    )
+
+    [row] = speed.worker("sac", 2, "sbx")["rows"]
+
+    assert (row["low"], row["speed_up"], row["high"]) == (2.0, 2.0, 2.0)
+    ours, theirs = np.median(blocks, 0)
+    assert row["steps_per_s"] == pytest.approx(10 / ours)
+    assert row["peer_steps_per_s"] == pytest.approx(10 / theirs)
+    assert theirs / ours != 2.0
