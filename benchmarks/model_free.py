@@ -9,8 +9,9 @@ Ours run with their file in `hyperparams/`, the others with what RL Zoo has for 
 on that environment (those of -v4 for -v5; SBX's DroQ: that of SAC with its documented arguments;
 SB3's gSDE: that of SAC with what ours has on Pendulum-v1).
 `sac` is our GSDESAC without gSDE, `bro_fast` BRO with two updates per step; the critics of
-`crossq_jax_narrow` have an eighth of the paper's width, those of `simba_narrow` and
-`bro_fast_narrow` a quarter, which two cores can bear. HDS, which knows a simulation of Pendulum-v1,
+`crossq_jax_narrow` have an eighth of the paper's width, those of `simba_narrow` (with four times
+the learning rate) and `bro_fast_narrow` a quarter, those of `tqc_jax_narrow` two layers of 256 for
+three of 512, which two cores can bear. HDS, which knows a simulation of Pendulum-v1,
 stands beside them with the few steps of its own file. Each run is a fresh process; training stops
 for each evaluation, whose time does not count. `seconds` of the runs are those of their days: the
 tables have what `model_free_pace.py` makes of them. On Pendulum-v1, policies start from the 500
