@@ -51,9 +51,8 @@ def test_the_speed_up_is_that_of_neighbouring_blocks(monkeypatch):
     monkeypatch.setattr(speed, "ours", lambda name, ratio: speed.Products(ratio))
     monkeypatch.setattr(speed, "other", lambda name, ratio, library: speed.Products(ratio))
     monkeypatch.setattr(speed, "block_length", lambda models, ratio: 10)
-    monkeypatch.setattr(
-        speed, "turn", lambda models, steps, backwards, left=iter(blocks): next(left)
-    )
+    left = iter(blocks)
+    monkeypatch.setattr(speed, "turn", lambda models, steps, backwards: next(left))
 
     [row] = speed.worker("sac", 2, "sbx")["rows"]
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol, cast
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
@@ -97,7 +98,8 @@ class Report(NamedTuple):
     @classmethod
     def nothing(cls) -> "Report":
         """:return: before any update"""
-        return cls(*(jnp.zeros(()) for _ in cls._fields))
+        # Of NumPy: JAX would dispatch each as a program of its own, at every step.
+        return cls(*(np.zeros((), jnp.result_type(float)) for _ in cls._fields))
 
 
 @dataclasses.dataclass(frozen=True)

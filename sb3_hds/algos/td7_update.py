@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, cast
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sb3_hds.algos.networks import Activation
@@ -220,7 +221,8 @@ class Report(NamedTuple):
     @classmethod
     def nothing(cls) -> "Report":
         """:return: before any update"""
-        return cls(*(jnp.zeros(()) for _ in cls._fields))
+        # Of NumPy: JAX would dispatch each as a program of its own, at every step.
+        return cls(*(np.zeros((), jnp.result_type(float)) for _ in cls._fields))
 
 
 def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
