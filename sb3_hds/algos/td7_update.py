@@ -222,7 +222,8 @@ class Report(NamedTuple):
     def nothing(cls) -> "Report":
         """:return: before any update"""
         # Of NumPy: JAX would dispatch each as a program of its own, at every step.
-        return cls(*(np.zeros((), jnp.result_type(float)) for _ in cls._fields))
+        zero: Any = np.zeros((), jnp.result_type(float))
+        return cls(*(zero for _ in cls._fields))
 
 
 def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
