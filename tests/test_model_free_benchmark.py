@@ -76,25 +76,30 @@ def test_every_setting_of_a_method_is_an_argument_of_its_class(method):
         assert len(model_free.marks(env, method)) > 1
 
 
-def test_narrow_critics_are_all_that_differs_from_the_file():
-    wide, narrow = (
-        model_free.made_of("HalfCheetah-v5", name)[1] for name in ("tqc_jax", "tqc_jax_narrow")
-    )
+@pytest.mark.parametrize(
+    ("name", "arch", "other"),
+    [
+        ("tqc_jax", {"pi": [256, 256], "qf": [256, 256]}, {}),
+        ("simba", {"pi": [128], "qf": [128, 128]}, {"learning_rate": 4e-4}),
+    ],
+)
+def test_narrow_critics_are_all_that_differs_but_for_the_learning_rate_of_simba(name, arch, other):
+    wide, narrow = (model_free.made_of("HalfCheetah-v5", n)[1] for n in (name, f"{name}_narrow"))
 
-    arch = {"net_arch": {"pi": [256, 256], "qf": [256, 256]}}
-    assert narrow == wide | {"policy_kwargs": wide["policy_kwargs"] | arch}
-    assert wide["policy_kwargs"]["net_arch"] != arch["net_arch"]
+    kwargs = wide["policy_kwargs"] | {"net_arch": arch}
+    assert narrow == wide | {"policy_kwargs": kwargs} | other
+    assert wide["policy_kwargs"].get("net_arch") != arch
 
 
 def test_what_a_narrow_layer_loses_of_its_steps_a_greater_learning_rate_makes_up_for():
-    wide, narrow = (
-        model_free.made_of("HalfCheetah-v5", name)[0]("MlpPolicy", "HalfCheetah-v5", **settings)
-        for name in ("simba", "simba_narrow")
-        for settings in [model_free.made_of("HalfCheetah-v5", name)[1]]
-    )
+    def begun(name):
+        algorithm, settings = model_free.made_of("HalfCheetah-v5", name)
+        return algorithm("MlpPolicy", "HalfCheetah-v5", **settings)
+
+    wide, narrow = begun("simba"), begun("simba_narrow")
 
     assert narrow.learning_rate == 4.0 * wide.learning_rate
-    assert [w // 4 for w in wide.policy.widths[1]] == list(narrow.policy.widths[1])
+    assert [width // 4 for width in wide.policy.widths[1]] == list(narrow.policy.widths[1])
 
 
 def test_a_long_run_goes_on_from_its_last_mark(tmp_path, monkeypatch):
