@@ -278,15 +278,16 @@ def evaluation(env: str):
     import gymnasium
 
     def episodes(model) -> np.ndarray:
-        system, returns = gymnasium.make(env), []
-        for episode in range(N_EPISODES):
-            (obs, _), total, over = system.reset(seed=70_000 + episode), 0.0, False
-            while not over:
-                action, _ = model.predict(obs, deterministic=True)
-                obs, reward, terminated, truncated, _ = system.step(action)
-                total, over = total + float(reward), terminated or truncated
-            returns.append(total)
-        return np.array(returns)
+        systems = [gymnasium.make(env) for _ in range(N_EPISODES)]
+        obs = np.array([system.reset(seed=70_000 + i)[0] for i, system in enumerate(systems)])
+        returns, running = np.zeros(N_EPISODES), np.ones(N_EPISODES, bool)
+        while running.any():
+            actions, _ = model.predict(obs, deterministic=True)
+            for i in np.flatnonzero(running):
+                obs[i], reward, terminated, truncated, _ = systems[i].step(actions[i])
+                returns[i] += float(reward)
+                running[i] = not (terminated or truncated)
+        return returns
 
     return episodes
 

@@ -1,5 +1,6 @@
 """Fresh processes, and runs and tables that survive an interruption."""
 
+import fcntl
 import hashlib
 import json
 import os
@@ -8,9 +9,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -44,6 +45,15 @@ def fresh_process(script: str, *arguments: Any, cache: Path | None = None) -> di
     if done.returncode:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr[-3000:]}")
     return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+@contextmanager
+def others_waiting() -> Iterator[None]:
+    """Of workers that run at a time, one measures; the others import and compile meanwhile."""
+    CACHE.mkdir(exist_ok=True)
+    with open(CACHE / "measuring.lock", "w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def code_version(*roots: Path) -> str:

@@ -4,6 +4,7 @@ Steps and updates per second of the model-free family, beside SBX, SB3 and SB3-c
     python benchmarks/speed.py                     # all rows; resumable
     python benchmarks/speed.py --rows "droq, 20" "droq, 1, start-up"
     python benchmarks/speed.py --table
+    python benchmarks/speed.py --on cuda --jobs 3  # rows of a GPU, in a table of their own
 
 Pendulum-v1, equal networks, batches and replay ratios. The two that are compared learn by turns in
 one process, in short blocks, so that a slow moment of the machine meets both; the ratio is the
@@ -20,12 +21,13 @@ twenty times, and depends on how many updates there are for each step in the env
 
 import argparse
 import json
+import os
 import sys
 import time
 
 import numpy as np
 import pandas as pd
-from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+from runs import CACHE, RESULTS, fresh_process, others_waiting, resume, seconds_since_start
 
 ENV, BATCH, STARTS = "Pendulum-v1", 256, 100
 WIDE = {"pi": [256, 256], "qf": [1024, 1024]}
@@ -59,6 +61,8 @@ IN_SB3 = ("sac", "gsde_sac", "tqc", "crossq")
 ALONE = {"td7": ("TD7", {"use_checkpoints": False}), "bro": ("BRO", {})}
 RATIOS = (1, 20)
 N_BLOCKS = 9
+#: of a block of the slower of two, about [s]
+BLOCK_S = {"cpu": 3.0, "cuda": 0.5}
 SEEDS = (1, 2, 4, 8)
 
 
@@ -66,25 +70,33 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("--rows", nargs="*", help='such as "droq, 20, sbx"; default: all')
     parser.add_argument("--table", action="store_true")
+    parser.add_argument("--on", default="cpu", choices=list(BLOCK_S))
+    parser.add_argument("--jobs", type=int, default=1, help="one measures, the others compile")
     parser.add_argument("--worker", nargs=3, metavar=("NAME", "RATIO", "PEER"))
     arguments = parser.parse_args()
     if arguments.worker:
         name, ratio, peer = arguments.worker
         print(json.dumps(worker(name, int(ratio), peer)))
         return
+    on = arguments.on
+    platforms = on if on == "cpu" else f"{on},cpu"
+    os.environ |= {"JAX_PLATFORMS": platforms, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    name = "speed" if on == "cpu" else f"speed_{on}"
     if not arguments.table:
-        wanted = [run for run in rows() if chosen(run, arguments.rows)]
+        wanted = [run for run in rows(on) if chosen(run, arguments.rows)]
         in_process = lambda *run: fresh_process(__file__, *run, cache=cache_of(run))["rows"]  # noqa: E731
-        resume("speed", ("name", "ratio", "peer"), wanted, in_process, jobs=1)
-    report()
+        resume(name, ("name", "ratio", "peer"), wanted, in_process, arguments.jobs)
+    report(name)
 
 
-def rows() -> list[tuple[str, int, str]]:
+def rows(on: str) -> list[tuple[str, int, str]]:
     pairs = [(name, ratio, "sbx") for name in PAIRS for ratio in RATIOS]
     pairs += [(name, ratio, "sb3") for name in IN_SB3 for ratio in RATIOS]
     pairs += [(name, ratio, "none") for name in ALONE for ratio in RATIOS]
-    pairs += [("sac", ratio, "products") for ratio in RATIOS]
     compiled = [("sac", n_seeds, "compiled") for n_seeds in SEEDS]
+    if on != "cpu":
+        return pairs + compiled
+    pairs += [("sac", ratio, "products") for ratio in RATIOS]
     starts = [(name, 1, f"start-up of {who}") for name in PAIRS for who in ("ours", "sbx")]
     return pairs + compiled + starts
 
@@ -107,8 +119,9 @@ def worker(name: str, ratio: int, peer: str) -> dict:
     models = [ours(name, ratio)] + ([] if peer == "none" else [other(name, ratio, peer)])
     for model in models:
         model.learn(STARTS + 20)
-    steps = block_length(models, ratio)
-    seconds = np.array([turn(models, steps, backwards=bool(i % 2)) for i in range(N_BLOCKS)])
+    with others_waiting():
+        steps = block_length(models)
+        seconds = np.array([turn(models, steps, backwards=bool(i % 2)) for i in range(N_BLOCKS)])
     middle = np.median(seconds, 0)
     row = {"steps_per_s": steps / middle[0], "updates_per_s": steps * ratio / middle[0]}
     if peer != "none":
@@ -118,10 +131,15 @@ def worker(name: str, ratio: int, peer: str) -> dict:
     return {"rows": [row]}
 
 
-def block_length(models: list, ratio: int) -> int:
-    """:return: steps that take the slower of them about three seconds"""
+def block_length(models: list) -> int:
+    """:return: steps that take the slower of them about ``BLOCK_S``"""
     slowest = max(turn(models, 10, backwards=False)) / 10
-    return int(np.clip(3.0 / slowest, 5, 500))
+    return int(np.clip(BLOCK_S[device()] / slowest, 5, 500))
+
+
+def device() -> str:
+    """:return: on which all of them compute"""
+    return os.environ["JAX_PLATFORMS"].partition(",")[0]
 
 
 def turn(models: list, steps: int, backwards: bool) -> list[float]:
@@ -158,7 +176,7 @@ def other(name: str, ratio: int, library: str):
 
     torch.set_num_threads(2)
     found = getattr(stable_baselines3, algorithm, None) or getattr(sb3_contrib, algorithm)
-    return found(**settings, device="cpu")
+    return found(**settings, device=device())
 
 
 class Products:
@@ -222,30 +240,34 @@ def compiled(name: str, n_seeds: int) -> dict:
 
     model, steps = ours(name, 1), 2_000
     learn_compiled(model, steps, range(n_seeds))
-    begin = time.perf_counter()
-    learn_compiled(model, steps, range(n_seeds))
-    seconds = time.perf_counter() - begin
+    with others_waiting():
+        begin = time.perf_counter()
+        learn_compiled(model, steps, range(n_seeds))
+        seconds = time.perf_counter() - begin
     made = {"steps_per_s": steps, "updates_per_s": steps - STARTS}
     return {name: n_seeds * each / seconds for name, each in made.items()}
 
 
-def report() -> None:
-    path = RESULTS / "speed.csv"
+def report(name: str) -> None:
+    """
+    :param name: of the table of all rows, with which those of others made from it begin
+    """
+    path = RESULTS / f"{name}.csv"
     if not path.exists():
         print("Nothing has been measured yet.", file=sys.stderr)
         return
     measured = pd.read_csv(path)
     tables = {
-        "speed_targets": beside_targets(measured),
-        "speed_sbx_sb3": sbx_beside_sb3(measured),
-        "speed_start_up": start_ups(measured),
-        "speed_products": products(measured),
-        "speed_alone": alone(measured),
+        "targets": beside_targets(measured),
+        "sbx_sb3": sbx_beside_sb3(measured),
+        "start_up": start_ups(measured),
+        "products": products(measured),
+        "alone": alone(measured),
     }
     print(measured.to_string(index=False, float_format="%.3g"))
-    for name, table in tables.items():
+    for part, table in tables.items():
         if len(table):
-            table.to_csv(RESULTS / f"{name}.csv", index=False, float_format="%.4g")
+            table.to_csv(RESULTS / f"{name}_{part}.csv", index=False, float_format="%.4g")
             print(f"\n{table.to_string(index=False, float_format='%.3g')}")
 
 

@@ -37,14 +37,20 @@ from sb3_hds.algos.observations import Seen, flattener, seen
 from sb3_hds.algos.off_policy import (
     Knobs,
     Trained,
-    Truncated,
     act,
     average,
     judge,
     least,
     mean,
     pessimistic,
+)
+from sb3_hds.algos.quantiles import (
+    Truncated,
+    all_targets,
     quantile_huber,
+    sorted_by_columns,
+    sorted_by_rows,
+    target_by_target,
 )
 from sb3_hds.algos.sampling import batches_of
 from sb3_hds.algos.squashed import Gaussian, exploration_std, log_probability, marginal_std
@@ -304,6 +310,10 @@ def test_the_slope_of_the_quantile_loss_is_that_of_all_pairs(n_targets):
 
     np.testing.assert_allclose(loss, expected, rtol=1e-5)
     np.testing.assert_allclose(slope, slope_of_pairs, rtol=1e-5, atol=1e-7)
+    for processor in (target_by_target, all_targets):
+        losses, slopes = processor(values, targets)
+        np.testing.assert_allclose(losses.sum() / (20 * n_targets), expected, rtol=1e-5)
+        np.testing.assert_allclose(slopes / (20 * n_targets), slope_of_pairs, rtol=1e-5, atol=1e-7)
     assert not jax.grad(quantile_huber, 1)(values, targets).any()
 
 
@@ -316,6 +326,17 @@ def test_the_least_quantiles_stay(n_quantiles, n_dropped):
 
     pool = np.sort(np.concatenate(list(values), -1), -1)
     np.testing.assert_array_equal(np.sort(kept, -1), pool[:, : 2 * (n_quantiles - n_dropped)])
+
+
+@pytest.mark.parametrize("processor", [sorted_by_columns, sorted_by_rows])
+def test_every_processor_sorts_alike(processor):
+    values = np.random.default_rng(0).normal(size=(7, 50)).astype(np.float32)
+    values[3, 4] = np.nan
+
+    rows = np.asarray(processor(jnp.asarray(values)))
+
+    assert np.isnan(rows[3]).all()
+    np.testing.assert_array_equal(np.delete(rows, 3, 0), np.sort(np.delete(values, 3, 0), -1))
 
 
 def test_a_quantile_that_is_no_number_makes_no_number_of_all_that_are_kept():

@@ -50,7 +50,7 @@ def test_the_speed_up_is_that_of_neighbouring_blocks(monkeypatch):
     blocks = [[0.5 * i, 1.0 * i] for i in range(1, speed.N_BLOCKS)] + [[9.0, 3.0]]
     monkeypatch.setattr(speed, "ours", lambda name, ratio: speed.Products(ratio))
     monkeypatch.setattr(speed, "other", lambda name, ratio, library: speed.Products(ratio))
-    monkeypatch.setattr(speed, "block_length", lambda models, ratio: 10)
+    monkeypatch.setattr(speed, "block_length", lambda models: 10)
     left = iter(blocks)
     monkeypatch.setattr(speed, "turn", lambda models, steps, backwards: next(left))
 

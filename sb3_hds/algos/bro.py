@@ -29,8 +29,8 @@ from sb3_hds.algos.off_policy import (
     average,
     judge,
     mean,
-    quantile_huber,
 )
+from sb3_hds.algos.quantiles import quantile_huber
 from sb3_hds.algos.soft_actor_critic import SoftActorCritic
 from sb3_hds.algos.squashed import Gaussian, squashed_between
 

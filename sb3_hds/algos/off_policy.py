@@ -207,84 +207,9 @@ def average(values: Values) -> Targets:
     return jnp.mean(values, 0)
 
 
-@dataclasses.dataclass(frozen=True)
-class Truncated:
-    """
-    The quantiles of all critics in one pool, without its ``n_dropped * n_critics`` largest (TQC).
-    Which critic these come from does not matter.
-
-    :param n_dropped: per critic that there is
-    """
-
-    n_dropped: int
-
-    def __call__(self, values: Values) -> Targets:
-        together = jnp.concatenate(list(values), -1)
-        if not self.n_dropped:
-            return together
-        return _sorted(together)[:, : together.shape[-1] - self.n_dropped * values.shape[0]]
-
-
-def _sorted(values: Float[Array, "batch n"]) -> Float[Array, "batch n"]:
-    """
-    Bitonic network (Batcher 1968) over whole columns, far faster on a CPU than ``jnp.sort`` of as
-    many short rows. A NaN in a row makes NaN of all that it meets.
-    """
-    n, columns = values.shape[-1], values.T
-    size = 1 << (n - 1).bit_length()
-    columns = jnp.pad(columns, ((0, size - n), (0, 0)), constant_values=jnp.inf)
-    for run in (2 << i for i in range(size.bit_length() - 1)):
-        # Two sorted runs become one: the second backwards, then ever closer partners.
-        first, second = jnp.split(columns.reshape(size // run, run, -1), 2, 1)
-        second = second[:, ::-1]
-        low, high = jnp.minimum(first, second), jnp.maximum(first, second)
-        columns = jnp.concatenate([low, high[:, ::-1]], 1)
-        apart = run // 4
-        while apart:
-            pairs = columns.reshape(size // (2 * apart), 2, apart, -1)
-            columns = jnp.stack([pairs.min(1), pairs.max(1)], 1)
-            apart //= 2
-    return columns.reshape(size, -1)[:n].T
-
-
 def squared(values: Values, targets: Targets) -> Loss:
     """Half the mean squared error, summed over critics."""
     return 0.5 * jnp.sum(jnp.mean((values - targets[None]) ** 2, (1, 2)))
-
-
-@jax.custom_jvp
-def quantile_huber(values: Values, targets: Targets) -> Loss:
-    """
-    Mean over quantiles, targets and batch, summed over critics (Dabney et al. 2018). Targets count
-    as constants: no gradient reaches them.
-
-    Reverse mode would keep every pair of a quantile and a target. Slopes that are summed up beside
-    the loss, one target after the other, take a CPU a fraction of the time.
-    """
-    return _quantile_huber(values, targets)[0]
-
-
-@quantile_huber.defjvp
-def _(primals: tuple[Values, Targets], tangents: tuple[Values, Targets]) -> tuple[Loss, Loss]:
-    loss, slope = _quantile_huber(*primals)
-    return loss, jnp.sum(slope * tangents[0])
-
-
-def _quantile_huber(values: Values, targets: Targets) -> tuple[Loss, Values]:
-    """:return: the loss, and its slope in the values"""
-    n = values.shape[-1]
-    level = (jnp.arange(n) + 0.5) / n
-
-    def add(sums: tuple[Values, Values], target: Float[Array, " batch"]) -> tuple[Any, None]:
-        delta = target[:, None] - values
-        clipped = jnp.clip(delta, -1.0, 1.0)
-        pull = jnp.where(delta < 0.0, 1.0 - level, level) * clipped
-        return (sums[0] + pull * (delta - 0.5 * clipped), sums[1] - pull), None
-
-    nothing = jnp.zeros_like(values), jnp.zeros_like(values)
-    (loss, slope), _ = jax.lax.scan(add, nothing, targets.T, unroll=4)
-    n_pairs = targets.size * n
-    return jnp.sum(loss) / n_pairs, slope / n_pairs
 
 
 def pessimistic(values: Values) -> Float[Array, " batch"]:

@@ -5,6 +5,7 @@ import math
 import warnings
 from typing import Any, ClassVar
 
+import jax
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
@@ -189,4 +190,4 @@ def _capacity(n: int) -> int:
 
 
 def _plain(report: Report) -> dict[str, float]:
-    return {name: float(value) for name, value in zip(report._fields, report, strict=True)}
+    return {name: float(value) for name, value in jax.device_get(report)._asdict().items()}

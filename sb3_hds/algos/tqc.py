@@ -7,7 +7,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_hds.algos.call_forms import check_count, is_count
-from sb3_hds.algos.off_policy import Recipe, Truncated, mean, quantile_huber
+from sb3_hds.algos.off_policy import Recipe, mean
+from sb3_hds.algos.quantiles import Truncated, quantile_huber
 from sb3_hds.algos.soft_actor_critic import SoftActorCritic
 
 
