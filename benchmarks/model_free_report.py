@@ -26,13 +26,17 @@ TARGETS = {PENDULUM: -150.0, CAR: 90.0, CART_POLE: 950.0}
 PUBLISHED = {
     ("HalfCheetah-v5", "sac"): {50_000: (4212.0, 498.0, 10), 100_000: (6156.0, 700.0, 10)},
     ("HalfCheetah-v5", "droq"): {50_000: (6383.0, 798.0, 10), 100_000: (7744.0, 1291.0, 10)},
-    ("HalfCheetah-v5", "crossq_jax"): {50_000: (6345.0, 790.0, 10), 100_000: (8112.0, 896.0, 10)},
+    ("HalfCheetah-v5", "crossq_jax"): {
+        10_000: (1148.0, 809.0, 10),
+        50_000: (6345.0, 790.0, 10),
+        100_000: (8112.0, 896.0, 10),
+    },
     ("HalfCheetah-v5", "simba"): {50_000: (4022.0, 539.0, 10), 100_000: (5462.0, 598.0, 10)},
     ("HalfCheetah-v5", "bro"): {50_000: (6504.0, 1151.0, 5), 100_000: (8330.0, 1352.0, 5)},
     ("HalfCheetah-v5", "bro_fast"): {50_000: (4280.0, 521.0, 5), 100_000: (6516.0, 858.0, 5)},
     ("Hopper-v5", "sac"): {50_000: (530.0, 284.0, 10)},
     ("Hopper-v5", "droq"): {50_000: (1569.0, 1132.0, 10)},
-    ("Hopper-v5", "crossq_jax"): {50_000: (1421.0, 910.0, 10)},
+    ("Hopper-v5", "crossq_jax"): {40_000: (2042.0, 1098.0, 10), 50_000: (1421.0, 910.0, 10)},
     ("Hopper-v5", "simba"): {50_000: (828.0, 263.0, 10)},
     ("Hopper-v5", "bro"): {50_000: (721.0, 371.0, 5)},
     ("Hopper-v5", "bro_fast"): {50_000: (631.0, 114.0, 5)},
@@ -248,12 +252,14 @@ def draw_curves(panels: Sequence["Axes"], table: pd.DataFrame, env: str, with_ba
         middle, low, high = (runs["return"].agg(f) for f in ("mean", "min", "max"))
         style, seconds = style_of(method), runs["seconds"].mean()
         for panel, x in zip(panels, (middle.index, seconds), strict=True):
-            panel.plot(x, middle, label=method, linewidth=1.5, **style)
+            marker = "o" if len(middle) == 1 else None
+            panel.plot(x, middle, label=method, linewidth=1.5, marker=marker, **style)
             if with_bands:
                 panel.fill_between(x, low, high, color=style["color"], alpha=0.12, linewidth=0.0)
-        for mark, (mean, deviation, _) in PUBLISHED.get((env, plain(method)), {}).items():
-            beside = 0.02 + 0.015 * list(OURS).index(plain(method))
-            at, colour = mark + beside * middle.index[-1], style["color"]
+    for method in {plain(method): None for method in OURS if method in present}:
+        for mark, (mean, deviation, _) in PUBLISHED.get((env, method), {}).items():
+            beside = 0.02 + 0.015 * list(OURS).index(method)
+            at, colour = mark + beside * table["mark"].max(), style_of(method)["color"]
             panels[0].errorbar(at, mean, deviation, fmt="_", color=colour, alpha=0.6, capsize=2)
     if table["seconds"].notna().any():
         panels[1].set_xscale("log")

@@ -126,6 +126,8 @@ PARTS: dict[str, Callable[[], str]] = {
     ),
     "sb3_tests": summaries.whole("sb3_tests_table"),
     "speed": summaries.whole("speed_targets"),
+    "speed_on_cuda": summaries.whole("speed_cuda_targets"),
+    "speed_of_sbx_on_cuda": summaries.whole("speed_cuda_sbx_sb3"),
     "speed_products": summaries.whole("speed_products"),
     "speed_of_sbx": summaries.whole("speed_sbx_sb3"),
     "speed_start_up": summaries.whole("speed_start_up"),
