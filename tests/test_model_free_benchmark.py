@@ -3,13 +3,14 @@
 import inspect
 from importlib.util import find_spec
 
+import gymnasium
 import intervals
 import model_free
 import model_free_report
 import numpy as np
 import pandas as pd
 import pytest
-from model_free import CAR, LENGTHS, ONLY_ON, OURS, PEERS, PENDULUM
+from model_free import CAR, CART_POLE, LENGTHS, ONLY_ON, OURS, PEERS, PENDULUM
 from runs import InterruptedRun
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 
@@ -135,6 +136,28 @@ def test_a_long_run_goes_on_from_its_last_mark(tmp_path, monkeypatch):
     assert [row["mark"] for row in rows] == [100, 200, 300]
     assert 300 <= rows[-1]["steps"] <= 330
     assert not kept.folder.exists()
+
+
+def test_episodes_side_by_side_are_those_of_one_after_the_other():
+    class Policy:
+        def predict(self, obs, deterministic):
+            assert deterministic
+            return 0.3 * obs[:, 1:2], None
+
+    expected = []
+    for episode in range(model_free.N_EPISODES):
+        system = gymnasium.make(CART_POLE)
+        (obs, _), total, over = system.reset(seed=70_000 + episode), 0.0, False
+        while not over:
+            action, _ = Policy().predict(obs[None], True)
+            obs, reward, terminated, truncated, _ = system.step(action[0])
+            total, over = total + reward, terminated or truncated
+        expected.append(total)
+
+    returns = model_free.evaluation(CART_POLE)(Policy())
+
+    assert returns.tolist() == expected
+    assert len(set(expected)) > 1
 
 
 def test_schedules_are_those_of_the_whole_run(monkeypatch):

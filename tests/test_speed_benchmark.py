@@ -1,8 +1,11 @@
 """What the benchmark of speed makes of what it measured."""
 
+import threading
+
 import numpy as np
 import pandas as pd
 import pytest
+import runs
 import speed
 
 
@@ -61,3 +64,30 @@ def test_the_speed_up_is_that_of_neighbouring_blocks(monkeypatch):
     assert row["steps_per_s"] == pytest.approx(10 / ours)
     assert row["peer_steps_per_s"] == pytest.approx(10 / theirs)
     assert theirs / ours != 2.0
+
+
+def test_one_measures_while_others_wait(monkeypatch, tmp_path):
+    monkeypatch.setattr(runs, "CACHE", tmp_path)
+    order: list[str] = []
+
+    def another() -> None:
+        with runs.others_waiting():
+            order.append("another")
+
+    with runs.others_waiting():
+        waiting = threading.Thread(target=another)
+        waiting.start()
+        waiting.join(0.2)
+        order.append("first")
+    waiting.join(10.0)
+
+    assert order == ["first", "another"]
+
+
+def test_an_accelerator_is_measured_beside_the_same_peers(monkeypatch):
+    on_both = set(speed.rows("cpu")) & set(speed.rows("cuda"))
+    assert on_both == set(speed.rows("cuda"))
+    assert {(name, ratio, "sbx") for name in speed.PAIRS for ratio in speed.RATIOS} <= on_both
+
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda,cpu")
+    assert speed.device() == "cuda"
