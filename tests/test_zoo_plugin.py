@@ -30,9 +30,11 @@ USUAL = {
 FURTHER = {"droq": {"Humanoid-v5"}}
 # What papers, or their authors' code where these are silent, have on tasks of 1000 steps.
 PUBLISHED = [
-    # Configs of SonyResearch/simba; where no episode ends early, one critic.
-    ("simba", "HalfCheetah-v5", {"gamma": 0.995, "policy_kwargs": {"n_critics": 1}}),
+    # Configs of DAVIAN-Robotics/SimbaV2, which count all of MuJoCo's as ending early; where no
+    # episode does, as in Swimmer, which they do not have: SonyResearch/simba.
+    ("simba", "HalfCheetah-v5", {"gamma": 0.995, "clipped_double_q": None, "policy_kwargs": None}),
     ("simba", "Hopper-v5", {"gamma": 0.995, "clipped_double_q": None, "policy_kwargs": None}),
+    ("simba", "Swimmer-v5", {"clipped_double_q": False, "policy_kwargs": {"n_critics": 1}}),
     # Hiraoka et al. 2022, appendix; HalfCheetah: their code, after MBPO.
     ("droq", "HalfCheetah-v5", {"learning_starts": 5000, "target_entropy": -3.0}),
     ("droq", "Hopper-v5", {"learning_starts": 5000, "target_entropy": -1.0}),

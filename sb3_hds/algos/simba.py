@@ -20,9 +20,10 @@ class SimbaSAC(SoftActorCritic):
     Source: Lee et al., *SimBa: Simplicity Bias for Scaling Up Parameters in Deep Reinforcement
     Learning*, ICLR 2025: replay ratio 2, learning rate 1e-4, weight decay 1e-2, initial temperature
     0.01, target entropy of minus half the number of controls; the least of two critics only in
-    tasks that end early. In others, the authors have one critic: ``clipped_double_q=False`` with
-    ``policy_kwargs={"n_critics": 1}``; of more, it takes the mean. Their discount, 1 - 5 / T with
-    episodes of T steps, within 0.95 and 0.995, is for ``gamma`` to say.
+    tasks that end early, for which their later code takes all of MuJoCo's in Gymnasium. In others,
+    the authors have one critic: ``clipped_double_q=False`` with ``policy_kwargs={"n_critics": 1}``;
+    of more, it takes the mean. Their discount, 1 - 5 / T with episodes of T steps, within 0.95 and
+    0.995, is for ``gamma`` to say.
 
     As in the authors' code, :math:`\tanh` squashes the logarithm of the deviation of actions into
     [-10, 2]: actions start with a deviation near :math:`e^{-4}`, where SAC and SBX clip it to
