@@ -16,7 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from sb3_hds.algos.bodies import BroBody
 from sb3_hds.algos.call_forms import between, is_count
 from sb3_hds.algos.gaussian_policy import GaussianPolicy
-from sb3_hds.algos.heads import GaussianActor
+from sb3_hds.algos.heads import Critic, GaussianActor
 from sb3_hds.algos.off_policy import (
     Batch,
     Knobs,
@@ -41,8 +41,9 @@ _FAST, _FAST_RESETS = 2, _RESETS[:1]
 _INITIAL_OPTIMISM, _INITIAL_REGULARIZER = 1.0, 0.25
 # Of the logarithms of the multipliers.
 _MULTIPLIER_LIMITS = (-10.0, 7.5)
-# Of the last layers of the actor.
+# Of last layers.
 _OF_MEAN, _OF_STD = (nn.initializers.orthogonal(scale) for scale in (math.sqrt(2), 1.0))
+_OF_VALUES = _OF_MEAN
 
 
 class BroPolicy(GaussianPolicy):
@@ -68,6 +69,9 @@ class BroPolicy(GaussianPolicy):
 
     def gaussian_actor(self, body: nn.Module, n_act: int) -> nn.Module:
         return GaussianActor(body, n_act, self.squash_log_std, _OF_MEAN, _OF_STD)
+
+    def one_critic(self, body: nn.Module, n_quantiles: int) -> nn.Module:
+        return Critic(body, n_quantiles, _OF_VALUES)
 
 
 class BRO(SoftActorCritic):

@@ -36,6 +36,8 @@ from sb3_hds.algos.off_policy import (
     squared,
 )
 
+# Of the last layers of SimBa's authors.
+_OF_SIMBA = nn.initializers.orthogonal(1.0)
 _OPTIMIZERS = {
     "adam": optax.adam,
     "adamw": optax.adamw,
@@ -179,7 +181,7 @@ class GaussianPolicy(LearningPolicy):
         if use_sde:
             gsde = (log_std_init, full_std, use_expln, clip_mean)
             self.actor_network = ExploringActor(body, n_act, *gsde)
-        self.critic_network = Critic(self.critic_body(qf), n_quantiles)
+        self.critic_network = self.one_critic(self.critic_body(qf), n_quantiles)
         own = dict(optimizer_kwargs or {})
         make: Any = chosen["optimizer_class"]
         usual = self.defaults.get("optimizer_kwargs", {}) if optimizer_class is None else {}
@@ -225,6 +227,10 @@ class GaussianPolicy(LearningPolicy):
     def gaussian_actor(self, body: nn.Module, n_act: int) -> nn.Module:
         """:return: the actor without gSDE"""
         return GaussianActor(body, n_act, self.squash_log_std)
+
+    def one_critic(self, body: nn.Module, n_quantiles: int) -> nn.Module:
+        """:return: a member of the ensemble"""
+        return Critic(body, n_quantiles)
 
     def build_plain(self) -> None:
         """That of SAC; with batch normalisation, that of CrossQ."""
@@ -348,10 +354,16 @@ class SimbaPolicy(GaussianPolicy):
 class SimbaSACPolicy(SimbaPolicy):
     """
     The policy of SimbaSAC: also what actions are drawn from is that of SimBa's authors, with
-    ``squash_log_std=True`` where there is no gSDE.
+    ``squash_log_std=True`` where there is no gSDE, and so is where last layers start.
     """
 
     defaults = {**SimbaPolicy.defaults, "squash_log_std": True}
+
+    def gaussian_actor(self, body: nn.Module, n_act: int) -> nn.Module:
+        return GaussianActor(body, n_act, self.squash_log_std, _OF_SIMBA, _OF_SIMBA)
+
+    def one_critic(self, body: nn.Module, n_quantiles: int) -> nn.Module:
+        return Critic(body, n_quantiles, _OF_SIMBA)
 
 
 class CrossQPolicy(GaussianPolicy):

@@ -82,10 +82,12 @@ class Critic(nn.Module):
 
     :param body: see ``bodies.py``
     :param n_values: 1, or the number of quantiles
+    :param of_values: draws their kernel
     """
 
     body: nn.Module
     n_values: int = 1
+    of_values: nn.initializers.Initializer = _USUAL
 
     @nn.compact
     def __call__(
@@ -95,7 +97,7 @@ class Critic(nn.Module):
         train: bool = False,
     ) -> Float[Array, "*batch values"]:
         latent = self.body(jnp.concatenate([obs, action], -1), train)
-        return nn.Dense(self.n_values)(latent)
+        return nn.Dense(self.n_values, kernel_init=self.of_values)(latent)
 
 
 def noise_std(actor: ExploringActor, weights: dict) -> Float[Array, "latent act"]:
