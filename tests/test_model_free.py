@@ -1114,6 +1114,19 @@ def test_hidden_layers_start_orthogonal_where_that_is_asked_for(name):
         )
 
 
+@pytest.mark.parametrize(("name", "gain"), [("simba", 1.0), ("bro", np.sqrt(2.0))])
+def test_last_layers_start_as_in_the_code_of_the_authors(name, gain):
+    learner = small(name, policy_kwargs={"net_arch": [16]}).policy.learner
+
+    [mean, std] = (learner.actor.weights["params"][f"Dense_{i}"]["kernel"] for i in (0, 1))
+    assert np.linalg.norm(mean) == pytest.approx(gain, rel=1e-5)
+    assert np.linalg.norm(std) == pytest.approx(1.0, rel=1e-5)
+    for values in learner.critic.weights["params"]["Dense_0"]["kernel"]:
+        n = min(values.shape)
+        short = values.T @ values if values.shape[1] == n else values @ values.T
+        np.testing.assert_allclose(short, gain**2 * np.eye(n), atol=1e-5)
+
+
 @pytest.mark.parametrize("name", ["simba", "bro"])
 def test_networks_that_start_as_in_their_papers_refuse_another_start(name):
     with pytest.raises(ValueError, match=r"'ortho_init': True.*do not use ortho_init"):
