@@ -10,8 +10,9 @@ from jaxtyping import Array, Float
 
 from sb3_hds.algos.networks import Activation
 
+#: where kernels start, with gains of the square root of 2 and of 1
+ORTHOGONAL, ORTHONORMAL = (nn.initializers.orthogonal(gain) for gain in (math.sqrt(2), 1.0))
 _HE = nn.initializers.he_normal()
-_ORTHOGONAL = nn.initializers.orthogonal(math.sqrt(2))
 # BatchRenorm's limits (Ioffe 2017, section 3), and the variance's floor in SBX's CrossQ.
 _R_MAX, _D_MAX, _RENORM_EPSILON = 3.0, 5.0, 1e-3
 
@@ -42,7 +43,7 @@ class Mlp(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch n"], train: bool) -> Float[Array, "*batch m"]:
-        kernels = _ORTHOGONAL if self.ortho_init else nn.initializers.lecun_normal()
+        kernels = ORTHOGONAL if self.ortho_init else nn.initializers.lecun_normal()
         if self.renorm_warmup_steps is not None:
             x = BatchRenorm(self.renorm_warmup_steps, self.momentum)(x, train)
         for width in self.net_arch:
@@ -76,7 +77,7 @@ class SimbaBody(nn.Module):
     def __call__(self, x: Float[Array, "*batch n"], train: bool) -> Float[Array, "*batch m"]:
         for i, width in enumerate(self.net_arch):
             if i == 0 or x.shape[-1] != width:
-                x = nn.Dense(width, kernel_init=nn.initializers.orthogonal(1.0))(x)
+                x = nn.Dense(width, kernel_init=ORTHONORMAL)(x)
             inside = nn.Dense(4 * width, kernel_init=_HE)(nn.LayerNorm()(x))
             x = x + nn.Dense(width, kernel_init=_HE)(self.activation_fn(inside))
             x = Dropout(self.dropout_rate)(x)
@@ -100,7 +101,7 @@ class BroBody(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch n"], train: bool) -> Float[Array, "*batch m"]:
-        dense = lambda width: nn.Dense(width, kernel_init=_ORTHOGONAL)  # noqa: E731
+        dense = lambda width: nn.Dense(width, kernel_init=ORTHOGONAL)  # noqa: E731
         for i, width in enumerate(self.net_arch):
             if i == 0 or x.shape[-1] != width:
                 x = self.activation_fn(nn.LayerNorm()(dense(width)(x)))

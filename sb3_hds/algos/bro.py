@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
-from sb3_hds.algos.bodies import BroBody
+from sb3_hds.algos.bodies import ORTHOGONAL, ORTHONORMAL, BroBody
 from sb3_hds.algos.call_forms import between, is_count
 from sb3_hds.algos.gaussian_policy import GaussianPolicy
 from sb3_hds.algos.heads import Critic, GaussianActor
@@ -41,9 +41,6 @@ _FAST, _FAST_RESETS = 2, _RESETS[:1]
 _INITIAL_OPTIMISM, _INITIAL_REGULARIZER = 1.0, 0.25
 # Of the logarithms of the multipliers.
 _MULTIPLIER_LIMITS = (-10.0, 7.5)
-# Of last layers.
-_OF_MEAN, _OF_STD = (nn.initializers.orthogonal(scale) for scale in (math.sqrt(2), 1.0))
-_OF_VALUES = _OF_MEAN
 
 
 class BroPolicy(GaussianPolicy):
@@ -68,10 +65,10 @@ class BroPolicy(GaussianPolicy):
         return BroBody(net_arch, self.activation_fn)
 
     def gaussian_actor(self, body: nn.Module, n_act: int) -> nn.Module:
-        return GaussianActor(body, n_act, self.squash_log_std, _OF_MEAN, _OF_STD)
+        return GaussianActor(body, n_act, self.squash_log_std, ORTHOGONAL, ORTHONORMAL)
 
     def one_critic(self, body: nn.Module, n_quantiles: int) -> nn.Module:
-        return Critic(body, n_quantiles, _OF_VALUES)
+        return Critic(body, n_quantiles, ORTHOGONAL)
 
 
 class BRO(SoftActorCritic):

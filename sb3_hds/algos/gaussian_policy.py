@@ -15,9 +15,9 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_hds.algos.bodies import Mlp, SimbaBody
+from sb3_hds.algos.bodies import ORTHOGONAL, ORTHONORMAL, Mlp, SimbaBody
 from sb3_hds.algos.call_forms import between, check_count
-from sb3_hds.algos.heads import Critic, ExploringActor, GaussianActor, noise_std
+from sb3_hds.algos.heads import USUAL, Critic, ExploringActor, GaussianActor, noise_std
 from sb3_hds.algos.learner import GENERATOR
 from sb3_hds.algos.learning_policy import LearningPolicy
 from sb3_hds.algos.networks import Activation, activation, widths_of
@@ -36,8 +36,6 @@ from sb3_hds.algos.off_policy import (
     squared,
 )
 
-# Of the last layers of SimBa's authors.
-_OF_SIMBA = nn.initializers.orthogonal(1.0)
 _OPTIMIZERS = {
     "adam": optax.adam,
     "adamw": optax.adamw,
@@ -83,9 +81,9 @@ class GaussianPolicy(LearningPolicy):
     :param renorm_warmup_steps: batch normalisation in actor and critics, which becomes batch
         renormalisation after so many updates; None: neither, but 100,000 with ``CrossQPolicy``
     :param batch_norm_momentum: the share of its running statistics that stays at an update
-    :param ortho_init: whether hidden layers start orthogonal, with a gain of the square root of 2,
-        as in SB3's PPO and in JAXRL's SAC, rather than as flax and SBX have it; the networks of
-        SimBa and BRO start as in their papers
+    :param ortho_init: whether layers start orthogonal, as in JAXRL's SAC, rather than as flax and
+        SBX have it: with a gain of the square root of 2, and of 1 where the deviation is read off;
+        ``"hidden"``: but the last ones. The networks of SimBa and BRO start as in their papers
     :param use_sde: generalised state-dependent exploration (Raffin et al., CoRL 2021)
     :param log_std_init: gSDE: where the logarithm of the noise matrix's deviation starts
     :param full_std: gSDE: one deviation for each feature and control, or for each feature
@@ -128,7 +126,7 @@ class GaussianPolicy(LearningPolicy):
         layer_norm: bool = False,
         renorm_warmup_steps: int | None = None,
         batch_norm_momentum: float = 0.99,
-        ortho_init: bool = False,
+        ortho_init: bool | str = False,
         use_sde: bool = False,
         log_std_init: float = -3.0,
         full_std: bool = True,
@@ -179,7 +177,7 @@ class GaussianPolicy(LearningPolicy):
         body = self.actor_body(pi)
         self.actor_network = self.gaussian_actor(body, n_act)
         if use_sde:
-            gsde = (log_std_init, full_std, use_expln, clip_mean)
+            gsde = (log_std_init, full_std, use_expln, clip_mean, self._of_last()[0])
             self.actor_network = ExploringActor(body, n_act, *gsde)
         self.critic_network = self.one_critic(self.critic_body(qf), n_quantiles)
         own = dict(optimizer_kwargs or {})
@@ -210,7 +208,7 @@ class GaussianPolicy(LearningPolicy):
             self.activation_fn,
             renorm_warmup_steps=self.renorm_warmup_steps,
             momentum=self.batch_norm_momentum,
-            ortho_init=self.ortho_init,
+            ortho_init=bool(self.ortho_init),
         )
 
     def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
@@ -221,16 +219,21 @@ class GaussianPolicy(LearningPolicy):
             self.layer_norm,
             self.renorm_warmup_steps,
             self.batch_norm_momentum,
-            self.ortho_init,
+            bool(self.ortho_init),
         )
 
     def gaussian_actor(self, body: nn.Module, n_act: int) -> nn.Module:
         """:return: the actor without gSDE"""
-        return GaussianActor(body, n_act, self.squash_log_std)
+        return GaussianActor(body, n_act, self.squash_log_std, *self._of_last())
 
     def one_critic(self, body: nn.Module, n_quantiles: int) -> nn.Module:
         """:return: a member of the ensemble"""
-        return Critic(body, n_quantiles)
+        return Critic(body, n_quantiles, self._of_last()[0])
+
+    def _of_last(self) -> tuple[Any, Any]:
+        """:return: where last layers start: of means and values, and of deviations"""
+        usual = self.ortho_init in (False, "hidden")
+        return (USUAL, USUAL) if usual else (ORTHOGONAL, ORTHONORMAL)
 
     def build_plain(self) -> None:
         """That of SAC; with batch normalisation, that of CrossQ."""
@@ -360,10 +363,10 @@ class SimbaSACPolicy(SimbaPolicy):
     defaults = {**SimbaPolicy.defaults, "squash_log_std": True}
 
     def gaussian_actor(self, body: nn.Module, n_act: int) -> nn.Module:
-        return GaussianActor(body, n_act, self.squash_log_std, _OF_SIMBA, _OF_SIMBA)
+        return GaussianActor(body, n_act, self.squash_log_std, ORTHONORMAL, ORTHONORMAL)
 
     def one_critic(self, body: nn.Module, n_quantiles: int) -> nn.Module:
-        return Critic(body, n_quantiles, _OF_SIMBA)
+        return Critic(body, n_quantiles, ORTHONORMAL)
 
 
 class CrossQPolicy(GaussianPolicy):
@@ -446,6 +449,9 @@ def _check_settings(arguments: Mapping[str, Any]) -> None:
     rate = arguments["dropout_rate"]
     if not (between(rate, 0.0, 1.0) and rate < 1.0):
         raise ValueError(f"dropout_rate must be at least 0 and below 1, got {rate!r}.")
+    start = arguments["ortho_init"]
+    if start not in (True, False, "hidden"):
+        raise ValueError(f"ortho_init must be True, False or 'hidden', got {start!r}.")
 
 
 @partial(jax.jit, static_argnums=0)

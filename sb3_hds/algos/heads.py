@@ -8,7 +8,8 @@ from sb3_hds.algos.squashed import Gaussian, exploration_std, marginal_std, squa
 
 # Of the logarithm of the deviation of actions: where it is clipped (SAC), and where it is squashed.
 _CLIPPED, _SQUASHED = (-20.0, 2.0), (-10.0, 2.0)
-_USUAL = nn.initializers.lecun_normal()
+#: where last layers start, as flax has them
+USUAL = nn.initializers.lecun_normal()
 
 
 class GaussianActor(nn.Module):
@@ -27,8 +28,8 @@ class GaussianActor(nn.Module):
     body: nn.Module
     n_act: int
     squash_log_std: bool = False
-    of_mean: nn.initializers.Initializer = _USUAL
-    of_std: nn.initializers.Initializer = _USUAL
+    of_mean: nn.initializers.Initializer = USUAL
+    of_std: nn.initializers.Initializer = USUAL
 
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch obs"], train: bool = False) -> Gaussian:
@@ -53,6 +54,7 @@ class ExploringActor(nn.Module):
     :param full_std: whether each pair of feature and control has its own, or each feature
     :param use_expln: see :func:`sb3_hds.algos.squashed.exploration_std`
     :param clip_mean: the mean is clipped to this, which helps where :math:`\tanh` saturates; 0: not
+    :param of_mean: draws the kernel of the mean
     """
 
     body: nn.Module
@@ -61,11 +63,12 @@ class ExploringActor(nn.Module):
     full_std: bool
     use_expln: bool
     clip_mean: float
+    of_mean: nn.initializers.Initializer = USUAL
 
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch obs"], train: bool = False) -> Gaussian:
         latent = self.body(obs, train)
-        mean = nn.Dense(self.n_act)(latent)
+        mean = nn.Dense(self.n_act, kernel_init=self.of_mean)(latent)
         if self.clip_mean > 0.0:
             mean = jnp.clip(mean, -self.clip_mean, self.clip_mean)
         shape = (latent.shape[-1], self.n_act if self.full_std else 1)
@@ -87,7 +90,7 @@ class Critic(nn.Module):
 
     body: nn.Module
     n_values: int = 1
-    of_values: nn.initializers.Initializer = _USUAL
+    of_values: nn.initializers.Initializer = USUAL
 
     @nn.compact
     def __call__(
