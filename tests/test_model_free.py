@@ -701,6 +701,7 @@ def test_batch_normalisation_of_crossq_begins_where_it_is_told_to():
         ("tqc_jax", {"policy_kwargs": {"n_quantiles": None}}),
         ("gsde_sac", {"policy_kwargs": {"n_quantiles": 2.0}}),
         ("gsde_sac", {"policy_kwargs": {"n_critics": 0}}),
+        ("gsde_sac", {"policy_kwargs": {"ortho_init": "last"}}),
         ("td7", {"policy_kwargs": {"n_critics": 0}}),
         ("td7", {"policy_kwargs": {"embedding_size": 0}}),
         ("bro", {"kl_target": -1}),
@@ -1101,9 +1102,10 @@ def test_state_dependent_noise_of_simba_is_not_squashed():
         small("simba", use_sde=True, policy_kwargs={"squash_log_std": True})
 
 
+@pytest.mark.parametrize("last", [True, False])
 @pytest.mark.parametrize("name", ["gsde_sac", "droq", "tqc_jax", "crossq_jax"])
-def test_hidden_layers_start_orthogonal_where_that_is_asked_for(name):
-    told = {"net_arch": [16, 16], "ortho_init": True}
+def test_layers_start_orthogonal_where_that_is_asked_for(name, last):
+    told = {"net_arch": [16, 16], "ortho_init": True if last else "hidden"}
     learner = small(name, policy_kwargs=told).policy.learner
 
     for weights in (learner.actor.weights, learner.critic.weights):
@@ -1112,6 +1114,14 @@ def test_hidden_layers_start_orthogonal_where_that_is_asked_for(name):
         np.testing.assert_allclose(
             gained, np.broadcast_to(2.0 * np.eye(16), gained.shape), atol=1e-5
         )
+    mean = learner.actor.weights["params"]["Dense_0"]["kernel"]
+    of_values = learner.critic.weights["params"]["Dense_0"]["kernel"][0]
+    for kernel in (mean, of_values):
+        gains = np.linalg.svd(kernel, compute_uv=False)
+        assert np.allclose(gains, np.sqrt(2.0), atol=1e-5) == last
+    if name != "gsde_sac":  # whose noise matrix is no layer
+        gains = np.linalg.svd(learner.actor.weights["params"]["Dense_1"]["kernel"])[1]
+        assert np.allclose(gains, 1.0, atol=1e-5) == last
 
 
 @pytest.mark.parametrize(("name", "gain"), [("simba", 1.0), ("bro", np.sqrt(2.0))])
