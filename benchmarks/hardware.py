@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-import numpy as np
+from episodes import returns_of
 from runs import CACHE, code_version
 
 PENDULUM, CART = "sb3_hds/PendulumReal-v1", "sb3_hds/InvertedPendulumFriction-v5"
@@ -88,13 +88,4 @@ def kept_at(twin: str, seed: int, changes: dict) -> Path:
 
 def return_of(model, cell: str) -> float:
     """:return: mean over the same start states of the real system, whoever asks"""
-    envs = [make(cell) for _ in range(N_STARTS)]
-    obs = np.stack([env.reset(seed=50_000 + start)[0] for start, env in enumerate(envs)])
-    returns, running = np.zeros(N_STARTS), np.ones(N_STARTS, bool)
-    while running.any():
-        actions, _ = model.predict(obs, deterministic=True)
-        for i in np.flatnonzero(running):
-            obs[i], reward, terminated, truncated, _ = envs[i].step(actions[i])
-            returns[i] += float(reward)
-            running[i] = not (terminated or truncated)
-    return float(np.mean(returns))
+    return float(returns_of(model, [make(cell) for _ in range(N_STARTS)], 50_000).mean())

@@ -33,6 +33,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
+from episodes import returns_of
 from pendulum import held_out_states, rollouts
 from runs import CACHE, InterruptedRun, fresh_process, resume
 
@@ -277,19 +278,7 @@ def evaluation(env: str):
         return lambda model: rollouts(model, angles, speeds)
     import gymnasium
 
-    def episodes(model) -> np.ndarray:
-        systems = [gymnasium.make(env) for _ in range(N_EPISODES)]
-        obs = np.array([system.reset(seed=70_000 + i)[0] for i, system in enumerate(systems)])
-        returns, running = np.zeros(N_EPISODES), np.ones(N_EPISODES, bool)
-        while running.any():
-            actions, _ = model.predict(obs, deterministic=True)
-            for i in np.flatnonzero(running):
-                obs[i], reward, terminated, truncated, _ = systems[i].step(actions[i])
-                returns[i] += float(reward)
-                running[i] = not (terminated or truncated)
-        return returns
-
-    return episodes
+    return lambda model: returns_of(model, [gymnasium.make(env) for _ in range(N_EPISODES)], 70_000)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ Steps and updates per second of the model-free family, beside SBX, SB3 and SB3-c
     python benchmarks/speed.py                     # all rows; resumable
     python benchmarks/speed.py --rows "droq, 20" "droq, 1, start-up"
     python benchmarks/speed.py --table
-    python benchmarks/speed.py --on cuda --jobs 3  # rows of a GPU, in a table of their own
+    python benchmarks/speed.py --on cuda --jobs 4  # rows of a GPU, in a table of their own
 
 Pendulum-v1, equal networks, batches and replay ratios. The two that are compared learn by turns in
 one process, in short blocks, so that a slow moment of the machine meets both; the ratio is the

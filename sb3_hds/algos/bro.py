@@ -16,7 +16,6 @@ from stable_baselines3.common.type_aliases import GymEnv
 from sb3_hds.algos.bodies import ORTHOGONAL, ORTHONORMAL, BroBody
 from sb3_hds.algos.call_forms import between, is_count
 from sb3_hds.algos.gaussian_policy import GaussianPolicy
-from sb3_hds.algos.heads import Critic, GaussianActor
 from sb3_hds.algos.off_policy import (
     Batch,
     Knobs,
@@ -64,11 +63,8 @@ class BroPolicy(GaussianPolicy):
     def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
         return BroBody(net_arch, self.activation_fn)
 
-    def gaussian_actor(self, body: nn.Module, n_act: int) -> nn.Module:
-        return GaussianActor(body, n_act, self.squash_log_std, ORTHOGONAL, ORTHONORMAL)
-
-    def one_critic(self, body: nn.Module, n_quantiles: int) -> nn.Module:
-        return Critic(body, n_quantiles, ORTHOGONAL)
+    def last_layers(self) -> tuple[nn.initializers.Initializer, nn.initializers.Initializer]:
+        return ORTHOGONAL, ORTHONORMAL
 
 
 class BRO(SoftActorCritic):

@@ -175,11 +175,12 @@ class GaussianPolicy(LearningPolicy):
         n_act = int(np.prod(action_space.shape))
         pi, qf = self.widths
         body = self.actor_body(pi)
-        self.actor_network = self.gaussian_actor(body, n_act)
+        of_mean, of_std = self.last_layers()
+        self.actor_network = GaussianActor(body, n_act, self.squash_log_std, of_mean, of_std)
         if use_sde:
-            gsde = (log_std_init, full_std, use_expln, clip_mean, self._of_last()[0])
+            gsde = (log_std_init, full_std, use_expln, clip_mean, of_mean)
             self.actor_network = ExploringActor(body, n_act, *gsde)
-        self.critic_network = self.one_critic(self.critic_body(qf), n_quantiles)
+        self.critic_network = Critic(self.critic_body(qf), n_quantiles, of_mean)
         own = dict(optimizer_kwargs or {})
         make: Any = chosen["optimizer_class"]
         usual = self.defaults.get("optimizer_kwargs", {}) if optimizer_class is None else {}
@@ -222,16 +223,8 @@ class GaussianPolicy(LearningPolicy):
             bool(self.ortho_init),
         )
 
-    def gaussian_actor(self, body: nn.Module, n_act: int) -> nn.Module:
-        """:return: the actor without gSDE"""
-        return GaussianActor(body, n_act, self.squash_log_std, *self._of_last())
-
-    def one_critic(self, body: nn.Module, n_quantiles: int) -> nn.Module:
-        """:return: a member of the ensemble"""
-        return Critic(body, n_quantiles, self._of_last()[0])
-
-    def _of_last(self) -> tuple[Any, Any]:
-        """:return: where last layers start: of means and values, and of deviations"""
+    def last_layers(self) -> tuple[nn.initializers.Initializer, nn.initializers.Initializer]:
+        """:return: where they start: those of means and values, and those of deviations"""
         usual = self.ortho_init in (False, "hidden")
         return (USUAL, USUAL) if usual else (ORTHOGONAL, ORTHONORMAL)
 
@@ -362,11 +355,8 @@ class SimbaSACPolicy(SimbaPolicy):
 
     defaults = {**SimbaPolicy.defaults, "squash_log_std": True}
 
-    def gaussian_actor(self, body: nn.Module, n_act: int) -> nn.Module:
-        return GaussianActor(body, n_act, self.squash_log_std, ORTHONORMAL, ORTHONORMAL)
-
-    def one_critic(self, body: nn.Module, n_quantiles: int) -> nn.Module:
-        return Critic(body, n_quantiles, ORTHONORMAL)
+    def last_layers(self) -> tuple[nn.initializers.Initializer, nn.initializers.Initializer]:
+        return ORTHONORMAL, ORTHONORMAL
 
 
 class CrossQPolicy(GaussianPolicy):
