@@ -1,6 +1,7 @@
 """Seeds side by side in one program: the same task, the same updates, none knows of the others."""
 
 from functools import partial
+from unittest.mock import Mock
 
 import gymnasium
 import jax
@@ -11,9 +12,12 @@ from small_models import SMALL, saved, small
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_hds import TD7, algos
-from sb3_hds.algos import learn_compiled
+from sb3_hds import TD7, algos, twins
+from sb3_hds.algos import DivergedError, compiled, learn_compiled
+from sb3_hds.algos.compiled_run import run_rounds
 from sb3_hds.envs import twin_of
+from sb3_hds.errors import EnvironmentMismatchError
+from sb3_hds.wrappers import ActionRateLimit
 
 SOFT = ["gsde_sac", "droq", "crossq_jax", "tqc_jax", "simba", "bro"]
 
@@ -107,6 +111,63 @@ def test_the_point_mass_is_solved():
         assert np.diff(own.timesteps).tolist() == [N_STEPS] * (1_500 // N_STEPS - 1)
 
 
+def test_runs_of_any_length_are_one_program():
+    model = small("tqc_jax", batch_size=13)
+    before = run_rounds._cache_size()
+
+    for n_steps in (1_100, 2_300):
+        learn_compiled(model, n_steps)
+
+    assert run_rounds._cache_size() == before + 1
+
+
+def test_seeds_that_diverge_leave_what_the_others_learned(monkeypatch):
+    model = small("tqc_jax")
+    both, _ = learn_compiled(model, 40, seeds=[3, 5])
+    monkeypatch.setattr(compiled, "_diverged", lambda _: np.array([True, False]))
+
+    with pytest.raises(DivergedError, match=r"with the seeds \[3\].*models") as caught:
+        learn_compiled(model, 40, seeds=[3, 5])
+
+    assert list(caught.value.models) == list(caught.value.episodes) == [5]
+    for one, other in zip(weights_of(caught.value.models[5]), weights_of(both[1]), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_divergence_of_all_seeds_ends_the_run(monkeypatch):
+    n_calls = Mock(side_effect=run_rounds)
+    monkeypatch.setattr(compiled, "run_rounds", n_calls)
+
+    with pytest.raises(DivergedError, match=r"with the seeds \[0, 1\]") as caught:
+        learn_compiled(small("tqc_jax", learning_rate=1e30), 3_000, seeds=[0, 1])
+
+    assert caught.value.models == {} and n_calls.call_count == 1
+
+
+def test_what_was_learned_before_an_interruption_is_returned(monkeypatch):
+    calls = iter([run_rounds, run_rounds, Mock(side_effect=KeyboardInterrupt)])
+    monkeypatch.setattr(compiled, "run_rounds", lambda *given: next(calls)(*given))
+
+    with pytest.warns(UserWarning, match="Interrupted after 2000 of 3000 steps"):
+        (model,), (episodes,) = learn_compiled(small("tqc_jax", buffer_size=5_000), 3_000)
+
+    assert model.num_timesteps == model.replay_buffer.size() == 2_000
+    assert episodes.timesteps[-1] == 2_000
+    assert model._n_updates == 2 * (2_000 - 10) // 5
+
+
+def test_a_twin_may_be_passed_for_what_a_wrapper_changes():
+    env = gymnasium.wrappers.TransformReward(gymnasium.make("Pendulum-v1"), lambda reward: reward)
+    with pytest.raises(EnvironmentMismatchError, match=r"pass a twin="):
+        learn_compiled(small("tqc_jax", env), 40)
+    with pytest.raises(EnvironmentMismatchError, match="takes actions from"):
+        learn_compiled(small("tqc_jax", env), 40, twin=twins.make("InvertedPendulum-v5"))
+
+    (model,), _ = learn_compiled(small("tqc_jax", env), 40, twin=twins.make("Pendulum"))
+
+    assert model.num_timesteps == 40
+
+
 def test_a_time_limit_is_the_environments_own():
     env = gymnasium.make("Pendulum-v1", max_episode_steps=30)
     assert twin_of(env).max_episode_steps == 200
@@ -132,6 +193,11 @@ def test_a_time_limit_is_the_environments_own():
         ),
         ("param_resets", lambda: "Pendulum-v1", {"param_resets": [50]}),
         ("episodes", lambda: "Pendulum-v1", {"train_freq": (1, "episode")}),
+        (
+            r"store='executed': use store='raw'",
+            lambda: ActionRateLimit(gymnasium.make("Pendulum-v1"), 4.0, store="executed"),
+            {},
+        ),
     ],
 )
 def test_what_needs_python_is_refused(words, env, arguments):

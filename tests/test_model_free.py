@@ -30,7 +30,7 @@ from rl_zoo_plugin.lazy import parameters_of
 from sb3_hds import GSDESAC, TD7, DroQ, SimbaSAC, algos
 from sb3_hds.algos import learn_compiled, soft_actor_critic, td7_update
 from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp, SimbaBody
-from sb3_hds.algos.gaussian_policy import SimbaPolicy, optimizer_of
+from sb3_hds.algos.gaussian_policy import SimbaPolicy
 from sb3_hds.algos.heads import ExploringActor
 from sb3_hds.algos.lap import LapReplayBuffer, SumTree
 from sb3_hds.algos.observations import Seen, flattener, seen
@@ -44,6 +44,7 @@ from sb3_hds.algos.off_policy import (
     mean,
     pessimistic,
 )
+from sb3_hds.algos.optimizers import optimizer_of
 from sb3_hds.algos.quantiles import (
     Truncated,
     all_targets,
@@ -181,7 +182,12 @@ def test_each_environment_has_its_noise_matrix_and_the_deviation_is_logged():
 
     model.learn(700, log_interval=1)
 
-    assert model.policy.matrices.shape == (3, 8, 1)
+    policy, obs = model.policy, np.ones((3, 3), np.float32)
+    gaussian, _ = act(policy.actor_network, policy.learner.actor.weights, obs)
+    noise = np.stack([gaussian.latent[0] @ matrix for matrix in policy.matrices])
+    wanted = 2.0 * np.tanh(gaussian.mean + noise)
+    np.testing.assert_allclose(model.predict(obs)[0], wanted, rtol=1e-4, atol=1e-6)
+    assert len(np.unique(wanted)) == 3
     stds = lines.column("train/std")
     assert stds and stds[-1] == pytest.approx(np.exp(-3.0), rel=0.5)
     assert isinstance(model.policy.actor_network, ExploringActor)
@@ -422,6 +428,47 @@ def test_entries_are_drawn_in_proportion_to_their_size():
     np.testing.assert_allclose(drawn, sizes / 10.0, atol=1e-3)
 
 
+def test_each_transition_has_its_priority_also_where_old_ones_are_replaced():
+    limits = spaces.Box(-1.0, 1.0, (1,))
+    buffer = LapReplayBuffer(8, limits, limits, n_envs=2)
+    add = lambda: buffer.add(*np.zeros((3, 2, 1)), np.zeros(2), np.zeros(2), [{}, {}])  # noqa: E731
+    for _ in range(4):
+        add()
+    assert buffer.priorities.entries().tolist() == [1.0] * 8
+
+    buffer.set_priorities(np.array([1, 2]), np.array([1, 0]), np.array([5.0, 3.0]))
+    assert buffer.priorities.entries().tolist() == [1.0, 1.0, 1.0, 5.0, 3.0, 1.0, 1.0, 1.0]
+    add()
+    assert buffer.priorities.entries().tolist() == [5.0, 5.0, 1.0, 5.0, 3.0, 1.0, 1.0, 1.0]
+
+    everything = np.arange(4).repeat(2), np.tile([0, 1], 4)
+    buffer.set_priorities(*everything, np.where(np.arange(8) == 5, 2.0, 0.0))
+    steps, copies = buffer.draw(10)
+    assert set(steps) == {2} and set(copies) == {1}
+    assert buffer.highest == 5.0
+    buffer.forget_highest()
+    assert buffer.highest == 2.0
+
+
+def test_td7_gives_what_it_drew_the_priority_of_its_error():
+    model = small("td7", learning_starts=100, target_update_interval=3).learn(20)
+    buffer, drawn = model.replay_buffer, (np.array([2, 5, 11]), np.zeros(3, int))
+    buffer.draw = lambda n: drawn
+    wanted = []
+    keep = buffer.set_priorities
+    buffer.set_priorities = lambda *given: wanted.append(given[2]) or keep(*given)
+
+    model.train(gradient_steps=2, batch_size=3)
+
+    entries = buffer.priorities.entries()
+    np.testing.assert_allclose(entries[[2, 5, 11]], wanted[-1])
+    assert len(np.unique(wanted)) > 3 and np.min(wanted) >= 1.0
+    assert (np.delete(entries[:20], [2, 5, 11]) == 1.0).all()
+    buffer.highest = 100.0
+    model.train(gradient_steps=1, batch_size=3)
+    assert buffer.highest == buffer.priorities.largest() < 100.0
+
+
 def test_choices_become_one_hot_and_dictionaries_one_row():
     space = spaces.Dict(
         {
@@ -503,6 +550,44 @@ def test_a_seed_may_be_a_number_of_numpy():
         small("droq", seed=0.5)
 
 
+@pytest.mark.parametrize(
+    ("name", "policy_kwargs", "message"),
+    [
+        (
+            "droq",
+            {"net_arc": [8]},
+            r"GaussianPolicy has no such argument.*mean 'net_arch'",
+        ),
+        ("td7", {"critics": 3}, r"TD7Policy has no such argument\. Did you mean 'n_critics'"),
+        ("droq", {"size": 3}, r"It has: net_arch, activation_fn, n_critics"),
+        ("simba", {"normalize_images": False}, r"for modules of torch, .*: leave it out"),
+        ("droq", {"n_quantiles": 5}, r"'n_quantiles': 5.*one value each: leave it out, or use TQC"),
+    ],
+)
+def test_arguments_that_a_policy_does_not_have_are_refused(name, policy_kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        algos.ALL[name]("Pendulum-v1", policy_kwargs=policy_kwargs)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("droq", {"policy_kwargs": {"log_std_init": -2.0}}, "log_std_init .* without use_sde"),
+        (
+            "crossq_jax",
+            {"policy_kwargs": {"batch_norm_momentum": 0.01}},
+            r"SB3-contrib's .*: pass 0\.99 for its 0\.01",
+        ),
+        ("crossq_jax", {"tau": 0.01}, "does not look at tau: there are no target networks"),
+        ("td7", {"tau": 0.01}, "does not look at tau: target networks are copied whole"),
+        ("td7", {"gradient_steps": 2}, "does not look at gradient_steps: with checkpoints"),
+    ],
+)
+def test_arguments_that_say_nothing_are_warned_of(name, arguments, message):
+    with pytest.warns(UserWarning, match=message):
+        algos.ALL[name]("Pendulum-v1", **arguments)
+
+
 def test_models_that_were_given_the_same_dictionary_do_not_share_it():
     kwargs = {"net_arch": [8]}
     exploring = GSDESAC("Pendulum-v1", policy_kwargs=kwargs)
@@ -530,6 +615,7 @@ def test_images_are_refused(shape):
         (spaces.MultiDiscrete([[2, 3], [3, 4]]), "MultiDiscrete with 2 axes"),
         (spaces.Box(-1, 1, (0,)), "has no numbers"),
         (spaces.Dict({}), "has no numbers"),
+        (spaces.Dict({"angle": spaces.Box(-1, 1, ())}), r"'angle' is a number without an axis"),
     ],
     ids=str,
 )
@@ -794,8 +880,11 @@ def test_returns_of_several_steps_and_compressed_buffers_are_learned_from(name):
     assert longer._n_updates > 0 and compressed._n_updates > 0
     discounts = batches_of(longer, 4, 16, 4).discount
     assert discounts.min() == pytest.approx(0.9**3)
-    batch = batches_of(compressed, 1, 16, 1)
-    assert (batch.obs != batch.next_obs).any()
+    batch, env = batches_of(compressed, 1, 16, 1), gymnasium.make("Pendulum-v1").unwrapped
+    env.reset()
+    for obs, action, next_obs in zip(batch.obs[0], batch.action[0], batch.next_obs[0], strict=True):
+        env.state = np.array([np.arctan2(obs[1], obs[0]), obs[2]], np.float64)
+        np.testing.assert_allclose(env.step(2.0 * action)[0], next_obs, atol=2e-5)
 
 
 @pytest.mark.parametrize("name", ["droq", "td7"])
@@ -847,6 +936,12 @@ def test_hindsight_replay_is_learned_from(name):
     )
 
     assert model.learn(40)._n_updates > 0
+    batch = batches_of(model, 1, 500, 1)
+    achieved, goal = batch.next_obs[0, :, :3], batch.obs[0, :, 3:6]
+    reached = (achieved == goal).all(1)
+    np.testing.assert_array_equal(batch.reward[0], np.where(reached, 0.0, -1.0))
+    # Four of five goals are those that were achieved later.
+    assert reached.mean() > 0.3 > (model.replay_buffer.rewards[:40] == 0.0).mean()
 
 
 def test_batches_are_normalised_as_the_environment_is_and_time_limits_are_no_end():

@@ -2,7 +2,9 @@
 
 import io
 import json
+import os
 import pickletools
+import re
 import subprocess
 import sys
 import warnings
@@ -10,9 +12,11 @@ import zipfile
 from base64 import b64decode
 from pathlib import Path
 
+import flax
 import gymnasium
 import jax
 import numpy as np
+import optax
 import pytest
 import torch as th
 from small_models import (
@@ -28,7 +32,7 @@ from small_models import (
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_hds import algos, effects, twins
+from sb3_hds import algos, effects, load_policy, twins
 from sb3_hds.algos import persistence
 from sb3_hds.errors import NoTwinError
 
@@ -46,6 +50,32 @@ folder, obs = sys.argv[1], np.load(sys.argv[1] + "/obs.npy")
 for name in sys.argv[2:]:
     model = algos.ALL[name].load(f"{folder}/{name}")
     np.save(f"{folder}/{name}.npy", model.predict(obs, deterministic=True)[0])
+"""
+
+
+# The second device stands for an accelerator, which is where arrays go unless told otherwise.
+TWO_DEVICES = """
+import sys
+import gymnasium
+import jax
+from sb3_hds import algos, load_policy
+
+cpu, accelerator = jax.devices()
+jax.config.update("jax_default_device", accelerator)
+
+def check(policy):
+    leaves = jax.tree.leaves((policy.weights, policy.training_state))
+    where = {device for leaf in leaves if isinstance(leaf, jax.Array) for device in leaf.devices()}
+    assert where == {cpu}, where
+
+for name in ("droq", "td7", "hds"):
+    path, env = f"{sys.argv[1]}/{name}.zip", gymnasium.make("Pendulum-v1")
+    model = algos.ALL[name].load(path, env=env, device="cpu")
+    check(model.policy)
+    model.set_parameters(model.get_parameters())
+    check(model.policy)
+    check(model.learn(25).policy)
+    check(load_policy(path))
 """
 
 
@@ -109,6 +139,37 @@ def test_a_file_holds_tensors_and_no_objects_of_jax(name):
     assert any("Policy" in found for found in names)
     foreign = [found for found in names if "jax" in found or "flax" in found or "learner" in found]
     assert foreign == []
+
+
+@pytest.mark.parametrize("name", ["droq", "td7", "hds"])
+def test_functions_of_jax_are_saved_by_their_names(name):
+    chosen = {"activation_fn": flax.linen.silu}
+    if name not in PLANNERS:
+        chosen["optimizer_class"] = optax.adamw
+    model = small(name)
+    model = type(model)("Pendulum-v1", policy_kwargs=model.policy_kwargs | chosen)
+
+    file = saved(model)
+
+    found = pickled_names(json.loads(zipfile.ZipFile(file).read("data")))
+    assert [name for name in found if re.search("jax|flax|optax|silu|adamw", name)] == []
+    loaded = type(model).load(file, policy_kwargs=model.policy_kwargs | chosen)
+    assert loaded.policy.arguments["activation_fn"] == "silu"
+    obs = observations()
+    for acting in (loaded, load_policy(file)):
+        actions = acting.predict(obs, deterministic=True)[0]
+        np.testing.assert_array_equal(actions, model.predict(obs, deterministic=True)[0])
+
+
+def test_what_is_loaded_stays_on_its_device(tmp_path):
+    for name in ("droq", "td7", "hds"):
+        small(name).learn(25).save(tmp_path / name)
+
+    subprocess.run(
+        [sys.executable, "-c", TWO_DEVICES, str(tmp_path)],
+        check=True,
+        env=os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"},
+    )
 
 
 @every_algorithm

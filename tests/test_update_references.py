@@ -19,6 +19,7 @@ from numpy_networks import (
     dense,
     descend,
     elu,
+    expln,
     gaussian,
     layer_norm,
     member,
@@ -35,7 +36,8 @@ from sb3_hds import algos
 from sb3_hds.algos import td7_update
 from sb3_hds.algos.bodies import Dropout
 from sb3_hds.algos.observations import Seen
-from sb3_hds.algos.off_policy import Batch, Knobs, Optimizer, Report, Trained, update
+from sb3_hds.algos.off_policy import Batch, Knobs, Report, update
+from sb3_hds.algos.optimizers import Optimizer, Trained
 
 pytestmark = pytest.mark.usefixtures("x64", "quick_compilation")
 
@@ -261,6 +263,19 @@ def test_soft_actor_critic_with_state_dependent_noise(full_std):
     check(recipe, learner, Soft(learner, mlp, least, half_square, least_worth))
 
 
+class Slow(Soft):
+    gaussian = staticmethod(partial(gaussian, matrix_std_of=expln))
+
+
+def test_the_deviation_of_the_noise_matrix_may_grow_more_slowly_than_the_exponential():
+    kwargs = {"use_expln": True, "log_std_init": 0.0}
+    recipe, learner = begun("gsde_sac", kwargs)
+    raw = np.asarray(learner.actor.weights["params"]["log_std"])
+    assert (raw > 0.0).any() and (raw < 0.0).any()
+
+    check(recipe, learner, Slow(learner, mlp, least, half_square, least_worth))
+
+
 @pytest.mark.parametrize("linear", [False, True])
 def test_droq_climbs_the_mean_and_regresses_on_the_least(linear):
     how = {"policy_delay": 1, "ent_coef": "auto_0.3", "linear_ent_coef": linear}
@@ -334,11 +349,17 @@ def _after_dropout(critic: Any, obs: Any, action: Any, w: Weights, key: Any) -> 
     return seen["intermediates"]["body"]["Dropout_0"]["__call__"][0]
 
 
-def test_tqc_drops_the_largest_of_all_quantiles():
-    recipe, learner = begun("tqc_jax", {"n_quantiles": 5}, top_quantiles_to_drop_per_net=2)
+@pytest.mark.parametrize(
+    ("n_critics", "use_sde"), [(2, False), pytest.param(5, True, marks=pytest.mark.expensive)]
+)
+def test_tqc_drops_the_largest_of_all_quantiles(n_critics, use_sde):
+    kwargs = {"n_quantiles": 5, "n_critics": n_critics}
+    kwargs |= {"log_std_init": -1.0} if use_sde else {}
+    drop = {"top_quantiles_to_drop_per_net": 2}
+    recipe, learner = begun("tqc_jax", kwargs, use_sde=use_sde, train_freq=8, **drop)
 
     def kept(values: np.ndarray) -> np.ndarray:
-        return np.array([sorted([*one, *other])[:6] for one, other in zip(*values, strict=True)])
+        return np.sort(np.concatenate([*values], -1))[:, : 3 * n_critics]
 
     check(recipe, learner, Soft(learner, mlp, kept, quantile_huber, mean_worth))
 
@@ -557,9 +578,11 @@ class Joint(Soft):
         return report
 
 
-def test_crossq_normalises_both_pairs_together_and_has_no_target_networks():
+@pytest.mark.parametrize("use_sde", [False, pytest.param(True, marks=pytest.mark.expensive)])
+def test_crossq_normalises_both_pairs_together_and_has_no_target_networks(use_sde):
     kwargs = {"renorm_warmup_steps": 1, "batch_norm_momentum": Joint.momentum}
-    recipe, learner = begun("crossq_jax", kwargs, policy_delay=1)
+    kwargs |= {"log_std_init": -1.0} if use_sde else {}
+    recipe, learner = begun("crossq_jax", kwargs, policy_delay=1, use_sde=use_sde, train_freq=8)
     assert recipe.joint_pass and learner.target == {}
     expected = Joint(learner)
 

@@ -20,15 +20,13 @@ from sb3_hds.algos.off_policy import (
     Batch,
     Knobs,
     Learner,
-    Optimizer,
     Recipe,
-    Trained,
-    Weights,
     act,
     average,
     judge,
     mean,
 )
+from sb3_hds.algos.optimizers import Optimizer, Trained, Weights
 from sb3_hds.algos.quantiles import quantile_huber
 from sb3_hds.algos.soft_actor_critic import SoftActorCritic
 from sb3_hds.algos.squashed import Gaussian, squashed_between

@@ -18,11 +18,13 @@ from sb3_hds.algos.compiled_run import Loop, Round, Run, Step, begin_run, run_ro
 from sb3_hds.algos.learner import GENERATOR
 from sb3_hds.algos.off_policy import Knobs
 from sb3_hds.algos.soft_actor_critic import SoftActorCritic
-from sb3_hds.envs import twin_of
+from sb3_hds.core import Twin
+from sb3_hds.envs.mirror import check_mirrors, twin_of
 
 Algorithm = TypeVar("Algorithm", bound=SoftActorCritic)
 
 _STEPS_PER_CALL = 1_000
+_LEAST_CAPACITY = 1 << 14
 _NO_LIMIT = np.iinfo(np.int32).max
 
 
@@ -38,49 +40,80 @@ class Episodes(NamedTuple):
     returns: np.ndarray
 
 
+class DivergedError(FloatingPointError):
+    """
+    Some seeds of ``learn_compiled`` diverged.
+
+    :param models: by their seeds, of those that did not
+    :param episodes: of the same
+    """
+
+    def __init__(
+        self,
+        message: str,
+        models: dict[int, SoftActorCritic],
+        episodes: dict[int, Episodes],
+    ) -> None:
+        super().__init__(message)
+        self.models, self.episodes = models, episodes
+
+
 def learn_compiled(
     model: Algorithm,
     total_timesteps: int,
     seeds: Iterable[int] = (0,),
     progress_bar: bool = False,
+    twin: Twin | None = None,
 ) -> tuple[list[Algorithm], list[Episodes]]:
     """
     Learn from scratch, once for each seed, without leaving the accelerator: the environment is its
     twin, stepped inside the program that also updates.
 
-    Compiled once for any number of steps, and again for another number of seeds. What SB3 does
-    around its steps is not done: callbacks, loggers, monitors. Schedules act round by round.
-    Interrupted (Ctrl-C), it returns what was learned by then.
+    Compiled once for all numbers of steps up to 16,384, again where they double, or ``buffer_size``
+    is less, and for another number of seeds. What SB3 does around its steps is not done: callbacks,
+    loggers, monitors. Schedules act round by round. Interrupted (Ctrl-C), it returns what was
+    learned by then.
 
     :param model: says how to learn, and is left as it is: any algorithm of the SAC family, with an
         environment that has a twin
     :param total_timesteps: of each seed, rounded up to whole rounds of ``train_freq``
     :param seeds: begin with the networks that the algorithm has with this seed
     :param progress_bar: show one
+    :param twin: to step in place of the one that the environment, as wrapped, is known to have
     :return: for each seed a model that can act, be saved, and go on learning from the transitions
         that it saw, and its episodes
     :raises NoTwinError: for an environment without a twin
+    :raises EnvironmentMismatchError: for a wrapper that its twin does not have, and for a twin with
+        other actions or observations
     :raises ValueError: for what only steps in Python can do: other algorithms, several
         environments, ``VecNormalize``, another replay buffer, n-step returns, action noise,
-        ``param_resets``, episodes as ``train_freq``
-    :raises FloatingPointError: if a seed diverged
+        ``param_resets``, episodes as ``train_freq``, a layer that stores what was executed
+    :raises DivergedError: if a seed diverged, when the others are done; it has what they learned
     """
     seeds = [int(seed) for seed in seeds]
     _refuse_what_needs_python(model, total_timesteps, seeds)
     models = [_copy_of(model, seed) for seed in seeds]
-    loop = _loop_of(models[0], total_timesteps)
-    runs, steps = _begun(loop, models, seeds), []
+    loop = _loop_of(models[0], total_timesteps, _twin_for(model.get_env(), twin))
+    runs, done = _begun(loop, models, seeds), []
+    lost = np.zeros(len(seeds), bool)
     try:
         for rounds in _calls(model, loop, total_timesteps, progress_bar):
             runs, now, report = run_rounds(loop, loop.twin.params, runs, rounds)
-            steps.append(_that_happened(now, rounds))
-            _refuse_divergence(report, seeds)
+            done.append((now, rounds))
+            lost |= _diverged(report)
+            if lost.all():
+                break
     except KeyboardInterrupt:
-        warnings.warn(f"Interrupted after {_n_steps(steps)} of {total_timesteps} steps.")
+        n_done = _n_steps([_that_happened(*call) for call in done])
+        warnings.warn(f"Interrupted after {n_done} of {total_timesteps} steps.")
+    steps = [_that_happened(*call) for call in done]
     whole = jax.device_get(runs._replace(key=jax.random.key_data(runs.key)))
-    for i, learned in enumerate(models):
-        _take_over(learned, _of_seed(runs, i), _of_seed(whole, i), _n_steps(steps))
-    return models, [_episodes(steps, i) for i in range(len(seeds))]
+    for i in np.flatnonzero(~lost):
+        _take_over(models[i], _of_seed(runs, i), _of_seed(whole, i), _n_steps(steps))
+    episodes = [_episodes(steps, i) for i in range(len(seeds))]
+    if lost.any():
+        raise _divergence(seeds, lost, models, episodes)
+    return models, episodes
 
 
 def _refuse_what_needs_python(model: Any, total_timesteps: Any, seeds: Sequence[int]) -> None:
@@ -95,21 +128,42 @@ def _refuse_what_needs_python(model: Any, total_timesteps: Any, seeds: Sequence[
         )
     frequency: Any = model.train_freq
     unfit = {
-        "several environments (n_envs > 1)": model.n_envs != 1,
-        "VecNormalize": model.get_vec_normalize_env() is not None,
-        "n_steps > 1": model.n_steps > 1,
-        "another replay buffer": model.replay_buffer_class not in (None, ReplayBuffer),
-        "action_noise": model.action_noise is not None,
-        "param_resets": any(at < total_timesteps for at in model.param_resets or []),
-        "episodes as train_freq": frequency.unit is not TrainFrequencyUnit.STEP,
-        "observations that are no vector": not isinstance(model.observation_space, spaces.Box),
+        "several environments (n_envs > 1)": (model.n_envs != 1, "make one"),
+        "VecNormalize": (model.get_vec_normalize_env() is not None, "leave it out"),
+        "n_steps > 1": (model.n_steps > 1, "pass n_steps=1"),
+        "another replay buffer": (
+            model.replay_buffer_class not in (None, ReplayBuffer),
+            "leave it out",
+        ),
+        "action_noise": (model.action_noise is not None, "leave it out"),
+        "param_resets": (
+            any(at < total_timesteps for at in model.param_resets or []),
+            "pass param_resets=[]",
+        ),
+        "episodes as train_freq": (
+            frequency.unit is not TrainFrequencyUnit.STEP,
+            "pass a number of steps",
+        ),
+        "observations that are no vector": (
+            not isinstance(model.observation_space, spaces.Box),
+            "flatten them",
+        ),
+        "layers with store='executed'": (_stores_executed(model.get_env()), "use store='raw'"),
     }
-    for what, is_so in unfit.items():
+    for what, (is_so, remedy) in unfit.items():
         if is_so:
             raise ValueError(
-                f"learn_compiled() cannot do {what}: leave it out, or use {type(model).__name__}"
+                f"learn_compiled() cannot do {what}: {remedy}, or use {type(model).__name__}"
                 ".learn()."
             )
+
+
+def _stores_executed(env: Any) -> bool:
+    """:return: whether the outermost layer asks for it"""
+    try:
+        return "executed" in env.get_attr("store")
+    except AttributeError:
+        return False
 
 
 def _copy_of(model: Algorithm, seed: int) -> Algorithm:
@@ -123,14 +177,21 @@ def _copy_of(model: Algorithm, seed: int) -> Algorithm:
     return copy
 
 
-def _loop_of(model: SoftActorCritic, total_timesteps: int) -> Loop:
+def _twin_for(env: Any, given: Twin | None) -> Twin:
+    if given is None:
+        return twin_of(env)
+    check_mirrors(env, given)
+    return given
+
+
+def _loop_of(model: SoftActorCritic, total_timesteps: int, twin: Twin) -> Loop:
     env: Any = model.get_env()
-    twin, frequency = twin_of(env), model.train_freq.frequency  # type: ignore[union-attr]
+    frequency = model.train_freq.frequency  # type: ignore[union-attr]
     return Loop(
         twin=twin,
         recipe=model.policy.recipe,
         limit=_limit_of(env),
-        capacity=min(model.buffer_size, _rounded_up(total_timesteps, frequency)),
+        capacity=min(model.buffer_size, _capacity(_rounded_up(total_timesteps, frequency))),
         learning_starts=model.learning_starts,
         train_freq=frequency,
         gradient_steps=frequency if model.gradient_steps == -1 else model.gradient_steps,
@@ -159,9 +220,10 @@ def _begun(loop: Loop, models: Sequence[SoftActorCritic], seeds: Sequence[int]) 
         learner = model.policy.learner._replace(key=network_key)
         singles.append(begin_run(loop, loop.twin.params, learner, key))
     stacked = jax.tree.map(lambda *parts: jnp.stack(parts), *singles)
-    return stacked._replace(
-        learner=stacked.learner._replace(n_updates=singles[0].learner.n_updates)
-    )
+    learner = stacked.learner._replace(n_updates=singles[0].learner.n_updates)
+    # What a program returns has a device of its own: arrays without would be compiled for apart.
+    (device,) = models[0].policy.learner.key.devices()
+    return jax.device_put(stacked._replace(learner=learner), device)
 
 
 def _calls(
@@ -245,13 +307,32 @@ def _n_steps(steps: Sequence[Step]) -> int:
     return sum(step.ended[0].size for step in steps)
 
 
-def _refuse_divergence(report: Any, seeds: Sequence[int]) -> None:
-    fine = np.logical_and.reduce([np.isfinite(value) for value in jax.device_get(report)])
-    if not fine.all():
-        lost = [seed for seed, ok in zip(seeds, fine, strict=True) if not ok]
-        raise FloatingPointError(
-            f"Learning diverged with the seeds {lost}. Lower the learning rate, or scale rewards."
-        )
+def _diverged(report: Any) -> np.ndarray:
+    """:return: of each seed, whether a number of its last updates is not finite"""
+    values = jax.device_get(report)
+    return ~np.logical_and.reduce([np.isfinite(value) for value in values])
+
+
+def _divergence(
+    seeds: Sequence[int],
+    lost: np.ndarray,
+    models: Sequence[SoftActorCritic],
+    episodes: Sequence[Episodes],
+) -> DivergedError:
+    names = [seed for seed, is_lost in zip(seeds, lost, strict=True) if is_lost]
+    rest = "" if lost.all() else " What the others learned is in this error's models and episodes."
+    kept = np.flatnonzero(~lost)
+    return DivergedError(
+        f"Learning diverged with the seeds {names}. Lower the learning rate, or scale "
+        f"rewards.{rest}",
+        {seeds[i]: models[i] for i in kept},
+        {seeds[i]: episodes[i] for i in kept},
+    )
+
+
+def _capacity(n: int) -> int:
+    """:return: a power of 2 from ``n`` on: few sizes are few compiled programs"""
+    return max(_LEAST_CAPACITY, 1 << (n - 1).bit_length())
 
 
 def _rounded_up(total_timesteps: int, frequency: int) -> int:

@@ -56,3 +56,7 @@ class CrossQ(SoftActorCritic):
             linear_ent_coef=linear_ent_coef,
             **arguments,
         )
+
+    def check_arguments(self) -> None:
+        super().check_arguments()
+        self.warn_unless_usual("tau", "target_update_interval", why="there are no target networks")

@@ -2,6 +2,7 @@
 
 import inspect
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
@@ -10,8 +11,6 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
@@ -24,9 +23,7 @@ from sb3_hds.algos.networks import Activation, activation, widths_of
 from sb3_hds.algos.observations import Seen, flattener, seen, size_of
 from sb3_hds.algos.off_policy import (
     Learner,
-    Optimizer,
     Recipe,
-    Weights,
     act,
     begin,
     explored,
@@ -35,32 +32,12 @@ from sb3_hds.algos.off_policy import (
     pessimistic,
     squared,
 )
+from sb3_hds.algos.optimizers import Weights, optimizer_of
+from sb3_hds.algos.policy_description import by_names
 
-_OPTIMIZERS = {
-    "adam": optax.adam,
-    "adamw": optax.adamw,
-    "sgd": optax.sgd,
-    "rmsprop": optax.rmsprop,
-    "nadam": optax.nadam,
-    "radam": optax.radam,
-    "adabelief": optax.adabelief,
-    "lion": optax.lion,
-    "adamax": optax.adamax,
-    "adadelta": optax.adadelta,
-    "adagrad": optax.adagrad,
-}
-# Of torch's classes: where their defaults are not those of optax. NAdam's momentum has a schedule
-# that optax does not have.
-_TORCH: dict[str, dict[str, Any]] = {
-    "adam": {},
-    "adamw": {"weight_decay": 1e-2},
-    "sgd": {},
-    "rmsprop": {"decay": 0.99, "eps_in_sqrt": False},
-    "radam": {},
-    "adamax": {},
-    "adadelta": {},
-    "adagrad": {"initial_accumulator_value": 0.0, "eps": 1e-10},
-}
+_OF_GSDE = ("log_std_init", "full_std", "use_expln", "clip_mean")
+# Of the policy's constructor: what is no argument.
+_NO_ARGUMENTS = ("self", "observation_space", "action_space", "__class__")
 
 
 class GaussianPolicy(LearningPolicy):
@@ -80,7 +57,8 @@ class GaussianPolicy(LearningPolicy):
     :param layer_norm: in the critics; the networks of SimBa and BRO have it in any case
     :param renorm_warmup_steps: batch normalisation in actor and critics, which becomes batch
         renormalisation after so many updates; None: neither, but 100,000 with ``CrossQPolicy``
-    :param batch_norm_momentum: the share of its running statistics that stays at an update
+    :param batch_norm_momentum: the share of its running statistics that stays at an update, as in
+        SBX; SB3-contrib's ``batch_norm_momentum=0.01`` is 0.99 here
     :param ortho_init: whether layers start orthogonal, as in JAXRL's SAC, rather than as flax and
         SBX have it: with a gain of the square root of 2, and of 1 where the deviation is read off;
         ``"hidden"``: but the last ones. The networks of SimBa and BRO start as in their papers
@@ -138,11 +116,8 @@ class GaussianPolicy(LearningPolicy):
         optimizer_kwargs: Mapping[str, Any] | None = None,
         qf_optimizer_kwargs: Mapping[str, Any] | None = None,
     ) -> None:
-        self.arguments = {
-            name: value
-            for name, value in locals().items()
-            if name not in ("self", "observation_space", "action_space", "__class__")
-        }
+        given = {name: value for name, value in locals().items() if name not in _NO_ARGUMENTS}
+        self.arguments = by_names(given)
         super().__init__(observation_space, action_space, squash_output=True)
         chosen = {
             name: self.defaults.get(name) if value is None else value
@@ -154,6 +129,7 @@ class GaussianPolicy(LearningPolicy):
             check_count("renorm_warmup_steps", chosen["renorm_warmup_steps"], 0)
         _check_settings(self.arguments)
         self._refuse_unused(has_batch_norm=chosen["renorm_warmup_steps"] is not None)
+        self._warn_of_unused()
         if use_sde and squash_log_std:
             raise ValueError(
                 f"policy_kwargs={{'squash_log_std': {squash_log_std!r}}}: with use_sde=True, the "
@@ -171,7 +147,7 @@ class GaussianPolicy(LearningPolicy):
         self.ortho_init = ortho_init
         self.normalize_observations = bool(chosen["normalize_observations"])
         self.squash_log_std = bool(chosen["squash_log_std"]) and not use_sde
-        self.n_critics, self.use_sde = n_critics, use_sde
+        self.n_critics, self.n_quantiles, self.use_sde = n_critics, n_quantiles, use_sde
         n_act = int(np.prod(action_space.shape))
         pi, qf = self.widths
         body = self.actor_body(pi)
@@ -202,6 +178,19 @@ class GaussianPolicy(LearningPolicy):
                     f"policy_kwargs={{'{name}': {self.arguments[name]!r}}}: the networks of "
                     f"{type(self).__name__} do not use {name} here; leave it out."
                 )
+
+    def _warn_of_unused(self) -> None:
+        usual = inspect.signature(GaussianPolicy).parameters
+        idle = [name for name in _OF_GSDE if self.arguments[name] != usual[name].default]
+        if idle and not self.arguments["use_sde"]:
+            warnings.warn(f"{', '.join(idle)} in policy_kwargs say nothing without use_sde=True.")
+        momentum = self.arguments["batch_norm_momentum"]
+        if momentum < 0.5:
+            warnings.warn(
+                f"batch_norm_momentum={momentum} is the share of the running statistics that "
+                "stays at an update, as in SBX. SB3-contrib's is the share of the new: pass "
+                f"{1.0 - momentum:g} for its {momentum}."
+            )
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
         return Mlp(
@@ -389,42 +378,6 @@ def widths(
             f"[256, 256]}}, got {net_arch!r}."
         )
     return pi, qf
-
-
-def optimizer_of(make: str | Callable[..., Any], arguments: Mapping[str, Any]) -> Optimizer:
-    """
-    :param make: name or function of optax, with its defaults, or torch class, with those of torch
-    :param arguments: of optax's function, or torch's ``betas`` and ``alpha``
-    :raises ValueError: for one that is not known here
-    """
-    arguments = dict(arguments)
-    if "betas" in arguments:
-        arguments["b1"], arguments["b2"] = arguments.pop("betas")
-    if "alpha" in arguments:
-        arguments["decay"] = arguments.pop("alpha")
-    name = make if isinstance(make, str) else getattr(make, "__name__", "")
-    of_torch = isinstance(make, type) and issubclass(make, th.optim.Optimizer)
-    # A function is taken as it is, whatever its name.
-    found = _OPTIMIZERS.get(name.lower()) if isinstance(make, str) or of_torch else None
-    if of_torch:
-        if name.lower() not in _TORCH or getattr(th.optim, name) is not make:
-            other = f"optimizer_class='{name.lower()}'" if found else "one of these names"
-            raise ValueError(
-                f"optimizer_class={name} of {make.__module__} has no equal in optax, as "
-                f"{', '.join(_TORCH)} of torch have: use {other}."
-            )
-        arguments = _TORCH[name.lower()] | arguments
-    if found is None and (isinstance(make, str | type) or not callable(make)):
-        raise ValueError(
-            f"optimizer_class must be one of {', '.join(_OPTIMIZERS)}, an optax function or a "
-            f"torch class of one of these names, got {make!r}."
-        )
-    optimizer = Optimizer(found or make, tuple(sorted(arguments.items())))  # type: ignore[arg-type]
-    try:
-        optimizer.init({"w": jnp.zeros(1)})
-    except TypeError as error:
-        raise ValueError(f"optimizer_kwargs {arguments!r} do not fit {name}: {error}.") from None
-    return optimizer
 
 
 def _check_settings(arguments: Mapping[str, Any]) -> None:

@@ -48,6 +48,10 @@ class SumTree:
             node = node + right
         return node - (1 << self._depth)
 
+    def entries(self) -> np.ndarray:
+        """:return: all, shape ``(m,)``, where ``m`` is a power of 2; those beyond ``n`` are 0"""
+        return self._sums[1 << self._depth :].copy()
+
     def largest(self) -> float:
         return float(self._sums[1 << self._depth :].max())
 

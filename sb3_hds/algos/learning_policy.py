@@ -11,7 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import is_vectorized_observation
 
 from sb3_hds.algos.learner import GENERATOR
-from sb3_hds.algos.off_policy import Trained
+from sb3_hds.algos.optimizers import Trained
 from sb3_hds.algos.persistence import TensorPolicy, TrainingTensors
 
 
@@ -61,6 +61,9 @@ class LearningPolicy(TensorPolicy):
     def learner(self, learner: Any) -> None:
         self._learner = learner
 
+    def move_to(self, device: Any) -> None:
+        self.learner = jax.device_put(self.learner, device)
+
     def prepare_obs(self, observation: Any) -> tuple[Any, bool]:
         space = self.observation_space
         if not isinstance(space, spaces.Dict):
@@ -104,8 +107,10 @@ class LearningPolicy(TensorPolicy):
 
     @training_state.setter
     def training_state(self, tree: Any) -> None:
-        key = jnp.asarray(np.asarray(tree["key"]).astype(np.uint32))
-        self._take("optimizer", tree | {"key": jax.random.wrap_key_data(key, impl=GENERATOR)})
+        data = jnp.asarray(np.asarray(tree["key"]).astype(np.uint32))
+        key = jax.random.wrap_key_data(data, impl=GENERATOR)
+        placed = jax.device_put(key, self.learner.key.sharding)
+        self._take("optimizer", tree | {"key": placed})
 
     def _take(self, of_networks: str, tree: Any) -> None:
         before = self.learner._asdict()

@@ -1,11 +1,15 @@
 """What model-free algorithms share: SB3 collects steps and calls ``train``, which updates."""
 
+import difflib
+import inspect
 import itertools
 import math
 import numbers
 import operator
 import warnings
 from abc import abstractmethod
+from collections import ChainMap
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from gymnasium import spaces
@@ -17,12 +21,21 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from sb3_hds.algos.call_forms import between, check_policy, is_count, policy_and_env, schedule_of
 from sb3_hds.algos.learning_policy import LearningPolicy
 from sb3_hds.algos.observations import check_actions, check_observations
+from sb3_hds.algos.policy_description import by_names
 from sb3_hds.algos.tensor_algorithm import TensorAlgorithm
 from sb3_hds.errors import EnvironmentMismatchError
 
 # What is logged of updates of the actor, which not every call of ``train`` makes.
 _OF_ACTOR = ("actor_loss", "ent_coef", "ent_coef_loss")
 _NOT_THERE = object()
+# What the constructors of policies are given by their algorithm, and what only SB3's have.
+_OF_ALGORITHMS = ("observation_space", "action_space", "lr_schedule", "use_sde")
+_OF_TORCH = (
+    "features_extractor_class",
+    "features_extractor_kwargs",
+    "share_features_extractor",
+    "normalize_images",
+)
 
 
 class ModelFreeAlgorithm(TensorAlgorithm):
@@ -129,7 +142,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
-            policy_kwargs=dict(policy_kwargs or {}),
+            policy_kwargs=by_names(policy_kwargs or {}),
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
@@ -289,6 +302,18 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             got = getattr(self, name)
             raise ValueError(f"{type(self).__name__}({name}={got!r}): {name} must be {allowed}.")
 
+    def warn_unless_usual(self, *names: str, why: str) -> None:
+        """
+        :param names: of arguments that do nothing here
+        :param why: not
+        """
+        usual = ChainMap(
+            *({**inspect.signature(kind.__init__).parameters} for kind in type(self).__mro__)
+        )
+        idle = [name for name in names if getattr(self, name) != usual[name].default]
+        if idle:
+            warnings.warn(f"{type(self).__name__} does not look at {', '.join(idle)}: {why}.")
+
     def _setup_model(self) -> None:
         if isinstance(self.learning_rate, str):
             self.learning_rate = schedule_of(self.learning_rate)
@@ -303,6 +328,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         super()._setup_model()
         self.qf_learning_rate = given
         self._derived_buffer = self.replay_buffer_class if derived else None
+        self._refuse_unknown(self.policy_kwargs)
         self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
         )
@@ -310,6 +336,26 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         # SB3 draws gSDE's noise and reads its deviation from the actor.
         self.actor: Any = self.policy.actor
         self.critic: Any = self.policy.critic
+
+    def _refuse_unknown(self, policy_kwargs: Mapping[str, Any]) -> None:
+        """
+        :raises ValueError: for what the policy has no argument of
+        """
+        parameters = inspect.signature(self.policy_class).parameters
+        if any(each.kind is inspect.Parameter.VAR_KEYWORD for each in parameters.values()):
+            return
+        known = [name for name in parameters if name not in _OF_ALGORITHMS]
+        for name in policy_kwargs:
+            if name in parameters:
+                continue
+            close = difflib.get_close_matches(name, known, 1)
+            way_out = f"Did you mean '{close[0]}'?" if close else f"It has: {', '.join(known)}."
+            if name in _OF_TORCH:
+                way_out = "It is for modules of torch, and networks here are JAX's: leave it out."
+            raise ValueError(
+                f"{type(self).__name__}(policy_kwargs={{'{name}': ...}}): "
+                f"{self.policy_class.__name__} has no such argument. {way_out}"
+            )
 
     def _derive_buffer(self) -> None:
         """What ``load`` was passed counts, not what it read."""

@@ -99,6 +99,12 @@ def activation(choice: str | Activation | type) -> Activation:
     return _checked(choice)
 
 
+def activation_name(choice: Any) -> Any:
+    """:return: of a function that is known here, its name; anything else as it is"""
+    names = (name for name, known in ACTIVATIONS.items() if known is choice)
+    return next(names, choice)
+
+
 def _checked(function: Activation) -> Activation:
     given = jax.ShapeDtypeStruct((2, 3), jnp.float32)
     try:

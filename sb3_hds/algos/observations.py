@@ -74,6 +74,11 @@ def check_observations(space: spaces.Space) -> None:
                 "MultiDiscrete, MultiBinary, and Dict of these: "
                 "gymnasium.wrappers.FlattenObservation makes one of most others."
             )
+        if name and isinstance(part, spaces.Box) and part.shape == ():
+            raise EnvironmentMismatchError(
+                f"{what} is a number without an axis ({part}), and SB3's replay buffers need one: "
+                "give it the shape (1,)."
+            )
         if isinstance(part, spaces.MultiDiscrete) and len(part.shape) != 1:
             raise EnvironmentMismatchError(
                 f"{what} is a MultiDiscrete with {len(part.shape)} axes, and SB3's replay buffers "

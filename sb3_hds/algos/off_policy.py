@@ -7,7 +7,7 @@ and optimisers there are.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -19,9 +19,9 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sb3_hds.algos.observations import Seen, seen
+from sb3_hds.algos.optimizers import Optimizer, Trained, Weights
 from sb3_hds.algos.squashed import Gaussian, log_probability
 
-Weights = Mapping[str, Any]
 Values = Float[Array, "critics batch values"]
 Targets = Float[Array, "batch targets"]
 Loss = Float[Array, ""]
@@ -38,16 +38,6 @@ class Batch(NamedTuple):
     reward: Float[Array, "*batch"]
     terminated: Float[Array, "*batch"]
     discount: Float[Array, "*batch"]
-
-
-class Trained(NamedTuple):
-    """
-    :param weights: flax variables, ``"params"`` and, where there are some, ``"statistics"``
-    :param optimizer: state of the optimiser of the params
-    """
-
-    weights: Weights
-    optimizer: Any
 
 
 class Learner(NamedTuple):
@@ -143,33 +133,6 @@ class Recipe:
     joint_pass: bool = False
     normalize: bool = False
     extra: "Extra | None" = None
-
-
-@dataclasses.dataclass(frozen=True)
-class Optimizer:
-    """
-    An optax optimiser, without its learning rate, so that schedules act without compiling again.
-
-    :param make: ``optax.adam`` or one that is called like it
-    :param arguments: besides the learning rate
-    """
-
-    make: Callable[..., optax.GradientTransformation]
-    arguments: tuple[tuple[str, Any], ...] = ()
-
-    def init(self, params: Any) -> Any:
-        return self._transformation.init(params)
-
-    def apply(self, gradient: Any, trained: Trained, rate: Any) -> Trained:
-        params = trained.weights["params"]
-        step, state = self._transformation.update(gradient, trained.optimizer, params)
-        step = jax.tree.map(lambda s: rate * s, step)
-        weights = {**trained.weights, "params": optax.apply_updates(params, step)}
-        return Trained(weights, state)
-
-    @property
-    def _transformation(self) -> optax.GradientTransformation:
-        return self.make(learning_rate=1.0, **dict(self.arguments))
 
 
 class Extra(Protocol):

@@ -96,7 +96,7 @@ def from_state_dict(tree: Any, tensors: dict[str, th.Tensor], strict: bool = Tru
     :param tree: a pytree of the wanted structure; gives shapes and dtypes
     :param tensors: what :func:`to_state_dict` made of such a pytree
     :param strict: whether names must match exactly; otherwise missing leaves keep their value
-    :return: the pytree with the tensors' values
+    :return: the pytree with the tensors' values, on the devices where its leaves are
     :raises RuntimeError: for missing or unexpected names, or another shape; as torch does
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(tree)
@@ -115,8 +115,7 @@ def from_state_dict(tree: Any, tensors: dict[str, th.Tensor], strict: bool = Tru
                 f"needs {np.shape(leaf)}. Was it built with other policy_kwargs?"
             )
         value = tensors[name].cpu().numpy() if name in tensors else leaf
-        on_host = isinstance(leaf, np.ndarray)
-        values.append(value if on_host else jnp.asarray(value, dtype=leaf.dtype))
+        values.append(_where(leaf, value))
     return jax.tree_util.tree_unflatten(structure, values)
 
 
@@ -172,6 +171,13 @@ class TensorPolicy(BaseJaxPolicy):
         """Rounding may lead out of the bounds, by one unit in the last place."""
         low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
         return np.clip(super().unscale_action(scaled_action), low, high)
+
+    def move_to(self, device: Any) -> None:
+        """
+        Nothing to move: its numbers are on the host.
+
+        :param device: of JAX
+        """
 
     @property
     def weights(self) -> Any:
@@ -247,6 +253,15 @@ class Tensors:
 def _remove(file: Path) -> None:
     with contextlib.suppress(OSError):
         file.unlink()
+
+
+def _where(leaf: Any, value: Any) -> Any:
+    """:return: the value, where the leaf is and of its type"""
+    if isinstance(leaf, np.ndarray):
+        return value
+    placed = jnp.asarray(value, dtype=leaf.dtype)
+    committed = isinstance(leaf, jax.Array) and leaf.committed
+    return jax.device_put(placed, leaf.sharding) if committed else placed
 
 
 def _name(path: tuple) -> str:

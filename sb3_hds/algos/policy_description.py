@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_hds.algos.networks import ACTIVATIONS, activation
+from sb3_hds.algos.networks import activation, activation_name
+from sb3_hds.algos.optimizers import optimizer_name
 from sb3_hds.algos.persistence import TensorPolicy
 
 # Arguments of policies that prediction does not need: they say how to learn.
@@ -23,7 +24,7 @@ def described(policy: TensorPolicy) -> dict[str, Any] | None:
     if not kind.__module__.startswith("sb3_hds."):
         return None
     arguments = {
-        name: _name_of(value) if name.endswith("activation_fn") else value
+        name: activation_name(activation(value)) if name.endswith("activation_fn") else value
         for name, value in policy.arguments.items()
         if name not in _OF_LEARNING
     }
@@ -38,6 +39,21 @@ def described(policy: TensorPolicy) -> dict[str, Any] | None:
         return json.loads(json.dumps(description, default=_plain))
     except TypeError:
         return None
+
+
+def by_names(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Files hold arguments, too, and a function of JAX is pickled by parts of JAX that change.
+
+    :return: the same, with the names of activations and optimisers where their functions were given
+    """
+    named = dict(policy_kwargs)
+    for argument, value in policy_kwargs.items():
+        if argument.endswith("activation_fn"):
+            named[argument] = activation_name(value)
+        elif argument == "optimizer_class":
+            named[argument] = optimizer_name(value)
+    return named
 
 
 def space_to_plain(space: spaces.Space) -> dict[str, Any]:
@@ -93,10 +109,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} is no plain data.")
-
-
-def _name_of(choice: Any) -> Any:
-    """An activation by its name; a function that has none stays one, which is no plain data."""
-    function = activation(choice)
-    names = (name for name, known in ACTIVATIONS.items() if known is function)
-    return next(names, function)

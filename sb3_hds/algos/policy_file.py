@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import torch as th
 
 from sb3_hds.algos.persistence import TensorPolicy
@@ -60,6 +61,7 @@ def load_policy(path: str | os.PathLike[str] | io.BufferedIOBase) -> TensorPolic
             "trust whoever saved it, load it with its algorithm, for example HDS.load(path)."
         )
     policy = _built(description)
+    policy.move_to(_cpu())
     try:
         policy.load_state_dict(th.load(tensors, map_location="cpu", weights_only=True))
     # What torch raises for a damaged file has many types, and recommends to unpickle it.
@@ -93,6 +95,14 @@ def _class_named(name: str) -> type[TensorPolicy]:
     :raises KeyError: for one that is not ours
     """
     return getattr(importlib.import_module(f"sb3_hds.algos.{_MODULES[name]}"), name)
+
+
+def _cpu() -> Any:
+    """:return: where ``JAX_PLATFORMS`` leaves out the CPU, the first device that there is"""
+    try:
+        return jax.devices("cpu")[0]
+    except RuntimeError:
+        return jax.devices()[0]
 
 
 def _existing(path: Any) -> Any:

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_hds.algos.call_forms import device_or_cpu
 from sb3_hds.algos.persistence import damage_reported, write_whole
-from sb3_hds.algos.policy_description import described
+from sb3_hds.algos.policy_description import by_names, described
 
 
 class SavesTensors(BaseAlgorithm):
@@ -54,6 +54,8 @@ class SavesTensors(BaseAlgorithm):
         :param device: where to; ``"cuda"`` means the CPU where there is none, with a warning
         :raises ValueError: for a damaged file, or one that another algorithm saved
         """
+        if kwargs.get("policy_kwargs"):
+            kwargs["policy_kwargs"] = by_names(kwargs["policy_kwargs"])
         with damage_reported(path):
             return super().load(path, env, device_or_cpu(device), *args, **kwargs)
 

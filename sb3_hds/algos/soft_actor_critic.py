@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv, TrainFrequencyUnit
 from sb3_hds.algos.call_forms import between, is_count, jax_device
 from sb3_hds.algos.gaussian_policy import GaussianPolicy, SimbaPolicy
 from sb3_hds.algos.model_free import ModelFreeAlgorithm, finite
-from sb3_hds.algos.off_policy import Knobs, Recipe, Report, log_of, update
+from sb3_hds.algos.off_policy import Knobs, Recipe, Report, log_of, squared, update
 from sb3_hds.algos.sampling import batches_of
 
 # Updates of one compiled call; more are made in several.
@@ -111,7 +111,13 @@ class SoftActorCritic(ModelFreeAlgorithm):
 
     def _build(self, seed: int) -> None:
         start, device = _initial_ent_coef(self.ent_coef), jax_device(self._device_name)
-        self.policy.build(self.recipe(), start, seed, device)
+        recipe, n_quantiles = self.recipe(), self.policy.n_quantiles
+        if recipe.error is squared and n_quantiles > 1:
+            raise ValueError(
+                f"{type(self).__name__}(policy_kwargs={{'n_quantiles': {n_quantiles}}}): its "
+                "critics have one value each: leave it out, or use TQC."
+            )
+        self.policy.build(recipe, start, seed, device)
 
     def _restart(self, seed: int) -> None:
         """The entropy coefficient stays with its optimiser, as in SBX, but for BRO."""

@@ -18,7 +18,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 
 from sb3_hds.algos.call_forms import between, check_count, is_count, jax_device
-from sb3_hds.algos.gaussian_policy import optimizer_of, widths
+from sb3_hds.algos.gaussian_policy import widths
 from sb3_hds.algos.lap import LapReplayBuffer
 from sb3_hds.algos.learner import GENERATOR
 from sb3_hds.algos.learning_policy import LearningPolicy
@@ -26,6 +26,8 @@ from sb3_hds.algos.model_free import ModelFreeAlgorithm, finite
 from sb3_hds.algos.networks import Activation, activation
 from sb3_hds.algos.observations import flattener, size_of
 from sb3_hds.algos.off_policy import Batch
+from sb3_hds.algos.optimizers import optimizer_of
+from sb3_hds.algos.policy_description import by_names
 from sb3_hds.algos.sampling import batches_of, transitions
 from sb3_hds.algos.td7_update import (
     Actor,
@@ -85,9 +87,8 @@ class TD7Policy(LearningPolicy):
         optimizer_kwargs: Mapping[str, Any] | None = None,
         use_sde: bool = False,
     ) -> None:
-        self.arguments = {
-            name: value for name, value in locals().items() if name not in _NO_ARGUMENTS
-        }
+        given = {name: value for name, value in locals().items() if name not in _NO_ARGUMENTS}
+        self.arguments = by_names(given)
         super().__init__(observation_space, action_space, squash_output=True)
         check_count("n_critics", n_critics)
         check_count("embedding_size", embedding_size)
@@ -308,6 +309,10 @@ class TD7(ModelFreeAlgorithm):
         several = self.n_envs > 1 and self.use_checkpoints
         self.refuse_unless(not several, "use_checkpoints", "False with several environments")
         self.refuse_unless(not self.use_sde, "use_sde", "False: noise is added to the actions")
+        self.warn_unless_usual("tau", why="target networks are copied whole")
+        if self.assesses:
+            why = "with checkpoints, there are as many updates as steps (use_checkpoints=False)"
+            self.warn_unless_usual("gradient_steps", why=why)
         if self.prioritised:
             self.refuse_unless(self.n_steps == 1, "n_steps", "1 with LapReplayBuffer")
             compressed = self.optimize_memory_usage

@@ -19,7 +19,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sb3_hds.algos.networks import Activation
-from sb3_hds.algos.off_policy import Batch, Optimizer, Trained, Weights
+from sb3_hds.algos.off_policy import (
+    Batch,
+)
+from sb3_hds.algos.optimizers import Optimizer, Trained, Weights
 
 _EPSILON = 1e-8
 # Uniform, of variance 1 / (3 n) with n inputs.

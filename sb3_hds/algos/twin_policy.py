@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from sb3_hds.algos.learner import GENERATOR, Networks, Progress, fresh_networks
 from sb3_hds.algos.networks import Activation, Actor, Value, activation, widths_of
 from sb3_hds.algos.persistence import TensorPolicy, TrainingTensors
+from sb3_hds.algos.policy_description import by_names
 
 _POLICY_WIDTHS, _VALUE_WIDTHS = (96, 96), (64, 64)
 
@@ -49,13 +50,14 @@ class TwinPolicy(TensorPolicy):
         function = activation(activation_fn)
         if not max_grad_norm > 0.0:
             raise ValueError(f"max_grad_norm must be above 0, got {max_grad_norm!r}.")
-        self.arguments = {
+        given = {
             "lr_schedule": lr_schedule,
             "net_arch": net_arch,
             "activation_fn": activation_fn,
             "linear_path": linear_path,
             "max_grad_norm": max_grad_norm,
         }
+        self.arguments = by_names(given)
         self.actor_network = Actor(int(np.prod(action_space.shape)), pi, function, linear_path)
         self.value_network = Value(vf, function)
         self.max_grad_norm = max_grad_norm
@@ -76,6 +78,9 @@ class TwinPolicy(TensorPolicy):
         )
         self.networks, self.progress = jax.device_put((networks, progress), device)
 
+    def move_to(self, device: Any) -> None:
+        self.networks, self.progress = jax.device_put((self.networks, self.progress), device)
+
     @property
     def weights(self) -> Networks:
         return self.networks
@@ -91,8 +96,9 @@ class TwinPolicy(TensorPolicy):
 
     @training_state.setter
     def training_state(self, tree: Progress) -> None:
-        key = np.asarray(tree.key).astype(np.uint32)
-        self.progress = tree._replace(key=jnp.asarray(key))
+        key = jnp.asarray(np.asarray(tree.key).astype(np.uint32))
+        placed = jax.device_put(key, self.progress.key.sharding)
+        self.progress = tree._replace(key=placed)
 
     def forward(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
         return self._predict(obs, deterministic)
