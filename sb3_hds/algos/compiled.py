@@ -108,7 +108,7 @@ def learn_compiled(
         warnings.warn(f"Interrupted after {n_done} of {total_timesteps} steps.")
     steps = [_that_happened(*call) for call in done]
     whole = jax.device_get(runs._replace(key=jax.random.key_data(runs.key)))
-    for i in np.flatnonzero(~lost):
+    for i in np.flatnonzero(~lost).tolist():
         _take_over(models[i], _of_seed(runs, i), _of_seed(whole, i), _n_steps(steps))
     episodes = [_episodes(steps, i) for i in range(len(seeds))]
     if lost.any():
@@ -321,7 +321,7 @@ def _divergence(
 ) -> DivergedError:
     names = [seed for seed, is_lost in zip(seeds, lost, strict=True) if is_lost]
     rest = "" if lost.all() else " What the others learned is in this error's models and episodes."
-    kept = np.flatnonzero(~lost)
+    kept = [i for i, is_lost in enumerate(lost) if not is_lost]
     return DivergedError(
         f"Learning diverged with the seeds {names}. Lower the learning rate, or scale "
         f"rewards.{rest}",
