@@ -26,11 +26,12 @@ class SimbaSAC(SoftActorCritic):
     0.995, is for ``gamma`` to say.
 
     As in the authors' code, :math:`\tanh` squashes the logarithm of the deviation of actions into
-    [-10, 2]: actions start with a deviation near :math:`e^{-4}`, where SAC and SBX clip it to
-    [-20, 2] and start near 1. With gSDE (``use_sde=True``), the deviation is that of the noise
-    matrix, which is neither. The loss of the entropy coefficient has the coefficient itself, as
-    theirs, where SBX has its logarithm. A file of SimbaSAC that says nothing of squashing clips, as
-    it did.
+    [-10, 2]: actions start with a deviation near :math:`e^{-4}`, where SAC and SBX clip it to [-20,
+    2] and start near 1. With gSDE (``use_sde=True``), the deviation is that of the noise matrix,
+    which is neither. The loss of the entropy coefficient has the coefficient itself, as theirs,
+    where SBX has its logarithm. Critics are updated before the actor, as in SBX and in the other
+    algorithms here; the authors' code updates them last. A file of SimbaSAC that says nothing of
+    squashing clips, as it did.
 
     SBX's variant is ``learning_rate=3e-4, ent_coef="auto", target_entropy=-n_act,
     linear_ent_coef=False, gradient_steps=1`` with ``policy_kwargs={"net_arch": [256, 256],
