@@ -558,15 +558,20 @@ def test_a_seed_may_be_a_number_of_numpy():
             {"net_arc": [8]},
             r"GaussianPolicy has no such argument.*mean 'net_arch'",
         ),
+        ("hds", {"net_arc": [8]}, r"TwinPolicy has no such argument.*mean 'net_arch'"),
         ("td7", {"critics": 3}, r"TD7Policy has no such argument\. Did you mean 'n_critics'"),
         ("droq", {"size": 3}, r"It has: net_arch, activation_fn, n_critics"),
         ("simba", {"normalize_images": False}, r"for modules of torch, .*: leave it out"),
-        ("droq", {"n_quantiles": 5}, r"'n_quantiles': 5.*one value each: leave it out, or use TQC"),
     ],
 )
 def test_arguments_that_a_policy_does_not_have_are_refused(name, policy_kwargs, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(TypeError, match=message):
         algos.ALL[name]("Pendulum-v1", policy_kwargs=policy_kwargs)
+
+
+def test_critics_of_one_value_have_no_quantiles():
+    with pytest.raises(ValueError, match=r"'n_quantiles': 5.*one value each: leave it out, or use"):
+        DroQ("Pendulum-v1", policy_kwargs={"n_quantiles": 5})
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,11 @@
 """The ways in which an algorithm may be called."""
 
+import difflib
+import inspect
 import math
 import numbers
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -53,6 +55,14 @@ _SHARES = (
     "temperature_decay",
 )
 _OF_RESIDUAL = ("n_members", "net_arch", "caution")
+# What the constructors of policies are given by their algorithm, and what only SB3's have.
+_OF_ALGORITHMS = ("observation_space", "action_space", "lr_schedule", "use_sde")
+_OF_TORCH = (
+    "features_extractor_class",
+    "features_extractor_kwargs",
+    "share_features_extractor",
+    "normalize_images",
+)
 _CHOICES = {
     "order": (1, 2),
     "planner": (None, *PLANNERS),
@@ -94,6 +104,28 @@ def check_twin_observes(space: spaces.Space) -> None:
         raise EnvironmentMismatchError(
             f"A twin observes a Box with one axis, and this environment observes {space}. Use one "
             "that has a twin (sb3_hds.twins.all_ids() lists them), or make your own of its state."
+        )
+
+
+def check_policy_kwargs(policy: type, policy_kwargs: Iterable[str]) -> None:
+    """
+    :param policy: a class
+    :param policy_kwargs: names of what it is made with, besides what algorithms pass
+    :raises TypeError: for what it has no argument of, as Python does
+    """
+    parameters = inspect.signature(policy).parameters
+    if any(each.kind is inspect.Parameter.VAR_KEYWORD for each in parameters.values()):
+        return
+    known = [name for name in parameters if name not in _OF_ALGORITHMS]
+    for name in policy_kwargs:
+        if name in parameters:
+            continue
+        close = difflib.get_close_matches(name, known, 1)
+        way_out = f"Did you mean '{close[0]}'?" if close else f"It has: {', '.join(known)}."
+        if name in _OF_TORCH:
+            way_out = "It is for modules of torch, and networks here are JAX's: leave it out."
+        raise TypeError(
+            f"policy_kwargs={{'{name}': ...}}: {policy.__name__} has no such argument. {way_out}"
         )
 
 

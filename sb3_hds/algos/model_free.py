@@ -1,6 +1,5 @@
 """What model-free algorithms share: SB3 collects steps and calls ``train``, which updates."""
 
-import difflib
 import inspect
 import itertools
 import math
@@ -9,7 +8,6 @@ import operator
 import warnings
 from abc import abstractmethod
 from collections import ChainMap
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from gymnasium import spaces
@@ -28,14 +26,6 @@ from sb3_hds.errors import EnvironmentMismatchError
 # What is logged of updates of the actor, which not every call of ``train`` makes.
 _OF_ACTOR = ("actor_loss", "ent_coef", "ent_coef_loss")
 _NOT_THERE = object()
-# What the constructors of policies are given by their algorithm, and what only SB3's have.
-_OF_ALGORITHMS = ("observation_space", "action_space", "lr_schedule", "use_sde")
-_OF_TORCH = (
-    "features_extractor_class",
-    "features_extractor_kwargs",
-    "share_features_extractor",
-    "normalize_images",
-)
 
 
 class ModelFreeAlgorithm(TensorAlgorithm):
@@ -328,7 +318,6 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         super()._setup_model()
         self.qf_learning_rate = given
         self._derived_buffer = self.replay_buffer_class if derived else None
-        self._refuse_unknown(self.policy_kwargs)
         self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
         )
@@ -336,26 +325,6 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         # SB3 draws gSDE's noise and reads its deviation from the actor.
         self.actor: Any = self.policy.actor
         self.critic: Any = self.policy.critic
-
-    def _refuse_unknown(self, policy_kwargs: Mapping[str, Any]) -> None:
-        """
-        :raises ValueError: for what the policy has no argument of
-        """
-        parameters = inspect.signature(self.policy_class).parameters
-        if any(each.kind is inspect.Parameter.VAR_KEYWORD for each in parameters.values()):
-            return
-        known = [name for name in parameters if name not in _OF_ALGORITHMS]
-        for name in policy_kwargs:
-            if name in parameters:
-                continue
-            close = difflib.get_close_matches(name, known, 1)
-            way_out = f"Did you mean '{close[0]}'?" if close else f"It has: {', '.join(known)}."
-            if name in _OF_TORCH:
-                way_out = "It is for modules of torch, and networks here are JAX's: leave it out."
-            raise ValueError(
-                f"{type(self).__name__}(policy_kwargs={{'{name}': ...}}): "
-                f"{self.policy_class.__name__} has no such argument. {way_out}"
-            )
 
     def _derive_buffer(self) -> None:
         """What ``load`` was passed counts, not what it read."""
