@@ -1,5 +1,7 @@
 """Errors raised on purpose: each message says what was expected, what came, and the way out."""
 
+from typing import Any
+
 
 class SB3HDSError(Exception):
     """Base of every error below."""
@@ -39,3 +41,16 @@ class EnvironmentMismatchError(SB3HDSError, ValueError, AssertionError):
 
 class SafetyError(SB3HDSError, RuntimeError):
     """A safety layer cannot keep what it promises: what it assumes does not hold."""
+
+
+class DivergedError(SB3HDSError, FloatingPointError):
+    """
+    Some of several seeds that learned side by side diverged.
+
+    :param models: by their seeds, of those that did not
+    :param episodes: of the same, what :func:`~sb3_hds.algos.learn_compiled` returns
+    """
+
+    def __init__(self, message: str, models: dict[int, Any], episodes: dict[int, Any]) -> None:
+        super().__init__(message)
+        self.models, self.episodes = models, episodes

@@ -13,10 +13,10 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_hds import TD7, algos, twins
-from sb3_hds.algos import DivergedError, compiled, learn_compiled
+from sb3_hds.algos import compiled, learn_compiled
 from sb3_hds.algos.compiled_run import run_rounds
 from sb3_hds.envs import twin_of
-from sb3_hds.errors import EnvironmentMismatchError
+from sb3_hds.errors import DivergedError, EnvironmentMismatchError
 from sb3_hds.wrappers import ActionRateLimit
 
 SOFT = ["gsde_sac", "droq", "crossq_jax", "tqc_jax", "simba", "bro"]

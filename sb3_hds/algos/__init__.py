@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sb3_hds.algos.bro import BRO
-    from sb3_hds.algos.compiled import DivergedError, Episodes, learn_compiled
+    from sb3_hds.algos.compiled import Episodes, learn_compiled
     from sb3_hds.algos.crossq import CrossQ
     from sb3_hds.algos.droq import DroQ
     from sb3_hds.algos.every import ALL
@@ -36,7 +36,6 @@ __all__ = [
     "TD7",
     "TQC",
     "CrossQ",
-    "DivergedError",
     "DroQ",
     "Episodes",
     "ExecutedDictReplayBuffer",
@@ -55,7 +54,6 @@ _MODULES = {
     "ALL": "every",
     "BRO": "bro",
     "CrossQ": "crossq",
-    "DivergedError": "compiled",
     "DroQ": "droq",
     "Episodes": "compiled",
     "ExecutedDictReplayBuffer": "executed_actions",

@@ -20,6 +20,7 @@ from sb3_hds.algos.off_policy import Knobs
 from sb3_hds.algos.soft_actor_critic import SoftActorCritic
 from sb3_hds.core import Twin
 from sb3_hds.envs.mirror import check_mirrors, twin_of
+from sb3_hds.errors import DivergedError
 
 Algorithm = TypeVar("Algorithm", bound=SoftActorCritic)
 
@@ -38,24 +39,6 @@ class Episodes(NamedTuple):
 
     timesteps: np.ndarray
     returns: np.ndarray
-
-
-class DivergedError(FloatingPointError):
-    """
-    Some seeds of ``learn_compiled`` diverged.
-
-    :param models: by their seeds, of those that did not
-    :param episodes: of the same
-    """
-
-    def __init__(
-        self,
-        message: str,
-        models: dict[int, SoftActorCritic],
-        episodes: dict[int, Episodes],
-    ) -> None:
-        super().__init__(message)
-        self.models, self.episodes = models, episodes
 
 
 def learn_compiled(
