@@ -18,7 +18,7 @@ from sb3_hds.algos.persistence import TensorPolicy, TrainingTensors
 class LearningPolicy(TensorPolicy):
     """
     Abstract: a policy that holds a learner, a named tuple of networks with their optimisers
-    (:class:`~sb3_hds.algos.off_policy.Trained`), a random ``key``, and more.
+    (:class:`~sb3_hds.algos.optimizers.Trained`), a random ``key``, and more.
     """
 
     #: fields of the learner that are saved with the networks, not with their optimisers
