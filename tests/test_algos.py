@@ -363,6 +363,13 @@ def test_a_policy_learns_and_acts_in_a_normalised_environment(name, options):
         assert (env.obs_rms.var > 0.1**2).all() and (env.obs_rms.var < 15.0**2).all()
 
 
+@pytest.mark.parametrize("name", OFF_POLICY)
+def test_the_third_argument_is_the_learning_rate_as_in_stable_baselines(name):
+    model = algos.ALL[name]("MlpPolicy", gymnasium.make("Pendulum-v1"), 1e-5)
+
+    assert model.learning_rate == model.lr_schedule(1.0) == 1e-5
+
+
 @every_off_policy
 @pytest.mark.parametrize(
     "rate", [1e-3, lambda left: 1e-3 * left, LinearSchedule(1e-3, 0.0, 1.0)], ids=type

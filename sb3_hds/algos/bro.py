@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_hds.algos.bodies import ORTHOGONAL, ORTHONORMAL, BroBody
 from sb3_hds.algos.call_forms import between, is_count
@@ -85,6 +85,8 @@ class BRO(SoftActorCritic):
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
+    :param learning_rate: of actor, entropy coefficient and critics; number, schedule or
+        ``"lin_3e-4"``
     :param gradient_steps: updates per call of ``train``
     :param batch_size: transitions per update
     :param linear_ent_coef: whether the loss of the entropy coefficient has it itself
@@ -108,6 +110,7 @@ class BRO(SoftActorCritic):
         self,
         policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
         env: GymEnv | str | None = None,
+        learning_rate: float | str | Schedule = 3e-4,
         *,
         gradient_steps: int = 10,
         batch_size: int = 128,
@@ -128,6 +131,7 @@ class BRO(SoftActorCritic):
         super().__init__(
             policy,
             env,
+            learning_rate=learning_rate,
             gradient_steps=gradient_steps,
             batch_size=batch_size,
             linear_ent_coef=linear_ent_coef,

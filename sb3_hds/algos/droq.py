@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any
 
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_hds.algos.off_policy import Recipe, mean
 from sb3_hds.algos.soft_actor_critic import SoftActorCritic
@@ -22,6 +22,8 @@ class DroQ(SoftActorCritic):
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
+    :param learning_rate: of actor, entropy coefficient and critics; number, schedule or
+        ``"lin_3e-4"``
     :param gradient_steps: updates of the critics per call of ``train``
     :param policy_delay: updates of the critics for each of the actor
     :param policy_kwargs: ``dropout_rate`` is 0.01 and ``layer_norm`` True unless they are given
@@ -32,6 +34,7 @@ class DroQ(SoftActorCritic):
         self,
         policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
         env: GymEnv | str | None = None,
+        learning_rate: float | str | Schedule = 3e-4,
         *,
         gradient_steps: int = 20,
         policy_delay: int = 20,
@@ -41,6 +44,7 @@ class DroQ(SoftActorCritic):
         super().__init__(
             policy,
             env,
+            learning_rate=learning_rate,
             gradient_steps=gradient_steps,
             policy_delay=policy_delay,
             policy_kwargs={"dropout_rate": 0.01, "layer_norm": True, **(policy_kwargs or {})},

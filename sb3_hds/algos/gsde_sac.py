@@ -3,7 +3,7 @@
 from typing import Any
 
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_hds.algos.soft_actor_critic import SoftActorCritic
 
@@ -25,6 +25,8 @@ class GSDESAC(SoftActorCritic):
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
+    :param learning_rate: of actor, entropy coefficient and critics; number, schedule or
+        ``"lin_3e-4"``
     :param use_sde: False makes it plain SAC
     :param train_freq: steps between two calls of ``train``
     :param gradient_steps: updates in each of them
@@ -37,6 +39,7 @@ class GSDESAC(SoftActorCritic):
         self,
         policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
         env: GymEnv | str | None = None,
+        learning_rate: float | str | Schedule = 3e-4,
         *,
         use_sde: bool = True,
         train_freq: int | tuple[int, str] = 8,
@@ -46,6 +49,7 @@ class GSDESAC(SoftActorCritic):
         super().__init__(
             policy,
             env,
+            learning_rate=learning_rate,
             use_sde=use_sde,
             train_freq=train_freq,
             gradient_steps=gradient_steps,

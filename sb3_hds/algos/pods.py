@@ -110,8 +110,8 @@ class PODS(TwinAlgorithm):
         self,
         policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
         env: GymEnv | str | None = None,
-        *,
         learning_rate: float | Schedule = LinearSchedule(5e-3, 1e-4, 1.0),  # noqa: B008
+        *,
         value_learning_rate: float | str | Schedule | None = None,
         buffer_size: int = 100_000,
         learning_starts: int = 0,

@@ -10,7 +10,7 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import GymEnv, Schedule, TrainFrequencyUnit
 
 from sb3_hds.algos.call_forms import between, is_count, jax_device
 from sb3_hds.algos.gaussian_policy import GaussianPolicy, SimbaPolicy
@@ -30,6 +30,8 @@ class SoftActorCritic(ModelFreeAlgorithm):
     :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` for Dict observations, ``"SimbaPolicy"``,
         a policy class, or the environment itself
     :param env: an environment, its id, or a vectorised environment
+    :param learning_rate: of actor, entropy coefficient and critics; number, schedule or
+        ``"lin_3e-4"``
     :param ent_coef: a number, ``"auto"``, or ``"auto_0.1"`` to start there
     :param target_entropy: a number, or ``"auto"``: minus the number of controls
     :param linear_ent_coef: whether the loss of the entropy coefficient has it itself, as equation
@@ -52,6 +54,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
         self,
         policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
         env: GymEnv | str | None = None,
+        learning_rate: float | str | Schedule = 3e-4,
         *,
         ent_coef: float | str = "auto",
         target_entropy: float | str = "auto",
@@ -62,7 +65,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
         self.ent_coef, self.target_entropy = ent_coef, target_entropy
         self.linear_ent_coef = linear_ent_coef
         self.target_update_interval = target_update_interval
-        super().__init__(policy, env, **arguments)
+        super().__init__(policy, env, learning_rate=learning_rate, **arguments)
 
     def recipe(self) -> Recipe:
         """:return: what an update is made of"""

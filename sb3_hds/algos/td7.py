@@ -197,6 +197,7 @@ class TD7(ModelFreeAlgorithm):
 
     :param policy: ``"MlpPolicy"``, a policy class, or the environment itself
     :param env: an environment, its id, or a vectorised environment
+    :param learning_rate: of encoder, actor and critics; number, schedule or ``"lin_3e-4"``
     :param learning_starts: steps with random actions before learning starts
     :param train_freq: steps between two calls of ``train``, or ``(n, "episode")``; None: one
         episode where policies are assessed, one step where not
@@ -228,6 +229,7 @@ class TD7(ModelFreeAlgorithm):
         self,
         policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
         env: GymEnv | str | None = None,
+        learning_rate: float | str | Schedule = 3e-4,
         *,
         learning_starts: int = 25_000,
         train_freq: int | tuple[int, str] | None = None,
@@ -263,6 +265,7 @@ class TD7(ModelFreeAlgorithm):
         super().__init__(
             policy,
             env,
+            learning_rate=learning_rate,
             learning_starts=learning_starts,
             train_freq=train_freq,  # type: ignore[arg-type]  # None until it is derived
             policy_delay=policy_delay,

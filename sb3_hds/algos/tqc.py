@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any
 
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_hds.algos.call_forms import check_count, is_count
 from sb3_hds.algos.off_policy import Recipe, mean
@@ -25,6 +25,8 @@ class TQC(SoftActorCritic):
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise
+    :param learning_rate: of actor, entropy coefficient and critics; number, schedule or
+        ``"lin_3e-4"``
     :param top_quantiles_to_drop_per_net: as many times the number of critics are left out of the
         pool of all critics' next values, the largest of the pool
     :param policy_kwargs: ``n_quantiles`` is 25 unless given
@@ -35,6 +37,7 @@ class TQC(SoftActorCritic):
         self,
         policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
         env: GymEnv | str | None = None,
+        learning_rate: float | str | Schedule = 3e-4,
         *,
         top_quantiles_to_drop_per_net: int = 2,
         policy_kwargs: dict[str, Any] | None = None,
@@ -42,7 +45,11 @@ class TQC(SoftActorCritic):
     ) -> None:
         self.top_quantiles_to_drop_per_net = top_quantiles_to_drop_per_net
         super().__init__(
-            policy, env, policy_kwargs={"n_quantiles": 25, **(policy_kwargs or {})}, **arguments
+            policy,
+            env,
+            learning_rate=learning_rate,
+            policy_kwargs={"n_quantiles": 25, **(policy_kwargs or {})},
+            **arguments,
         )
 
     def recipe(self) -> Recipe:
