@@ -155,6 +155,9 @@ def test_functions_of_jax_are_saved_by_their_names(name):
     assert [name for name in found if re.search("jax|flax|optax|silu|adamw", name)] == []
     loaded = type(model).load(file, policy_kwargs=model.policy_kwargs | chosen)
     assert loaded.policy.arguments["activation_fn"] == "silu"
+    policy, spaces = type(model.policy), (model.observation_space, model.action_space)
+    alone = policy(*spaces, lambda _: 0.0, **chosen)._get_constructor_parameters()
+    assert alone["activation_fn"] == "silu" and "adam" in alone.get("optimizer_class", "adam")
     obs = observations()
     for acting in (loaded, load_policy(file)):
         actions = acting.predict(obs, deterministic=True)[0]

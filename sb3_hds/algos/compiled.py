@@ -91,11 +91,18 @@ def learn_compiled(
         warnings.warn(f"Interrupted after {n_done} of {total_timesteps} steps.")
     steps = [_that_happened(*call) for call in done]
     whole = jax.device_get(runs._replace(key=jax.random.key_data(runs.key)))
-    for i in np.flatnonzero(~lost).tolist():
+    kept = np.flatnonzero(~lost).tolist()
+    for i in kept:
         _take_over(models[i], _of_seed(runs, i), _of_seed(whole, i), _n_steps(steps))
     episodes = [_episodes(steps, i) for i in range(len(seeds))]
     if lost.any():
-        raise _divergence(seeds, lost, models, episodes)
+        raise DivergedError(
+            f"Learning diverged with the seeds {[seeds[i] for i in np.flatnonzero(lost)]}. Lower "
+            "the learning rate, or scale rewards. What others learned is in this error's models "
+            "and episodes.",
+            {seeds[i]: models[i] for i in kept},
+            {seeds[i]: episodes[i] for i in kept},
+        )
     return models, episodes
 
 
@@ -294,23 +301,6 @@ def _diverged(report: Any) -> np.ndarray:
     """:return: of each seed, whether a number of its last updates is not finite"""
     values = jax.device_get(report)
     return ~np.logical_and.reduce([np.isfinite(value) for value in values])
-
-
-def _divergence(
-    seeds: Sequence[int],
-    lost: np.ndarray,
-    models: Sequence[SoftActorCritic],
-    episodes: Sequence[Episodes],
-) -> DivergedError:
-    names = [seed for seed, is_lost in zip(seeds, lost, strict=True) if is_lost]
-    rest = "" if lost.all() else " What the others learned is in this error's models and episodes."
-    kept = [i for i, is_lost in enumerate(lost) if not is_lost]
-    return DivergedError(
-        f"Learning diverged with the seeds {names}. Lower the learning rate, or scale "
-        f"rewards.{rest}",
-        {seeds[i]: models[i] for i in kept},
-        {seeds[i]: episodes[i] for i in kept},
-    )
 
 
 def _capacity(n: int) -> int:

@@ -33,7 +33,6 @@ from sb3_hds.algos.off_policy import (
     squared,
 )
 from sb3_hds.algos.optimizers import Weights, optimizer_of
-from sb3_hds.algos.policy_description import by_names
 
 _OF_GSDE = ("log_std_init", "full_std", "use_expln", "clip_mean")
 # Of the policy's constructor: what is no argument.
@@ -116,8 +115,9 @@ class GaussianPolicy(LearningPolicy):
         optimizer_kwargs: Mapping[str, Any] | None = None,
         qf_optimizer_kwargs: Mapping[str, Any] | None = None,
     ) -> None:
-        given = {name: value for name, value in locals().items() if name not in _NO_ARGUMENTS}
-        self.arguments = by_names(given)
+        self.arguments = {
+            name: value for name, value in locals().items() if name not in _NO_ARGUMENTS
+        }
         super().__init__(observation_space, action_space, squash_output=True)
         chosen = {
             name: self.defaults.get(name) if value is None else value

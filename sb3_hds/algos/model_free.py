@@ -19,7 +19,6 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from sb3_hds.algos.call_forms import between, check_policy, is_count, policy_and_env, schedule_of
 from sb3_hds.algos.learning_policy import LearningPolicy
 from sb3_hds.algos.observations import check_actions, check_observations
-from sb3_hds.algos.policy_description import by_names
 from sb3_hds.algos.tensor_algorithm import TensorAlgorithm
 from sb3_hds.errors import EnvironmentMismatchError
 
@@ -132,7 +131,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
-            policy_kwargs=by_names(policy_kwargs or {}),
+            policy_kwargs=dict(policy_kwargs or {}),
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,

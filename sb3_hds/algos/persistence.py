@@ -25,6 +25,9 @@ import numpy as np
 import torch as th
 from sbx.common.policies import BaseJaxPolicy
 
+from sb3_hds.algos.networks import activation_name
+from sb3_hds.algos.optimizers import optimizer_name
+
 
 def write_whole(
     path: str | os.PathLike[str] | io.BufferedIOBase,
@@ -119,6 +122,21 @@ def from_state_dict(tree: Any, tensors: dict[str, th.Tensor], strict: bool = Tru
     return jax.tree_util.tree_unflatten(structure, values)
 
 
+def by_names(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Files hold arguments, too, and a function of JAX is pickled by parts of JAX that change.
+
+    :return: the same, with the names of activations and optimisers where their functions were given
+    """
+    named = dict(policy_kwargs)
+    for argument, value in policy_kwargs.items():
+        if argument.endswith("activation_fn"):
+            named[argument] = activation_name(value)
+        elif argument == "optimizer_class":
+            named[argument] = optimizer_name(value)
+    return named
+
+
 def refuse_odd(observation: Any) -> None:
     """
     :raises ValueError: for what ``reset`` returns beside an observation, and for one that is not
@@ -201,7 +219,7 @@ class TensorPolicy(BaseJaxPolicy):
         """What ``save`` keeps of the policy besides its weights, and ``load`` makes it from."""
         spaces_and_more = super()._get_constructor_parameters()
         spaces_and_more.pop("normalize_images")
-        return spaces_and_more | self.arguments
+        return spaces_and_more | by_names(self.arguments)
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, th.Tensor]:
         return to_state_dict(self.weights)
@@ -259,9 +277,9 @@ def _where(leaf: Any, value: Any) -> Any:
     """:return: the value, where the leaf is and of its type"""
     if isinstance(leaf, np.ndarray):
         return value
-    placed = jnp.asarray(value, dtype=leaf.dtype)
-    committed = isinstance(leaf, jax.Array) and leaf.committed
-    return jax.device_put(placed, leaf.sharding) if committed else placed
+    if isinstance(leaf, jax.Array) and leaf.committed:
+        return jax.device_put(np.asarray(value, leaf.dtype), leaf.sharding)
+    return jnp.asarray(value, dtype=leaf.dtype)
 
 
 def _name(path: tuple) -> str:

@@ -8,7 +8,6 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_hds.algos.networks import activation, activation_name
-from sb3_hds.algos.optimizers import optimizer_name
 from sb3_hds.algos.persistence import TensorPolicy
 
 # Arguments of policies that prediction does not need: they say how to learn.
@@ -39,21 +38,6 @@ def described(policy: TensorPolicy) -> dict[str, Any] | None:
         return json.loads(json.dumps(description, default=_plain))
     except TypeError:
         return None
-
-
-def by_names(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    Files hold arguments, too, and a function of JAX is pickled by parts of JAX that change.
-
-    :return: the same, with the names of activations and optimisers where their functions were given
-    """
-    named = dict(policy_kwargs)
-    for argument, value in policy_kwargs.items():
-        if argument.endswith("activation_fn"):
-            named[argument] = activation_name(value)
-        elif argument == "optimizer_class":
-            named[argument] = optimizer_name(value)
-    return named
 
 
 def space_to_plain(space: spaces.Space) -> dict[str, Any]:

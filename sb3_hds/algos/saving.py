@@ -10,8 +10,8 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_hds.algos.call_forms import device_or_cpu
-from sb3_hds.algos.persistence import damage_reported, write_whole
-from sb3_hds.algos.policy_description import by_names, described
+from sb3_hds.algos.persistence import by_names, damage_reported, write_whole
+from sb3_hds.algos.policy_description import described
 
 
 class SavesTensors(BaseAlgorithm):

@@ -27,7 +27,6 @@ from sb3_hds.algos.networks import Activation, activation
 from sb3_hds.algos.observations import flattener, size_of
 from sb3_hds.algos.off_policy import Batch
 from sb3_hds.algos.optimizers import optimizer_of
-from sb3_hds.algos.policy_description import by_names
 from sb3_hds.algos.sampling import batches_of, transitions
 from sb3_hds.algos.td7_update import (
     Actor,
@@ -87,8 +86,9 @@ class TD7Policy(LearningPolicy):
         optimizer_kwargs: Mapping[str, Any] | None = None,
         use_sde: bool = False,
     ) -> None:
-        given = {name: value for name, value in locals().items() if name not in _NO_ARGUMENTS}
-        self.arguments = by_names(given)
+        self.arguments = {
+            name: value for name, value in locals().items() if name not in _NO_ARGUMENTS
+        }
         super().__init__(observation_space, action_space, squash_output=True)
         check_count("n_critics", n_critics)
         check_count("embedding_size", embedding_size)

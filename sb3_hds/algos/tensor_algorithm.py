@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_hds.algos.call_forms import check_origin, check_policy_kwargs
 from sb3_hds.algos.executed_actions import executed
-from sb3_hds.algos.persistence import TensorPolicy, write_whole
+from sb3_hds.algos.persistence import TensorPolicy, by_names, write_whole
 from sb3_hds.algos.saving import SavesTensors
 
 
@@ -118,6 +118,7 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
     def _setup_model(self) -> None:
         check_origin(type(self), self.saved_by)
         check_policy_kwargs(self.policy_class, self.policy_kwargs)
+        self.policy_kwargs = by_names(self.policy_kwargs)
         self.check_arguments()
         super()._setup_model()
 

@@ -41,7 +41,6 @@ from sb3_hds.algos.log import record_epoch
 from sb3_hds.algos.model import check_reward, required, twin_from_spec
 from sb3_hds.algos.normalisation import prepare_statistics, view_of
 from sb3_hds.algos.persistence import Tensors
-from sb3_hds.algos.policy_description import by_names
 from sb3_hds.algos.pretraining import Pretraining
 from sb3_hds.algos.selection import (
     choose_policy,
@@ -141,7 +140,7 @@ class TwinAlgorithm(TensorAlgorithm):
             replay_buffer_class=replay_buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
             optimize_memory_usage=optimize_memory_usage,
-            policy_kwargs=by_names(policy_kwargs or {}),
+            policy_kwargs=dict(policy_kwargs or {}),
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,

@@ -13,7 +13,6 @@ from stable_baselines3.common.type_aliases import Schedule
 from sb3_hds.algos.learner import GENERATOR, Networks, Progress, fresh_networks
 from sb3_hds.algos.networks import Activation, Actor, Value, activation, widths_of
 from sb3_hds.algos.persistence import TensorPolicy, TrainingTensors
-from sb3_hds.algos.policy_description import by_names
 
 _POLICY_WIDTHS, _VALUE_WIDTHS = (96, 96), (64, 64)
 
@@ -50,14 +49,13 @@ class TwinPolicy(TensorPolicy):
         function = activation(activation_fn)
         if not max_grad_norm > 0.0:
             raise ValueError(f"max_grad_norm must be above 0, got {max_grad_norm!r}.")
-        given = {
+        self.arguments = {
             "lr_schedule": lr_schedule,
             "net_arch": net_arch,
             "activation_fn": activation_fn,
             "linear_path": linear_path,
             "max_grad_norm": max_grad_norm,
         }
-        self.arguments = by_names(given)
         self.actor_network = Actor(int(np.prod(action_space.shape)), pi, function, linear_path)
         self.value_network = Value(vf, function)
         self.max_grad_norm = max_grad_norm
