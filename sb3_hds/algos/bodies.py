@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sb3_hds.algos.networks import Activation
+from sb3_hds.algos.thin import Hidden
 
 #: where kernels start, with gains of the square root of 2 and of 1
 ORTHOGONAL, ORTHONORMAL = (nn.initializers.orthogonal(gain) for gain in (math.sqrt(2), 1.0))
@@ -47,7 +48,7 @@ class Mlp(nn.Module):
         if self.renorm_warmup_steps is not None:
             x = BatchRenorm(self.renorm_warmup_steps, self.momentum)(x, train)
         for width in self.net_arch:
-            x = nn.Dense(width, kernel_init=kernels)(x)
+            x = Hidden(width, kernel_init=kernels)(x)
             x = Dropout(self.dropout_rate)(x)
             x = nn.LayerNorm()(x) if self.layer_norm else x
             x = self.activation_fn(x)
@@ -77,9 +78,9 @@ class SimbaBody(nn.Module):
     def __call__(self, x: Float[Array, "*batch n"], train: bool) -> Float[Array, "*batch m"]:
         for i, width in enumerate(self.net_arch):
             if i == 0 or x.shape[-1] != width:
-                x = nn.Dense(width, kernel_init=ORTHONORMAL)(x)
-            inside = nn.Dense(4 * width, kernel_init=_HE)(nn.LayerNorm()(x))
-            x = x + nn.Dense(width, kernel_init=_HE)(self.activation_fn(inside))
+                x = Hidden(width, kernel_init=ORTHONORMAL)(x)
+            inside = Hidden(4 * width, kernel_init=_HE)(nn.LayerNorm()(x))
+            x = x + Hidden(width, kernel_init=_HE)(self.activation_fn(inside))
             x = Dropout(self.dropout_rate)(x)
         return nn.LayerNorm()(x) if self.net_arch else x
 
@@ -101,7 +102,7 @@ class BroBody(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch n"], train: bool) -> Float[Array, "*batch m"]:
-        dense = lambda width: nn.Dense(width, kernel_init=ORTHOGONAL)  # noqa: E731
+        dense = lambda width: Hidden(width, kernel_init=ORTHOGONAL)  # noqa: E731
         for i, width in enumerate(self.net_arch):
             if i == 0 or x.shape[-1] != width:
                 x = self.activation_fn(nn.LayerNorm()(dense(width)(x)))

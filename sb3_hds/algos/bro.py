@@ -30,6 +30,7 @@ from sb3_hds.algos.optimizers import Optimizer, Trained, Weights
 from sb3_hds.algos.quantiles import quantile_huber
 from sb3_hds.algos.soft_actor_critic import SoftActorCritic
 from sb3_hds.algos.squashed import Gaussian, squashed_between
+from sb3_hds.algos.thin import Last
 
 # Steps of the environment at which the authors' networks start afresh: with the full replay ratio,
 # and with the fast one of 2.
@@ -185,7 +186,7 @@ class Shift(nn.Module):
     ) -> Float[Array, "*batch act"]:
         latent = self.body(jnp.concatenate([obs, mean], -1), False)
         small = nn.initializers.orthogonal(0.01)
-        return nn.Dense(self.n_act, use_bias=False, kernel_init=small)(latent)
+        return Last(self.n_act, use_bias=False, kernel_init=small)(latent)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sb3_hds.algos.squashed import Gaussian, exploration_std, marginal_std, squashed_between
+from sb3_hds.algos.thin import Last
 
 # Of the logarithm of the deviation of actions: where it is clipped (SAC), and where it is squashed.
 _CLIPPED, _SQUASHED = (-20.0, 2.0), (-10.0, 2.0)
@@ -34,8 +35,8 @@ class GaussianActor(nn.Module):
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch obs"], train: bool = False) -> Gaussian:
         latent = self.body(obs, train)
-        mean = nn.Dense(self.n_act, kernel_init=self.of_mean)(latent)
-        raw = nn.Dense(self.n_act, kernel_init=self.of_std)(latent)
+        mean = Last(self.n_act, kernel_init=self.of_mean)(latent)
+        raw = Last(self.n_act, kernel_init=self.of_std)(latent)
         if self.squash_log_std:
             log_std = squashed_between(raw, *_SQUASHED)
         else:
@@ -68,7 +69,7 @@ class ExploringActor(nn.Module):
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch obs"], train: bool = False) -> Gaussian:
         latent = self.body(obs, train)
-        mean = nn.Dense(self.n_act, kernel_init=self.of_mean)(latent)
+        mean = Last(self.n_act, kernel_init=self.of_mean)(latent)
         if self.clip_mean > 0.0:
             mean = jnp.clip(mean, -self.clip_mean, self.clip_mean)
         shape = (latent.shape[-1], self.n_act if self.full_std else 1)
@@ -100,7 +101,7 @@ class Critic(nn.Module):
         train: bool = False,
     ) -> Float[Array, "*batch values"]:
         latent = self.body(jnp.concatenate([obs, action], -1), train)
-        return nn.Dense(self.n_values, kernel_init=self.of_values)(latent)
+        return Last(self.n_values, kernel_init=self.of_values)(latent)
 
 
 def noise_std(actor: ExploringActor, weights: dict) -> Float[Array, "latent act"]:

@@ -211,7 +211,9 @@ def judge(
     :return: values of all critics, and their weights with the statistics of this pass
     """
 
-    def one(weights: Weights, key: PRNGKeyArray) -> tuple[Array, Weights]:
+    def one(
+        weights: Weights, key: PRNGKeyArray, obs: Array, action: Array
+    ) -> tuple[Array, Weights]:
         rngs = {"dropout": key}
         if not train or "statistics" not in weights:
             return cast(Array, recipe.critic.apply(weights, obs, action, train, rngs=rngs)), weights
@@ -222,9 +224,11 @@ def judge(
 
     keys = jax.random.split(key, recipe.n_critics)
     if recipe.n_critics > 1:
-        return jax.vmap(one)(weights, keys)
+        # Of inputs without an axis of the critics, XLA computes products that it then transposes.
+        each = lambda x: jnp.broadcast_to(x, (recipe.n_critics, *x.shape))  # noqa: E731
+        return jax.vmap(one)(weights, keys, each(obs), each(action))
     # One critic, mapped: XLA computes gradients of its kernels transposed, and Adam walks across.
-    values, weights = one(jax.tree.map(lambda x: x[0], weights), keys[0])
+    values, weights = one(jax.tree.map(lambda x: x[0], weights), keys[0], obs, action)
     return values[None], jax.tree.map(lambda x: x[None], weights)
 
 

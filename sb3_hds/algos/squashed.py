@@ -13,6 +13,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sb3_hds.algos.thin import product
+
 _EPSILON = 1e-6
 _LOG_SQRT_TAU = 0.5 * math.log(2.0 * math.pi)
 
@@ -79,7 +81,7 @@ def marginal_std(
     Source: Raffin, Kober and Stulp, *Smooth Exploration for Robotic Reinforcement Learning*, CoRL
     2021, equation 6.
     """
-    return jnp.sqrt(latent**2 @ std**2 + _EPSILON)
+    return jnp.sqrt(product(latent**2, std**2) + _EPSILON)
 
 
 def _tanh_slope(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
