@@ -7,7 +7,7 @@ written out, they become part of the loops over the activations around them.
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import flax.linen as nn
@@ -52,7 +52,7 @@ def _to_one(x: Array, kernel: Array) -> Array:
 @jax.custom_vjp
 def _of_few(x: Array, kernel: Array) -> Array:
     columns = jnp.split(x, len(kernel), -1)
-    return sum(column * row for column, row in zip(columns, kernel, strict=True))
+    return reduce(jnp.add, map(jnp.multiply, columns, kernel))
 
 
 def _to_one_back(seen: tuple[Array, Array], slope: Array) -> tuple[Array, Array]:
