@@ -2,8 +2,8 @@
 Products with thin matrices.
 
 Networks that control robots have few inputs, and critics have one output. XLA gives products of
-such matrices to the kernels of large ones, and their slopes too, which costs a seventh of an update
-of SAC; written out, they become part of the loops over the activations around them.
+such matrices to the kernels of large ones, and their slopes too; written out, they become part of
+the loops over the activations around them.
 """
 
 from collections.abc import Callable
