@@ -1,5 +1,7 @@
 """Errors raised on purpose: each message says what was expected, what came, and the way out."""
 
+import difflib
+from collections.abc import Iterable
 from typing import Any
 
 
@@ -54,3 +56,12 @@ class DivergedError(SB3HDSError, FloatingPointError):
     def __init__(self, message: str, models: dict[int, Any], episodes: dict[int, Any]) -> None:
         super().__init__(message)
         self.models, self.episodes = models, episodes
+
+
+def did_you_mean(name: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
+    """
+    :param cutoff: how like each other two names must be, of ``difflib``, in [0, 1]
+    :return: to end a message with: a question, after a space, or nothing, if no name is close
+    """
+    close = difflib.get_close_matches(name, list(known), 1, cutoff)
+    return f" Did you mean '{close[0]}'?" if close else ""

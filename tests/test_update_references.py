@@ -36,7 +36,7 @@ from sb3_hds import algos
 from sb3_hds.algos import td7_update
 from sb3_hds.algos.bodies import Dropout
 from sb3_hds.algos.observations import Seen
-from sb3_hds.algos.off_policy import Batch, Knobs, Report, update
+from sb3_hds.algos.off_policy import Batch, Knobs, Report, before_any, update
 from sb3_hds.algos.optimizers import Optimizer, Trained
 
 pytestmark = pytest.mark.usefixtures("x64", "quick_compilation")
@@ -226,7 +226,7 @@ def check(
 ) -> Any:
     """:return: the learner after as many updates as the reference makes, which agree with it"""
     given = batches(n, seed)
-    learner, report = update(recipe, learner, given, n, KNOBS, Report.nothing())
+    learner, report = update(recipe, learner, given, n, KNOBS, before_any(Report))
     for i in range(n):
         batch = jax.tree.map(lambda x, i=i: np.array(x[i]), given)
         said = expected.update(batch._replace(obs=seen(batch.obs), next_obs=seen(batch.next_obs)))
@@ -683,7 +683,7 @@ def test_td7_learns_embeddings_clips_targets_and_copies_them_late():
     )
     learner = learner._replace(copies=fixed)
     expected = Sale(recipe, learner)
-    report, given = td7_update.Report.nothing(), batches(4)
+    report, given = before_any(td7_update.Report), batches(4)
     rates = KNOBS.learning_rate, KNOBS.qf_learning_rate
 
     # The third update is the first one by copied networks, within the range of targets.

@@ -1,6 +1,5 @@
 """The ways in which an algorithm may be called."""
 
-import difflib
 import inspect
 import math
 import numbers
@@ -19,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_hds.algos.epoch import PLANNERS
 from sb3_hds.algos.persistence import TensorPolicy
-from sb3_hds.errors import EnvironmentMismatchError
+from sb3_hds.errors import EnvironmentMismatchError, did_you_mean
 
 if TYPE_CHECKING:
     from sb3_hds.algos.twin_algorithm import TwinAlgorithm
@@ -120,12 +119,11 @@ def check_policy_kwargs(policy: type, policy_kwargs: Iterable[str]) -> None:
     for name in policy_kwargs:
         if name in parameters:
             continue
-        close = difflib.get_close_matches(name, known, 1)
-        way_out = f"Did you mean '{close[0]}'?" if close else f"It has: {', '.join(known)}."
+        way_out = did_you_mean(name, known) or f" It has: {', '.join(known)}."
         if name in _OF_TORCH:
-            way_out = "It is for modules of torch, and networks here are JAX's: leave it out."
+            way_out = " It is for modules of torch, and networks here are JAX's: leave it out."
         raise TypeError(
-            f"policy_kwargs={{'{name}': ...}}: {policy.__name__} has no such argument. {way_out}"
+            f"policy_kwargs={{'{name}': ...}}: {policy.__name__} has no such argument.{way_out}"
         )
 
 

@@ -22,6 +22,7 @@ from sb3_hds.algos.off_policy import (
     Learner,
     Recipe,
     Report,
+    before_any,
     explored,
     update_once,
 )
@@ -135,7 +136,7 @@ def run_rounds(loop: Loop, params: Params, runs: Run, rounds: Round) -> tuple[Ru
     axes = runs_axes()
 
     def one(run: Run) -> tuple[Run, Step, Report]:
-        before = run, Report.nothing()
+        before = run, before_any(Report)
         (run, report), steps = jax.lax.scan(partial(_round, loop, params), before, rounds)
         return run, steps, report
 

@@ -9,7 +9,7 @@ and optimisers there are.
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol, TypeVar, cast
 
 import flax.linen as nn
 import jax
@@ -25,6 +25,7 @@ from sb3_hds.algos.squashed import Gaussian, log_probability
 Values = Float[Array, "critics batch values"]
 Targets = Float[Array, "batch targets"]
 Loss = Float[Array, ""]
+Losses = TypeVar("Losses", bound=NamedTuple)
 
 
 class Batch(NamedTuple):
@@ -85,12 +86,15 @@ class Report(NamedTuple):
     ent_coef: Loss
     ent_coef_loss: Loss
 
-    @classmethod
-    def nothing(cls) -> "Report":
-        """:return: before any update"""
-        # Of NumPy: JAX would dispatch each as a program of its own, at every step.
-        zero: Any = np.zeros((), jnp.result_type(float))
-        return cls(*(zero for _ in cls._fields))
+
+def before_any(report: type[Losses]) -> Losses:
+    """
+    :param report: a named tuple of numbers
+    :return: one before any update
+    """
+    # Of NumPy: JAX would dispatch each as a program of its own, at every step.
+    zero: Any = np.zeros((), jnp.result_type(float))
+    return report._make(zero for _ in report._fields)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule, TrainFrequen
 from sb3_hds.algos.call_forms import between, is_count, jax_device
 from sb3_hds.algos.gaussian_policy import GaussianPolicy, SimbaPolicy
 from sb3_hds.algos.model_free import ModelFreeAlgorithm, finite
-from sb3_hds.algos.off_policy import Knobs, Recipe, Report, log_of, squared, update
+from sb3_hds.algos.off_policy import Knobs, Recipe, Report, before_any, log_of, squared, update
 from sb3_hds.algos.sampling import batches_of
 
 # Updates of one compiled call; more are made in several.
@@ -130,7 +130,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
         self.policy.learner = self.policy.learner._replace(**kept)
 
     def _updates(self, n: int, batch_size: int) -> dict[str, float]:
-        policy, knobs, report, found = self.policy, self.knobs(), {}, Report.nothing()
+        policy, knobs, report, found = self.policy, self.knobs(), {}, before_any(Report)
         for done in range(0, n, _MOST_UPDATES):
             now = min(_MOST_UPDATES, n - done)
             batches = batches_of(self, now, batch_size, _capacity(now))

@@ -25,7 +25,7 @@ from sb3_hds.algos.learning_policy import LearningPolicy
 from sb3_hds.algos.model_free import ModelFreeAlgorithm, finite
 from sb3_hds.algos.networks import Activation, activation
 from sb3_hds.algos.observations import flattener, size_of
-from sb3_hds.algos.off_policy import Batch
+from sb3_hds.algos.off_policy import Batch, before_any
 from sb3_hds.algos.optimizers import optimizer_of
 from sb3_hds.algos.sampling import batches_of, transitions
 from sb3_hds.algos.td7_update import (
@@ -433,7 +433,7 @@ class TD7(ModelFreeAlgorithm):
         """One after the other: what is drawn depends on the errors of the update before."""
         buffer: Any = self.replay_buffer
         rates, policy = self.learning_rates(), self.policy
-        report, found = {}, Report.nothing()
+        report, found = {}, before_any(Report)
         for i in range(n):
             batch, drawn = self._drawn(batch_size)
             learner, found, priorities = update(policy.recipe, policy.learner, batch, *rates, found)

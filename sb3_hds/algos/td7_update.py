@@ -15,7 +15,6 @@ from typing import Any, NamedTuple, cast
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sb3_hds.algos.networks import Activation
@@ -220,13 +219,6 @@ class Report(NamedTuple):
     critic_loss: Float[Array, ""]
     actor_loss: Float[Array, ""]
     encoder_loss: Float[Array, ""]
-
-    @classmethod
-    def nothing(cls) -> "Report":
-        """:return: before any update"""
-        # Of NumPy: JAX would dispatch each as a program of its own, at every step.
-        zero: Any = np.zeros((), jnp.result_type(float))
-        return cls(*(zero for _ in cls._fields))
 
 
 def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:

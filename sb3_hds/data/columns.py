@@ -1,7 +1,6 @@
 """What the columns of a log mean: said in a dict or a yml file."""
 
 import dataclasses
-import difflib
 import math
 import os
 from collections import Counter
@@ -12,7 +11,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from sb3_hds.core.episodes import check_dt
-from sb3_hds.errors import TrajectoryError
+from sb3_hds.errors import TrajectoryError, did_you_mean
 
 FORM = (
     "columns names what a log holds: {'time': NAME, 'obs': [{'column': NAME, 'scale': 1.0}, ...], "
@@ -140,11 +139,9 @@ def _read_yml(path: Path) -> Any:
 def _check_keys(where: str, given: Mapping[Any, Any], known: Sequence[str]) -> None:
     for key in given:
         if key not in known:
-            close = difflib.get_close_matches(str(key), known, 1)
-            hint = f" Did you mean '{close[0]}'?" if close else ""
             raise TrajectoryError(
                 f"{where} has the key '{key}', which is not known. "
-                f"Known are: {', '.join(known)}.{hint}"
+                f"Known are: {', '.join(known)}.{did_you_mean(str(key), known)}"
             )
 
 

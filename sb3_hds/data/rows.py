@@ -1,6 +1,5 @@
 """The rows of a table, in the channels of the result, checked at the door."""
 
-import difflib
 import itertools
 import re
 from collections.abc import Mapping
@@ -10,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int
 
 from sb3_hds.data.columns import Columns, Entry
-from sb3_hds.errors import TrajectoryError
+from sb3_hds.errors import TrajectoryError, did_you_mean
 
 Table = Mapping[str, np.ndarray]
 """Columns by name, each of shape ``(rows,)``; a value that holds for all rows has shape ``()``."""
@@ -79,8 +78,7 @@ def _length(table: Table, columns: Columns, source: str) -> int:
     """Number of rows; all columns that are used must exist and have it."""
     missing = sorted(columns.wanted - set(table))
     if missing:
-        near = difflib.get_close_matches(missing[0], table, 1, cutoff=0.75)
-        hint = f" Did you mean '{near[0]}'?" if near else ""
+        hint = did_you_mean(missing[0], table, cutoff=0.75)
         names = ", ".join(f"'{name}'" for name in missing)
         raise TrajectoryError(
             f"'{source}' has no column {names}. It has: {', '.join(table) or 'none'}.{hint}"

@@ -1,12 +1,11 @@
 """Which twins exist, by name and by environment id."""
 
-import difflib
 import importlib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from sb3_hds.core import Effect, Twin, seen_through
-from sb3_hds.errors import NoTwinError
+from sb3_hds.errors import NoTwinError, did_you_mean
 
 _TWINS: dict[str, type[Twin]] = {}
 
@@ -135,10 +134,8 @@ def _imported(module: str, name: str) -> type[Twin]:
 
 
 def _how_to_add_one(wanted: str) -> str:
-    close = difflib.get_close_matches(wanted, _TWINS, n=1)
-    hint = f" Did you mean '{close[0]}'?" if close else ""
     return (
-        f"There is no twin for '{wanted}'.{hint}\n"
+        f"There is no twin for '{wanted}'.{did_you_mean(wanted, _TWINS)}\n"
         f"Environments with a twin: {', '.join(all_ids())}.\n"
         f"Twins by name: {', '.join(names())}.\n"
         "To add your own (see 'Your own twin' in the documentation):\n\n"
