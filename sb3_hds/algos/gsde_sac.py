@@ -27,7 +27,8 @@ class GSDESAC(SoftActorCritic):
     :param env: likewise
     :param learning_rate: of actor, entropy coefficient and critics; number, schedule or
         ``"lin_3e-4"``
-    :param use_sde: False makes it plain SAC
+    :param use_sde: False: independent noise at each step, and with ``train_freq=1,
+        gradient_steps=1`` plain SAC
     :param train_freq: steps between two calls of ``train``
     :param gradient_steps: updates in each of them
     :param policy_kwargs: ``log_std_init``, ``full_std``, ``use_expln``, ``clip_mean`` and those of

@@ -31,8 +31,8 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     """
     Abstract: off-policy learning from transitions.
 
-    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` for Dict observations, ``"SimbaPolicy"``,
-        a policy class, or the environment itself
+    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` for Dict observations, ``"SimbaPolicy"``
+        (not CrossQ, TD7 and BRO), a policy class, or the environment itself
     :param env: an environment, its id, or a vectorised environment
     :param learning_rate: of the actor and the entropy coefficient; number, schedule or
         ``"lin_3e-4"``
@@ -50,8 +50,10 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     :param action_noise: added to the actions
     :param replay_buffer_class: as in SB3
     :param replay_buffer_kwargs: as in SB3
-    :param optimize_memory_usage: as in SB3
-    :param n_steps: of the returns that critics are regressed on
+    :param optimize_memory_usage: as in SB3; needs
+        ``replay_buffer_kwargs={"handle_timeout_termination": False}``
+    :param n_steps: of the returns that critics are regressed on; above 1, neither with Dict
+        observations nor with ``optimize_memory_usage``
     :param use_sde: explore by gSDE instead of independent noise at each step; not with TD7, which
         adds noise to its actions
     :param sde_sample_freq: steps after which its noise matrix is drawn again, in how many
@@ -62,7 +64,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     :param tensorboard_log: folder for TensorBoard
     :param policy_kwargs: see :class:`~sb3_hds.algos.gaussian_policy.GaussianPolicy`
     :param param_resets: steps of the environment at which networks and their optimisers start
-        afresh
+        afresh; the entropy coefficient stays, but with BRO, and so does TD7's checkpoint
     :param verbose: 0 nothing, 1 information, 2 debugging
     :param seed: of all random numbers
     :param device: ``"auto"``, ``"cpu"`` or ``"cuda"``, as JAX has it
@@ -70,6 +72,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     :param _init_setup_model: as in SB3
     """
 
+    #: steps of ``learn()`` without a number
     default_timesteps: ClassVar[int] = 20_000
     policy: LearningPolicy
     qf_learning_rate: Any

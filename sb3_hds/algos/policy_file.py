@@ -44,6 +44,7 @@ def load_policy(path: str | os.PathLike[str] | io.BufferedIOBase) -> TensorPolic
     BRO draws from its plain actor with ``deterministic=False``, not from the optimistic one.
 
     :param path: of a zip file that one of our algorithms saved; ``.zip`` may be left out
+    :return: a policy with ``predict``, and no optimiser
     :raises FileNotFoundError: if there is none
     :raises ValueError: for a file that is damaged, that another library saved, or whose policy only
         Python code describes: a class or an activation function of your own

@@ -19,19 +19,19 @@ class SimbaSAC(SoftActorCritic):
 
     Source: Lee et al., *SimBa: Simplicity Bias for Scaling Up Parameters in Deep Reinforcement
     Learning*, ICLR 2025: replay ratio 2, learning rate 1e-4, weight decay 1e-2, initial temperature
-    0.01, target entropy of minus half the number of controls; the least of two critics only in
-    tasks that end early, for which their later code takes all of MuJoCo's in Gymnasium. In others,
-    the authors have one critic: ``clipped_double_q=False`` with ``policy_kwargs={"n_critics": 1}``;
-    of more, it takes the mean. Their discount, 1 - 5 / T with episodes of T steps, within 0.95 and
-    0.995, is for ``gamma`` to say.
+    0.01, target entropy of minus half the number of controls. The least of two critics counts in
+    tasks that end early; their later code takes all of MuJoCo's in Gymnasium for such, HalfCheetah
+    included. In others, the authors have one critic: ``clipped_double_q=False`` with
+    ``policy_kwargs={"n_critics": 1}``; of more, it takes the mean. Their
+    discount, 1 - 5 / T with episodes of T steps, within 0.95 and 0.995, is for ``gamma`` to say.
 
     As in the authors' code, :math:`\tanh` squashes the logarithm of the deviation of actions into
     [-10, 2]: actions start with a deviation near :math:`e^{-4}`, where SAC and SBX clip it to [-20,
     2] and start near 1. With gSDE (``use_sde=True``), the deviation is that of the noise matrix,
     which is neither. The loss of the entropy coefficient has the coefficient itself, as theirs,
     where SBX has its logarithm. Critics are updated before the actor, as in SBX and in the other
-    algorithms here; the authors' code updates them last. A file of SimbaSAC that says nothing of
-    squashing clips, as it did.
+    algorithms here; the authors' code updates them last. What was saved before there was
+    ``squash_log_std`` goes on clipping.
 
     SBX's variant is ``learning_rate=3e-4, ent_coef="auto", target_entropy=-n_act,
     linear_ent_coef=False, gradient_steps=1`` with ``policy_kwargs={"net_arch": [256, 256],

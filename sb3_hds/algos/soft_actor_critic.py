@@ -27,8 +27,8 @@ class SoftActorCritic(ModelFreeAlgorithm):
     Abstract: soft actor-critic (Haarnoja et al. 2018), on which the algorithms of this family
     differ by their :class:`~sb3_hds.algos.off_policy.Recipe`.
 
-    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` for Dict observations, ``"SimbaPolicy"``,
-        a policy class, or the environment itself
+    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` for Dict observations, ``"SimbaPolicy"``
+        (not CrossQ and BRO), a policy class, or the environment itself
     :param env: an environment, its id, or a vectorised environment
     :param learning_rate: of actor, entropy coefficient and critics; number, schedule or
         ``"lin_3e-4"``

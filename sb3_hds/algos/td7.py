@@ -195,7 +195,8 @@ class TD7(ModelFreeAlgorithm):
     uniformly, and weights in the loss make its expected gradient the same (Fujimoto, Meger and
     Precup, NeurIPS 2020).
 
-    :param policy: ``"MlpPolicy"``, a policy class, or the environment itself
+    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` for Dict observations, a policy class, or
+        the environment itself
     :param env: an environment, its id, or a vectorised environment
     :param learning_rate: of encoder, actor and critics; number, schedule or ``"lin_3e-4"``
     :param learning_starts: steps with random actions before learning starts
@@ -221,7 +222,7 @@ class TD7(ModelFreeAlgorithm):
         "MlpPolicy": TD7Policy,
         "MultiInputPolicy": TD7Policy,
     }
-    #: twice as many as are random
+    #: steps of ``learn()`` without a number: twice as many as are random
     default_timesteps: ClassVar[int] = 50_000
     policy: TD7Policy
 
@@ -361,6 +362,10 @@ class TD7(ModelFreeAlgorithm):
         truncate_last_traj: bool = True,
     ) -> None:
         """
+        Unpickles, as SB3's does: load what you have saved yourself.
+
+        :param path: of what ``save_replay_buffer`` wrote
+        :param truncate_last_traj: of ``HerReplayBuffer``: as in SB3
         :raises ValueError: for a buffer without priorities, where transitions are drawn by them;
             the model then keeps the one that it has
         """
@@ -387,6 +392,14 @@ class TD7(ModelFreeAlgorithm):
         self.policy.learner = self.policy.learner._replace(**kept)
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
+        """
+        Updates, where policies are assessed once for each step that the last one made, and none
+        while it is assessed.
+
+        :param gradient_steps: how many, where policies are not assessed
+        :param batch_size: transitions in each
+        :raises FloatingPointError: if one of them diverged; the model keeps its last good state
+        """
         if self.assesses:
             gradient_steps = self._assessed()
         elif gradient_steps > 0:
