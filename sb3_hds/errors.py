@@ -45,7 +45,16 @@ class SafetyError(SB3HDSError, RuntimeError):
     """A safety layer cannot keep what it promises: what it assumes does not hold."""
 
 
-class DivergedError(SB3HDSError, FloatingPointError):
+class DivergedError(SB3HDSError, FloatingPointError, ValueError):
+    """
+    Learning diverged.
+
+    It is a ``ValueError``, too, because RL Zoo gives up one trial of a search for that, and the
+    whole search for other errors.
+    """
+
+
+class SeedsDivergedError(DivergedError):
     """
     Some of several seeds that learned side by side diverged.
 

@@ -16,7 +16,7 @@ from sb3_hds import TD7, algos, twins
 from sb3_hds.algos import compiled, learn_compiled
 from sb3_hds.algos.compiled_run import run_rounds
 from sb3_hds.envs import twin_of
-from sb3_hds.errors import DivergedError, EnvironmentMismatchError
+from sb3_hds.errors import EnvironmentMismatchError, SeedsDivergedError
 from sb3_hds.wrappers import ActionRateLimit
 
 SOFT = ["gsde_sac", "droq", "crossq_jax", "tqc_jax", "simba", "bro"]
@@ -126,7 +126,7 @@ def test_seeds_that_diverge_leave_what_the_others_learned(monkeypatch):
     both, _ = learn_compiled(model, 40, seeds=[3, 5])
     monkeypatch.setattr(compiled, "_diverged", lambda _: np.array([True, False]))
 
-    with pytest.raises(DivergedError, match=r"with the seeds \[3\].*models") as caught:
+    with pytest.raises(SeedsDivergedError, match=r"with the seeds \[3\].*models") as caught:
         learn_compiled(model, 40, seeds=[3, 5])
 
     assert list(caught.value.models) == list(caught.value.episodes) == [5]
@@ -138,7 +138,7 @@ def test_divergence_of_all_seeds_ends_the_run(monkeypatch):
     n_calls = Mock(side_effect=run_rounds)
     monkeypatch.setattr(compiled, "run_rounds", n_calls)
 
-    with pytest.raises(DivergedError, match=r"with the seeds \[0, 1\]") as caught:
+    with pytest.raises(SeedsDivergedError, match=r"with the seeds \[0, 1\]") as caught:
         learn_compiled(small("tqc_jax", learning_rate=1e30), 3_000, seeds=[0, 1])
 
     assert caught.value.models == {} and n_calls.call_count == 1
@@ -194,6 +194,14 @@ def test_a_time_limit_is_the_environments_own():
         ),
         ("param_resets", lambda: "Pendulum-v1", {"param_resets": [50]}),
         ("episodes", lambda: "Pendulum-v1", {"train_freq": (1, "episode")}),
+        (
+            "time limits that count as ends",
+            lambda: "Pendulum-v1",
+            {
+                "optimize_memory_usage": True,
+                "replay_buffer_kwargs": {"handle_timeout_termination": False},
+            },
+        ),
         (
             r"store='executed': use store='raw'",
             lambda: ActionRateLimit(gymnasium.make("Pendulum-v1"), 4.0, store="executed"),

@@ -281,6 +281,24 @@ def test_what_a_model_free_algorithm_is_sampled_with_can_be_trained(zoo, algo):
     assert "Number of finished trials:  1" in output and "Value:" in output
 
 
+@pytest.mark.expensive
+def test_a_trial_that_diverges_does_not_end_the_search(zoo):
+    (zoo.folder / "huge.py").write_text(
+        "import gymnasium as gym\n"
+        "def make(**given):\n"
+        "    env = gym.make('Pendulum-v1', **given)\n"
+        "    return gym.wrappers.TransformReward(env, lambda reward: 1e37 * reward)\n"
+        "gym.register('Huge-v0', make, max_episode_steps=200)\n"
+    )
+    agent = ("--algo", "droq", "--env", "Huge-v0", "--gym-packages", "huge", "-f", "huge")
+    budget = ("-n", "12000", "--n-trials", "2", "--n-evaluations", "1", "--n-startup-trials", "2")
+    path = os.pathsep.join((str(zoo.folder), os.environ.get("PYTHONPATH", "")))
+
+    output = zoo.run(*CONSOLE, "train", *agent, "-optimize", *budget, PYTHONPATH=path).stdout
+
+    assert "DroQ: an update diverged" in output and "Trial 1 pruned" in output, output[-3000:]
+
+
 def test_an_unknown_key_in_a_yml_file_is_named_with_the_one_that_was_meant(zoo):
     entry = {"n_timesteps": 100, "policy": "MlpPolicy", "n_rolouts": 8}
     (zoo.folder / "typo.yml").write_text(yaml.dump({"Pendulum-v1": entry}))

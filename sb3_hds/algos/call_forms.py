@@ -4,7 +4,8 @@ import inspect
 import math
 import numbers
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -14,10 +15,9 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_hds.algos.epoch import PLANNERS
-from sb3_hds.algos.persistence import TensorPolicy
 from sb3_hds.errors import EnvironmentMismatchError, did_you_mean
 
 if TYPE_CHECKING:
@@ -70,29 +70,41 @@ _CHOICES = {
 
 
 def policy_and_env(
+    algorithm: type[BaseAlgorithm],
     policy: Any,
     env: Any,
-    aliases: Mapping[str, Any],
     check: Callable[[spaces.Space], None],
+    monitor_wrapper: bool,
 ) -> tuple[Any, Any]:
     """
     A lone environment, or a lone string that names no policy, is the environment:
     ``HDS("Pendulum-v1")`` means ``HDS("MlpPolicy", "Pendulum-v1")``.
 
     :param check: raises for observations that the algorithm cannot use
+    :param monitor_wrapper: whether SB3 may wrap a lone environment in its ``Monitor``
     :return: policy and environment in SB3's order; the environment made, if it was a string
     :raises EnvironmentMismatchError: for observations that the algorithm cannot use
+    :raises ValueError: for a policy that it cannot use
     """
+    aliases = algorithm.policy_aliases
     if env is None and (
         isinstance(policy, gym.Env | VecEnv) or (isinstance(policy, str) and policy not in aliases)
     ):
         policy, env = None, policy
-    if env is None:
-        return policy, None
-    env = maybe_make_env(env, 0)
-    check(env.observation_space)
-    of_several = isinstance(env.observation_space, spaces.Dict)
-    return policy or ("MultiInputPolicy" if of_several else "MlpPolicy"), env
+    if env is not None:
+        env = maybe_make_env(env, 0)
+        check(env.observation_space)
+        of_several = isinstance(env.observation_space, spaces.Dict)
+        policy = policy or ("MultiInputPolicy" if of_several else "MlpPolicy")
+        if isinstance(env, gym.Env) and not monitor_wrapper:
+            # SBX does not hand the argument on to SB3, which leaves vectorised ones as they are.
+            env = DummyVecEnv([partial(_itself, env)])
+    _check_policy(algorithm, policy)
+    return policy, env
+
+
+def _itself(env: gym.Env) -> gym.Env:
+    return env
 
 
 def check_twin_observes(space: spaces.Space) -> None:
@@ -127,7 +139,7 @@ def check_policy_kwargs(policy: type, policy_kwargs: Iterable[str]) -> None:
         )
 
 
-def check_policy(algorithm: type[BaseAlgorithm], policy: Any) -> None:
+def _check_policy(algorithm: Any, policy: Any) -> None:
     """
     :raises ValueError: for a name that the algorithm does not know, and for a policy class of
         another algorithm, as its saved files name it
@@ -135,7 +147,7 @@ def check_policy(algorithm: type[BaseAlgorithm], policy: Any) -> None:
     known = algorithm.policy_aliases
     if isinstance(policy, str) and policy not in known:
         raise ValueError(f"{algorithm.__name__} has no policy {policy!r}: use {', '.join(known)}.")
-    if isinstance(policy, type) and not issubclass(policy, TensorPolicy):
+    if isinstance(policy, type) and not issubclass(policy, algorithm.policy_family):
         raise ValueError(
             f"{algorithm.__name__} cannot use the policy {policy.__name__}: pass 'MlpPolicy'. "
             "A file that another algorithm saved is loaded by the class of that algorithm."

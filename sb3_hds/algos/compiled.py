@@ -20,7 +20,7 @@ from sb3_hds.algos.off_policy import Knobs
 from sb3_hds.algos.soft_actor_critic import SoftActorCritic
 from sb3_hds.core import Twin
 from sb3_hds.envs.mirror import check_mirrors, twin_of
-from sb3_hds.errors import DivergedError
+from sb3_hds.errors import SeedsDivergedError
 
 Algorithm = TypeVar("Algorithm", bound=SoftActorCritic)
 
@@ -70,9 +70,11 @@ def learn_compiled(
     :raises EnvironmentMismatchError: for a wrapper that its twin does not have, and for a twin with
         other actions or observations
     :raises ValueError: for what only steps in Python can do: other algorithms, several
-        environments, ``VecNormalize``, another replay buffer, n-step returns, action noise,
-        ``param_resets``, episodes as ``train_freq``, a layer that stores what was executed
-    :raises DivergedError: if a seed diverged, when the others are done; it has what they learned
+        environments, ``VecNormalize``, another replay buffer, ``optimize_memory_usage``, n-step
+        returns, action noise, ``param_resets``, episodes as ``train_freq``, a layer that stores
+        what was executed
+    :raises SeedsDivergedError: if a seed diverged, when the others are done; it has what they
+        learned
     """
     seeds = [int(seed) for seed in seeds]
     _refuse_what_needs_python(model, total_timesteps, seeds)
@@ -97,7 +99,7 @@ def learn_compiled(
         _take_over(models[i], _of_seed(runs, i), _of_seed(whole, i), _n_steps(steps))
     episodes = [_episodes(steps, i) for i in range(len(seeds))]
     if lost.any():
-        raise DivergedError(
+        raise SeedsDivergedError(
             f"Learning diverged with the seeds {[seeds[i] for i in np.flatnonzero(lost)]}. Lower "
             "the learning rate, or scale rewards. What others learned is in this error's models "
             "and episodes.",
@@ -127,6 +129,10 @@ def _refuse_what_needs_python(model: Any, total_timesteps: Any, seeds: Sequence[
             "leave it out",
         ),
         "action_noise": (model.action_noise is not None, "leave it out"),
+        "time limits that count as ends, which optimize_memory_usage needs": (
+            not (model.replay_buffer_kwargs or {}).get("handle_timeout_termination", True),
+            "leave out replay_buffer_kwargs and optimize_memory_usage",
+        ),
         "param_resets": (
             any(at < total_timesteps for at in model.param_resets or []),
             "pass param_resets=[]",

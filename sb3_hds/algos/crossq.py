@@ -37,6 +37,7 @@ class CrossQ(SoftActorCritic):
         "MlpPolicy": CrossQPolicy,
         "MultiInputPolicy": CrossQPolicy,
     }
+    policy_family = CrossQPolicy
 
     def __init__(
         self,
@@ -56,7 +57,3 @@ class CrossQ(SoftActorCritic):
             linear_ent_coef=linear_ent_coef,
             **arguments,
         )
-
-    def check_arguments(self) -> None:
-        super().check_arguments()
-        self.warn_unless_usual("tau", "target_update_interval", why="there are no target networks")

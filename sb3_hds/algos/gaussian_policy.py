@@ -55,7 +55,8 @@ class GaussianPolicy(LearningPolicy):
     :param dropout_rate: of the critics
     :param layer_norm: in the critics; the networks of SimBa and BRO have it in any case
     :param renorm_warmup_steps: batch normalisation in actor and critics, which becomes batch
-        renormalisation after so many updates; None: neither, but 100,000 with ``CrossQPolicy``
+        renormalisation after so many updates, and CrossQ's update, without target networks; None:
+        neither, but 100,000 with ``CrossQPolicy``
     :param batch_norm_momentum: the share of its running statistics that stays at an update, as in
         SBX; SB3-contrib's ``batch_norm_momentum=0.01`` is 0.99 here
     :param ortho_init: whether layers start orthogonal, as in JAXRL's SAC, rather than as flax and

@@ -8,23 +8,31 @@ import operator
 import warnings
 from abc import abstractmethod
 from collections import ChainMap
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
 
+import jax
+import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.her import HerReplayBuffer
 
-from sb3_hds.algos.call_forms import between, check_policy, is_count, policy_and_env, schedule_of
+from sb3_hds.algos.call_forms import between, is_count, policy_and_env, schedule_of
 from sb3_hds.algos.learning_policy import LearningPolicy
+from sb3_hds.algos.networks import finite_leaves
 from sb3_hds.algos.observations import check_actions, check_observations
+from sb3_hds.algos.optimizers import Trained
 from sb3_hds.algos.tensor_algorithm import TensorAlgorithm
-from sb3_hds.errors import EnvironmentMismatchError
+from sb3_hds.errors import DivergedError, EnvironmentMismatchError
 
 # What is logged of updates of the actor, which not every call of ``train`` makes.
 _OF_ACTOR = ("actor_loss", "ent_coef", "ent_coef_loss")
 _NOT_THERE = object()
+# What networks compute in.
+_LARGEST = float(np.finfo(np.float32).max)
 
 
 class ModelFreeAlgorithm(TensorAlgorithm):
@@ -78,6 +86,10 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     qf_learning_rate: Any
     #: the replay buffer that arguments led to, where none was passed
     _derived_buffer: type[ReplayBuffer] | None = None
+    #: the learner before the last update
+    _before: Any = None
+    #: the ``param_resets`` that ``reset_idx`` counts in
+    _counted_resets: list[int] | None = None
 
     def __init__(
         self,
@@ -113,9 +125,8 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         _init_setup_model: bool = True,
     ) -> None:
         policy_class, made_env = policy_and_env(
-            policy, env, self.policy_aliases, check_observations
+            type(self), policy, env, check_observations, monitor_wrapper
         )
-        check_policy(type(self), policy_class)
         super().__init__(
             policy=policy_class,
             env=made_env,
@@ -179,14 +190,17 @@ class ModelFreeAlgorithm(TensorAlgorithm):
 
         :param gradient_steps: how many
         :param batch_size: transitions in each
-        :raises FloatingPointError: if one of them diverged; the model keeps its last good state
+        :raises DivergedError: if one of them diverged; the model keeps its last good state
         """
         self._maybe_reset_params()
         rate, qf_rate = self.learning_rates()
-        n_improved = self._n_improved()
-        report = self._updates(gradient_steps, batch_size)
+        n_improved, n_before = self._n_improved(), int(self.policy.learner.n_updates)
+        try:
+            report = self._updates(gradient_steps, batch_size)
+        finally:
+            # Interrupted, some of them were made.
+            self._n_updates += int(self.policy.learner.n_updates) - n_before
         silent = _OF_ACTOR if self._n_improved() == n_improved else ()
-        self._n_updates += gradient_steps
         self.logger.record("train/learning_rate", rate)
         if self.qf_learning_rate is not None:
             self.logger.record("train/qf_learning_rate", qf_rate)
@@ -194,6 +208,70 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         for name, value in report.items():
             if name not in silent:
                 self.logger.record(f"train/{name}", value)
+
+    def _take(self, learner: Any, report: dict[str, float]) -> None:
+        """
+        Go on with what an update made of the networks.
+
+        :param report: its losses, which show whether the networks before it are good
+        :raises DivergedError: if it diverged; the model keeps its last good state
+        """
+        if not all(map(math.isfinite, report.values())):
+            self._give_up(f"an update diverged ({report})")
+        self._before, self.policy.learner = self.policy.learner, learner
+
+    def check_weights(self) -> None:
+        if not finite_leaves(_trained(self.policy.learner)):
+            self._give_up("an update made weights that are not finite")
+
+    def _give_up(self, what: str) -> NoReturn:
+        if self._before is not None and not finite_leaves(_trained(self.policy.learner)):
+            self.policy.learner = self._before
+        raise DivergedError(
+            f"{type(self).__name__}: {what}. The model keeps its last good state; lower "
+            "learning_rate, or scale rewards."
+        )
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        actions = super()._sample_action(learning_starts, action_noise, n_envs)
+        if not np.isfinite(actions[1]).all():
+            self._give_up("its actions are not finite")
+        return actions
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if reset_num_timesteps or self._last_obs is None:
+            self._end_episode()
+        resets = list(self.param_resets or [])
+        if resets != self._counted_resets:
+            # Others than those of the model that was loaded.
+            self._counted_resets = resets
+            self.reset_idx = sum(at <= self.num_timesteps for at in resets)
+        return super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+
+    def _end_episode(self) -> None:
+        """What was stored last shall not go on where the environment is reset to."""
+        buffer: Any = self.replay_buffer
+        if buffer is None or not (buffer.full or buffer.pos):
+            return
+        if isinstance(buffer, HerReplayBuffer):
+            with warnings.catch_warnings(action="ignore"):
+                buffer.truncate_last_trajectory()
+            return
+        goes_on = buffer.dones[buffer.pos - 1] == 0.0
+        buffer.dones[buffer.pos - 1, goes_on] = 1.0
+        if buffer.handle_timeout_termination:
+            buffer.timeouts[buffer.pos - 1, goes_on] = 1.0
 
     def _n_improved(self) -> int:
         """:return: updates of the actor so far"""
@@ -213,7 +291,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         # The last collection may go beyond the steps that were asked for.
         remaining = max(0.0, self._current_progress_remaining)
         rate = float(schedule(remaining))
-        if not between(rate, 0.0, math.inf):
+        if not between(rate, 0.0, _LARGEST):
             raise ValueError(
                 f"{type(self).__name__}({name}={getattr(self, name)!r}): {name} must be a finite "
                 f"number of at least 0 all the time; where {remaining:.3g} of the training "
@@ -313,7 +391,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             self.learning_rate = float(self.learning_rate)
         self._take_older_rate()
         # Of None, SBX makes the first number of ``learning_rate``.
-        given = self.qf_learning_rate
+        given, self._before = self.qf_learning_rate, None
         derived = self.replay_buffer_class in (None, self._derived_buffer)
         if derived:
             self._derive_buffer()
@@ -353,7 +431,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             self._restart(self.network_seed)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor", "critic"]
+        return [*super()._excluded_save_params(), "actor", "critic", "_before"]
 
 
 def _are_rising_steps(given: Any) -> bool:
@@ -362,14 +440,7 @@ def _are_rising_steps(given: Any) -> bool:
     return all(before < after for before, after in itertools.pairwise(given))
 
 
-def finite(report: dict[str, float]) -> dict[str, float]:
-    """
-    :return: the same
-    :raises FloatingPointError: if a number of it is not finite
-    """
-    if all(map(math.isfinite, report.values())):
-        return report
-    raise FloatingPointError(
-        f"The update diverged ({report}); the model keeps the state before it. Lower the learning "
-        "rate, or scale rewards and observations (VecNormalize)."
-    )
+def _trained(learner: Any) -> list[Any]:
+    """:return: all that optimisers change, with their own state"""
+    parts = jax.tree.leaves(learner, is_leaf=lambda part: isinstance(part, Trained))
+    return [part for part in parts if isinstance(part, Trained)]

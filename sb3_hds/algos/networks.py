@@ -241,3 +241,14 @@ def _mlp(x: jax.Array, net_arch: Sequence[int], activation_fn: Activation) -> ja
     for width in net_arch:
         x = activation_fn(nn.Dense(width, kernel_init=_HIDDEN)(x))
     return x
+
+
+def finite_leaves(tree: Any) -> bool:
+    """:return: whether no number in it is infinite or not a number"""
+    leaves = jax.tree.leaves(tree)
+    return bool(_finite([leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.inexact)]))
+
+
+@jax.jit
+def _finite(leaves: list[Array]) -> Array:
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in leaves]).all()

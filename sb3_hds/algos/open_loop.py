@@ -21,7 +21,6 @@ from sb3_hds.algos.body import Body, body_of, refuse_without_state, space_of, st
 from sb3_hds.algos.call_forms import (
     between,
     check_origin,
-    check_policy,
     is_count,
     jax_device,
     policy_and_env,
@@ -29,6 +28,7 @@ from sb3_hds.algos.call_forms import (
 from sb3_hds.algos.gait_space import Constants, GaitSpace
 from sb3_hds.algos.gait_trials import Trial, Trials
 from sb3_hds.algos.oscillator_policy import OscillatorPolicy
+from sb3_hds.algos.persistence import TensorPolicy
 from sb3_hds.algos.saving import SavesTensors
 from sb3_hds.core.oscillators import LEADS
 from sb3_hds.errors import EnvironmentMismatchError, ParameterError
@@ -104,6 +104,8 @@ class OpenLoop(SavesTensors):
         "MlpPolicy": OscillatorPolicy,
         "MultiInputPolicy": OscillatorPolicy,
     }
+    #: what a policy class must extend
+    policy_family: ClassVar[type[TensorPolicy]] = OscillatorPolicy
     policy: OscillatorPolicy
 
     def __init__(
@@ -139,9 +141,8 @@ class OpenLoop(SavesTensors):
         _init_setup_model: bool = True,
     ) -> None:
         policy_class, made_env = policy_and_env(
-            policy, env, self.policy_aliases, lambda space: None
+            type(self), policy, env, lambda space: None, monitor_wrapper
         )
-        check_policy(type(self), policy_class)
         self.population_size = population_size
         self.n_resets = n_resets
         self.horizon = horizon

@@ -32,7 +32,9 @@ class SavesTensors(BaseAlgorithm):
         :param exclude: attributes to leave out besides the usual ones
         :param include: attributes to write although they are usually left out
         :raises OSError: if the file cannot be written; an older one is then left as it was
+        :raises DivergedError: for weights that are not finite
         """
+        self.check_weights()
         self.policy_description = described(self.policy)  # type: ignore[arg-type]
         write = super().save
         write_whole(path, "zip", lambda file: write(file, exclude, include))
@@ -58,6 +60,11 @@ class SavesTensors(BaseAlgorithm):
             kwargs["policy_kwargs"] = by_names(kwargs["policy_kwargs"])
         with damage_reported(path):
             return super().load(path, env, device_or_cpu(device), *args, **kwargs)
+
+    def check_weights(self) -> None:
+        """
+        :raises DivergedError: for weights that are not finite, of algorithms that may have some
+        """
 
     def get_parameters(self) -> dict[str, dict]:
         """:return: by the object's name its tensors by theirs; objects that have some"""

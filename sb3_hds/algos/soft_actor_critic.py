@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule, TrainFrequen
 
 from sb3_hds.algos.call_forms import between, is_count, jax_device
 from sb3_hds.algos.gaussian_policy import GaussianPolicy, SimbaPolicy
-from sb3_hds.algos.model_free import ModelFreeAlgorithm, finite
+from sb3_hds.algos.model_free import ModelFreeAlgorithm
 from sb3_hds.algos.off_policy import Knobs, Recipe, Report, before_any, log_of, squared, update
 from sb3_hds.algos.sampling import batches_of
 
@@ -46,6 +46,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
         "MultiInputPolicy": GaussianPolicy,
         "SimbaPolicy": SimbaPolicy,
     }
+    policy_family = GaussianPolicy
     #: fields of the learner that ``param_resets`` leaves as they are
     kept_by_restarts: ClassVar[tuple[str, ...]] = ("log_ent_coef", "seen", "n_updates")
     policy: GaussianPolicy
@@ -98,6 +99,12 @@ class SoftActorCritic(ModelFreeAlgorithm):
                 "gradient_steps=8."
             )
 
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if self.policy.recipe.joint_pass:
+            why = "there are no target networks with batch normalisation"
+            self.warn_unless_usual("tau", "target_update_interval", why=why)
+
     def set_parameters(
         self,
         load_path_or_dict: str | dict[str, Any],
@@ -135,8 +142,8 @@ class SoftActorCritic(ModelFreeAlgorithm):
             now = min(_MOST_UPDATES, n - done)
             batches = batches_of(self, now, batch_size, _capacity(now))
             learner, found = update(policy.recipe, policy.learner, batches, now, knobs, found)
-            report = finite(_plain(found))
-            policy.learner = learner
+            report = _plain(found)
+            self._take(learner, report)
         return report
 
     def knobs(self) -> Knobs:

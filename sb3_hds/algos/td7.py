@@ -12,17 +12,16 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
+from stable_baselines3.common.type_aliases import GymEnv, Schedule, TrainFreq
 
 from sb3_hds.algos.call_forms import between, check_count, is_count, jax_device
 from sb3_hds.algos.gaussian_policy import widths
 from sb3_hds.algos.lap import LapReplayBuffer
 from sb3_hds.algos.learner import GENERATOR
 from sb3_hds.algos.learning_policy import LearningPolicy
-from sb3_hds.algos.model_free import ModelFreeAlgorithm, finite
+from sb3_hds.algos.model_free import ModelFreeAlgorithm
 from sb3_hds.algos.networks import Activation, activation
 from sb3_hds.algos.observations import flattener, size_of
 from sb3_hds.algos.off_policy import Batch, before_any
@@ -184,10 +183,12 @@ class TD7(ModelFreeAlgorithm):
 
     With checkpoints, as in the paper, a policy acts for whole episodes and is assessed by the worst
     of them, in rewards of the environment itself; only then it is updated, once for each step that
-    it made. That needs one environment, and ``gradient_steps`` is not looked at; nor, ever, is
-    ``tau``: target networks are copied whole. Networks that start afresh (``param_resets``) leave
-    the checkpoint and its assessment as they are. Where a model with a checkpoint goes on learning
-    without assessments, the first update drops it. Without a checkpoint, the policy as it is acts.
+    it made. That needs one environment, and episodes that end: from one that never does, ``learn``
+    never returns, unless ``use_checkpoints=False``. ``gradient_steps`` is then not looked at; nor,
+    ever, is ``tau``: target networks are copied whole. Networks that start afresh
+    (``param_resets``) leave the checkpoint and its assessment as they are. Where a model with a
+    checkpoint goes on learning without assessments, the first update drops it. Without a
+    checkpoint, the policy as it is acts.
     SBX has no TD7.
 
     Prioritised replay draws from SB3's plain buffer. With ``n_steps`` above 1, Dict observations,
@@ -222,6 +223,7 @@ class TD7(ModelFreeAlgorithm):
         "MlpPolicy": TD7Policy,
         "MultiInputPolicy": TD7Policy,
     }
+    policy_family = TD7Policy
     #: steps of ``learn()`` without a number: twice as many as are random
     default_timesteps: ClassVar[int] = 50_000
     policy: TD7Policy
@@ -398,7 +400,7 @@ class TD7(ModelFreeAlgorithm):
 
         :param gradient_steps: how many, where policies are not assessed
         :param batch_size: transitions in each
-        :raises FloatingPointError: if one of them diverged; the model keeps its last good state
+        :raises DivergedError: if one of them diverged; the model keeps its last good state
         """
         if self.assesses:
             gradient_steps = self._assessed()
@@ -447,15 +449,15 @@ class TD7(ModelFreeAlgorithm):
         buffer: Any = self.replay_buffer
         rates, policy = self.learning_rates(), self.policy
         report, found = {}, before_any(Report)
-        for i in range(n):
+        for _ in range(n):
             batch, drawn = self._drawn(batch_size)
             learner, found, priorities = update(policy.recipe, policy.learner, batch, *rates, found)
-            report = finite({name: float(value) for name, value in found._asdict().items()})
-            policy.learner = learner
+            report = {name: float(value) for name, value in found._asdict().items()}
+            self._take(learner, report)
             if drawn is None:
                 continue
             buffer.set_priorities(*drawn, np.asarray(priorities))
-            if (self._n_updates + i + 1) % self.target_update_interval == 0:
+            if int(learner.n_updates) % self.target_update_interval == 0:
                 buffer.forget_highest()
         return report
 
@@ -490,19 +492,9 @@ class TD7(ModelFreeAlgorithm):
                 self._finished.append((self._episode_return, self._episode_length))
             self._begin_episode()
 
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        if reset_num_timesteps or self._last_obs is None:  # SB3 resets the environment
-            self._begin_episode()
-        return super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
+    def _end_episode(self) -> None:
+        super()._end_episode()
+        self._begin_episode()
 
     def _begin_episode(self) -> None:
         self._episode_return, self._episode_length = 0.0, 0

@@ -1,6 +1,7 @@
 """What all our algorithms share: one way in, weights as tensors, files that are whole or not there,
 and no measurement that is not finite."""
 
+import copy
 import io
 import pathlib
 from typing import Any, ClassVar, Self
@@ -8,12 +9,15 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from sbx.common.off_policy_algorithm import OffPolicyAlgorithmJax
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_hds.algos.call_forms import check_origin, check_policy_kwargs
 from sb3_hds.algos.executed_actions import executed
 from sb3_hds.algos.persistence import TensorPolicy, by_names, write_whole
 from sb3_hds.algos.saving import SavesTensors
+
+_STATISTICS = ("obs_rms", "ret_rms", "returns")
 
 
 class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
@@ -22,8 +26,12 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
     default_timesteps: ClassVar[int] = 1_000
     #: whether a layer around the environment may decide that executed actions are stored
     stores_executed: ClassVar[bool] = True
+    #: what a policy class must extend
+    policy_family: ClassVar[type[TensorPolicy]] = TensorPolicy
     policy: TensorPolicy
     saved_by: str
+    #: of ``VecNormalize``, as they were after the last step that was stored
+    _statistics: dict[str, Any] | None = None
 
     def _constructed(self, device: Any, set_up: bool) -> None:
         """
@@ -69,7 +77,7 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         """
         if total_timesteps is None:
             total_timesteps = self.default_timesteps
-        return super().learn(
+        learned = super().learn(
             total_timesteps,
             callback,
             log_interval,  # type: ignore[arg-type]
@@ -77,6 +85,17 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
             reset_num_timesteps,
             progress_bar,
         )
+        self.check_weights()
+        return learned
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        """
+        :raises ValueError: where what the environment begins with is not finite
+        """
+        self._keep_statistics()
+        found = super()._setup_learn(*args, **kwargs)
+        self._refuse_unless_finite("What the environment begins with", self._last_obs)
+        return found
 
     def _store_transition(
         self,
@@ -92,16 +111,37 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
             the next call of ``learn`` resets the environment
         """
         ends = [info["terminal_observation"] for info in infos if "terminal_observation" in info]
-        if not all(_is_finite(measured) for measured in (new_obs, reward, *ends)):
-            self._last_obs = None
-            raise ValueError(
-                f"Step {self.num_timesteps} of the environment is not finite: observation "
-                f"{new_obs}, reward {reward}. The model and the steps before are as they were: "
-                "mend the sensor, then learn(..., reset_num_timesteps=False)."
-            )
+        step = f"Step {self.num_timesteps} of the environment"
+        self._refuse_unless_finite(step, new_obs, reward, *ends)
+        self._keep_statistics()
         if self.stores_executed:
             buffer_action = executed(self.action_space, buffer_action, infos)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
+
+    def _keep_statistics(self) -> None:
+        normalizer = self._vec_normalize_env
+        if normalizer is not None:
+            held = [name for name in _STATISTICS if hasattr(normalizer, name)]
+            self._statistics = {name: copy.deepcopy(getattr(normalizer, name)) for name in held}
+
+    def _refuse_unless_finite(self, what: str, *measured: Any) -> None:
+        """``VecNormalize`` has counted it already, and clips what is infinite."""
+        normalizer = self._vec_normalize_env
+        given = measured
+        if normalizer is not None:
+            own = normalizer.get_original_obs(), normalizer.get_original_reward()
+            given = own[: len(measured)]
+        if all(map(_is_finite, (*measured, *given))):
+            return
+        for name, value in (self._statistics or {}).items():
+            setattr(normalizer, name, value)
+        self._last_obs = None
+        named = zip(("observation", "reward"), given, strict=False)
+        raise ValueError(
+            f"{what} is not finite: {', '.join(f'{name} {value}' for name, value in named)}. The "
+            "model and the steps before are as they were: mend the sensor, then learn(..., "
+            "reset_num_timesteps=False)."
+        )
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         write_whole(path, "pkl", super().save_replay_buffer)
@@ -121,6 +161,9 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         self.policy_kwargs = by_names(self.policy_kwargs)
         self.check_arguments()
         super()._setup_model()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_statistics"]
 
     def check_arguments(self) -> None:
         """

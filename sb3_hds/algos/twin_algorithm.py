@@ -23,7 +23,6 @@ from sb3_hds import twins
 from sb3_hds.algos.arguments import knobs_of, settings_of
 from sb3_hds.algos.call_forms import (
     check_arguments,
-    check_policy,
     check_twin_observes,
     jax_device,
     policy_and_env,
@@ -51,6 +50,7 @@ from sb3_hds.algos.tensor_algorithm import TensorAlgorithm
 from sb3_hds.algos.twin_policy import TwinPolicy, all_finite
 from sb3_hds.core import Params, Twin
 from sb3_hds.envs.mirror import check_mirrors, twin_of
+from sb3_hds.errors import DivergedError
 
 # Decay of what counts as recent in the pretraining, per epoch, and the fewest epochs to judge by.
 _RECENT = 0.9
@@ -63,6 +63,7 @@ class TwinAlgorithm(TensorAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": TwinPolicy}
+    policy_family = TwinPolicy
     policy: TwinPolicy
     #: the twin contains the layers: it has to be told what they were told
     stores_executed: ClassVar[bool] = False
@@ -123,9 +124,8 @@ class TwinAlgorithm(TensorAlgorithm):
         _init_setup_model: bool,
     ) -> None:
         policy_class, made_env = policy_and_env(
-            policy, env, self.policy_aliases, check_twin_observes
+            type(self), policy, env, check_twin_observes, monitor_wrapper
         )
-        check_policy(type(self), policy_class)
         super().__init__(
             policy=policy_class,
             env=made_env,
@@ -241,7 +241,7 @@ class TwinAlgorithm(TensorAlgorithm):
         :param gradient_steps: regression steps
         :return: what happened, on the device
         :raises NoTwinError: if the model was loaded without environment and without twin
-        :raises FloatingPointError: if the regression diverged; the model keeps its last good state
+        :raises DivergedError: if the regression diverged; the model keeps its last good state
         """
         first = self._workspace is None
         learner, settings = self._learner(), self._settings
@@ -257,7 +257,7 @@ class TwinAlgorithm(TensorAlgorithm):
         )
         losses = float(report.policy_loss), float(report.value_loss)
         if not (all(map(math.isfinite, losses)) and all_finite(learner.networks)):
-            raise FloatingPointError(
+            raise DivergedError(
                 f"The regression diverged (losses {losses}); the model keeps the state before this "
                 "epoch. Lower learning_rate."
             )

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_hds.algos.learner import GENERATOR, Networks, Progress, fresh_networks
-from sb3_hds.algos.networks import Activation, Actor, Value, activation, widths_of
+from sb3_hds.algos.networks import Activation, Actor, Value, activation, finite_leaves, widths_of
 from sb3_hds.algos.persistence import TensorPolicy, TrainingTensors
 
 _POLICY_WIDTHS, _VALUE_WIDTHS = (96, 96), (64, 64)
@@ -115,15 +115,9 @@ def _act(actor: Actor, networks: Networks, obs: Any) -> Any:
     return actor.apply(networks.acting, networks.acting_inside(jnp.asarray(obs, jnp.float32)))
 
 
-@jax.jit
-def _finite(leaves: list[jax.Array]) -> jax.Array:
-    return jnp.stack([jnp.isfinite(leaf).all() for leaf in leaves]).all()
-
-
 def all_finite(networks: Networks) -> bool:
     """:return: whether no weight is infinite or not a number"""
-    learned = networks.actor, networks.average, networks.value, networks.acting
-    return bool(_finite(jax.tree.leaves(learned)))
+    return finite_leaves((networks.actor, networks.average, networks.value, networks.acting))
 
 
 def _widths(

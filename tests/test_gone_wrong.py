@@ -1,0 +1,283 @@
+"""What is left of a model, and of what it remembers, when something went wrong or was cut off."""
+
+import gymnasium
+import numpy as np
+import pytest
+from small_models import OFF_POLICY, PLANNERS, same, saved, small
+from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.her import HerReplayBuffer
+
+from sb3_hds import HDS, TD7, TQC, CrossQ, DroQ, SimbaSAC
+from sb3_hds.algos.gaussian_policy import CrossQPolicy, GaussianPolicy
+from sb3_hds.algos.networks import finite_leaves
+from sb3_hds.algos.td7 import TD7Policy
+from sb3_hds.errors import DivergedError
+
+MODEL_FREE = [name for name in OFF_POLICY if name not in PLANNERS]
+REPRESENTATIVES = ("droq", "td7", "bro")
+every_algorithm = pytest.mark.parametrize(
+    "name",
+    [
+        name if name in REPRESENTATIVES else pytest.param(name, marks=pytest.mark.expensive)
+        for name in MODEL_FREE
+    ],
+)
+
+
+def finite(model) -> bool:
+    return finite_leaves(model.policy.weights)
+
+
+class Dead(gymnasium.Wrapper):
+    """An environment whose sensor, or reward, is ``value`` from the tenth step on."""
+
+    def __init__(self, value: float, of_reward: bool) -> None:
+        super().__init__(gymnasium.make("Pendulum-v1"))
+        self.value, self.of_reward, self.n_steps = value, of_reward, 0
+
+    def step(self, action):
+        self.n_steps += 1
+        obs, reward, *ends = super().step(action)
+        if self.n_steps >= 10 and self.of_reward:
+            reward = self.value
+        elif self.n_steps >= 10:
+            obs = np.full_like(obs, self.value)
+        return obs, reward, *ends
+
+
+class Watched(gymnasium.Wrapper):
+    """Keeps the commands that it is given."""
+
+    def __init__(self) -> None:
+        super().__init__(gymnasium.make("Pendulum-v1"))
+        self.commands = []
+
+    def step(self, action):
+        self.commands.append(np.array(action))
+        return super().step(action)
+
+
+# --- Divergence
+
+
+def test_an_update_that_diverges_is_an_error_and_leaves_the_last_good_weights():
+    model = small("droq").learn(20)
+    before = model.get_parameters()["policy"]
+    model.replay_buffer.rewards[:] = 1e38
+
+    with pytest.raises(DivergedError, match="diverged"):
+        for _ in range(20):
+            model.train(gradient_steps=4, batch_size=16)
+
+    after = model.get_parameters()["policy"]
+    assert finite(model) and before.keys() == after.keys()
+    assert model._n_updates == int(model.policy.learner.n_updates)
+
+
+def test_a_diverged_trial_is_no_reason_to_end_a_search():
+    """RL Zoo prunes trials for the latter."""
+    assert issubclass(DivergedError, FloatingPointError) and issubclass(DivergedError, ValueError)
+
+
+def infinite_step(name: str, env, monkeypatch):
+    """:return: a model that has learned, whose next steps are too large for its weights"""
+    model = small(name, env, gradient_steps=1, train_freq=5).learn(20)
+    monkeypatch.setattr(model, "learning_rates", lambda: (np.inf, np.inf))
+    return model
+
+
+@every_algorithm
+def test_weights_of_which_no_loss_tells_are_noticed_before_they_act(name, monkeypatch):
+    env = Watched()
+    model = infinite_step(name, env, monkeypatch)
+
+    with pytest.raises(DivergedError, match="keeps its last good state"):
+        model.learn(50, reset_num_timesteps=False)
+
+    assert finite(model) and np.isfinite(env.commands).all()
+    assert np.isfinite(model.replay_buffer.actions).all()
+    assert np.isfinite(model.predict(np.zeros(3, np.float32))[0]).all()
+
+
+@every_algorithm
+def test_weights_that_the_last_update_spoils_are_noticed_in_the_end(name, monkeypatch, tmp_path):
+    model = infinite_step(name, "Pendulum-v1", monkeypatch)
+
+    with pytest.raises(DivergedError, match="last good state"):
+        model.learn(5, reset_num_timesteps=False)
+
+    assert finite(model)
+    model.save(tmp_path / "model")
+
+
+def test_weights_that_are_none_are_not_saved(monkeypatch, tmp_path):
+    model = infinite_step("droq", "Pendulum-v1", monkeypatch)
+    model.train(gradient_steps=1, batch_size=16)
+    assert not finite(model)
+
+    with pytest.raises(DivergedError, match="last good state"):
+        model.save(tmp_path / "model")
+
+    assert not list(tmp_path.iterdir()) and finite(model)
+
+
+def test_rates_that_are_infinite_where_networks_compute_are_refused():
+    model = small("droq", learning_rate=1e39)
+    with pytest.raises(ValueError, match="learning_rate must be a finite number"):
+        model.learn(20)
+
+
+@pytest.mark.parametrize("name", ["droq", "td7"])
+def test_updates_are_counted_where_they_are_interrupted(name, monkeypatch):
+    model, made = small(name, gradient_steps=200).learn(10), []
+
+    def interrupted(*given):
+        made.append(given)
+        if len(made) == 3:
+            raise KeyboardInterrupt
+        return taken(*given)
+
+    taken = model._take
+    monkeypatch.setattr(model, "_take", interrupted)
+    before = model._n_updates
+    with pytest.raises(KeyboardInterrupt):
+        model.train(gradient_steps=200, batch_size=16)
+
+    assert model._n_updates == int(model.policy.learner.n_updates) > before
+
+
+# --- Sensors that die
+
+
+@pytest.mark.parametrize("name", ["droq", "hds"])
+@pytest.mark.parametrize("of_reward", [False, True])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_statistics_of_vec_normalize_survive_a_dead_sensor(name, of_reward, value):
+    env = Dead(value, of_reward)
+    normalizer = VecNormalize(DummyVecEnv([lambda: env]))
+    model = small(name, normalizer, **({"twin": "Pendulum"} if name == "hds" else {}))
+
+    with pytest.raises(ValueError, match=r"Step 10 of the environment is not finite.*mend"):
+        model.learn(100)
+
+    assert np.isfinite(normalizer.obs_rms.mean).all() and np.isfinite(normalizer.ret_rms.var)
+    # Nine steps and what the environment began with; HDS has counted steps of its twin before.
+    assert name == "hds" or normalizer.obs_rms.count == pytest.approx(10.0, abs=0.01)
+    env.value = 0.5
+    model.learn(20, reset_num_timesteps=False)
+    assert np.isfinite(model.replay_buffer.observations).all()
+
+
+def test_an_environment_that_begins_with_no_number_is_an_error():
+    class Blind(gymnasium.Wrapper):
+        value = np.nan
+
+        def reset(self, **given):
+            obs, info = super().reset(**given)
+            return obs * self.value, info
+
+    env = Blind(gymnasium.make("Pendulum-v1"))
+    model = small("droq", env)
+
+    with pytest.raises(ValueError, match="What the environment begins with is not finite"):
+        model.learn(20)
+
+    env.value = 1.0
+    assert model.learn(20).num_timesteps == 20
+
+
+# --- Episodes that are cut off from outside
+
+
+def test_returns_of_n_steps_end_where_learning_began_anew():
+    model = small("droq", n_steps=3).learn(30).learn(30)
+    buffer = model.replay_buffer
+
+    # One environment: of each row, the return is that of its own episode.
+    batch = buffer._get_samples(np.array([27, 28, 29, 30]))
+    rewards, gamma = buffer.rewards[:, 0], model.gamma
+    of_rows = [(27, 28, 29), (28, 29), (29,), (30, 31, 32)]
+    expected = [sum(gamma**i * rewards[j] for i, j in enumerate(rows)) for rows in of_rows]
+    np.testing.assert_allclose(batch.rewards[:, 0], expected, rtol=1e-5)
+    np.testing.assert_allclose(batch.discounts[:, 0], [gamma**3, gamma**2, gamma, gamma**3])
+    # They go on to be worth something there: a cut is no end of the task.
+    assert not batch.dones.any()
+    np.testing.assert_array_equal(batch.next_observations[1], buffer.next_observations[29, 0])
+
+
+def test_an_episode_that_goes_on_is_not_cut_off():
+    model = small("droq").learn(30).learn(30, reset_num_timesteps=False)
+
+    assert not model.replay_buffer.timeouts[:60].any()
+
+
+def test_goals_are_not_taken_from_the_episode_after_the_cut():
+    env = BitFlippingEnv(n_bits=4, continuous=True, max_steps=50)
+    arguments = {"policy": "MultiInputPolicy", "replay_buffer_class": HerReplayBuffer}
+    model = small("droq", env, **arguments).learn(30)
+    goes_on = not model.replay_buffer.dones[29].any()
+
+    model.learn(10)
+
+    lengths = model.replay_buffer.ep_length[:30, 0]
+    assert not goes_on or (lengths[29] > 0 and model.replay_buffer.timeouts[29].all())
+
+
+def test_with_shared_memory_a_cut_counts_as_an_end():
+    shared = {"handle_timeout_termination": False}
+    model = small("droq", optimize_memory_usage=True, replay_buffer_kwargs=shared).learn(30)
+    model._last_obs = None
+
+    model.learn(5, reset_num_timesteps=False)
+
+    assert model.replay_buffer.dones[29].all()
+
+
+# --- Arguments that did less than they said
+
+
+def test_networks_start_afresh_as_what_load_was_passed_says():
+    model = small("droq", param_resets=[20]).learn(30)
+    assert model.reset_idx == 1
+
+    other = DroQ.load(saved(model), env=model.get_env(), param_resets=[20, 40])
+    other.learn(30, reset_num_timesteps=False)
+    late = DroQ.load(saved(model), env=model.get_env(), param_resets=[40])
+    late.learn(30, reset_num_timesteps=False)
+    as_it_was = DroQ.load(saved(model), env=model.get_env())
+    as_it_was.learn(30, reset_num_timesteps=False)
+
+    assert (other.reset_idx, late.reset_idx, as_it_was.reset_idx) == (2, 1, 1)
+
+
+def test_who_has_batch_normalisation_has_no_target_networks_and_is_told():
+    with pytest.warns(UserWarning, match="does not look at tau"):
+        small("tqc_jax", tau=0.05, policy_kwargs={"net_arch": [8], "renorm_warmup_steps": 10})
+
+
+@pytest.mark.parametrize("algorithm", [DroQ, TD7, HDS])
+def test_without_its_monitor_an_environment_is_left_as_it_is(algorithm):
+    watched, bare = (
+        algorithm("Pendulum-v1", monitor_wrapper=wrapped).get_env().envs[0]
+        for wrapped in (True, False)
+    )
+
+    assert isinstance(watched, Monitor) and not isinstance(bare, Monitor)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "policy"),
+    [(TD7, GaussianPolicy), (TQC, TD7Policy), (CrossQ, GaussianPolicy), (HDS, TD7Policy)],
+)
+def test_a_policy_of_another_family_is_refused(algorithm, policy):
+    with pytest.raises(ValueError, match=f"cannot use the policy {policy.__name__}"):
+        algorithm(policy, "Pendulum-v1")
+
+
+def test_policies_of_the_same_family_may_be_swapped():
+    model = SimbaSAC(CrossQPolicy, "Pendulum-v1", policy_kwargs={"net_arch": [8]}, seed=0)
+    again = SimbaSAC.load(saved(model))
+
+    assert same(model.get_parameters(), again.get_parameters())
