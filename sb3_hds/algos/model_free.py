@@ -194,13 +194,15 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         """
         self._maybe_reset_params()
         rate, qf_rate = self.learning_rates()
-        n_improved, n_before = self._n_improved(), int(self.policy.learner.n_updates)
+        before = int(self.policy.learner.n_updates)
         try:
             report = self._updates(gradient_steps, batch_size)
         finally:
             # Interrupted, some of them were made.
-            self._n_updates += int(self.policy.learner.n_updates) - n_before
-        silent = _OF_ACTOR if self._n_improved() == n_improved else ()
+            now = int(self.policy.learner.n_updates)
+            self._n_updates += now - before
+        improved = now // self.policy_delay > before // self.policy_delay
+        silent = () if improved else _OF_ACTOR
         self.logger.record("train/learning_rate", rate)
         if self.qf_learning_rate is not None:
             self.logger.record("train/qf_learning_rate", qf_rate)
@@ -272,10 +274,6 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         buffer.dones[buffer.pos - 1, goes_on] = 1.0
         if buffer.handle_timeout_termination:
             buffer.timeouts[buffer.pos - 1, goes_on] = 1.0
-
-    def _n_improved(self) -> int:
-        """:return: updates of the actor so far"""
-        return int(self.policy.learner.n_updates) // self.policy_delay
 
     def learning_rates(self) -> tuple[float, float]:
         """:return: of the actor and of the critics, at this point of the training"""
