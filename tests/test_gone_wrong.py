@@ -16,7 +16,7 @@ from sb3_hds.algos.td7 import TD7Policy
 from sb3_hds.errors import DivergedError
 
 MODEL_FREE = [name for name in OFF_POLICY if name not in PLANNERS]
-REPRESENTATIVES = ("droq", "td7", "bro")
+REPRESENTATIVES = ("gsde_sac", "droq", "td7", "bro")
 every_algorithm = pytest.mark.parametrize(
     "name",
     [

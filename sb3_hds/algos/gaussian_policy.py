@@ -167,7 +167,7 @@ class GaussianPolicy(LearningPolicy):
         )
         self.n_obs, self.n_act = size_of(observation_space), n_act
         self.flatten = flattener(observation_space)
-        self._forget_matrices()
+        self.forget_noise()
         self._noise = np.random.default_rng(0)
 
     def _refuse_unused(self, has_batch_norm: bool) -> None:
@@ -248,7 +248,7 @@ class GaussianPolicy(LearningPolicy):
         key = jax.random.key(seed, impl=GENERATOR)
         self.learner = jax.device_put(begin(recipe, self.n_obs, self.n_act, ent_coef, key), device)
         self._noise = np.random.default_rng(seed)
-        self._forget_matrices()
+        self.forget_noise()
 
     def observed(self, obs: np.ndarray | dict[str, np.ndarray]) -> None:
         """Count observations, of one step of every environment, among those seen."""
@@ -285,7 +285,7 @@ class GaussianPolicy(LearningPolicy):
         self.matrices = self._lasting
         self._age += 1
 
-    def _forget_matrices(self) -> None:
+    def forget_noise(self) -> None:
         self.matrices: Any = None
         self._lasting, self._age = self.matrices, 0
 

@@ -45,6 +45,9 @@ class LearningPolicy(TensorPolicy):
         :return: of each critic, shape ``(n, 1)``; the mean, where it has quantiles
         """
 
+    def forget_noise(self) -> None:
+        """What was drawn for several steps is drawn anew, where a policy explores so."""
+
     @property
     def actor(self) -> "LearningPolicy":
         """Where SB3 has the actor apart: here, it is the policy."""

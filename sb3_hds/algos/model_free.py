@@ -229,6 +229,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     def _give_up(self, what: str) -> NoReturn:
         if self._before is not None and not finite_leaves(_trained(self.policy.learner)):
             self.policy.learner = self._before
+            self.policy.forget_noise()
         raise DivergedError(
             f"{type(self).__name__}: {what}. The model keeps its last good state; lower "
             "learning_rate, or scale rewards."
