@@ -1,9 +1,10 @@
 """
-One update for the whole SAC family, pure and compiled once.
+Updates of the model-free algorithms, pure and compiled once.
 
-What differs between two algorithms is a :class:`Recipe`: how the critics' next values become a
-target, how far predictions are from it, what the critics are worth to the actor, and which networks
-and optimisers there are.
+All go by :func:`in_turn`: critics, now and then the actor, now and then what is copied. The SAC
+family shares these parts, too, and what differs between two of its algorithms is a :class:`Recipe`:
+how the critics' next values become a target, how far predictions are from it, what the critics are
+worth to the actor, and which networks and optimisers there are. TD7 has parts of its own.
 """
 
 import dataclasses
@@ -26,6 +27,8 @@ Values = Float[Array, "critics batch values"]
 Targets = Float[Array, "batch targets"]
 Loss = Float[Array, ""]
 Losses = TypeVar("Losses", bound=NamedTuple)
+AnyLearner = TypeVar("AnyLearner", bound=NamedTuple)
+Found = TypeVar("Found")
 
 
 class Batch(NamedTuple):
@@ -59,14 +62,6 @@ class Learner(NamedTuple):
     extra: Any
     key: PRNGKeyArray
     n_updates: Int[Array, ""]
-
-
-class _Improved(NamedTuple):
-    """What an update of the actor changes of a ``Learner``."""
-
-    actor: Trained
-    log_ent_coef: Trained
-    extra: Any
 
 
 class Knobs(NamedTuple):
@@ -189,7 +184,48 @@ def mean(values: Values) -> Float[Array, " batch"]:
     return jnp.mean(values, (0, 2))
 
 
-# --- the update
+# --- the skeleton of all updates
+
+
+class Turn(NamedTuple):
+    """
+    A part of an update.
+
+    :param fields: of the learner, which it changes
+    :param every: updates from one turn of it to the next
+    :param change: learner, what was found so far and a key to what becomes of these fields, and
+        what is found now
+    """
+
+    fields: tuple[str, ...]
+    every: int
+    change: Callable[[Any, Any, PRNGKeyArray], tuple[tuple[Any, ...], Any]]
+
+
+def in_turn(learner: AnyLearner, found: Found, *turns: Turn) -> tuple[AnyLearner, Found]:
+    """
+    :param learner: has a ``key`` and counts its updates in ``n_updates``
+    :param found: a report, or more
+    :param turns: one after the other; each sees what those before it have changed
+    :return: both after an update
+    """
+    now: Any = learner
+    key, *keys = jax.random.split(now.key, 1 + len(turns))
+    now = now._replace(key=key, n_updates=now.n_updates + 1)
+    for turn, key in zip(turns, keys, strict=True):
+        change = partial(turn.change, now, found, key)
+        if turn.every == 1:
+            fields, found = change()
+        else:
+            # Other fields stay outside: what a branch hands through is copied.
+            before = tuple(getattr(now, name) for name in turn.fields), found
+            due = now.n_updates % turn.every == 0
+            fields, found = jax.lax.cond(due, change, lambda before=before: before)
+        now = now._replace(**dict(zip(turn.fields, fields, strict=True)))
+    return now, found
+
+
+# --- the update of the SAC family
 
 
 def act(
@@ -318,32 +354,26 @@ def update_once(
         batch = batch._replace(
             obs=seen(learner.seen, batch.obs), next_obs=seen(learner.seen, batch.next_obs)
         )
-    key, critic_key, actor_key = jax.random.split(learner.key, 3)
-    learner = learner._replace(key=key, n_updates=learner.n_updates + 1)
-    learner, report = update_critics(recipe, learner, batch, knobs, report, critic_key)
-
-    def improved() -> tuple[_Improved, Report]:
-        return update_actor(recipe, learner, batch, knobs, report, actor_key)
-
-    if recipe.policy_delay == 1:
-        now, report = improved()
-    else:
-        # Critics stay outside: what a branch hands through is copied.
-        before = _Improved(learner.actor, learner.log_ent_coef, learner.extra)
-        due = learner.n_updates % recipe.policy_delay == 0
-        now, report = jax.lax.cond(due, improved, lambda: (before, report))
-    return learner._replace(**now._asdict()), report
+    critics = partial(update_critics, recipe, batch, knobs)
+    actor = partial(update_actor, recipe, batch, knobs)
+    turns = [
+        Turn(("critic",), 1, critics),
+        Turn(("actor", "log_ent_coef", "extra"), recipe.policy_delay, actor),
+    ]
+    if not recipe.joint_pass:
+        turns.append(Turn(("target",), recipe.target_every, partial(follow, knobs.tau)))
+    return in_turn(learner, report, *turns)
 
 
 def update_critics(
     recipe: Recipe,
-    learner: Learner,
     batch: Batch,
     knobs: Knobs,
+    learner: Learner,
     report: Report,
     key: PRNGKeyArray,
-) -> tuple[Learner, Report]:
-    """Regress the critics on soft targets; the target networks follow."""
+) -> tuple[tuple[Trained], Report]:
+    """Regress the critics on soft targets."""
     act_key, key, next_key = jax.random.split(key, 3)
     gaussian, _ = act(recipe.actor, learner.actor.weights, batch.next_obs)
     next_action, log_prob = sample(gaussian, act_key)
@@ -374,33 +404,25 @@ def update_critics(
     critic = recipe.qf_optimizer.apply(
         slope, Trained(weights, learner.critic.optimizer), knobs.qf_learning_rate
     )
-    learner, report = learner._replace(critic=critic), report._replace(critic_loss=value)
-    return _with_target(recipe, learner, knobs), report
+    return (critic,), report._replace(critic_loss=value)
 
 
-def _with_target(recipe: Recipe, learner: Learner, knobs: Knobs) -> Learner:
-    """The target critics follow, where there are some."""
-    if recipe.joint_pass:
-        return learner
-
-    def follow() -> Weights:
-        nearer = lambda old, new: old + knobs.tau * (new - old)  # noqa: E731
-        return jax.tree.map(nearer, learner.target, learner.critic.weights)
-
-    if recipe.target_every == 1:
-        return learner._replace(target=follow())
-    due = learner.n_updates % recipe.target_every == 0
-    return learner._replace(target=jax.lax.cond(due, follow, lambda: learner.target))
+def follow(
+    tau: float | Array, learner: Learner, report: Report, _: PRNGKeyArray
+) -> tuple[tuple[Weights], Report]:
+    """The target critics come nearer."""
+    nearer = lambda old, new: old + tau * (new - old)  # noqa: E731
+    return (jax.tree.map(nearer, learner.target, learner.critic.weights),), report
 
 
 def update_actor(
     recipe: Recipe,
-    learner: Learner,
     batch: Batch,
     knobs: Knobs,
+    learner: Learner,
     report: Report,
     key: PRNGKeyArray,
-) -> tuple[_Improved, Report]:
+) -> tuple[tuple[Trained, Trained, Any], Report]:
     r"""
     Climb what the critics think of the actor's own actions, and follow the target entropy.
 
@@ -442,7 +464,7 @@ def update_actor(
     if recipe.extra is not None:
         now = learner._replace(actor=actor, log_ent_coef=log_ent_coef)
         extra = recipe.extra.update(recipe, now, batch, knobs, extra_key)
-    return _Improved(actor, log_ent_coef, extra), report
+    return (actor, log_ent_coef, extra), report
 
 
 _ADAM = Optimizer(optax.adam)

@@ -18,9 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sb3_hds.algos.networks import Activation
-from sb3_hds.algos.off_policy import (
-    Batch,
-)
+from sb3_hds.algos.off_policy import Batch, Turn, in_turn
 from sb3_hds.algos.optimizers import Optimizer, Trained, Weights
 
 _EPSILON = 1e-8
@@ -277,47 +275,17 @@ def update(
     :param batch: of one update
     :return: the learner, what happened, and the transitions' priorities
     """
-    key, noise_key = jax.random.split(learner.key)
-    copies = learner.copies
-    learner = learner._replace(key=key, n_updates=learner.n_updates + 1)
-    encoder, encoder_loss = _update_encoder(recipe, learner.encoder, batch, qf_learning_rate)
-
-    noise = recipe.target_noise * jax.random.normal(noise_key, batch.action.shape)
-    noise = jnp.clip(noise, -recipe.noise_clip, recipe.noise_clip)
-    next_action = act(recipe, copies.target_encoder, copies.actor, batch.next_obs)
-    next_action = jnp.clip(next_action + noise, -1.0, 1.0)
-    embedded = embed(recipe, copies.target_encoder, batch.next_obs, next_action)
-    next_value = judge(recipe, copies.critic, batch.next_obs, next_action, *embedded).min(0)
-    next_value = jnp.clip(next_value, learner.clip.low, learner.clip.high)
-    target = batch.reward + (1.0 - batch.terminated) * batch.discount * next_value
-    seen = Range(
-        jnp.minimum(learner.range.low, target.min()), jnp.maximum(learner.range.high, target.max())
+    embedded = embed(recipe, learner.copies.encoder, batch.obs, batch.action)
+    critics = partial(_update_critics, recipe, batch, embedded, qf_learning_rate)
+    actor = partial(_update_actor, recipe, batch, embedded[0], learning_rate)
+    learner, found = in_turn(
+        learner,
+        _Found(report, jnp.zeros(batch.reward.shape)),
+        Turn(("encoder", "critic", "range"), 1, critics),
+        Turn(("actor",), recipe.policy_delay, actor),
+        Turn(("copies", "clip"), recipe.target_every, _copy),
     )
-    state, both = embed(recipe, copies.encoder, batch.obs, batch.action)
-
-    def critic_loss(params: Any) -> tuple[Array, Array]:
-        value = judge(recipe, {"params": params}, batch.obs, batch.action, state, both)
-        error = jnp.abs(value - target)
-        return loss_of(recipe, error), error
-
-    gradient = jax.value_and_grad(critic_loss, has_aux=True)
-    (loss, error), slope = gradient(learner.critic.weights["params"])
-    critic = recipe.qf_optimizer.apply(slope, learner.critic, qf_learning_rate)
-    priority = priorities_of(recipe, error)
-    learner = learner._replace(encoder=encoder, critic=critic, range=seen)
-    report = report._replace(critic_loss=loss, encoder_loss=encoder_loss)
-
-    improve = lambda: _update_actor(recipe, learner, batch, state, learning_rate)  # noqa: E731
-    due = learner.n_updates % recipe.policy_delay == 0
-    actor, loss = jax.lax.cond(due, improve, lambda: (learner.actor, report.actor_loss))
-    learner = learner._replace(actor=actor)
-    copied = learner._replace(
-        copies=Copies(encoder.weights, actor.weights, critic.weights, copies.encoder),
-        clip=seen,
-    )
-    due = learner.n_updates % recipe.target_every == 0
-    learner = jax.lax.cond(due, lambda: copied, lambda: learner)
-    return learner, report._replace(actor_loss=loss), priority
+    return learner, found.report, found.priority
 
 
 def priorities_of(recipe: Recipe, error: Float[Array, "critics batch"]) -> Float[Array, " batch"]:
@@ -340,6 +308,51 @@ def loss_of(recipe: Recipe, error: Float[Array, "critics batch"]) -> Float[Array
     return jnp.sum(jnp.mean(loss, 1))
 
 
+class _Found(NamedTuple):
+    """
+    :param priority: of the batch's transitions
+    """
+
+    report: Report
+    priority: Float[Array, " batch"]
+
+
+def _update_critics(
+    recipe: Recipe,
+    batch: Batch,
+    embedded: tuple[Array, Array],
+    rate: float,
+    learner: Learner,
+    found: _Found,
+    key: PRNGKeyArray,
+) -> tuple[tuple[Trained, Trained, Range], _Found]:
+    """Embeddings, and critics by the embeddings and targets of copied networks."""
+    copies = learner.copies
+    encoder, encoder_loss = _update_encoder(recipe, learner.encoder, batch, rate)
+    noise = recipe.target_noise * jax.random.normal(key, batch.action.shape)
+    noise = jnp.clip(noise, -recipe.noise_clip, recipe.noise_clip)
+    next_action = act(recipe, copies.target_encoder, copies.actor, batch.next_obs)
+    next_action = jnp.clip(next_action + noise, -1.0, 1.0)
+    next_embedded = embed(recipe, copies.target_encoder, batch.next_obs, next_action)
+    next_value = judge(recipe, copies.critic, batch.next_obs, next_action, *next_embedded).min(0)
+    next_value = jnp.clip(next_value, learner.clip.low, learner.clip.high)
+    target = batch.reward + (1.0 - batch.terminated) * batch.discount * next_value
+    seen = Range(
+        jnp.minimum(learner.range.low, target.min()), jnp.maximum(learner.range.high, target.max())
+    )
+
+    def loss_and_error(params: Any) -> tuple[Array, Array]:
+        value = judge(recipe, {"params": params}, batch.obs, batch.action, *embedded)
+        error = jnp.abs(value - target)
+        return loss_of(recipe, error), error
+
+    gradient = jax.value_and_grad(loss_and_error, has_aux=True)
+    (loss, error), slope = gradient(learner.critic.weights["params"])
+    critic = recipe.qf_optimizer.apply(slope, learner.critic, rate)
+    report = found.report._replace(critic_loss=loss, encoder_loss=encoder_loss)
+    return (encoder, critic, seen), _Found(report, priorities_of(recipe, error))
+
+
 def _update_encoder(
     recipe: Recipe, encoder: Trained, batch: Batch, rate: float
 ) -> tuple[Trained, Array]:
@@ -355,8 +368,16 @@ def _update_encoder(
 
 
 def _update_actor(
-    recipe: Recipe, learner: Learner, batch: Batch, state: Array, rate: float
-) -> tuple[Trained, Array]:
+    recipe: Recipe,
+    batch: Batch,
+    state: Array,
+    rate: float,
+    learner: Learner,
+    found: _Found,
+    _: PRNGKeyArray,
+) -> tuple[tuple[Trained], _Found]:
+    """Climb what all critics think of the actor's own actions."""
+
     def loss(params: Any) -> Array:
         action = cast(Array, recipe.actor.apply({"params": params}, batch.obs, state))
         _, both = embed(recipe, learner.copies.encoder, batch.obs, action)
@@ -364,4 +385,16 @@ def _update_actor(
         return -jnp.mean(value)
 
     value, slope = jax.value_and_grad(loss)(learner.actor.weights["params"])
-    return recipe.optimizer.apply(slope, learner.actor, rate), value
+    actor = recipe.optimizer.apply(slope, learner.actor, rate)
+    return (actor,), found._replace(report=found.report._replace(actor_loss=value))
+
+
+def _copy(learner: Learner, found: _Found, _: PRNGKeyArray) -> tuple[tuple[Copies, Range], _Found]:
+    """Networks, and the range of targets, into those that do not move with every update."""
+    copies = Copies(
+        learner.encoder.weights,
+        learner.actor.weights,
+        learner.critic.weights,
+        learner.copies.encoder,
+    )
+    return (copies, learner.range), found
