@@ -540,6 +540,23 @@ def test_actions_have_the_shape_of_the_action_space(name, shape):
     assert model.replay_buffer.actions.shape[2:] == (int(np.prod(shape)),)
 
 
+@pytest.mark.parametrize("use_sde", [False, True])
+def test_after_the_same_seed_a_model_explores_and_learns_alike(use_sde):
+    models = [small("tqc_jax", use_sde=use_sde, train_freq=5, seed=seed) for seed in (1, 2)]
+    actor = models[0].policy.learner.actor
+    models[1].policy.learner = models[1].policy.learner._replace(actor=actor)
+    obs = np.tile(models[0].observation_space.sample(), (4, 1))
+    assert not np.array_equal(*(model.predict(obs)[0] for model in models))
+
+    for model in models:
+        model.set_random_seed(7)
+        model.set_random_seed(None)
+
+    np.testing.assert_array_equal(*(model.predict(obs)[0] for model in models))
+    keys = [jax.random.key_data(model.policy.learner.key) for model in models]
+    np.testing.assert_array_equal(*keys)
+
+
 def test_a_seed_may_be_a_number_of_numpy():
     seeds = np.random.SeedSequence(0).generate_state(1)
 

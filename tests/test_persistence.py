@@ -383,6 +383,26 @@ def test_a_policy_can_be_saved_alone(name, tmp_path):
     assert same({"": policy.state_dict()}, {"": expected.state_dict()})
 
 
+@pytest.mark.parametrize("name", ["tqc_jax", "td7"])
+def test_a_policy_can_be_saved_alone_with_a_learning_rate_of_ones_own(name, tmp_path):
+    model = small(name, learning_rate=lambda left: 1e-3 * left)
+
+    model.policy.save(tmp_path / "policy.pth")
+    policy = type(model.policy).load(tmp_path / "policy.pth")
+
+    expected = model.predict(observations(), deterministic=True)[0]
+    np.testing.assert_array_equal(policy.predict(observations(), deterministic=True)[0], expected)
+
+
+@pytest.mark.parametrize("name", ["tqc_jax", "td7"])
+def test_widths_in_an_array_are_loaded_again(name):
+    model = small(name, policy_kwargs={"net_arch": np.array([8, 8])})
+
+    again = algos.ALL[name].load(saved(model))
+
+    assert again.policy_kwargs["net_arch"] == [8, 8]
+
+
 def test_a_policy_of_td7_alone_acts_by_its_checkpoint(tmp_path):
     model = small("td7", use_checkpoints=True, train_freq=None)
     moved = jax.tree.map(lambda weight: weight + 0.1, model.policy.learner.checkpoint)

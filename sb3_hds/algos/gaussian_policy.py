@@ -285,6 +285,11 @@ class GaussianPolicy(LearningPolicy):
         self.matrices = self._lasting
         self._age += 1
 
+    def set_random_seed(self, seed: int) -> None:
+        super().set_random_seed(seed)
+        self._noise = np.random.default_rng(seed)
+        self.forget_noise()
+
     def forget_noise(self) -> None:
         self.matrices: Any = None
         self._lasting, self._age = self.matrices, 0

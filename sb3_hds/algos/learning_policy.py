@@ -45,6 +45,12 @@ class LearningPolicy(TensorPolicy):
         :return: of each critic, shape ``(n, 1)``; the mean, where it has quantiles
         """
 
+    def set_random_seed(self, seed: int) -> None:
+        """Updates, and actions by which the policy explores, draw from here on by this seed."""
+        key = jax.random.key(seed, impl=GENERATOR)
+        placed = jax.device_put(key, self.learner.key.sharding)
+        self.learner = self.learner._replace(key=placed)
+
     def forget_noise(self) -> None:
         """What was drawn for several steps is drawn anew, where a policy explores so."""
 

@@ -169,6 +169,16 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         self.policy_delay = policy_delay
         self._constructed(device, _init_setup_model)
 
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """
+        As in SB3, but that the random numbers are this model's own, not those of the process.
+
+        :param seed: None: nothing changes
+        """
+        super().set_random_seed(seed)
+        if seed is not None and hasattr(self, "policy"):
+            self.policy.set_random_seed(seed)
+
     @abstractmethod
     def _build(self, seed: int) -> None:
         """Draw fresh networks."""

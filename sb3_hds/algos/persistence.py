@@ -126,11 +126,14 @@ def by_names(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """
     Files hold arguments, too, and a function of JAX is pickled by parts of JAX that change.
 
-    :return: the same, with the names of activations and optimisers where their functions were given
+    :return: the same, with the names of activations and optimisers where their functions were
+        given, and lists where arrays were, whose truth SB3 asks for
     """
     named = dict(policy_kwargs)
     for argument, value in policy_kwargs.items():
-        if argument.endswith("activation_fn"):
+        if isinstance(value, np.ndarray):
+            named[argument] = value.tolist()
+        elif argument.endswith("activation_fn"):
             named[argument] = activation_name(value)
         elif argument == "optimizer_class":
             named[argument] = optimizer_name(value)
@@ -219,7 +222,11 @@ class TensorPolicy(BaseJaxPolicy):
         """What ``save`` keeps of the policy besides its weights, and ``load`` makes it from."""
         spaces_and_more = super()._get_constructor_parameters()
         spaces_and_more.pop("normalize_images")
-        return spaces_and_more | by_names(self.arguments)
+        arguments = by_names(self.arguments)
+        if "lr_schedule" in arguments:
+            # As SB3: what acts needs none, and a function of one's own cannot be pickled.
+            arguments["lr_schedule"] = self._dummy_schedule
+        return spaces_and_more | arguments
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, th.Tensor]:
         return to_state_dict(self.weights)
