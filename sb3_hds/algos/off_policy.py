@@ -204,6 +204,8 @@ class Turn(NamedTuple):
 
 def in_turn(learner: AnyLearner, found: Found, *turns: Turn) -> tuple[AnyLearner, Found]:
     """
+    One update of any model-free algorithm: its parts, each where it is due, with a random key.
+
     :param learner: has a ``key`` and counts its updates in ``n_updates``
     :param found: a report, or more
     :param turns: one after the other; each sees what those before it have changed
