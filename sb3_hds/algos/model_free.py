@@ -171,7 +171,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
-        As in SB3, but that the random numbers are this model's own, not those of the process.
+        As in SB3; what updates and policies draw by is the model's own, and begins anew, too.
 
         :param seed: None: nothing changes
         """
