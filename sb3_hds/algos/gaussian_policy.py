@@ -247,8 +247,7 @@ class GaussianPolicy(LearningPolicy):
         self.recipe = recipe
         key = jax.random.key(seed, impl=GENERATOR)
         self.learner = jax.device_put(begin(recipe, self.n_obs, self.n_act, ent_coef, key), device)
-        self._noise = np.random.default_rng(seed)
-        self.forget_noise()
+        self._draw_noise_by(seed)
 
     def observed(self, obs: np.ndarray | dict[str, np.ndarray]) -> None:
         """Count observations, of one step of every environment, among those seen."""
@@ -287,6 +286,9 @@ class GaussianPolicy(LearningPolicy):
 
     def set_random_seed(self, seed: int) -> None:
         super().set_random_seed(seed)
+        self._draw_noise_by(seed)
+
+    def _draw_noise_by(self, seed: int) -> None:
         self._noise = np.random.default_rng(seed)
         self.forget_noise()
 
