@@ -33,6 +33,7 @@ from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp, SimbaBody
 from sb3_hds.algos.gaussian_policy import SimbaPolicy
 from sb3_hds.algos.heads import ExploringActor
 from sb3_hds.algos.lap import LapReplayBuffer, SumTree
+from sb3_hds.algos.learner import GENERATOR
 from sb3_hds.algos.observations import Seen, flattener, seen
 from sb3_hds.algos.off_policy import (
     Knobs,
@@ -555,6 +556,8 @@ def test_after_the_same_seed_a_model_explores_and_learns_alike(use_sde):
     np.testing.assert_array_equal(*(model.predict(obs)[0] for model in models))
     keys = [jax.random.key_data(model.policy.learner.key) for model in models]
     np.testing.assert_array_equal(*keys)
+    of_networks = jax.random.key_data(jax.random.key(7, impl=GENERATOR))
+    assert not np.array_equal(keys[0], of_networks)
 
 
 def test_a_seed_may_be_a_number_of_numpy():

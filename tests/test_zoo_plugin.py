@@ -28,10 +28,7 @@ USUAL = {
 }
 # DroQ's paper has a target entropy for it.
 FURTHER = {"droq": {"Humanoid-v5"}}
-_TQC = {
-    "learning_starts": 256,
-    "policy_kwargs": {"n_critics": 5, "net_arch": {"pi": [256, 256], "qf": [512, 512, 512]}},
-}
+_TQC = {"n_critics": 5, "net_arch": {"pi": [256, 256], "qf": [512, 512, 512]}}
 # What papers, or their authors' code where these are silent, have on tasks of 1000 steps.
 PUBLISHED = [
     # Configs of DAVIAN-Robotics/SimbaV2, which count all of MuJoCo's as ending early; where no
@@ -49,9 +46,16 @@ PUBLISHED = [
     ("crossq_jax", "HalfCheetah-v5", {"learning_starts": 5000, "gamma": None}),
     ("crossq_jax", "Swimmer-v5", {"learning_starts": 5000, "gamma": 0.9999}),
     # SamsungLabs/tqc_pytorch, main.py: training begins with the first full batch.
-    ("tqc_jax", "HalfCheetah-v5", _TQC | {"top_quantiles_to_drop_per_net": 0}),
-    ("tqc_jax", "Hopper-v5", _TQC | {"top_quantiles_to_drop_per_net": 5}),
-    ("tqc_jax", "Ant-v5", _TQC | {"top_quantiles_to_drop_per_net": None}),
+    (
+        "tqc_jax",
+        "Hopper-v5",
+        {"learning_starts": 256, "policy_kwargs": _TQC, "top_quantiles_to_drop_per_net": 5},
+    ),
+    (
+        "tqc_jax",
+        "Ant-v5",
+        {"learning_starts": 256, "policy_kwargs": _TQC, "top_quantiles_to_drop_per_net": None},
+    ),
 ]
 # Keys of a zoo entry that the zoo itself consumes, see ExperimentManager._preprocess_hyperparams.
 CONSUMED_BY_THE_ZOO = {
@@ -203,6 +207,15 @@ def test_settings_of_the_benchmarks_are_the_published_ones(algo, env_id, publish
     entry = load_yml(algo)[env_id]
 
     assert {name: entry.get(name) for name in published} == published
+
+
+def test_tqc_has_published_networks_on_half_cheetah_and_the_start_of_sac():
+    tqc, sac = load_yml("tqc_jax")["HalfCheetah-v5"], load_yml("gsde_sac")["HalfCheetah-v5"]
+
+    assert tqc["policy_kwargs"] == _TQC | sac["policy_kwargs"]
+    assert tqc["top_quantiles_to_drop_per_net"] == 0
+    for name in ("learning_starts", "target_entropy"):
+        assert tqc[name] == sac[name]
 
 
 @pytest.mark.parametrize("algo", tables.ALGORITHMS)

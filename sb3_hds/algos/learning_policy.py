@@ -47,7 +47,8 @@ class LearningPolicy(TensorPolicy):
 
     def set_random_seed(self, seed: int) -> None:
         """Updates, and actions by which the policy explores, draw from here on by this seed."""
-        key = jax.random.key(seed, impl=GENERATOR)
+        # Networks of this seed were drawn by the key that is folded here.
+        key = jax.random.fold_in(jax.random.key(seed, impl=GENERATOR), 1)
         placed = jax.device_put(key, self.learner.key.sharding)
         self.learner = self.learner._replace(key=placed)
 
