@@ -28,7 +28,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rl_zoo_plugin.lazy import parameters_of
 from sb3_hds import GSDESAC, TD7, DroQ, SimbaSAC, algos
-from sb3_hds.algos import learn_compiled, soft_actor_critic, td7_update
+from sb3_hds.algos import learn_compiled, off_policy, soft_actor_critic, td7_update
 from sb3_hds.algos.bodies import BatchRenorm, Dropout, Mlp, SimbaBody
 from sb3_hds.algos.gaussian_policy import SimbaPolicy
 from sb3_hds.algos.heads import ExploringActor
@@ -487,6 +487,17 @@ def test_choices_become_one_hot_and_dictionaries_one_row():
     assert flat.shape == (spaces.flatdim(space),)
     np.testing.assert_array_equal(flat[4:7], [0, 1, 0])
     np.testing.assert_array_equal(flat[7:12], [0, 1, 0, 0, 1])
+
+
+@mostly_expensive("td7")
+def test_all_updates_run_one_program(name):
+    program = td7_update.update if name == "td7" else off_policy.update
+    model = small(name, batch_size=17)  # as no other test has
+    before = program._cache_size()
+
+    model.learn(50)
+
+    assert program._cache_size() == before + 1
 
 
 # --- what an algorithm takes

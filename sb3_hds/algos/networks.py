@@ -245,10 +245,5 @@ def _mlp(x: jax.Array, net_arch: Sequence[int], activation_fn: Activation) -> ja
 
 def finite_leaves(tree: Any) -> bool:
     """:return: whether no number in it is infinite or not a number"""
-    leaves = jax.tree.leaves(tree)
-    return bool(_finite([leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.inexact)]))
-
-
-@jax.jit
-def _finite(leaves: list[Array]) -> Array:
-    return jnp.stack([jnp.isfinite(leaf).all() for leaf in leaves]).all()
+    numbers = (leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact))
+    return all(np.isfinite(leaf).all() for leaf in numbers)

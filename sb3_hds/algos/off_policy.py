@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from sb3_hds.algos.observations import Seen, seen
 from sb3_hds.algos.optimizers import Optimizer, Trained, Weights
 from sb3_hds.algos.squashed import Gaussian, log_probability
+from sb3_hds.core.compilation import QUICK_COMPILATION
 
 Values = Float[Array, "critics batch values"]
 Targets = Float[Array, "batch targets"]
@@ -301,6 +302,7 @@ def log_of(ent_coef: Array | float) -> Array:
     return jnp.log(jnp.maximum(jnp.asarray(ent_coef, jnp.float32), jnp.finfo(jnp.float32).tiny))
 
 
+@partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=QUICK_COMPILATION)
 def begin(recipe: Recipe, n_obs: int, n_act: int, ent_coef: float, key: PRNGKeyArray) -> Learner:
     """:return: fresh networks and optimisers"""
     key, actor_key, critic_key, extra_key = jax.random.split(key, 4)

@@ -452,6 +452,7 @@ class TD7(ModelFreeAlgorithm):
         for _ in range(n):
             batch, drawn = self._drawn(batch_size)
             learner, found, priorities = update(policy.recipe, policy.learner, batch, *rates, found)
+            found = jax.device_get(found)  # as before the first update, or it is compiled twice
             report = {name: float(value) for name, value in found._asdict().items()}
             self._take(learner, report)
             if drawn is None:

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from sb3_hds.algos.networks import Activation
 from sb3_hds.algos.off_policy import Batch, Turn, in_turn
 from sb3_hds.algos.optimizers import Optimizer, Trained, Weights
+from sb3_hds.core.compilation import QUICK_COMPILATION
 
 _EPSILON = 1e-8
 # Uniform, of variance 1 / (3 n) with n inputs.
@@ -219,6 +220,7 @@ class Report(NamedTuple):
     encoder_loss: Float[Array, ""]
 
 
+@partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=QUICK_COMPILATION)
 def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
     """:return: fresh networks and optimisers"""
     key, encoder_key, actor_key, critic_key = jax.random.split(key, 4)
@@ -228,7 +230,7 @@ def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
     actor = recipe.actor.init(actor_key, obs, state)
     init = lambda key: recipe.critic.init(key, obs, action, both, state)  # noqa: E731
     critic = jax.vmap(init)(jax.random.split(critic_key, recipe.n_critics))
-    zero, infinite = jnp.zeros(()), jnp.full((), jnp.inf)
+    zero, infinite = jnp.zeros(()), jnp.full((), jnp.inf, jnp.float32)
     return Learner(
         encoder=Trained(encoder, recipe.qf_optimizer.init(encoder["params"])),
         actor=Trained(actor, recipe.optimizer.init(actor["params"])),
