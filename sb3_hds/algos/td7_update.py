@@ -230,7 +230,8 @@ def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
     actor = recipe.actor.init(actor_key, obs, state)
     init = lambda key: recipe.critic.init(key, obs, action, both, state)  # noqa: E731
     critic = jax.vmap(init)(jax.random.split(critic_key, recipe.n_critics))
-    zero, infinite = jnp.zeros(()), jnp.full((), jnp.inf, jnp.float32)
+    zero = jnp.zeros(())
+    infinite = jnp.full_like(zero, jnp.inf)
     return Learner(
         encoder=Trained(encoder, recipe.qf_optimizer.init(encoder["params"])),
         actor=Trained(actor, recipe.optimizer.init(actor["params"])),
