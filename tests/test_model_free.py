@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import re
 from functools import partial
 from typing import Any
 
@@ -498,6 +499,23 @@ def test_all_updates_run_one_program(name):
     model.learn(50)
 
     assert program._cache_size() == before + 1
+
+
+DECOMPOSITION = re.compile(r"@lapack_\w+qr\w*\(.*: \(tensor<(\w+)xf32>")
+
+
+@every_soft
+def test_no_batch_is_decomposed_at_once(name):
+    """With two in one program, both threads of two could wait for the other one for ever."""
+    args: Any = {"policy_kwargs": {"ortho_init": True}} if name not in ("simba", "bro") else {}
+    model = small(name, **args)
+    recipe, n_obs, n_act = (getattr(model.policy, each) for each in ("recipe", "n_obs", "n_act"))
+
+    program = off_policy.begin.lower(recipe, n_obs, n_act, 1.0, jax.random.key(0)).as_text()
+
+    shapes = DECOMPOSITION.findall(program)
+    assert shapes
+    assert all(shape.count("x") == 1 for shape in shapes)
 
 
 # --- what an algorithm takes

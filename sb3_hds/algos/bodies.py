@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -11,8 +12,23 @@ from jaxtyping import Array, Float
 from sb3_hds.algos.networks import Activation
 from sb3_hds.algos.thin import Hidden
 
+
+def orthogonal(gain: float) -> nn.initializers.Initializer:
+    """
+    Flax's ``orthogonal``, one kernel after the other under ``vmap``: jaxlib 0.10 and 0.11 hand the
+    decompositions of a batch to the pool that runs the program and wait for them there, and a
+    program in which as many wait as the pool has threads never ends.
+    """
+    draw = nn.initializers.orthogonal(gain)
+
+    def init(key: Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Array:
+        return jax.custom_batching.sequential_vmap(lambda key: draw(key, shape, dtype))(key)
+
+    return init
+
+
 #: where kernels start, with gains of the square root of 2 and of 1
-ORTHOGONAL, ORTHONORMAL = (nn.initializers.orthogonal(gain) for gain in (math.sqrt(2), 1.0))
+ORTHOGONAL, ORTHONORMAL = orthogonal(math.sqrt(2)), orthogonal(1.0)
 _HE = nn.initializers.he_normal()
 # BatchRenorm's limits (Ioffe 2017, section 3), and the variance's floor in SBX's CrossQ.
 _R_MAX, _D_MAX, _RENORM_EPSILON = 3.0, 5.0, 1e-3

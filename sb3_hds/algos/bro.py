@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from sb3_hds.algos.bodies import ORTHOGONAL, ORTHONORMAL, BroBody
+from sb3_hds.algos.bodies import ORTHOGONAL, ORTHONORMAL, BroBody, orthogonal
 from sb3_hds.algos.call_forms import between, is_count
 from sb3_hds.algos.gaussian_policy import GaussianPolicy
 from sb3_hds.algos.off_policy import (
@@ -185,7 +185,7 @@ class Shift(nn.Module):
         self, obs: Float[Array, "*batch obs"], mean: Float[Array, "*batch act"]
     ) -> Float[Array, "*batch act"]:
         latent = self.body(jnp.concatenate([obs, mean], -1), False)
-        small = nn.initializers.orthogonal(0.01)
+        small = orthogonal(0.01)
         return Last(self.n_act, use_bias=False, kernel_init=small)(latent)
 
 
