@@ -558,7 +558,7 @@ def test_observations_of_numbers_and_choices_are_learned_from(space):
     assert env.action_space.contains(action)
 
 
-@every_algorithm
+@mostly_expensive("gsde_sac", "td7", "bro")
 @pytest.mark.parametrize("shape", [(2, 2), (3, 1)])
 def test_actions_have_the_shape_of_the_action_space(name, shape):
     # It refuses what the space does not contain.
@@ -718,7 +718,7 @@ def test_parts_of_an_observation_come_in_equal_numbers():
 # --- what SB3's own tests ask for
 
 
-@every_algorithm
+@mostly_expensive("droq", "td7")
 @pytest.mark.parametrize("net_arch", [[], {"pi": [8, 4], "qf": [6]}])
 def test_networks_may_have_no_hidden_layer_or_layers_of_several_widths(name, net_arch):
     kwargs = SMALL[name]["policy_kwargs"] | {"net_arch": net_arch}
