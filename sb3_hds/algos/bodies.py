@@ -15,9 +15,11 @@ from sb3_hds.algos.thin import Hidden
 
 def orthogonal(gain: float) -> nn.initializers.Initializer:
     """
-    Flax's ``orthogonal``, one kernel after the other under ``vmap``: jaxlib 0.10 and 0.11 hand the
-    decompositions of a batch to the pool that runs the program and wait for them there, and a
+    Flax's ``orthogonal``, one kernel after the other under ``vmap``: jaxlib 0.10 hands the
+    decompositions of a batch to the pool that runs the program and waits for them there, and a
     program in which as many wait as the pool has threads never ends.
+
+    :param gain: what an orthogonal kernel is multiplied by
     """
     draw = nn.initializers.orthogonal(gain)
 
