@@ -1,6 +1,6 @@
 """Find out what a simulation gets wrong: propose on some recordings, confirm once on others."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral
 from typing import Any, Literal
 
@@ -10,6 +10,7 @@ from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.calibrate import check_fits
 from sb3_hds.sysid.diagnosis import Diagnosis
 from sb3_hds.sysid.inquiry import EFFORTS, Inquiry
+from sb3_hds.sysid.priors import Belief
 
 _DESCRIBED = ("name", "slot", "parameters", "explanation")  # what a finding is told with
 
@@ -19,7 +20,7 @@ def diagnose(
     data: Trajectories,
     *,
     effects: type[Effect] | str | Sequence[type[Effect] | str] = ALL,
-    calibrate: str | Sequence[str] = (),
+    calibrate: str | Sequence[str] | Mapping[str, Belief] = (),
     seed: int = 0,
     budget: Literal["full", "quick"] = "full",
     progress: bool = True,
@@ -42,7 +43,10 @@ def diagnose(
     :param data: measured, sampled at the twin's ``dt``
     :param effects: classes of the catalogue, their names, or classes of your own
     :param calibrate: parameters of the twin that are not believed: they are refitted under every
-        hypothesis, and are never a finding
+        hypothesis, and are never a finding. The prior of each is normal around the twin's value
+        with the parameter's ``scale`` as its standard deviation, within a factor of 20:
+        ``{"mass": 3.0}`` widens it three times, ``{"mass": (0.5, 8.0)}`` sets other bounds. Where
+        one ends at a bound, nothing is named.
     :param seed: of the split
     :param budget: ``"full"``, or ``"quick"``: fewer candidates are fitted to the end
     :param progress: whether a bar shows how far it is
@@ -62,23 +66,23 @@ def diagnose(
         raise CalibrationError(f"budget must be 'full' or 'quick', got {budget!r}.")
     if not isinstance(seed, Integral) or seed < 0:
         raise CalibrationError(f"seed must be a whole number of at least 0, got {seed!r}.")
-    kinds, nuisances = classes_of(effects), _names_of(calibrate)
+    kinds, nuisances = classes_of(effects), _beliefs_of(calibrate)
     inquiry = Inquiry(twin, data, kinds, nuisances, int(seed), budget, progress)
     reason = inquiry.poor()
     return inquiry.refused(reason) if reason else inquiry.run()
 
 
-def _names_of(calibrate: str | Iterable[str]) -> tuple[str, ...]:
-    """:return: names of parameters, of which a single one may stand alone"""
+def _beliefs_of(calibrate: str | Iterable[str] | Mapping[str, Belief]) -> dict[str, Belief]:
+    """:return: by names of parameters, of which a single one may stand alone"""
     if isinstance(calibrate, str):
-        return (calibrate,)
+        return {calibrate: None}
     names = tuple(calibrate) if isinstance(calibrate, Iterable) else (calibrate,)
     if not all(isinstance(name, str) for name in names):
         raise CalibrationError(
             f"calibrate is a list of names of parameters, such as ['mass'], got {calibrate!r}. "
             "Leave it out where all of them are believed."
         )
-    return names
+    return dict(calibrate) if isinstance(calibrate, Mapping) else dict.fromkeys(names)
 
 
 def classes_of(

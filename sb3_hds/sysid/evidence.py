@@ -51,7 +51,7 @@ class Point(NamedTuple):
     :param theta: all parameters that may move, shape ``(p,)``
     :param offsets: of the start states, shape ``(n, free)``
     :param raw: simulated minus measured, shape ``(n, steps + 1, n_obs)``
-    :param cost: what fits minimise: large errors count in proportion
+    :param cost: what fits minimise: large errors count in proportion; with the prior of what moved
     """
 
     theta: np.ndarray
@@ -140,10 +140,13 @@ class Evidence:
         theta = np.array(theta, float)
         offsets = self._measured(theta) if offsets is None else offsets
         now, damping = self._blocks(theta, moving, offsets), _DAMPING
+        null, firm = h.null[moving], (size / h.prior[moving]) ** 2
+        doubt = lambda x: float(0.5 * firm @ ((x[moving] - null) / size) ** 2)  # noqa: E731
         for _ in range(n_steps):
             step = _eliminated(now, damping)
             new = theta.copy()
-            new[moving] = _moved(theta[moving], step, size, low, high, damping)
+            pull = firm, firm * (theta[moving] - null) / size
+            new[moving] = _moved(theta[moving], step, pull, size, low, high, damping)
             z = (new[moving] - theta[moving]) / size
             ahead = offsets + step.from_score + step.from_step @ z
             then = self._blocks(new, moving, ahead)
@@ -158,12 +161,12 @@ class Evidence:
                         for a, b in zip(then, now, strict=True)
                     )
                 )
-            elif gained := max(now.cost.sum() - then.cost.sum(), 0.0):
+            elif gained := max(now.cost.sum() + doubt(theta) - then.cost.sum() - doubt(new), 0.0):
                 theta, offsets, now = new, ahead, then
             damping *= _LESS if gained else _MORE
             if (gained and gained < _ENOUGH * now.cost.sum()) or damping > _MOST_DAMPING:
                 break
-        return Point(theta, offsets, now.raw, float(now.cost.sum()))
+        return Point(theta, offsets, now.raw, float(now.cost.sum()) + doubt(theta))
 
     def slopes(self, point: Point, index: Sequence[int] | None = None) -> Slopes:
         """
@@ -374,13 +377,19 @@ def _eliminated(blocks: _Blocks, damping: float) -> _Step:
 def _moved(
     values: np.ndarray,
     step: _Step,
+    pull: tuple[np.ndarray, np.ndarray],
     size: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
     damping: float,
 ) -> np.ndarray:
-    """Where the damped step leads; what would leave its bounds stays."""
-    curvature, score = step.curvature.sum(0), step.scores.sum(0)
+    """
+    Where the damped step leads; what would leave its bounds stays.
+
+    :param pull: curvature and slope of the prior
+    """
+    curvature = step.curvature.sum(0) + np.diag(pull[0])
+    score = step.scores.sum(0) + pull[1]
     free = ~(((values <= low) & (score > 0.0)) | ((values >= high) & (score < 0.0)))
     if not free.any():
         return values

@@ -22,6 +22,7 @@ from sb3_hds.core.effect import Attached, Chosen
 from sb3_hds.core.layers import layers_of, plant_of
 from sb3_hds.effects import NAMELESS, ConstantForce, NeuralForce, SignFlip, reversed_joint
 from sb3_hds.errors import CalibrationError, EffectError
+from sb3_hds.sysid.priors import Belief, prior_of
 from sb3_hds.sysid.shooting import remembered_for
 
 #: the slot of a twin's own parameter, beside those of effects
@@ -77,6 +78,8 @@ class Hypotheses:
     :param lower: smallest admissible values
     :param upper: largest admissible values
     :param nuisances: indices of those that are refitted under every hypothesis
+    :param prior: standard deviation of the prior of each nuisance around its value in ``null``;
+        infinite for all other parameters
     :param pushes: index of a constant force at each joint, to measure what force is missing
     :param nameless: forces that no finding is, and that findings have to beat
     :param starts: for candidates by key, values by full name at which a search may begin
@@ -91,20 +94,28 @@ class Hypotheses:
     lower: Float[np.ndarray, " p"]
     upper: Float[np.ndarray, " p"]
     nuisances: tuple[int, ...]
+    prior: Float[np.ndarray, " p"]
     pushes: tuple[int, ...]
     nameless: tuple[Candidate, ...] = ()
     starts: Mapping[str, tuple[Mapping[str, float], ...]] = dataclasses.field(default_factory=dict)
 
     @classmethod
     def about(
-        cls, twin: Twin, effects: Sequence[type[Effect]], calibrate: Sequence[str]
+        cls,
+        twin: Twin,
+        effects: Sequence[type[Effect]],
+        calibrate: Sequence[str] | Mapping[str, Belief],
     ) -> "Hypotheses":
         """
         :param twin: as it is believed
         :param effects: classes that are tried at every place
-        :param calibrate: parameters of the twin that are not believed, and not worth a finding
-        :raises CalibrationError: for a name in ``calibrate`` that the twin does not have
+        :param calibrate: parameters of the twin that are not believed, and not worth a finding; see
+            :func:`~sb3_hds.sysid.priors.prior_of`
+        :raises CalibrationError: for a name in ``calibrate`` that the twin does not have, or a
+            belief that is none
         """
+        beliefs = dict(calibrate) if isinstance(calibrate, Mapping) else dict.fromkeys(calibrate)
+        calibrate = tuple(beliefs)
         unknown = [name for name in calibrate if name not in twin.parameters]
         if unknown:
             raise CalibrationError(
@@ -143,6 +154,11 @@ class Hypotheses:
                 # The twin has some of it already: there may be less than it believes.
                 target = native[name]
                 lower[i] = twin.parameters[target].lower - twin.values[target]
+        upper = np.array([every[name].upper for name in moving], float)
+        prior = np.full(len(moving), np.inf)
+        for i, (name, belief) in enumerate(beliefs.items()):
+            own_prior = prior_of(name, twin.parameters[name], twin.values[name], belief)
+            prior[i], lower[i], upper[i] = own_prior
         return cls(
             believed=twin,
             twin=extended,
@@ -151,8 +167,9 @@ class Hypotheses:
             null=values,
             scale=np.array([every[name].scale for name in moving], float),
             lower=lower,
-            upper=np.array([every[name].upper for name in moving], float),
+            upper=upper,
             nuisances=tuple(range(len(calibrate))),
+            prior=prior,
             pushes=tuple(moving.index(name) for name in pushes),
             nameless=nameless,
         )

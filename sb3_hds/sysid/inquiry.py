@@ -2,7 +2,7 @@
 
 import dataclasses
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ from sb3_hds.sysid.account import (
     detectable,
     pictures_of,
 )
+from sb3_hds.sysid.adequacy import distances, far_in_words, noise_of
 from sb3_hds.sysid.calibrate import spread_of
 from sb3_hds.sysid.comparison import Comparison, split
 from sb3_hds.sysid.constancy import Change, change
@@ -22,6 +23,7 @@ from sb3_hds.sysid.diagnosis import Diagnosis, Rejected
 from sb3_hds.sysid.evidence import Evidence, Point, portion_for
 from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
 from sb3_hds.sysid.naming import Naming, keys_of
+from sb3_hds.sysid.priors import Belief, at_limit
 from sb3_hds.sysid.remainder import (
     MissingForce,
     Remainder,
@@ -45,6 +47,7 @@ from sb3_hds.sysid.telling import (
     nameless_in_words,
     nearest_in_words,
     out_of_reach,
+    stuck_in_words,
     to_tell_apart,
     why,
 )
@@ -99,7 +102,7 @@ class Inquiry:
     :param twin: as it is believed
     :param data: measured
     :param effects: classes of what may be wrong
-    :param calibrate: names of nuisances
+    :param calibrate: names of nuisances, or what is believed of each
     :param seed: of the split
     :param budget: how long to search: a key of ``EFFORTS``
     :param progress: whether bars show how far it is
@@ -110,7 +113,7 @@ class Inquiry:
         twin: Twin,
         data: Trajectories,
         effects: tuple[type[Effect], ...],
-        calibrate: tuple[str, ...],
+        calibrate: Sequence[str] | Mapping[str, Belief],
         seed: int,
         budget: str,
         progress: bool,
@@ -119,6 +122,7 @@ class Inquiry:
         self.data_hash = _hash(data)
         data, self.audit, corrected = _without_glitches(twin, data)
         data, moved = in_step(twin, data)
+        self.sensor_noise = noise_of(data)
         self.corrected = (*corrected, *moved)
         coarse, self.data, self.every = thinned(twin, data)
         self.hypotheses = Hypotheses.about(coarse, effects, calibrate)
@@ -196,6 +200,10 @@ class Inquiry:
             nearest = contradiction(rejected)
         self._set_noise(base.point)
         start, base = map(self.search.again, (start, base))
+        if stuck := self._stuck(base):
+            found, base, left, nearest = [], start, before, stuck
+        elif not (found or nearest) and left.remainder is None:
+            nearest = self._far_off(base)
         return self._told(found, rejected, start, base, before, left, nearest)
 
     def _weighed(self, firsts: Sequence[Tried], start: Base) -> list[tuple[Candidate, Comparison]]:
@@ -288,6 +296,23 @@ class Inquiry:
         unit = float(np.mean((missing.noise / self.search.noise) ** 2))
         predicted = 0.0 if found is None else unit * found.power
         return _Left(found, predicted, unit * power, missing, short)
+
+    def _stuck(self, base: Base) -> str:
+        """:return: a sentence on nuisances that end at a bound, if any does"""
+        h, (_, point) = self.hypotheses, self.search.whole(base)
+        ends = [
+            i for i in h.nuisances if at_limit(point.theta[i], h.lower[i], h.upper[i], h.null[i])
+        ]
+        units = {name: p.unit for name, p in h.twin.parameters.items()}
+        return stuck_in_words(
+            [(h.names[i], point.theta[i], h.null[i], units[h.names[i]]) for i in ends]
+        )
+
+    def _far_off(self, base: Base) -> str:
+        """:return: a sentence on how far held-out windows are from what is believed, if they are"""
+        raw = self.search.confirm.evidence.fit(base.point.theta, (), base.kept.offsets).raw
+        found = distances(self.believed.channels, raw, self.sensor_noise, self.spread)
+        return far_in_words(found)
 
     def _explained(
         self,

@@ -174,6 +174,22 @@ def why(verdict: Comparison, turned_down: str | None) -> str:
     return turned_down or (CHANCE if verdict.p_value >= LEVEL else "others gain more")
 
 
+def stuck_in_words(ends: Sequence[tuple[str, float, float, str]]) -> str:
+    """
+    :param ends: of each nuisance at a bound, its name, its value there, the nominal value, and unit
+    :return: why nothing is named; empty if there is none
+    """
+    if not ends:
+        return ""
+    said = " and ".join(f"{n} = {x:.3g} {unit} (nominal {was:.3g})" for n, x, was, unit in ends)
+    verb = "ends at its bound" if len(ends) == 1 else "end at their bounds"
+    return (
+        f"Refitted, {said} {verb}: whatever is wrong, this is not how the system is. "
+        "Check conventions (signs, units, order of the columns), leave it out of calibrate, or "
+        "widen its bounds if such a value is possible: calibrate={name: (low, high)}."
+    )
+
+
 def in_words(left: Remainder) -> str:
     share = f"{left.gain:.0%}"
     return (

@@ -1,0 +1,87 @@
+"""How far a model is from what was measured: in the unit of each channel, and beside its noise."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sb3_hds.core import Channel, Trajectories
+
+# A model predicts to near the noise where its error is below this multiple of it, or below this
+# share of the channel's standard deviation, whichever is larger.
+_NEAR, _SMALL = 3.0, 0.05
+# Of white noise of one, the standard deviation of fourth differences; a smooth signal has none.
+_FOURTH = np.sqrt(70.0)
+# Standard deviation of normal noise, in units of its median absolute value.
+_NORMAL = 1.4826
+
+
+class Distance(NamedTuple):
+    """
+    How far predictions of a channel are off, on windows that nothing was fitted to.
+
+    :param channel: name and unit
+    :param error: root mean square [channel's unit]
+    :param noise: of the sensor, estimated from fourth differences of its samples, likewise
+    :param spread: standard deviation of what was measured, likewise
+    """
+
+    channel: Channel
+    error: float
+    noise: float
+    spread: float
+
+    @property
+    def near(self) -> bool:
+        """Whether the model predicts this channel to near its noise."""
+        return self.error <= max(_NEAR * self.noise, _SMALL * self.spread)
+
+    def __str__(self) -> str:
+        unit = f" {self.channel.unit}" if self.channel.unit else ""
+        return (
+            f"{self.channel.name} by {self.error:.3g}{unit}, {self.error / self.spread:.0%} of its "
+            f"standard deviation (the noise is about {self.noise:.2g}{unit})"
+        )
+
+
+def noise_of(data: Trajectories) -> Float[np.ndarray, " obs"]:
+    """
+    :return: standard deviation of each channel's white noise, from fourth differences of its
+        samples, which a smooth motion hardly has; where the motion is not smooth from sample to
+        sample, more than that
+    """
+    rows = [data.episode(i)[0] for i in range(len(data))]
+    fourth = [np.diff(row, 4, axis=0) for row in rows if len(row) > 4]
+    if not fourth:
+        return np.zeros(data.n_obs)
+    return _NORMAL * np.median(np.abs(np.concatenate(fourth)), axis=0) / _FOURTH
+
+
+def distances(
+    channels: Sequence[Channel],
+    raw: Float[np.ndarray, "n rows obs"],
+    noise: Float[np.ndarray, " obs"],
+    spread: Float[np.ndarray, " obs"],
+) -> tuple[Distance, ...]:
+    """
+    :param raw: simulated minus measured
+    :param noise: of each channel
+    :param spread: of each channel
+    """
+    errors = np.sqrt(np.mean(np.minimum(np.nan_to_num(raw**2, nan=np.inf), 1e6), axis=(0, 1)))
+    return tuple(
+        Distance(channel, float(e), float(n), float(s))
+        for channel, e, n, s in zip(channels, errors, noise, spread, strict=True)
+    )
+
+
+def far_in_words(found: Sequence[Distance]) -> str:
+    """:return: a sentence on the channels that are not near; empty if all are"""
+    far = [one for one in found if not one.near]
+    if not far:
+        return ""
+    return (
+        f"Held-out windows are not predicted to near the noise: {'; '.join(map(str, far))}. "
+        "Check zero, direction, units and order of the columns against the model."
+    )
