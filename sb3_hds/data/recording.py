@@ -154,6 +154,15 @@ class Recorder:
         return True
 
 
+def is_recording(line: bytes) -> bool:
+    """:return: whether the first line of a file says that a :class:`Recorder` wrote it"""
+    try:
+        header = json.loads(line)
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(header, dict) and header.get("format") == _FORMAT
+
+
 def read_recording(path: Path) -> tuple[list[dict[str, np.ndarray]], Columns]:
     """
     :param path: of a file that a :class:`Recorder` wrote, or was writing
@@ -186,7 +195,7 @@ def read_recording(path: Path) -> tuple[list[dict[str, np.ndarray]], Columns]:
     return tables, Columns(
         obs=tuple(Entry(name, name) for name in header["obs"]),
         actions=tuple(Entry(name, name) for name in header["actions"]),
-        time=Entry("time", "time"),
+        time=(Entry("time", "time"),),
         condition=Label("condition"),
         dt=header["dt"],
     )
