@@ -9,6 +9,7 @@ import numpy as np
 from sb3_hds.data.columns import Columns
 from sb3_hds.data.reading.hdf5 import is_hdf5, opened, stored
 from sb3_hds.data.reading.log import Log, foreign
+from sb3_hds.data.reading.matlab_elements import check_elements
 from sb3_hds.data.reading.tree import Cells, tables_of
 from sb3_hds.errors import TrajectoryError
 
@@ -31,6 +32,7 @@ def read_mat(path: Path, columns: Columns) -> Log:
     from scipy.io import loadmat
 
     with foreign(path):
+        check_elements(path)
         variables = loadmat(path)
         tree = {k: _plain(v) for k, v in variables.items() if not k.startswith("__")}
     known = _known(tree)

@@ -261,8 +261,9 @@ def _check_names(
     shown = f"'{body[0][1][:60]}' and then '{body[1][1][:60]}'" if first else ""
     numbers = any(map(dialect.is_number, first))
     later = rows[2] if len(rows) > 2 else []
-    if first and not numbers and (len(first) > len(names) or any(map(dialect.is_number, later))):
-        at = _first_names(dialect, rows)
+    at = _first_names(dialect, rows)
+    odd = len(first) > len(names) or any(map(dialect.is_number, later)) or at
+    if first and not numbers and odd:
         remedy = f"skip: {body[at][0]}" if at else "skip: NUMBER OF LINES"
         raise TrajectoryError(
             f"'{path}' must begin with the names of its columns, and what follows must be numbers, "
