@@ -206,7 +206,7 @@ class Trajectories:
             return dataclasses.replace(loaded, origin=stored["origin"])
         except (KeyError, ValueError, TypeError) as error:
             raise TrajectoryError(
-                f"The content of '{path}' does not fit together ({error}). "
+                f"The content of '{path}' does not fit together ({str(error)[:200]}). "
                 "Restore it from a copy, or record it again."
             ) from error
 

@@ -5,7 +5,7 @@ import glob
 import os
 import warnings
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from sb3_hds.data.minari_sets import PREFIX, read_minari
 from sb3_hds.data.reading import READERS, Log, Table, read_log
 from sb3_hds.data.reading.log import listed
 from sb3_hds.data.reading.ros import is_bag
+from sb3_hds.data.report import Reading
 from sb3_hds.data.rows import Rows, rows_of
 from sb3_hds.data.sampling import at_one_interval
 from sb3_hds.errors import TrajectoryError
@@ -55,13 +56,54 @@ def load(files: Files, columns: Any = None) -> Trajectories:
     :raises TrajectoryError: for a file that cannot be read, a column that is missing or holds no
         finite numbers, or decreasing time; says where
     """
+    try:
+        data = _loaded(files, columns)
+    except TrajectoryError as error:
+        if len(str(error).splitlines()) < 2:
+            raise
+        # Names in a damaged file may hold anything.
+        raise TrajectoryError(" ".join(str(error).split())) from error
+    report = data.report
+    if isinstance(report, Reading) and report.altered:
+        warnings.warn(report.summary(), SamplingWarning, stacklevel=3)
+    return data
+
+
+def _loaded(files: Files, columns: Any) -> Trajectories:
     said = None if columns is None else columns_from(columns)
     paths = _paths(files)
     if said is None and all(_is_own(path) for path in paths):
         return Trajectories.concatenate([Trajectories.load(path) for path in paths])
-    episodes: list[Rows] = []
+    read = _read(paths, said)
+    steps, report = at_one_interval(read.episodes, read.columns)
+    channels = (read.columns.obs or (), read.columns.actions or ())
+    units, action_units = (tuple(e.si_unit for e in entries) for entries in channels)
+    report = dataclasses.replace(
+        report, units=units, action_units=action_units, notes=tuple(read.notes)
+    )
+    data = Trajectories.from_arrays(
+        steps.obs, steps.actions, dt=report.dt, conditions=steps.conditions
+    )
+    return dataclasses.replace(data, origin=np.array(steps.origin), report=report)
+
+
+class _Read(NamedTuple):
+    """
+    What all files hold.
+
+    :param columns: as the first file has them; the others agree
+    :param notes: sentences, each once
+    """
+
+    episodes: list[Rows]
+    columns: Columns
+    notes: dict[str, None]
+
+
+def _read(paths: Sequence[str], said: Columns | None) -> _Read:
+    """One file after another: what is not used of a file is gone when the next one is read."""
+    episodes, notes = list[Rows](), dict[str, None]()
     first: _First | None = None
-    notes: dict[str, None] = {}
     for path in paths:
         log = _log(path, said)
         here, told = _understood((said or Columns()).over(log.columns), log)
@@ -73,18 +115,7 @@ def load(files: Files, columns: Any = None) -> Trajectories:
             name = path if path.startswith(PREFIX) else Path(path).name
             source = name if len(log.tables) == 1 else f"{name}, episode {i}"
             episodes += rows_of(table, here, source, Path(path).stem)
-    assert first is not None  # there is at least one path
-    steps, report = at_one_interval(episodes, first.columns)
-    obs, actions = (
-        tuple(e.si_unit for e in x or ()) for x in (first.columns.obs, first.columns.actions)
-    )
-    report = dataclasses.replace(report, units=obs, action_units=actions, notes=tuple(notes))
-    if report.altered:
-        warnings.warn(report.summary(), SamplingWarning, stacklevel=3)
-    data = Trajectories.from_arrays(
-        steps.obs, steps.actions, dt=report.dt, conditions=steps.conditions
-    )
-    return dataclasses.replace(data, origin=np.array(steps.origin), report=report)
+    return _Read(episodes, first.columns if first else Columns(), notes)
 
 
 class _First(NamedTuple):

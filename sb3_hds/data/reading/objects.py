@@ -33,7 +33,9 @@ def read_json_lines(path: Path, columns: Columns) -> Log:
     """
     with foreign(path):
         lines = path.read_bytes().split(b"\n")
-    if is_recording(lines[0]):
+    whole = [line for line in lines if line.strip()]
+    # A recording that was interrupted says so.
+    if not whole or is_recording(whole[0]) or (len(whole) == 1 and not _is_object(whole[0])):
         return Log(*read_recording(path))
     with foreign(path):
         objects: list[Any] = []
@@ -45,3 +47,10 @@ def read_json_lines(path: Path, columns: Columns) -> Log:
                     raise ValueError(f"line {number}: {error}") from error
         content = plain_of(objects)
     return Log(tables_of(content, columns, path.name))
+
+
+def _is_object(line: bytes) -> bool:
+    try:
+        return isinstance(json.loads(line), dict)
+    except (ValueError, RecursionError):
+        return False

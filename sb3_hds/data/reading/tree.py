@@ -155,13 +155,18 @@ def _walk(node: Mapping[str, Any], search: _Search, prefix: str = "") -> Iterabl
 
 
 def _episodes(node: Mapping[str, Any], search: _Search, prefix: str) -> list[Any] | None:
-    """The parts of a group of episodes; None if it is anything else."""
-    begins = tuple(f"{prefix}{key}{search.separator}" for key in node)
+    """The groups of a group of episodes, each with what stands beside them; None otherwise."""
+    groups = {
+        key: value
+        for key, value in node.items()
+        if isinstance(value, Mapping) and _EPISODES.fullmatch(str(key))
+    }
+    begins = tuple(f"{prefix}{key}{search.separator}" for key in groups)
     direct = any(name.startswith(begins) for name in search.wanted)
-    named = all(_EPISODES.fullmatch(str(key)) for key in node)
-    return (
-        _in_order(node) if node and named and not direct and _alike(list(node.values())) else None
-    )
+    if not groups or direct or not _alike(list(groups.values())):
+        return None
+    beside = {key: value for key, value in node.items() if key not in groups}
+    return [beside | group for group in _in_order(groups)]
 
 
 def _alike(parts: Sequence[Any]) -> bool:
