@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import warnings
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
+import yaml
 
 from sb3_hds import Trajectories, audit, cli, twins
 from sb3_hds.data import Recorder
@@ -662,6 +664,18 @@ def test_a_recording_needs_no_map(tmp_path, capsys):
     assert "needs no map" in described(capsys, tmp_path / "log.jsonl")
     assert cli.main(["columns", str(tmp_path / "nowhere.csv")]) == 1
     assert "does not exist" in capsys.readouterr().err
+
+
+def test_the_maps_on_the_page_about_logs_are_understood():
+    page = Path(__file__).parent.parent / "docs/guide/reading_logs.md"
+    maps = re.findall(r"^```yml\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+
+    assert len(maps) == 9
+    assert all(columns_from(yaml.safe_load(text)).obs for text in maps)
+    table = page.read_text().partition("## Units")[2].partition("Prefixes")[0]
+    units = re.findall(r"`([^`]+)`", table.partition("|---|")[2])
+    assert len(units) > 30
+    assert [unit for unit in units if unit != "scale" and unit_of(unit) is None] == []
 
 
 # --- damaged files
