@@ -57,6 +57,7 @@ def text(table=TABLE, separator=",", names=True):
         ("t,q,u\n(ms),(mrad),(-)\n0,100,0\n10,200,0\n20,300,0\n", {}),
         ("# rig 3, Monday\n# Tuesday\nt,q,u\n0.00,0.1,0\n0.01,0.2,0\n0.02,0.3,0\n", {}),
         ("% t q u\n0.00 0.1 0\n0.01 0.2 0\n0.02 0.3 0\n", {}),
+        ("sep=;\nt;q;u\n0.00;0.1;0\n0.01;0.2;0\n0.02;0.3;0\n", {}),
         ("rig 3\n\nt,q,u\n0.00,0.1,0\n0.01,0.2,0\n0.02,0.3,0\n", {"skip": 1}),
         ("0.00,0.1,0\n0.01,0.2,0\n0.02,0.3,0\n", {"time": 0, "obs": [1], "actions": [2]}),
         (
@@ -290,8 +291,11 @@ def test_lines_of_json_are_rows_and_a_line_that_was_cut_is_left_out(tmp_path):
     assert load(tmp_path / "log.jsonl", COLUMNS, lines[:-9]).lengths.tolist() == [3]
     with pytest.raises(TrajectoryError, match=r"cannot be read without columns.*sb3-hds columns"):
         load(tmp_path / "log.jsonl")
-    with pytest.raises(TrajectoryError, match="line 1: "):
-        load(tmp_path / "bad.jsonl", COLUMNS, "{t: 0}\n" + lines)
+    assert load(tmp_path / "log.json", COLUMNS, lines).lengths.tolist() == [4]
+    pretty = json.dumps([json.loads(line) for line in lines.splitlines()], indent=1)
+    assert load(tmp_path / "pretty.jsonl", COLUMNS, pretty).lengths.tolist() == [4]
+    with pytest.raises(TrajectoryError, match="line 2: "):
+        load(tmp_path / "bad.jsonl", COLUMNS, lines.replace('{"t": 0.1,', "{t: 0.1,", 1))
 
 
 def test_records_that_lead_nowhere_say_what_there_is(tmp_path):
@@ -528,7 +532,7 @@ def test_joints_keep_their_names_whatever_their_order(tmp_path):
         load(tmp_path / "log", {"obs": ["/arm:position[elbow]"], "actions": []})
 
 
-def messages_of_two_more_topics():
+def more_topics():
     """A linear signal sampled at other times, with a hole, and a command without a header."""
     for stamp in STAMPS[0] + 7_000_000 * np.arange(-2, 50):
         if not 150_000_000 < stamp - STAMPS[0] < 220_000_000:
@@ -541,6 +545,10 @@ def messages_of_two_more_topics():
             "std_msgs/msg/Float64",
             {"data": k},
         )
+
+
+def commands():
+    return [message for message in more_topics() if message[0] == "/command"]
 
 
 def with_wrenches(messages):
@@ -557,7 +565,7 @@ def with_wrenches(messages):
 
 
 def test_topics_are_put_on_one_clock_observations_interpolated_and_actions_held(tmp_path):
-    several = sorted([*joint_states(), *messages_of_two_more_topics()], key=lambda m: m[1])
+    several = sorted([*joint_states(), *more_topics()], key=lambda m: m[1])
     write_bag(tmp_path / "log", with_wrenches(several))
     columns = {
         "obs": ["/joints:position[elbow]", "/wrench:wrench.force.z"],
@@ -581,6 +589,13 @@ def test_topics_are_put_on_one_clock_observations_interpolated_and_actions_held(
         load(tmp_path / "log", columns | {"time": "/joints:header.stamp"})
     with pytest.raises(TrajectoryError, match="several topics are put on one clock, which"):
         load(tmp_path / "log", columns | {"time": "/joints:position[0]"})
+
+
+def test_the_only_number_of_a_field_is_its_first_one(tmp_path):
+    write_bag(tmp_path / "log", commands())
+    columns = {"obs": ["/command:data[0]"], "actions": [], "time": "time"}
+
+    assert load(tmp_path / "log", columns).obs[0, :, 0].tolist() == [0.0, 1.0, 2.0]
 
 
 def test_header_stamps_count_more_than_the_time_of_recording(tmp_path):

@@ -15,8 +15,8 @@ from sb3_hds.data.conversion import KNOWN, TIMES, Unit, unit_of
 from sb3_hds.errors import TrajectoryError, did_you_mean
 
 FORM = (
-    "columns names what a log holds: {'time': NAME, 'obs': [{'column': NAME, 'scale': 1.0}, ...], "
-    "'actions': [{'column': NAME, 'scale': 1.0}, ...]}, or is the path of a yml file with that."
+    "columns names what a log holds: {'time': NAME, 'obs': [{'column': NAME, 'unit': 'deg'}, ...], "
+    "'actions': [{'column': NAME}, ...]}, or is the path of a yml file with that."
 )
 
 

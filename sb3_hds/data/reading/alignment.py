@@ -67,10 +67,8 @@ def aligned(
             continue
         columns[name] = _interpolated(times, values, stamps, observed[name])
         after = np.minimum(np.searchsorted(times, stamps, side="left"), len(times) - 1)
-        intervals = np.diff(times)
-        longest = (
-            1e9 * gap if gap else _GAP * float(np.median(intervals)) if len(intervals) else 0.0
-        )
+        usual = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        longest = 1e9 * gap if gap else _GAP * usual
         kept &= (stamps <= times[-1]) & (times[after] - times[np.maximum(before, 0)] <= longest)
         interpolated.append(name)
     columns[""] = stamps

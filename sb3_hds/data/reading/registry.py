@@ -8,7 +8,7 @@ from sb3_hds.data.reading.arrays import read_npy, read_npz
 from sb3_hds.data.reading.hdf5 import read_hdf5
 from sb3_hds.data.reading.log import Log, aliases
 from sb3_hds.data.reading.matlab import read_mat
-from sb3_hds.data.reading.objects import read_json, read_json_lines
+from sb3_hds.data.reading.objects import read_json
 from sb3_hds.data.reading.parquet import read_parquet
 from sb3_hds.data.reading.ros import is_bag, read_bag
 from sb3_hds.data.reading.text import read_text
@@ -25,8 +25,8 @@ READERS: dict[str, Callable[[Path, Columns], Log]] = {
     ".npy": read_npy,
     ".mat": read_mat,
     ".json": read_json,
-    ".jsonl": read_json_lines,
-    ".ndjson": read_json_lines,
+    ".jsonl": read_json,
+    ".ndjson": read_json,
     ".h5": read_hdf5,
     ".hdf5": read_hdf5,
     ".hdf": read_hdf5,

@@ -1,6 +1,7 @@
 """Bags of ROS 1 and ROS 2, as rosbags reads them."""
 
 import contextlib
+import itertools
 import re
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -16,9 +17,11 @@ from sb3_hds.errors import TrajectoryError
 
 STORAGE = (".db3", ".mcap")
 _REMEDY = "A recording that was cut off is mended by 'ros2 bag reindex' or 'rosbag reindex'."
+_TIME = Entry("time", "time")
 _RECEIVED, _STAMP = "received", "header.stamp"
 _NAMES = ("name", "names", "joint_names")  # fields that name the entries of those beside them
 _LONGEST = 64  # entries of an array that are listed: more are a picture or a scan
+_FIRST = 50  # messages from which the names of columns are taken
 _TOKEN = re.compile(r"\[([^\]]*)\]|([^.\[\]]+)")
 
 
@@ -42,7 +45,7 @@ def read_bag(path: Path, columns: Columns) -> Log:
         have no clock in common
     """
     with _opened(path) as bag:
-        fields = _fields_of(sorted(columns.wanted))
+        fields = _fields_of(sorted(columns.wanted - {_TIME.name}))
         if fields and set(fields) <= {connection.topic for connection in bag.connections}:
             topics = {t: _read(bag, t, names, path) for t, names in fields.items()}
             lacking = [f"{t}:{n}" for t, topic in topics.items() for n in topic.lacking]
@@ -55,9 +58,6 @@ def read_bag(path: Path, columns: Columns) -> Log:
             topics = {t: _read(bag, t, n, path) for t, n in _fields_of(found).items()}
             return Log([{k: v for t in topics.values() for k, v in t.columns().items()}])
     return _rows(topics, columns, path)
-
-
-_TIME = Entry("time", "time")
 
 
 class _Topic:
@@ -151,9 +151,10 @@ def _fields_of(names: Iterable[str]) -> dict[str, list[str]]:
 
 def _rows(topics: Mapping[str, _Topic], columns: Columns, path: Path) -> Log:
     """Everything at the stamps of one topic."""
-    said = [entry.column or "" for entry in columns.time or ()]
+    said = [entry.column for entry in columns.time or () if entry.column not in (None, "time")]
     observed = [entry.column or "" for entry in columns.obs or () if entry.column]
-    leading, _, first = ([*said, *observed, *sorted(columns.wanted)][0]).partition(":")
+    every = [*said, *observed, *sorted(columns.wanted - {_TIME.name})]
+    leading, _, first = str(every[0]).partition(":")
     clock = _clock(topics, first if said else "", leading, path)
     series = {
         f"{topic.name}:{field}": topic.series(field, clock)
@@ -225,8 +226,7 @@ def _messages(bag: Any, topic: str) -> Iterator[tuple[Any, int]]:
         except KeyError as error:
             raise TrajectoryError(
                 f"Messages of '{topic}' are of the type {connection.msgtype}, which this bag does "
-                "not define. Record the topic again with a newer ROS, or convert the bag: "
-                "rosbags-convert."
+                "not define. Record it with ROS 2 Iron or later, whose bags hold the definitions."
             ) from error
 
 
@@ -245,18 +245,18 @@ def _value(message: Any, path: Sequence[tuple[str, str]]) -> Any:
     for place, (index, name) in enumerate(path):
         if name:
             value = getattr(value, name, None)
-        elif index.isdigit():
-            value = (
-                value[int(index)] if hasattr(value, "__len__") and int(index) < len(value) else None
-            )
-        else:
-            names = _names_beside(message, path[: place + 1])
-            at = names.index(index) if index in names else len(names)
-            value = value[at] if hasattr(value, "__len__") and at < len(value) else None
+        elif hasattr(value, "__len__"):
+            names = [] if index.isdigit() else _names_beside(message, path[: place + 1])
+            at = int(index) if index.isdigit() else names.index(index) if index in names else -1
+            value = value[at] if 0 <= at < len(value) else None
+        elif index != "0":  # a single number may be called the first one
+            return None
         if value is None:
             return None
     if hasattr(value, "sec") and hasattr(value, "nanosec"):
         return int(value.sec) * 1_000_000_000 + int(value.nanosec)
+    if isinstance(value, np.ndarray) and value.size == 1:
+        return value.ravel()[0]
     return value if isinstance(value, str | bool | int | float | np.generic) else None
 
 
@@ -277,13 +277,14 @@ def _names_beside(message: Any, path: Sequence[tuple[str, str]]) -> list[str]:
 
 
 def _discovered(bag: Any) -> list[str]:
-    """Names of all columns, from the first message of each topic."""
-    found = []
+    """Names of all columns, from the first messages of each topic."""
+    found: dict[str, None] = {}
     for topic in dict.fromkeys(connection.topic for connection in bag.connections):
-        with contextlib.suppress(TrajectoryError, StopIteration):
-            message, _ = next(_messages(bag, topic))
-            found += [f"{topic}:{field}" for field in [_RECEIVED, *_leaves(message, message, "")]]
-    return found
+        with contextlib.suppress(TrajectoryError):
+            for message, _ in itertools.islice(_messages(bag, topic), _FIRST):
+                leaves = [_RECEIVED, *_leaves(message, message, "")]
+                found |= dict.fromkeys(f"{topic}:{field}" for field in leaves)
+    return list(found)
 
 
 def _leaves(message: Any, root: Any, prefix: str) -> Iterator[str]:

@@ -178,7 +178,7 @@ def _layout(path: Path, lines: Sequence[str], columns: Columns) -> _Layout:
     """Where the names are, the units and the first row, and how fields are separated."""
     skip = columns.skip or 0
     filled = [(i, line.strip()) for i, line in enumerate(lines) if i >= skip and line.strip()]
-    comments = list(itertools.takewhile(lambda numbered: numbered[1][0] in "#%", filled))
+    comments = list(itertools.takewhile(lambda numbered: _is_comment(numbered[1]), filled))
     body = filled[len(comments) :]
     if not filled:
         raise TrajectoryError(f"'{path}' is empty: nothing was logged.")
@@ -211,6 +211,11 @@ def _layout(path: Path, lines: Sequence[str], columns: Columns) -> _Layout:
         match = _UNIT_IN_NAME.fullmatch(name)
         units[i] = units[i] or (match[1] if named and match else "")
     return _Layout(_distinct(names), units, before, dialect, not named)
+
+
+def _is_comment(line: str) -> bool:
+    """Excel's line that names the separator is one too."""
+    return line[0] in "#%" or re.fullmatch(r"sep=.", line) is not None
 
 
 def _merit(dialect: _Dialect, sample: Sequence[str]) -> tuple[int, float, int]:
