@@ -124,6 +124,17 @@ def test_dates_of_this_century_are_told_by_their_size(unit, start, tmp_path):
     assert data.report.notes == ((f"t counts {unit} since 1970.",) if unit != "s" else ())
 
 
+def test_nanoseconds_since_1970_are_not_rounded(tmp_path):
+    content = "t,q,u\n" + "".join(
+        f"{1_700_000_000_000_000_000 + 10_000 * k},0,0\n" for k in range(9)
+    )
+
+    data = load(tmp_path / "log.csv", COLUMNS, content)
+
+    # Doubles of that size are 256 ns apart.
+    assert data.dt == pytest.approx(1e-5, rel=1e-9) and not data.report.altered
+
+
 # --- units
 
 
@@ -694,6 +705,23 @@ def test_the_maps_on_the_page_about_logs_are_understood():
 
 
 # --- damaged files
+
+
+@pytest.mark.parametrize(
+    ("at", "byte", "says"),
+    [
+        (145, 0x08, "an array of class 6 that lacks a part"),  # complex, without an imaginary part
+        (177, 0x55, "an element of type"),
+        (144, 0x01, "lacks a part"),  # a cell array of numbers
+    ],
+)
+def test_a_damaged_matlab_file_does_not_end_the_process(at, byte, says, tmp_path):
+    scipy.io.savemat(tmp_path / "log.mat", TABLE)
+    content = bytearray((tmp_path / "log.mat").read_bytes())
+    content[at] = byte
+
+    with pytest.raises(TrajectoryError, match=says):
+        load(tmp_path / "log.mat", COLUMNS, bytes(content))
 
 
 def healthy(folder):
