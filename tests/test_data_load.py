@@ -445,16 +445,16 @@ def test_files_that_cannot_be_read_say_why(tmp_path):
     (tmp_path / "log.npz").write_bytes(b"PK nothing")
     (tmp_path / "empty.csv").write_text("")
     (tmp_path / "numbers.csv").write_text("0.0,1,2,3\n0.1,1,2,3\n")
-    (tmp_path / "log.bag").write_text("")
+    (tmp_path / "log.xls").write_text("")
     (tmp_path / "picture.csv").write_bytes(bytes(range(256)))
     expected = {
         "log.json": "is damaged or not a .json file",
-        "text.json": "holds neither an object nor a list",
+        "text.json": "has no column 'q', 't', 'u', 'v'. It has: 0.",
         "log.mat": "is damaged or not a .mat file",
         "log.npz": "is damaged",
-        "empty.csv": "is damaged or not a .csv file",
-        "numbers.csv": "begins with numbers: its first line must hold the names",
-        "log.bag": "there are readers for .csv, .tsv, .txt, .parquet, .npz, .mat, .json, .jsonl",
+        "empty.csv": "is empty: nothing was logged",
+        "numbers.csv": "begins with numbers, so that its 4 columns have no names: write their numb",
+        "log.xls": "there are readers for .csv, .tsv, .txt, .dat, .log, .parquet, .npz, .npy",
         "picture.csv": "is damaged or not a .csv file",
         "nowhere.csv": "does not exist",
         "": "is a folder; name the files in it",
@@ -492,8 +492,9 @@ def test_nothing_is_unpickled(tmp_path):
 
     np.savez(tmp_path / "log.npz", t=np.array([Evil()], dtype=object))
 
-    with pytest.raises(TrajectoryError, match="is damaged"):
-        Trajectories.load(tmp_path / "log.npz", columns=COLUMNS)
+    for columns in (COLUMNS, None):
+        with pytest.raises(TrajectoryError, match=r"holds Python objects.* have to be unpickled"):
+            Trajectories.load(tmp_path / "log.npz", columns=columns)
     assert not (tmp_path / "owned").exists()
 
 
@@ -578,12 +579,16 @@ def test_a_log_without_rows_says_so(tmp_path):
         Trajectories.load(path, columns={"time": "t", "obs": ["q"], "actions": ["u"]})
 
 
-def test_vectors_in_records_are_refused(tmp_path):
+def test_numbers_of_a_vector_in_a_record_are_named_one_by_one(tmp_path):
     path = tmp_path / "log.json"
-    path.write_text(json.dumps([{"t": 0.1 * i, "obs": [0.1, 0.2], "u": 0} for i in range(9)]))
+    path.write_text(json.dumps([{"t": 0.1 * i, "obs": [i, -i], "u": 0} for i in range(9)]))
+    columns = {"time": "t", "actions": ["u"]}
 
-    with pytest.raises(TrajectoryError, match="one number in each row, got 2"):
-        Trajectories.load(path, columns={"time": "t", "obs": ["obs"], "actions": ["u"]})
+    data = Trajectories.load(path, columns=columns | {"obs": ["obs[1]", "obs[0]"]})
+
+    np.testing.assert_array_equal(data.obs[0], np.outer(np.arange(9), [-1, 1]))
+    with pytest.raises(TrajectoryError, match=r"in each row. Name them one by one: obs\[0\], obs"):
+        Trajectories.load(path, columns=columns | {"obs": ["obs"]})
 
 
 @pytest.mark.parametrize("kind", ["datetime64[ns]", "timedelta64[us]"])
@@ -620,11 +625,10 @@ def test_what_names_no_file_is_refused(files):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("# rig 3, Monday\nt,q,u\n0.0,1.0,0.0\n0.1,1.1,0.0\n", "Delete the lines before the names"),
-        ("logged by rig 3\nt,q,u\n0.0,1.0,0.0\n0.1,1.1,0.0\n", "got 'logged by rig 3' and then"),
-        ("# rig 3\n# Monday\nt,q,u\n0.0,1.0,0.0\n0.1,1.1,0.0\n", "Delete the lines before"),
-        ("t,q,u\ns,rad,N m\n0.0,1.0,0.0\n0.1,1.1,0.0\n", "row of units below the names (line 2"),
-        ("t,q,u\ns,rad,1\n0.0,1.0,0.0\n0.1,1.1,0.0\n", "row of units below the names (line 2"),
+        ("logged by rig 3\nt,q,u\n0.0,1.0,0.0\n0.1,1.1,0.0\n", "before the names: skip: 1."),
+        ("rig,3,hot\nMonday\nt,q,u\n0.0,1.0,0.0\n0.1,1.1,0.0\n", "before the names: skip: 2."),
+        ("t,q,u\nlow,high,low\n0.0,1.0,0.0\n0.1,1.1,0.0\n", "what follows must be numbers, got"),
+        ("t,q,u\n0,1,2\n3,4,5,6\n", "has 4 fields in line 3 and 3 before. Correct"),
         ("t,q,u\n2024-05-01 12:00:00.1,1,0\n2024-05-01 12:00:00.2,1,0\n", "to seconds before"),
         ("t,q,u\n12:00:00.1,1.0,0.0\n12:00:00.2,1.1,0.0\n", "Convert dates and times of day"),
     ],

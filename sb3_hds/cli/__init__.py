@@ -4,6 +4,7 @@
     sb3-hds diagnose --twin PendulumReal --data 'logs/*.csv' --columns map.yml --report out.html
     sb3-hds diagnose --twin my_module:MyTwin --data 'logs/*.csv' --columns map.yml
     sb3-hds diagnose --twin LinearAxis --set observe:q mass:95 --data log.mat --columns map.yml
+    sb3-hds columns log.csv > map.yml
     sb3-hds robustness --algo openloop --model model.zip --env Swimmer-v5
     sb3-hds effects
     sb3-hds twins
@@ -22,7 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :return: 0 on any verdict; 1 where the question makes no sense, with one line on why
     """
     given = parser().parse_args(arguments)
-    from sb3_hds.cli import diagnose, listing, robustness
+    from sb3_hds.cli import columns, diagnose, listing, robustness
     from sb3_hds.errors import SB3HDSError
 
     try:
@@ -31,6 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             # Meant for programmers.
             warnings.simplefilter("ignore", DeprecationWarning)
             {
+                "columns": columns.run,
                 "diagnose": diagnose.run,
                 "robustness": robustness.run,
                 "effects": listing.effects,
@@ -61,6 +63,8 @@ def _warn(
 
 def parser() -> argparse.ArgumentParser:
     """:return: what the command understands"""
+    from sb3_hds.cli import columns
+
     every = argparse.ArgumentParser(
         prog="sb3-hds",
         description="What a simulation gets wrong, and what a policy endures.",
@@ -121,6 +125,7 @@ def parser() -> argparse.ArgumentParser:
     shake.add_argument("--vecnormalize", help="vecnormalize.pkl of the training")
     shake.add_argument("--push", type=float, default=5.0, help="force on the torso [N]")
     shake.add_argument("--csv", help="table to write")
+    columns.add(commands)
     commands.add_parser("effects", help="list the candidates, with units and explanations")
     commands.add_parser("twins", help="list the simulations, with their parameters")
     return every

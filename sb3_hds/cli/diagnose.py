@@ -17,9 +17,11 @@ if TYPE_CHECKING:
 
 _COLUMNS = """Say what the columns mean in a yml file, --columns map.yml:
 
-    time: NAME                               # or {column: NAME, scale: 0.001}, or dt: SECONDS
-    obs: [NAME, {column: NAME, scale: 1.0}]  # in the order of 'sb3-hds twins'
-    actions: [NAME]"""
+    time: NAME                               # or {column: NAME, unit: ms}, or dt: SECONDS
+    obs: [NAME, {column: NAME, unit: deg}]   # in the order of 'sb3-hds twins'
+    actions: [NAME]
+
+'sb3-hds columns FILE' prints what is in a log, and such a map to start from."""
 
 
 def run(given: argparse.Namespace) -> None:

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import secrets
+import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -99,8 +100,17 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
             raise ValueError("it holds a single array")
         with archive:
             return {name: np.asarray(archive[name]) for name in archive.files}
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        reason = "it holds no arrays of numbers" if "pickle" in str(error) else error
+    except (
+        *(OSError, EOFError, ValueError, KeyError, NotImplementedError, RuntimeError),
+        *(zipfile.BadZipFile, zlib.error, struct.error),
+    ) as error:
+        if "allow_pickle" in str(error) and zipfile.is_zipfile(source):
+            raise TrajectoryError(
+                f"'{source}' was not written by Trajectories.save: it holds Python objects, which "
+                "would have to be unpickled, and no file is. Save arrays of numbers."
+            ) from error
+        told = " ".join(str(error).split())[:200]
+        reason = "it holds no arrays of numbers" if "pickle" in told else told
         raise TrajectoryError(
             f"'{source}' is damaged or was not written by Trajectories.save ({reason}). "
             "Restore it from a copy, or record it again."

@@ -162,7 +162,8 @@ class Trajectories:
         are resampled; what that changed is warned of and stays in ``report``.
 
         :param files: path, or pattern with ``*``, or several: ``.npz``, ``.jsonl`` (a recording),
-            ``.csv``, ``.parquet``, ``.mat``, ``.json``; or ``minari:`` and the name of a data set
+            ``.csv``, ``.parquet``, ``.mat``, ``.h5``, ``.json``, a bag of ROS; or ``minari:`` and
+            the name of a data set
         :param columns: what the columns of a log mean, as a dict or the path of a yml file; not
             needed for what :meth:`save` or a recorder wrote
         :raises TrajectoryError: if there is no such file, if it is damaged or of another kind, if
@@ -186,7 +187,8 @@ class Trajectories:
         if stored.get("format", np.array("")).tolist() != _FORMAT:
             raise TrajectoryError(
                 f"'{path}' was not written by Trajectories.save; it holds: {', '.join(stored)}. "
-                "Build the data with Trajectories.from_arrays."
+                "Say what that is, columns={'time': NAME, 'obs': [NAME, ...], 'actions': [NAME, "
+                "...]}, or build the data with Trajectories.from_arrays."
             )
         if stored.get("version", np.array(0)) > _VERSION:
             raise TrajectoryError(
@@ -204,7 +206,7 @@ class Trajectories:
             return dataclasses.replace(loaded, origin=stored["origin"])
         except (KeyError, ValueError, TypeError) as error:
             raise TrajectoryError(
-                f"The content of '{path}' does not fit together ({error}). "
+                f"The content of '{path}' does not fit together ({str(error)[:200]}). "
                 "Restore it from a copy, or record it again."
             ) from error
 

@@ -45,7 +45,8 @@ def audit(data: Trajectories, channels: Sequence[str | Channel] | None = None) -
     :param data: of any kind
     :param channels: names of the observation channels, or a twin's ``channels``; default: those
         that were read, or ``obs[0]``, ``obs[1]``, ...
-    :raises TrajectoryError: if the number of names is not that of the channels
+    :raises TrajectoryError: if the number of names is not that of the channels, or if one was read
+        in a unit of something else
     """
     report = data.report if isinstance(data.report, Reading) else None
     named = _channels(data, channels, report)
@@ -99,7 +100,9 @@ def audit(data: Trajectories, channels: Sequence[str | Channel] | None = None) -
 def _channels(
     data: Trajectories, channels: Sequence[str | Channel] | None, report: Reading | None
 ) -> list[Channel]:
-    if channels is None:
+    if channels is None and report is not None and any(report.units):
+        channels = [Channel(*pair) for pair in zip(report.obs, report.units, strict=True)]
+    elif channels is None:
         channels = report.obs if report else [f"obs[{j}]" for j in range(data.n_obs)]
     named = [Channel(c, "") if isinstance(c, str) else c for c in channels]
     if len(named) != data.n_obs or len({channel.name for channel in named}) < len(named):
@@ -107,6 +110,9 @@ def _channels(
             f"channels must hold a name of its own for each of the {data.n_obs} observation "
             f"channels, got {[channel.name for channel in named]}."
         )
+    misfit = report.misfit(named) if report else ""
+    if misfit:
+        raise TrajectoryError(misfit)
     return named
 
 

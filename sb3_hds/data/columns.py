@@ -11,23 +11,27 @@ from typing import Any, NamedTuple
 import yaml
 
 from sb3_hds.core.episodes import check_dt
+from sb3_hds.data.conversion import KNOWN, TIMES, Unit, unit_of
 from sb3_hds.errors import TrajectoryError, did_you_mean
 
 FORM = (
-    "columns names what a log holds: {'time': NAME, 'obs': [{'column': NAME, 'scale': 1.0}, ...], "
-    "'actions': [{'column': NAME, 'scale': 1.0}, ...]}, or is the path of a yml file with that."
+    "columns names what a log holds: {'time': NAME, 'obs': [{'column': NAME, 'unit': 'deg'}, ...], "
+    "'actions': [{'column': NAME}, ...]}, or is the path of a yml file with that."
 )
 
 
 class Entry(NamedTuple):
     """
-    One channel: ``scale * column + offset``, or ``offset`` alone where nothing was recorded.
+    One channel: ``factor * column + offset``, or ``offset`` alone where nothing was recorded.
 
     :param name: of the channel; default: that of its column
     :param column: in the log; None for a channel that is constant
-    :param scale: factor to the unit of the twin, as pi / 180 for degrees
+    :param scale: of the column, besides the factor of its unit
     :param offset: added after scaling, in the unit of the twin
     :param angle: whether the result wraps to [-pi, pi) [rad]: it then turns the shorter way
+    :param unit: that the column, once scaled, is in, as ``"deg"``: it is converted to the SI unit.
+        Empty if ``scale`` leads to the unit of the twin; None if nothing is said, so that a file
+        which names its units may
     """
 
     name: str
@@ -35,6 +39,19 @@ class Entry(NamedTuple):
     scale: float = 1.0
     offset: float = 0.0
     angle: bool = False
+    unit: str | None = None
+
+    @property
+    def factor(self) -> float:
+        """From the column to the unit of the twin."""
+        unit = unit_of(self.unit) if self.unit else None
+        return self.scale * (unit.factor if unit else 1.0)
+
+    @property
+    def si_unit(self) -> str:
+        """Unit of the channel; empty where it is not known."""
+        unit = unit_of(self.unit) if self.unit else None
+        return unit.name if unit else ""
 
 
 class Label(NamedTuple):
@@ -54,25 +71,30 @@ class Columns:
 
     :param obs: observation channels, in the order of the twin; None: as the file itself says
     :param actions: action channels, in the order of the twin; None: as the file itself says
-    :param time: stamps, scaled to seconds; None where rows are exactly ``dt`` apart
+    :param time: stamps, scaled to seconds, the sum of several columns where seconds and nanoseconds
+        stand apart; None where rows are exactly ``dt`` apart
     :param condition: where the label is from; default: all trajectories have the same one
     :param episode: the column that changes where a new episode begins
     :param dt: sampling interval of the result [s]; default: the one in the log
     :param gap: a longer time between two rows ends the episode [s]; default: five intervals
+    :param records: where the rows are in a file that nests them, as ``"data"`` or ``"run.rows"``
+    :param skip: number of lines of a text file before its names, or its first row
     """
 
     obs: tuple[Entry, ...] | None = None
     actions: tuple[Entry, ...] | None = None
-    time: Entry | None = None
+    time: tuple[Entry, ...] | None = None
     condition: Label | None = None
     episode: str | None = None
     dt: float | None = None
     gap: float | None = None
+    records: str | None = None
+    skip: int | None = None
 
     @property
     def wanted(self) -> frozenset[str]:
         """Names of all columns that are read."""
-        entries = [*(self.obs or ()), *(self.actions or ()), *([self.time] if self.time else [])]
+        entries = [*(self.obs or ()), *(self.actions or ()), *(self.time or ())]
         labels = [self.condition.column] if self.condition else []
         names = [*(entry.column for entry in entries), *labels, self.episode]
         return frozenset(name for name in names if name is not None)
@@ -98,6 +120,29 @@ class Columns:
             )
         return merged
 
+    def in_units(self, units: Mapping[str, str]) -> "Columns":
+        """
+        :param units: of columns, as a file names them
+        :return: with these units where nothing else is said and they are understood
+        """
+
+        si = {name: unit_of(unit) for name, unit in units.items()}
+        known = {name: units[name] for name, unit in si.items() if unit and unit.name}
+        times = {name: units[name] for name, unit in si.items() if unit and unit.name == "s"}
+
+        def completed(entries: tuple[Entry, ...], units: Mapping[str, str]) -> tuple[Entry, ...]:
+            return tuple(
+                entry._replace(unit=units.get(entry.column or "")) if entry.unit is None else entry
+                for entry in entries
+            )
+
+        return dataclasses.replace(
+            self,
+            obs=self.obs and completed(self.obs, known),
+            actions=self.actions and completed(self.actions, known),
+            time=self.time and completed(self.time, times),
+        )
+
 
 def columns_from(source: Any) -> Columns:
     """
@@ -117,9 +162,11 @@ def columns_from(source: Any) -> Columns:
     return Columns(
         obs=_entries(where, "obs", source.get("obs")),
         actions=_entries(where, "actions", source.get("actions")),
-        time=None if source.get("time") is None else _entry(f"{where}: time", source["time"]),
+        time=_time(where, source.get("time")),
         condition=_condition(where, source.get("condition")),
         episode=_episode(where, source.get("episode")),
+        records=None if source.get("records") is None else str(source["records"]),
+        skip=_skip(where, source.get("skip")),
         **{key: check_dt(value) for key, value in seconds.items()},
     )
 
@@ -133,7 +180,10 @@ def _read_yml(path: Path) -> Any:
         ) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split())
-        raise TrajectoryError(f"The columns file '{path}' is not valid yml: {reason}.") from error
+        raise TrajectoryError(
+            f"The columns file '{path}' is not valid yml: {reason}. Names with a bracket, a comma "
+            "or a percent sign need quotes: {column: 'x[0]'}."
+        ) from error
 
 
 def _check_keys(where: str, given: Mapping[Any, Any], known: Sequence[str]) -> None:
@@ -168,15 +218,18 @@ def _entry(where: str, given: Any, name_of_constant: str = "") -> Entry:
     if not isinstance(given, Mapping):
         name = _column_name(where, given)
         return Entry(name, name)
-    _check_keys(where, given, ("column", "scale", "offset", "angle", "constant", "name"))
+    keys = ("column", "unit", "scale", "offset", "angle", "constant", "name")
+    _check_keys(where, given, keys)
     if ("column" in given) == ("constant" in given and bool(name_of_constant)):
         raise TrajectoryError(
             f"{where} needs either 'column' (its name in the log) or 'constant' (a value that was "
             f"not recorded), got {dict(given)}."
         )
+    unit = _unit(where, given)
     if "constant" in given:
-        value = _number(f"{where}: constant", given["constant"])
-        return Entry(str(given.get("name", name_of_constant)), None, offset=value)
+        value = _number(f"{where}: constant", given["constant"]) * (unit.factor if unit else 1.0)
+        name = str(given.get("name", name_of_constant))
+        return Entry(name, None, offset=value, unit=unit and unit.name)
     column = _column_name(where, given["column"])
     return Entry(
         str(given.get("name", column)),
@@ -184,6 +237,53 @@ def _entry(where: str, given: Any, name_of_constant: str = "") -> Entry:
         _number(f"{where}: scale", given.get("scale", 1.0)),
         _number(f"{where}: offset", given.get("offset", 0.0)),
         bool(given.get("angle", False)),
+        str(given["unit"]) if unit else "" if "scale" in given else None,
+    )
+
+
+def _unit(where: str, given: Mapping[str, Any]) -> Unit | None:
+    if given.get("unit") is None:
+        return None
+    unit = unit_of(str(given["unit"]))
+    if unit is None:
+        raise TrajectoryError(
+            f"{where}: the unit '{given['unit']}' is not known. Known are {KNOWN}, and what is "
+            "made of them, as 'deg/s' or 'N mm'. For another one, give the factor to the unit of "
+            "the twin: scale: NUMBER."
+        )
+    if not unit.name and "scale" not in given:
+        raise TrajectoryError(
+            f"{where}: {given['unit']} mean nothing without a scale. Say what one of them is, in "
+            "the unit of the twin: scale: NUMBER."
+        )
+    if given.get("angle") and unit.name not in ("rad", ""):
+        raise TrajectoryError(
+            f"{where}: an angle is in rad, deg or turns, not in '{given['unit']}'. Leave out "
+            "angle: true, or correct the unit."
+        )
+    return unit
+
+
+def _time(where: str, given: Any) -> tuple[Entry, ...] | None:
+    if given is None:
+        return None
+    several = isinstance(given, Sequence) and not isinstance(given, str)
+    if several and not given:
+        raise TrajectoryError(f"{where}: time is an empty list. Name a column, or leave it out.")
+    entries = tuple(_entry(f"{where}: time", item) for item in (given if several else [given]))
+    for entry in entries:
+        if entry.unit and entry.si_unit not in ("s", ""):
+            raise TrajectoryError(
+                f"{where}: time is in one of {', '.join(TIMES)}, got unit: '{entry.unit}'."
+            )
+    return entries
+
+
+def _skip(where: str, given: Any) -> int | None:
+    if given is None or (isinstance(given, int) and not isinstance(given, bool) and given >= 0):
+        return given
+    raise TrajectoryError(
+        f"{where}: skip is the number of lines before the names, or the first row, got {given!r}."
     )
 
 

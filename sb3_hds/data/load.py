@@ -5,25 +5,31 @@ import glob
 import os
 import warnings
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.data import recording
-from sb3_hds.data.columns import Columns, columns_from
+from sb3_hds.data.columns import Columns, Entry, columns_from
 from sb3_hds.data.minari_sets import PREFIX, read_minari
+from sb3_hds.data.reading import READERS, Log, Table, read_log
+from sb3_hds.data.reading.log import listed
+from sb3_hds.data.reading.ros import is_bag
+from sb3_hds.data.report import Reading
 from sb3_hds.data.rows import Rows, rows_of
 from sb3_hds.data.sampling import at_one_interval
-from sb3_hds.data.tables import READERS, Log, read_log
 from sb3_hds.errors import TrajectoryError
 
 _SUFFIX = ".npz"  # of what Trajectories.save writes
 WITHOUT_COLUMNS = (
-    "Say what its columns mean: columns={'time': NAME, 'obs': [NAME, ...], 'actions': [NAME, ...]}."
+    "Say what its columns mean: columns={'time': NAME, 'obs': [NAME, ...], 'actions': [NAME, "
+    "...]}. 'sb3-hds columns FILE' prints what there is."
 )
+_EPOCH = {1.0: "s", 1e3: "ms", 1e6: "us", 1e9: "ns"}  # unit by how many there are in a second
+_FROM, _TO = 9.4e8, 4.1e9  # years 2000 to 2100 [s since 1970]
 
 Files = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
@@ -50,27 +56,74 @@ def load(files: Files, columns: Any = None) -> Trajectories:
     :raises TrajectoryError: for a file that cannot be read, a column that is missing or holds no
         finite numbers, or decreasing time; says where
     """
+    try:
+        data = _loaded(files, columns)
+    except TrajectoryError as error:
+        if len(str(error).splitlines()) < 2:
+            raise
+        # Names in a damaged file may hold anything.
+        raise TrajectoryError(" ".join(str(error).split())) from error
+    report = data.report
+    if isinstance(report, Reading) and report.altered:
+        warnings.warn(report.summary(), SamplingWarning, stacklevel=3)
+    return data
+
+
+def _loaded(files: Files, columns: Any) -> Trajectories:
     said = None if columns is None else columns_from(columns)
     paths = _paths(files)
     if said is None and all(_is_own(path) for path in paths):
         return Trajectories.concatenate([Trajectories.load(path) for path in paths])
-    episodes: list[Rows] = []
-    logs = [_log(path, said) for path in paths]
-    meant = [(said or Columns()).over(log.columns) for log in logs]
-    for path, log, here in zip(paths, logs, meant, strict=True):
-        _check_same(meant[0], here, paths[0], path)
-        _check_columns(here, logs[0], log, paths[0], path)
-        for i, table in enumerate(log.tables):
-            name = path if path.startswith(PREFIX) else Path(path).name
-            source = name if len(log.tables) == 1 else f"{name}, episode {i}"
-            episodes += rows_of(table, here, source, Path(path).stem)
-    steps, report = at_one_interval(episodes, meant[0])
-    if report.altered:
-        warnings.warn(report.summary(), SamplingWarning, stacklevel=3)
+    read = _read(paths, said)
+    steps, report = at_one_interval(read.episodes, read.columns)
+    channels = (read.columns.obs or (), read.columns.actions or ())
+    units, action_units = (tuple(e.si_unit for e in entries) for entries in channels)
+    report = dataclasses.replace(
+        report, units=units, action_units=action_units, notes=tuple(read.notes)
+    )
     data = Trajectories.from_arrays(
         steps.obs, steps.actions, dt=report.dt, conditions=steps.conditions
     )
     return dataclasses.replace(data, origin=np.array(steps.origin), report=report)
+
+
+class _Read(NamedTuple):
+    """
+    What all files hold.
+
+    :param columns: as the first file has them; the others agree
+    :param notes: sentences, each once
+    """
+
+    episodes: list[Rows]
+    columns: Columns
+    notes: dict[str, None]
+
+
+def _read(paths: Sequence[str], said: Columns | None) -> _Read:
+    """One file after another: what is not used of a file is gone when the next one is read."""
+    episodes, notes = list[Rows](), dict[str, None]()
+    first: _First | None = None
+    for path in paths:
+        log = _log(path, said)
+        here, told = _understood((said or Columns()).over(log.columns), log)
+        first = first or _First(path, here, frozenset(log.tables[0]))
+        _check_same(first, here, path)
+        _check_columns(first, here, log.tables[0], path)
+        notes |= dict.fromkeys(told)
+        for i, table in enumerate(log.tables):
+            name = path if path.startswith(PREFIX) else Path(path).name
+            source = name if len(log.tables) == 1 else f"{name}, episode {i}"
+            episodes += rows_of(table, here, source, Path(path).stem)
+    return _Read(episodes, first.columns if first else Columns(), notes)
+
+
+class _First(NamedTuple):
+    """The file that others have to agree with."""
+
+    path: str
+    columns: Columns
+    names: frozenset[str]
 
 
 def _paths(files: Any) -> list[str]:
@@ -86,7 +139,7 @@ def _paths(files: Any) -> list[str]:
         if path.startswith(PREFIX) or not glob.has_magic(path) or Path(path).exists():
             found.append(path)
             continue
-        matching = sorted(p for p in glob.glob(path, recursive=True) if Path(p).is_file())
+        matching = sorted(p for p in glob.glob(path, recursive=True) if _is_log(Path(p)))
         if not matching:
             raise TrajectoryError(f"No file matches '{path}' (in {Path.cwd()}).")
         found += matching
@@ -103,40 +156,87 @@ def _is_own(path: str) -> bool:
     return Path(path).suffix == _SUFFIX or Path(path + _SUFFIX).is_file()
 
 
+def _is_log(path: Path) -> bool:
+    return path.is_file() or is_bag(path)
+
+
 def _log(path: str, said: Columns | None) -> Log:
     if path.startswith(PREFIX):
         return Log(*read_minari(path.removeprefix(PREFIX)))
-    if said is None and Path(path).suffix in READERS and Path(path).suffix != recording.SUFFIX:
+    suffix = Path(path).suffix
+    known = suffix.lower() in READERS or is_bag(Path(path))
+    log = None
+    if said is not None or not known or suffix.lower() == recording.SUFFIX:
+        log = read_log(Path(path), said or Columns())
+    if log is None or (said is None and (log.columns is None or log.columns.obs is None)):
         raise TrajectoryError(
-            f"'{path}' cannot be read without columns: files that end in {_SUFFIX} can, not those "
-            f"that end in '{Path(path).suffix}'. "
-            f"{WITHOUT_COLUMNS}"
+            f"'{path}' cannot be read without columns: files that end in {_SUFFIX} can, and "
+            f"recordings, not what else ends in '{suffix}'. {WITHOUT_COLUMNS}"
         )
-    return read_log(Path(path), frozenset() if said is None else said.wanted)
+    return log
 
 
-def _check_columns(columns: Columns, first: Log, here: Log, first_path: str, path: str) -> None:
-    ours, theirs = set(first.tables[0]), set(here.tables[0])
-    lacking = sorted((columns.wanted & ours) - theirs)
+def _understood(columns: Columns, log: Log) -> tuple[Columns, tuple[str, ...]]:
+    """With the units that the file itself names, and what was made of them, in sentences."""
+    columns = columns.in_units(log.units)
+    notes = list(log.notes)
+    used = [*(columns.obs or ()), *(columns.actions or ()), *(columns.time or ())]
+    named = {e.column: e.unit for e in used if e.unit and e.unit == log.units.get(e.column or "")}
+    if named:
+        shown = (f"{name} in {(unit or '').strip('[]()')}" for name, unit in named.items())
+        notes.append(f"Units as the file names them: {listed(shown)}.")
+    if columns.time is not None and len(columns.time) == 1:
+        [entry] = columns.time
+        unit = epoch_unit(log.tables[0], entry)
+        if unit:
+            columns = dataclasses.replace(columns, time=(entry._replace(unit=unit),))
+            notes.append(f"{entry.column} counts {unit} since 1970.")
+    return columns, tuple(notes)
+
+
+def epoch_unit(table: Table, entry: Entry) -> str:
+    """
+    :param table: of a file
+    :param entry: of its stamps
+    :return: their unit, if they are dates of this century and nobody names it; otherwise empty
+    """
+    stamps = table.get(entry.column or "", np.zeros(0))
+    if entry.unit is not None or not stamps.size or stamps.dtype.kind not in "iuf":
+        return ""
+    first = float(stamps.ravel()[0])
+    units = [unit for factor, unit in _EPOCH.items() if _FROM <= first / factor <= _TO]
+    return units[0] if units and units[0] != "s" else ""
+
+
+def _check_columns(first: _First, columns: Columns, table: Table, path: str) -> None:
+    lacking = sorted((columns.wanted & first.names) - set(table))
     if lacking:
         raise TrajectoryError(
-            f"The files have different columns: '{first_path}' has '{lacking[0]}', '{path}' has "
-            f"not; it has: {', '.join(here.tables[0])}. Load them with a map of columns for each, "
+            f"The files have different columns: '{first.path}' has '{lacking[0]}', '{path}' has "
+            f"not; it has: {listed(table)}. Load them with a map of columns for each, "
             "then join them: Trajectories.concatenate."
         )
 
 
-def _check_same(first: Columns, here: Columns, first_path: str, path: str) -> None:
-    """Recordings say their own channels; those of all files must be the same."""
+def _check_same(first: _First, here: Columns, path: str) -> None:
+    """Recordings say their own channels, and files their units; those of all must be the same."""
     for name in ("obs", "actions"):
-        ours, theirs = ([e.name for e in getattr(c, name) or ()] for c in (first, here))
+        one, other = (getattr(c, name) or () for c in (first.columns, here))
+        ours, theirs = ([e.name for e in entries] for entries in (one, other))
         if ours != theirs:
             raise TrajectoryError(
-                f"All files must have the same {name}, but '{first_path}' has {ours} and '{path}' "
+                f"All files must have the same {name}, but '{first.path}' has {ours} and '{path}' "
                 f"has {theirs}. Choose those that they share by columns."
             )
-    if first.dt != here.dt:
+        for a, b in zip(one, other, strict=True):
+            if a.si_unit != b.si_unit:
+                raise TrajectoryError(
+                    f"'{a.name}' is in {a.unit or 'a unit that is not named'} in '{first.path}' "
+                    f"and in {b.unit or 'a unit that is not named'} in '{path}'. Say in which "
+                    f"unit it is: {name}: [{{column: {a.column}, unit: UNIT}}]."
+                )
+    if first.columns.dt != here.dt:
         raise TrajectoryError(
-            f"'{first_path}' is sampled every {first.dt} s and '{path}' every {here.dt} s. "
+            f"'{first.path}' is sampled every {first.columns.dt} s and '{path}' every {here.dt} s. "
             "Say which interval you want: columns={'dt': SECONDS}."
         )

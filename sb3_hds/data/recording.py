@@ -154,6 +154,15 @@ class Recorder:
         return True
 
 
+def is_recording(line: bytes) -> bool:
+    """:return: whether the first line of a file says that a :class:`Recorder` wrote it"""
+    try:
+        header = json.loads(line)
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(header, dict) and header.get("format") == _FORMAT
+
+
 def read_recording(path: Path) -> tuple[list[dict[str, np.ndarray]], Columns]:
     """
     :param path: of a file that a :class:`Recorder` wrote, or was writing
@@ -167,6 +176,7 @@ def read_recording(path: Path) -> tuple[list[dict[str, np.ndarray]], Columns]:
             f"'{path}' is no recording, or it was interrupted before its first line was written: "
             f"it begins with {(lines or [cut])[0][:60]!r}."
         )
+    _check_header(header, path)
     if header["version"] > _VERSION:
         raise TrajectoryError(
             f"'{path}' is of version {header['version']}, this sb3_hds reads up to {_VERSION}. "
@@ -186,10 +196,19 @@ def read_recording(path: Path) -> tuple[list[dict[str, np.ndarray]], Columns]:
     return tables, Columns(
         obs=tuple(Entry(name, name) for name in header["obs"]),
         actions=tuple(Entry(name, name) for name in header["actions"]),
-        time=Entry("time", "time"),
+        time=(Entry("time", "time"),),
         condition=Label("condition"),
         dt=header["dt"],
     )
+
+
+def _check_header(header: dict[str, Any], path: Path) -> None:
+    obs, actions = header.get("obs"), header.get("actions")
+    numbers = all(isinstance(header.get(key), int | float) for key in ("version", "dt"))
+    if not (isinstance(obs, list) and isinstance(actions, list) and numbers):
+        raise _damaged(path, 1, "it lacks version, dt, obs or actions")
+    check_dt(header["dt"])
+    _names(obs, actions)
 
 
 def _table(rows: list[dict[str, Any]], header: dict[str, Any], path: Path) -> dict[str, np.ndarray]:

@@ -3,8 +3,11 @@
 import dataclasses
 import math
 import textwrap
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from sb3_hds.core.signals import Actuator, Channel
+from sb3_hds.data.conversion import same_quantity
 from sb3_hds.data.rows import Rows
 
 _LISTED = 20
@@ -73,6 +76,9 @@ class Reading:
         otherwise 0
     :param recordings: one for each that was read, in order; ``Trajectories.origin`` counts them
     :param parts: the rows as measured that each trajectory was made of, in order
+    :param units: of the observation channels, as they are now; empty where nobody named one
+    :param action_units: of the action channels, likewise
+    :param notes: sentences on what was understood of the files themselves
     """
 
     dt: float
@@ -81,6 +87,9 @@ class Reading:
     resolution: tuple[float, ...]
     recordings: tuple[Sampling, ...]
     parts: tuple[Part, ...] = dataclasses.field(default=(), repr=False, compare=False)
+    units: tuple[str, ...] = ()
+    action_units: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def altered(self) -> bool:
@@ -118,6 +127,25 @@ class Reading:
             )
         return ". ".join(said) + "." if said else "Nothing was changed."
 
+    def misfit(self, channels: Sequence[Channel], actuators: Sequence[Actuator] = ()) -> str:
+        """
+        :param channels: of a twin
+        :param actuators: of a twin
+        :return: which channel was read in a unit of something else than the twin's, and the line
+            to write; empty if there is none. What has no unit that is understood fits
+        """
+        read = (("obs", self.obs, self.units), ("actions", self.actions, self.action_units))
+        for (key, names, units), wanted in zip(read, (channels, actuators), strict=True):
+            for name, unit, target in zip(names, units, wanted, strict=False):
+                if same_quantity(unit, target.unit) is False:
+                    return (
+                        f"'{name}' was read in {unit}, and '{target.name}' is in {target.unit}. "
+                        "Either the columns are in another order than the channels, or their units "
+                        f"are others: in the map of columns, {key}: [{{column: {name}, unit: "
+                        f"{target.unit}}}]."
+                    )
+        return ""
+
     def to_dict(self) -> dict[str, Any]:
         """:return: plain data for JSON"""
         plain = dataclasses.asdict(dataclasses.replace(self, parts=()))
@@ -138,7 +166,8 @@ class Reading:
             lines.append(_row(width, name, r.rows, interval, len(r.repeated), len(r.gaps)))
         if len(self.recordings) > _LISTED:
             lines.append(f"  and {len(self.recordings) - _LISTED} more")
-        return "\n".join([*lines, *_wrapped(self.summary())])
+        told = [self.summary(), *self.notes]
+        return "\n".join([*lines, *(line for text in told for line in _wrapped(text))])
 
 
 def _row(width: int, name: str, *values: Any) -> str:

@@ -2,17 +2,17 @@
 
 import itertools
 import re
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int
 
 from sb3_hds.data.columns import Columns, Entry
+from sb3_hds.data.reading.log import Table, base_of, listed
 from sb3_hds.errors import TrajectoryError, did_you_mean
 
-Table = Mapping[str, np.ndarray]
-"""Columns by name, each of shape ``(rows,)``; a value that holds for all rows has shape ``()``."""
+_EXACT = 2**53  # whole numbers beyond are no double
 
 
 class Rows(NamedTuple):
@@ -43,7 +43,7 @@ class Rows(NamedTuple):
 
 def rows_of(table: Table, columns: Columns, source: str, filename: str) -> list[Rows]:
     """
-    :param table: all columns of a file
+    :param table: columns of a file, at least those that are used
     :param columns: which of them are used, and for what
     :param source: where it is from, for messages
     :param filename: without folder and suffix, for a label
@@ -52,14 +52,9 @@ def rows_of(table: Table, columns: Columns, source: str, filename: str) -> list[
         numbers; if time decreases within an episode
     """
     n = _length(table, columns, source)
-    obs, actions = (
-        np.stack([*(_values(table, e, n, source) for e in entries or ()), np.zeros(n)], 1)[:, :-1]
-        for entries in (columns.obs, columns.actions)
-    )
-    if columns.time is not None:
-        times = _values(table, columns.time, n, source)
-    else:
-        times = (columns.dt or np.nan) * np.arange(n)
+    obs = _matrix(table, columns.obs or (), n, source)
+    actions = _matrix(table, columns.actions or (), n, source)
+    times = _times(table, columns, n, source)
     said = columns.condition
     labels = _labels(table, said.column if said else None, n, filename if said else "default")
     numbers = _labels(table, columns.episode, n, "")
@@ -78,51 +73,96 @@ def _length(table: Table, columns: Columns, source: str) -> int:
     """Number of rows; all columns that are used must exist and have it."""
     missing = sorted(columns.wanted - set(table))
     if missing:
-        hint = did_you_mean(missing[0], table, cutoff=0.75)
-        names = ", ".join(f"'{name}'" for name in missing)
-        raise TrajectoryError(
-            f"'{source}' has no column {names}. It has: {', '.join(table) or 'none'}.{hint}"
-        )
+        raise TrajectoryError(_lacks(table, missing, source))
     lengths = {name: len(table[name]) for name in sorted(columns.wanted) if table[name].ndim}
-    if len(set(lengths.values())) != 1:
-        listed = ", ".join(f"{name} {n}" for name, n in lengths.items()) or "single values only"
-        raise TrajectoryError(f"The columns of '{source}' must have the same length, got {listed}.")
-    n = next(iter(lengths.values()))
+    observed = {entry.column for entry in (*(columns.obs or ()), *(columns.time or ()))}
+    commands = {entry.column for entry in columns.actions or ()} - observed
+    n = max(lengths.values(), default=0)
+    # The last observation may have no action.
+    fits = {n, n - 1} if set(lengths) - commands else {n}
+    if not lengths or any(x not in (fits if c in commands else {n}) for c, x in lengths.items()):
+        shown = ", ".join(f"{name} {n}" for name, n in lengths.items()) or "single values only"
+        raise TrajectoryError(f"The columns of '{source}' must have the same length, got {shown}.")
     if n == 0:
         raise TrajectoryError(f"'{source}' has names of columns and no row: nothing was logged.")
     return n
 
 
-def _values(table: Table, entry: Entry, n: int, source: str) -> np.ndarray:
-    """One channel, scaled; shape ``(n,)``."""
+def _lacks(table: Table, missing: Sequence[str], source: str) -> str:
+    """What is missing, and what there is instead."""
+    parts = [name for name in table if base_of(name) == missing[0] != name]
+    if parts:
+        return (
+            f"'{source}' holds several numbers of '{missing[0]}' in each row. Name them one by "
+            f"one: {listed(parts)}."
+        )
+    hint = did_you_mean(missing[0], table, cutoff=0.75)
+    names = ", ".join(f"'{name}'" for name in missing)
+    return f"'{source}' has no column {names}. It has: {listed(table)}.{hint}"
+
+
+def _matrix(table: Table, entries: Sequence[Entry], n: int, source: str) -> np.ndarray:
+    """Channels side by side; shape ``(n, entries)``."""
+    matrix = np.empty((n, len(entries)))
+    for j, entry in enumerate(entries):
+        _fill(matrix[:, j], table, entry, source)
+    return matrix
+
+
+def _fill(channel: np.ndarray, table: Table, entry: Entry, source: str) -> None:
+    """One channel, in its unit."""
     if entry.column is None:
-        return np.full(n, entry.offset)
+        channel[:] = entry.offset
+        return
     column = table[entry.column]
     if column.ndim > 1:
         raise TrajectoryError(
             f"Column '{entry.column}' of '{source}' must hold one number in each row, got "
             f"{column.shape[1]}: write each into a column of its own."
         )
+    # An action that is missing at the end acts on nothing.
+    rows = len(column) if column.ndim else len(channel)
+    channel[rows:] = np.nan
+    with np.errstate(over="ignore", invalid="ignore"):
+        channel[:rows] = _numbers(column, entry, source)
+        channel *= entry.factor
+        channel += entry.offset
+
+
+def _numbers(column: np.ndarray, entry: Entry, source: str) -> np.ndarray:
     if column.dtype.kind in "mM":
         # Dates and durations, of whatever resolution, count from the first row.
-        passed = (column - column.ravel()[0]) / np.timedelta64(1, "s")
-        return np.broadcast_to(entry.scale * passed + entry.offset, n)
+        return (column - column.ravel()[0]) / np.timedelta64(1, "s")
     try:
-        numbers = column.astype(np.float64)
-    except (TypeError, ValueError) as error:
+        return column.astype(np.float64, copy=False)
+    except (TypeError, ValueError, OverflowError) as error:
         raise TrajectoryError(
             f"Column '{entry.column}' of '{source}' must hold numbers, got {_first_text(column)}. "
             f"{_way_out(column)}"
         ) from error
-    return np.broadcast_to(entry.scale * numbers + entry.offset, n)
+
+
+def _times(table: Table, columns: Columns, n: int, source: str) -> np.ndarray:
+    """Stamps [s]; large whole numbers, as nanoseconds since 1970, count from the first row."""
+    if columns.time is None:
+        return (columns.dt or np.nan) * np.arange(n)
+    times, part = np.zeros(n), np.empty(n)
+    for entry in columns.time:
+        column = table[entry.column or ""]
+        whole = column.ndim == 1 and column.dtype.kind in "iu"
+        if whole and (len(columns.time) > 1 or abs(int(column[0])) >= _EXACT):
+            column = column.astype(np.int64) - column[:1].astype(np.int64)
+        _fill(part, {entry.column or "": column}, entry, source)
+        times += part
+    return times
 
 
 def _first_text(column: np.ndarray) -> str:
     for row, value in enumerate(column.ravel()):
         try:
             float(value)
-        except (TypeError, ValueError):
-            return f"{value!r} in row {row}, counted from 0"
+        except (TypeError, ValueError, OverflowError):
+            return f"{str(value)[:60]!r} in row {row}, counted from 0"
     return f"the type {column.dtype}"
 
 
@@ -130,23 +170,12 @@ def _way_out(column: np.ndarray) -> str:
     values = [str(value) for value in column.ravel()[:2]]
     if any(re.search(r"\d[-/.:]\d+[-/.:]\d", value) for value in values):
         return "Convert dates and times of day to seconds before."
-    if not all(map(is_number, values[:1])) and all(map(is_number, values[1:])):
-        return "If that is the row of units below the names (line 2 of the file), delete it."
     return "Correct it, or delete that row."
-
-
-def is_number(text: str) -> bool:
-    """:return: whether a field of a text file is one"""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _labels(table: Table, column: str | None, n: int, constant: str) -> np.ndarray:
     if column is None:
-        return np.full(n, constant)
+        return np.broadcast_to(np.array(constant), n)
     values = table[column]
     if values.dtype.kind == "f":  # 100.0 is the label 100
         values = np.array([f"{value:.12g}" for value in values.ravel()]).reshape(values.shape)
@@ -155,18 +184,18 @@ def _labels(table: Table, column: str | None, n: int, constant: str) -> np.ndarr
 
 def _check(rows: Rows, columns: Columns) -> None:
     """Finite numbers, except for the last action, which acts on nothing; time never decreases."""
+    time = columns.time[0].column if columns.time else "time"
     checked = (
-        ((columns.time,), rows.times[:, None]),
-        (columns.obs or (), rows.obs),
-        (columns.actions or (), rows.actions[:-1]),
+        ([time], rows.times[:, None]),
+        ([entry.column for entry in columns.obs or ()], rows.obs),
+        ([entry.column for entry in columns.actions or ()], rows.actions[:-1]),
     )
-    for entries, values in checked:
+    for names, values in checked:
         bad = np.argwhere(~np.isfinite(values))
         if len(bad):
             row, channel = bad[0]
-            entry = entries[channel]
             raise TrajectoryError(
-                f"Column '{entry.column if entry else 'time'}' of '{rows.source}' must be finite, "
+                f"Column '{names[channel]}' of '{rows.source}' must be finite, "
                 f"got {values[row, channel]} in row {rows.numbers[row]}, counted from 0 "
                 f"({len(bad)} such values in all). Cut the log before it, or leave those rows out: "
                 "a gap of up to five intervals is interpolated, a longer one ends the episode "

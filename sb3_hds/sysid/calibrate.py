@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sb3_hds.core import Params, Trajectories, Twin
+from sb3_hds.data.report import Reading
 from sb3_hds.effects import force_of
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.bounds import bounds_of
@@ -160,6 +161,10 @@ def check_fits(twin: Twin, data: Trajectories) -> None:
             f"{len(twin.actuators)} commands; the data have {data.n_obs} and {data.n_act}. "
             "Choose the columns, or the twin, that fit."
         )
+    report = data.report if isinstance(data.report, Reading) else None
+    misfit = report.misfit(twin.channels, twin.actuators) if report else ""
+    if misfit:
+        raise CalibrationError(misfit)
     if not np.isclose(data.dt, twin.dt, rtol=1e-6):
         raise CalibrationError(
             f"{twin.name} steps by {twin.dt:g} s and the data are sampled every {data.dt:g} s. "

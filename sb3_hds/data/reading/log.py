@@ -1,0 +1,137 @@
+"""What a reader makes of a file, and what all readers share."""
+
+import contextlib
+import errno
+import warnings
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_hds.data.columns import Columns
+from sb3_hds.errors import TrajectoryError
+
+Table = Mapping[str, np.ndarray]
+"""Columns by name, each of shape ``(rows,)``; a value that holds for all rows has shape ``()``."""
+
+_LISTED = 40
+_OF_THE_SYSTEM = (errno.EACCES, errno.EPERM, errno.EIO, errno.ENOENT, errno.EISDIR, errno.EMFILE)
+
+_CONTENTS = {
+    b"\x89HDF\r\n\x1a\n": ("an HDF5 file", (".h5", ".hdf5", ".hdf", ".mat")),
+    b"PK\x03\x04": ("a zip archive, as NumPy and Excel write", (".npz",)),
+    b"\x93NUMPY": ("a NumPy array", (".npy",)),
+    b"PAR1": ("a Parquet file", (".parquet",)),
+    b"SQLite format 3\x00": ("a SQLite data base, as of rosbag2", (".db3",)),
+    b"\x89MCAP": ("an MCAP file", (".mcap",)),
+    b"#ROSBAG V": ("a bag of ROS 1", (".bag",)),
+    b"MATLAB": ("a MATLAB file", (".mat",)),
+    b"\x1f\x8b": ("compressed with gzip", (".gz",)),
+    b"\x28\xb5\x2f\xfd": ("compressed with zstd", (".zst",)),
+}
+"""What a file is, by its first bytes, and the suffixes of that kind."""
+
+
+class Log(NamedTuple):
+    """
+    What one file holds.
+
+    :param tables: one or more, with rows in order of time. Columns that are not wanted may be left
+        out; where one that is wanted does not exist, all names are there, for the message
+    :param columns: what the file itself says about its columns
+    :param units: of columns, as the file names them
+    :param notes: sentences on what was done to the values
+    """
+
+    tables: Sequence[Table]
+    columns: Columns | None = None
+    units: Mapping[str, str] = {}
+    notes: tuple[str, ...] = ()
+
+
+@contextlib.contextmanager
+def foreign(
+    path: Path, remedy: str = "Restore it from a copy, or record it again."
+) -> Iterator[None]:
+    """
+    What other libraries raise while they read a file becomes one sentence on that file.
+
+    :raises TrajectoryError: for whatever is raised inside
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except TrajectoryError:
+        raise
+    except ImportError:
+        raise
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno in _OF_THE_SYSTEM:
+            raise TrajectoryError(f"'{path}' could not be read: {error.strerror}.") from error
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise TrajectoryError(
+            _other_kind(path)
+            or f"'{path}' is damaged or not a {path.suffix} file ({reason}). {remedy}"
+        ) from error
+
+
+def _other_kind(path: Path) -> str:
+    """A sentence where the content is of another kind than the name says, otherwise nothing."""
+    try:
+        with path.open("rb") as file:
+            begin = file.read(16)
+    except OSError:
+        return ""
+    for signature, (kind, suffixes) in _CONTENTS.items():
+        if begin.startswith(signature) and path.suffix.lower() not in suffixes:
+            return (
+                f"'{path}' is {kind}, in spite of its name. If it is, rename it to "
+                f"'{path.stem}{suffixes[0]}'; otherwise export it again."
+            )
+    return ""
+
+
+def listed(names: Iterable[str]) -> str:
+    """:return: names for a message, not all of very many"""
+    every = [str(name) for name in names]
+    more = f", and {len(every) - _LISTED} more" if len(every) > _LISTED else ""
+    return ", ".join(every[:_LISTED]) + more or "none"
+
+
+def base_of(name: str) -> str:
+    """:return: ``"x"`` of ``"x[3]"``"""
+    return name.partition("[")[0]
+
+
+def columns_of(name: str, array: np.ndarray, rows: int | None = None) -> dict[str, np.ndarray]:
+    """
+    :param name: of a vector, and ``x`` of the columns ``x[0]``, ``x[1]`` of a matrix
+    :param array: of one or two axes; others have no columns
+    :param rows: their number, where it is known; otherwise the longer axis of a matrix is time
+    """
+    if array.size == 1:
+        return {name or "0": array.reshape(())}
+    if array.ndim == 2 and min(array.shape) == 1:
+        array = array.ravel()
+    if array.ndim == 2:
+        upright = array.shape[0] >= array.shape[1]
+        if rows in array.shape:
+            upright = array.shape[0] == rows
+        by_column = array.T if upright else array
+        label = f"{name}[{{}}]" if name else "{}"
+        return {label.format(i): column for i, column in enumerate(by_column)}
+    return {name or "0": array} if array.ndim == 1 else {}
+
+
+def aliases(names: Collection[str], wanted: Iterable[str]) -> dict[str, str]:
+    """:return: names that exist of columns that are wanted: the only one of ``x`` is ``x[0]``"""
+    found = {}
+    for name in set(wanted) - set(names):
+        base = base_of(name)
+        if name == f"{base}[0]" and base in names:
+            found[name] = base
+        elif f"{name}[0]" in names and f"{name}[1]" not in names:
+            found[name] = f"{name}[0]"
+    return found

@@ -1,0 +1,62 @@
+"""Which reader reads which file."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from sb3_hds.data.columns import Columns
+from sb3_hds.data.reading.arrays import read_npy, read_npz
+from sb3_hds.data.reading.hdf5 import read_hdf5
+from sb3_hds.data.reading.log import Log, aliases
+from sb3_hds.data.reading.matlab import read_mat
+from sb3_hds.data.reading.objects import read_json
+from sb3_hds.data.reading.parquet import read_parquet
+from sb3_hds.data.reading.ros import is_bag, read_bag
+from sb3_hds.data.reading.text import read_text
+from sb3_hds.errors import TrajectoryError
+
+READERS: dict[str, Callable[[Path, Columns], Log]] = {
+    ".csv": read_text,
+    ".tsv": read_text,
+    ".txt": read_text,
+    ".dat": read_text,
+    ".log": read_text,
+    ".parquet": read_parquet,
+    ".npz": read_npz,
+    ".npy": read_npy,
+    ".mat": read_mat,
+    ".json": read_json,
+    ".jsonl": read_json,
+    ".ndjson": read_json,
+    ".h5": read_hdf5,
+    ".hdf5": read_hdf5,
+    ".hdf": read_hdf5,
+    ".bag": read_bag,
+    ".db3": read_bag,
+    ".mcap": read_bag,
+}
+"""The reader of each suffix. A reader of your own goes in here."""
+
+
+def read_log(path: Path, columns: Columns) -> Log:
+    """
+    :param path: its suffix says how to read it; a folder may be a bag of ROS 2
+    :param columns: what will be used; nothing for all there is
+    :raises TrajectoryError: if there is no such file, if it is damaged, or for another suffix
+    """
+    folder = is_bag(path)
+    reader = read_bag if folder else READERS.get(path.suffix.lower())
+    if not folder and not path.is_file():
+        what = "is a folder; name the files in it, as" if path.is_dir() else "does not exist (in"
+        rest = f"'{path / '*.csv'}'." if path.is_dir() else f"{Path.cwd()})."
+        raise TrajectoryError(f"'{path}' {what} {rest}")
+    if reader is None:
+        raise TrajectoryError(
+            f"'{path}' cannot be read: there are readers for {', '.join(READERS)}, not for "
+            f"'{path.suffix}'. Read it yourself and use Trajectories.from_arrays."
+        )
+    log = reader(path, columns)
+    tables = []
+    for table in log.tables:
+        other = aliases(table.keys(), columns.wanted)
+        tables.append({**table, **{name: table[own] for name, own in other.items()}})
+    return log._replace(tables=tables)

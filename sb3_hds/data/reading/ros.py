@@ -1,0 +1,305 @@
+"""Bags of ROS 1 and ROS 2, as rosbags reads them."""
+
+import contextlib
+import itertools
+import re
+from array import array
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_hds.data.columns import Columns, Entry
+from sb3_hds.data.reading.alignment import Series, aligned, in_order
+from sb3_hds.data.reading.log import Log, foreign, listed
+from sb3_hds.errors import TrajectoryError
+
+STORAGE = (".db3", ".mcap")
+_REMEDY = "A recording that was cut off is mended by 'ros2 bag reindex' or 'rosbag reindex'."
+_TIME = Entry("time", "time")
+_RECEIVED, _STAMP = "received", "header.stamp"
+_NAMES = ("name", "names", "joint_names")  # fields that name the entries of those beside them
+_LONGEST = 64  # entries of an array that are listed: more are a picture or a scan
+_FIRST = 50  # messages from which the names of columns are taken
+_TOKEN = re.compile(r"\[([^\]]*)\]|([^.\[\]]+)")
+
+
+def is_bag(path: Path) -> bool:
+    """:return: whether a folder is one of rosbag2, with its metadata or without"""
+    return path.is_dir() and bool(_storage(path))
+
+
+def read_bag(path: Path, columns: Columns) -> Log:
+    """
+    Fields of topics, as ``/joint_states:position[0]`` or ``/joint_states:position[elbow]``.
+
+    Rows are the messages of one topic: that of ``time``, as ``/joint_states:header.stamp`` or
+    ``/joint_states:received``, or else that of the first observation. Observations of other topics
+    are interpolated linearly, actions and labels are held. All topics are on one clock: their
+    header stamps where every one that is used has some, otherwise the time of recording.
+
+    :param path: of a ``.bag``, ``.db3`` or ``.mcap`` file, or of a folder with the latter
+    :param columns: for what is wanted, and what it is
+    :raises TrajectoryError: if rosbags is not installed, a message is of an unknown type, or topics
+        have no clock in common
+    """
+    with _opened(path) as bag:
+        fields = _fields_of(sorted(columns.wanted - {_TIME.name}))
+        if fields and set(fields) <= {connection.topic for connection in bag.connections}:
+            topics = {t: _read(bag, t, names, path) for t, names in fields.items()}
+            lacking = [f"{t}:{n}" for t, topic in topics.items() for n in topic.lacking]
+        else:
+            topics, lacking = {}, ["all"]
+        if lacking or not fields:
+            found = _discovered(bag)
+            if fields:
+                return Log([dict.fromkeys([*found, "time"], np.zeros(0))], Columns(time=(_TIME,)))
+            topics = {t: _read(bag, t, n, path) for t, n in _fields_of(found).items()}
+            return Log([{k: v for t in topics.values() for k, v in t.columns().items()}])
+    return _rows(topics, columns, path)
+
+
+class _Topic:
+    """
+    Some fields of all messages of a topic.
+
+    :param name: of the topic
+    :param fields: as in ``position[elbow]``
+    """
+
+    def __init__(self, name: str, fields: Iterable[str]) -> None:
+        self.name = name
+        self.received, self.header = array("q"), array("q")
+        self._paths = {field: _TOKEN.findall(field) for field in fields}
+        self._values: dict[str, Any] = {}
+        self._at: dict[str, array[int]] = {field: array("q") for field in self._paths}
+        # Arrays whose entries are chosen by number, and the names of the entries.
+        self._numbered: dict[str, list[str] | None] = {}
+        for path in self._paths.values():
+            for i, (index, _) in enumerate(path):
+                if index.isdigit():
+                    self._numbered[_written(path[:i])] = None
+
+    def add(self, message: Any, received: int) -> None:
+        """
+        :param message: whose fields are kept; one that it lacks is left out
+        :param received: when it was recorded [ns]
+        """
+        number = len(self.received)
+        self.received.append(received)
+        stamp = _value(message, [("", "header"), ("", "stamp")])
+        self.header.append(stamp if isinstance(stamp, int) else 0)
+        for field, path in self._paths.items():
+            value = received if field == _RECEIVED else _value(message, path)
+            if value is None:
+                continue
+            if field not in self._values:
+                self._values[field] = [] if isinstance(value, str) else array("d")
+            self._values[field].append(value)
+            self._at[field].append(number)
+        for field, first in self._numbered.items():
+            names = _names_beside(message, [*_TOKEN.findall(field), ("0", "")])
+            if first is None:
+                self._numbered[field] = names
+            elif names != first:
+                raise TrajectoryError(
+                    f"The names in '{self.name}' change from message to message, so that entries "
+                    f"have no number. Choose them by name, as {self.name}:{field}[{names[0]}]. "
+                    f"There are: {listed(dict.fromkeys([*first, *names]))}."
+                )
+
+    @property
+    def lacking(self) -> list[str]:
+        """Fields that no message has."""
+        return [field for field, at in self._at.items() if not at and field != _STAMP]
+
+    def stamps(self, clock: str) -> np.ndarray:
+        """:return: of all messages [ns]"""
+        return np.array(self.header if clock == _STAMP else self.received, np.int64)
+
+    def series(self, field: str, clock: str) -> Series:
+        """:return: the messages that have the field"""
+        at = np.array(self._at[field], np.int64)
+        return Series(self.stamps(clock)[at], np.array(self._values.get(field, ())))
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """:return: all fields, with their full names; times in seconds, from the first message"""
+        found = {}
+        for field, values in self._values.items():
+            column = np.array(values)
+            if field in (_STAMP, _RECEIVED):
+                stamps = self.stamps(field)
+                column = 1e-9 * (stamps - stamps[0])
+            found[f"{self.name}:{field}"] = column
+        return found
+
+
+def _written(path: Sequence[tuple[str, str]]) -> str:
+    """The reverse of the split into tokens."""
+    return "".join(f".{name}" if name else f"[{index}]" for index, name in path).lstrip(".")
+
+
+def _fields_of(names: Iterable[str]) -> dict[str, list[str]]:
+    """Fields by topic."""
+    found: dict[str, list[str]] = {}
+    for name in names:
+        topic, _, field = name.partition(":")
+        found.setdefault(topic, []).append(field)
+    return found
+
+
+def _rows(topics: Mapping[str, _Topic], columns: Columns, path: Path) -> Log:
+    """Everything at the stamps of one topic."""
+    said = [entry.column for entry in columns.time or () if entry.column not in (None, "time")]
+    observed = [entry.column or "" for entry in columns.obs or () if entry.column]
+    every = [*said, *observed, *sorted(columns.wanted - {_TIME.name})]
+    leading, _, first = str(every[0]).partition(":")
+    clock = _clock(topics, first if said else "", leading, path)
+    series = {
+        f"{topic.name}:{field}": topic.series(field, clock)
+        for topic in topics.values()
+        for field in topic._paths
+        if field not in (_STAMP, _RECEIVED)
+    }
+    main = f"{leading}:{first}"
+    stamps = in_order(series[main].stamps if main in series else topics[leading].stamps(clock))
+    entries = {entry.column: entry for entry in columns.obs or ()}
+    table, done = aligned(series, stamps, entries, columns.gap)
+    left = table.pop("")
+    if not len(left):
+        others = listed(sorted(set(topics) - {leading}))
+        raise TrajectoryError(
+            f"'{path}': no message of '{leading}' lies between those of {others}, without a gap. "
+            "Record them at once, or say how long a gap may be: gap: SECONDS."
+        )
+    for name in (f"{leading}:{_STAMP}", f"{leading}:{_RECEIVED}", "time"):
+        table[name] = 1e-9 * (left - stamps[0])
+    which = "header stamps" if clock == _STAMP else "times of recording"
+    note = f"At the {which} of '{leading}', {' and '.join(done)}."
+    return Log([table], Columns(time=(_TIME,)), notes=(note,) if done else ())
+
+
+def _clock(topics: Mapping[str, _Topic], said: str, leading: str, path: Path) -> str:
+    """The stamps that all topics share."""
+    without = [t.name for t in topics.values() if not any(t.header)]
+    if said == _STAMP and without:
+        raise TrajectoryError(
+            f"'{path}': {listed(without)} has no header stamps. Use the time of recording: "
+            f"time: '{leading}:{_RECEIVED}'."
+        )
+    if said not in ("", _STAMP, _RECEIVED) and len(topics) > 1:
+        raise TrajectoryError(
+            f"'{path}': several topics are put on one clock, which '{leading}:{said}' is not. Use "
+            f"time: '{leading}:{_STAMP}' or time: '{leading}:{_RECEIVED}'."
+        )
+    return said if said in (_STAMP, _RECEIVED) else _RECEIVED if without else _STAMP
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise TrajectoryError(
+            f"'{path}': bags are read by rosbags, which is not installed. Install it: "
+            "pip install sb3-hds[ros]."
+        ) from error
+    # Bags before ROS 2 Iron do not hold the definitions of their messages.
+    known = get_typestore(Stores.ROS2_HUMBLE)
+    with foreign(path, _REMEDY), AnyReader(_storage(path), default_typestore=known) as bag:
+        yield bag
+
+
+def _storage(path: Path) -> list[Path]:
+    if not path.is_dir() or (path / "metadata.yaml").is_file():
+        return [path]
+    return sorted(file for file in path.iterdir() if file.suffix in STORAGE)
+
+
+def _messages(bag: Any, topic: str) -> Iterator[tuple[Any, int]]:
+    connections = [connection for connection in bag.connections if connection.topic == topic]
+    for connection, received, raw in bag.messages(connections=connections):
+        try:
+            yield bag.deserialize(raw, connection.msgtype), received
+        except KeyError as error:
+            raise TrajectoryError(
+                f"Messages of '{topic}' are of the type {connection.msgtype}, which this bag does "
+                "not define. Record it with ROS 2 Iron or later, whose bags hold the definitions."
+            ) from error
+
+
+def _read(bag: Any, name: str, fields: Iterable[str], path: Path) -> _Topic:
+    topic = _Topic(name, fields)
+    for message, received in _messages(bag, name):
+        topic.add(message, received)
+    if not topic.received:
+        raise TrajectoryError(f"'{path}' has no message of '{name}'.")
+    return topic
+
+
+def _value(message: Any, path: Sequence[tuple[str, str]]) -> Any:
+    """A number, a text, or a time [ns]; None if the message has no such field."""
+    value = message
+    for place, (index, name) in enumerate(path):
+        if name:
+            value = getattr(value, name, None)
+        elif hasattr(value, "__len__"):
+            names = [] if index.isdigit() else _names_beside(message, path[: place + 1])
+            at = int(index) if index.isdigit() else names.index(index) if index in names else -1
+            value = value[at] if 0 <= at < len(value) else None
+        elif index != "0":  # a single number may be called the first one
+            return None
+        if value is None:
+            return None
+    if hasattr(value, "sec") and hasattr(value, "nanosec"):
+        return int(value.sec) * 1_000_000_000 + int(value.nanosec)
+    if isinstance(value, np.ndarray) and value.size == 1:
+        return value.ravel()[0]
+    return value if isinstance(value, str | bool | int | float | np.generic) else None
+
+
+def _names_beside(message: Any, path: Sequence[tuple[str, str]]) -> list[str]:
+    """Names of the entries of an array, from the closest part of the message that has some."""
+    owners = [message]
+    for _, name in path[:-1]:
+        owner = getattr(owners[-1], name, None) if name else None
+        if owner is None:
+            break
+        owners.append(owner)
+    for owner in reversed(owners):
+        for field in _NAMES:
+            names = getattr(owner, field, None)
+            if isinstance(names, list) and names and isinstance(names[0], str):
+                return names
+    return []
+
+
+def _discovered(bag: Any) -> list[str]:
+    """Names of all columns, from the first messages of each topic."""
+    found: dict[str, None] = {}
+    for topic in dict.fromkeys(connection.topic for connection in bag.connections):
+        with contextlib.suppress(TrajectoryError):
+            for message, _ in itertools.islice(_messages(bag, topic), _FIRST):
+                leaves = [_RECEIVED, *_leaves(message, message, "")]
+                found |= dict.fromkeys(f"{topic}:{field}" for field in leaves)
+    return list(found)
+
+
+def _leaves(message: Any, root: Any, prefix: str) -> Iterator[str]:
+    for field in getattr(message, "__dataclass_fields__", ()):
+        value, name = getattr(message, field), f"{prefix}{field}"
+        if field.startswith("__"):
+            continue
+        if hasattr(value, "nanosec") or isinstance(value, str | bool | int | float | np.generic):
+            yield name
+        elif isinstance(value, np.ndarray) and len(value) <= _LONGEST:
+            names = _names_beside(root, _TOKEN.findall(f"{name}[0]"))
+            each = names if len(names) == len(value) else range(len(value))
+            yield from (f"{name}[{index}]" for index in each)
+        elif isinstance(value, list) and len(value) <= _LONGEST:
+            for i, part in enumerate(value):
+                yield from _leaves(part, root, f"{name}[{i}].")
+        else:
+            yield from _leaves(value, root, f"{name}.")
