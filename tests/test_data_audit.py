@@ -95,7 +95,7 @@ def test_gaps_and_repeated_stamps_are_found_where_they_are(data, tmp_path):
     def times(i, n):
         t = data.dt * np.arange(n)
         t[100:] += 3.0 * (i == 2)
-        t[51] = t[50] if i == 4 else t[51]
+        t[51:] -= data.dt * (i == 4)
         return t
 
     found = audit(logged(data, tmp_path / "log.csv", times=times))
@@ -104,6 +104,25 @@ def test_gaps_and_repeated_stamps_are_found_where_they_are(data, tmp_path):
     [stamp] = [f for f in found.findings if type(f).__name__ == "RepeatedStamps"]
     assert gap.longest == pytest.approx(3.0 + data.dt) and "episode 2, sample 502" in str(gap)
     assert stamp.n_rows == 1 and "episode 4, sample 855" in str(stamp)
+
+
+def test_stamps_that_are_off_and_rows_that_are_missing_are_found_where_they_are(data, tmp_path):
+    def times(i, n):
+        t = data.dt * np.arange(n)
+        t[51] -= 0.6 * data.dt * (i == 4)
+        t[100:] += 2.0 * data.dt * (i == 2)
+        return t
+
+    read = logged(data, tmp_path / "log.csv", times=times)
+    off, missing = audit(read).findings
+
+    assert (type(off).__name__, type(missing).__name__) == ("JitteredStamps", "MissingRows")
+    assert (off.n_rows, off.longest) == (1, pytest.approx(0.6 * data.dt))
+    assert "1 time stamp is off by up to 30 ms" in str(off) and "episode 4, sample 855" in str(off)
+    assert "2 rows of a regular clock are missing, before log.csv, episode 2, sample 502" in str(
+        missing
+    )
+    np.testing.assert_array_equal(read.episode(4)[0], data.episode(4)[0])
 
 
 @pytest.mark.parametrize("how", ["hold", "insert", "half the rate"])

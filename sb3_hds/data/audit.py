@@ -11,6 +11,8 @@ from sb3_hds.data.excitation import excitation
 from sb3_hds.data.finding import Finding, Place
 from sb3_hds.data.findings import (
     Gaps,
+    JitteredStamps,
+    MissingRows,
     Outliers,
     RepeatedStamps,
     StandingStill,
@@ -137,6 +139,31 @@ def _sampling(data: Trajectories, report: Reading | None) -> list[Finding]:
                 sum(r.uneven for _, r in uneven) / n,
             )
         )
+    late = [(i, r) for i, r in recordings if r.clock == "late" and not r.resampled]
+    if late:
+        found.append(
+            JitteredStamps(
+                "time",
+                tuple(Place(r.source, k, k, i) for i, r in late for k in r.late),
+                sum(len(r.late) for _, r in late),
+                max(r.off for _, r in late),
+                max(r.jitter for _, r in late),
+            )
+        )
+    jittered = [(i, r) for i, r in recordings if r.clock == "jittered" and not r.resampled]
+    if jittered:
+        found.append(
+            JitteredStamps(
+                "time",
+                tuple(Place(r.source, 0, r.rows - 1, i) for i, r in jittered),
+                0,
+                max(r.off for _, r in jittered),
+                max(r.jitter for _, r in jittered),
+            )
+        )
+    holes = [(Place(r.source, k, k, i), n) for i, r in recordings for k, n in r.missing]
+    if holes:
+        found.append(MissingRows("time", tuple(p for p, _ in holes), sum(n for _, n in holes)))
     stamps = tuple(Place(r.source, k, k, i) for i, r in recordings for k in r.repeated)
     if stamps:
         found.append(RepeatedStamps("time", stamps, len(stamps)))

@@ -5,6 +5,10 @@ import dataclasses
 from sb3_hds.data.finding import Finding, counted, listed, percent, recordings
 
 
+def _are(n: int) -> str:
+    return "is" if n == 1 else "are"
+
+
 @dataclasses.dataclass(frozen=True)
 class UnevenSampling(Finding):
     """
@@ -31,6 +35,55 @@ class UnevenSampling(Finding):
         "The rows were resampled; compare the error of that (print data.report) with the noise. "
         "Next time, let one clock trigger command and measurement."
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class JitteredStamps(Finding):
+    """
+    Of a regular clock.
+
+    :param n_rows: whose stamps are off, where these are few; otherwise 0
+    :param longest: farthest that a stamp is off [s]
+    :param rms: root mean square of how far stamps are off [s]
+    """
+
+    n_rows: int
+    longest: float
+    rms: float
+
+    @property
+    def sentence(self) -> str:
+        far = f"up to {1e3 * self.longest:.3g} ms"
+        if self.n_rows:
+            return (
+                f"{counted(self.n_rows, 'time stamp')} {_are(self.n_rows)} off by {far} in an "
+                f"otherwise regular clock ({listed(self.places)})."
+            )
+        return (
+            f"Time stamps jitter by {1e3 * self.rms:.3g} ms (rms), {far}, around the ticks of a "
+            f"regular clock ({recordings(self.places)})."
+        )
+
+    remedy = (
+        "The rows were kept at their ticks, as their values do not contradict. Next time, let the "
+        "sensor's own clock stamp them."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class MissingRows(Finding):
+    """:param n_rows: that are missing between rows of a regular clock"""
+
+    n_rows: int
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"{counted(self.n_rows, 'row')} of a regular clock {_are(self.n_rows)} missing, before "
+            f"{listed(self.places)}."
+        )
+
+    remedy = "Interpolated. A longer gap ends the trajectory: gap: SECONDS in columns says when."
 
 
 @dataclasses.dataclass(frozen=True)

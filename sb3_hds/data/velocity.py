@@ -161,7 +161,7 @@ def _positions(
     """Everything that channel v may be the derivative of, per episode; turns are counted."""
     others = [j for j in range(episodes[0].shape[1]) if j != v]
     found: list[tuple[tuple[int, ...], list[np.ndarray]]]
-    found = [((j,), [_unwrapped(x[:, j]) for x in episodes]) for j in others]
+    found = [((j,), [unwrapped(x[:, j]) for x in episodes]) for j in others]
     joined = np.concatenate(episodes)
     for c, s in itertools.permutations(others, 2):
         if np.sqrt(np.mean((joined[:, c] ** 2 + joined[:, s] ** 2 - 1.0) ** 2)) < _CIRCLE:
@@ -170,7 +170,7 @@ def _positions(
     return found
 
 
-def _unwrapped(x: np.ndarray) -> np.ndarray:
+def unwrapped(x: np.ndarray) -> np.ndarray:
     """With turns counted, where the values look like a wrapped angle [rad] or [deg]."""
     for turn in (2.0 * np.pi, 360.0):
         wraps = np.abs(np.abs(np.diff(x)) - turn) < turn / (2.0 * np.pi)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sb3_hds.core import Params, Trajectories, Twin
+from sb3_hds.core.episodes import same_interval
 from sb3_hds.effects import force_of
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.bounds import bounds_of
@@ -160,7 +161,7 @@ def check_fits(twin: Twin, data: Trajectories) -> None:
             f"{len(twin.actuators)} commands; the data have {data.n_obs} and {data.n_act}. "
             "Choose the columns, or the twin, that fit."
         )
-    if not np.isclose(data.dt, twin.dt, rtol=1e-6):
+    if not same_interval(data.dt, twin.dt):
         raise CalibrationError(
             f"{twin.name} steps by {twin.dt:g} s and the data are sampled every {data.dt:g} s. "
             f"{_other_unit(data.dt / twin.dt)}Use data.resample(dt={twin.dt:g}) (in the map of "
