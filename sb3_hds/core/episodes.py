@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from sb3_hds.errors import TrajectoryError
+
 SAME_RATE = 1e-3
 """Relative difference of two sampling rates that counts as none."""
-
-from sb3_hds.errors import TrajectoryError
 
 
 def check_dt(dt: Any) -> float:
@@ -29,7 +29,7 @@ def check_dt(dt: Any) -> float:
 
 
 def same_interval(dt: float, other: float) -> bool:
-    """Whether two sampling intervals are the same to 0.1 %, which is what a log tells of its own."""
+    """Whether two sampling intervals are the same to 0.1 %, which is what logs tell."""
     return math.isclose(dt, other, rel_tol=SAME_RATE)
 
 
