@@ -65,7 +65,7 @@ class JitteredStamps(Finding):
         )
 
     remedy = (
-        "The rows were kept at their ticks, as their values do not contradict. Next time, let the "
+        "The rows were kept at their ticks, which their values fit no worse. Next time, let the "
         "sensor's own clock stamp them."
     )
 

@@ -127,7 +127,7 @@ class Reading:
         drifts = [r.drift for r in self.recordings]
         if max(drifts) > _DRIFT:
             said.append(f"Within a recording, the rate changes by up to {100 * max(drifts):.2g} %")
-        return ". ".join(text[0].upper() + text[1:] for text in said) + "."
+        return ". ".join(said) + "."
 
     def summary(self) -> str:
         """:return: what was changed, in one sentence for each kind of change"""
@@ -168,9 +168,9 @@ class Reading:
         return ". ".join(said) + "." if said else "Nothing was changed."
 
     def to_dict(self) -> dict[str, Any]:
-        """:return: plain data for JSON"""
+        """:return: plain data for JSON; what is not finite is None"""
         plain = dataclasses.asdict(dataclasses.replace(self, parts=()))
-        return {name: value for name, value in plain.items() if name != "parts"}
+        return {name: _finite(value) for name, value in plain.items() if name != "parts"}
 
     def __str__(self) -> str:
         shown = self.recordings[:_LISTED]
@@ -214,7 +214,7 @@ def _jittered(some: list[Sampling], kept: bool) -> str:
 
 
 def _whether(kept: bool, said: str) -> str:
-    values = f"{said}, which their values do not contradict"
+    values = f"{said}: their values fit these no worse"
     return values if kept else "rows were measured when the stamps say, as their values show"
 
 
@@ -236,6 +236,14 @@ def _hertz(some: list[Sampling]) -> str:
     rates = sorted(1.0 / r.interval for r in some)
     low, high = f"{rates[0]:.5g}", f"{rates[-1]:.5g}"
     return f"{low} Hz" if low == high else f"{low} to {high} Hz"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _finite(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _row(width: int, name: str, *values: Any) -> str:

@@ -1,5 +1,6 @@
 """Estimate the parameters of a twin from measured data."""
 
+import math
 from collections.abc import Iterable
 from functools import partial
 
@@ -78,6 +79,8 @@ def calibrate(
     check_fits(twin, data)
     if loss not in ("huber", "linear"):
         raise CalibrationError(f"loss must be 'huber' or 'linear', got {loss!r}.")
+    if not 0.0 <= prior < math.inf:
+        raise CalibrationError(f"prior must be at least 0 (no belief), got {prior}.")
     if not 0.0 < level < 1.0:
         raise CalibrationError(f"level must lie between 0 and 1, got {level}.")
     shots, origin = shots_of(data, window or default_window(data), twin, n_windows, seed)
