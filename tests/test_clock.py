@@ -75,6 +75,16 @@ def test_ticks_of_the_logger_may_be_longer_than_the_interval(hz, tick):
     assert "stamps rounded to" in str(report) and report.recordings[0].repeated == ()
 
 
+def test_ticks_that_slip_against_the_rows_now_and_then_are_rounding():
+    """Rows 3.0003 ms apart in whole milliseconds: exactly 3 ms, but for one in 3,333."""
+    t = 3.0003e-3 * np.arange(8000)
+
+    [obs], _, report = read(np.round(t, 3), values=[motion(t)])
+
+    np.testing.assert_array_equal(obs, motion(t))
+    assert report.dt == pytest.approx(3.0003e-3, rel=2e-4) and not report.altered
+
+
 @pytest.mark.parametrize("digits", [9, 3])
 def test_dropped_rows_are_filled_in_and_the_others_stay(digits):
     t = regular(150.0)

@@ -73,15 +73,15 @@ def clock_of(
     if n < 3:
         own = dt or (float(stamps[-1] - stamps[0]) / (n - 1) if n > 1 else guess)
         return Clock("regular", own, np.inf, np.arange(n), stamps.copy())
-    line = _line(np.arange(n), stamps, guess, dt is not None)
+    line = _line(np.arange(n), stamps, guess, rounding, dt is not None)
     if rounding < 1.5 * guess and (slots := _slots(stamps, guess)) is not None:
-        skipping = _line(slots, stamps, guess, dt is not None)
+        skipping = _line(slots, stamps, guess, rounding, dt is not None)
         # Ticks of the logger that rows leave out regularly are those of another clock.
         often = slots[-1] - n + 1 > _SKIPPED and _kind(line, rounding) == "rounded"
         if not often and np.abs(skipping.off).mean() < np.abs(line.off).mean():
             line = skipping
     drift = 0.0
-    if not _holds(line):
+    if not _holds(line, rounding):
         found = _trend(line) if dt is None else None
         if found is None:
             return _irregular(stamps)
@@ -182,7 +182,9 @@ class _Line(NamedTuple):
     off: np.ndarray  # of the stamps [s]
 
 
-def _line(slots: np.ndarray, stamps: np.ndarray, guess: float, known: bool) -> _Line:
+def _line(
+    slots: np.ndarray, stamps: np.ndarray, guess: float, rounding: float, known: bool
+) -> _Line:
     """Median of the slopes between blocks, then least squares without what is far off."""
     over = stamps - stamps[0] - guess * slots
     slope = 0.0
@@ -194,7 +196,8 @@ def _line(slots: np.ndarray, stamps: np.ndarray, guess: float, known: bool) -> _
         slope = float(np.median((height[j] - height[i]) / (at[j] - at[i])))
     off = over - slope * slots
     off -= np.median(off)
-    near = np.abs(off) <= max(3.0 * _MAD * float(np.median(np.abs(off))), 1e-6 * guess)
+    scatter = 3.0 * _MAD * float(np.median(np.abs(off)))
+    near = np.abs(off) <= max(scatter, 2.0 * _ROUNDED * rounding, 1e-6 * guess)
     x = slots[near] - slots[near].mean()
     wide = float(x @ x)
     if not known and wide > 0.0:
@@ -206,11 +209,11 @@ def _line(slots: np.ndarray, stamps: np.ndarray, guess: float, known: bool) -> _
     return _Line(slots, guess + slope, float(stderr), off)
 
 
-def _holds(line: _Line) -> bool:
+def _holds(line: _Line, rounding: float) -> bool:
     """Whether one line describes all parts of the rows: jitter does not add up."""
     blocks = np.array_split(line.off, max(1, min(16, len(line.off) // _BLOCK)))
     level = np.array([np.median(block) for block in blocks])
-    if np.abs(level).max() <= _STEADY * line.dt:
+    if np.abs(level).max() <= max(_STEADY * line.dt, _ROUNDED * rounding):
         return True
     return bool(np.mean(level**2) <= _CHANCE * _of_median(blocks))
 

@@ -31,6 +31,7 @@ _GAP = 5.0  # intervals
 _LARGEST = 0.2  # usual step from which a whole turn is told [rad]
 _ENDS = 6.0  # usual steps: how near to its ends an angle wraps
 _AS_GOOD = 1.05  # ratio of mean deviations up to which two clocks fit stamps equally well
+_SIGMAS = 3.0  # standard errors by which an interval may differ from the common one
 _FAR = 10.0  # intervals between two measurements that nobody can fill in
 
 
@@ -206,7 +207,8 @@ def _agreeing(clock: Clock, part: Rows, rounding: float, dt: float) -> Clock:
     if common.kind in ("regular", "rounded"):
         return common
     own, other = (float(np.abs(part.times - one.times).mean()) for one in (clock, common))
-    return common if clock.ticks and common.ticks and other <= _AS_GOOD * own else clock
+    near = abs(clock.dt - dt) <= _SIGMAS * clock.stderr or other <= _AS_GOOD * own
+    return common if clock.ticks and common.ticks and near else clock
 
 
 def _at_steps(
