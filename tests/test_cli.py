@@ -3,12 +3,16 @@
 import json
 import sys
 import warnings
+from argparse import Namespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from measuring import measured
 
 from sb3_hds import Trajectories, cli, effects, twins
+from sb3_hds.cli import measured as measured_room
+from sb3_hds.core import State, rollout
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid import Diagnosis
 from sb3_hds.twins import registry
@@ -82,6 +86,122 @@ def test_a_question_that_makes_no_sense_is_one_message(log, capsys, changes, mes
     assert code == 1
     told = capsys.readouterr().err
     assert told.startswith("sb3-hds: ") and message in told and "Traceback" not in told
+
+
+@pytest.fixture(scope="module")
+def swings(tmp_path_factory):
+    """A free pendulum of 0.3 kg: its log in radians, with stamps in milliseconds, and a map."""
+    folder = tmp_path_factory.mktemp("swings")
+    twin = twins.make("FreePendulum", mass=0.3, damping=0.002, dt=1.0 / 150.0)
+    starts = np.linspace(0.6, 1.6, 6)
+    rows = []
+    for run, start in enumerate(starts):
+        state = State(jnp.array([start]), jnp.zeros(1), {})
+        obs = np.asarray(rollout(twin, twin.params, state, jnp.zeros((450, 0))).obs)
+        stamps = np.round(np.arange(451) / 150.0, 3)
+        rows.append(np.column_stack([stamps, np.full(451, run), obs]))
+    table = np.concatenate(rows)
+    for name, scale in (("rad", 1.0), ("deg", 180.0 / np.pi)):
+        scaled = table * [1.0, 1.0, scale, scale]
+        np.savetxt(
+            folder / f"{name}.csv", scaled, "%.9f", ",", header="t,run,angle,speed", comments=""
+        )
+    (folder / "map.yml").write_text("{time: t, episode: run, obs: [angle, speed], actions: []}")
+    return folder
+
+
+def question(swings, command, name="rad", *words):
+    about = ["--data", swings / f"{name}.csv", "--columns", swings / "map.yml"]
+    return cli.main([command, *map(str, [*about, *words])])
+
+
+def test_an_audit_needs_no_twin_and_says_what_the_clock_was(swings, tmp_path, capsys):
+    told = tmp_path / "audit.json"
+
+    assert question(swings, "audit", "rad", "--json", told) == 0
+
+    shown = capsys.readouterr().out
+    assert "regular clock of 150 Hz, stamps rounded to 1 ms" in shown and "usable: yes" in shown
+    plain = json.loads(told.read_text())
+    assert plain["usable"] and plain["reading"]["recordings"][0]["clock"] == "rounded"
+    assert plain["dt"] == pytest.approx(1.0 / 150.0, rel=1e-9)
+
+
+def test_an_audit_with_a_twin_sees_degrees_and_any_verdict_is_success(swings, tmp_path, capsys):
+    twin = ["--twin", "FreePendulum", "--set", "mass:0.3", "dt:0.00666667"]
+
+    assert question(swings, "audit", "deg") == 0
+    assert "usable: yes" in capsys.readouterr().out
+    assert question(swings, "audit", "deg", *twin) == 0
+    assert "{column: angle, unit: deg}" in " ".join(capsys.readouterr().out.split())
+    assert question(swings, "calibrate", "deg", *twin, "--write", tmp_path / "twin.json") == 1
+    assert "sb3-hds: No parameter can be estimated" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_an_audit_corrects_is_said_and_audited_again(tmp_path, capsys):
+    time = 0.01 * np.arange(2000)
+    obs = np.stack([np.sin(3.0 * time), 3.0 * np.cos(3.0 * (time - 0.04))], 1)
+    commands = np.random.default_rng(0).standard_normal((1999, 1))
+    log = Trajectories.from_arrays([obs], [commands], dt=0.01).save(tmp_path / "log")
+    told = tmp_path / "audit.json"
+
+    assert cli.main(["audit", "--data", str(log), "--correct", "--json", str(told)]) == 0
+
+    shown, plain = capsys.readouterr().out, json.loads(told.read_text())
+    assert "'obs[1]' was shifted by -40 ms." in shown and shown.count("Audit of 1 trajectory") == 2
+    assert plain["corrections"] and plain["velocity_shift"]
+    assert plain["corrected"]["velocity_shift"] == {}
+
+
+def test_a_calibrated_twin_is_printed_written_and_read_again(swings, tmp_path, capsys):
+    twin, told = tmp_path / "twin.json", tmp_path / "fit.json"
+    about = ["--twin", "FreePendulum", "--set", "dt:0.00666667", "mass:0.3"]
+
+    code = question(
+        swings, "calibrate", "rad", *about, "--free", "com,damping", "--json", told, "--write", twin
+    )
+
+    assert code == 0
+    assert "com" in (shown := capsys.readouterr().out) and "95 % interval" in shown
+    plain = json.loads(told.read_text())
+    assert [e["name"] for e in plain["estimates"]] == ["com", "damping"] and plain["converged"]
+    assert plain["estimates"][1]["estimate"] == pytest.approx(0.002, rel=0.02)
+    assert json.loads(twin.read_text()) == {"twin": plain["twin"]}
+    for path in (twin, told):
+        again = measured_room.twin_of(Namespace(twin=str(path), set=["mass:0.31"]))
+        assert again.values["damping"] == plain["estimates"][1]["estimate"]
+        assert again.values["mass"] == 0.31
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "message"),
+    [
+        ("audit", ["--set", "mass:1"], "--set changes the twin: name one with --twin."),
+        ("audit", ["--json", "nowhere/out.json"], "nowhere/out.json cannot be written"),
+        ("audit", ["--twin", "CartPole"], "CartPole has 5 channels and 1 commands"),
+        ("calibrate", ["--twin", "FreePendulum"], "steps by 0.01 s and the data are sampled every"),
+        ("calibrate", ["--twin", "FreePendulum", "--free", "weight"], "free must name parameters"),
+        ("calibrate", ["--twin", "Nothing"], "There is no twin for 'Nothing'"),
+        (
+            "calibrate",
+            ["--twin", "FreePendulum", "--set", "dt:0.00666667", "--prior", "-1"],
+            "prior must be at least 0",
+        ),
+        (
+            "calibrate",
+            ["--twin", "FreePendulum", "--set", "dt:0.00666667", "--level", "95"],
+            "level must lie between 0 and 1",
+        ),
+    ],
+)
+def test_other_questions_that_make_no_sense_are_one_message_too(
+    swings, capsys, command, words, message
+):
+    assert question(swings, command, "rad", *words) == 1
+    told = capsys.readouterr().err
+    assert message in told and "Traceback" not in told
+    assert len([line for line in told.splitlines() if line.startswith("sb3-hds: ")]) == 1
 
 
 def test_what_exists_is_listed_with_units_and_explanations(capsys):

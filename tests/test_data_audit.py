@@ -67,6 +67,7 @@ def test_clean_data_raise_no_alarm(name, seed, noise, tmp_path):
     clean = measured(twins.make(name), n_steps=200, noise=sigma, seed=seed, share=0.5)
 
     found = audit(clean, channels_of(name))
+    assert audit(clean, twin=twins.make(name)) == found
     from_file = audit(logged(clean, tmp_path / "log.csv", warns=False))
 
     assert found.findings == from_file.findings == ()
@@ -95,7 +96,7 @@ def test_gaps_and_repeated_stamps_are_found_where_they_are(data, tmp_path):
     def times(i, n):
         t = data.dt * np.arange(n)
         t[100:] += 3.0 * (i == 2)
-        t[51] = t[50] if i == 4 else t[51]
+        t[51:] -= data.dt * (i == 4)
         return t
 
     found = audit(logged(data, tmp_path / "log.csv", times=times))
@@ -104,6 +105,25 @@ def test_gaps_and_repeated_stamps_are_found_where_they_are(data, tmp_path):
     [stamp] = [f for f in found.findings if type(f).__name__ == "RepeatedStamps"]
     assert gap.longest == pytest.approx(3.0 + data.dt) and "episode 2, sample 502" in str(gap)
     assert stamp.n_rows == 1 and "episode 4, sample 855" in str(stamp)
+
+
+def test_stamps_that_are_off_and_rows_that_are_missing_are_found_where_they_are(data, tmp_path):
+    def times(i, n):
+        t = data.dt * np.arange(n)
+        t[51] -= 0.6 * data.dt * (i == 4)
+        t[100:] += 2.0 * data.dt * (i == 2)
+        return t
+
+    read = logged(data, tmp_path / "log.csv", times=times)
+    off, missing = audit(read).findings
+
+    assert (type(off).__name__, type(missing).__name__) == ("JitteredStamps", "MissingRows")
+    assert (off.n_rows, off.longest) == (1, pytest.approx(0.6 * data.dt))
+    assert "1 time stamp is off by up to 30 ms" in str(off) and "episode 4, sample 855" in str(off)
+    assert "2 rows of a regular clock are missing, before log.csv, episode 2, sample 502" in str(
+        missing
+    )
+    np.testing.assert_array_equal(read.episode(4)[0], data.episode(4)[0])
 
 
 @pytest.mark.parametrize("how", ["hold", "insert", "half the rate"])
@@ -623,6 +643,7 @@ KNOWN = (Channel("angle", "rad"), Channel("speed", "rad/s"))
         ((1.0, 180.0 / np.pi), "as if 'speed' were in degrees"),
         ((1000.0, 1.0), "as if 'angle' were in millimetres"),
         ((1.0, 30.0), "one of them is in other units."),
+        ((1.0, 30.0 / np.pi), "as if 'speed' were in revolutions per minute"),
     ],
 )
 def test_a_position_in_other_units_than_its_velocity_is_refused(channels, noise, scales, says):
@@ -632,7 +653,7 @@ def test_a_position_in_other_units_than_its_velocity_is_refused(channels, noise,
 
     assert kinds(found) == {"OtherUnits"} and not found.usable
     assert found.findings[0].factor == pytest.approx(scales[0] / scales[1], rel=0.1)
-    assert says in found.reason and "Give that one its scale in columns" in found.reason
+    assert says in found.reason and "Give that one its unit in columns" in found.reason
 
 
 def test_a_wrapped_angle_in_degrees_is_in_other_units_than_its_velocity():
@@ -654,6 +675,154 @@ def test_a_factor_that_a_scale_of_the_sensor_explains_is_left_to_it(factor, dt):
     data = changed(pendulum_data(dt), lambda _, obs, actions: (obs * [factor, 1.0], actions))
 
     assert "OtherUnits" not in kinds(audit(data, KNOWN)) | kinds(audit(data))
+
+
+def swings(seed=0, n=8, steps=300, dt=0.02, noise=0.003):
+    """Angles of a free pendulum with dry friction: w^2 = 42 1/s^2, up to 1.4 rad."""
+    rng, recordings = np.random.default_rng(seed), []
+    for q in rng.uniform(0.6, 1.4, n) * rng.choice([-1.0, 1.0], n):
+        v, seen = 0.0, []
+        for step in range(10 * steps + 1):
+            if step % 10 == 0:
+                seen.append(q)
+            v += 0.1 * dt * (-42.0 * np.sin(q) - 0.86 * np.tanh(v / 0.01))
+            q += 0.1 * dt * v
+        recordings.append(np.array(seen)[:, None] + noise * rng.standard_normal((steps + 1, 1)))
+    return recordings
+
+
+def pendulum_twin(**changes):
+    own = {"mass": 0.3, "com": 0.2, "inertia": 0.002, "observe": "q", "dt": 0.02}
+    return twins.make("FreePendulum", **own | changes)
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"com": 0.28}, {"com": 0.14}, {"mass": 0.6}, {"damping": 0.02}]
+)
+def test_an_angle_in_degrees_is_refused_if_the_twin_says_so_whatever_else_is_wrong(changes):
+    twin, none = pendulum_twin(**changes), [np.zeros((300, 0))] * 8
+    right = Trajectories.from_arrays(swings(), none, dt=0.02)
+    degrees = Trajectories.from_arrays([np.rad2deg(q) for q in swings()], none, dt=0.02)
+
+    found = audit(degrees, twin=twin)
+
+    assert not found.usable and kinds(found) == {"MistakenUnits"}
+    assert "{column: hinge_position, unit: deg}, or scale it by 0.0174533" in found.reason
+    assert audit(right, twin=twin).usable and audit(degrees).usable
+
+
+def test_an_angle_in_degrees_under_a_twin_that_is_all_wrong_is_a_caveat():
+    none = [np.zeros((300, 0))] * 8
+    degrees = Trajectories.from_arrays([np.rad2deg(q) for q in swings()], none, dt=0.02)
+
+    found = audit(degrees, ["angle"], pendulum_twin(zero="up"))
+
+    assert found.usable and kinds(found) == {"LikelyUnits"}
+    assert "'angle' spans" in str(found) and "as if it were in degrees" in str(found.findings[0])
+
+
+def test_the_line_to_write_names_the_column_of_the_log(tmp_path):
+    rows = np.concatenate([np.rad2deg(q) for q in swings()])[:, 0]
+    table = np.stack([np.tile(0.02 * np.arange(301), 8), np.repeat(np.arange(8), 301), rows], 1)
+    np.savetxt(tmp_path / "log.csv", table, "%.9f", ",", header="t,run,enc", comments="")
+    columns = {"time": "t", "episode": "run", "obs": ["enc"], "actions": []}
+
+    found = audit(Trajectories.load(tmp_path / "log.csv", columns), twin=pendulum_twin())
+
+    assert "'hinge_position' spans" in found.reason and "{column: enc, unit: deg}" in found.reason
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("millimetres", 1e3), ("centimetres", 1e2)])
+def test_an_axis_in_millimetres_is_refused(unit, factor):
+    rng = np.random.default_rng(0)
+    force = 5.0 * np.sin(0.2 * rng.standard_normal((8, 200, 1)).cumsum(1))
+    twin = twins.make("LinearAxis", mass=2.6)  # the real one has 2 kg
+    clean = measured(twins.make("LinearAxis", mass=2.0), n_steps=200, commands=force)
+    data = changed(clean, lambda _, obs, actions: (factor * obs, actions))
+
+    found = audit(data, twin=twin)
+
+    assert f"if it is in {unit}" in found.reason
+    assert audit(clean, twin=twin).usable
+
+
+@pytest.mark.parametrize("changes", [{}, {"mass": 1.0}, {"zero": "up"}, {"gravity": 0.0}])
+def test_a_joint_that_turns_many_times_is_in_the_right_unit(changes):
+    own = {"driven": True, "mass": 0.5, "com": 0.2, "inertia": 0.01}
+    rng = np.random.default_rng(0)
+    torque = 2.0 + np.sin(0.05 * rng.standard_normal((6, 300, 1)).cumsum(1))
+    wheel = {"gravity": 0.0} if "gravity" in changes else {}
+    real = twins.make("FreePendulum", damping=0.02, **own, **wheel)
+    data = measured(real, n=6, n_steps=300, noise=np.array([1e-3, 2e-2]), commands=torque)
+
+    found = audit(data, twin=twins.make("FreePendulum", **own | changes))
+
+    assert np.ptp(data.obs[..., 0]) > 20.0 * np.pi
+    assert not kinds(found) & {"MistakenUnits", "LikelyUnits", "OtherUnits"}
+
+
+def test_a_twin_of_another_system_is_refused(data):
+    with pytest.raises(TrajectoryError, match="CartPole has 5 channels and 1 commands; the data"):
+        audit(data, twin=twins.make("CartPole"))
+
+
+# --- backward differences
+
+
+def differentiated(noise=1e-4, dt=0.01):
+    """An angle of an encoder, and its backward difference."""
+    rng, t = np.random.default_rng(0), dt * np.arange(1, 1001)
+    obs = []
+    for w in np.linspace(2.0, 5.0, 6):
+        angle = np.sin(w * t) + noise * rng.standard_normal(1000)
+        obs.append(np.stack([angle, np.diff(angle, prepend=0.0) / dt], 1)[1:])
+    return Trajectories.from_arrays(obs, [rng.standard_normal((998, 1))] * 6, dt=dt)
+
+
+@pytest.mark.parametrize("digits", [15, 4])
+def test_a_backward_difference_is_recognised_and_offered_as_a_correction(digits):
+    data = changed(differentiated(), lambda _, obs, u: (obs.round(digits), u))
+
+    found = audit(data, KNOWN)
+    better = found.corrected(data)
+
+    assert kinds(found) == {"BackwardDifference"} and found.usable
+    assert "'speed' is the backward difference of 'angle'" in str(found) and "5 ms" in str(found)
+    assert found.velocity_shift == {"speed": 0.005}
+    assert found.corrections == ("'speed' was shifted by -5 ms.",)
+    central = np.gradient(better.obs[..., 0], 0.01, axis=1)[:, 1:-1]
+    np.testing.assert_allclose(better.obs[:, 1:-1, 1], central, atol=0.02)
+
+
+def test_a_speed_that_a_sensor_measures_half_a_sample_late_is_no_backward_difference():
+    rng, t = np.random.default_rng(0), 0.01 * np.arange(1000)
+    obs = np.stack([np.sin(3.0 * t), 3.0 * np.cos(3.0 * (t - 0.005))], 1)
+    torque = [rng.standard_normal((999, 1))]
+
+    for noise in ([0.0, 0.0], [1e-4, 3e-2]):
+        seen = obs + noise * rng.standard_normal(obs.shape)
+        assert kinds(audit(Trajectories.from_arrays([seen], torque, dt=0.01), KNOWN)) <= {
+            "PoorExcitation"
+        }
+
+
+def test_a_twin_that_steps_like_a_backward_difference_raises_no_alarm():
+    semi, exact = (twins.make(name) for name in ("CartPole", "LinearAxis"))
+    force = np.sin(0.2 * np.random.default_rng(0).standard_normal((8, 200, 1)).cumsum(1))
+    cart = measured(semi, n_steps=200)
+    axis = measured(exact, n_steps=200, commands=force)
+    differences = changed(
+        axis,
+        lambda _, obs, u: (
+            np.stack([obs[1:, 0], np.diff(obs[:, 0]) / exact.dt], 1),
+            u[1:],
+        ),
+    )
+
+    assert audit(cart, twin=semi).findings == ()
+    assert "BackwardDifference" in kinds(audit(differences, twin=exact))
+    # Without noise and without a twin, nobody knows.
+    assert "BackwardDifference" not in kinds(audit(differences))
 
 
 def test_a_position_and_a_velocity_that_are_swapped_are_refused():

@@ -18,6 +18,7 @@ from sb3_hds.core import (
 )
 from sb3_hds.data import SamplingWarning
 from sb3_hds.errors import CalibrationError, EffectError, ParameterError
+from sb3_hds.sysid.calibrate import check_fits
 
 FRICTION = (effects.ViscousFriction, effects.CoulombFriction)
 
@@ -263,6 +264,19 @@ def test_another_interval_says_how_to_change_it_and_which_unit_it_may_be_in(fact
 
     assert says in str(refusal.value)
     assert ("seconds:" in str(refusal.value)) == (factor > 100.0)
+
+
+def test_an_interval_that_a_log_cannot_tell_from_the_twins_is_the_same():
+    twin = twins.make("FreePendulum", dt=0.0333333)
+
+    for dt, fits in ((1.0 / 30.0, True), (0.03335, True), (0.0334, False)):
+        data = Trajectories.from_arrays([np.zeros((9, 2))], [np.zeros((8, 0))], dt=dt)
+        if fits:
+            check_fits(twin, data)
+            assert len(Trajectories.concatenate([data, data.resample(dt * 1.0002)])) == 2
+        else:
+            with pytest.raises(CalibrationError, match=r"steps by 0\.0333333 s and the data are"):
+                check_fits(twin, data)
 
 
 def test_a_single_parameter_to_calibrate_may_stand_alone():

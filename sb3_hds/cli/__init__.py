@@ -5,6 +5,8 @@
     sb3-hds diagnose --twin my_module:MyTwin --data 'logs/*.csv' --columns map.yml
     sb3-hds diagnose --twin LinearAxis --set observe:q mass:95 --data log.mat --columns map.yml
     sb3-hds columns log.csv > map.yml
+    sb3-hds audit --data 'logs/*.csv' --columns map.yml
+    sb3-hds calibrate --twin LinearAxis --data log.mat --columns map.yml --write axis.json
     sb3-hds robustness --algo openloop --model model.zip --env Swimmer-v5
     sb3-hds effects
     sb3-hds twins
@@ -23,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :return: 0 on any verdict; 1 where the question makes no sense, with one line on why
     """
     given = parser().parse_args(arguments)
-    from sb3_hds.cli import columns, diagnose, listing, robustness
+    from sb3_hds.cli import audit, calibrate, columns, diagnose, listing, robustness
     from sb3_hds.errors import SB3HDSError
 
     try:
@@ -33,6 +35,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.simplefilter("ignore", DeprecationWarning)
             {
                 "columns": columns.run,
+                "audit": audit.run,
+                "calibrate": calibrate.run,
                 "diagnose": diagnose.run,
                 "robustness": robustness.run,
                 "effects": listing.effects,
@@ -63,7 +67,7 @@ def _warn(
 
 def parser() -> argparse.ArgumentParser:
     """:return: what the command understands"""
-    from sb3_hds.cli import columns
+    from sb3_hds.cli import audit, calibrate, columns, measured
 
     every = argparse.ArgumentParser(
         prog="sb3-hds",
@@ -71,24 +75,7 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = every.add_subparsers(dest="command", required=True)
     ask = commands.add_parser("diagnose", help="name the cause, from measured data")
-    ask.add_argument(
-        "--twin",
-        required=True,
-        help="name or environment id, see 'sb3-hds twins'; module:Name for one of your own; or the "
-        "file that --json wrote, for the twin that was extended there",
-    )
-    ask.add_argument("--data", required=True, nargs="+", help="files, or patterns in quotes")
-    ask.add_argument("--columns", help="yml file: what the columns of a log mean")
-    ask.add_argument(
-        "--correct", action="store_true", help="cut and shift the data where their audit says so"
-    )
-    ask.add_argument(
-        "--set",
-        nargs="*",
-        default=[],
-        metavar="NAME:VALUE",
-        help="parameters and options of the twin: mass:0.3 observe:q driven:true",
-    )
+    measured.add_arguments(ask)
     ask.add_argument("--calibrate", nargs="*", default=[], help="parameters that are not believed")
     ask.add_argument("--effects", nargs="*", help="candidates; default: all, see 'sb3-hds effects'")
     ask.add_argument("--budget", choices=("full", "quick"), default="full")
@@ -104,6 +91,10 @@ def parser() -> argparse.ArgumentParser:
     worth.add_argument("--episodes", type=int, default=20, help="for each policy; default: 20")
     worth.add_argument(
         "--hyperparams", nargs="*", default=[], metavar="NAME:VALUE", help="of the algorithm"
+    )
+    audit.add_arguments(commands.add_parser("audit", help="find defects of measured data"))
+    calibrate.add_arguments(
+        commands.add_parser("calibrate", help="estimate parameters of a twin from measured data")
     )
     shake = commands.add_parser("robustness", help="return under noise, failed sensors, pushes")
     shake.add_argument(

@@ -8,6 +8,9 @@ import numpy as np
 
 from sb3_hds.errors import TrajectoryError
 
+SAME_RATE = 1e-3
+"""Relative difference of two sampling rates that counts as none."""
+
 
 def check_dt(dt: Any) -> float:
     """
@@ -23,6 +26,11 @@ def check_dt(dt: Any) -> float:
             f"dt must be the sampling interval in seconds, finite and positive, got {dt!r}."
         )
     return value
+
+
+def same_interval(dt: float, other: float) -> bool:
+    """Whether two sampling intervals are the same to 0.1 %, which is what logs tell."""
+    return math.isclose(dt, other, rel_tol=SAME_RATE)
 
 
 def check_episodes(

@@ -13,7 +13,14 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from sb3_hds.core.episodes import check_conditions, check_dt, check_episodes, pad, resample
+from sb3_hds.core.episodes import (
+    check_conditions,
+    check_dt,
+    check_episodes,
+    pad,
+    resample,
+    same_interval,
+)
 from sb3_hds.core.replay_buffer import episodes_in
 from sb3_hds.core.storage import read_npz, write_npz
 from sb3_hds.errors import TrajectoryError
@@ -118,12 +125,13 @@ class Trajectories:
     @classmethod
     def concatenate(cls, parts: Iterable["Trajectories"]) -> "Trajectories":
         """
-        :param parts: sampled at the same interval, with the same channels
+        :param parts: sampled at the same interval, to 0.1 %, with the same channels; that of the
+            first is kept
         :raises TrajectoryError: for other intervals or channels, or if there are no parts
         """
         parts = list(parts)
         for part in parts:
-            if not math.isclose(part.dt, parts[0].dt, rel_tol=1e-9):
+            if not same_interval(part.dt, parts[0].dt):
                 raise TrajectoryError(
                     f"Only trajectories of one dt can be joined, got {parts[0].dt} s and "
                     f"{part.dt} s. Resample first: part.resample(dt={parts[0].dt})."

@@ -1,16 +1,22 @@
 """Are these data fit for a verdict? Asked before any physics."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
+from sb3_hds.core.episodes import same_interval
 from sb3_hds.core.signals import Channel
 from sb3_hds.core.trajectories import Trajectories
+from sb3_hds.core.twin import Twin
 from sb3_hds.data import continuity
+from sb3_hds.data.differences import backward_differences
 from sb3_hds.data.excitation import excitation
 from sb3_hds.data.finding import Finding, Place
 from sb3_hds.data.findings import (
     Gaps,
+    JitteredStamps,
+    MissingRows,
     Outliers,
     RepeatedStamps,
     StandingStill,
@@ -24,12 +30,17 @@ from sb3_hds.data.resolution import resolutions
 from sb3_hds.data.results import Audit, ChannelSummary
 from sb3_hds.data.stillness import stillness_of
 from sb3_hds.data.stretches import Stretch, stretches_of
+from sb3_hds.data.twin_units import mistaken_units
 from sb3_hds.data.units import other_units, swapped
 from sb3_hds.data.velocity import matches_of, velocity_shifts
 from sb3_hds.errors import TrajectoryError
 
 
-def audit(data: Trajectories, channels: Sequence[str | Channel] | None = None) -> Audit:
+def audit(
+    data: Trajectories,
+    channels: Sequence[str | Channel] | None = None,
+    twin: Twin | None = None,
+) -> Audit:
     """
     Look for defects of the recording, which physics would have to explain otherwise.
 
@@ -43,13 +54,20 @@ def audit(data: Trajectories, channels: Sequence[str | Channel] | None = None) -
     measure.
 
     :param data: of any kind
-    :param channels: names of the observation channels, or a twin's ``channels``; default: those
-        that were read, or ``obs[0]``, ``obs[1]``, ...
-    :raises TrajectoryError: if the number of names is not that of the channels, or if one was read
-        in a unit of something else
+    :param channels: names of the observation channels, or a twin's ``channels``; default: those of
+        the twin, those that were read, or ``obs[0]``, ``obs[1]``, ...
+    :param twin: of what was measured, as far as it is known: says what the channels are, whether
+        its own velocities are backward differences, and which positions it cannot follow unless
+        they are in another unit
+    :raises TrajectoryError: if the number of names is not that of the channels, or if the twin has
+        other channels or commands, or if one was read in a unit of something else
     """
     report = data.report if isinstance(data.report, Reading) else None
+    if twin is not None:
+        twin = _fitting(twin, data)
+        channels = twin.channels if channels is None else channels
     named = _channels(data, channels, report)
+    columns = report.obs if report else [channel.name for channel in named]
     names = [channel.name for channel in named]
     actions = report.actions if report else [f"action[{j}]" for j in range(data.n_act)]
     rows = stretches_of(data)
@@ -66,10 +84,12 @@ def audit(data: Trajectories, channels: Sequence[str | Channel] | None = None) -
     if not unfit:
         matches = matches_of(data, names)
         found += [
+            *(mistaken_units(data, twin, named, columns) if twin else ()),
             *continuity.reinitialised(rows, names, resolution),
             *other_units(data, named, matches),
             *swapped(data, named, matches),
             *velocity_shifts(data, names, matches),
+            *backward_differences(data, names, matches, twin),
             *continuity.stuck(rows, names, resolution),
             *continuity.saturated(rows, names, resolution),
             *continuity.repeated_samples(rows, names, resolution),
@@ -95,6 +115,19 @@ def audit(data: Trajectories, channels: Sequence[str | Channel] | None = None) -
         data.dt,
         report is not None,
     )
+
+
+def _fitting(twin: Twin, data: Trajectories) -> Twin:
+    """The twin at the interval of the data, if it is one of their system."""
+    if (len(twin.channels), len(twin.actuators)) != (data.n_obs, data.n_act):
+        raise TrajectoryError(
+            f"{twin.name} has {len(twin.channels)} channels and {len(twin.actuators)} commands; "
+            f"the data have {data.n_obs} and {data.n_act}. Choose the columns, or the twin, that "
+            "fit."
+        )
+    if same_interval(twin.dt, data.dt):
+        return twin
+    return twin.at_interval(data.dt, math.ceil(data.dt * twin.substeps / twin.dt - 1e-9))
 
 
 def _channels(
@@ -143,6 +176,31 @@ def _sampling(data: Trajectories, report: Reading | None) -> list[Finding]:
                 sum(r.uneven for _, r in uneven) / n,
             )
         )
+    late = [(i, r) for i, r in recordings if r.clock == "late" and not r.resampled]
+    if late:
+        found.append(
+            JitteredStamps(
+                "time",
+                tuple(Place(r.source, k, k, i) for i, r in late for k in r.late),
+                sum(len(r.late) for _, r in late),
+                max(r.off for _, r in late),
+                max(r.jitter for _, r in late),
+            )
+        )
+    jittered = [(i, r) for i, r in recordings if r.clock == "jittered" and not r.resampled]
+    if jittered:
+        found.append(
+            JitteredStamps(
+                "time",
+                tuple(Place(r.source, 0, r.rows - 1, i) for i, r in jittered),
+                0,
+                max(r.off for _, r in jittered),
+                max(r.jitter for _, r in jittered),
+            )
+        )
+    holes = [(Place(r.source, k, k, i), n) for i, r in recordings for k, n in r.missing]
+    if holes:
+        found.append(MissingRows("time", tuple(p for p, _ in holes), sum(n for _, n in holes)))
     stamps = tuple(Place(r.source, k, k, i) for i, r in recordings for k in r.repeated)
     if stamps:
         found.append(RepeatedStamps("time", stamps, len(stamps)))

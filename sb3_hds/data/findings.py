@@ -5,6 +5,10 @@ import dataclasses
 from sb3_hds.data.finding import Finding, counted, listed, percent, recordings
 
 
+def _are(n: int) -> str:
+    return "is" if n == 1 else "are"
+
+
 @dataclasses.dataclass(frozen=True)
 class UnevenSampling(Finding):
     """
@@ -31,6 +35,55 @@ class UnevenSampling(Finding):
         "The rows were resampled; compare the error of that (print data.report) with the noise. "
         "Next time, let one clock trigger command and measurement."
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class JitteredStamps(Finding):
+    """
+    Of a regular clock.
+
+    :param n_rows: whose stamps are off, where these are few; otherwise 0
+    :param longest: farthest that a stamp is off [s]
+    :param rms: root mean square of how far stamps are off [s]
+    """
+
+    n_rows: int
+    longest: float
+    rms: float
+
+    @property
+    def sentence(self) -> str:
+        far = f"up to {1e3 * self.longest:.3g} ms"
+        if self.n_rows:
+            return (
+                f"{counted(self.n_rows, 'time stamp')} {_are(self.n_rows)} off by {far} in an "
+                f"otherwise regular clock ({listed(self.places)})."
+            )
+        return (
+            f"Time stamps jitter by {1e3 * self.rms:.3g} ms (rms), {far}, around the ticks of a "
+            f"regular clock ({recordings(self.places)})."
+        )
+
+    remedy = (
+        "The rows were kept at their ticks, which their values fit no worse. Next time, let the "
+        "sensor's own clock stamp them."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class MissingRows(Finding):
+    """:param n_rows: that are missing between rows of a regular clock"""
+
+    n_rows: int
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"{counted(self.n_rows, 'row')} of a regular clock {_are(self.n_rows)} missing, before "
+            f"{listed(self.places)}."
+        )
+
+    remedy = "Interpolated. A longer gap ends the trajectory: gap: SECONDS in columns says when."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -225,7 +278,26 @@ class VelocityShift(Finding):
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class BackwardDifference(VelocityShift):
+    """A velocity that was computed as one, so that it belongs half a sample earlier."""
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' is the backward difference of '{self.position}', which belongs half "
+            f"a sample, {1e3 * self.seconds:.3g} ms, earlier ({recordings(self.places)})."
+        )
+
+    remedy = (
+        "Shift it: audit.corrected(data). No sensor is late, unless the twin computes its velocity "
+        "in the same way."
+    )
+
+
 _UNITS = {"degrees": 57.29578, "millimetres": 1000.0, "centimetres": 100.0}
+RPM = 30.0 / 3.1415926536
+"""Revolutions per minute of one radian per second."""
 _NEAR = 0.15  # what a central difference and noise may change of the factor
 
 
@@ -256,12 +328,72 @@ class OtherUnits(Finding):
             for name, ratio in ((self.position, factor), (self.channel, 1.0 / factor)):
                 if abs(self.factor / ratio - 1.0) < _NEAR:
                     return f", as if '{name}' were in {unit}"
+        if abs(self.factor * RPM - 1.0) < _NEAR:
+            return f", as if '{self.channel}' were in revolutions per minute"
         return ""
 
     remedy = (
-        "Give that one its scale in columns: 0.0174533 if it is in degrees, 0.001 if it is in "
-        "millimetres."
+        "Give that one its unit in columns, as {column: NAME, unit: deg}, or rpm or mm, or its "
+        "scale: 0.0174533 if it is in degrees, 0.104720 if it is in revolutions per minute, 0.001 "
+        "if it is in millimetres."
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class MistakenUnits(Finding):
+    """
+    A position that moves as the twin says only if it is in another unit.
+
+    :param column: its name in the log
+    :param span: of its measurements
+    :param unit: that the twin takes it for
+    :param other: the one that fits, in words
+    :param symbol: of that
+    :param factor: from that to the twin's
+    :param explained: share of its acceleration that the twin explains then
+    :param times: how often it accelerates as much as the twin says, if it is in the twin's unit
+    """
+
+    blocks = True
+    column: str
+    span: float
+    unit: str
+    other: str
+    symbol: str
+    factor: float
+    explained: float
+    times: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' spans {self.span:.3g} {self.unit}, and {self._why} "
+            f"({recordings(self.places)}). Write {{column: {self.column}, unit: {self.symbol}}}, "
+            f"or scale it by {self.factor:.6g}."
+        )
+
+    @property
+    def _why(self) -> str:
+        return (
+            f"the twin explains hardly any of its acceleration, but {percent(self.explained)} if "
+            f"it is in {self.other}"
+        )
+
+    remedy = "Whatever is named from such data makes up for the factor."
+
+
+@dataclasses.dataclass(frozen=True)
+class LikelyUnits(MistakenUnits):
+    """In the other unit, it moves about as much as the twin says, but not when it says so."""
+
+    blocks = False
+
+    @property
+    def _why(self) -> str:
+        return (
+            f"it accelerates {self.times:.2g} times as much as the twin says, as if it were in "
+            f"{self.other}"
+        )
 
 
 @dataclasses.dataclass(frozen=True)

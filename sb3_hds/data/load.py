@@ -43,10 +43,10 @@ def load(files: Files, columns: Any = None) -> Trajectories:
     Read logs; what ``Trajectories.load`` does.
 
     Row k of a log is observation k, with the action that acts from then on: the action in the last
-    row of an episode is not used. Where all stamps are within 1 % of an interval of a grid, rows
-    stay as they are; otherwise they are resampled. A row with the stamp of the one before is left
-    out. A gap ends the episode, and so does another label. What was changed is warned of and stays
-    in ``report``.
+    row of an episode is not used. Rows of a regular clock stay as they are, also where their stamps
+    are rounded, late or jitter; others are resampled. A row that was written twice is left out. A
+    gap ends the episode, and so does another label. What was changed is warned of; that, and what
+    paced the rows, stays in ``report``.
 
     :param files: path, pattern with ``*``, ``minari:`` and the name of a data set, or several of
         them; a pattern gives its files in alphabetical order

@@ -7,11 +7,12 @@ import numpy as np
 from sb3_hds.core.signals import Channel
 from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.data.finding import Place
-from sb3_hds.data.findings import OtherUnits, Swapped
+from sb3_hds.data.findings import RPM, OtherUnits, Swapped
 from sb3_hds.data.velocity import Match
 
 # Factor: up to here `effects.SensorScale`, which is bounded to 0.1 to 10, gives it a name.
 _BEYOND = 10.0
+_RPM_NEAR = 0.05  # relative: a factor within those bounds that has a name of its own
 _LATEST = 4.0  # samples: a pair whose lag is longer may be a sine and its second derivative
 _ALIKE = 0.3  # largest difference of a block's slope from that of all data, for half of the blocks
 _FEWEST = 3  # blocks
@@ -22,7 +23,8 @@ def other_units(
     data: Trajectories, channels: Sequence[Channel], matches: Sequence[Match]
 ) -> list[OtherUnits]:
     """
-    Velocities that are the derivative of a position but for a large factor.
+    Velocities that are the derivative of a position but for a large factor, or that of revolutions
+    per minute.
 
     Only of channels that belong to no other one as position or velocity: in an oscillation,
     everything is the derivative of something, but for a factor. Where units are known, they say
@@ -75,7 +77,9 @@ def swapped(
 def _far(match: Match, dt: float) -> bool:
     """Whether the factor is large, beyond doubt, and about the same everywhere."""
     scores = match.scores
-    if 1.0 / _BEYOND <= scores.slope_there <= _BEYOND or abs(scores.lag) > _LATEST:
+    known = abs(scores.slope_there / RPM - 1.0) < _RPM_NEAR
+    usual = 1.0 / _BEYOND <= scores.slope_there <= _BEYOND and not known
+    if usual or abs(scores.lag) > _LATEST:
         return False
     v = np.concatenate([v - v.mean() for _, v in match.pairs])
     slopes = match.slopes(dt)

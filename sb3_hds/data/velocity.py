@@ -23,6 +23,12 @@ _BLOCKS = 12
 _VISIBLE = 0.75  # samples: half of one is what a backward difference or semi-implicit Euler has
 _SIGMAS = 3.0
 _BETTER = 2.0  # by how much the shift must reduce the unexplained variance,
+# Mean square of a velocity less its backward difference, by that less a smoother one: where both
+# are noise, and where they are not. A smooth velocity half a sample late has 1/50.
+_SAME_NOISE, _SAME_NUMBER = 0.5, 2.5e-3
+# Correlation of successive fourth differences: -0.8 for noise of a position, -0.67 under random
+# forces, and more for smooth motion.
+_ALTERNATES = -0.735
 _LONG = 2.0  # unless it is longer than this [samples]
 
 Pairs = Sequence[tuple[np.ndarray, np.ndarray]]
@@ -36,6 +42,7 @@ class Lag(NamedTuple):
     :param samples: by how many the velocity comes late; negative: early
     :param stderr: standard error of that, from blocks of the data
     :param better: unexplained variance of the velocity without the shift by that with it
+    :param backward: whether it is the backward difference of the position
     """
 
     velocity: int
@@ -43,6 +50,7 @@ class Lag(NamedTuple):
     samples: float
     stderr: float
     better: float
+    backward: bool = False
 
 
 class Match(NamedTuple):
@@ -102,6 +110,36 @@ def velocity_shifts(
     ]
 
 
+class Difference(NamedTuple):
+    """
+    :param backward: whether a velocity is the backward difference of its position: it has that
+        one's noise, or it is the same number
+    :param rough: whether the noise of the position shows in it
+    """
+
+    backward: bool
+    rough: bool
+
+
+def difference_of(pairs: Pairs, dt: float) -> Difference:
+    """
+    Compare a velocity with the backward difference, and with a mean of four that is as late.
+
+    :param pairs: position and velocity of each episode
+    """
+    exact, smooth, bends = [], [], []
+    for q, v in pairs:
+        steps = np.diff(q) / dt
+        exact.append(v[2:-1] - steps[1:-1])
+        smooth.append(v[2:-1] - (steps[2:] + 2.0 * steps[1:-1] + steps[:-2]) / 4.0)
+        bends.append(np.diff(q, 4))
+    ours, others = (float(np.mean(np.concatenate(part) ** 2)) for part in (exact, smooth))
+    products = sum(float(x[1:] @ x[:-1]) for x in bends)
+    rough = bool(products < _ALTERNATES * sum(float(x @ x) for x in bends))
+    share = _SAME_NOISE if rough else _SAME_NUMBER
+    return Difference(ours < share * others, rough)
+
+
 def lags_of(data: Trajectories, names: Sequence[str]) -> list[Lag]:
     """
     Pairs of a position and its velocity in the same unit, and the lag between them.
@@ -151,7 +189,8 @@ def _lags(matches: Sequence[Match], dt: float) -> list[Lag]:
         best = max(own, key=lambda match: match.scores.highest)
         scores = best.scores
         stderr = _stderr(best.pairs, dt, len(scores.slope) // 2, best.width)
-        found.append(Lag(v, best.position, scores.lag, stderr, scores.better))
+        backward = difference_of(best.pairs, dt).backward
+        found.append(Lag(v, best.position, scores.lag, stderr, scores.better, backward))
     return found
 
 
@@ -161,7 +200,7 @@ def _positions(
     """Everything that channel v may be the derivative of, per episode; turns are counted."""
     others = [j for j in range(episodes[0].shape[1]) if j != v]
     found: list[tuple[tuple[int, ...], list[np.ndarray]]]
-    found = [((j,), [_unwrapped(x[:, j]) for x in episodes]) for j in others]
+    found = [((j,), [unwrapped(x[:, j]) for x in episodes]) for j in others]
     joined = np.concatenate(episodes)
     for c, s in itertools.permutations(others, 2):
         if np.sqrt(np.mean((joined[:, c] ** 2 + joined[:, s] ** 2 - 1.0) ** 2)) < _CIRCLE:
@@ -170,7 +209,7 @@ def _positions(
     return found
 
 
-def _unwrapped(x: np.ndarray) -> np.ndarray:
+def unwrapped(x: np.ndarray) -> np.ndarray:
     """With turns counted, where the values look like a wrapped angle [rad] or [deg]."""
     for turn in (2.0 * np.pi, 360.0):
         wraps = np.abs(np.abs(np.diff(x)) - turn) < turn / (2.0 * np.pi)

@@ -1,5 +1,6 @@
 """Estimate the parameters of a twin from measured data."""
 
+import math
 from collections.abc import Iterable
 from functools import partial
 
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sb3_hds.core import Params, Trajectories, Twin
+from sb3_hds.core.episodes import same_interval
 from sb3_hds.data.report import Reading
 from sb3_hds.effects import force_of
 from sb3_hds.errors import CalibrationError
@@ -78,6 +80,8 @@ def calibrate(
     check_fits(twin, data)
     if loss not in ("huber", "linear"):
         raise CalibrationError(f"loss must be 'huber' or 'linear', got {loss!r}.")
+    if not 0.0 <= prior < math.inf:
+        raise CalibrationError(f"prior must be at least 0 (no belief), got {prior}.")
     if not 0.0 < level < 1.0:
         raise CalibrationError(f"level must lie between 0 and 1, got {level}.")
     shots, origin = shots_of(data, window or default_window(data), twin, n_windows, seed)
@@ -165,7 +169,7 @@ def check_fits(twin: Twin, data: Trajectories) -> None:
     misfit = report.misfit(twin.channels, twin.actuators) if report else ""
     if misfit:
         raise CalibrationError(misfit)
-    if not np.isclose(data.dt, twin.dt, rtol=1e-6):
+    if not same_interval(data.dt, twin.dt):
         raise CalibrationError(
             f"{twin.name} steps by {twin.dt:g} s and the data are sampled every {data.dt:g} s. "
             f"{_other_unit(data.dt / twin.dt)}Use data.resample(dt={twin.dt:g}) (in the map of "

@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_hds.core import Effect, Trajectories, Twin
 from sb3_hds.data import Audit, audit
-from sb3_hds.data.findings import Glitches, Outliers
+from sb3_hds.data.findings import BackwardDifference, Glitches, Outliers
 from sb3_hds.sysid.account import (
     by_horizon,
     detectable,
@@ -392,13 +392,20 @@ def _without_glitches(
     twin: Twin, data: Trajectories
 ) -> tuple[Trajectories, Audit, tuple[str, ...]]:
     """:return: the data without single samples far off, what is found in these, what was cut out"""
-    found = audit(data, channels=twin.channels)
+    found = _audited(twin, data)
     far = [finding for finding in found.findings if isinstance(finding, Outliers)]
     if not far or not all(isinstance(finding, Glitches) for finding in far):
         return data, found, ()
     data = found.corrected(data)
     words = tuple(f"{finding.sentence} Cut out." for finding in far)
-    return data, audit(data, channels=twin.channels), words
+    return data, _audited(twin, data), words
+
+
+def _audited(twin: Twin, data: Trajectories) -> Audit:
+    """Without backward differences: they are moved to where they belong."""
+    found = audit(data, twin=twin)
+    left = tuple(one for one in found.findings if not isinstance(one, BackwardDifference))
+    return dataclasses.replace(found, findings=left)
 
 
 def _share(before: _Left, left: _Left) -> float:

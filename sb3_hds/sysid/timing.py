@@ -20,7 +20,8 @@ def in_step(twin: Twin, data: Trajectories) -> tuple[Trajectories, tuple[str, ..
     Velocities moved to where those of the twin are, relative to its positions.
 
     A rig that differentiates and filters its encoders reports velocities late by a part of a
-    sample; at a high rate this is seen, and is not worth a name.
+    sample; at a high rate this is seen, and is not worth a name. A backward difference is half a
+    sample late at any rate, and is no sensor's delay.
 
     :return: the data, and what was changed, in words
     """
@@ -30,20 +31,34 @@ def in_step(twin: Twin, data: Trajectories) -> tuple[Trajectories, tuple[str, ..
         return data, ()
     own = {lag.velocity: lag.samples for lag in lags_of(_replayed(twin, data), names)}
     late = {
-        lag.velocity: lag.samples - own[lag.velocity] for lag in measured if lag.velocity in own
+        lag: (0.5 if lag.backward else lag.samples) - own[lag.velocity]
+        for lag in measured
+        if lag.velocity in own
     }
-    late = {channel: samples for channel, samples in late.items() if abs(samples) > _VISIBLE}
+    late = {lag: samples for lag, samples in late.items() if abs(samples) > _VISIBLE}
     if not late:
         return data, ()
-    words = tuple(
-        f"{names[channel]} comes {1e3 * samples * data.dt:.2g} ms ({samples:.2g} samples) after "
-        "the position that it belongs to, as filters do; it was moved back."
-        for channel, samples in late.items()
+    words = tuple(_in_words(lag, names[lag.velocity], n, data.dt) for lag, n in late.items())
+    return shifted(data, {lag.velocity: samples for lag, samples in late.items()}), words
+
+
+def _in_words(lag: Lag, name: str, samples: float, dt: float) -> str:
+    time = f"{1e3 * abs(samples) * dt:.2g} ms ({abs(samples):.2g} samples)"
+    if lag.backward:
+        return (
+            f"{name} is the backward difference of {lag.position}, and so {time} late; it was "
+            "moved back. No sensor delays it."
+        )
+    when = "after" if samples > 0.0 else "before"
+    return (
+        f"{name} comes {time} {when} the position that it belongs to, as filters do; it was moved "
+        "back."
     )
-    return shifted(data, late), words
 
 
 def _short(lag: Lag, dt: float) -> bool:
+    if lag.backward:
+        return True
     short = abs(lag.samples) <= _SAMPLES and abs(lag.samples) * dt <= _SECONDS
     return short and abs(lag.samples) > max(_VISIBLE, _SIGMAS * lag.stderr)
 

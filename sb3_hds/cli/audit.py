@@ -1,0 +1,42 @@
+"""``sb3-hds audit``."""
+
+import argparse
+from typing import Any
+
+from sb3_hds.cli import measured
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """:param command: that is to understand them"""
+    measured.add_arguments(command, twin_required=False)
+    command.add_argument("--json", help="JSON file to write")
+
+
+def run(given: argparse.Namespace) -> None:
+    """Say what paced the rows and what is wrong with them, and once more after corrections."""
+    from sb3_hds.core.storage import check_target
+    from sb3_hds.data import audit
+    from sb3_hds.errors import ParameterError
+
+    if given.json:
+        check_target(given.json)
+    if given.set and given.twin is None:
+        raise ParameterError("--set changes the twin: name one with --twin.")
+    twin = None if given.twin is None else measured.twin_of(given)
+    data = measured.data_of(given)
+    plain: dict[str, Any] = {}
+    if data.report is not None:
+        plain["reading"] = data.report.to_dict()
+        print(f"{data.report}\n")
+    found = audit(data, twin=twin)
+    print(found)
+    plain |= found.to_dict()
+    if given.correct:
+        plain["corrections"] = list(found.corrections)
+        print("\n" + ("\n".join(found.corrections) or "There is nothing to correct."))
+    if given.correct and found.corrections:
+        better = audit(found.corrected(data), twin=twin)
+        plain["corrected"] = better.to_dict()
+        print(f"\n{better}")
+    if given.json:
+        measured.write_json(given.json, plain)

@@ -1,0 +1,111 @@
+"""What commands on measured data share: their arguments, the data, the twin, what they write."""
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from sb3_hds.cli.settings import settings
+
+if TYPE_CHECKING:
+    from sb3_hds.core import Trajectories, Twin
+
+_COLUMNS = """Say what the columns mean in a yml file, --columns map.yml:
+
+    time: NAME                               # or {column: NAME, unit: ms}, or dt: SECONDS
+    obs: [NAME, {column: NAME, unit: deg}]   # in the order of 'sb3-hds twins'
+    actions: [NAME]
+
+'sb3-hds columns FILE' prints what is in a log, and such a map to start from."""
+
+
+def add_arguments(command: argparse.ArgumentParser, *, twin_required: bool = True) -> None:
+    """
+    :param command: to which ``--twin``, ``--data``, ``--columns``, ``--correct`` and ``--set`` are
+        added
+    :param twin_required: whether it makes no sense without a twin
+    """
+    command.add_argument(
+        "--twin",
+        required=twin_required,
+        help="name or environment id, see 'sb3-hds twins'; module:Name for one of your own; or the "
+        "file that --json or --write wrote, for the twin that was extended or calibrated there",
+    )
+    command.add_argument("--data", required=True, nargs="+", help="files, or patterns in quotes")
+    command.add_argument("--columns", help="yml file: what the columns of a log mean")
+    command.add_argument(
+        "--correct", action="store_true", help="cut and shift the data where their audit says so"
+    )
+    command.add_argument(
+        "--set",
+        nargs="*",
+        default=[],
+        metavar="NAME:VALUE",
+        help="parameters and options of the twin: mass:0.3 observe:q driven:true",
+    )
+
+
+def data_of(given: argparse.Namespace) -> "Trajectories":
+    """What ``--data`` names; what is wrong with the map of columns is said in yml."""
+    from sb3_hds.data import Trajectories
+    from sb3_hds.data.columns import FORM
+    from sb3_hds.data.load import WITHOUT_COLUMNS
+    from sb3_hds.errors import TrajectoryError
+
+    files: str | Sequence[str] = given.data[0] if len(given.data) == 1 else given.data
+    try:
+        return Trajectories.load(files, columns=given.columns)
+    except TrajectoryError as error:
+        told = str(error)
+        for python in (FORM, WITHOUT_COLUMNS):
+            if python in told:
+                told = told.replace(python, _COLUMNS)
+        raise TrajectoryError(told) from error
+
+
+def twin_of(given: argparse.Namespace) -> "Twin":
+    """What ``--twin`` and ``--set`` name; a module or a file may lie in the current folder."""
+    from sb3_hds.errors import NoTwinError
+    from sb3_hds.twins import get
+
+    name, values = given.twin, settings("--set", given.set)
+    if name.endswith(".json"):
+        return _twin_in(name).with_parameters(**values)
+    if ":" in name and "" not in sys.path:
+        sys.path.insert(0, "")
+    try:
+        kind = get(name)
+    except NoTwinError as error:
+        if ":" in name:
+            raise
+        told = str(error).partition("\n")[0]
+        raise NoTwinError(
+            f"{told} 'sb3-hds twins' lists what there is. One of your own is --twin module:Name, "
+            "where module.py in this folder registers Name."
+        ) from None
+    return kind(**values)
+
+
+def _twin_in(path: str) -> "Twin":
+    """The twin in a file that ``--json`` or ``--write`` wrote."""
+    from sb3_hds.effects import ALL
+    from sb3_hds.errors import NoTwinError
+    from sb3_hds.twins import from_spec
+
+    with open(path, encoding="utf-8") as file:
+        text = file.read()
+    try:
+        return from_spec(json.loads(text)["twin"], ALL)
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise NoTwinError(
+            f"{path} holds no twin: it has to be what 'sb3-hds diagnose --json' or 'sb3-hds "
+            "calibrate --write' wrote."
+        ) from error
+
+
+def write_json(path: str, plain: Mapping[str, Any]) -> None:
+    """:param plain: without numbers that are not finite"""
+    from sb3_hds.core.storage import write_bytes
+
+    write_bytes(path, (json.dumps(plain, indent=1, allow_nan=False) + "\n").encode())
