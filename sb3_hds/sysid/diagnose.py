@@ -5,6 +5,7 @@ from numbers import Integral
 from typing import Any, Literal
 
 from sb3_hds.core import Effect, Trajectories, Twin
+from sb3_hds.core.contract import check_methods
 from sb3_hds.effects import ALL
 from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.calibrate import check_fits
@@ -50,6 +51,7 @@ def diagnose(
     :raises CalibrationError: for other channels or another interval than the twin's, or an unknown
         name in ``calibrate``
     :raises EffectError: for an unknown effect, or a twin whose step does not use effects
+    :raises TwinError: for a twin whose methods do not return what they have to
     :raises TrajectoryError: if no recording is long enough
     """
     if not isinstance(twin, Twin) or not isinstance(data, Trajectories):
@@ -57,6 +59,7 @@ def diagnose(
             f"diagnose(twin, data) takes a twin, as from twins.make(...), and Trajectories, got "
             f"{type(twin).__name__} and {type(data).__name__}."
         )
+    check_methods(twin)
     check_fits(twin, data)
     if budget not in EFFORTS:
         raise CalibrationError(f"budget must be 'full' or 'quick', got {budget!r}.")
