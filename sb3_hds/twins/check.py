@@ -156,7 +156,7 @@ def _motions(twin: Twin, seeds: np.ndarray, params: Params, actions: np.ndarray)
     n_variants, n_starts = actions.shape[:2]
     flat = (
         np.tile(seeds, n_variants),
-        actions.reshape(-1, *actions.shape[2:]),
+        actions.reshape(n_variants * n_starts, *actions.shape[2:]),
         {name: np.repeat(values, n_starts) for name, values in params.items()},
     )
     found = jax.jit(jax.vmap(motion), compiler_options=QUICKEST_COMPILATION)(*flat)

@@ -19,8 +19,8 @@ ROUNDING = 1e-9
 _SPEEDS = (1.0, 10.0, 100.0)  # of the typical one: the faster, the less damping weighs
 _N_FREE = 8  # motions without actuators
 _LEAST_SUBSTEPS, _MOST_SUBSTEPS = 20, 100  # of each
-# An error of first order or better falls to half or less with sub-steps a quarter as long.
-_FINER, _FALLS = 4, 0.5
+# An error of first order falls to a quarter with sub-steps a quarter as long, but for hard stops.
+_FINER, _FALLS = (1, 4, 16), 0.5
 _NEGLIGIBLE = 1e-4  # share of the energy
 _TINY = 1e-300
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
@@ -158,8 +158,8 @@ def _energy_item(plant: AnalyticTwin, points: Points) -> CheckItem:
     name, h = "energy", plant.dt / plant.substeps
     n = min(max(plant.substeps, _LEAST_SUBSTEPS), _MOST_SUBSTEPS)
     first = jax.tree.map(lambda values: values[:_N_FREE], points)
-    errors = []
-    for finer in (1, _FINER):
+    errors: list[float] = []
+    for finer in _FINER:
         error, size = _compiled(jax.vmap(_balance(plant, h / finer, n, finer)))(*first)
         if not np.isfinite(error).all():
             return CheckItem(
@@ -170,20 +170,21 @@ def _energy_item(plant: AnalyticTwin, points: Points) -> CheckItem:
             )
         largest = float(np.asarray(error).flat[np.abs(error).argmax()])
         errors.append(largest / max(float(np.max(size)), _TINY))
-        if abs(errors[0]) <= _NEGLIGIBLE:
+        least = _FALLS * abs(errors[-2]) if len(errors) > 1 else 0.0
+        if falls := abs(errors[-1]) <= max(least, _NEGLIGIBLE):
             break
-    told = f"undriven for {n} sub-steps of {h:g} s, {_share(errors[0])} of the largest is missing"
+    told = f"undriven for {n} sub-steps of {h:g} s, off by {errors[0]:+.0e} of the largest energy"
     if len(errors) == 1:
         return CheckItem(name, True, told)
-    told += f", and {_share(errors[1])} with sub-steps a quarter as long"
-    if abs(errors[1]) <= _FALLS * abs(errors[0]):
+    told += f", by {errors[-1]:+.0e} with sub-steps {_FINER[len(errors) - 1]} times as short"
+    if falls:
         return CheckItem(name, True, f"{told}: the integrator's error")
     clips = [
         method
         for method in ("limit", "limit_velocity")
         if getattr(type(plant), method) is not getattr(AnalyticTwin, method)
     ]
-    if clips and errors[1] < 0.0:
+    if clips and errors[-1] < 0.0:
         return CheckItem(name, True, f"{told}: {' and '.join(clips)} dissipates")
     return CheckItem(
         name,
@@ -191,11 +192,6 @@ def _energy_item(plant: AnalyticTwin, points: Points) -> CheckItem:
         f"{told}, which is no error of the integrator",
         "Look at the integrator, and at step, limit and limit_velocity, if the twin has its own.",
     )
-
-
-def _share(error: float) -> str:
-    """Of the energy that is missing; one that is gained is less than none."""
-    return f"{-error:.0e}" if error else "nothing"
 
 
 def _balance(plant: AnalyticTwin, h: float, n: int, finer: int) -> Callable[..., Any]:
