@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from sb3_hds.core import Effect, Trajectories, Twin
 from sb3_hds.core.contract import check_methods
-from sb3_hds.effects import ALL
+from sb3_hds.effects import ALL, effect_named
 from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.calibrate import check_fits
 from sb3_hds.sysid.diagnosis import Diagnosis
@@ -88,19 +88,14 @@ def classes_of(
     effects: type[Effect] | str | Iterable[type[Effect] | str],
 ) -> tuple[type[Effect], ...]:
     """
-    :param effects: classes, or names of the catalogue, of which a single one may stand alone
+    :param effects: classes, or names of the catalogue, of which a single one may stand alone:
+        ``"coulomb_friction"`` or ``"CoulombFriction"``
     :raises EffectError: for anything else
     """
-    known = {effect.name: effect for effect in ALL}
     given: list[Any] = [effects]
     if isinstance(effects, Iterable) and not isinstance(effects, str | type):
         given = list(effects)
-    unknown = [one for one in given if isinstance(one, str) and one not in known]
-    if unknown:
-        raise EffectError(
-            f"There is no effect {', '.join(unknown)}. There are: {', '.join(known)}."
-        )
-    found = [known[one] if isinstance(one, str) else one for one in given]
+    found = [effect_named(one, ALL) if isinstance(one, str) else one for one in given]
     wrong = [one for one in found if not (isinstance(one, type) and issubclass(one, Effect))]
     if wrong:
         raise EffectError(
