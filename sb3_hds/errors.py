@@ -13,6 +13,10 @@ class NoTwinError(SB3HDSError, LookupError):
     """No twin is registered for an environment or a name."""
 
 
+class TwinError(SB3HDSError, ValueError):
+    """A twin does not keep the contract: a declaration, or what a method returns, is wrong."""
+
+
 class ParameterError(SB3HDSError, ValueError):
     """A physical parameter is unknown, out of its bounds, or not finite."""
 

@@ -58,7 +58,7 @@ def test_any_verdict_is_success(tmp_path, capsys):
     [
         ({"--twin": "Nothing"}, "There is no twin for 'Nothing'"),
         ({"--data": "missing.npz"}, "missing.npz"),
-        ({"--effects": "magic"}, "There is no effect magic"),
+        ({"--effects": "magic"}, "There is no effect 'magic'"),
         ({"--set": "mass=2"}, "--set takes NAME:VALUE, got 'mass=2'"),
         ({"--set": "mass:"}, "--set takes NAME:VALUE, got 'mass:'"),
         ({"--set": "mass:-1"}, "mass"),

@@ -183,7 +183,7 @@ class Nondescript(JointEffect):
 @pytest.mark.parametrize(
     ("changes", "error", "says"),
     [
-        ({"effects": ["rubbing"]}, EffectError, "no effect rubbing. There are: viscous_friction"),
+        ({"effects": ["rubbing"]}, EffectError, "no effect 'rubbing'. There are: viscous_friction"),
         ({"effects": [effects.CoulombFriction(0)]}, EffectError, "effects are classes"),
         ({"effects": None}, EffectError, "got None. Leave them out to try the whole catalogue"),
         ({"effects": [Nondescript]}, EffectError, "Nondescript lacks explanation"),

@@ -376,7 +376,9 @@ def objection(words: list[str]) -> str | None:
         case ["sb3-hds", *options]:
             try:
                 cli.parser().parse_args(options)
-            except SystemExit:
+            except SystemExit as end:
+                if end.code == 0:
+                    return None
                 return f"sb3-hds does not take {' '.join(options)}"
             return None
         case ["python", script, *options]:
@@ -398,9 +400,9 @@ def _unknown_packages(words: list[str]) -> str | None:
     for word in words:
         name, _, extras = word.partition("[")
         extra = [e for e in extras.rstrip("]").split(",") if e]
-        if name == "sb3-hds" and not set(extra) <= set(project["optional-dependencies"]):
+        if name in ("sb3-hds", ".") and not set(extra) <= set(project["optional-dependencies"]):
             return f"no extra {extra}"
-        if name not in (project["name"], "torch") and not word.startswith(("-", "http")):
+        if name not in (project["name"], ".", "torch") and not word.startswith(("-", "http")):
             return f"unknown package {name}"
     return None
 

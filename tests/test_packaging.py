@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import sysconfig
+import tomllib
 import venv
 import zipfile
 from importlib.util import find_spec
@@ -75,6 +76,19 @@ def installed(tmp_path_factory, wheel) -> Environment:
     environment = Environment(tmp_path_factory.mktemp("wheel"))
     environment.install(wheel)
     return environment
+
+
+def test_an_extra_is_one_that_something_uses_and_the_documentation_lists():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    files = [*ROOT.glob("sb3_hds/**/*.py"), *ROOT.glob("rl_zoo_plugin/**/*.py")]
+    source = "\n".join(file.read_text() for file in files)
+    listed = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs/guide/install.md").read_text(), re.M)
+
+    assert set(listed) == set(extras)
+    for name in set(extras) - {"dev"}:
+        packages = [re.split(r"[\[>=<!]", package)[0] for package in extras[name]]
+        assert any(re.search(rf"\b{package}\b", source) for package in packages), name
 
 
 @needs_build

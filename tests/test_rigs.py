@@ -259,6 +259,7 @@ def test_a_logged_gain_takes_the_place_of_the_parameter(x64):
     found = replayed(logged, [0.1], np.column_stack([goals, np.ones(40), np.full(40, 123.0)]))
 
     np.testing.assert_allclose(found, replayed(plain, [0.1], goals), rtol=1e-9)
+    assert "kp" in plain.parameters and "kp" not in logged.parameters
 
 
 @pytest.mark.parametrize("name", (*RIGS, "CartPole"))

@@ -2,6 +2,7 @@
 
 import csv
 import functools
+import zipfile
 
 import gymnasium
 import numpy as np
@@ -65,7 +66,18 @@ def test_a_table_has_shares_of_the_return_without_perturbation():
 
     assert found.share("push") == 0.375
     assert "push" in str(found) and "0.38" in str(found)
-    assert np.isnan(Robustness({"none": np.array([-1.0])}).share("none"))
+
+
+def test_what_means_nothing_is_left_out_of_the_table():
+    """A share of a return that is negative, and the spread of a single episode."""
+    negative = Robustness({"none": np.array([-100.0, -300.0]), "push": np.array([-400.0, -500.0])})
+    single = Robustness({"none": np.array([100.0]), "push": np.array([50.0])})
+
+    assert negative.share("push") is None and "share  " not in str(negative)
+    assert "so there are no shares of it" in str(negative) and "-450.0" in str(negative)
+    assert single.to_rows()[1]["std"] is None and "std" not in str(single)
+    assert "Return of one episode each" in str(single) and "0.50" in str(single)
+    assert "nan" not in f"{negative}{single}"
 
 
 def test_a_question_that_makes_no_sense_is_refused(swimmer):
@@ -207,4 +219,26 @@ def test_the_command_names_an_algorithm_that_there_is_not(capsys):
     words = ["--algo", "opneloop", "--model", "model.zip", "--env", "Swimmer-v5"]
 
     assert cli.main(["robustness", *words]) == 1
-    assert "no algorithm 'opneloop'" in capsys.readouterr().err
+    assert "no algorithm 'opneloop'. Did you mean 'openloop'?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("modle.zip", "There is no model '{folder}/modle.zip'. Did you mean '{folder}/model.zip'?"),
+        ("modle", "There is no model '{folder}/modle'. Did you mean"),
+        ("text.zip", "text.zip holds no model of droq: "),
+        ("other.zip", "other.zip holds no model of droq: "),
+    ],
+)
+def test_a_model_that_there_is_not_is_told_in_one_line(path, message, tmp_path, capsys):
+    (tmp_path / "model.zip").touch()
+    (tmp_path / "text.zip").write_text("no archive")
+    with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
+        archive.writestr("data", "{}")
+    words = ["--algo", "droq", "--model", str(tmp_path / path), "--env", "Pendulum-v1"]
+
+    assert cli.main(["robustness", *words]) == 1
+    told = capsys.readouterr().err
+    assert message.format(folder=tmp_path) in told and ".zip.zip" not in told
+    assert told.count("\n") == 1

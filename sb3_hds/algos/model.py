@@ -7,7 +7,7 @@ from typing import Any
 from sb3_hds import effects, twins
 from sb3_hds.core import Effect, Twin
 from sb3_hds.core.layers import plant_of
-from sb3_hds.errors import EffectError, NoTwinError, RewardError
+from sb3_hds.errors import NoTwinError, RewardError
 
 
 def check_reward(twin: Twin) -> None:
@@ -60,15 +60,14 @@ def missing_effects(twin: Twin, wanted: Sequence[str | dict[str, Any]]) -> list[
     :return: those that the twin does not have yet
     :raises EffectError: for a name that is not in the catalogue
     """
-    check_known(entry if isinstance(entry, str) else entry["effect"] for entry in wanted)
-    known = {effect.name: effect for effect in effects.KNOWN}
     found: list[Effect] = []
     for entry in wanted:
         if isinstance(entry, str):
-            effect = known[entry]
+            effect = effects.effect_named(entry, effects.KNOWN)
             found += [effect(place.name) for place in _places(twin)[effect.slot]]
         else:
-            effect, options = known[entry["effect"]], entry.get("options", {})
+            effect = effects.effect_named(entry["effect"], effects.KNOWN)
+            options = entry.get("options", {})
             found.append(effect(entry["where"], **options, **entry["parameters"]))
     return [effect for effect in found if not _has(twin, effect)]
 
@@ -77,13 +76,8 @@ def check_known(names: Iterable[str]) -> None:
     """
     :raises EffectError: for a name that is not in the catalogue
     """
-    known = {effect.name for effect in effects.KNOWN}
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise EffectError(
-            f"There is no effect called {', '.join(unknown)}. The catalogue has: "
-            f"{', '.join(effect.name for effect in effects.ALL)}."
-        )
+    for name in names:
+        effects.effect_named(name, effects.KNOWN)
 
 
 def nulls_of(attached: Sequence[Effect]) -> dict[str, float]:

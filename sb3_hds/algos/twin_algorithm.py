@@ -49,6 +49,7 @@ from sb3_hds.algos.selection import (
 from sb3_hds.algos.tensor_algorithm import TensorAlgorithm
 from sb3_hds.algos.twin_policy import TwinPolicy, all_finite
 from sb3_hds.core import Params, Twin
+from sb3_hds.core.contract import check_methods
 from sb3_hds.envs.mirror import check_mirrors, twin_of
 from sb3_hds.errors import DivergedError
 
@@ -317,6 +318,7 @@ class TwinAlgorithm(TensorAlgorithm):
             elif twin is not None:
                 check_mirrors(self.env, twin)
         if twin is not None:
+            check_methods(twin)
             check_reward(twin)
             twin = self._prepared(twin)
             if self.twin is not None and (twin != self.twin or twin.values != self.twin.values):

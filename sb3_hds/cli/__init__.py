@@ -8,24 +8,49 @@
     sb3-hds audit --data 'logs/*.csv' --columns map.yml
     sb3-hds calibrate --twin LinearAxis --data log.mat --columns map.yml --write axis.json
     sb3-hds robustness --algo openloop --model model.zip --env Swimmer-v5
-    sb3-hds effects
+    sb3-hds effects friction
     sb3-hds twins
+    sb3-hds twins check my_module:MyTwin
 """
 
 import argparse
+import os
+import signal
 import sys
 import warnings
 from collections.abc import Sequence
 from typing import Any
 
+_INTERRUPTED = "sb3-hds: interrupted"
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """
     :param arguments: as on the command line; default: those of this process
-    :return: 0 on any verdict; 1 where the question makes no sense, with one line on why
+    :return: 0 on any verdict; 1 where the question makes no sense, with one line on why, or where
+        a twin fails its check; 130 where it is interrupted
+    :raises SystemExit: for words that are no command, with 2
     """
-    given = parser().parse_args(arguments)
-    from sb3_hds.cli import audit, calibrate, columns, diagnose, listing, robustness
+    if arguments is None:
+        signal.signal(signal.SIGINT, _stop)
+    try:
+        return _run(parser().parse_args(arguments))
+    except KeyboardInterrupt:
+        print(_INTERRUPTED, file=sys.stderr)
+        return 130
+
+
+def _stop(*_: Any) -> None:
+    """End at once: an exception gets lost in a callback of JAX, and breaks the import of one."""
+    for stream in (sys.stdout, sys.stderr):
+        # A progress bar has hidden the cursor.
+        print("\x1b[?25h" if stream.isatty() else "", end="", file=stream, flush=True)
+    print(_INTERRUPTED, file=sys.stderr, flush=True)
+    os._exit(130)
+
+
+def _run(given: argparse.Namespace) -> int:
+    from sb3_hds.cli import audit, calibrate, columns, diagnose, listing, robustness, twins
     from sb3_hds.errors import SB3HDSError
 
     try:
@@ -33,24 +58,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.showwarning = _warn
             # Meant for programmers.
             warnings.simplefilter("ignore", DeprecationWarning)
-            {
+            code = {
                 "columns": columns.run,
                 "audit": audit.run,
                 "calibrate": calibrate.run,
                 "diagnose": diagnose.run,
                 "robustness": robustness.run,
-                "effects": listing.effects,
-                "twins": listing.twins,
+                "effects": listing.run_effects,
+                "twins": twins.run,
             }[given.command](given)
+            return code or 0
     except BrokenPipeError:
         return 0
     except (SB3HDSError, OSError, ImportError) as error:
         print(f"sb3-hds: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("sb3-hds: interrupted", file=sys.stderr)
-        return 130
-    return 0
 
 
 def _warn(
@@ -67,13 +89,15 @@ def _warn(
 
 def parser() -> argparse.ArgumentParser:
     """:return: what the command understands"""
-    from sb3_hds.cli import audit, calibrate, columns, measured
+    from sb3_hds.cli import audit, calibrate, columns, measured, twins
+    from sb3_hds.cli.parsing import Parser, Version
 
-    every = argparse.ArgumentParser(
+    every = Parser(
         prog="sb3-hds",
         description="What a simulation gets wrong, and what a policy endures.",
     )
-    commands = every.add_subparsers(dest="command", required=True)
+    every.add_argument("--version", action=Version)
+    commands = every.add_subparsers(dest="command", required=True, metavar="command")
     ask = commands.add_parser("diagnose", help="name the cause, from measured data")
     measured.add_arguments(ask)
     ask.add_argument("--calibrate", nargs="*", default=[], help="parameters that are not believed")
@@ -117,6 +141,16 @@ def parser() -> argparse.ArgumentParser:
     shake.add_argument("--push", type=float, default=5.0, help="force on the torso [N]")
     shake.add_argument("--csv", help="table to write")
     columns.add(commands)
-    commands.add_parser("effects", help="list the candidates, with units and explanations")
-    commands.add_parser("twins", help="list the simulations, with their parameters")
+    known = commands.add_parser("effects", help="list the candidates, with units and explanations")
+    known.add_argument(
+        "words",
+        nargs="*",
+        metavar="WORD",
+        help="list only those that mention all of these",
+    )
+    twins.add_arguments(
+        commands.add_parser(
+            "twins", help="list the simulations, with their parameters, or check one"
+        )
+    )
     return every

@@ -27,14 +27,15 @@ def algorithm(name: str) -> Any:
     :raises ParameterError: if there is none, or if it loads no model
     """
     from sb3_hds.algos import ALL
-    from sb3_hds.errors import ParameterError
+    from sb3_hds.errors import ParameterError, did_you_mean
 
     if name in ALL:
         return ALL[name]
     if name not in _THEIRS and "." not in name:
-        known = ", ".join([*ALL, *_THEIRS])
+        known = [*ALL, *_THEIRS]
         raise ParameterError(
-            f"There is no algorithm '{name}'. There are: {known}; or name a class: sbx.SAC."
+            f"There is no algorithm '{name}'.{did_you_mean(name.lower(), known)} There are: "
+            f"{', '.join(known)}; or name a class: sbx.SAC."
         )
     found = _class_of(_THEIRS.get(name, name))
     if not hasattr(found, "load"):

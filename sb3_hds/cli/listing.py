@@ -17,23 +17,22 @@ _OF_A_TWIN = (
 )
 
 
-def effects(given: argparse.Namespace) -> None:
-    """All candidates, with units and explanations."""
+def run_effects(given: argparse.Namespace) -> None:
+    """All candidates, or those that have the words, with units and explanations."""
     from sb3_hds.effects import ALL
 
-    _show(
-        ("effect", "acts on", "parameters", "what it is"),
-        [
-            (
-                effect.name,
-                effect.slot,
-                ", ".join(map(_sized, effect.parameters.items())),
-                effect.explanation + _FURTHER.get(effect.name, ""),
-            )
-            for effect in ALL
-        ]
-        + [("parameter.NAME", "twin", "its own [unit]", _OF_A_TWIN)],
-    )
+    columns = ("effect", "acts on", "parameters", "what it is")
+    rows = [
+        (
+            effect.name,
+            effect.slot,
+            ", ".join(map(_sized, effect.parameters.items())),
+            effect.explanation + _FURTHER.get(effect.name, ""),
+        )
+        for effect in ALL
+    ]
+    rows.append(("parameter.NAME", "twin", "its own [unit]", _OF_A_TWIN))
+    _show(columns, _with_words(rows, given.words, "effect"))
     print(
         "Units at joints are those of a rotary joint; for a slider, read N and m in place of N m "
         "and rad."
@@ -46,13 +45,13 @@ def _sized(parameter: "tuple[str, Parameter]") -> str:
     return "on or off" if switch else f"{name} [{known.unit}]"
 
 
-def twins(given: argparse.Namespace) -> None:
-    """All simulations, with parameters and options."""
-    from sb3_hds.twins import make, names
+def twins(words: Sequence[str]) -> None:
+    """All simulations, or those that have the words, with parameters and options."""
+    from sb3_hds.twins import get, names
 
     rows = []
     for name in names():
-        twin = make(name)
+        twin = get(name)()
         explained = (inspect.getdoc(type(twin)) or "").partition("\n\n")[0].replace("\n", " ")
         described = ", ".join(
             f"{key} {value:g} {twin.parameters[key].unit}" for key, value in twin.values.items()
@@ -65,7 +64,36 @@ def twins(given: argparse.Namespace) -> None:
                 f"{described}\noptions: {options}",
             )
         )
-    _show(("twin, environment", "what it is", "parameters and options, for --set"), rows)
+    columns = ("twin, environment", "what it is", "parameters and options, for --set")
+    _show(columns, _with_words(rows, words, "twin"))
+
+
+def _with_words(
+    rows: Sequence[tuple[str, ...]], words: Sequence[str], kind: str
+) -> Sequence[tuple[str, ...]]:
+    """
+    Those that have all the words, in any case and with any hyphens.
+
+    :raises ParameterError: if there are none
+    """
+    from sb3_hds.errors import ParameterError, did_you_mean
+
+    spoken = [_spoken(" ".join(row)) for row in rows]
+    found = [
+        row
+        for row, text in zip(rows, spoken, strict=True)
+        if all(_spoken(word) in text for word in words)
+    ]
+    if not found:
+        unknown = next((word for word in words if not any(_spoken(word) in t for t in spoken)), "")
+        vocabulary = {"check", *(word for text in spoken for word in text.split())}
+        meant = did_you_mean(_spoken(unknown), vocabulary)
+        raise ParameterError(f"No {kind} mentions '{' '.join(words)}'.{meant}")
+    return found
+
+
+def _spoken(text: str) -> str:
+    return re.sub(r"[\W_]+", " ", text.lower()).strip()
 
 
 def _show(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

@@ -26,7 +26,7 @@ from sb3_hds.core.types import (
     Tangent,
     Velocity,
 )
-from sb3_hds.errors import EffectError, ParameterError
+from sb3_hds.errors import EffectError, ParameterError, TwinError, did_you_mean
 
 if TYPE_CHECKING:
     from sb3_hds.core.effect import Effect
@@ -66,6 +66,7 @@ class Twin(abc.ABC):
     :param substeps: internal steps per control interval; default: the class attribute
     :param settings: values of parameters by name, and of the options that the class declares
     :raises ParameterError: for a name that is neither, a value out of bounds, or an impossible step
+    :raises TwinError: for a class without name, or whose parameters are no ``Parameter``
     """
 
     name: str
@@ -91,7 +92,8 @@ class Twin(abc.ABC):
     def __init__(
         self, *, dt: float | None = None, substeps: int | None = None, **settings: Any
     ) -> None:
-        dt = self.dt if dt is None else dt
+        self._check_declared()
+        dt = getattr(self, "dt", None) if dt is None else dt
         substeps = self.substeps if substeps is None else substeps
         whole = isinstance(substeps, Integral) and substeps >= 1
         if not (whole and isinstance(dt, Real) and 0.0 < dt < math.inf):
@@ -271,6 +273,19 @@ class Twin(abc.ABC):
         values = ", ".join(f"{name}={value:g}" for name, value in self.values.items())
         return f"{type(self).__name__}({values})"
 
+    def _check_declared(self) -> None:
+        """What has to be there before there are values."""
+        kind = type(self).__name__
+        if not isinstance(getattr(self, "name", None), str):
+            raise TwinError(f"{kind} has no name. Write it into the class: name = 'MyTwin'.")
+        declared = getattr(self, "parameters", None)
+        entries = declared.values() if isinstance(declared, Mapping) else [declared]
+        if not all(isinstance(entry, Parameter) for entry in entries):
+            raise TwinError(
+                f"{kind} must declare parameters as a dictionary of Parameter by name, {{}} where "
+                f"there are none, got {declared!r}."
+            )
+
     def _mirror(self, base: "Twin") -> None:
         """Take over what a twin that wraps ``base`` has in common with it."""
         self.name, self.env_id = base.name, base.env_id
@@ -287,7 +302,9 @@ class Twin(abc.ABC):
             if name not in self.parameters:
                 known = ", ".join(self.parameters) or "none"
                 choices = f"; its options are: {', '.join(self.options)}" if self.options else ""
+                meant = did_you_mean(name, (*self.parameters, *self.options, "dt", "substeps"))
                 raise ParameterError(
-                    f"{self.name} has no parameter '{name}'. Its parameters are: {known}{choices}."
+                    f"{self.name} has no parameter '{name}'.{meant} Its parameters are: "
+                    f"{known}{choices}."
                 )
             self.values[name] = self.parameters[name].check(name, value)

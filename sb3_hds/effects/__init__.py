@@ -19,6 +19,7 @@ from sb3_hds.effects.joint import (
     ViscousFriction,
 )
 from sb3_hds.effects.nameless import ClearanceSpring, Hysteresis
+from sb3_hds.effects.names import effect_named
 from sb3_hds.effects.neural import NeuralForce, force_of
 from sb3_hds.effects.position import Cogging, ConstantForce, CubicStiffness, Stiffness
 from sb3_hds.effects.sensor import (
@@ -96,6 +97,7 @@ __all__ = [
     "StribeckFriction",
     "TorqueGain",
     "ViscousFriction",
+    "effect_named",
     "force_of",
     "reversed_joint",
 ]

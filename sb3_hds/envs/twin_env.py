@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_hds.core import Actuator, Channel, State, Twin
+from sb3_hds.core.contract import check_methods
 from sb3_hds.envs import programs
 from sb3_hds.envs.doors import check_action, check_start, start_of
 from sb3_hds.twins import registry
@@ -32,6 +33,7 @@ class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         name, also its options, ``dt`` [s] and ``substeps``
     :raises NoTwinError: for a name that is not registered
     :raises ParameterError: for a setting that the twin does not have, or a value out of bounds
+    :raises TwinError: for a twin whose methods do not return what they have to
     :raises ValueError: for another render mode
     """
 
@@ -126,8 +128,10 @@ def twin_from(twin: Twin | str, settings: Mapping[str, Any]) -> Twin:
     """
     :return: the twin that is meant, with ``settings``
     :raises TypeError: for neither a twin nor a name
+    :raises TwinError: for a twin whose methods do not return what they have to
     """
     if isinstance(twin, Twin):
+        check_methods(twin)
         return twin.with_parameters(**settings) if settings else twin
     if isinstance(twin, str):
         return registry.make(twin, **settings)

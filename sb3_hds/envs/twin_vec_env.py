@@ -47,6 +47,7 @@ class TwinVecEnv(VecEnv):
         name, also its options, ``dt`` [s] and ``substeps``
     :raises NoTwinError: for a name that is not registered
     :raises ParameterError: for a setting that the twin does not have, or a value out of bounds
+    :raises TwinError: for a twin whose methods do not return what they have to
     :raises ValueError: for no copies, an impossible limit, or another render mode
     """
 

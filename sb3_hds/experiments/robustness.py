@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 import textwrap
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -42,18 +43,18 @@ class Robustness:
     returns: Mapping[str, Float[np.ndarray, " episodes"]]
     left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
-    def share(self, perturbation: str) -> float:
-        """:return: mean return as a share of the unperturbed one, nan unless that is positive"""
+    def share(self, perturbation: str) -> float | None:
+        """:return: mean return as a share of the unperturbed one; None unless that is positive"""
         whole = float(np.mean(self.returns["none"]))
-        return float(np.mean(self.returns[perturbation])) / whole if whole > 0.0 else float("nan")
+        return float(np.mean(self.returns[perturbation])) / whole if whole > 0.0 else None
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """:return: plain data, one row for each perturbation"""
+        """:return: plain data, one row for each perturbation; None where a number means nothing"""
         return [
             {
                 "perturbation": name,
                 "return": float(np.mean(values)),
-                "std": float(np.std(values)),
+                "std": float(np.std(values)) if len(values) > 1 else None,
                 "worst": float(np.min(values)),
                 "share": self.share(name),
             }
@@ -61,20 +62,32 @@ class Robustness:
         ]
 
     def __str__(self) -> str:
-        n = len(self.returns["none"])
-        lines = [
-            f"Return over {n} episodes from the same starts:",
-            f"  {'perturbation':<16}{'return':>10}{'std':>9}{'worst':>10}{'share':>8}",
-        ]
-        for row in self.to_rows():
-            numbers = f"{row['return']:>10.1f}{row['std']:>9.1f}{row['worst']:>10.1f}"
-            lines.append(f"  {row['perturbation']:<16}{numbers}{row['share']:>8.2f}")
-        for name, why in self.left_out.items():
-            said = f"{name} is left out: {why}"
-            lines += textwrap.wrap(said, 78, initial_indent="  ", subsequent_indent="  ")
+        n, rows = len(self.returns["none"]), self.to_rows()
+        over = f"over {n} episodes from the same starts" if n > 1 else "of one episode each"
+        widths = {"return": 10, "std": 9, "worst": 10, "share": 8}
+        if n == 1:
+            del widths["std"], widths["worst"]
+        if rows[0]["share"] is None:
+            del widths["share"]
+        header = "".join(f"{name:>{width}}" for name, width in widths.items())
+        lines = [f"Return {over}:", f"  {'perturbation':<16}{header}"]
+        for row in rows:
+            cells = "".join(_cell(name, row[name], width) for name, width in widths.items())
+            lines.append(f"  {row['perturbation']:<16}{cells}")
+        notes = [f"{name} is left out: {why}" for name, why in self.left_out.items()]
+        if "share" not in widths:
+            notes.append("Unperturbed, the return is not positive, so there are no shares of it.")
+        for note in notes:
+            lines += textwrap.wrap(note, 78, initial_indent="  ", subsequent_indent="  ")
         return "\n".join(lines)
 
     __repr__ = __str__
+
+
+def _cell(name: str, value: float, width: int) -> str:
+    if not math.isfinite(value):
+        return f"{'infinite':>{width}}"
+    return f"{value:>{width}.{2 if name == 'share' else 1}f}"
 
 
 def measure_robustness(

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sb3_hds.core import Params, Trajectories, Twin
+from sb3_hds.core.contract import check_methods
 from sb3_hds.core.episodes import same_interval
 from sb3_hds.data.report import Reading
 from sb3_hds.effects import force_of
@@ -75,7 +76,9 @@ def calibrate(
     :raises CalibrationError: for an unknown or missing parameter, other channels or another
         interval than the twin's, or fewer measurements than unknowns
     :raises TrajectoryError: if no recording is as long as a window
+    :raises TwinError: for a twin whose methods do not return what they have to
     """
+    check_methods(twin)
     names = free_names(twin, free)
     check_fits(twin, data)
     if loss not in ("huber", "linear"):

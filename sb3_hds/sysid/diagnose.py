@@ -5,7 +5,8 @@ from numbers import Integral
 from typing import Any, Literal
 
 from sb3_hds.core import Effect, Trajectories, Twin
-from sb3_hds.effects import ALL
+from sb3_hds.core.contract import check_methods
+from sb3_hds.effects import ALL, effect_named
 from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.calibrate import check_fits
 from sb3_hds.sysid.diagnosis import Diagnosis
@@ -54,6 +55,7 @@ def diagnose(
     :raises CalibrationError: for other channels or another interval than the twin's, or an unknown
         name in ``calibrate``
     :raises EffectError: for an unknown effect, or a twin whose step does not use effects
+    :raises TwinError: for a twin whose methods do not return what they have to
     :raises TrajectoryError: if no recording is long enough
     """
     if not isinstance(twin, Twin) or not isinstance(data, Trajectories):
@@ -61,6 +63,7 @@ def diagnose(
             f"diagnose(twin, data) takes a twin, as from twins.make(...), and Trajectories, got "
             f"{type(twin).__name__} and {type(data).__name__}."
         )
+    check_methods(twin)
     check_fits(twin, data)
     if budget not in EFFORTS:
         raise CalibrationError(f"budget must be 'full' or 'quick', got {budget!r}.")
@@ -89,19 +92,14 @@ def classes_of(
     effects: type[Effect] | str | Iterable[type[Effect] | str],
 ) -> tuple[type[Effect], ...]:
     """
-    :param effects: classes, or names of the catalogue, of which a single one may stand alone
+    :param effects: classes, or names of the catalogue, of which a single one may stand alone:
+        ``"coulomb_friction"`` or ``"CoulombFriction"``
     :raises EffectError: for anything else
     """
-    known = {effect.name: effect for effect in ALL}
     given: list[Any] = [effects]
     if isinstance(effects, Iterable) and not isinstance(effects, str | type):
         given = list(effects)
-    unknown = [one for one in given if isinstance(one, str) and one not in known]
-    if unknown:
-        raise EffectError(
-            f"There is no effect {', '.join(unknown)}. There are: {', '.join(known)}."
-        )
-    found = [known[one] if isinstance(one, str) else one for one in given]
+    found = [effect_named(one, ALL) if isinstance(one, str) else one for one in given]
     wrong = [one for one in found if not (isinstance(one, type) and issubclass(one, Effect))]
     if wrong:
         raise EffectError(

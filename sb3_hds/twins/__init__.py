@@ -2,6 +2,8 @@
 
 from sb3_hds.twins.acrobot import Acrobot
 from sb3_hds.twins.cart_pole import CartPole
+from sb3_hds.twins.check import check
+from sb3_hds.twins.check_result import CheckItem, TwinCheck
 from sb3_hds.twins.double_pendulum import DoublePendulum
 from sb3_hds.twins.duffing import Duffing
 from sb3_hds.twins.free_pendulum import FreePendulum
@@ -40,6 +42,7 @@ for _twin in (
 __all__ = [
     "Acrobot",
     "CartPole",
+    "CheckItem",
     "DoublePendulum",
     "Duffing",
     "FreePendulum",
@@ -54,7 +57,9 @@ __all__ = [
     "PendulumReal",
     "Rig",
     "ServoPendulum",
+    "TwinCheck",
     "all_ids",
+    "check",
     "from_env",
     "from_spec",
     "get",

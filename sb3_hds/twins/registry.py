@@ -1,13 +1,16 @@
 """Which twins exist, by name and by environment id."""
 
 import importlib
+import inspect
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from sb3_hds.core import Effect, Twin, seen_through
-from sb3_hds.errors import NoTwinError, did_you_mean
+from sb3_hds.core.contract import check_methods, missing_methods
+from sb3_hds.errors import NoTwinError, TwinError, did_you_mean
 
 _TWINS: dict[str, type[Twin]] = {}
+_VARIADIC = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
 def register(twin: type[Twin]) -> type[Twin]:
@@ -18,21 +21,39 @@ def register(twin: type[Twin]) -> type[Twin]:
     :return: the class itself
     :raises TypeError: for anything but a subclass of ``Twin``
     :raises ValueError: if another class has the name or the id already
+    :raises TwinError: if a method is missing, or returns another shape or dtype than it has to
     """
     if not (isinstance(twin, type) and issubclass(twin, Twin)):
         raise TypeError(
             f"twins.register takes a subclass of Twin, got {twin!r}. "
             "Register the class, not an instance."
         )
-    for key in filter(None, (twin.name, twin.env_id)):
-        other = _TWINS.setdefault(key, twin)
+    if not isinstance(getattr(twin, "name", None), str):
+        raise TwinError(f"{twin.__name__} has no name. Write it into the class: name = 'MyTwin'.")
+    keys = [key for key in (twin.name, twin.env_id) if key]
+    for key in keys:
+        other = _TWINS.get(key, twin)
         if other.__qualname__ != twin.__qualname__:
             raise ValueError(
                 f"'{key}' is already the twin {other.__qualname__}. "
                 f"Choose another name for {twin!r}."
             )
-        _TWINS[key] = twin
+    if missing := missing_methods(twin):
+        raise TwinError(
+            f"{twin.__name__} lacks {', '.join(missing)}: implement what is abstract in "
+            f"{twin.__mro__[1].__name__}."
+        )
+    if _has_defaults(twin):
+        check_methods(twin())
+    _TWINS.update(dict.fromkeys(keys, twin))
     return twin
+
+
+def _has_defaults(twin: type[Twin]) -> bool:
+    """Whether it can be made without arguments; what cannot is checked on first use."""
+    arguments = inspect.signature(twin).parameters.values()
+    needed = [a for a in arguments if a.default is a.empty and a.kind not in _VARIADIC]
+    return hasattr(twin, "dt") and not needed
 
 
 def names() -> list[str]:
@@ -69,8 +90,11 @@ def make(name_or_env_id: str, **settings: Any) -> Twin:
     :param settings: values of parameters, options of the twin, ``dt`` [s], ``substeps``
     :raises NoTwinError: if there is no such twin
     :raises ParameterError: for a setting that the twin does not have, or a value out of bounds
+    :raises TwinError: for a twin whose methods do not return what they have to
     """
-    return get(name_or_env_id)(**settings)
+    twin = get(name_or_env_id)(**settings)
+    check_methods(twin)
+    return twin
 
 
 def from_env(env: Any) -> Twin:
@@ -79,13 +103,16 @@ def from_env(env: Any) -> Twin:
     :return: its twin, with the parameters that the environment was made with; the very twin that
         it simulates if it is made of one
     :raises NoTwinError: if its id has no twin
+    :raises TwinError: for a twin whose methods do not return what they have to
     """
     own = getattr(env.unwrapped, "twin", None)
     if isinstance(own, Twin):
         return own
     spec = getattr(env, "spec", None)
     env_id = spec.id if spec is not None else type(env.unwrapped).__name__
-    return get(env_id).from_env(env)
+    twin = get(env_id).from_env(env)
+    check_methods(twin)
+    return twin
 
 
 def from_spec(spec: Mapping[str, Any], effects: Iterable[type[Effect]] = ()) -> Twin:

@@ -22,10 +22,11 @@ from sb3_hds.twins.rig import TILT, Rig
 _GOAL = Actuator("goal", "rad", -math.pi, math.pi)
 _ENABLE = Actuator("enable", "1", 0.0, 1.0)
 _GAIN = Actuator("gain", "1", 0.0, math.inf)
+_LOGGED_GAIN = "goal, enable, gain"
 _COMMANDS = {
     "goal": (_GOAL,),
     "goal, enable": (_GOAL, _ENABLE),
-    "goal, enable, gain": (_GOAL, _ENABLE, _GAIN),
+    _LOGGED_GAIN: (_GOAL, _ENABLE, _GAIN),
 }
 
 
@@ -45,7 +46,7 @@ class ServoPendulum(Rig):
     Source: Duclusaud et al., arXiv 2410.08650, 2024, section III; a DC motor without inductance.
 
     :param commands: option; ``"goal"``, ``"goal, enable"`` or ``"goal, enable, gain"``: the latter
-        for logs over which the firmware's gain differs, which then replaces ``kp``
+        for logs over which the firmware's gain differs, which then replaces the parameter ``kp``
     """
 
     name = "ServoPendulum"
@@ -70,6 +71,8 @@ class ServoPendulum(Rig):
     native_effects = {("viscous_friction", 0): {"b": "damping"}}
 
     def __init__(self, **settings: object) -> None:
+        if settings.get("commands") == _LOGGED_GAIN:
+            self.parameters = {n: p for n, p in self.parameters.items() if n != "kp"}
         super().__init__(**settings)  # type: ignore[arg-type]
         if self.commands not in _COMMANDS:
             raise ParameterError(

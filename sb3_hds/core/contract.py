@@ -1,0 +1,277 @@
+"""What a twin declares, and the shape and dtype of what its methods return: checked before use."""
+
+import inspect
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from sb3_hds.core.analytic import AnalyticTwin
+from sb3_hds.core.layers import layers_of
+from sb3_hds.core.signals import Actuator, Channel, Joint
+from sb3_hds.core.twin import State, Twin
+from sb3_hds.errors import TwinError
+
+_SIGNALS = {"joints": Joint, "actuators": Actuator, "channels": Channel}
+_LONGEST = 200  # letters of another library's message
+_MOST_NAMED = 4
+_WAYS_OUT = {
+    "TracerBoolConversionError": "Replace `if` on an array by jnp.where.",
+    "ConcretizationTypeError": "Replace `if` and float() on an array by jnp.where and jnp.",
+    "TracerArrayConversionError": "Use jax.numpy in place of numpy and math.",
+}
+
+
+def check_methods(twin: Twin) -> None:
+    """
+    Check the declarations of a twin, and what each of its methods returns: type, shape, dtype.
+
+    Methods are evaluated abstractly (``jax.eval_shape``), in single and in double precision:
+    nothing is computed or compiled. A twin is checked once, equal twins are not checked again, and
+    those of the library are left to its tests.
+
+    :raises TwinError: in one line, with the method, what it should return, and what it does
+    """
+    try:
+        hash(twin)
+    except TypeError as error:
+        raise TwinError(
+            f"The options of {type(twin).__name__} must be hashable, for equal twins share a "
+            f"compiled program: {error}. Use tuples in place of lists."
+        ) from None
+    for layer in reversed(list(layers_of(twin))):
+        if not _is_tested_here(layer):
+            check_now(layer)
+
+
+def _is_tested_here(layer: Twin) -> bool:
+    """Whether nothing in it is of the user's own making."""
+    inside = (getattr(layer, name, None) for name in ("observation", "action", "stateful"))
+    parts = (layer, *getattr(layer, "effects", ()), *filter(None, inside))
+    return all(type(part).__module__.partition(".")[0] == "sb3_hds" for part in parts)
+
+
+@lru_cache(maxsize=256)
+def check_now(twin: Twin) -> None:
+    """
+    :func:`check_methods` of one layer of a twin, whoever wrote it.
+
+    :raises TwinError: as there
+    """
+    _check_declarations(twin)
+    for double in (False, True):
+        with jax.enable_x64(double):
+            _check_returns(twin, jnp.float64 if double else jnp.float32)
+
+
+def _check_declarations(twin: Twin) -> None:
+    kind = type(twin).__name__
+    for name, signal in _SIGNALS.items():
+        declared = getattr(twin, name, None)
+        form = f"{name} = ({signal.__name__}(...),)"
+        if not isinstance(declared, Sequence) or any(
+            not isinstance(one, signal) for one in declared
+        ):
+            raise TwinError(
+                f"{kind} must declare {name} as a tuple of {signal.__name__}, got {declared!r}. "
+                f"Write {form}, with a comma even after a single one."
+            )
+        twice = [one for one, n in Counter(signal.name for signal in declared).items() if n > 1]
+        if twice:
+            raise TwinError(f"{kind} has {name} of the same name: {', '.join(twice)}. Rename one.")
+    for signal in (*twin.actuators, *twin.channels):
+        if not signal.low < signal.high:
+            raise TwinError(
+                f"The limits of '{signal.name}' in {kind} must be low < high, got {signal.low} and "
+                f"{signal.high}."
+            )
+    for place, targets in twin.native_effects.items():
+        unknown = set(targets.values()) - set(twin.parameters)
+        if unknown:
+            raise TwinError(
+                f"native_effects of {kind} maps {place} to {', '.join(sorted(unknown))}, which is "
+                f"no parameter. Its parameters are: {', '.join(twin.parameters) or 'none'}."
+            )
+
+
+def _check_returns(twin: Twin, dtype: Any) -> None:
+    """:param dtype: of everything that goes in, and therefore of everything that comes out"""
+
+    def array(*shape: int) -> Any:
+        return jax.ShapeDtypeStruct(shape, dtype)
+
+    def in_dtype(leaf: Any) -> jax.ShapeDtypeStruct:
+        like = jnp.result_type(leaf)
+        kept = like if not jnp.issubdtype(like, jnp.floating) else dtype
+        return jax.ShapeDtypeStruct(getattr(leaf, "shape", ()), kept)
+
+    dof = len(twin.joints)
+    joints, channels = _listed("joint", twin.joints), _listed("channel", twin.channels)
+    per_joint = f"one entry for each {joints}"
+    params = jax.tree.map(in_dtype, twin.params)
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    call = _Caller(twin, dtype)
+
+    state = call("initial", key, params)
+    call.expect_state("initial", state, dof, per_joint, any_float=True)
+    state = State(array(dof), array(dof), jax.tree.map(in_dtype, state.memory))
+    obs, action = array(len(twin.channels)), array(len(twin.actuators))
+
+    inferred = call("infer", obs, params)
+    call.expect_state("infer", inferred, dof, per_joint)
+    seen = call("observe", state, params)
+    call.expect("observe", seen, obs, f"one entry for each {channels}")
+    if isinstance(twin, AnalyticTwin):
+        q, v = state.q, state.v
+        force = f"one generalised force for each {joints}, zero where nothing pushes"
+        call.expect("actuate", call("actuate", state, action, params), q, force)
+        square = f"a row and a column for each {joints}"
+        call.expect("mass_matrix", call("mass_matrix", q, params), array(dof, dof), square)
+        call.expect("bias", call("bias", q, v, params), q, force)
+        call.expect("limit_velocity", call("limit_velocity", v), v, per_joint)
+        limited = call("limit", q, v)
+        if not (isinstance(limited, tuple) and len(limited) == 2):
+            call.refuse("limit", _described(limited), "the pair (q, v)")
+        for part, like in zip(limited, (q, v), strict=True):
+            call.expect("limit", part, like, per_joint)
+    after = call("step", state, action, params)
+    call.expect_state("step", after, dof, per_joint, memory=state.memory)
+    number = "one number; over joints, take jnp.sum(...) or an entry"
+    for method in ("reward", "planning_reward"):
+        call.expect(method, call(method, state, action, state, params), array(), number)
+    over = jax.ShapeDtypeStruct((), jnp.bool_)
+    truth = "one truth value; over joints, take jnp.any(...)"
+    call.expect("terminated", call("terminated", state, params), over, truth)
+    tangent = call("difference", state, state)
+    if getattr(tangent, "ndim", None) != 1:
+        call.refuse("difference", _described(tangent), "a vector")
+    call.expect("difference", tangent, tangent, "a vector")
+    moved = call("retract", state, tangent)
+    call.expect_state("retract", moved, dof, per_joint, memory=state.memory)
+    points = call("sketch", state, params)
+    if getattr(points, "shape", ())[1:] != (2,):
+        call.refuse("sketch", _described(points), "shape (points, 2): two coordinates of each")
+
+
+class _Caller:
+    """Evaluates methods of a twin abstractly, and says in one line what is wrong with them."""
+
+    def __init__(self, twin: Twin, dtype: Any) -> None:
+        self.twin, self.dtype = twin, jnp.dtype(dtype)
+
+    def __call__(self, method: str, *arguments: Any) -> Any:
+        function = getattr(self.twin, method)
+        try:
+            return jax.eval_shape(function, *arguments)
+        except TwinError:
+            raise
+        except Exception as error:
+            raise TwinError(self._failure(method, function, error)) from error
+
+    def expect(self, method: str, found: Any, like: Any, meaning: str) -> None:
+        """:param meaning: of the shape, in words"""
+        if not isinstance(found, jax.ShapeDtypeStruct):
+            self.refuse(method, _described(found), f"one array of shape {like.shape}: {meaning}")
+        if found.shape != like.shape:
+            self.refuse(method, f"shape {found.shape}", f"{like.shape}: {meaning}")
+        if found.dtype != like.dtype:
+            self.refuse(method, str(found.dtype), f"{like.dtype}. {self._cast(found, like)}")
+
+    def expect_state(
+        self,
+        method: str,
+        found: Any,
+        dof: int,
+        meaning: str,
+        *,
+        memory: Any = None,
+        any_float: bool = False,
+    ) -> None:
+        """
+        :param memory: what the state's has to be like; None: anything
+        :param any_float: whether another precision will do
+        """
+        if not isinstance(found, State):
+            self.refuse(method, _described(found), "State(q, v, memory)")
+        for part in ("q", "v"):
+            entry = getattr(found, part)
+            other = any_float and jnp.issubdtype(getattr(entry, "dtype", int), jnp.floating)
+            like = jax.ShapeDtypeStruct((dof,), entry.dtype if other else self.dtype)
+            self.expect(f"{method}(...).{part}", entry, like, meaning)
+        if not isinstance(found.memory, dict):
+            self.refuse(
+                f"{method}(...).memory", _described(found.memory), "a dictionary, {} where nothing "
+                "is remembered"
+            )  # fmt: skip
+        if memory is not None and _summary(found.memory) != _summary(memory):
+            self.refuse(
+                f"{method}(...).memory", str(_summary(found.memory)), f"{_summary(memory)}, as it "
+                "went in. Pass state.memory on"
+            )  # fmt: skip
+
+    def refuse(self, method: str, found: str, expected: str) -> None:
+        raise TwinError(
+            f"{type(self.twin).__name__}.{method} returns {found}, expected {expected}."
+        )
+
+    def _failure(self, method: str, function: Callable[..., Any], error: Exception) -> str:
+        told = " ".join(str(error).split())
+        told = told if len(told) <= _LONGEST else f"{told[:_LONGEST]}..."
+        names = [base.__name__ for base in type(error).__mro__]
+        way_out = next((f" {_WAYS_OUT[name]}" for name in names if name in _WAYS_OUT), "")
+        if isinstance(error, KeyError):
+            way_out = f" Its parameters are: {', '.join(self.twin.params) or 'none'}."
+        return (
+            f"{type(self.twin).__name__}.{method} raises {type(error).__name__}"
+            f"{_line_of(function, error)}: {told}.{way_out}"
+        )
+
+    def _cast(self, found: Any, like: Any) -> str:
+        if like.dtype == jnp.bool_:
+            return "Compare, as in jnp.abs(state.q[0]) > 1.0"
+        if not jnp.issubdtype(found.dtype, jnp.floating):
+            return "Write constants with a decimal point, and 1.0 * (...) around comparisons"
+        return (
+            "Data are fitted in double precision and policies trained in single: make arrays with "
+            "the dtype of what comes in, as in jnp.zeros(3, q.dtype)"
+        )
+
+
+def missing_methods(kind: type[Twin]) -> list[str]:
+    """:return: the abstract methods that a class does not implement"""
+    return sorted(getattr(kind, "__abstractmethods__", ())) if inspect.isabstract(kind) else []
+
+
+def _listed(what: str, signals: Sequence[Any]) -> str:
+    """``"joint (hip, knee)"``, shortened where there are many."""
+    names = [signal.name for signal in signals]
+    shown = [*names[:_MOST_NAMED], *(["..."] if len(names) > _MOST_NAMED else [])]
+    return f"{what} ({', '.join(shown) or 'none'})"
+
+
+def _described(found: Any) -> str:
+    if isinstance(found, jax.ShapeDtypeStruct):
+        return f"one array of shape {found.shape}"
+    return "None" if found is None else f"a {type(found).__name__}"
+
+
+def _summary(tree: Any) -> Any:
+    """Shapes and dtypes in the place of arrays."""
+    return jax.tree.map(lambda leaf: f"{leaf.dtype}{list(leaf.shape)}", tree)
+
+
+def _line_of(function: Callable[..., Any], error: Exception) -> str:
+    """Where in the file of the method it happened: `` (rigs.py, line 42)``."""
+    file = inspect.unwrap(function).__code__.co_filename if inspect.ismethod(function) else ""
+    lines: Iterator[int | None] = (
+        frame.lineno
+        for frame in reversed(traceback.extract_tb(error.__traceback__))
+        if frame.filename == file
+    )
+    line = next(lines, None)
+    return f" ({Path(file).name}, line {line})" if line else ""

@@ -1,0 +1,354 @@
+"""Whether a twin is the mechanical system that it is written down to be."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from sb3_hds.core import AnalyticTwin, Params, State, Twin
+from sb3_hds.core.compilation import QUICKEST_COMPILATION
+from sb3_hds.core.contract import check_now
+from sb3_hds.core.layers import layers_of, plant_of
+from sb3_hds.errors import TwinError
+from sb3_hds.twins import registry
+from sb3_hds.twins.check_result import CheckItem, TwinCheck
+from sb3_hds.twins.mechanics import ROUNDING, Points, check_mechanics, precision
+
+_N_STARTS, _N_STEPS = 16, 20
+_N_POINTS = 64  # at which the terms of the equation of motion are compared
+_OWN, _GENERIC = 0, 1  # the first two variants of the parameters
+_TINY = 1e-300
+# In the order in which they are blamed: a later one uses what an earlier one returns.
+_METHODS = (
+    "step", "observe", "infer", "observe(infer(obs))", "terminated", "reward", "planning_reward"
+)  # fmt: skip
+
+
+def check(twin: Twin | type[Twin] | str, *, seed: int = 0) -> TwinCheck:
+    r"""
+    Check that a twin is finite, consistent and, where it has a mass matrix, mechanical.
+
+    - shapes and dtypes of what every method returns, in single and double precision
+    - states, observations, rewards and their derivatives are finite, at the bounds of the
+      parameters too
+    - ``infer`` is the inverse of ``observe``
+    - each parameter and each command has an effect
+    - the mass matrix is symmetric and positive definite
+    - gravity and springs have a potential: :math:`\partial c(q, 0) / \partial q` is symmetric
+    - the forces of inertia do no work, :math:`v^T (\tfrac12 \dot M v - c(q, v) + c(q, 0)) = 0`, or
+      less than none, where the twin has damping of its own
+    - without actuators, what is left of the energy after :meth:`step` is what damping leaves, but
+      for an error that shrinks with the sub-step
+
+    Everything is evaluated in double precision at random states, commands and values of parameters
+    within a ``scale`` of the twin's own. What a mass or a length *is*, no check can know:
+    ``verify_mirror`` compares with an environment, and ``calibrate`` with data.
+
+    Source of the third last and second last: Spong, Hutchinson and Vidyasagar, *Robot Modeling and
+    Control*, 2006, section 7.5 (passivity).
+
+    :param twin: a twin, its class, or the name under which one is registered
+    :param seed: of what is drawn
+    :raises NoTwinError: for a name that is not registered
+    """
+    if isinstance(twin, str):
+        twin = registry.get(twin)
+    made = twin() if isinstance(twin, type) else twin
+    contract = _contract(made)
+    if not contract.ok:
+        return TwinCheck(made.name, (contract,), "everything else, before that is mended")
+    with jax.enable_x64(True):
+        samples = _sampled(made, seed)
+        finite = _finite(samples)
+        if not finite.ok:
+            return TwinCheck(
+                made.name, (contract, finite), "everything else, before that is mended"
+            )
+        items = [contract, finite, _inverse(made, samples), _parameters(made, samples)]
+        items += [_commands(made, samples)] if made.actuators else []
+        plant = plant_of(made)
+        if not isinstance(plant, AnalyticTwin):
+            return TwinCheck(made.name, tuple(items), "energy, without a mass matrix")
+        items += check_mechanics(plant, _points(plant, samples, seed))
+    return TwinCheck(made.name, tuple(items))
+
+
+# --- motion
+
+
+class _Samples(NamedTuple):
+    """
+    Motions under random commands with several values of the parameters. The first of them are the
+    twin's own, the second all generic, and each of the others differs from the second in one thing.
+
+    :param names: of what differs
+    :param params: leading axis ``n_variants``
+    :param states: after each step, the start first: ``(n_variants, n_starts, n_steps + 1, ...)``
+    :param seen: after each step, what was observed, inferred and earned, by method
+    :param smooth: whether the derivatives of each method are finite there
+    """
+
+    names: tuple[str, ...]
+    params: Params
+    states: State
+    seen: dict[str, np.ndarray]
+    smooth: dict[str, Any]
+
+
+def _sampled(twin: Twin, seed: int) -> _Samples:
+    rng = np.random.default_rng(seed)
+    own = {name: float(value) for name, value in twin.values.items()}
+    generic = {name: _moved(twin, name, own[name]) for name in own}
+    variants = {"own": own, "generic": generic}
+    for name, parameter in twin.parameters.items():
+        variants[f"value {name}"] = generic | {name: _moved(twin, name, generic[name])}
+        for bound in (parameter.lower, parameter.upper):
+            if np.isfinite(bound):
+                variants[f"{name} = {bound:g}"] = generic | {name: bound}
+    low, high = _limits(twin)
+    shape = (_N_STARTS, _N_STEPS, len(low))
+    actions = low + rng.uniform(size=shape) * (high - low)
+    every = [actions] * len(variants)
+    for i, actuator in enumerate(twin.actuators):
+        variants[f"command {actuator.name}"] = generic
+        # Elsewhere within the limits, half their distance away.
+        half = actions[..., i] + 0.5 * (high - low)[i]
+        every.append(actions.copy())
+        every[-1][..., i] = np.where(half > high[i], half - (high - low)[i], half)
+    params = {name: np.array([values[name] for values in variants.values()]) for name in own}
+    seeds = rng.integers(2**31, size=_N_STARTS)
+    return _Samples(tuple(variants), params, *_motions(twin, seeds, params, np.stack(every)))
+
+
+def _motions(twin: Twin, seeds: np.ndarray, params: Params, actions: np.ndarray) -> Any:
+    """:return: states, what was seen, and whether slopes are finite, one for each step"""
+
+    def outcome(state: State, action: Array, params: Params) -> tuple[State, dict[str, Array]]:
+        params = {**params, **twin.tensors}
+        after = twin.step(state, action, params)
+        obs = twin.observe(after, params)
+        inferred = twin.infer(obs, params)
+        return after, {
+            "observe": obs,
+            "infer": jnp.concatenate([inferred.q, inferred.v]),
+            "observe(infer(obs))": twin.observe(inferred, params),
+            "reward": twin.reward(state, action, after, params),
+            "planning_reward": twin.planning_reward(state, action, after, params),
+        }
+
+    def motion(seed: Array, actions: Array, params: Params) -> Any:
+        def step(state: State, action: Array) -> Any:
+            at = (state, action, params)
+            found, slopes = jax.jvp(outcome, at, jax.tree.map(jnp.ones_like, at))
+            after, seen = found
+            over = 1.0 * twin.terminated(after, {**params, **twin.tensors})
+            smooth = {"step": slopes[0], **slopes[1]}
+            return after, (after, seen | {"terminated": over}, jax.tree.map(_all_finite, smooth))
+
+        start = twin.initial(jax.random.key(seed), {**params, **twin.tensors})
+        start = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), start)
+        _, (states, seen, smooth) = jax.lax.scan(step, start, actions)
+        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, states), seen, smooth
+
+    # One axis for variants and starts: two take twice as long to compile.
+    n_variants, n_starts = actions.shape[:2]
+    flat = (
+        np.tile(seeds, n_variants),
+        actions.reshape(n_variants * n_starts, *actions.shape[2:]),
+        {name: np.repeat(values, n_starts) for name, values in params.items()},
+    )
+    found = jax.jit(jax.vmap(motion), compiler_options=QUICKEST_COMPILATION)(*flat)
+    return jax.tree.map(
+        lambda leaf: np.asarray(leaf).reshape(n_variants, n_starts, *leaf.shape[1:]), found
+    )
+
+
+def _all_finite(values: Array) -> Array:
+    return jnp.isfinite(values).all()
+
+
+def _moved(twin: Twin, name: str, value: float) -> float:
+    """:return: another value, half a typical deviation away and within the bounds"""
+    parameter = twin.parameters[name]
+    for move in (0.5, -0.5, 0.05, -0.05):
+        if parameter.lower <= (moved := value + move * parameter.scale) <= parameter.upper:
+            return moved
+    return value
+
+
+def _limits(twin: Twin) -> tuple[np.ndarray, np.ndarray]:
+    """Finite limits of commands: where there are none, as far as gravity pulls, or 1."""
+    far = max(twin.typical_forces(), default=0.0) or 1.0
+    low, high = np.array([(a.low, a.high) for a in twin.actuators], float).reshape(-1, 2).T
+    low, high = (
+        np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - far, -far)),
+        np.where(np.isfinite(high), high, np.where(np.isfinite(low), low + far, far)),
+    )
+    return low, high
+
+
+# --- checks of any twin
+
+
+def _contract(twin: Twin) -> CheckItem:
+    name = "shapes and dtypes"
+    try:
+        for layer in reversed(list(layers_of(twin))):
+            check_now(layer)
+    except TwinError as error:
+        return CheckItem(name, False, str(error))
+    return CheckItem(name, True, "what every method returns, in single and double precision")
+
+
+def _finite(samples: _Samples) -> CheckItem:
+    name = "finite"
+    values = {"step": np.concatenate(samples.states[:2], -1)[:, :, 1:], **samples.seen}
+    values = {method: values[method] for method in _METHODS}
+    for variant, told in enumerate(samples.names):
+        # At a bound, one step: a motion may be too fast there for the twin's sub-step.
+        n_steps = 1 if " = " in told else _N_STEPS
+        for method, found in values.items():
+            bad = ~np.isfinite(found[variant, :, :n_steps]).reshape(_N_STARTS, n_steps, -1)
+            if bad.any():
+                after = int(bad.any((0, 2)).argmax()) + 1
+                where = f"with {told}" if n_steps == 1 else f"with {_variant_in_words(told)}"
+                return CheckItem(
+                    name,
+                    False,
+                    f"{method} is not finite after {after} of {_N_STEPS} steps {where}",
+                    f"Move the bound of {told.partition(' = ')[0]} to where the twin still works."
+                    if n_steps == 1
+                    else "Look for a division by zero or a root, or take more sub-steps.",
+                )
+    steep = [
+        method
+        for method in _METHODS
+        if not all(
+            leaf[[_OWN, _GENERIC]].all() for leaf in jax.tree.leaves(samples.smooth.get(method))
+        )
+    ]
+    if steep:
+        return CheckItem(
+            name,
+            False,
+            f"the derivative of {steep[0]} is not finite at a state that is visited",
+            "A root or a norm has none at zero: write sqrt(x**2 + 1e-12), or jnp.where before it.",
+        )
+    return CheckItem(
+        name,
+        True,
+        f"{_N_STARTS} motions of {_N_STEPS} steps under random commands, their derivatives, and a "
+        "step with each parameter at its bounds",
+    )
+
+
+def _variant_in_words(variant: str) -> str:
+    words = {"own": "the twin's own values", "generic": "values within a scale of its own"}
+    return words.get(variant, f"another {variant.partition(' ')[2]}")
+
+
+def _inverse(twin: Twin, samples: _Samples) -> CheckItem:
+    name = "infer inverts observe"
+    obs, again, inferred = (
+        samples.seen[key][_GENERIC].reshape(_N_STARTS * _N_STEPS, -1)
+        for key in ("observe", "observe(infer(obs))", "infer")
+    )
+    size = np.maximum(np.abs(obs).max(0), _TINY)
+    error = (np.abs(again - obs) / size).max(0)
+    worst = int(error.argmax())
+    if not error.max() < ROUNDING:
+        return CheckItem(
+            name,
+            False,
+            f"observe(infer(obs)) differs from obs in '{twin.channels[worst].name}' by "
+            f"{error[worst]:.1%} of its largest value",
+            "infer has to put each channel back where observe took it from.",
+        )
+    moved = (part[_GENERIC, :, 1:].reshape(len(obs), -1) for part in samples.states[:2])
+    parts = zip(("position", "velocity"), moved, np.split(inferred, 2, 1), strict=True)
+    lost = [
+        f"{what} of {joint.name}"
+        for what, before, after in parts
+        for joint, b, a in zip(twin.joints, before.T, after.T, strict=True)
+        if _apart(a - b, what == "position" and joint.unit == "rad") > ROUNDING * np.abs(b).max()
+    ]
+    told = f"observe(infer(obs)) equals obs {precision(error.max())}"
+    return CheckItem(
+        name, True, f"{told}; infer does not recover {', '.join(lost)}" if lost else told
+    )
+
+
+def _apart(change: np.ndarray, angle: bool) -> float:
+    """The largest change, of an angle up to whole turns."""
+    turns = np.round(change / (2.0 * np.pi)) if angle else 0.0
+    return float(np.abs(change - 2.0 * np.pi * turns).max())
+
+
+def _parameters(twin: Twin, samples: _Samples) -> CheckItem:
+    name = "parameters"
+    effects = {parameter: _effect(samples, f"value {parameter}") for parameter in twin.parameters}
+    outside = [n for n, p in twin.parameters.items() if not p.lower <= twin.values[n] <= p.upper]
+    if outside:
+        return CheckItem(name, False, f"out of bounds: {', '.join(outside)}", "Set other values.")
+    idle = [parameter for parameter, effect in effects.items() if not effect > ROUNDING]
+    if idle:
+        return CheckItem(
+            name,
+            False,
+            f"without effect on motion, observation and reward: {', '.join(idle)}",
+            "Methods take values from params, never from self. Leave out what nothing uses.",
+        )
+    return CheckItem(name, True, f"within their bounds, and each has an effect{_least(effects)}")
+
+
+def _commands(twin: Twin, samples: _Samples) -> CheckItem:
+    effects = {a.name: _effect(samples, f"command {a.name}") for a in twin.actuators}
+    idle = [actuator for actuator, effect in effects.items() if not effect > ROUNDING]
+    if idle:
+        return CheckItem(
+            "commands",
+            False,
+            f"without effect on the motion: {', '.join(idle)}",
+            "Use each entry of the action in actuate, within its limits low and high.",
+        )
+    return CheckItem("commands", True, f"each has an effect{_least(effects)}")
+
+
+def _least(effects: dict[str, float]) -> str:
+    if not effects:
+        return ""
+    name = min(effects, key=lambda name: effects[name])
+    return f" (least: {name}, {min(effects[name], 1.0):.0e} of what it acts on)"
+
+
+def _effect(samples: _Samples, variant: str) -> float:
+    """How much it changes at most, as a share of how large that is."""
+    i = samples.names.index(variant)
+    moved = np.concatenate(samples.states[:2], -1)
+    every = [moved, *samples.seen.values()] if variant.startswith("value") else [moved]
+    found = 0.0
+    for values in every:
+        values = values.reshape(*values.shape[:3], -1)
+        size = np.abs(values[[i, _GENERIC]]).max((0, 1, 2))
+        change = np.abs(values[i] - values[_GENERIC]).max((0, 1))
+        found = max(found, float(np.max(change / np.maximum(size, _TINY), initial=0.0)))
+    return found
+
+
+def _points(plant: AnalyticTwin, samples: _Samples, seed: int) -> Points:
+    """Positions that were visited, hinges turned anywhere, and speeds as large as those seen."""
+    rng = np.random.default_rng(seed + 1)
+    params = {}
+    for name, parameter in plant.parameters.items():
+        own = float(samples.params[name][_OWN])
+        drawn = own + parameter.scale * rng.uniform(-1.0, 1.0, _N_POINTS)
+        params[name] = np.clip(drawn, parameter.lower, parameter.upper)
+    dof = len(plant.joints)
+    q, v = (part[: _GENERIC + 1].reshape(-1, dof) for part in samples.states[:2])
+    rotary = np.array([joint.unit == "rad" for joint in plant.joints], float)
+    q = rng.choice(q, _N_POINTS) + rotary * rng.uniform(-np.pi, np.pi, (_N_POINTS, dof))
+    speeds = np.sqrt(np.mean(v**2, 0))
+    speeds = np.where(speeds > 0.0, speeds, 1.0)
+    return Points(params, q, speeds * rng.standard_normal((_N_POINTS, dof)))

@@ -1,0 +1,283 @@
+"""What checking a twin finds, and that every twin of the library passes."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from free_mass import Mass
+from test_twin_contract import broken
+
+from sb3_hds import twins
+from sb3_hds.core import AnalyticTwin, Parameter, State, TransformedTwin, Twin, semi_implicit_euler
+from sb3_hds.core.filters import Delay
+from sb3_hds.effects import CoulombFriction, SensorBias
+from sb3_hds.twins.mechanics import Points, check_mechanics
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+
+@pytest.mark.parametrize("name", twins.names())
+def test_every_twin_passes(name):
+    found = twins.check(name)
+
+    assert found.ok, found
+    energy = [item for item in found.items if item.name in ("mass matrix", "energy")]
+    assert len(energy) == 2
+
+
+class Cart(Mass):
+    """A mass that is quick to check."""
+
+    substeps = 1
+
+
+def flawed(**changes):
+    return type("Cart", (Cart,), changes)()
+
+
+def light(mass):
+    return {"mass": Parameter(1.0, 0.1, "kg", lower=mass)}
+
+
+FLAWS = {
+    "shapes": (
+        {"bias": lambda self, q, v, params: jnp.ones(2)},
+        "shapes and dtypes",
+        "Cart.bias returns shape (2,), expected (1,)",
+        "not checked: everything else",
+    ),
+    "nothing finite": (
+        {"bias": lambda self, q, v, params: params["damping"] * v / (q - q)},
+        "finite",
+        "step is not finite after 1 of 20 steps with the twin's own values",
+        "division by zero",
+    ),
+    "a bound at which nothing works": (
+        {
+            "parameters": light(0.0),
+            "bias": lambda self, q, v, params: 0.1 * v,
+        },
+        "finite",
+        "is not finite after 1 of 20 steps with mass = 0",
+        "Move the bound of mass",
+    ),
+    "no derivative": (
+        {
+            "parameters": light(0.1),
+            "initial": lambda self, key, params: State(jnp.zeros(1), jnp.zeros(1), {}),
+            "reward": lambda self, state, action, after, params: -jnp.sqrt(jnp.sum(state.q**2)),
+            "bias": lambda self, q, v, params: 0.1 * v,
+        },
+        "finite",
+        "the derivative of reward is not finite",
+        "write sqrt(x**2 + 1e-12)",
+    ),
+    "no inverse": (
+        {"infer": lambda self, obs, params: State(obs[:1], 2.0 * obs[1:], {})},
+        "infer inverts observe",
+        "differs from obs in 'speed' by 100.0% of its largest value",
+        "put each channel back",
+    ),
+    "a value that is read from self": (
+        {
+            "mass_matrix": lambda self, q, params: self.values["mass"] * jnp.ones((1, 1), q.dtype),
+        },
+        "parameters",
+        "without effect on motion, observation and reward: mass",
+        "take values from params, never from self",
+    ),
+    "a command that does nothing": (
+        {"actuate": lambda self, state, action, params: 0.0 * action},
+        "commands",
+        "without effect on the motion: push",
+        "Use each entry of the action",
+    ),
+    "a mass that vanishes": (
+        {
+            "mass_matrix": lambda self, q, params: (
+                (params["mass"] - 1.2) * jnp.ones((1, 1), q.dtype)
+            ),
+        },
+        "mass matrix",
+        "rail has an inertia of -",
+        "lower bounds",
+    ),
+    "damping with the wrong sign": (
+        {"bias": lambda self, q, v, params: -params["damping"] * v},
+        "forces of inertia",
+        "they add energy: v'(dM/dt v / 2 - bias(q, v) + bias(q, 0)) is positive",
+        "damping is + d v",
+    ),
+    "a wall that throws back": (
+        {"limit": lambda self, q, v: (q, jnp.where(q > 0.0, -1.5 * jnp.abs(v), v))},
+        "energy",
+        "which is no error of the integrator",
+        "limit and limit_velocity",
+    ),
+}
+
+
+@pytest.mark.parametrize("flaw", FLAWS)
+def test_a_flaw_is_found_by_its_check_and_told_with_a_way_out(flaw):
+    changes, name, message, way_out = FLAWS[flaw]
+
+    found = twins.check(flawed(**changes))
+
+    assert found.failed == (name,)
+    told = " ".join(str(found).split())
+    assert f"FAIL {name}: " in told and message in told and way_out in told
+    assert max(map(len, str(found).splitlines())) <= 80
+
+
+# --- equations of motion of two joints, at points that were drawn by hand
+
+
+class Arm(AnalyticTwin):
+    """Two links that hang; mass matrix and forces of inertia as in every textbook."""
+
+    name, dt = "Arm", 0.01
+    joints = twins.DoublePendulum.joints
+    actuators = channels = ()
+    parameters = {}
+    integrator = staticmethod(semi_implicit_euler)
+
+    def initial(self, key, params):
+        return State(jnp.zeros(2), jnp.zeros(2), {})
+
+    def infer(self, obs, params):
+        raise NotImplementedError
+
+    observe = infer
+
+    def actuate(self, state, action, params):
+        return jnp.zeros_like(state.q)
+
+    def mass_matrix(self, q, params):
+        both = 1.0 + jnp.cos(q[1])
+        return jnp.stack([3.0 + 2.0 * jnp.cos(q[1]), both, both, 0.0 * both + 1.0]).reshape(2, 2)
+
+    def bias(self, q, v, params):
+        return self.coriolis(q, v) + self.weight(q)
+
+    def coriolis(self, q, v):
+        return jnp.sin(q[1]) * jnp.stack([-v[1] * (2.0 * v[0] + v[1]), v[0] ** 2])
+
+    def weight(self, q):
+        outer = 9.81 * jnp.sin(q[0] + q[1])
+        return jnp.stack([19.62 * jnp.sin(q[0]) + outer, outer])
+
+
+def judged(**changes):
+    rng = np.random.default_rng(0)
+    points = Points({}, rng.uniform(-3.0, 3.0, (8, 2)), rng.standard_normal((8, 2)))
+    return check_mechanics(type("Arm", (Arm,), changes)(), points)
+
+
+def test_an_arm_conserves_its_energy_but_for_the_error_of_the_integrator(x64):
+    items = judged()
+
+    assert [item.name for item in items if item.ok] == [
+        "mass matrix", "gravity and springs", "forces of inertia", "energy"
+    ]  # fmt: skip
+    assert "they do no work, to" in items[2].found and "no damping" in items[2].found
+    # Semi-implicit Euler is of first order: a quarter of the step, a quarter of the error.
+    assert items[3].found.endswith("the integrator's error")
+
+
+def test_damping_of_its_own_dissipates(x64):
+    items = judged(bias=lambda self, q, v, params: self.coriolis(q, v) + self.weight(q) + 0.3 * v)
+
+    assert all(item.ok for item in items) and "own damping dissipates" in items[2].found
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "message"),
+    [
+        (
+            {"mass_matrix": lambda self, q, params: jnp.array([[2.0, 1.0], [0.5, 2.0]])},
+            "mass matrix",
+            "not symmetric: entry (joint1, joint2) differs from its mirror image by 25.0%",
+        ),
+        (
+            # Eigenvalues 1 - 1.5 and 1 + 1.5.
+            {"mass_matrix": lambda self, q, params: jnp.array([[1.0, 1.5], [1.5, 1.0]])},
+            "mass matrix",
+            "not positive definite: smallest eigenvalue -0.5",
+        ),
+        (
+            {"weight": lambda self, q: 9.81 * jnp.stack([jnp.sin(q[0] + q[1]), jnp.sin(q[1])])},
+            "gravity and springs",
+            "the load of joint1 changes with joint2 by",
+        ),
+        (
+            {"coriolis": lambda self, q, v: -Arm.coriolis(self, q, v)},
+            "forces of inertia",
+            "they add energy",
+        ),
+        (
+            {"coriolis": lambda self, q, v: 0.9 * Arm.coriolis(self, q, v) + 0.3 * v},
+            "forces of inertia",
+            "they add energy",  # at high speed, where damping does not hide it
+        ),
+        (
+            {"mass_matrix": lambda self, q, params: jnp.eye(2) / (q[0] - q[0])},
+            "equation of motion",
+            "mass_matrix is not finite",
+        ),
+        (
+            {"integrator": staticmethod(lambda a, q, v, h, limit: (q + h * v, v * (1.0 + h)))},
+            "energy",
+            "which is no error of the integrator",
+        ),
+    ],
+)
+def test_what_is_not_mechanical_is_named(changes, name, message, x64):
+    failed = [item for item in judged(**changes) if not item.ok]
+
+    assert failed[0].name == name
+    assert message in failed[0].found and failed[0].way_out
+
+
+def test_angles_that_a_twin_wraps_lose_no_energy(x64):
+    def wrapped(self, q, v):
+        return (q + jnp.pi) % (2.0 * jnp.pi) - jnp.pi, v
+
+    assert all(item.ok for item in judged(limit=wrapped))
+
+
+# --- what else is checked
+
+
+def test_effects_and_wrappers_are_looked_through(x64):
+    extended = Cart().extend(CoulombFriction(0, tau_c=0.3), SensorBias(1, bias=0.1))
+
+    found = twins.check(TransformedTwin(extended, stateful=Delay(steps=2)))
+
+    assert found.ok, found
+    assert "coulomb_friction" in str(found) or "least:" in str(found)
+
+
+def test_without_a_mass_matrix_there_is_no_energy_to_check():
+    class Plain(Twin):
+        name, dt = "Plain", 0.1
+        joints, actuators, channels = Cart.joints, Cart.actuators, Cart.channels
+        parameters = {"rate": Parameter(1.0, 0.1, "1/s")}
+        initial, infer, observe = Cart.initial, Cart.infer, Cart.observe
+
+        def step(self, state, action, params):
+            return State(state.q + 0.1 * state.v, params["rate"] * state.v + action, {})
+
+    found = twins.check(Plain)
+
+    assert found.ok and "not checked: energy, without a mass matrix" in str(found)
+
+
+def test_positions_that_are_not_observed_are_named():
+    found = twins.check(twins.make("LinearAxis", observe="q"))
+
+    assert found.ok and "infer does not recover velocity of axis" in " ".join(str(found).split())
+
+
+def test_a_twin_that_breaks_the_contract_is_told_and_not_raised():
+    found = twins.check(broken(bias=lambda self, q, v, params: jnp.sum(q)))
+
+    assert found.failed == ("shapes and dtypes",) and repr(found) == str(found)
