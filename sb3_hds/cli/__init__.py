@@ -140,7 +140,9 @@ def parser() -> argparse.ArgumentParser:
     shake.add_argument("--vecnormalize", help="vecnormalize.pkl of the training")
     shake.add_argument("--push", type=float, default=5.0, help="force on the torso [N]")
     shake.add_argument("--csv", help="table to write")
-    columns.add(commands)
+    columns.add_arguments(
+        commands.add_parser("columns", help="list what is in a log, with a map to start from")
+    )
     known = commands.add_parser("effects", help="list the candidates, with units and explanations")
     known.add_argument(
         "words",

@@ -3,11 +3,8 @@
 import argparse
 
 
-def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """
-    :param commands: that the command is added to
-    """
-    ask = commands.add_parser("columns", help="list what is in a log, with a map to start from")
+def add_arguments(ask: argparse.ArgumentParser) -> None:
+    """:param ask: to which the arguments are added"""
     ask.add_argument("file", metavar="FILE", help="a log of any format, or a folder with a bag")
     ask.add_argument("--records", help="where the rows are in a file that nests them: data")
     ask.add_argument("--skip", type=int, help="lines of a text file before its names")

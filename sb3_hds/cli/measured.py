@@ -65,11 +65,15 @@ def data_of(given: argparse.Namespace) -> "Trajectories":
 
 
 def twin_of(given: argparse.Namespace) -> "Twin":
-    """What ``--twin`` and ``--set`` name; a module or a file may lie in the current folder."""
+    """What ``--twin`` and ``--set`` name."""
+    return twin_called(given.twin, settings("--set", given.set))
+
+
+def twin_called(name: str, values: Mapping[str, Any]) -> "Twin":
+    """A module or a file may lie in the current folder."""
     from sb3_hds.errors import NoTwinError
     from sb3_hds.twins import get
 
-    name, values = given.twin, settings("--set", given.set)
     if name.endswith(".json"):
         return _twin_in(name).with_parameters(**values)
     if ":" in name and "" not in sys.path:

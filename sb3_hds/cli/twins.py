@@ -40,9 +40,9 @@ def run(given: argparse.Namespace) -> int:
             "Name one twin, as in 'sb3-hds twins check Pendulum' or 'sb3-hds twins check "
             f"my_module:MyTwin', got '{' '.join(given.words)}'."
         )
-    from sb3_hds.cli.diagnose import _twin
+    from sb3_hds.cli.measured import twin_called
     from sb3_hds.twins import check
 
-    found = check(_twin(given.words[1], settings("--set", given.set)))
+    found = check(twin_called(given.words[1], settings("--set", given.set)))
     print(found)
     return 0 if found.ok else 1
