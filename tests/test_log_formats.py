@@ -206,7 +206,7 @@ def test_a_scale_counts_more_than_the_unit_that_a_file_names(tmp_path):
 
     assert load(tmp_path / "log.csv", scaled, content).obs[0, :, 0].tolist() == [10.0, 20.0]
     named = load(tmp_path / "log.csv", COLUMNS)
-    assert "q in deg" in str(named.report) and named.report.to_dict()["units"] == ("rad",)
+    assert "q in deg" in str(named.report) and named.report.units == ("rad",)
 
 
 def test_files_that_name_different_units_are_told_apart(tmp_path):
@@ -616,9 +616,13 @@ def test_header_stamps_count_more_than_the_time_of_recording(tmp_path):
     ]
     write_bag(tmp_path / "log", messages)
 
-    assert not load(tmp_path / "log", BAG).report.altered
-    with pytest.warns(UserWarning, match="log was resampled to dt"):
-        load(tmp_path / "log", BAG | {"time": "/joints:received"})
+    def intervals(columns):
+        [recording] = load(tmp_path / "log", BAG | columns).report.recordings
+        return recording.intervals
+
+    assert intervals({}) == pytest.approx((0.01, 0.01, 0.01))
+    shortest, _, longest = intervals({"time": "/joints:received"})
+    assert (shortest, longest) == pytest.approx((0.006, 0.014))
 
 
 @pytest.mark.measured
