@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_hds.algos.call_forms import check_origin, check_policy_kwargs
 from sb3_hds.algos.executed_actions import executed
-from sb3_hds.algos.persistence import TensorPolicy, by_names, write_whole
+from sb3_hds.algos.persistence import TensorPolicy, by_names, damaged, write_whole
 from sb3_hds.algos.saving import SavesTensors
 
 _STATISTICS = ("obs_rms", "ret_rms", "returns")
@@ -151,8 +151,24 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         path: str | pathlib.Path | io.BufferedIOBase,
         truncate_last_traj: bool = True,
     ) -> None:
+        """
+        SB3's ``load_replay_buffer``, which unpickles: load what you have saved yourself.
+
+        :param path: of a file that ``save_replay_buffer`` wrote; ``.pkl`` may be left out
+        :param truncate_last_traj: of a buffer of HER, whether its last episode has ended
+        :raises ValueError: for a damaged file; the buffer of before is then still there
+        """
+        before = self.replay_buffer
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+        except (OSError, AssertionError):
+            raise
+        # Where pickle meets damage, it may raise anything.
+        except Exception as error:
+            if self.replay_buffer is not before:
+                raise
+            raise damaged(path, error) from error
         # SBX marks the buffer as the CPU's, where SB3 has the model's device.
-        super().load_replay_buffer(path, truncate_last_traj)
         self.replay_buffer.device = self.device  # type: ignore[union-attr]
 
     def _setup_model(self) -> None:

@@ -24,7 +24,7 @@ class Limit(NamedTuple):
 
 
 def limits_of(env: gymnasium.Env) -> list[Limit]:
-    """:return: of each wrapper that has one (``TimeLimit``, ``InfiniteHorizon``), outermost first"""
+    """:return: of each wrapper with one (``TimeLimit``, ``InfiniteHorizon``), outermost first"""
     layer, limits = env, []
     while isinstance(layer, gymnasium.Wrapper):
         limits += own_limit(layer, "_max_episode_steps")
