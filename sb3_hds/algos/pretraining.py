@@ -62,14 +62,19 @@ class Pretraining(CallbackList):
         model.before_planning()
         due = model.pretraining_due
         every = max(1, due // _N_LOGS)
+        bars = [each for each in _each(self.callbacks) if isinstance(each, ProgressBarCallback)]
         for i in self._shown(range(1, due + 1)):
             model.pretrain_epoch()
+            for bar in bars:
+                bar.pbar.set_description(f"planning {i}/{due}")
             done = not model.pretraining_due
             if done or i % every == 0:
                 model.logger.dump(step=model.num_timesteps)
             _call(self.callbacks, ProgressBarCallback)
             if done:
                 break
+        for bar in bars:
+            bar.pbar.set_description("")
 
     def _poll(self) -> None:
         """While programs compile: there is no epoch yet that anybody could count."""
