@@ -30,13 +30,26 @@ USUAL = {
 # DroQ's paper has a target entropy for it.
 FURTHER = {"droq": {"Humanoid-v5"}}
 _TQC = {"n_critics": 5, "net_arch": {"pi": [256, 256], "qf": [512, 512, 512]}}
+_SIMBA = {
+    "learning_rate": 1e-4,
+    "policy_kwargs": {"net_arch": {"pi": [128], "qf": [512, 512]}},
+}
+_CROSSQ = {"policy_kwargs": {"net_arch": {"pi": [256, 256], "qf": [2048, 2048]}}}
 # What papers, or their authors' code where these are silent, have on tasks of 1000 steps.
 PUBLISHED = [
     # Configs of DAVIAN-Robotics/SimbaV2, which count all of MuJoCo's as ending early; where no
     # episode does, as in Swimmer, which they do not have: SonyResearch/simba.
-    ("simba", "HalfCheetah-v5", {"gamma": 0.995, "clipped_double_q": None, "policy_kwargs": None}),
-    ("simba", "Hopper-v5", {"gamma": 0.995, "clipped_double_q": None, "policy_kwargs": None}),
-    ("simba", "Swimmer-v5", {"clipped_double_q": False, "policy_kwargs": {"n_critics": 1}}),
+    ("simba", "HalfCheetah-v5", {"gamma": 0.995, "clipped_double_q": None} | _SIMBA),
+    ("simba", "Hopper-v5", {"gamma": 0.995, "clipped_double_q": None} | _SIMBA),
+    (
+        "simba",
+        "Swimmer-v5",
+        {
+            "clipped_double_q": False,
+            "policy_kwargs": {"n_critics": 1, "net_arch": {"pi": [128], "qf": [512, 512]}},
+        },
+    ),
+    ("bro", "HalfCheetah-v5", {"learning_starts": 2500, "gradient_steps": 10}),
     # Hiraoka et al. 2022, appendix; HalfCheetah: their code, after MBPO.
     ("droq", "HalfCheetah-v5", {"learning_starts": 5000, "target_entropy": -3.0}),
     ("droq", "Hopper-v5", {"learning_starts": 5000, "target_entropy": -1.0}),
@@ -44,8 +57,8 @@ PUBLISHED = [
     ("droq", "Ant-v5", {"learning_starts": 5000, "target_entropy": -4.0}),
     ("droq", "Humanoid-v5", {"learning_starts": 5000, "target_entropy": -2.0}),
     # adityab/CrossQ, train.py.
-    ("crossq_jax", "HalfCheetah-v5", {"learning_starts": 5000, "gamma": None}),
-    ("crossq_jax", "Swimmer-v5", {"learning_starts": 5000, "gamma": 0.9999}),
+    ("crossq_jax", "HalfCheetah-v5", {"learning_starts": 5000, "gamma": None} | _CROSSQ),
+    ("crossq_jax", "Swimmer-v5", {"learning_starts": 5000, "gamma": 0.9999} | _CROSSQ),
     # SamsungLabs/tqc_pytorch, main.py: training begins with the first full batch.
     (
         "tqc_jax",

@@ -297,6 +297,13 @@ class HDS(TwinAlgorithm):
             self.correct_model(gradient_steps)
         super().train(gradient_steps, batch_size)
 
+    def remedies(self, updates_per_step: float) -> list[str]:
+        own = (
+            [f"refit_freq={4 * self.refit_freq}, {self.refit_freq} now"] if self.refit_freq else []
+        )
+        own += ["residual=False"] if self.residual else []
+        return own + super().remedies(updates_per_step)
+
     def before_planning(self) -> None:
         if self.measured.earlier is not None and not self._saw_earlier:
             self.correct_model()

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 import torch as th
 from sbx.common.policies import BaseJaxPolicy
+from stable_baselines3.common.utils import get_device
 
 from sb3_hds.algos.networks import activation_name
 from sb3_hds.algos.optimizers import optimizer_name
@@ -296,7 +297,20 @@ class TensorPolicy(BaseJaxPolicy):
         """
         refuse_damaged(path)
         with damage_reported(path):
-            return super().load(path, device)
+            # As SB3 says, spaces are no tensors.
+            saved = th.load(path, map_location="cpu", weights_only=False)
+        policy = cls(**cls.arguments_of_file(saved["data"]))
+        policy.load_state_dict(saved["state_dict"])
+        policy.to(get_device(device))
+        return policy
+
+    @classmethod
+    def arguments_of_file(cls, saved: Mapping[str, Any]) -> dict[str, Any]:
+        """
+        :param saved: arguments of the constructor
+        :return: what they meant when they were saved
+        """
+        return dict(saved)
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, th.Tensor]:
         return to_state_dict(self.weights)

@@ -86,9 +86,8 @@ def _built(description: Mapping[str, Any]) -> TensorPolicy:
         make = _class_named(description["class"])
         observation_space = space_from_plain(description["observation_space"])
         action_space: Any = space_from_plain(description["action_space"])
-        policy = make(  # type: ignore[call-arg]
-            observation_space, action_space, lr_schedule=_no_rate, **description["arguments"]
-        )
+        arguments = make.arguments_of_file(description["arguments"])
+        policy = make(observation_space, action_space, lr_schedule=_no_rate, **arguments)  # type: ignore[call-arg]
         policy.plain_state = description["state"]
     # Whatever a constructor makes of numbers that a stranger wrote.
     except Exception as error:

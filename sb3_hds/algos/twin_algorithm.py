@@ -311,6 +311,14 @@ class TwinAlgorithm(TensorAlgorithm):
     def check_arguments(self) -> None:
         check_arguments(self)
 
+    def remedies(self, updates_per_step: float) -> list[str]:
+        return [
+            f"n_rollouts={max(1, self.n_rollouts // 4)}, {self.n_rollouts} now",
+            "a larger train_freq",
+            f"fewer gradient_steps, {updates_per_step:.3g} for each step now",
+            "a GPU",
+        ]
+
     def _setup_twin(self) -> None:
         """The twin that was passed, or saved because it had been, or the environment's own."""
         given: Any = self.twin  # a name, where one was passed to `load`
@@ -449,6 +457,7 @@ class TwinAlgorithm(TensorAlgorithm):
             "_workspace",
             "_compiled",
             "poll",
+            "stopped",
             "unstored_step",
             "learned_force",
         ]
