@@ -5,6 +5,8 @@ import inspect
 from collections.abc import Iterable
 from typing import Any
 
+from rl_zoo_plugin import trials
+
 #: a key that begins with it sets one of ``policy_kwargs``, and leaves the others as they are
 OF_POLICY = "policy_kwargs."
 
@@ -40,7 +42,8 @@ class LazyAlgorithm:
         if of_policy:
             hyperparams["policy_kwargs"] = {**(hyperparams.get("policy_kwargs") or {}), **of_policy}
         _refuse_unknown(algorithm, hyperparams)
-        return algorithm(*args, **hyperparams)
+        defaults = {name: each.default for name, each in parameters_of(algorithm).items()}
+        return algorithm(*args, **trials.capped(hyperparams, defaults))
 
     def load(self, path: Any, *args: Any, **hyperparams: Any) -> Any:
         """

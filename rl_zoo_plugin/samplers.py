@@ -10,6 +10,7 @@ replace all of them.
 from collections.abc import Callable
 from typing import Any
 
+from rl_zoo_plugin import trials
 from rl_zoo_plugin.lazy import OF_POLICY
 
 Params = dict[str, Any]
@@ -21,6 +22,10 @@ _BLOCKS = {
     "medium": {"pi": [128], "qf": [256, 256]},
     "big": {"pi": [256], "qf": [512, 512]},
 }
+
+# Of OpenLoop: the smallest population that is tried, how many generations a trial should have, and
+# how many steps a whole episode is taken to have.
+_SMALLEST, _FEWEST_GENERATIONS, _WHOLE_EPISODE = 8, 5, 1_000
 
 
 def sample_planner_params(
@@ -63,7 +68,7 @@ def _suggest_usual(trial: Any) -> None:
     trial.suggest_float("one_minus_gamma", 1e-3, 0.1, log=True)
     trial.suggest_float("learning_rate", 1e-5, 2e-3, log=True)
     trial.suggest_int("batch_size_pow", 5, 9)
-    trial.suggest_int("learning_starts", 100, 10_000, log=True)
+    trial.suggest_int("learning_starts", *trials.learning_starts_range(), log=True)
     trial.suggest_categorical("net_arch", list(_NET_ARCHS))
 
 
@@ -195,9 +200,11 @@ def sample_open_loop_params(
     :param n_actions: unused, as are the next two: the zoo calls every sampler with them
     :return: hyperparameters
     """
-    trial.suggest_categorical("horizon", [100, 200, 400, 0])
-    trial.suggest_int("n_resets", 1, 4)
-    trial.suggest_int("population_pow", 3, 5)
+    horizon = trial.suggest_categorical("horizon", [100, 200, 400, 0]) or _WHOLE_EPISODE
+    most = _candidates(horizon)
+    n_resets = trial.suggest_int("n_resets", 1, min(4, max(1, most // _SMALLEST)))
+    largest = max(_SMALLEST, min(32, most // n_resets)).bit_length() - 1
+    trial.suggest_int("population_pow", 3, largest)
     trial.suggest_float("initial_sigma", 0.3, 2.0, log=True)
     trial.suggest_float("kp", 0.5, 20.0, log=True)
     trial.suggest_float("kd_share", 0.01, 0.2, log=True)
@@ -207,6 +214,12 @@ def sample_open_loop_params(
     trial.suggest_float("lowest_frequency", 0.1, 1.0, log=True)
     trial.suggest_float("frequency_ratio", 3.0, 20.0, log=True)
     return convert_open_loop_params(trial.params)
+
+
+def _candidates(horizon: int) -> int:
+    """:return: episodes of this length in each of a few generations"""
+    now = trials.budget()
+    return 32 * 4 if now is None else now.n_timesteps // (_FEWEST_GENERATIONS * horizon)
 
 
 def convert_open_loop_params(sampled_params: Params) -> Params:

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from rl_zoo_plugin import trials
 from rl_zoo_plugin.lazy import LazyAlgorithm
 
 ALGORITHMS = {
@@ -22,6 +23,9 @@ ALGORITHMS = {
     "openloop": "OpenLoop",
 }
 """Id in the zoo (lower case, as it names a folder) to public name in ``sb3_hds``."""
+
+_PROGRESS = "rl_zoo_plugin.trial_progress.TrialProgress"
+_PROGRESS_BAR = "stable_baselines3.common.callbacks.ProgressBarCallback"
 
 
 def hyperparams_file(algo: str) -> Path:
@@ -66,6 +70,33 @@ def _extend_manager(exp_manager: ModuleType) -> None:
         original(*call.args, **call.kwargs)
 
     manager.__init__ = init
+    _extend_trials(exp_manager, manager)
+
+
+def _extend_trials(exp_manager: ModuleType, manager: Any) -> None:
+    """Trials of our algorithms know how many steps they have, and show how far they are."""
+    optimize, objective = manager.hyperparameters_optimization, manager.objective
+
+    def is_ours(self: Any) -> bool:
+        return isinstance(exp_manager.ALGOS.get(self.algo), LazyAlgorithm)
+
+    @functools.wraps(optimize)
+    def optimize_visibly(self: Any) -> None:
+        if is_ours(self):
+            given = self.specified_callbacks or []
+            given = given if isinstance(given, list) else [given]
+            bar = self.show_progress and self.n_jobs == 1
+            self.specified_callbacks = [*given, _PROGRESS_BAR if bar else _PROGRESS]
+        optimize(self)
+
+    @functools.wraps(objective)
+    def objective_within(self: Any, trial: Any) -> float:
+        if not is_ours(self):
+            return objective(self, trial)
+        with trials.running(trial.number, self.n_timesteps):
+            return objective(self, trial)
+
+    manager.hyperparameters_optimization, manager.objective = optimize_visibly, objective_within
 
 
 EXTENSIONS: dict[str, Callable[[ModuleType], None]] = {

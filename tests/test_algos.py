@@ -252,7 +252,9 @@ def test_callbacks_may_be_given_in_every_form(name, kind):
     form = {
         "one": watching[0],
         "list": watching,
-        "function": lambda local, _: calls.append(local["new_obs"]) or True,
+        "function": lambda local, _: (
+            local.get("pretraining") or calls.append(local["new_obs"]) or True
+        ),
         "none": None,
     }
 

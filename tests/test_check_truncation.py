@@ -7,9 +7,17 @@ import numpy as np
 import pytest
 from counting import CountingVector
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
+from gymnasium.wrappers.vector import RescaleAction
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecEnv,
+    VecEnvWrapper,
+    VecMonitor,
+)
 
 from sb3_hds.errors import ParameterError
 from sb3_hds.wrappers import (
@@ -379,3 +387,92 @@ def test_a_vector_environment_whose_copies_cannot_be_reset_alone_is_a_problem():
     report = check_truncation(gymnasium.wrappers.vector.NormalizeObservation(copies))
 
     assert not report.ok and "VecNormalize" in report.problems[0]
+
+
+# --- limits inside limits ------------------------------------------------------------------------
+
+
+class CutsVectors(VecEnvWrapper):
+    """A vectorised wrapper that has a limit of its own, which is never reached here."""
+
+    _max_episode_steps = None
+
+    def __init__(self, env, limit):
+        super().__init__(env)
+        self._max_episode_steps = limit
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        return self.venv.step_wait()
+
+
+def outrun() -> gymnasium.Env:
+    return TimeLimit(limited(), 1_000)
+
+
+@pytest.mark.parametrize(
+    "stacked",
+    [
+        outrun,
+        lambda: Monitor(outrun()),
+        lambda: InfiniteHorizon(Monitor(limited()), 1_000),
+        lambda: DummyVecEnv([limited, outrun]),
+        lambda: VecMonitor(CutsVectors(DummyVecEnv([limited] * 2), 1_000)),
+        lambda: SyncVectorEnv([outrun] * 2),
+        lambda: RescaleAction(SyncVectorEnv([outrun] * 2), -1.0, 1.0),
+        lambda: GymnasiumVecEnv(SyncVectorEnv([outrun] * 2)),
+    ],
+)
+def test_a_limit_around_a_shorter_one_is_found_through_every_wrapper(stacked):
+    text = problem(stacked())
+
+    assert re.match(r"The limit of 1000 steps of \w+ never acts", text)
+    assert "that of 20 steps of TimeLimit inside it comes first" in text
+
+
+def test_it_says_how_an_environment_of_gymnasium_gets_the_longer_limit():
+    text = problem(TimeLimit(gymnasium.make("Pendulum-v1"), 1_000))
+
+    assert "gymnasium.make('Pendulum-v1', max_episode_steps=1000)" in text
+    assert check_truncation(gymnasium.make("Pendulum-v1", max_episode_steps=300)).ok
+
+
+def test_a_limit_around_a_longer_one_or_an_equal_one_is_fine():
+    assert check_truncation(TimeLimit(TimeLimit(Drawn(), 1_000), LIMIT)).ok
+    assert check_truncation(TimeLimit(limited(), LIMIT)).ok
+
+
+def test_a_shorter_limit_that_the_environment_keeps_to_itself_is_seen_by_where_episodes_end():
+    text = problem(TimeLimit(Drawn(0.005, limit=LIMIT, how="truncated"), 500))
+
+    found = re.match(r"(\d+) of 20 episodes were cut after exactly 20 steps", text)
+    # Each step fails with 0.5 %: 0.995^19 = 91 % reach the limit.
+    assert found and 12 <= int(found[1]) <= 20
+    assert "the limit of 500 steps of TimeLimit never acts" in text
+
+
+@pytest.mark.parametrize("kind", [SubprocVecEnv, AsyncVectorEnv])
+@pytest.mark.expensive
+def test_it_is_found_in_copies_in_processes_of_their_own(kind):
+    env = kind([outrun] * 2)
+    try:
+        text = problem(env, n_steps=400)
+        env.reset()
+    finally:
+        env.close()
+
+    assert "20 of 20 episodes were cut after exactly 20 steps" in text
+    assert "the limit of 1000 steps of the outermost wrapper never acts" in text
+
+
+@pytest.mark.parametrize("kind", [SubprocVecEnv, AsyncVectorEnv])
+@pytest.mark.expensive
+def test_copies_without_a_limit_in_processes_of_their_own_are_not_lost(kind):
+    env = kind([lambda: Drawn(0.1)] * 2)
+    try:
+        assert check_truncation(env, n_steps=400).ok
+        env.reset()
+    finally:
+        env.close()

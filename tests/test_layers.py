@@ -51,6 +51,7 @@ LIBRARIES = {
     "cli": LEARNING | TABLES,
     "rl_zoo_plugin": {"rl_zoo3", "optuna"},
     "rl_zoo_plugin/compilation_cache.py": {"jax"},
+    "rl_zoo_plugin/trial_progress.py": {"stable_baselines3"},
 }
 """What a layer, or one file of it, imports from outside; the standard library is free."""
 

@@ -1,7 +1,9 @@
 """
 What each model-free algorithm is made with, unless told otherwise: the numbers of its paper, and
 SB3's and SB3-Contrib's for the networks of GSDESAC and TQC (TQC's paper has five critics of three
-layers of 512, which are in its file for MuJoCo's tasks).
+layers of 512, which are in its file for MuJoCo's tasks). But critics of CrossQ (2048) and SimBa
+(512, with a learning rate of 1e-4) have a quarter of the paper's width, for two cores, and BRO's
+replay ratio is that of its fast variant (10). The paper's are in their files for MuJoCo's tasks.
 """
 
 from typing import Any
@@ -30,14 +32,11 @@ OF_THE_MODEL: dict[str, dict[str, Any]] = {
     "simba": {"gradient_steps": 2, "batch_size": 256, "ent_coef": "auto_0.01", "tau": 0.005},
     # Nauman et al. 2024.
     "bro": {
-        "gradient_steps": 10,
+        "gradient_steps": 2,
         "batch_size": 128,
         "kl_target": 0.05,
         "std_multiplier": 0.75,
-        "param_resets": [
-            *(15_000, 50_000, 250_000, 500_000),
-            *(750_000, 1_000_000, 1_500_000, 2_000_000),
-        ],
+        "param_resets": [15_000],
     },
     # Fujimoto et al. 2023.
     "td7": {
@@ -61,16 +60,16 @@ RATES = {
     "droq": (3e-4, -1.0),
     "crossq_jax": (1e-3, -1.0),
     "tqc_jax": (3e-4, -1.0),
-    "simba": (1e-4, -0.5),
+    "simba": (4e-4, -0.5),
     "bro": (3e-4, -0.5),
 }
 #: by id: widths of actor and critics, values of each critic, and optimiser
 NETWORKS = {
     "gsde_sac": ((256, 256), (256, 256), 1, "adam", {}),
     "droq": ((256, 256), (256, 256), 1, "adam", {}),
-    "crossq_jax": ((256, 256), (2048, 2048), 1, "adam", {"b1": 0.5}),
+    "crossq_jax": ((256, 256), (512, 512), 1, "adam", {"b1": 0.5}),
     "tqc_jax": ((256, 256), (256, 256), 25, "adam", {}),
-    "simba": ((128,), (512, 512), 1, "adamw", {"weight_decay": 1e-2}),
+    "simba": ((128,), (128, 128), 1, "adamw", {"weight_decay": 1e-2}),
     "bro": ((256,), (512, 512), 100, "adamw", {"weight_decay": 1e-4}),
 }
 #: by id: attributes of the critics' body
@@ -133,6 +132,15 @@ def test_multipliers_of_bro_start_and_are_updated_as_in_the_paper(made):
         assert np.exp(squashed_between(raw, -10.0, 7.5)) == pytest.approx(start, rel=1e-4)
     assert (optimizer.make.__name__, dict(optimizer.arguments)) == ("adam", {"b1": 0.5})
     assert model.multiplier_rate * model.knobs().learning_rate == pytest.approx(3e-5)
+
+
+def test_bro_with_the_ratio_of_the_paper_starts_afresh_as_often_as_there():
+    resets = algos.BRO(env="Pendulum-v1", buffer_size=1000, gradient_steps=10).param_resets
+
+    assert resets == [
+        *(15_000, 50_000, 250_000, 500_000),
+        *(750_000, 1_000_000, 1_500_000, 2_000_000),
+    ]
 
 
 def test_networks_of_td7_are_those_of_the_paper(made):

@@ -103,6 +103,40 @@ def test_simba_learns_on_with_the_deviation_that_it_was_saved_with(squashed):
     assert again.policy.recipe.actor.squash_log_std == squashed
 
 
+def test_widths_that_a_file_does_not_say_are_those_of_its_day(monkeypatch, tmp_path):
+    arch, unsaid = {"pi": [8], "qf": [16, 16]}, {"net_arch": None}
+    model = small("crossq_jax", policy_kwargs={"net_arch": arch})
+    monkeypatch.setattr(type(model.policy), "of_older_files", arch)
+    model.save(tmp_path / "now.zip")
+    with zipfile.ZipFile(tmp_path / "now.zip") as now:
+        parts = {name: now.read(name) for name in now.namelist()}
+    data = json.loads(parts["data"])
+    data["policy_kwargs"] = {}
+    data["policy_description"]["arguments"] |= unsaid
+    with zipfile.ZipFile(tmp_path / "older.zip", "w") as older:
+        for name, content in (parts | {"data": json.dumps(data)}).items():
+            older.writestr(name, content)
+    model.policy.arguments |= unsaid
+    model.policy.save(tmp_path / "policy.pth")
+
+    loaded = algos.CrossQ.load(tmp_path / "older")
+
+    for policy in (
+        loaded.policy,
+        algos.CrossQ.load(saved(loaded)).policy,
+        sb3_hds.load_policy(tmp_path / "older"),
+        type(model.policy).load(tmp_path / "policy.pth"),
+    ):
+        assert policy.widths == ((8,), (16, 16))
+        assert_acts(policy, model.predict(OBSERVATIONS, deterministic=True)[0])
+
+
+def test_a_file_says_the_widths_that_were_the_default(tmp_path):
+    policy = algos.SimbaSAC(env="Pendulum-v1", buffer_size=10).policy
+
+    assert policy.arguments["net_arch"] == {"pi": (128,), "qf": (128, 128)}
+
+
 def assert_acts(model, expected):
     actions, _ = model.predict(OBSERVATIONS, deterministic=True)
     np.testing.assert_allclose(actions, expected, rtol=1e-4, atol=1e-5)

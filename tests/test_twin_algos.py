@@ -115,8 +115,8 @@ def test_pretraining_alone_never_steps_the_environment(name):
 
     assert env.n_steps == 0 and model.num_timesteps == 0
     assert (model.n_pretrained, n_epochs(model), model._n_updates) == (3, 3, 0)
-    assert lines.column("time/epochs") == [1, 2, 3]
-    assert model.twin_timesteps == lines.column("time/twin_timesteps")[-1] > 0
+    assert lines.column("pretrain/time/epochs") == [1, 2, 3]
+    assert model.twin_timesteps == lines.column("pretrain/time/twin_timesteps")[-1] > 0
 
 
 @every_planner
@@ -140,7 +140,7 @@ def test_simulated_steps_grow_alike_with_every_epoch(name):
     model.learn(0)
 
     # From the definition: 8 rollouts of 4 steps, each with own, random and improved plans.
-    growth = np.diff(lines.column("time/twin_timesteps"))
+    growth = np.diff(lines.column("pretrain/time/twin_timesteps"))
     assert (growth == growth[0]).all() and growth[0] >= 8 * 4 * (1 + 2 + 2)
 
 
@@ -217,8 +217,8 @@ def test_a_plan_is_never_worse_than_what_it_started_from(name):
 
     model.learn(0)
 
-    assert lines.column("train/worsened_plans") == [0] * 10
-    before, after = (lines.column(f"train/plan_return_{when}") for when in ("before", "after"))
+    assert lines.column("pretrain/worsened_plans") == [0] * 10
+    before, after = (lines.column(f"pretrain/plan_return_{when}") for when in ("before", "after"))
     assert (np.array(after) >= np.array(before)).all() and after != before
 
 
@@ -231,8 +231,8 @@ def test_a_high_temperature_takes_worse_steps_at_times(name):
 
     model.learn(0)
 
-    assert lines.column("train/temperature") == [1e3] * 10
-    assert sum(lines.column("train/worsened_plans")) > 0
+    assert lines.column("pretrain/temperature") == [1e3] * 10
+    assert sum(lines.column("pretrain/worsened_plans")) > 0
     assert finite(model)
 
 
@@ -243,7 +243,7 @@ def test_samples_that_are_not_finite_are_dropped_and_counted(name):
 
     model.learn(30)
 
-    dropped = lines.column("train/dropped_samples")
+    dropped = lines.column("pretrain/dropped_samples")
     # A quarter of the starts lies right of 0.5 m; there are 8 rollouts of 4 steps.
     assert 0 < sum(dropped) < 10 * 8 * 4 and max(dropped) < 8 * 4
     assert finite(model)
@@ -355,7 +355,7 @@ def test_it_learns_through_a_twin_with_friction(name):
     model.learn(25)
 
     assert model.twin.values["viscous_friction.hinge.b"] == 0.2
-    assert np.isfinite(lines.column("train/plan_return_after")).all() and finite(model)
+    assert np.isfinite(lines.column("pretrain/plan_return_after")).all() and finite(model)
 
 
 @every_planner
@@ -512,9 +512,9 @@ def test_the_settings_of_the_pods_paper_improve_plans(name, order):
 
     model.learn(25)
 
-    before, after = (lines.column(f"train/plan_return_{when}") for when in ("before", "after"))
+    before, after = (lines.column(f"pretrain/plan_return_{when}") for when in ("before", "after"))
     assert (np.array(after) > np.array(before)).all()
-    assert set(lines.column("train/value_loss")) == {0.0}
+    assert set(lines.column("pretrain/value_loss")) == {0.0}
     assert finite(model)
 
 
@@ -539,7 +539,7 @@ def test_each_choice_improves_plans(changes):
 
     model.learn(25)
 
-    before, after = (lines.column(f"train/plan_return_{when}") for when in ("before", "after"))
+    before, after = (lines.column(f"pretrain/plan_return_{when}") for when in ("before", "after"))
     assert (np.array(after) > np.array(before)).all() and finite(model)
 
 

@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -83,7 +84,8 @@ def trained(zoo) -> Path:
     schedule = ("-n", str(N_STEPS), "--eval-freq", str(EVAL_FREQ), "--save-freq", str(SAVE_FREQ))
     evaluation = ("--n-eval-envs", "2", "--eval-episodes", "2")
     changes = ("--env-kwargs", "g:9.8", "-params", "train_freq:2", *QUICK)
-    zoo.succeeds(*CONSOLE, "train", *train(*schedule, *evaluation, "-P", *changes))
+    shown = ("-P", "--tensorboard-log", "curves")
+    zoo.succeeds(*CONSOLE, "train", *train(*schedule, *evaluation, *shown, *changes))
     return zoo.logs / "Pendulum-v1_1"
 
 
@@ -156,12 +158,24 @@ def test_training_continues_from_a_saved_agent(continued):
     assert np.load(continued / "evaluations.npz")["timesteps"][-1] == N_STEPS
 
 
-def test_enjoy_replays_the_best_agent(zoo, trained):
+def test_enjoy_shows_the_best_agent_in_a_window(zoo, trained):
     agent = ("--algo", "hds", "--env", "Pendulum-v1", "-f", "logs", "--exp-id", "1", "--load-best")
 
-    output = zoo.succeeds(*CONSOLE, "enjoy", *agent, "--no-render", "-n", "400")
+    output = zoo.succeeds(*CONSOLE, "enjoy", *agent, "-n", "202", SDL_VIDEODRIVER="dummy")
 
-    assert "2 Episodes" in output and "Mean reward" in output
+    assert "Episode Reward" in output
+
+
+def test_tensorboard_has_curves_of_what_was_trained(zoo, trained):
+    assert list(zoo.folder.glob("curves/Pendulum-v1/HDS_1/events.out.tfevents.*"))
+
+
+def test_the_extra_brings_what_the_commands_need():
+    project = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())
+    extra = project["project"]["optional-dependencies"]["zoo"]
+
+    for needed in ("gymnasium[classic-control]", "moviepy", "tensorboard", "requests"):
+        assert any(requirement.startswith(needed) for requirement in extra)
 
 
 @pytest.mark.expensive

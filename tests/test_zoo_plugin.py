@@ -8,9 +8,10 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
+from small_models import small
 
 import sb3_hds
-from rl_zoo_plugin import hook, lazy, tables
+from rl_zoo_plugin import hook, lazy, tables, trial_progress, trials
 from rl_zoo_plugin.lazy import LazyAlgorithm
 from rl_zoo_plugin.samplers import CONVERTERS, SAMPLERS
 
@@ -29,13 +30,26 @@ USUAL = {
 # DroQ's paper has a target entropy for it.
 FURTHER = {"droq": {"Humanoid-v5"}}
 _TQC = {"n_critics": 5, "net_arch": {"pi": [256, 256], "qf": [512, 512, 512]}}
+_SIMBA = {
+    "learning_rate": 1e-4,
+    "policy_kwargs": {"net_arch": {"pi": [128], "qf": [512, 512]}},
+}
+_CROSSQ = {"policy_kwargs": {"net_arch": {"pi": [256, 256], "qf": [2048, 2048]}}}
 # What papers, or their authors' code where these are silent, have on tasks of 1000 steps.
 PUBLISHED = [
     # Configs of DAVIAN-Robotics/SimbaV2, which count all of MuJoCo's as ending early; where no
     # episode does, as in Swimmer, which they do not have: SonyResearch/simba.
-    ("simba", "HalfCheetah-v5", {"gamma": 0.995, "clipped_double_q": None, "policy_kwargs": None}),
-    ("simba", "Hopper-v5", {"gamma": 0.995, "clipped_double_q": None, "policy_kwargs": None}),
-    ("simba", "Swimmer-v5", {"clipped_double_q": False, "policy_kwargs": {"n_critics": 1}}),
+    ("simba", "HalfCheetah-v5", {"gamma": 0.995, "clipped_double_q": None} | _SIMBA),
+    ("simba", "Hopper-v5", {"gamma": 0.995, "clipped_double_q": None} | _SIMBA),
+    (
+        "simba",
+        "Swimmer-v5",
+        {
+            "clipped_double_q": False,
+            "policy_kwargs": {"n_critics": 1, "net_arch": {"pi": [128], "qf": [512, 512]}},
+        },
+    ),
+    ("bro", "HalfCheetah-v5", {"learning_starts": 2500, "gradient_steps": 10}),
     # Hiraoka et al. 2022, appendix; HalfCheetah: their code, after MBPO.
     ("droq", "HalfCheetah-v5", {"learning_starts": 5000, "target_entropy": -3.0}),
     ("droq", "Hopper-v5", {"learning_starts": 5000, "target_entropy": -1.0}),
@@ -43,8 +57,8 @@ PUBLISHED = [
     ("droq", "Ant-v5", {"learning_starts": 5000, "target_entropy": -4.0}),
     ("droq", "Humanoid-v5", {"learning_starts": 5000, "target_entropy": -2.0}),
     # adityab/CrossQ, train.py.
-    ("crossq_jax", "HalfCheetah-v5", {"learning_starts": 5000, "gamma": None}),
-    ("crossq_jax", "Swimmer-v5", {"learning_starts": 5000, "gamma": 0.9999}),
+    ("crossq_jax", "HalfCheetah-v5", {"learning_starts": 5000, "gamma": None} | _CROSSQ),
+    ("crossq_jax", "Swimmer-v5", {"learning_starts": 5000, "gamma": 0.9999} | _CROSSQ),
     # SamsungLabs/tqc_pytorch, main.py: training begins with the first full batch.
     (
         "tqc_jax",
@@ -286,6 +300,84 @@ def test_no_trial_of_tqc_drops_all_quantiles():
         assert 0 <= sampled["top_quantiles_to_drop_per_net"] < kept
 
 
+@pytest.mark.parametrize("algo", tables.ALGORITHMS)
+@pytest.mark.parametrize("n_timesteps", [50, 1_000, 20_000])
+def test_a_trial_has_steps_left_to_learn_from(algo, n_timesteps):
+    optuna = pytest.importorskip("optuna")
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+
+    for _ in range(20):
+        with trials.running(0, n_timesteps):
+            sampled = SAMPLERS[algo](study.ask(), n_actions=1, n_envs=1, additional_args={})
+        assert 0 <= sampled.get("learning_starts", 0) <= n_timesteps / 4
+        # A generation of OpenLoop, where the steps are enough for a few small ones.
+        horizon = sampled.get("horizon") or 1_000
+        in_one = horizon * sampled.get("n_resets", 1) * sampled.get("population_size", 1)
+        smallest = 8 * horizon
+        assert in_one <= max(n_timesteps / 5, smallest)
+
+
+def test_a_trial_has_memory_for_its_own_steps_alone():
+    algorithm = LazyAlgorithm("DroQ")
+
+    with trials.running(3, 400):
+        in_trial = algorithm(env="Pendulum-v1", learning_starts=5_000)
+        smaller = algorithm(env="Pendulum-v1", buffer_size=50, learning_starts=7)
+
+    assert (in_trial.buffer_size, in_trial.learning_starts) == (400, 100)
+    assert (smaller.buffer_size, smaller.learning_starts) == (50, 7)
+    assert algorithm(env="Pendulum-v1", learning_starts=5_000).learning_starts == 5_000
+
+
+def test_a_trial_says_now_and_then_how_far_it_is(capsys, monkeypatch):
+    monkeypatch.setattr(trial_progress, "_EVERY", 0.0)
+    with trials.running(3, 20):
+        progress = trial_progress.TrialProgress()
+    small("hds", pretrain_epochs=2, train_freq=25).learn(25, callback=progress)
+
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("Trial 3: 0 of 25 steps after 0 s")
+    assert any("Trial 3: planning before the first step after" in line for line in lines)
+    assert lines[-1].startswith("Trial 3: 25 of 25 steps after")
+
+
+class Manager:
+    """Stands for the zoo's ``ExperimentManager``."""
+
+    def __init__(self, algo, config=None, show_progress=False, n_jobs=1):
+        self.algo, self.n_timesteps, self.specified_callbacks = algo, 500, ["theirs.Callback"]
+        self.show_progress, self.n_jobs = show_progress, n_jobs
+
+    def objective(self, trial):
+        return trials.budget()
+
+    def hyperparameters_optimization(self):
+        self.found = self.objective(SimpleNamespace(number=3))
+
+
+@pytest.mark.parametrize(
+    ("given", "shown"),
+    [
+        ({}, "rl_zoo_plugin.trial_progress.TrialProgress"),
+        ({"show_progress": True}, "stable_baselines3.common.callbacks.ProgressBarCallback"),
+        ({"show_progress": True, "n_jobs": 2}, "rl_zoo_plugin.trial_progress.TrialProgress"),
+    ],
+)
+def test_trials_of_ours_know_their_steps_and_show_where_they_are(given, shown, monkeypatch):
+    manager = type("Manager", (Manager,), dict(vars(Manager)))
+    zoo = SimpleNamespace(ALGOS={"hds": LazyAlgorithm("HDS"), "sac": object})
+    zoo.ExperimentManager = manager
+    tables.EXTENSIONS["rl_zoo3.exp_manager"](zoo)
+    ours, stock = manager("hds", **given), manager("sac", **given)
+
+    ours.hyperparameters_optimization()
+    stock.hyperparameters_optimization()
+
+    assert ours.found == (3, 500) and trials.budget() is None
+    assert ours.specified_callbacks == ["theirs.Callback", shown]
+    assert stock.found is None and stock.specified_callbacks == ["theirs.Callback"]
+
+
 def test_installing_twice_installs_one_finder(monkeypatch):
     monkeypatch.setattr(sys, "meta_path", [f for f in sys.meta_path if not is_ours(f)])
 
@@ -335,6 +427,10 @@ def fake_zoo(tmp_path) -> str:
         "class ExperimentManager:\n"
         "    def __init__(self, args, algo, env_id, config=None):\n"
         "        self.config = config\n"
+        "    def objective(self, trial):\n"
+        "        return 0.0\n"
+        "    def hyperparameters_optimization(self):\n"
+        "        pass\n"
     )
     return str(tmp_path)
 

@@ -55,6 +55,7 @@ class BroPolicy(GaussianPolicy):
         "squash_log_std": True,
     }
     unused = ("renorm_warmup_steps", "dropout_rate", "ortho_init")
+    narrow = 128
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
         return BroBody(net_arch, self.activation_fn)
@@ -73,12 +74,13 @@ class BRO(SoftActorCritic):
     that start afresh.
 
     Source: Nauman et al., *Bigger, Regularized, Optimistic: scaling for compute and
-    sample-efficient continuous control*, NeurIPS 2024: replay ratio 10 (``gradient_steps=2`` is
-    their fast variant), batches of 128, AdamW with 3e-4, target entropy of minus half the number of
-    controls, Adam with b1 = 0.5 for the temperature and the multipliers. Their first values are no
-    arguments (optimism 1, regulariser 0.25). As in the authors' code (MIT licence), fresh starts
-    include the temperature, the multipliers and all optimisers, and the logarithms of multipliers
-    and of the deviation of actions are squashed into their limits by :math:`\tanh`: actions start
+    sample-efficient continuous control*, NeurIPS 2024: replay ratio 10 (``gradient_steps=10``; here
+    2, their fast variant, which two cores bear), batches of 128, AdamW with 3e-4, target entropy of
+    minus half the number of controls, Adam with b1 = 0.5 for the temperature and the multipliers.
+    Their first values are no arguments (optimism 1, regulariser 0.25). As in the authors' code (MIT
+    licence), fresh starts include the temperature, the multipliers and all optimisers, and the
+    logarithms of multipliers and of the deviation of actions are squashed into their limits by
+    :math:`\tanh`: actions start
     with a deviation near :math:`e^{-4}`, not near 1 as with SAC. Its quantile loss is a sum over
     quantiles where this is their mean, a factor that Adam takes out again. The loss of the
     entropy coefficient has the coefficient itself, as theirs. With ``use_sde=True``, which the
@@ -113,7 +115,7 @@ class BRO(SoftActorCritic):
         env: GymEnv | str | None = None,
         learning_rate: float | str | Schedule = 3e-4,
         *,
-        gradient_steps: int = 10,
+        gradient_steps: int = 2,
         batch_size: int = 128,
         linear_ent_coef: bool = True,
         kl_target: float = 0.05,

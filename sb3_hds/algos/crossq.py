@@ -15,8 +15,10 @@ class CrossQ(SoftActorCritic):
     next pairs of state and action, and no target networks.
 
     Source: Bhatt et al., *CrossQ: Batch Normalization in Deep Reinforcement Learning for Greater
-    Sample Efficiency and Simplicity*, ICLR 2024: critics of width 2048, Adam with b1 = 0.5,
-    learning rate 1e-3, three updates of the critics for each of the actor.
+    Sample Efficiency and Simplicity*, ICLR 2024: critics of width 2048
+    (``policy_kwargs={"net_arch": {"pi": [256, 256], "qf": [2048, 2048]}}``; here 512, which two
+    cores bear), Adam with b1 = 0.5, learning rate 1e-3, three updates of the critics for each of
+    the actor.
     Their discount is 0.99, but 0.9999 on Swimmer. Batch normalisation becomes batch
     renormalisation, in each network after 100,000 updates of its own, as in the authors' code
     (``policy_kwargs={"renorm_warmup_steps": ...}``). SBX's default width is 1024, and its

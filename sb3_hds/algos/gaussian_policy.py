@@ -90,6 +90,8 @@ class GaussianPolicy(LearningPolicy):
     }
     #: arguments that these networks do not use
     unused: ClassVar[tuple[str, ...]] = ()
+    #: ``net_arch`` of files that do not say it: the default of their day, where that changed
+    of_older_files: ClassVar[Mapping[str, Sequence[int]] | None] = None
 
     def __init__(
         self,
@@ -138,6 +140,8 @@ class GaussianPolicy(LearningPolicy):
                 "one of them."
             )
         net: Any = chosen["net_arch"]
+        # Files say it, so that they do not depend on the default.
+        self.arguments["net_arch"] = dict(net) if isinstance(net, Mapping) else net
         self.widths = widths(net, "qf")
         self.activation_fn = activation(activation_fn)
         self.dropout_rate, self.layer_norm = float(dropout_rate), layer_norm
@@ -169,6 +173,11 @@ class GaussianPolicy(LearningPolicy):
         self.flatten = flattener(observation_space)
         self.forget_noise()
         self._noise = np.random.default_rng(0)
+
+    @classmethod
+    def arguments_of_file(cls, saved: Mapping[str, Any]) -> dict[str, Any]:
+        older = cls.of_older_files if saved.get("net_arch") is None else None
+        return dict(saved) if older is None else {**saved, "net_arch": dict(older)}
 
     def _refuse_unused(self, has_batch_norm: bool) -> None:
         unused = self.unused if has_batch_norm else (*self.unused, "batch_norm_momentum")
@@ -321,7 +330,8 @@ class GaussianPolicy(LearningPolicy):
 class SimbaPolicy(GaussianPolicy):
     """
     ``"SimbaPolicy"``: residual networks on observations normalised by running statistics (Lee et
-    al., ICLR 2025), with the widths and the weight decay of the paper.
+    al., ICLR 2025), with the weight decay of the paper. Its critics have 512 units, which two cores
+    do not bear: ``net_arch={"pi": [128], "qf": [512, 512]}``; the default has a quarter of them.
 
     What the algorithm samples from stays that of the algorithm: the logarithm of the deviation of
     actions is clipped, as in SBX, and starts near 0, which is what the first entropy coefficient of
@@ -330,12 +340,14 @@ class SimbaPolicy(GaussianPolicy):
     """
 
     defaults: ClassVar[Mapping[str, Any]] = {
-        "net_arch": {"pi": (128,), "qf": (512, 512)},
+        "net_arch": {"pi": (128,), "qf": (128, 128)},
         "optimizer_class": "adamw",
         "optimizer_kwargs": {"weight_decay": 1e-2},
         "normalize_observations": True,
     }
     unused = ("renorm_warmup_steps", "ortho_init")
+    narrow = 128
+    of_older_files = {"pi": (128,), "qf": (512, 512)}
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
         return SimbaBody(net_arch, self.activation_fn)
@@ -359,15 +371,18 @@ class SimbaSACPolicy(SimbaPolicy):
 class CrossQPolicy(GaussianPolicy):
     """
     Batch normalisation in actor and critics, and Adam's ``b1`` of 0.5 (Bhatt et al., ICLR 2024).
+    Their critics have 2048 units, which two cores do not bear: ``net_arch={"pi": [256, 256], "qf":
+    [2048, 2048]}``; the default has a quarter of them.
     """
 
     defaults = {
-        "net_arch": {"pi": (256, 256), "qf": (2048, 2048)},
+        "net_arch": {"pi": (256, 256), "qf": (512, 512)},
         "optimizer_class": "adam",
         "optimizer_kwargs": {"b1": 0.5},
         "normalize_observations": False,
         "renorm_warmup_steps": 100_000,
     }
+    of_older_files = {"pi": (256, 256), "qf": (2048, 2048)}
 
 
 def widths(

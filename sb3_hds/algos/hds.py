@@ -1,6 +1,7 @@
 """Hybrid differentiable simulation."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from sb3_hds.algos.correction import Correction, Since, Wishes, correct, names_t
 from sb3_hds.algos.log import record_correction
 from sb3_hds.algos.measured import Measured, data_from
 from sb3_hds.algos.model import check_known, missing_effects, nulls_of, required
+from sb3_hds.algos.pretraining import meanwhile, nothing
 from sb3_hds.algos.twin_algorithm import TwinAlgorithm
 from sb3_hds.core import Effect, Params, Trajectories, Twin
 from sb3_hds.core.layers import plant_of
@@ -295,6 +297,13 @@ class HDS(TwinAlgorithm):
             self.correct_model(gradient_steps)
         super().train(gradient_steps, batch_size)
 
+    def remedies(self, updates_per_step: float) -> list[str]:
+        own = (
+            [f"refit_freq={4 * self.refit_freq}, {self.refit_freq} now"] if self.refit_freq else []
+        )
+        own += ["residual=False"] if self.residual else []
+        return own + super().remedies(updates_per_step)
+
     def before_planning(self) -> None:
         if self.measured.earlier is not None and not self._saw_earlier:
             self.correct_model()
@@ -312,7 +321,8 @@ class HDS(TwinAlgorithm):
         if data is None or self.twin is None:
             return None
         n_steps = data.n_steps if n_counted is None else min(data.n_steps, n_counted)
-        found = correct(
+        by_data = partial(
+            correct,
             self.twin,
             data,
             self._wishes(self.twin),
@@ -321,6 +331,7 @@ class HDS(TwinAlgorithm):
             n_new=self.real_timesteps - self._refitted_at,
             since=None if n_counted is None else Since(n_counted, self._changed_in),
         )
+        found = by_data() if self.poll is nothing else meanwhile([by_data], self.poll)[0]
         if found.since is not None:
             self._changed_at = self.real_timesteps - found.since.n_steps
             self._changed_in, self._steps_at_force = found.since.recording, 0

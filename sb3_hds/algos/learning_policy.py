@@ -23,6 +23,10 @@ class LearningPolicy(TensorPolicy):
 
     #: fields of the learner that are saved with the networks, not with their optimisers
     held: ClassVar[tuple[str, ...]]
+    #: hidden widths of the actor and of the critics
+    widths: tuple[tuple[int, ...], tuple[int, ...]]
+    #: width of critics that a CPU bears
+    narrow: ClassVar[int] = 256
     #: observations to rows of numbers
     flatten: Callable[[Any], np.ndarray]
 

@@ -17,7 +17,13 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    MaybeCallback,
+    Schedule,
+    TrainFreq,
+    TrainFrequencyUnit,
+)
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_hds.algos.call_forms import between, is_count, policy_and_env, schedule_of
@@ -31,6 +37,7 @@ from sb3_hds.errors import DivergedError, EnvironmentMismatchError
 # What is logged of updates of the actor, which not every call of ``train`` makes.
 _OF_ACTOR = ("actor_loss", "ent_coef", "ent_coef_loss")
 _NOT_THERE = object()
+_USUAL_BATCH = 256
 # What networks compute in.
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -232,6 +239,21 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             self._give_up(f"an update diverged ({report})")
         self._before, self.policy.learner = self.policy.learner, learner
 
+    def remedies(self, updates_per_step: float) -> list[str]:
+        (pi, qf), narrow, freq = self.policy.widths, self.policy.narrow, self.train_freq
+        found = []
+        if max(qf) > narrow:
+            arch = {"pi": list(pi), "qf": [narrow for _ in qf]}
+            found.append(f"policy_kwargs={{'net_arch': {arch}}}, with critics of {list(qf)} now")
+        if updates_per_step > 1.0:
+            found.append(f"fewer gradient_steps, {updates_per_step:.3g} for each step now")
+        elif isinstance(freq, TrainFreq) and freq.unit is TrainFrequencyUnit.STEP:
+            more = 4 * freq.frequency
+            found.append(f"train_freq={more} with gradient_steps={max(1, self.gradient_steps)}")
+        if self.batch_size > _USUAL_BATCH:
+            found.append(f"batch_size={_USUAL_BATCH}, {self.batch_size} now")
+        return [*found, "a GPU"]
+
     def check_weights(self) -> None:
         if not finite_leaves(_trained(self.policy.learner)):
             self._give_up("an update made weights that are not finite")
@@ -399,6 +421,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         elif isinstance(self.learning_rate, numbers.Real):
             self.learning_rate = float(self.learning_rate)
         self._take_older_rate()
+        self._take_older_widths()
         # Of None, SBX makes the first number of ``learning_rate``.
         given, self._before = self.qf_learning_rate, None
         derived = self.replay_buffer_class in (None, self._derived_buffer)
@@ -432,6 +455,15 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         older = vars(self).pop("critic_learning_rate", _NOT_THERE)
         if older is not _NOT_THERE and self.qf_learning_rate == self.lr_schedule(1.0):
             self.qf_learning_rate = older
+
+    def _take_older_widths(self) -> None:
+        """Of a file that does not say its widths, they are the default of when it was saved."""
+        described = vars(self).get("policy_description")
+        if described is None or "net_arch" in self.policy_kwargs:
+            return
+        kind: Any = self.policy_class
+        saved = kind.arguments_of_file(described["arguments"])["net_arch"]
+        self.policy_kwargs = {**self.policy_kwargs, "net_arch": saved}
 
     def _maybe_reset_params(self) -> None:
         resets = self.param_resets or []

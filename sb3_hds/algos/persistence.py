@@ -11,19 +11,22 @@ A file appears under its name only when it is complete (:func:`write_whole`).
 
 import contextlib
 import io
+import json
 import os
-import re
+import pickle
 import secrets
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import torch as th
 from sbx.common.policies import BaseJaxPolicy
+from stable_baselines3.common.utils import get_device
 
 from sb3_hds.algos.networks import activation_name
 from sb3_hds.algos.optimizers import optimizer_name
@@ -66,26 +69,81 @@ def write_whole(
         raise OSError(error.errno, reason) from error
 
 
+def refuse_damaged(path: str | os.PathLike[str] | io.BufferedIOBase, *parts: str) -> None:
+    """
+    Read a zip file once, so that what fails later is not the file.
+
+    A file that was cut off may still look like a zip file, because the weights in it are one each.
+
+    :param path: of the file, or the file; ``.zip`` may be left out
+    :param parts: that must be in it
+    :raises OSError: if it is not there, or cannot be opened
+    :raises ValueError: in one line, if it is damaged, or is something else
+    """
+    with _opened(path) as file:
+        begin = file.tell()
+        try:
+            with zipfile.ZipFile(file) as archive:
+                # What zipfile raises where a header is damaged has many types.
+                broken, missing = archive.testzip(), set(parts) - set(archive.namelist())
+        except Exception as error:
+            raise damaged(path, error) from error
+        file.seek(begin)
+    if broken or missing:
+        raise damaged(path, f"'{broken}' was changed" if broken else f"no '{min(missing)}'")
+
+
+def damaged(path: Any, reason: Any) -> ValueError:
+    """
+    :param path: of a file, or the file
+    :param reason: why it cannot be read
+    :return: the error that says so, in one line
+    """
+    kind = f"{type(reason).__name__}: " if isinstance(reason, Exception) else ""
+    found = kind + " ".join(str(reason).split())
+    return ValueError(
+        f"{name_of(path)} is damaged, or is no saved model ({found:.120}): copy it once more "
+        "from where it was saved, or load an older checkpoint."
+    )
+
+
+def name_of(path: Any) -> str:
+    """:return: of a file, to begin a message with"""
+    return f"'{path}'" if isinstance(path, str | os.PathLike) else "The file"
+
+
+def existing(path: Any, suffix: str = "zip") -> Any:
+    """:return: the path with the suffix, where SB3 would look for it; a file as it is"""
+    if not isinstance(path, str | os.PathLike):
+        return path
+    named = Path(path)
+    return named if named.exists() else named.with_name(f"{named.name}.{suffix}")
+
+
+def _opened(path: Any) -> contextlib.AbstractContextManager[Any]:
+    path = existing(path)
+    return path.open("rb") if isinstance(path, Path) else contextlib.nullcontext(path)
+
+
 @contextlib.contextmanager
 def damage_reported(path: Any) -> Iterator[None]:
     """
-    A file that was cut off may still look like a zip file, because the weights in it are one each.
-
-    :raises ValueError: where SB3 only asserts that the file has all its parts, or takes one that
-        misses some for an old one of its own
+    :raises ValueError: where SB3 takes a file that misses some parts for an old one of its own
     """
     try:
         yield
     except KeyError as error:
         if not isinstance(error.__context__, ValueError):
             raise
-        raise ValueError(f"'{path}' does not fit this model: {error.__context__}") from error
-    except AssertionError as error:
-        if not re.match("No (data|params) found", str(error)):
-            raise
         raise ValueError(
-            f"'{path}' is damaged, or is no saved model: {error}. Load an older checkpoint."
+            f"{name_of(path)} does not fit this model, or is damaged: {error.__context__}"
         ) from error
+    except (pickle.UnpicklingError, json.JSONDecodeError, UnicodeDecodeError, EOFError) as error:
+        raise damaged(path, error) from error
+    except RuntimeError as error:
+        if "PytorchStreamReader" not in str(error):
+            raise
+        raise damaged(path, error) from error
 
 
 def to_state_dict(tree: Any) -> dict[str, th.Tensor]:
@@ -227,6 +285,32 @@ class TensorPolicy(BaseJaxPolicy):
             # As SB3: what acts needs none, and a function of one's own cannot be pickled.
             arguments["lr_schedule"] = self._dummy_schedule
         return spaces_and_more | arguments
+
+    @classmethod
+    def load(cls, path: str, device: Any = "auto") -> Self:
+        """
+        SB3's ``load`` of a policy alone, which unpickles: load what you have saved yourself.
+
+        :param path: of a file that ``save`` of a policy wrote
+        :param device: as in SB3
+        :raises ValueError: for a damaged file
+        """
+        refuse_damaged(path)
+        with damage_reported(path):
+            # As SB3 says, spaces are no tensors.
+            saved = th.load(path, map_location="cpu", weights_only=False)
+        policy = cls(**cls.arguments_of_file(saved["data"]))
+        policy.load_state_dict(saved["state_dict"])
+        policy.to(get_device(device))
+        return policy
+
+    @classmethod
+    def arguments_of_file(cls, saved: Mapping[str, Any]) -> dict[str, Any]:
+        """
+        :param saved: arguments of the constructor
+        :return: what they meant when they were saved
+        """
+        return dict(saved)
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, th.Tensor]:
         return to_state_dict(self.weights)

@@ -12,13 +12,18 @@ import json
 import os
 import zipfile
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import jax
 import torch as th
 
-from sb3_hds.algos.persistence import TensorPolicy
+from sb3_hds.algos.persistence import (
+    TensorPolicy,
+    damaged,
+    existing,
+    name_of,
+    refuse_damaged,
+)
 from sb3_hds.algos.policy_description import space_from_plain
 
 # Where each policy is: of the others, nothing is imported.
@@ -49,17 +54,19 @@ def load_policy(path: str | os.PathLike[str] | io.BufferedIOBase) -> TensorPolic
     :raises ValueError: for a file that is damaged, that another library saved, or whose policy only
         Python code describes: a class or an activation function of your own
     """
+    refuse_damaged(path, "data", "policy.pth")
+    with zipfile.ZipFile(existing(path)) as file:
+        content, tensors = file.read("data"), io.BytesIO(file.read("policy.pth"))
     try:
-        with zipfile.ZipFile(_existing(path)) as file:
-            data, tensors = json.loads(file.read("data")), io.BytesIO(file.read("policy.pth"))
-        description = data.get("policy_description")
-    except (zipfile.BadZipFile, KeyError, AttributeError, ValueError) as error:
-        raise ValueError(f"'{path}' is damaged, or is no saved model: {error}.") from error
+        description = json.loads(content).get("policy_description")
+    # Whatever a stranger wrote there, however deep it is nested.
+    except (AttributeError, ValueError, RecursionError) as error:
+        raise damaged(path, error) from error
     if description is None:
         raise ValueError(
-            f"'{path}' does not describe its policy in plain data: another library saved it, an "
-            "older version of this one, or its policy has a class or function of your own. If you "
-            "trust whoever saved it, load it with its algorithm, for example HDS.load(path)."
+            f"{name_of(path)} does not describe its policy in plain data: another library saved "
+            "it, an older version of this one, or its policy has a class or function of your own. "
+            "If you trust whoever saved it, load it with its algorithm, for example HDS.load(path)."
         )
     policy = _built(description)
     policy.move_to(_cpu())
@@ -68,8 +75,8 @@ def load_policy(path: str | os.PathLike[str] | io.BufferedIOBase) -> TensorPolic
     # What torch raises for a damaged file has many types, and recommends to unpickle it.
     except Exception as error:
         raise ValueError(
-            f"The weights in '{path}' are damaged, or do not fit the policy that it describes "
-            f"({type(error).__name__}): copy it once more from where it was saved."
+            f"{name_of(path)} has weights that are damaged, or do not fit the policy that it "
+            f"describes ({type(error).__name__}): copy it once more from where it was saved."
         ) from None
     return policy
 
@@ -79,14 +86,14 @@ def _built(description: Mapping[str, Any]) -> TensorPolicy:
         make = _class_named(description["class"])
         observation_space = space_from_plain(description["observation_space"])
         action_space: Any = space_from_plain(description["action_space"])
-        policy = make(  # type: ignore[call-arg]
-            observation_space, action_space, lr_schedule=_no_rate, **description["arguments"]
-        )
+        arguments = make.arguments_of_file(description["arguments"])
+        policy = make(observation_space, action_space, lr_schedule=_no_rate, **arguments)  # type: ignore[call-arg]
         policy.plain_state = description["state"]
-    except (KeyError, TypeError) as error:
+    # Whatever a constructor makes of numbers that a stranger wrote.
+    except Exception as error:
         raise ValueError(
-            f"This file describes its policy in a way that this version does not know ({error}): "
-            "was it saved by a newer one?"
+            f"This file describes its policy in a way that this version does not know "
+            f"({type(error).__name__}: {error}): it is damaged, or a newer one saved it."
         ) from error
     return policy
 
@@ -104,13 +111,6 @@ def _cpu() -> Any:
         return jax.devices("cpu")[0]
     except RuntimeError:
         return jax.devices()[0]
-
-
-def _existing(path: Any) -> Any:
-    if not isinstance(path, str | os.PathLike):
-        return path
-    named = Path(path)
-    return named if named.exists() else named.with_name(f"{named.name}.zip")
 
 
 def _no_rate(_: float) -> float:

@@ -10,7 +10,13 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_hds.algos.call_forms import device_or_cpu
-from sb3_hds.algos.persistence import by_names, damage_reported, write_whole
+from sb3_hds.algos.persistence import (
+    by_names,
+    damage_reported,
+    name_of,
+    refuse_damaged,
+    write_whole,
+)
 from sb3_hds.algos.policy_description import described
 
 
@@ -58,6 +64,7 @@ class SavesTensors(BaseAlgorithm):
         """
         if kwargs.get("policy_kwargs"):
             kwargs["policy_kwargs"] = by_names(kwargs["policy_kwargs"])
+        refuse_damaged(path, "data", "policy.pth")
         with damage_reported(path):
             return super().load(path, env, device_or_cpu(device), *args, **kwargs)
 
@@ -82,15 +89,25 @@ class SavesTensors(BaseAlgorithm):
         :param load_path_or_dict: of a file, or what ``get_parameters`` returned
         :param exact_match: whether nothing may be missing
         :param device: where to
-        :raises ValueError: for names of objects that this model does not have, or has and misses
+        :raises ValueError: for names of objects that this model does not have, or has and misses,
+            and for a damaged file
         :raises RuntimeError: for tensors that do not fit
         """
         given = load_path_or_dict
         if not isinstance(given, dict):
-            _, given, _ = load_from_zip_file(given, device=device, load_data=False)
+            refuse_damaged(given, "policy.pth")
+            with damage_reported(load_path_or_dict):
+                _, given, _ = load_from_zip_file(given, device=device, load_data=False)
         own, (names, _) = self.get_parameters(), self._get_torch_save_params()
         empty: dict[str, Any] = {name: {} for name in names if name not in own}
-        super().set_parameters(empty | given, exact_match, device)
+        try:
+            super().set_parameters(empty | given, exact_match, device)
+        except ValueError as error:
+            if isinstance(load_path_or_dict, dict):
+                raise
+            raise ValueError(
+                f"{name_of(load_path_or_dict)} does not fit this model, or is damaged: {error}"
+            ) from error
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []

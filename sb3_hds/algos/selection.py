@@ -1,7 +1,6 @@
 """Which of the policies that came by is the one that acts."""
 
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -51,15 +50,15 @@ def choose_policy(
     return learner._replace(networks=acting), None
 
 
-def compile_together(settings: Settings, learner: Learner, knobs: Knobs, compares: bool) -> None:
+def programs(
+    settings: Settings, learner: Learner, knobs: Knobs, compares: bool
+) -> list[Callable[[], Any]]:
     """
-    Compile the programs of an epoch side by side, by running each once for nothing.
-
     :param compares: whether policies will be compared
+    :return: the programs of an epoch, to be run side by side once for nothing, which compiles them
     """
-    programs = [plan_ahead, learn_from_plans, *([keep_better] if compares else [])]
-    with ThreadPoolExecutor(len(programs)) as pool:
-        list(pool.map(lambda program: program(settings, learner, knobs), programs))
+    used = [plan_ahead, learn_from_plans, *([keep_better] if compares else [])]
+    return [partial(program, settings, learner, knobs) for program in used]
 
 
 def twin_steps_per_comparison(settings: Settings) -> int:

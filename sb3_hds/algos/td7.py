@@ -91,7 +91,7 @@ class TD7Policy(LearningPolicy):
         super().__init__(observation_space, action_space, squash_output=True)
         check_count("n_critics", n_critics)
         check_count("embedding_size", embedding_size)
-        pi, qf = widths(net_arch, "qf")
+        self.widths = pi, qf = widths(net_arch, "qf")
         of_values = activation(qf_activation_fn)
         self.n_obs = size_of(observation_space)
         self.action_shape = action_space.shape

@@ -10,11 +10,12 @@ import numpy as np
 from sbx.common.off_policy_algorithm import OffPolicyAlgorithmJax
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.type_aliases import MaybeCallback, RolloutReturn
 
 from sb3_hds.algos.call_forms import check_origin, check_policy_kwargs
 from sb3_hds.algos.executed_actions import executed
-from sb3_hds.algos.persistence import TensorPolicy, by_names, write_whole
+from sb3_hds.algos.pace import Pace
+from sb3_hds.algos.persistence import TensorPolicy, by_names, damaged, write_whole
 from sb3_hds.algos.saving import SavesTensors
 
 _STATISTICS = ("obs_rms", "ret_rms", "returns")
@@ -42,6 +43,7 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         :raises ValueError: if there is no environment to make them for
         """
         self.saved_by, self._device_name = type(self).__name__, str(device)
+        self._pace = Pace()
         if not set_up:
             return
         if self.env is None:
@@ -93,9 +95,21 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         :raises ValueError: where what the environment begins with is not finite
         """
         self._keep_statistics()
+        self._pace.pause()
         found = super()._setup_learn(*args, **kwargs)
         self._refuse_unless_finite("What the environment begins with", self._last_obs)
         return found
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        self._pace.updated(self)
+        before = self.num_timesteps
+        collected = super().collect_rollouts(*args, **kwargs)
+        self._pace.collected(self, self.num_timesteps - before)
+        return collected
+
+    def remedies(self, updates_per_step: float) -> list[str]:
+        """:return: what would make a slow learner faster, as arguments"""
+        raise NotImplementedError
 
     def _store_transition(
         self,
@@ -151,8 +165,24 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         path: str | pathlib.Path | io.BufferedIOBase,
         truncate_last_traj: bool = True,
     ) -> None:
+        """
+        SB3's ``load_replay_buffer``, which unpickles: load what you have saved yourself.
+
+        :param path: of a file that ``save_replay_buffer`` wrote; ``.pkl`` may be left out
+        :param truncate_last_traj: of a buffer of HER, whether its last episode has ended
+        :raises ValueError: for a damaged file; the buffer of before is then still there
+        """
+        before = self.replay_buffer
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+        except (OSError, AssertionError):
+            raise
+        # Where pickle meets damage, it may raise anything.
+        except Exception as error:
+            if self.replay_buffer is not before:
+                raise
+            raise damaged(path, error) from error
         # SBX marks the buffer as the CPU's, where SB3 has the model's device.
-        super().load_replay_buffer(path, truncate_last_traj)
         self.replay_buffer.device = self.device  # type: ignore[union-attr]
 
     def _setup_model(self) -> None:
@@ -163,7 +193,7 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         super()._setup_model()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_statistics"]
+        return [*super()._excluded_save_params(), "_statistics", "_pace"]
 
     def check_arguments(self) -> None:
         """

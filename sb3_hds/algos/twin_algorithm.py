@@ -7,6 +7,8 @@ in, nothing else; simulated steps are counted apart.
 """
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar, Self
 
 import jax
@@ -17,7 +19,13 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    MaybeCallback,
+    RolloutReturn,
+    Schedule,
+    TrainFreq,
+)
 
 from sb3_hds import twins
 from sb3_hds.algos.arguments import knobs_of, settings_of
@@ -40,12 +48,8 @@ from sb3_hds.algos.log import record_epoch
 from sb3_hds.algos.model import check_reward, required, twin_from_spec
 from sb3_hds.algos.normalisation import prepare_statistics, view_of
 from sb3_hds.algos.persistence import Tensors
-from sb3_hds.algos.pretraining import Pretraining
-from sb3_hds.algos.selection import (
-    choose_policy,
-    compile_together,
-    twin_steps_per_comparison,
-)
+from sb3_hds.algos.pretraining import Pretraining, meanwhile, nothing
+from sb3_hds.algos.selection import choose_policy, programs, twin_steps_per_comparison
 from sb3_hds.algos.tensor_algorithm import TensorAlgorithm
 from sb3_hds.algos.twin_policy import TwinPolicy, all_finite
 from sb3_hds.core import Params, Twin
@@ -191,6 +195,9 @@ class TwinAlgorithm(TensorAlgorithm):
         self._n_updates = 0
         self._epochs_planned, self._epochs_done = 0, 0
         self._workspace: Workspace | None = None
+        self._compiled: Settings | None = None
+        self.stopped = False
+        self.poll: Callable[[], None] = nothing
         self._constructed(device, _init_setup_model)
 
     def learn(  # type: ignore[override]
@@ -207,7 +214,8 @@ class TwinAlgorithm(TensorAlgorithm):
 
         :param total_timesteps: steps of the *environment*; default ``default_timesteps``. With 0,
             only the pretraining runs, and the environment is not stepped.
-        :param callback: called at every step of the environment
+        :param callback: called at every step of the environment, and before the first one after
+            every planning epoch, with ``locals["pretraining"]`` and no timestep counted
         :param log_interval: episodes between two log lines
         :param tb_log_name: name of the run for TensorBoard; default: the class's name
         :param reset_num_timesteps: False goes on counting
@@ -221,6 +229,12 @@ class TwinAlgorithm(TensorAlgorithm):
         """One planning epoch with ``gradient_steps`` regression steps, between real steps."""
         self._n_updates += gradient_steps
         self.run_epoch(gradient_steps)
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        if self.stopped:
+            # By a callback, before the first step.
+            return RolloutReturn(0, 0, continue_training=False)
+        return super().collect_rollouts(*args, **kwargs)
 
     def _store_transition(
         self,
@@ -244,14 +258,14 @@ class TwinAlgorithm(TensorAlgorithm):
         :raises NoTwinError: if the model was loaded without environment and without twin
         :raises DivergedError: if the regression diverged; the model keeps its last good state
         """
-        first = self._workspace is None
         learner, settings = self._learner(), self._settings
         knobs = knobs_of(self, settings.twin, self._progress_remaining(), gradient_steps)
-        if first:
+        if settings != self._compiled:
             compares = self.compare_every > 0 and (
                 self.comparison_due or self.compare_every <= self._epochs_planned
             )
-            compile_together(settings, learner, knobs, compares)
+            meanwhile(programs(settings, learner, knobs, compares), self.poll)
+            self._compiled = settings
         learner, report = epoch(settings, learner, knobs)
         learner, returns = choose_policy(
             settings, learner, knobs, self.compare_every, self.comparison_due
@@ -297,6 +311,14 @@ class TwinAlgorithm(TensorAlgorithm):
 
     def check_arguments(self) -> None:
         check_arguments(self)
+
+    def remedies(self, updates_per_step: float) -> list[str]:
+        return [
+            f"n_rollouts={max(1, self.n_rollouts // 4)}, {self.n_rollouts} now",
+            "a larger train_freq",
+            f"fewer gradient_steps, {updates_per_step:.3g} for each step now",
+            "a GPU",
+        ]
 
     def _setup_twin(self) -> None:
         """The twin that was passed, or saved because it had been, or the environment's own."""
@@ -365,9 +387,8 @@ class TwinAlgorithm(TensorAlgorithm):
                 seed = int(np.asarray(policy.progress.key)[0])
                 prepare_statistics(self._vec_normalize_env, settings.twin, jax.random.key(seed))
             view = view_of(self._vec_normalize_env, len(settings.twin.channels))
-            workspace, scales, progress = begin(
-                settings, settings.twin.params, view, policy.progress
-            )
+            started = partial(begin, settings, settings.twin.params, view, policy.progress)
+            [(workspace, scales, progress)] = meanwhile([started], self.poll)
             if fresh:
                 policy.networks = policy.networks._replace(inside=scales.inside)
                 progress = progress._replace(
@@ -386,7 +407,7 @@ class TwinAlgorithm(TensorAlgorithm):
         total_timesteps, callback = super()._setup_learn(total_timesteps, *args, **kwargs)
         steps = total_timesteps - self.num_timesteps
         self._epochs_planned = self.pretraining_due + math.ceil(steps / self._steps_per_epoch)
-        self._epochs_done = 0
+        self._epochs_done, self.stopped = 0, False
         return total_timesteps, callback
 
     @property
@@ -426,7 +447,7 @@ class TwinAlgorithm(TensorAlgorithm):
             given = callback
         else:
             given = [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
-        return super()._init_callback([Pretraining(progress_bar), *given], progress_bar)
+        return super()._init_callback(Pretraining(given, progress_bar), progress_bar)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names, variables = super()._get_torch_save_params()
@@ -436,6 +457,9 @@ class TwinAlgorithm(TensorAlgorithm):
         ours = [
             "twin",
             "_workspace",
+            "_compiled",
+            "poll",
+            "stopped",
             "unstored_step",
             "learned_force",
         ]

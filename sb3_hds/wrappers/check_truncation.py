@@ -6,14 +6,20 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import (
+    AsyncVectorEnv,
+    AutoresetMode,
+    SyncVectorEnv,
+    VectorEnv,
+    VectorWrapper,
+)
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_hds.errors import ParameterError
 from sb3_hds.wrappers.ends_seen import End, Seen, ends_of_env, ends_of_vec_env, is_same
 from sb3_hds.wrappers.gymnasium_vec_env import GymnasiumVecEnv
 from sb3_hds.wrappers.report import Report, counted, name_of
-from sb3_hds.wrappers.step_limit import step_limit_of
+from sb3_hds.wrappers.step_limit import Limit, limits_of, own_limit, step_limit_of
 
 # Steps that are made where no limit is known.
 _USUAL = 2_000
@@ -21,6 +27,8 @@ _USUAL = 2_000
 # those after any number of steps in the last fifth before, and those after any other number.
 _FEWEST = 3
 _THAN_BEFORE, _THAN_ANY = 3.0, 1.5
+# Where layers of vectorised environments keep their limit; copies keep it under the first name.
+_NAMES = ("_max_episode_steps", "max_episode_steps")
 # What Python says where an environment keeps to Gym before 0.26.
 _OLD_SIGNS = ("values to unpack", "unexpected keyword argument 'seed'")
 
@@ -41,7 +49,9 @@ def check_truncation(
 
     Episodes are made with random actions. What an end *means* cannot be seen from outside; but
     ends that come after the same number of steps time and again are a limit, unless observations
-    tell the time. The environment is reset and stepped, and not closed.
+    tell the time. A limit around a shorter one, which never acts, is found in the whole stack of
+    wrappers; in copies in processes of their own, by where episodes end. The environment is reset
+    and stepped, and not closed.
 
     :param env: an environment, an SB3 ``VecEnv`` of anybody's, or a Gymnasium ``VectorEnv`` in any
         autoreset mode, wrapped as the learner gets it
@@ -79,16 +89,18 @@ def _of_env(env: gymnasium.Env, n_steps: int | None, seed: int) -> tuple[list, l
         )
         return [old], [], Seen([], 0, False)
     problems = _only_in_info(seen) + _looks_like_a_limit(seen, limit)
-    problems += _nothing_ended(seen)
+    problems += _never_acts([limits_of(env)], env, seen) + _nothing_ended(seen)
     return problems, [] if problems else _unseen(seen, limit), seen
 
 
 def _of_vec_env(env: VecEnv, n_steps: int | None, seed: int) -> tuple[list, list, Seen]:
-    limit = _limit_of_copies(env)
+    stacks, copies = _stacks(env)
+    known = [min(map(_steps_of, stack)) for stack in stacks if stack]
+    limit = max(filter(None, known or map(step_limit_of, copies)), default=None)
     seen = ends_of_vec_env(env, n_steps or env.num_envs * 4 * (limit or _USUAL // 4), seed)
     problems = _missing_keys(seen) + _lost_observations(env, seen)
     if _tells_time_outs(seen):
-        problems += _looks_like_a_limit(seen, limit)
+        problems += _looks_like_a_limit(seen, limit) + _never_acts(stacks, env, seen)
     problems += _nothing_ended(seen)
     return problems, [] if problems else _unseen(seen, limit), seen
 
@@ -138,6 +150,45 @@ def _looks_like_a_limit(seen: Seen, limit: int | None) -> list[str]:
         f"sb3_hds.wrappers.InfiniteHorizon(env, max_episode_steps={longest}). If the task really "
         "is over then, let observations tell the time: sb3_hds.wrappers.TimeAware."
     ]
+
+
+def _never_acts(stacks: list[list[Limit]], env: Any, seen: Seen) -> list[str]:
+    """A limit around a shorter one, which ends every episode before."""
+    found = [pair for stack in stacks if (pair := _outrun(stack)) is not None]
+    if found:
+        outer, inner = found[0]
+        where = f" (in {len(found)} of {len(stacks)} copies)" if len(stacks) > 1 else ""
+        what = f"The limit of {outer} never acts{where}: that of {inner} inside it comes first."
+    else:
+        outer = min((stack[0] for stack in stacks if stack), key=_steps_of, default=None)
+        cut = Counter(end.length for end in seen.ends if not end.terminated)
+        longest = max((end.length for end in seen.ends), default=0)
+        n = cut[longest]
+        if outer is None or longest >= outer.steps or n < _FEWEST or 2 * n < cut.total():
+            return []
+        what = (
+            f"{n} of {counted(len(seen.ends), 'episode')} were cut after exactly {longest} steps, "
+            f"by something inside: the limit of {outer} never acts."
+        )
+    spec = getattr(env, "spec", None)
+    made = f"gymnasium.make('{spec.id}'" if spec is not None else "gymnasium.make(id"
+    return [
+        f"{what} Episodes are shorter than was asked for. Set the limit where the environment is "
+        f"made, as {made}, max_episode_steps={outer.steps}), or leave one of them out."
+    ]
+
+
+def _outrun(stack: list[Limit]) -> tuple[Limit, Limit] | None:
+    """:return: the first limit around a shorter one, and the shortest one inside it"""
+    for i, outer in enumerate(stack):
+        inner = min(stack[i:], key=_steps_of)
+        if inner.steps < outer.steps:
+            return outer, inner
+    return None
+
+
+def _steps_of(limit: Limit) -> int:
+    return limit.steps
 
 
 def _stands_out(lengths: Counter, longest: int) -> bool:
@@ -218,18 +269,38 @@ def _unseen(seen: Seen, limit: int | None) -> list[str]:
     ]
 
 
-def _limit_of_copies(env: VecEnv) -> int | None:
-    """What the copies in this process, or the whole, say; others are not asked."""
-    bare: Any = env
-    while isinstance(bare, VecEnvWrapper):
-        bare = bare.venv
-    if isinstance(bare, DummyVecEnv):
-        return step_limit_of(bare.envs[0])
+def _stacks(env: VecEnv) -> tuple[list[list[Limit]], list[gymnasium.Env]]:
+    """:return: of each copy, the limits around it, outermost first; and copies in this process"""
+    bare, around = _unwrapped(env, VecEnvWrapper, "venv")
     if isinstance(bare, GymnasiumVecEnv):
-        copies = getattr(bare.env.unwrapped, "envs", None)
-        return step_limit_of(copies[0]) if copies else None
-    limit = getattr(bare, "max_episode_steps", None)
-    return limit if isinstance(limit, int) and 0 < limit < np.iinfo(np.int32).max else None
+        bare, more = _unwrapped(bare.env, VectorWrapper, "env")
+        around += more
+    if isinstance(bare, DummyVecEnv | SyncVectorEnv):
+        return [around + limits_of(copy) for copy in bare.envs], list(bare.envs)
+    return [around + (own_limit(bare, *_NAMES) or _asked(bare))], []
+
+
+def _unwrapped(env: Any, wrapper: type, inner: str) -> tuple[Any, list[Limit]]:
+    """:return: what the wrappers of a kind are around, and their limits"""
+    limits = []
+    while isinstance(env, wrapper):
+        limits += own_limit(env, *_NAMES)
+        env = getattr(env, inner)
+    return env, limits
+
+
+def _asked(env: Any) -> list[Limit]:
+    """What copies in processes of their own say, of which the outermost wrapper answers first."""
+    try:
+        if isinstance(env, AsyncVectorEnv):
+            # Asked for what they do not have, they end.
+            has_some = all(env.call("has_wrapper_attr", _NAMES[0]))
+        else:
+            has_some = env.has_attr(_NAMES[0])
+        steps = max(env.get_attr(_NAMES[0])) if has_some else None
+    except (AttributeError, NotImplementedError, TypeError, ValueError):
+        return []
+    return [Limit("the outermost wrapper", steps)] if isinstance(steps, int) and steps > 0 else []
 
 
 def _fits(env: VecEnv, obs: Any) -> bool:

@@ -1,8 +1,47 @@
 """After how many steps an environment cuts its episodes."""
 
+from typing import Any, NamedTuple
+
 import gymnasium
 
 from sb3_hds.errors import ParameterError
+
+# Gymnasium writes -1 for "no limit", and vectorised simulators the largest int32.
+_NONE = 2**31 - 1
+
+
+class Limit(NamedTuple):
+    """
+    :param layer: class of the wrapper that has it
+    :param steps: after which that cuts an episode
+    """
+
+    layer: str
+    steps: int
+
+    def __str__(self) -> str:
+        return f"{self.steps} steps of {self.layer}"
+
+
+def limits_of(env: gymnasium.Env) -> list[Limit]:
+    """:return: of each wrapper with one (``TimeLimit``, ``InfiniteHorizon``), outermost first"""
+    layer, limits = env, []
+    while isinstance(layer, gymnasium.Wrapper):
+        limits += own_limit(layer, "_max_episode_steps")
+        layer = layer.env
+    return limits
+
+
+def own_limit(layer: Any, *names: str) -> list[Limit]:
+    """
+    :param names: of the attribute that holds it, the first one that is there counts
+    :return: of this layer alone; empty: it has none
+    """
+    for name in names:
+        steps = vars(layer).get(name)
+        if isinstance(steps, int) and 0 < steps < _NONE:
+            return [Limit(type(layer).__name__, steps)]
+    return []
 
 
 def step_limit_of(env: gymnasium.Env) -> int | None:
@@ -10,13 +49,8 @@ def step_limit_of(env: gymnasium.Env) -> int | None:
     :return: the least of all layers (``TimeLimit``, ``InfiniteHorizon``), or without those what the
         environment is registered with
     """
-    layer, limits = env, []
-    while isinstance(layer, gymnasium.Wrapper):
-        if isinstance(limit := vars(layer).get("_max_episode_steps"), int):
-            limits.append(limit)
-        layer = layer.env
-    if limits:
-        return min(limits)
+    if limits := limits_of(env):
+        return min(limit.steps for limit in limits)
     spec = env.spec
     # Gymnasium writes -1 for "none, whatever is registered".
     return (
