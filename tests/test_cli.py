@@ -373,7 +373,7 @@ def test_the_gain_in_policy_is_in_the_report(log, tmp_path, capsys):
     )
 
     assert code == 0
-    assert "Return on the real system, 1 run, 2 start states" in capsys.readouterr().out
+    assert "interquartile mean over 2 start states, one run" in capsys.readouterr().out
     gain = json.loads(plain.read_text())["policy_gain"]
     assert set(gain["simulations"]) == {"believed", "extended", "true"}
     assert f"{gain['gain']['mean']:.1f}" in page.read_text()
