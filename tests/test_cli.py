@@ -1,9 +1,12 @@
 """The command line: what it prints, what it writes, how it fails."""
 
+import importlib
 import json
+import subprocess
 import sys
 import warnings
 from argparse import Namespace
+from importlib.metadata import version
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +19,8 @@ from sb3_hds.core import State, rollout
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid import Diagnosis
 from sb3_hds.twins import registry
+
+diagnose_module = importlib.import_module("sb3_hds.sysid.diagnose")
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +72,9 @@ def test_any_verdict_is_success(tmp_path, capsys):
         ({"--calibrate": "weight"}, "Its parameters are"),
         ({"--columns": "missing.yml"}, "missing.yml"),
         ({"--report": "nowhere/out.html"}, "nowhere/out.html cannot be written"),
+        ({"--report": "r.pdf"}, "A report is an HTML page: name it r.html in place of r.pdf."),
+        ({"--effects": "CoulombFrction"}, "'CoulombFrction'. Did you mean 'coulomb_friction'?"),
+        ({"--set": "mas:1"}, "no parameter 'mas'. Did you mean 'mass'?"),
         ({"--json": "."}, ". is a folder"),
         ({"--env": "Nothing-v0"}, "Nothing"),
         ({"--env": "Pendulum-v1", "--algo": "magic"}, "There is no algorithm 'magic'"),
@@ -373,7 +381,7 @@ def test_the_gain_in_policy_is_in_the_report(log, tmp_path, capsys):
     )
 
     assert code == 0
-    assert "Return on the real system, 1 run, 2 start states" in capsys.readouterr().out
+    assert "interquartile mean over 2 start states, one run" in capsys.readouterr().out
     gain = json.loads(plain.read_text())["policy_gain"]
     assert set(gain["simulations"]) == {"believed", "extended", "true"}
     assert f"{gain['gain']['mean']:.1f}" in page.read_text()
@@ -388,3 +396,121 @@ def test_where_nothing_was_found_no_policies_are_compared(tmp_path, capsys, monk
     code = ask(*words, "--env", "sb3_hds/PendulumReal-v1")
 
     assert code == 0 and "no policies to compare" in capsys.readouterr().out
+
+
+# --- what is meant, what exists, and what is sound
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["diagnos"], "no command 'diagnos'. Did you mean 'diagnose'? There are: diagnose, "),
+        (
+            ["diagnose", "--twin", "a", "--data", "b", "--efects", "x"],
+            "unknown option '--efects'. Did",
+        ),
+        (["diagnose", "--twin", "a", "--data", "b", "--budget", "quik"], "Did you mean 'quick'?"),
+        (["diagnose", "--twin", "a"], "are required: --data. See 'sb3-hds diagnose --help'."),
+        (["robustness", "--modle", "x"], "are required: --algo"),
+        ([], "are required: command. See 'sb3-hds --help'."),
+    ],
+)
+def test_words_that_are_not_understood_are_one_line(words, message, capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main(words)
+
+    told = capsys.readouterr().err
+    assert end.value.code == 2 and message in told and told.count("\n") == 1
+
+
+def test_version_and_help_come_without_jax():
+    code = (
+        "import sys; from sb3_hds import cli\n"
+        "for words in (['--version'], ['--help'], ['diagnose', '--help']):\n"
+        "    try: cli.main(words)\n"
+        "    except SystemExit as end: assert not end.code\n"
+        "assert not {'jax', 'torch', 'pandas'} & set(sys.modules), 'slow'\n"
+    )
+
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"sb3-hds {version('sb3-hds')}\n")
+
+
+def test_an_interrupt_ends_any_command_with_one_line():
+    """Also one that is lost as an exception, as in a callback of the garbage collector."""
+    code = (
+        "import os, signal, sys, time; from sb3_hds import cli\n"
+        "from sb3_hds.cli import listing\n"
+        "def slow(given):\n"
+        "    try: os.kill(os.getpid(), signal.SIGINT)\n"
+        "    except KeyboardInterrupt: pass\n"
+        "    time.sleep(20)\n"
+        "listing.run_effects = slow\n"
+        "sys.argv = ['sb3-hds', 'effects']\n"
+        "sys.exit(cli.main())\n"
+    )
+
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=15)
+
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "sb3-hds: interrupted\n")
+
+
+def test_an_effect_is_named_as_in_python_or_as_in_the_catalogue():
+    found = diagnose_module.classes_of(["CoulombFriction", "coulomb_friction", "Coulomb friction"])
+
+    assert found == (effects.CoulombFriction,) * 3
+    assert effects.effect_named("sb3_hds.effects.MotorLag", effects.ALL) is effects.MotorLag
+
+
+@pytest.mark.parametrize(
+    ("words", "there", "not_there"),
+    [
+        (["effects", "friction"], "stribeck_friction", "backlash"),
+        (["effects", "Coulomb-friction"], "directional_coulomb_friction", "viscous_friction"),
+        (["twins", "cart"], "CartPole", "FreePendulum"),
+        (["twins", "payload", "handle"], "PayloadPendulum", "PendulumReal"),
+    ],
+)
+def test_lists_are_filtered_by_words(words, there, not_there, capsys):
+    assert cli.main(words) == 0
+    first_column = [line.split("│")[1].strip() for line in capsys.readouterr().out.splitlines()
+                    if line.startswith("│")]  # fmt: skip
+    assert there in first_column and not_there not in first_column
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["effects", "frictoin"], "No effect mentions 'frictoin'. Did you mean 'friction'?"),
+        (["twins", "chek", "Pendulum"], "No twin mentions 'chek Pendulum'. Did you mean 'check'?"),
+        (["twins", "check"], "Name one twin, as in 'sb3-hds twins check Pendulum'"),
+        (
+            ["twins", "check", "Pendulun"],
+            "There is no twin for 'Pendulun'. Did you mean 'Pendulum'",
+        ),
+        (["twins", "cart", "--set", "mass:1"], "--set changes the twin that is checked"),
+    ],
+)
+def test_a_list_without_entries_is_one_message(words, message, capsys):
+    assert cli.main(words) == 1
+    told = capsys.readouterr().err
+    assert message in told and told.count("\n") == 1
+
+
+def test_a_twin_is_checked_and_a_flaw_is_a_failure(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(registry, "_TWINS", dict(registry._TWINS))
+    monkeypatch.setattr("sys.path", [path for path in sys.path if path])
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rigs_to_check.py").write_text(
+        "from sb3_hds import twins\n\n\n@twins.register\n"
+        "class Slide(twins.LinearAxis):\n    name = 'SlideToCheck'\n"
+        "    def bias(self, q, v, params):\n        return -params['damping'] * v\n"
+    )
+
+    assert cli.main(["twins", "check", "rigs_to_check:SlideToCheck"]) == 1
+    told = capsys.readouterr().out
+    assert "SlideToCheck: 1 of 8 checks failed" in told and "FAIL forces of inertia" in told
+    assert cli.main(["twins", "check", "LinearAxis", "--set", "mass:3"]) == 0
+    assert "LinearAxis: all 9 checks passed" in capsys.readouterr().out

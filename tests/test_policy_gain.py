@@ -70,14 +70,37 @@ def test_an_outlier_among_runs_does_not_move_the_interquartile_mean():
     assert _summarised(values).mean == expected
 
 
-def test_a_single_run_is_resampled_over_its_start_states():
+def test_a_single_run_has_no_interval_and_says_so():
     values = np.arange(16.0)[None]
     found = _summarised(values)
-    assert found.low < found.mean < found.high
+    assert found.mean == pytest.approx(7.5) and found.low is found.high is None
 
-    text = str(PolicyGain({"believed": values, "extended": values + 1.0}, found))
-    assert "1 run, 16 start states" in text and "interval over start states" in text
-    assert all(len(line) <= 80 for line in text.splitlines())
+    gain = PolicyGain(
+        {"believed": values, "extended": values + 1.0}, _summarised(values * 0.0 + 1.0)
+    )
+    text = str(gain)
+    assert "over 16 start states, one run" in text and "interval" not in text
+    assert "One run in each simulation tells nothing of how others would differ." in text
+    assert gain.to_dict()["gain"] == {"mean": 1.0, "low": None, "high": None}
+
+
+def test_a_paired_gain_is_labelled_where_it_is_not_the_difference_of_the_means():
+    """
+    Of the inner halves: 1.5 believed, 12.5 extended; differences 10, 20, 10 and -87, so 10 paired.
+    """
+    believed = np.array([[0.0, 1.0, 2.0, 100.0]] * 2)
+    extended = np.array([[10.0, 21.0, 12.0, 13.0]] * 2)
+    other = PolicyGain(
+        {"believed": believed, "extended": extended}, _summarised(extended - believed)
+    )
+    same = PolicyGain(
+        {"believed": believed, "extended": believed + 3.0}, _summarised(np.full((2, 4), 3.0))
+    )
+
+    assert other.gain.mean == 10.0 and "gain, paired" in str(other)
+    assert "The means themselves differ by 11.0: each" in " ".join(str(other).split())
+    assert "differ by" not in str(same)
+    assert all(len(line) <= 80 for line in f"{other}\n{same}".splitlines())
 
 
 def test_other_algorithms_train_in_the_simulation_for_a_budget():

@@ -14,6 +14,7 @@ import pytest
 from measuring import measured
 
 from sb3_hds import diagnose, effects, twins
+from sb3_hds.errors import ParameterError
 from sb3_hds.sysid import plots, telling
 from sb3_hds.sysid.diagnosis import SENTENCES, Rejected
 
@@ -32,7 +33,17 @@ def crowded(rubbing):
     """As many candidates as a machine with two joints has, and long sentences."""
     name = "directional_viscous_friction.pendulum"
     more = [Rejected(f"{name}{i}", 0.7 / (i + 1), 0.01, "others gain more") for i in range(66)]
-    alike = dataclasses.replace(rubbing.findings[0], alternatives=(f"{name}0", f"{name}1"))
+    (first,) = rubbing.findings
+    sizes = {
+        f"{name}_{side}": dataclasses.replace(
+            size, unit="N m s2/rad2", stderr=1.234e-05, low=-1.234e-05, added_to=0.05
+        )
+        for name, size in first.parameters.items()
+        for side in ("positive", "negative")
+    }
+    alike = dataclasses.replace(
+        first, alternatives=(f"{name}0", f"{name}1"), parameters=first.parameters | sizes
+    )
     return dataclasses.replace(
         rubbing,
         verdict="ambiguous",
@@ -69,10 +80,22 @@ def test_a_diagnosis_prints_itself_in_80_columns(which, request):
     assert max(map(len, text.splitlines())) <= 80
     assert "coulomb_friction at joint hinge" in text and "N m" in text
     assert "Not accepted" in text
-    # A reason is a whole one.
-    assert all(
-        line.endswith(("more", "little")) for line in text.splitlines() if "gain" in line[60:]
-    )
+
+
+def test_every_rejected_candidate_is_printed_whole_and_with_its_reason(crowded):
+    text = str(crowded)
+    by_reason = {}
+    for line in text.partition("Not accepted")[2].splitlines()[1:]:
+        if line.startswith("  (gain"):
+            break
+        by_reason.setdefault("last", []).append(line)
+    told = " ".join(" ".join(by_reason["last"]).split())
+
+    assert [
+        r.name for r in crowded.rejected if f"{r.name} " not in f"{told} ".replace(",", "")
+    ] == []
+    assert told.count("others gain more") == 5 + 1 and "gains too little: sign_flip.cos" in told
+    assert "%" not in told.partition("gains too little")[2]
 
 
 REASONS = ("UNCERTAIN", "SMALL", "CHANCE", "NO_CONSTANT", "NAMELESS", "ANOTHER")
@@ -80,10 +103,65 @@ REASONS = ("UNCERTAIN", "SMALL", "CHANCE", "NO_CONSTANT", "NAMELESS", "ANOTHER")
 
 @pytest.mark.parametrize("why", [getattr(telling, name) for name in REASONS])
 def test_a_reason_to_turn_something_down_is_printed_as_a_whole(rubbing, why):
-    rejected = (Rejected("sign_flip.hinge_velocity", -50.0, 1.0, why),)
-    lines = str(dataclasses.replace(rubbing, rejected=rejected)).splitlines()
+    rejected = (Rejected("directional_viscous_friction.hinge_velocity", -50.0, math.nan, why),)
+    text = str(dataclasses.replace(rubbing, rejected=rejected))
+    lines = text.splitlines()
 
     assert any(line.endswith(why) for line in lines) and max(map(len, lines)) <= 80
+    assert "far worse" in text and "nan" not in text
+
+
+def test_print_and_page_say_the_same(crowded, tmp_path):
+    """Evidence, sizes, alternatives, errors by horizon, and a reason for every candidate."""
+    text = " ".join(str(crowded).split())
+    page = crowded.to_html(tmp_path / "report.html", POLICY).read_text()
+    page = html.unescape(re.sub("<[^>]*>", " ", page.replace("<wbr>", ""))).replace("\xa0", " ")
+    page = " ".join(page.split())
+    (one,) = crowded.findings
+    size = one.parameters["tau_c"]
+
+    for said in (
+        crowded.sentence,
+        f"It lowers the mean square error of held-out recordings by {one.gain:.0%} (p = ",
+        f"{size.estimate:.4g} N m",
+        f"{size.low:.4g} to {size.high:.4g}",
+        "The data cannot tell it from: directional_viscous_friction.pendulum0, ",
+        f"What was found explains {crowded.explained:.0%} of the force that is missing",
+        crowded.unexplained,
+        "Held-out error by steps ahead, in units of what the best fit leaves:",
+        *(f"{gain.low:.0%} to {gain.high:.0%}" for gain in crowded.gain.values()),
+        "gain: by how much the candidate lowers the mean square error of held-out recordings; p:",
+        crowded.made_with,
+    ):
+        assert said in text and said in page, said
+    for rejected in crowded.rejected:
+        assert f"{rejected.name} " in page and rejected.why in page
+    assert page.count("others gain more") == 66
+
+
+def test_what_was_refitted_on_the_way_is_said(rubbing):
+    heavier = rubbing.twin.with_parameters(mass=1.2)
+    assert "Refitted" not in str(rubbing)
+    assert "Refitted: mass 1 -> 1.2 kg" in str(dataclasses.replace(rubbing, twin=heavier))
+
+
+def test_what_is_added_to_the_twins_own_says_so(rubbing, tmp_path):
+    (first,) = rubbing.findings
+    added = dataclasses.replace(first.parameters["tau_c"], added_to=0.05)
+    other = dataclasses.replace(first, parameters={"tau_c": added})
+    found = dataclasses.replace(rubbing, findings=(other,))
+
+    page = found.to_html(tmp_path / "report.html").read_text().replace("\xa0", " ")
+    for told in (" ".join(str(found).split()), page.replace("&#39;", "'")):
+        assert f"{added.estimate:.4g} N m, added to the twin's own 0.05 N m" in told
+
+
+def test_a_report_is_a_page(rubbing, tmp_path):
+    with pytest.raises(
+        ParameterError, match=r"an HTML page: name it .*r\.html in place of .*r\.pdf"
+    ):
+        rubbing.to_html(tmp_path / "r.pdf")
+    assert not list(tmp_path.iterdir())
 
 
 def test_who_is_told_that_nothing_is_wrong_is_told_what_would_have_shown(rubbing):
@@ -199,6 +277,7 @@ def test_a_report_without_a_folder_is_refused_at_once(rubbing, tmp_path):
 
 def test_the_report_says_sizes_with_units_and_errors(rubbing, tmp_path):
     text = rubbing.to_html(tmp_path / "report.html").read_text().replace("\N{NO-BREAK SPACE}", " ")
+    text = text.replace(' class="short"', "")
     size = rubbing.findings[0].parameters["tau_c"]
 
     for shown in (
@@ -263,6 +342,8 @@ LOOK = """
     e => e.getBoundingClientRect().right > root.clientWidth + 1);
   document.title = JSON.stringify({
     visible: page.defaultView.innerWidth, laid_out: root.scrollWidth, shown: root.clientWidth,
+    overrun: [...page.querySelectorAll(".finding *")].filter(e => e.getBoundingClientRect().right
+      > e.closest(".finding").getBoundingClientRect().right + 1).map(e => e.outerHTML.slice(0, 80)),
     sticking_out: wide.map(e => e.tagName + " " + e.textContent.slice(0, 40)),
     pictures: [...page.images].map(i => i.complete ? i.naturalWidth / i.clientWidth : 0)});
 })</script>"""
@@ -316,6 +397,7 @@ def test_the_report_fits_a_browser(which, width, request, tmp_path):
 
     assert found["visible"] == width
     assert found["laid_out"] <= found["shown"] and not found["sticking_out"]
+    assert not found["overrun"]
     assert len(found["pictures"]) == 5
     # A picture has at least as many pixels as it is shown with.
     assert all(ratio >= 1.0 for ratio in found["pictures"])

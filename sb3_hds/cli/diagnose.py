@@ -58,11 +58,12 @@ def _check_targets(given: argparse.Namespace) -> None:
     """What would fail after minutes fails now."""
     from sb3_hds.core.storage import check_target
 
-    for target in filter(None, (given.report, given.json)):
-        check_target(target)
+    if given.json:
+        check_target(given.json)
     if given.report:
-        from sb3_hds.sysid.report import check_installed
+        from sb3_hds.sysid.report import check_installed, check_page
 
+        check_page(given.report)
         check_installed()
 
 

@@ -23,7 +23,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """:raises SystemExit: with 2"""
-        if wrong := _CHOICE.fullmatch(message):
+        if wrong := _CHOICE.match(message):
             argument, word, listed = wrong.groups()
             choices = re.findall(r"[\w-]+", listed)
             kind = "command" if argument == "command" else argument
@@ -52,4 +52,5 @@ class Version(argparse.Action):
             told = version("sb3-hds")
         except PackageNotFoundError:  # a checkout that is on the path without being installed
             told = "0+unknown"
-        parser.exit(0, f"{parser.prog} {told}\n")
+        print(f"{parser.prog} {told}")
+        parser.exit()

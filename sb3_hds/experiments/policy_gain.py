@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import os
+import textwrap
 from collections.abc import Callable, Mapping
 from numbers import Integral
 from pathlib import Path
@@ -25,6 +26,7 @@ from sb3_hds.errors import EnvironmentMismatchError, ParameterError, TrajectoryE
 from sb3_hds.experiments.returns import returns_of
 from sb3_hds.sysid import Diagnosis
 from sb3_hds.sysid.plots import as_png, plot_policy_gain
+from sb3_hds.sysid.wording import policy_in_words
 from sb3_hds.wrappers.step_limit import step_limit_of
 
 _N_RESAMPLES = 2000
@@ -35,14 +37,14 @@ _LEVEL = 0.9
 class Return:
     """
     :param mean: interquartile mean over runs and episodes
-    :param low: lower end of its 90 % interval (bootstrap over runs; over start states where there
-        is a single run, so that it says nothing of other runs)
+    :param low: lower end of its 90 % interval, by bootstrap over runs; None with a single run,
+        which tells nothing of how others would differ
     :param high: upper end
     """
 
     mean: float
-    low: float
-    high: float
+    low: float | None
+    high: float | None
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -86,7 +88,8 @@ class PolicyGain:
 
     def plot(self, path: str | os.PathLike[str]) -> Path:
         """
-        Draw the returns: one dot for each run, bars for the interquartile means.
+        Draw the returns: one dot for each run (of a single run, for each start state), lines at
+        the interquartile means, and bars over their intervals.
 
         :param path: of the picture
         :raises ImportError: without matplotlib (extra ``report``)
@@ -94,17 +97,12 @@ class PolicyGain:
         return write_bytes(path, as_png(plot_policy_gain(self.to_dict())))
 
     def __str__(self) -> str:
-        runs, episodes = self.returns["believed"].shape
-        over = "runs" if runs > 1 else "start states"
-        lines = [
-            f"Return on the real system, {runs} {'runs' if runs > 1 else 'run'}, {episodes} start "
-            "states each:",
-            f"interquartile mean [90 % interval over {over}]",
-        ]
-        rows = {s: self.of(s) for s in self.returns} | {"gain": self.gain}
-        lines += [f"  {s:<9} {r.mean:9.1f} [{r.low:.1f}, {r.high:.1f}]" for s, r in rows.items()]
-        if self.share_of_ceiling is not None:
-            lines.append(f"  {self.share_of_ceiling:.0%} of the gap to the true twin is closed")
+        told = policy_in_words(self.to_dict())
+        lines = textwrap.wrap(f"{told.measured}:", 80)
+        for name, value, *interval in (told.columns, *told.rows):
+            lines.append(f"  {name:<22} {value:>9}   {''.join(interval)}".rstrip())
+        for note in told.notes:
+            lines += textwrap.wrap(note, 80)
         return "\n".join(lines)
 
     __repr__ = __str__
@@ -268,12 +266,11 @@ def _task(twin: Twin) -> gymnasium.Env:
 
 
 def _summarised(values: Float[np.ndarray, "runs episodes"]) -> Return:
-    """Interquartile mean, and what resampling makes of it: the runs, or what a single run did."""
-    rng, (n, episodes) = np.random.default_rng(0), values.shape
-    if n > 1:
-        drawn = values[rng.integers(n, size=(_N_RESAMPLES, n))]
-    else:
-        drawn = values[0, rng.integers(episodes, size=(_N_RESAMPLES, 1, episodes))]
+    """Interquartile mean, and what resampling the runs makes of it, if there are several."""
+    n = len(values)
+    if n == 1:
+        return Return(float(_interquartile_means(values[None])[0]), None, None)
+    drawn = values[np.random.default_rng(0).integers(n, size=(_N_RESAMPLES, n))]
     means = _interquartile_means(np.concatenate([values[None], drawn]))
     low, high = np.quantile(means[1:], [0.5 - 0.5 * _LEVEL, 0.5 + 0.5 * _LEVEL])
     return Return(float(means[0]), float(low), float(high))

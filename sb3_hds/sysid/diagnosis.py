@@ -9,15 +9,18 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from sb3_hds.core import Params, Twin
+from sb3_hds.sysid import wording
 from sb3_hds.sysid.pictures import Pictures
 from sb3_hds.sysid.results import Estimate, plain
-from sb3_hds.sysid.units import sizes_in_words
+from sb3_hds.sysid.units import sizes_in_words, with_unit
 
 Verdict = Literal["named", "ambiguous", "none", "unknown", "not_identifiable"]
 
 _WIDTH = 80
 # Candidates whose smallest sizes are printed; all are in the report.
 _MOST_SHOWN = 12
+# Rejected candidates that get a line of their own.
+_MOST_IN_TABLE = 5
 #: what each verdict means
 SENTENCES = {
     "named": "The data name what is missing.",
@@ -180,26 +183,68 @@ class Diagnosis:
         lines = [*_wrapped(f"{self.verdict}: {self.sentence}"), "=" * _WIDTH]
         for finding in self.findings:
             lines += _of_finding(finding)
+        if self.findings:
+            lines += _wrapped(wording.explained_in_words(self.explained))
         if self.verdict == "none":
             lines += self._would_have_shown()
         if self.unexplained:
             lines += _wrapped(f"Unexplained: {self.unexplained}")
+        if self.refitted:
+            changes = ", ".join(f"{name} {a} -> {b}" for name, a, b in self.refitted)
+            lines += _wrapped(f"Refitted: {changes}")
         if self.gain:
-            lines.append("Held-out error, in units of what the best fit leaves, by steps ahead:")
+            lines.append(f"{wording.HORIZONS}:")
             lines += [
                 f"  {g.steps:5d}: {g.before:9.3g} -> {g.after:9.3g}   "
                 f"(90 % interval of the gain {g.low:.0%} to {g.high:.0%})"
                 for g in self.gain.values()
             ]
-        if self.rejected:
-            lines.append(f"{'Not accepted, best first:':<37} {'gain':>6} {'p':>7}  why")
-            lines += [
-                f"  {r.name:<35.35} {max(r.gain, -9.99):6.0%} {r.p_value:7.2g}  {r.why}"
-                for r in self.rejected[:5]
-            ]
+        lines += self._not_accepted()
         for caveat in self.caveats:
             lines += _wrapped(f"Caveat: {caveat}")
-        return "\n".join(lines)
+        text = "\n".join([*lines, *_wrapped(self.made_with)])
+        return text.replace("\N{NO-BREAK SPACE}", " ")
+
+    @property
+    def refitted(self) -> tuple[tuple[str, str, str], ...]:
+        """What was calibrated on the way: name, value as believed, and value in the end."""
+        known = self.believed.values
+        found = {e.name for finding in self.findings for e in finding.parameters.values()}
+        return tuple(
+            (name, f"{known[name]:.4g}", with_unit(f"{value:.4g}", self.twin.parameters[name].unit))
+            for name, value in self.twin.values.items()
+            if name in known and name not in found and value != known[name]
+        )
+
+    @property
+    def made_with(self) -> str:
+        """What a diagnosis is computed again from."""
+        versions = "".join(f", {name} {version}" for name, version in self.versions.items())
+        return f"Data {self.data_hash}, seed {self.seed}{versions}."
+
+    def _not_accepted(self) -> list[str]:
+        """The best as a table, and all others by the reason."""
+        if not self.rejected:
+            return []
+        best, others = self.rejected[:_MOST_IN_TABLE], self.rejected[_MOST_IN_TABLE:]
+        width = max(len(r.name) for r in best)
+        lines = [f"{'Not accepted':<{width + 2}} {'gain':>9} {'p':>7}  why"]
+        for r in best:
+            gain, chance = wording.share_in_words(r.gain), wording.chance_in_words(r.p_value)
+            row = f"  {r.name:<{width}} {gain:>9} {chance:>7}  {r.why}"
+            lines += (
+                [row] if len(row) <= _WIDTH else [row.removesuffix(f"  {r.why}"), f"    {r.why}"]
+            )
+        for why in dict.fromkeys(r.why for r in others):
+            names = [
+                r.name
+                if why == wording.TOO_LITTLE
+                else f"{r.name} {wording.share_in_words(r.gain)}"
+                for r in others
+                if r.why == why
+            ]
+            lines += _wrapped(f"{why}: {', '.join(map(str.strip, names))}", "  ")
+        return [*lines, *_wrapped(f"({wording.REJECTED})", "  ")]
 
     def _would_have_shown(self) -> list[str]:
         shown = [
@@ -236,10 +281,11 @@ class Diagnosis:
         """
         Write one self-contained page: the verdict, its evidence, pictures, caveats.
 
-        :param path: of the file; one of that name is replaced as a whole
+        :param path: of the file, which ends in ``.html``; one of that name is replaced as a whole
         :param policy_gain: what ``measure_policy_gain`` returned, where it was measured
         :return: its path
         :raises ImportError: without matplotlib and jinja2 (extra ``report``)
+        :raises ParameterError: for another ending
         :raises OSError: if there is no folder to write it in
         """
         from sb3_hds.sysid.report import write_report
@@ -270,12 +316,11 @@ def _of_finding(finding: Finding) -> list[str]:
     lines = [finding.effect if own else f"{finding.effect} at {finding.where['slot']} {place}"]
     lines += _wrapped(finding.explanation, "  ")
     for name, e in finding.parameters.items():
-        unit = "" if e.unit == "1" else f" {e.unit}"
-        beside = f", added to the twin's own {e.added_to:.4g}" if e.added_to else ""
-        lines.append(f"  {name} = {e.estimate:.4g} [{e.low:.4g}, {e.high:.4g}]{unit}{beside}")
-    lines.append(f"  held-out gain {finding.gain:.1%}, p = {finding.p_value:.2g}")
+        said = f"{name} = {wording.size_in_words(e)}, standard error {e.stderr:.2g}, 90 % interval "
+        lines += _wrapped(f"{said}{wording.interval_in_words(e)}", "  ")
+    lines += _wrapped(wording.evidence_in_words(finding.gain, finding.p_value), "  ")
     if finding.alternatives:
-        lines += _wrapped(f"cannot be told from: {', '.join(finding.alternatives)}", "  ")
+        lines += _wrapped(f"{wording.ALIKE} {', '.join(finding.alternatives)}.", "  ")
     return lines
 
 
@@ -294,4 +339,12 @@ def _choice(finding: Finding) -> str:
 
 
 def _wrapped(text: str, indent: str = "") -> list[str]:
-    return textwrap.wrap(text, _WIDTH, initial_indent=indent, subsequent_indent=indent + "  ")
+    # A name that is longer than a line stays whole.
+    return textwrap.wrap(
+        text,
+        _WIDTH,
+        initial_indent=indent,
+        subsequent_indent=indent + "  ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )

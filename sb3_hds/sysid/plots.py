@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_hds.sysid.wording import TRAINED_IN, share_in_words
+
 if TYPE_CHECKING:
     from sb3_hds.sysid.diagnosis import Diagnosis
     from sb3_hds.sysid.pictures import Pictures
@@ -17,13 +19,6 @@ _WIDE, _NARROW = 9.0, 4.4
 _DPI = 150
 # A candidate that makes predictions worse than this is drawn as if it did so by this much.
 _WORST = -0.05
-
-#: what each simulation of a measured gain in policy is called
-TRAINED_IN = {
-    "believed": "the twin as believed",
-    "extended": "the extended twin",
-    "true": "the true twin",
-}
 
 
 def as_png(figure: Any) -> bytes:
@@ -139,11 +134,11 @@ def plot_evidence(d: "Diagnosis", narrow: bool = False) -> Any:
     figure, panels = _figure(1, 1, 0.4 + 0.18 * len(bars), narrow)
     axes, rows = panels[0, 0], np.arange(len(bars))
     axes.barh(rows, [max(gain, _WORST) for _, gain, _ in bars], color=[c for *_, c in bars])
-    axes.axvline(0.05, color=_BEFORE, lw=1.0, ls="--")
+    axes.axvline(0.05, color=_BEFORE, lw=1.0, ls="--", zorder=0.5)
     axes.axvline(0.0, color=_MEASURED, lw=0.6)
     for row, (_, gain, _) in enumerate(bars):
         axes.annotate(
-            "far worse" if gain < -1.0 else f"{round(100.0 * gain):d} %",
+            share_in_words(gain),
             (max(gain, 0.0), row),
             (3, 0),
             textcoords="offset points",
@@ -168,7 +163,8 @@ def plot_evidence(d: "Diagnosis", narrow: bool = False) -> Any:
 
 def plot_policy_gain(gain: Mapping[str, Any], narrow: bool = False) -> Any:
     """
-    A dot for each run, a line at the interquartile mean, a bar over its interval.
+    A dot for each run, a line at the interquartile mean, a bar over its interval; of a single run,
+    a dot for each start state, and no interval.
 
     :param gain: ``PolicyGain.to_dict()``
     """
@@ -177,11 +173,14 @@ def plot_policy_gain(gain: Mapping[str, Any], narrow: bool = False) -> Any:
     figure, panels = _figure(1, 1, 0.5 + 0.6 * len(names), narrow)
     axes = panels[0, 0]
     for row, name in enumerate(names):
-        found, means = gain["simulations"][name], np.mean(gain["returns"][name], 1)
-        spread = row + np.linspace(-0.15, 0.15, len(means) + 2)[1:-1]
-        axes.plot([found["low"], found["high"]], [row] * 2, color=colours[name], lw=8, alpha=0.3)
+        found, returns = gain["simulations"][name], np.asarray(gain["returns"][name])
+        dots = np.mean(returns, 1) if len(returns) > 1 else returns[0]
+        apart = row + np.linspace(-0.15, 0.15, len(dots) + 2)[1:-1]
+        if len(returns) > 1:
+            ends = [found["low"], found["high"]]
+            axes.plot(ends, [row] * 2, color=colours[name], lw=8, alpha=0.3)
         axes.plot([found["mean"]] * 2, [row - 0.25, row + 0.25], color=colours[name], lw=2)
-        axes.plot(means, spread, "o", color=colours[name], ms=4, alpha=0.6)
+        axes.plot(dots, apart, "o", color=colours[name], ms=4, alpha=0.6)
     axes.set_yticks(range(len(names)), [TRAINED_IN[name] for name in names])
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.margins(x=0.1)

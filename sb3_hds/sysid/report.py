@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_hds.core.storage import check_target, write_bytes
-from sb3_hds.sysid import plots
+from sb3_hds.errors import ParameterError
+from sb3_hds.sysid import plots, wording
 from sb3_hds.sysid.diagnosis import Diagnosis
 from sb3_hds.sysid.units import sizes_in_words, with_unit
 
@@ -40,8 +41,9 @@ figcaption, .quiet { color: #6b6860; font-size: .9rem; }
   background: #f6f7f9; }
 table { border-collapse: collapse; width: 100%; font-size: .95rem; }
 th, td { text-align: left; padding: .25rem .8rem .25rem 0; border-bottom: 1px solid #eceae3;
-  vertical-align: top; font-variant-numeric: tabular-nums; overflow-wrap: break-word; }
-th { font-weight: 600; font-size: .9rem; }
+  vertical-align: top; font-variant-numeric: tabular-nums; overflow-wrap: anywhere; }
+th { font-weight: 600; font-size: .9rem; overflow-wrap: normal; }
+td.short { white-space: nowrap; }
 @media screen and (max-width: 40rem) { h1 { font-size: 1.35rem; } table { font-size: .8rem; }
   th, td { padding-right: .4rem; } th { font-size: .8rem; } }
 @media print { @page { margin: 1.6cm; }
@@ -52,7 +54,8 @@ th { font-weight: 600; font-size: .9rem; }
 {%- macro table(columns, rows) %}
 <table><thead><tr>{% for c in columns %}<th>{{ c }}</th>{% endfor %}</tr></thead><tbody>
 {% for row in rows %}<tr>{% for cell in row -%}
-<td>{{ cell | replace("_", "_<wbr>" | safe) }}</td>
+<td{% if cell | length < 10 %} class="short"{% endif %}>
+{{- cell | replace("_", "_<wbr>" | safe) }}</td>
 {%- endfor %}</tr>
 {% endfor %}</tbody></table>
 {%- endmacro %}
@@ -69,30 +72,31 @@ th { font-weight: 600; font-size: .9rem; }
 <p><strong>{{ f.effect }}</strong>{% if f.place %} at {{ f.slot }}
 <strong>{{ f.place }}</strong>{% endif %}. {{ f.explanation }}</p>
 {{ table(("parameter", "estimate", "standard error", "90 % interval"), f.rows) }}
-<p>It lowers the mean square error of held-out recordings by {{ f.gain }} (p = {{ f.p }}).
-{% if f.alternatives %}<strong>These data cannot tell it from:</strong>
+<p>{{ f.evidence }}{% if f.alternatives %} <strong>{{ wording.ALIKE }}</strong>
 {{ f.alternatives }}.{% endif %}</p>
 </div>{% endfor %}
-{% if findings %}<p>What was found explains {{ explained }} of the force that is missing and can be
-predicted.</p>{% endif %}
+{% if findings %}<p>{{ explained }}</p>{% endif %}
 {% if d.unexplained %}<p><strong>Unexplained:</strong> {{ d.unexplained }}</p>{% endif %}
 {% for caveat in d.caveats %}<p><strong>Caveat:</strong> {{ caveat }}</p>{% endfor %}
 {% for picture in pictures %}<section class="picture"><h2>{{ picture.title }}</h2>
-{{ shown(picture) }}</section>{% endfor %}
+{{ shown(picture) }}{% if picture.rows %}<p class="quiet">{{ wording.HORIZONS }}:</p>
+{{ table(("steps", "before", "after", "90 % interval of the gain"), picture.rows) }}{% endif %}
+</section>{% endfor %}
+{% if rejected %}<section><h2>Not accepted</h2>
+<p class="quiet">{{ wording.REJECTED }}.</p>
+{{ table(("candidate", "gain", "p", "why"), rejected) }}</section>{% endif %}
 {% if policy %}<section class="picture"><h2>What it buys</h2>
-<p>Return on the real system of policies that were trained in each simulation: interquartile mean
-over {{ policy.runs }} and {{ policy.episodes }} each.{% if policy.share %}
-{{ policy.share }} of the gap to policies from the true twin is closed.{% endif %}</p>
+<p>{{ policy.told.measured }}.</p>
 {{ shown(policy.picture) }}
-{{ table(("trained in", "return", "90 % interval"), policy.rows) }}</section>{% endif %}
+{{ table(policy.told.columns, policy.told.rows) }}
+{% for note in policy.told.notes %}<p class="quiet">{{ note }}</p>{% endfor %}</section>{% endif %}
 {% if parameters %}<section><h2>Parameters of the extended twin</h2>
 {{ table(("parameter", "as believed", "extended"), parameters) }}</section>{% endif %}
 {% if detectable %}<section><h2>What these data would have shown</h2>
 <p class="quiet">The smallest size of each candidate that lowers the error by 5 %, to first order.
 Where there is none, the effect cannot be seen by its slope at zero.</p>
 {{ table(("candidate", "smallest size"), detectable) }}</section>{% endif %}
-<p class="quiet">Data {{ d.data_hash }}, seed {{ d.seed }}{% for name, v in d.versions.items() %},
-{{ name }} {{ v }}{% endfor %}.</p>
+<p class="quiet">{{ d.made_with }}</p>
 </body></html>
 """
 
@@ -103,14 +107,29 @@ def check_installed() -> None:
         raise ImportError(_INSTALL)
 
 
+def check_page(path: str | os.PathLike[str]) -> None:
+    """
+    :raises ParameterError: for a name that is none of a page
+    :raises OSError: if there is no folder to write it in
+    """
+    if Path(path).suffix.lower() not in (".html", ".htm"):
+        raise ParameterError(
+            f"A report is an HTML page: name it {Path(path).with_suffix('.html')} in place of "
+            f"{path}. A browser prints it as PDF."
+        )
+    check_target(path)
+
+
 class _Picture(NamedTuple):
     """
     :param draw: called with whether the picture is for a narrow page
+    :param rows: of a table below it
     """
 
     title: str
     caption: str
     draw: Callable[[bool], Any]
+    rows: tuple[tuple[str, ...], ...] = ()
 
 
 def write_report(
@@ -122,9 +141,10 @@ def write_report(
     :param path: of the page; a file of that name is replaced as a whole
     :param policy_gain: as plain data
     :raises ImportError: without matplotlib and jinja2
+    :raises ParameterError: for a name that is none of a page
     :raises OSError: if there is no folder to write it in
     """
-    check_target(path)
+    check_page(path)
     check_installed()
     import jinja2
 
@@ -163,14 +183,13 @@ def _content(d: Diagnosis) -> dict[str, Any]:
             "rows": [
                 (
                     name,
-                    with_unit(f"{e.estimate:.4g}", e.unit),
+                    wording.size_in_words(e),
                     f"{e.stderr:.2g}",
-                    f"{e.low:.4g} to {e.high:.4g}",
+                    wording.interval_in_words(e),
                 )
                 for name, e in f.parameters.items()
             ],
-            "gain": f"{f.gain:.0%}",
-            "p": f"{f.p_value:.2g}",
+            "evidence": wording.evidence_in_words(f.gain, f.p_value),
             "alternatives": ", ".join(f.alternatives),
         }
         for f in d.findings
@@ -178,11 +197,16 @@ def _content(d: Diagnosis) -> dict[str, Any]:
     n = 0 if d.pictures is None else len(np.unique(d.pictures.missing.origin))
     return {
         "d": d,
+        "wording": wording,
         "title": f"{d.twin.name}: {d.verdict}",
         "n_recordings": f"{n} recordings" if n > 1 else "its recording",
         "colour": _COLOURS.get(d.verdict, _NO_NAME),
         "findings": findings,
-        "explained": f"{d.explained:.0%}",
+        "explained": wording.explained_in_words(d.explained),
+        "rejected": [
+            (r.name, wording.share_in_words(r.gain), wording.chance_in_words(r.p_value), r.why)
+            for r in d.rejected
+        ],
         "parameters": _parameters(d),
         "detectable": [
             (key, sizes_in_words(d.twin, key, sizes) or "none")
@@ -210,24 +234,15 @@ def _parameters(d: Diagnosis) -> list[tuple[str, str, str]]:
 def _policy(gain: Mapping[str, Any] | None) -> dict[str, Any] | None:
     if gain is None:
         return None
-    rows = [(plots.TRAINED_IN[name], r) for name, r in gain["simulations"].items()]
-    rows.append(("gain, extended over believed", gain["gain"]))
-    share = gain["share_of_ceiling"]
+    caption = "Dots: runs. Lines: interquartile means. Bars: their 90 % intervals over runs."
+    if gain["runs"] == 1:
+        caption = "Dots: start states of the one run. Lines: interquartile means of these."
     picture = _Picture(
         "Return on the real system",
-        "Dots: runs. Lines: interquartile means, with 90 % intervals over "
-        f"{'runs' if gain['runs'] > 1 else 'start states'}.",
+        caption,
         lambda narrow: plots.plot_policy_gain(gain, narrow),
     )
-    return {
-        "runs": f"{gain['runs']} {'run' if gain['runs'] == 1 else 'runs'}",
-        "episodes": f"{gain['episodes']} start states",
-        "share": "" if share is None else f"{share:.0%}",
-        "picture": _inlined(picture),
-        "rows": [
-            (name, f"{r['mean']:.1f}", f"{r['low']:.1f} to {r['high']:.1f}") for name, r in rows
-        ],
-    }
+    return {"picture": _inlined(picture), "told": wording.policy_in_words(gain)}
 
 
 def _pictures(d: Diagnosis) -> list[_Picture]:
@@ -247,6 +262,10 @@ def _pictures(d: Diagnosis) -> list[_Picture]:
             "fit of any candidate leaves: the noise, where one of them is right. Bars: 90 % "
             "interval of the gain.",
             lambda narrow: plots.plot_horizons(d, p, narrow),
+            tuple(
+                (str(g.steps), f"{g.before:.3g}", f"{g.after:.3g}", f"{g.low:.0%} to {g.high:.0%}")
+                for g in d.gain.values()
+            ),
         ),
         _Picture(
             "The missing force",
@@ -257,7 +276,7 @@ def _pictures(d: Diagnosis) -> list[_Picture]:
     ]
     if d.rejected or d.findings:
         caption = (
-            "By how much each candidate alone lowers the mean square error of held-out recordings; "
+            "By how much each candidate lowers the mean square error of held-out recordings; "
             "dashed: the least that counts."
         )
         found.append(
@@ -270,8 +289,8 @@ def _pictures(d: Diagnosis) -> list[_Picture]:
     return found
 
 
-def _inlined(picture: _Picture) -> dict[str, str]:
+def _inlined(picture: _Picture) -> dict[str, Any]:
     wide, narrow = (
         base64.b64encode(plots.as_png(picture.draw(narrow))).decode() for narrow in (False, True)
     )
-    return {"title": picture.title, "caption": picture.caption, "wide": wide, "narrow": narrow}
+    return picture._asdict() | {"wide": wide, "narrow": narrow}

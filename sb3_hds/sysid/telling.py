@@ -18,12 +18,13 @@ from sb3_hds.sysid.profile import profiled
 from sb3_hds.sysid.remainder import Remainder
 from sb3_hds.sysid.results import Estimate
 from sb3_hds.sysid.search import LEAST_GAIN, LEVEL, Base, Half, Tried
+from sb3_hds.sysid.wording import TOO_LITTLE
 
-#: why a candidate was turned down that predicts better; a line of a printed table has 26 letters
-UNCERTAIN, SMALL, CHANCE = "has no certain size", "is small beside the others", "may be chance"
-NO_CONSTANT = "near, but no constant size"
-NAMELESS = "a nameless force is better"
-ANOTHER = "its sizes mean another"
+#: why a candidate was turned down that predicts better
+UNCERTAIN, SMALL, CHANCE = "its size is uncertain", "it is small beside the others", "may be chance"
+NO_CONSTANT = "it comes near, but its size is not constant"
+NAMELESS = "a force without a name predicts better"
+ANOTHER = "its fitted sizes are those of another effect"
 _CONFIDENCE = 0.9
 # Family-wise level of what contradicts that nothing is wrong, though it is no finding.
 _CONTRADICTS = 0.01
@@ -170,7 +171,7 @@ def why(verdict: Comparison, turned_down: str | None) -> str:
     :param turned_down: for which reason, if it was the best for a time
     """
     if verdict.gain < LEAST_GAIN:
-        return "gains too little"
+        return TOO_LITTLE
     return turned_down or (CHANCE if verdict.p_value >= LEVEL else "others gain more")
 
 
