@@ -388,6 +388,10 @@ def test_a_replay_buffer_of_another_environment_is_refused_and_the_own_one_stays
         model.load_replay_buffer(buffer)
     assert model.replay_buffer is own
 
+    # As SB3's own tests do.
+    del model.replay_buffer
+    small("droq").save_replay_buffer(buffer)
+    model.load_replay_buffer(buffer)
     small("droq", make_vec_env("Pendulum-v1", 2)).save_replay_buffer(buffer)
     with pytest.raises(EnvironmentMismatchError, match="its n_envs is 2, this model's 1"):
         model.load_replay_buffer(buffer)

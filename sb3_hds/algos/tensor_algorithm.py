@@ -176,14 +176,14 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         :raises ValueError: for a damaged file, and for a buffer of another environment; that of
             before is then still there
         """
-        before = self.replay_buffer
+        before: Any = getattr(self, "replay_buffer", None)
         try:
             super().load_replay_buffer(path, truncate_last_traj)
         except (OSError, AssertionError):
             raise
         # Where pickle meets damage, it may raise anything.
         except Exception as error:
-            if self.replay_buffer is not before:
+            if getattr(self, "replay_buffer", None) is not before:
                 raise
             raise damaged(path, error) from error
         try:
