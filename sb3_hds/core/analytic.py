@@ -3,6 +3,7 @@
 import abc
 import math
 from functools import lru_cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -44,6 +45,9 @@ class AnalyticTwin(Twin):
     @abc.abstractmethod
     def bias(self, q: Position, v: Velocity, params: Params) -> Force:
         """:return: the force that would keep the system from accelerating, shape ``(dof,)``"""
+
+    def structure(self) -> tuple[Any, ...]:
+        return (*super().structure(), self.integrator)
 
     def limit_velocity(self, v: Velocity) -> Velocity:
         """Where the environment clips speeds."""
