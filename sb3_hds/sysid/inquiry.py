@@ -311,10 +311,10 @@ class Inquiry:
         return Diagnosis(
             verdict="unknown",
             believed=self.believed,
+            convention=convention.name,
             unexplained=(
-                f"The log is not written as the model has it. {convention.words} The equation of "
-                f"motion then leaves {convention.after:.2g} times the noise, not "
-                f"{convention.before:.2g} times. No cause was looked for."
+                f"{convention.words} The equation of motion then leaves {convention.after:.1f} "
+                f"times the noise, not {convention.before:.0f} times. No cause was looked for."
             ),
             caveats=(*map(str, self.audit.findings), *self.corrected),
             twin=self.believed,
