@@ -231,7 +231,7 @@ class Inquiry:
         nearest = ""
         if found:
             found, base, left, nearest = self._constant(found, base)
-        if len(found) == 1 and left.remainder is not None:
+        if len(found) == 1 and left.remainder is not None and self.screened is None:
             pair = naming.pair(found[0], base, firsts) or naming.several_as_confirmed(firsts)
             if pair is not None and (rest := self._left_by(*pair)) is not None:
                 found, base, left = *pair, rest
