@@ -4,6 +4,7 @@ import io
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -60,10 +61,14 @@ NAMES = list(algos.ALL)
 PLANNERS = [name for name in NAMES if issubclass(algos.ALL[name], TwinAlgorithm)]
 #: the algorithms that learn from a replay buffer, by gradients
 OFF_POLICY = [name for name in NAMES if issubclass(algos.ALL[name], OffPolicyAlgorithm)]
+MODEL_FREE = [name for name in OFF_POLICY if name not in PLANNERS]
+
+#: observations of Pendulum-v1
+STATES = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, -2.0]], np.float32)
 
 
 def _mostly_expensive(representatives: tuple[str, ...]) -> list[Any]:
-    quick = {*PLANNERS, *representatives}
+    quick = {"hds", *representatives}
     mark = pytest.mark.expensive
     return [name if name in quick else pytest.param(name, marks=mark) for name in NAMES]
 
@@ -72,8 +77,7 @@ def _id_of(name: Any) -> str:
     return name if isinstance(name, str) else name.values[0]
 
 
-#: all; of the model-free ones, those that share every line with one that is here are among the
-#: expensive tests
+#: all; those that share every line with one of these are among the expensive tests
 EVERY_NAME = _mostly_expensive(("droq", "td7", "openloop"))
 EVERY_OFF_POLICY = [name for name in EVERY_NAME if _id_of(name) in OFF_POLICY]
 #: all, for tests that take long
@@ -123,6 +127,16 @@ def saved(model: BaseAlgorithm) -> io.BytesIO:
     model.save(file)
     file.seek(0)
     return file
+
+
+def reloaded(model: BaseAlgorithm, **changes: Any) -> BaseAlgorithm:
+    """:return: the model saved and loaded, with an environment unless another is given"""
+    return type(model).load(saved(model), **({"env": "Pendulum-v1"} | changes))
+
+
+def greedy(actor: Any, obs: Any = STATES) -> np.ndarray:
+    """:return: what a model, or a policy, does where it explores nothing"""
+    return actor.predict(obs, deterministic=True)[0]
 
 
 def steps_of(checkpoint: Path) -> int:
