@@ -67,21 +67,14 @@ MODEL_FREE = [name for name in OFF_POLICY if name not in PLANNERS]
 STATES = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, -2.0]], np.float32)
 
 
-def _mostly_expensive(representatives: tuple[str, ...]) -> list[Any]:
-    quick = {"hds", *representatives}
-    mark = pytest.mark.expensive
-    return [name if name in quick else pytest.param(name, marks=mark) for name in NAMES]
+def _or_expensive(name: str) -> Any:
+    quick = name in ("hds", "droq", "td7", "openloop")
+    return name if quick else pytest.param(name, marks=pytest.mark.expensive)
 
 
-def _id_of(name: Any) -> str:
-    return name if isinstance(name, str) else name.values[0]
-
-
-#: all; those that share every line with one of these are among the expensive tests
-EVERY_NAME = _mostly_expensive(("droq", "td7", "openloop"))
-EVERY_OFF_POLICY = [name for name in EVERY_NAME if _id_of(name) in OFF_POLICY]
-#: all, for tests that take long
-QUICK_NAMES = _mostly_expensive(("droq", "openloop"))
+#: all; those that share every line with one of these four are among the expensive tests
+EVERY_NAME = [_or_expensive(name) for name in NAMES]
+EVERY_OFF_POLICY = [_or_expensive(name) for name in OFF_POLICY]
 
 
 def small(name: str, env: Any = "Pendulum-v1", **changes: Any) -> BaseAlgorithm:
@@ -96,13 +89,17 @@ class Lines(KVWriter):
         self.lines: list[dict[str, Any]] = []
 
     def write(self, key_values, key_excluded, step: int = 0) -> None:
-        self.lines.append(dict(key_values))
+        self.lines.append({"step": step, **key_values})
 
     def close(self) -> None:
         self.lines = []
 
     def column(self, key: str) -> list[Any]:
         return [line[key] for line in self.lines if key in line]
+
+    def steps(self, key: str) -> list[int]:
+        """:return: where a curve of it has its points"""
+        return [line["step"] for line in self.lines if key in line]
 
 
 def logged(model: BaseAlgorithm) -> Lines:
