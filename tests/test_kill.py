@@ -9,7 +9,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from small_models import QUICK_NAMES, steps_of
+from small_models import steps_of
 
 from sb3_hds import algos
 
@@ -36,7 +36,10 @@ small(sys.argv[1]).learn(1_000, callback=CheckpointCallback(50, sys.argv[2]))
 ENVIRON = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
 
 
-@pytest.mark.parametrize("name", QUICK_NAMES)
+@pytest.mark.parametrize(
+    "name",
+    ["droq", *(pytest.param(each, marks=pytest.mark.expensive) for each in ("hds", "openloop"))],
+)
 def test_the_last_checkpoint_of_a_killed_process_loads_and_trains_on(name, tmp_path):
     process = subprocess.run([sys.executable, "-c", SCRIPT, name, str(tmp_path)], env=ENVIRON)
 
