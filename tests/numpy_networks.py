@@ -40,10 +40,10 @@ def descend(loss: Callable[[Weights], float], weights: Weights, rate: float) -> 
 
 
 class Adam:
-    """Kingma and Ba, 2015, algorithm 1; ``decay`` is AdamW's (Loshchilov and Hutter, 2019)."""
+    """Kingma and Ba, 2015, algorithm 1."""
 
-    def __init__(self, rate: float, b1: float = 0.9, decay: float = 0.0) -> None:
-        self.rate, self.b1, self.decay = rate, b1, decay
+    def __init__(self, rate: float, b1: float = 0.9) -> None:
+        self.rate, self.b1 = rate, b1
         self.t, self.m, self.v = 0, 0.0, 0.0
 
     def step(self, w: Any, g: Any) -> Any:
@@ -51,7 +51,7 @@ class Adam:
         self.m = self.b1 * self.m + (1.0 - self.b1) * g
         self.v = 0.999 * self.v + 0.001 * g**2
         m, v = self.m / (1.0 - self.b1**self.t), self.v / (1.0 - 0.999**self.t)
-        return w - self.rate * (m / (np.sqrt(v) + 1e-8) + self.decay * w)
+        return w - self.rate * m / (np.sqrt(v) + 1e-8)
 
 
 def member(weights: Weights, i: int) -> Weights:

@@ -7,14 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import flax.linen as nn
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from small_models import NAMES, saved, small
+from odd_envs import AnySpaces
+from small_models import NAMES, STATES, greedy, reloaded, saved, small
 from stable_baselines3 import SAC
 
 import sb3_hds
@@ -22,19 +22,16 @@ from sb3_hds.algos.policy_description import space_from_plain, space_to_plain
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_policy_alone_acts_as_its_model_and_nothing_is_unpickled(name, tmp_path, no_pickle):
+def test_a_policy_alone_acts_as_its_model_and_nothing_is_unpickled(name, no_pickle):
     model = small(name, seed=3)
-    obs = np.array([[1.0, 0.0, 0.5], [-0.6, 0.8, -7.0]], np.float32)
     if name == "simba":
-        model.policy.observed(obs)
-    model.save(tmp_path / "model")
+        model.policy.observed(STATES)
 
-    policy = sb3_hds.load_policy(tmp_path / "model")
+    policy = sb3_hds.load_policy(saved(model))
 
-    expected, _ = model.predict(obs, deterministic=True)
-    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], expected)
-    explored, _ = policy.predict(obs)
-    assert explored.shape == expected.shape and np.abs(explored).max() <= 2.0
+    np.testing.assert_array_equal(greedy(policy), greedy(model))
+    explored, _ = policy.predict(STATES)
+    assert explored.shape == (2, 1) and np.abs(explored).max() <= 2.0
     assert policy.observation_space == model.observation_space
     assert policy.action_space == model.action_space
 
@@ -46,41 +43,27 @@ def test_checkpoints_of_td7_act_in_the_policy_alone(no_pickle):
     actor = jax.tree.map(lambda weight: weight + 0.1, learner.checkpoint.actor)
     other = learner.checkpoint._replace(actor=actor)
     model.policy.learner = learner._replace(checkpoint=other)
-    obs = model.observation_space.sample()
 
     policy = sb3_hds.load_policy(saved(model))
 
-    expected, _ = model.predict(obs, deterministic=True)
-    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], expected)
+    np.testing.assert_array_equal(greedy(policy), greedy(model))
     model.policy.drop_checkpoint()
-    assert (model.predict(obs, deterministic=True)[0] != expected).any()
-
-
-class Choices(gymnasium.Env):
-    """Observations that are numbers and choices, in an order that is not the alphabet's."""
-
-    observation_space = spaces.Dict(
-        [("speed", spaces.Box(-np.inf, np.inf, (2,))), ("gear", spaces.Discrete(3, start=1))]
-    )
-    action_space = spaces.Box(-1.0, 1.0, (2, 2))
-
-    def reset(self, **settings):
-        super().reset(**settings)
-        return self.observation_space.sample(), {}
-
-    def step(self, action):
-        return self.observation_space.sample(), float(action.sum()), False, False, {}
+    assert (greedy(model) != greedy(policy)).any()
 
 
 def test_observations_of_several_parts_keep_their_order(no_pickle):
-    model = small("droq", Choices(), policy="MultiInputPolicy", seed=3)
+    # In an order that is not the alphabet's.
+    space = spaces.Dict(
+        [("speed", spaces.Box(-np.inf, np.inf, (2,))), ("gear", spaces.Discrete(3, start=1))]
+    )
+    env = AnySpaces(space, spaces.Box(-1.0, 1.0, (2, 2)))
+    model = small("droq", env, policy="MultiInputPolicy", seed=3)
     obs = {"speed": np.array([0.3, -2.0], np.float32), "gear": 2}
 
     policy = sb3_hds.load_policy(saved(model))
 
-    expected, _ = model.predict(obs, deterministic=True)
-    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], expected)
-    assert expected.shape == (2, 2)
+    np.testing.assert_array_equal(greedy(policy, obs), greedy(model, obs))
+    assert greedy(model, obs).shape == (2, 2)
 
 
 @pytest.mark.parametrize(
@@ -116,12 +99,16 @@ def test_numbers_of_numpy_are_plain(name, no_pickle):
     if name == "td7":
         kwargs |= {"n_critics": np.int32(2), "embedding_size": np.int64(4)}
     model = small(name, policy_kwargs=kwargs)
-    obs = np.array([[1.0, 0.0, 0.5]], np.float32)
 
     policy = sb3_hds.load_policy(saved(model))
 
-    expected, _ = model.predict(obs, deterministic=True)
-    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], expected)
+    np.testing.assert_array_equal(greedy(policy), greedy(model))
+
+
+def test_widths_in_an_array_are_loaded_again():
+    model = small("td7", policy_kwargs={"net_arch": np.array([8, 8])})
+
+    assert reloaded(model).policy_kwargs["net_arch"] == [8, 8]
 
 
 def test_a_function_of_ones_own_is_no_plain_data():

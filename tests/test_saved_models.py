@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch as th
 from numpy_networks import clipped, gaussian, simba, squashed_between
-from small_models import SMALL, saved, small
+from small_models import MODEL_FREE, SMALL, saved, small
 
 import sb3_hds
 from sb3_hds import algos
@@ -44,7 +44,10 @@ def test_every_algorithm_has_a_file_of_its_first_version():
 @pytest.mark.parametrize("name", SMALL)
 def test_a_file_holds_what_the_newest_stored_one_holds(name):
     """Where this fails, files have another format: store some of it under a new name."""
-    now = contents(saved(trained(name)))
+    # Updates change numbers, and neither names nor shapes.
+    without = {"learning_starts": 1_000} if name in MODEL_FREE else {}
+
+    now = contents(saved(trained(name, **without)))
 
     assert now == contents(SAVED / NEWEST / f"{name}.zip")
 
@@ -131,19 +134,13 @@ def test_widths_that_a_file_does_not_say_are_those_of_its_day(monkeypatch, tmp_p
         assert_acts(policy, model.predict(OBSERVATIONS, deterministic=True)[0])
 
 
-def test_a_file_says_the_widths_that_were_the_default(tmp_path):
-    policy = algos.SimbaSAC(env="Pendulum-v1", buffer_size=10).policy
-
-    assert policy.arguments["net_arch"] == {"pi": (128,), "qf": (128, 128)}
-
-
 def assert_acts(model, expected):
     actions, _ = model.predict(OBSERVATIONS, deterministic=True)
     np.testing.assert_allclose(actions, expected, rtol=1e-4, atol=1e-5)
 
 
-def trained(name):
-    return small(name).learn(N_STEPS.get(name, 30))
+def trained(name, **changes):
+    return small(name, **changes).learn(N_STEPS.get(name, 30))
 
 
 def contents(file):
