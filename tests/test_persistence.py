@@ -5,6 +5,7 @@ import json
 import os
 import pickletools
 import re
+import signal
 import subprocess
 import sys
 import warnings
@@ -32,6 +33,7 @@ from small_models import (
     same,
     saved,
     small,
+    steps_of,
 )
 from stable_baselines3 import SAC
 
@@ -375,3 +377,42 @@ def test_a_truncated_file_is_refused(name, tmp_path):
 def test_a_file_that_is_not_there_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="absent"):
         algos.DroQ.load(tmp_path / "absent")
+
+
+# Several files of tensors go into each checkpoint: the process dies within the third one.
+DIES = """
+import glob, os, signal, sys
+import torch
+from small_models import small
+from stable_baselines3.common.callbacks import CheckpointCallback
+
+write, calls = torch.save, []
+
+def deadly(*args, **kwargs):
+    calls.append(len(glob.glob(sys.argv[2] + "/*.zip")))
+    if calls.count(2) == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    write(*args, **kwargs)
+
+torch.save = deadly
+small(sys.argv[1]).learn(1_000, callback=CheckpointCallback(50, sys.argv[2]))
+"""
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["droq", *(pytest.param(each, marks=pytest.mark.expensive) for each in ("hds", "openloop"))],
+)
+def test_the_last_checkpoint_of_a_killed_process_loads_and_trains_on(name, tmp_path):
+    environ = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.run([sys.executable, "-c", DIES, name, str(tmp_path)], env=environ)
+
+    assert process.returncode == -signal.SIGKILL
+    checkpoints = sorted(tmp_path.glob("*.zip"), key=lambda path: path.stat().st_mtime)
+    assert [steps_of(path) for path in checkpoints] == [50, 100]
+    model = algos.ALL[name].load(checkpoints[-1], env="Pendulum-v1")
+    updates = model._n_updates
+    model.learn(50, reset_num_timesteps=False)
+    assert model.num_timesteps == 150 and model._n_updates > updates
+    weights = model.get_parameters()["policy"].values()
+    assert all(np.isfinite(weight.numpy()).all() for weight in weights if weight.ndim)
