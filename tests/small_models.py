@@ -1,6 +1,8 @@
 """Every algorithm, so small that a test of it takes moments: tests ask whether, not how well."""
 
 import io
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +124,16 @@ def saved(model: BaseAlgorithm) -> io.BytesIO:
     """:return: the model's zip file in memory"""
     file = io.BytesIO()
     model.save(file)
+    file.seek(0)
+    return file
+
+
+def repacked(model: BaseAlgorithm, part: str, change: Callable[[bytes], bytes]) -> io.BytesIO:
+    """:return: the model's zip file, of which one part was changed"""
+    old, file = zipfile.ZipFile(saved(model)), io.BytesIO()
+    with zipfile.ZipFile(file, "w") as new:
+        for name in old.namelist():
+            new.writestr(name, change(old.read(name)) if name == part else old.read(name))
     file.seek(0)
     return file
 

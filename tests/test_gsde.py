@@ -89,6 +89,9 @@ def test_noise_depends_on_the_state_and_stays_until_it_is_drawn_again():
     assert np.abs(deviations() - first).min() > 1e-3
     assert model.policy.get_std().shape == (8, 1)
     assert model.policy.get_std().mean() == pytest.approx(1.0)
+    told = {"net_arch": [8], "log_std_init": 1.0, "use_expln": True}
+    slower = small("gsde_sac", policy_kwargs=told).policy.get_std()
+    assert slower.mean() == pytest.approx(1.0 + np.log(2.0), rel=1e-5)
 
 
 def test_each_environment_has_its_noise_matrix_and_the_deviation_is_logged():

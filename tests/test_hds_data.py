@@ -1,5 +1,6 @@
 """HDS and the data that it measures: what they correct, what they may not spoil, what is kept."""
 
+import dataclasses
 from types import SimpleNamespace
 from typing import Any
 
@@ -480,7 +481,8 @@ def test_what_counts_since_a_change_is_remembered_in_real_steps(monkeypatch):
 
     def changed_once(twin, data, *_, since, **__):
         counted.append(since)
-        return Correction(twin, 0.0, False, since=Since(15, 0) if len(counted) == 2 else None)
+        found = Correction(twin, 0.0, changed=False, attached={"friction": 0.0})
+        return dataclasses.replace(found, since=Since(15, 0) if len(counted) == 2 else None)
 
     monkeypatch.setattr("sb3_hds.algos.hds.correct", changed_once)
     model = small("hds", train_freq=10).learn(20).learn(10)
@@ -488,6 +490,8 @@ def test_what_counts_since_a_change_is_remembered_in_real_steps(monkeypatch):
     assert (model.num_timesteps, model.real_timesteps) == (10, 30)
     # Fifteen of the first twenty steps, and the ten that came after.
     assert counted == [None, None, Since(25, 0)]
+    # What was believed of effects that were attached is known from then on.
+    assert model.nominal["friction"] == 0.0
 
 
 def test_planning_anew_is_no_block_of_its_own(monkeypatch):

@@ -364,21 +364,6 @@ def test_a_file_of_another_algorithm_is_refused(tmp_path):
             algos.ALL[name].load(tmp_path / "sac")
 
 
-@pytest.mark.parametrize("name", ["droq", "hds", "openloop"])
-def test_a_truncated_file_is_refused(name, tmp_path):
-    content = saved(small(name)).getvalue()
-
-    for share in (0.0, 0.3, 0.7, 0.999):
-        (tmp_path / "model.zip").write_bytes(content[: int(share * len(content))])
-        with pytest.raises(ValueError, match=r"wasn't a zip-file|is damaged"):
-            algos.ALL[name].load(tmp_path / "model.zip")
-
-
-def test_a_file_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="absent"):
-        algos.DroQ.load(tmp_path / "absent")
-
-
 # Several files of tensors go into each checkpoint: the process dies within the third one.
 DIES = """
 import glob, os, signal, sys

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch as th
 from numpy_networks import clipped, gaussian, simba, squashed_between
-from small_models import MODEL_FREE, SMALL, saved, small
+from small_models import MODEL_FREE, SMALL, greedy, reloaded, repacked, saved, small
 
 import sb3_hds
 from sb3_hds import algos
@@ -110,15 +110,13 @@ def test_widths_that_a_file_does_not_say_are_those_of_its_day(monkeypatch, tmp_p
     arch, unsaid = {"pi": [8], "qf": [16, 16]}, {"net_arch": None}
     model = small("crossq_jax", policy_kwargs={"net_arch": arch})
     monkeypatch.setattr(type(model.policy), "of_older_files", arch)
-    model.save(tmp_path / "now.zip")
-    with zipfile.ZipFile(tmp_path / "now.zip") as now:
-        parts = {name: now.read(name) for name in now.namelist()}
-    data = json.loads(parts["data"])
-    data["policy_kwargs"] = {}
-    data["policy_description"]["arguments"] |= unsaid
-    with zipfile.ZipFile(tmp_path / "older.zip", "w") as older:
-        for name, content in (parts | {"data": json.dumps(data)}).items():
-            older.writestr(name, content)
+
+    def older(content: bytes) -> bytes:
+        data = json.loads(content) | {"policy_kwargs": {}}
+        data["policy_description"]["arguments"] |= unsaid
+        return json.dumps(data).encode()
+
+    (tmp_path / "older.zip").write_bytes(repacked(model, "data", older).getvalue())
     model.policy.arguments |= unsaid
     model.policy.save(tmp_path / "policy.pth")
 
@@ -126,12 +124,12 @@ def test_widths_that_a_file_does_not_say_are_those_of_its_day(monkeypatch, tmp_p
 
     for policy in (
         loaded.policy,
-        algos.CrossQ.load(saved(loaded)).policy,
+        reloaded(loaded, env=None).policy,
         sb3_hds.load_policy(tmp_path / "older"),
         type(model.policy).load(tmp_path / "policy.pth"),
     ):
         assert policy.widths == ((8,), (16, 16))
-        assert_acts(policy, model.predict(OBSERVATIONS, deterministic=True)[0])
+        assert_acts(policy, greedy(model, OBSERVATIONS))
 
 
 def assert_acts(model, expected):
