@@ -19,6 +19,8 @@ from sb3_hds.envs import twin_of
 from sb3_hds.errors import EnvironmentMismatchError, SeedsDivergedError
 from sb3_hds.wrappers import ActionRateLimit
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 SOFT = ["gsde_sac", "droq", "crossq_jax", "tqc_jax", "simba", "bro"]
 
 

@@ -54,6 +54,11 @@ def inertia(twin) -> float:
     return (twin.values["mass"] / 3.0 + twin.values["payload"]) * twin.values["length"] ** 2
 
 
+def real(**settings) -> HDS:
+    """:return: a model that plans in the twin of the real system, without a learned force"""
+    return small("hds", REAL, twin="PendulumReal", residual=False, **settings)
+
+
 # --- what is corrected
 
 
@@ -91,7 +96,7 @@ def held_fast():
         obs.append(env.step(actions[-1])[0])
     assert np.abs(np.array(obs)[50:, 1]).max() < 0.2
     data = Trajectories.from_arrays([obs], [actions], dt=0.05)
-    return corrected(twins.make("PendulumReal"), data)
+    return corrected(twins.make("PendulumReal"), data, suspected=())
 
 
 def test_a_system_that_friction_holds_fast_is_not_taken_for_a_heavier_one(held_fast):
@@ -277,7 +282,7 @@ def test_values_that_were_not_taken_over_are_not_logged_as_those_of_the_model(he
 
 @pytest.mark.expensive  # a whole diagnosis
 def test_a_model_diagnoses_its_data_sheet_by_what_it_has_measured(heavier):
-    model = small("hds", REAL, twin="PendulumReal", pretrain_data=heavier, residual=False)
+    model = real(pretrain_data=heavier)
     model.learn(0)
 
     found = model.diagnose(effects=[effects.CoulombFriction], calibrate=["mass"], progress=False)
@@ -287,7 +292,7 @@ def test_a_model_diagnoses_its_data_sheet_by_what_it_has_measured(heavier):
 
 
 def test_what_is_diagnosed_is_the_twin_as_it_was_before_any_data(heavier, monkeypatch):
-    model = small("hds", REAL, twin="PendulumReal", pretrain_data=heavier, residual=False)
+    model = real(pretrain_data=heavier)
     model.twin = model.twin.with_parameters(mass=1.3)
     monkeypatch.setattr("sb3_hds.algos.hds.diagnose", lambda *given, **_: given)
 
@@ -302,7 +307,7 @@ def test_what_is_diagnosed_is_the_twin_as_it_was_before_any_data(heavier, monkey
 def test_what_the_data_name_is_attached_and_estimated_from_then_on(tmp_path):
     rubbing = twins.make("PendulumReal").extend(effects.CoulombFriction(0, tau_c=0.3))
     data = measured(rubbing, n=10, n_steps=100, noise=0.01)
-    model = small("hds", REAL, twin="PendulumReal", pretrain_data=data, residual=False)
+    model = real(pretrain_data=data)
     assert small("hds", REAL, twin="PendulumReal").extend_model() is None
 
     found = model.extend_model(effects=[effects.CoulombFriction, effects.ActionDelay])
@@ -414,19 +419,6 @@ def test_effects_are_attached_by_name_or_as_they_are():
         small("hds", REAL, calibrated=["weight"])
 
 
-def test_data_from_a_file_correct_the_model_before_the_first_plan(tmp_path, heavier):
-    path = heavier.save(tmp_path / "log")
-    model = small("hds", REAL, twin="PendulumReal", pretrain_data=str(path), residual=False)
-
-    model.learn(0)
-
-    assert model.twin.values["damping"] == pytest.approx(0.1, rel=0.15)
-    with pytest.raises(TrajectoryError, match="no file"):
-        small("hds", REAL, pretrain_data=str(tmp_path / "missing.npz"))
-    with pytest.raises(TrajectoryError, match="Trajectories or the path"):
-        small("hds", REAL, pretrain_data=3)
-
-
 # --- what is kept
 
 
@@ -439,11 +431,10 @@ def columns(model):
     }
 
 
-def test_data_and_corrections_travel_with_the_model(heavier):
-    model = small(
-        "hds", REAL, twin="PendulumReal", pretrain_data=heavier, residual=False, refit_freq=0
-    )
-    model.learn(50)
+def test_data_from_a_file_correct_the_model_and_travel_with_it(tmp_path, heavier):
+    path = heavier.save(tmp_path / "log")
+    model = real(pretrain_data=str(path), refit_freq=0).learn(50)
+    assert model.twin.values["damping"] == pytest.approx(0.1, rel=0.15)
 
     loaded = reloaded(model, env=REAL)
 
@@ -454,6 +445,10 @@ def test_data_and_corrections_travel_with_the_model(heavier):
     assert loaded.measured.trajectories().n_steps == heavier.n_steps + 50
     loaded.learn(25, reset_num_timesteps=False)
     assert loaded.replay_buffer.size() == 75
+    with pytest.raises(TrajectoryError, match="no file"):
+        small("hds", REAL, pretrain_data=str(tmp_path / "missing.npz"))
+    with pytest.raises(TrajectoryError, match="Trajectories or the path"):
+        small("hds", REAL, pretrain_data=3)
 
 
 @pytest.mark.parametrize("name", PLANNERS)
@@ -485,7 +480,7 @@ def test_what_counts_since_a_change_is_remembered_in_real_steps(monkeypatch):
         return dataclasses.replace(found, since=Since(15, 0) if len(counted) == 2 else None)
 
     monkeypatch.setattr("sb3_hds.algos.hds.correct", changed_once)
-    model = small("hds", train_freq=10).learn(20).learn(10)
+    model = real(train_freq=10).learn(20).learn(10)
 
     assert (model.num_timesteps, model.real_timesteps) == (10, 30)
     # Fifteen of the first twenty steps, and the ten that came after.
@@ -502,7 +497,7 @@ def test_planning_anew_is_no_block_of_its_own(monkeypatch):
         return Correction(twin, 0.0, changed=True)
 
     monkeypatch.setattr("sb3_hds.algos.hds.correct", always_changed)
-    model = small("hds", train_freq=10, replan_epochs=2, gradient_steps=3).learn(30)
+    model = real(train_freq=10, replan_epochs=2, gradient_steps=3).learn(30)
 
     assert asked == [10, 20, 30]
     assert model._n_updates == 3 * (2 + 1) * 3
@@ -526,8 +521,8 @@ def test_settings_of_learning_from_data_are_checked_at_the_door(name, value, exp
 
 def test_how_much_is_saved_may_be_limited():
     for settings, kept in (({"max_saved_steps": 40}, 40), ({"save_data": False}, 0)):
-        model = small("hds", **settings).learn(60)
-        loaded = reloaded(model)
+        model = real(refit_freq=0, **settings).learn(60)
+        loaded = reloaded(model, env=REAL)
         assert loaded.replay_buffer.size() == kept
         latest = columns(model)["observations"][model.replay_buffer.size() - kept :]
         np.testing.assert_array_equal(columns(loaded)["observations"], latest)

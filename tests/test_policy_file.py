@@ -17,6 +17,8 @@ from stable_baselines3 import SAC
 import sb3_hds
 from sb3_hds.algos.policy_description import space_from_plain, space_to_plain
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_policy_alone_acts_as_its_model_and_nothing_is_unpickled(name, no_pickle):

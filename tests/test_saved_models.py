@@ -26,6 +26,8 @@ from sb3_hds import algos
 from sb3_hds.algos.observations import seen
 from sb3_hds.algos.off_policy import act
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 SAVED = Path(__file__).parent / "saved"
 NEWEST = "0.1.0-2026-11-28"
 OBSERVATIONS = np.array(
