@@ -213,20 +213,14 @@ BRIEF = {
     ),
     "td7": (*_FEW_UPDATES, "policy_kwargs:dict(net_arch=[8],embedding_size=8)"),
 }
-_QUICK_IDS = ("droq",)
 
 
 def test_every_algorithm_is_tried_by_the_commands():
     assert {*BRIEF, "openloop"} == set(ALGORITHMS)
 
 
-@pytest.mark.parametrize(
-    "algo",
-    [
-        algo if algo in _QUICK_IDS else pytest.param(algo, marks=pytest.mark.expensive)
-        for algo in BRIEF
-    ],
-)
+@pytest.mark.expensive  # two processes each; HDS, above, goes the same way
+@pytest.mark.parametrize("algo", BRIEF)
 def test_every_algorithm_is_trained_and_replayed(zoo, algo):
     agent = ("--algo", algo, "--env", "Pendulum-v1", "-f", "brief")
     budget = ("--seed", "0", "-n", "200", "--eval-freq", "-1")
