@@ -480,9 +480,9 @@ def test_what_counts_since_a_change_is_remembered_in_real_steps(monkeypatch):
         return dataclasses.replace(found, since=Since(15, 0) if len(counted) == 2 else None)
 
     monkeypatch.setattr("sb3_hds.algos.hds.correct", changed_once)
-    model = real(train_freq=10).learn(20).learn(10)
+    model = real(train_freq=10).learn(10).learn(20)
 
-    assert (model.num_timesteps, model.real_timesteps) == (10, 30)
+    assert (model.num_timesteps, model.real_timesteps) == (20, 30)
     # Fifteen of the first twenty steps, and the ten that came after.
     assert counted == [None, None, Since(25, 0)]
     # What was believed of effects that were attached is known from then on.
