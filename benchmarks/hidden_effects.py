@@ -248,6 +248,7 @@ def run(
     seconds = time.time() - started
     names = [key(finding) for finding in found.findings]
     first = found.findings[0] if names else None
+    turned = _turned(found.convention)
     values = {n: e.estimate for n, e in first.parameters.items()} if first else {}
     commands = np.concatenate([data.episode(i)[1] for i in range(len(data))])
     more = {}
@@ -265,9 +266,9 @@ def run(
         "recordings": case.recordings,
         "wrong_base": case.wrong_base,
         "disturbance": case.disturbance,
-        "verdict": found.verdict,
-        "named": names[0] if names else "",
-        "set": ";".join((names[0], *first.alternatives)) if first else "",
+        "verdict": "named" if turned else found.verdict,
+        "named": names[0] if names else turned,
+        "set": ";".join((names[0], *first.alternatives)) if first else turned,
         "more": ";".join(names[1:]),
         "gain": first.gain if first else 0.0,
         "explained": found.explained,
@@ -279,6 +280,12 @@ def run(
         "seconds": seconds,
         **more,
     }
+
+
+def _turned(convention: str) -> str:
+    """A wrong direction is told as a convention; what is planted then is a sign."""
+    kind, _, place = convention.partition(".")
+    return f"sign_flip.{place}" if kind in ("direction", "command") else ""
 
 
 def others(inquiry: Any, case: Case) -> dict[str, Any]:

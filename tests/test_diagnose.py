@@ -268,7 +268,7 @@ def test_a_joint_that_is_counted_the_other_way_round_is_a_matter_of_convention()
 
     found = asked(with_signs(data, [-1.0, -1.0]), pushed, effects=[effects.ViscousFriction])
 
-    assert (found.verdict, found.convention) == ("unknown", "direction")
+    assert (found.verdict, found.convention) == ("unknown", "direction.hinge")
     assert "hinge is counted the other way round" in found.unexplained
     assert found.twin == pushed
 

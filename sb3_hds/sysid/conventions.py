@@ -31,13 +31,13 @@ _FINE = 2.0
 
 class Convention(NamedTuple):
     """
-    :param name: what kind it is
+    :param key: what kind it is, and where: ``"direction.hinge"``
     :param words: what is the case, and what to write
     :param before: what the equation of motion leaves of the log as it is, in units of the noise
     :param after: the same with the convention changed
     """
 
-    name: str
+    key: str
     words: str
     before: float
     after: float
@@ -45,6 +45,7 @@ class Convention(NamedTuple):
 
 class _Change(NamedTuple):
     name: str
+    places: tuple[str, ...]
     words: str
     q: Callable[[np.ndarray], np.ndarray]
     slopes: Callable[[np.ndarray], np.ndarray]
@@ -86,7 +87,7 @@ def other_convention(twin: Twin, motion: Motion, nuisances: Sequence[str]) -> Co
     before, after = (float(np.sqrt(np.mean(np.maximum(x, 1.0) ** 2))) for x in (now, then))
     if gain < _WORTH or before < _SMALLER * after:
         return None
-    return Convention(change.name, change.words, before, after)
+    return Convention(".".join((change.name, *change.places)), change.words, before, after)
 
 
 def what_friction_leaves(twin: Twin, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
@@ -126,6 +127,7 @@ def _changes(twin: Twin, motion: Motion) -> Iterator[_Change]:
         ahead = np.pi * np.eye(dof)[j]
         yield _Change(
             "zero",
+            (names[j],),
             f"{names[j]} is counted from a zero that is half a turn from the model's: write its "
             "column with offset: 3.14159265, or give the model that zero.",
             lambda q, ahead=ahead: q + ahead,
@@ -137,6 +139,7 @@ def _changes(twin: Twin, motion: Motion) -> Iterator[_Change]:
         side = one - 2.0 * np.eye(dof)[j]
         yield _Change(
             "direction",
+            (names[j],),
             f"{names[j]} is counted the other way round: write its columns with scale: -1.",
             lambda q, side=side: q * side,
             lambda x, side=side: x * side,
@@ -147,6 +150,7 @@ def _changes(twin: Twin, motion: Motion) -> Iterator[_Change]:
         side = np.ones(n_act) - 2.0 * np.eye(n_act)[i]
         yield _Change(
             "command",
+            (twin.actuators[i].name,),
             f"The command {twin.actuators[i].name} has the wrong sign: write its column with "
             "scale: -1.",
             same,
@@ -157,6 +161,7 @@ def _changes(twin: Twin, motion: Motion) -> Iterator[_Change]:
     if n_act > 1:
         yield _Change(
             "command",
+            (),
             "All commands have the wrong sign: write their columns with scale: -1.",
             same,
             same,
@@ -167,6 +172,7 @@ def _changes(twin: Twin, motion: Motion) -> Iterator[_Change]:
         size = np.where(rotary, np.pi / 180.0, 1.0)
         yield _Change(
             "degrees",
+            (),
             "Angles are in degrees: write their columns with unit: deg.",
             lambda q: q * size,
             lambda x: x * size,
@@ -180,6 +186,7 @@ def _changes(twin: Twin, motion: Motion) -> Iterator[_Change]:
         order[[i, j]] = j, i
         yield _Change(
             "order",
+            (names[i], names[j]),
             f"The columns of {names[i]} and {names[j]} are exchanged: exchange them in the map.",
             lambda q, order=order: q[:, order],
             lambda x, order=order: x[:, order],
@@ -191,6 +198,7 @@ def _changes(twin: Twin, motion: Motion) -> Iterator[_Change]:
         order[[i, j]] = j, i
         yield _Change(
             "order",
+            (twin.actuators[i].name, twin.actuators[j].name),
             f"The commands {twin.actuators[i].name} and {twin.actuators[j].name} are exchanged: "
             "exchange their columns in the map.",
             same,

@@ -129,9 +129,9 @@ class Diagnosis:
     :param seed: of the split and of what else was drawn
     :param findings: causes, in the order in which they were found
     :param unexplained: what remains after them, in words; empty if nothing does
-    :param convention: what kind of convention of the model the log does not follow (``"zero"``,
-        ``"direction"``, ``"command"``, ``"degrees"``, ``"order"``), or empty; ``unexplained`` says
-        what to write
+    :param convention: which convention of the model the log does not follow (``"zero"``,
+        ``"direction"``, ``"command"``, ``"degrees"`` or ``"order"``, and where:
+        ``"direction.hinge"``), or empty; ``unexplained`` says what to write
     :param gain: by horizon in steps
     :param explained: share that the findings explain of the force that is missing and can be
         predicted, or 0

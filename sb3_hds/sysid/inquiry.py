@@ -311,7 +311,7 @@ class Inquiry:
         return Diagnosis(
             verdict="unknown",
             believed=self.believed,
-            convention=convention.name,
+            convention=convention.key,
             unexplained=(
                 f"{convention.words} The equation of motion then leaves {convention.after:.1f} "
                 f"times the noise, not {convention.before:.0f} times. No cause was looked for."
