@@ -13,7 +13,15 @@ from sb3_hds.core.effect import NO_EFFECTS, EffectChain, Moment
 from sb3_hds.core.integrators import Integrator, semi_implicit_euler
 from sb3_hds.core.linear import solve_spd
 from sb3_hds.core.twin import State, Twin
-from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Velocity
+from sb3_hds.core.types import (
+    Action,
+    Coordinates,
+    Force,
+    MassMatrix,
+    Params,
+    Position,
+    Velocity,
+)
 
 # Turns of a rotary joint at which its load is asked for: at one of them gravity pulls hard.
 _TURNS = (0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi)
@@ -45,6 +53,25 @@ class AnalyticTwin(Twin):
     def bias(self, q: Position, v: Velocity, params: Params) -> Force:
         """:return: the force that would keep the system from accelerating, shape ``(dof,)``"""
 
+    def coordinates(self, q: Position) -> Coordinates:
+        """:return: the position of each joint, as effects there see it; override for quaternions"""
+        return q
+
+    def displace(self, q: Position, way: Velocity) -> Position:
+        """:return: the position after a velocity times a time; override for quaternions"""
+        return q + way
+
+    def accelerate(
+        self, state: State, now: Moment, force: Force, command: Action, params: Params
+    ) -> Velocity:
+        """
+        :param now: the system in this state
+        :param force: of actuators and effects together, shape ``(dof,)``
+        :param command: what reaches the actuators
+        :return: the acceleration; override where the equation of motion is solved another way
+        """
+        return solve_spd(now.mass_matrix, force - now.load)
+
     def limit_velocity(self, v: Velocity) -> Velocity:
         """Where the environment clips speeds."""
         return v
@@ -66,18 +93,19 @@ class AnalyticTwin(Twin):
 
             def moment(q: Position, v: Velocity) -> Moment:
                 actuator = self.actuate(State(q, v, state.memory), command, params)
-                return Moment(
-                    q, v, actuator, self.bias(q, v, params), self.mass_matrix(q, params), h
-                )
+                load, mass_matrix = self.bias(q, v, params), self.mass_matrix(q, params)
+                return Moment(self.coordinates(q), v, actuator, load, mass_matrix, h)
 
-            held, middle = effects.held(moment, state.q, state.v, memory, h)
+            held, middle = effects.held(moment, state.q, state.v, memory, h, self.displace)
 
             def acceleration(q: Position, v: Velocity) -> Velocity:
-                now = moment(q, v)
-                added = held + effects.force(now, memory)
-                return solve_spd(now.mass_matrix, now.actuator + added - now.load)
+                now, there = moment(q, v), State(q, v, state.memory)
+                force = now.actuator + held + effects.force(now, memory)
+                return self.accelerate(there, now, force, command, params)
 
-            q, v = self.integrator(acceleration, state.q, state.v, h, self.limit_velocity)
+            q, v = self.integrator(
+                acceleration, state.q, state.v, h, self.limit_velocity, self.displace
+            )
             q, v = self.limit(q, v)
             # With the new velocity: an elastic memory then keeps energy, as the twin itself does.
             return State(q, v, effects.advance(middle, moment(q, v), memory)), None
@@ -103,8 +131,8 @@ def _typical_forces(twin: AnalyticTwin) -> tuple[float, ...]:
         start = twin.initial(key, params)
         standing = start._replace(v=jnp.zeros_like(start.v))
 
-        def at(turn: Position) -> Force:
-            state = standing._replace(q=start.q + turn)
+        def at(turn: Coordinates) -> Force:
+            state = standing._replace(q=twin.displace(start.q, turn))
             driven = twin.actuate(state, largest, params)
             return jnp.abs(driven) + jnp.abs(twin.bias(state.q, state.v, params))
 

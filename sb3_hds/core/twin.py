@@ -40,7 +40,8 @@ class State(NamedTuple):
     """
     Everything that the next step depends on besides the action and the parameters.
 
-    :param q: generalised position [rad] or [m], shape ``(dof,)``
+    :param q: generalised position [rad] or [m], shape ``(dof,)``; longer where quaternions are
+        among its numbers
     :param v: generalised velocity [rad/s] or [m/s], shape ``(dof,)``
     :param memory: what attached effects remember, keyed by the effect's full name
     """

@@ -1,0 +1,6 @@
+"""Twins of robots from their model files."""
+
+from sb3_hds.twins.mujoco.mechanism import Mechanism
+from sb3_hds.twins.mujoco.twin import MechanismTwin
+
+__all__ = ["Mechanism", "MechanismTwin"]

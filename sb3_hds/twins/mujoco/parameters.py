@@ -1,0 +1,320 @@
+"""
+The parameters of a mechanism: names, units, bounds, and what they change.
+
+Joints keep their names in MJCF's words, ``elbow_damping`` and ``elbow_frictionloss``; actuators
+likewise, ``elbow_servo_kp``.
+"""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from sb3_hds.core import Parameter
+from sb3_hds.errors import ParameterError, did_you_mean
+from sb3_hds.twins.mujoco import scalars as s
+from sb3_hds.twins.mujoco.dynamics import Inertia, inverse_dynamics, mass_matrix, poses
+from sb3_hds.twins.mujoco.mechanism import (
+    BALL,
+    FREE,
+    SLIDE,
+    SUFFIXES,
+    Body,
+    Drive,
+    Link,
+    Mechanism,
+    Place,
+)
+from sb3_hds.twins.mujoco.scalars import Matrix, Number, Vector
+
+Values = Mapping[str, Number]
+
+_AXES = "xyz"
+# Typical deviations: shares of what is typical at a joint, and of a parameter's own value.
+_OF_TORQUE, _OF_TORQUE_PER_SPEED, _OF_INERTIA, _OF_ITSELF = 0.05, 0.02, 0.1, 0.1
+# A payload is a share of the mass that moves [1], at some distance from its place [m].
+_OF_MASS, _NEAR = 0.05, 0.05
+_TILT = 0.02  # [rad]
+_SHIFT, _STRETCH = 0.02, 0.1  # of a body's centre [m], and of its shape, as a logarithm
+_N_POSES = 64
+
+
+def of_plant(mechanism: Mechanism, payload: Place | None, masses: bool) -> dict[str, Parameter]:
+    """
+    :param payload: where an unknown mass may be
+    :param masses: whether mass, centre and inertia of each body are parameters
+    :return: all that the equation of motion has
+    """
+    inertias, torques = typical(mechanism)
+    found = {name: Parameter(0.0, _TILT, "rad", -1.0, 1.0) for name in tilts(mechanism)}
+    for link in mechanism.links:
+        found |= _of_link(link, inertias, torques)
+    moving = [link.body for link in mechanism.links if link.body]
+    if payload is not None:
+        scale = _OF_MASS * sum(body.mass for body in moving)
+        found[f"{payload.name}_payload"] = Parameter(0.0, scale, "kg", 0.0)
+        for axis in _AXES:
+            found[f"{payload.name}_payload_{axis}"] = Parameter(0.0, _NEAR, "m")
+    if masses:
+        for body in moving:
+            found |= _of_body(body)
+    return found
+
+
+def of_drives(mechanism: Mechanism) -> dict[str, Parameter]:
+    """:return: all that turns commands into forces"""
+    found = {}
+    for drive in mechanism.drives:
+        found |= _of_drive(drive, mechanism.links[drive.link])
+    return found
+
+
+def native_effects(mechanism: Mechanism) -> dict[tuple[str, int], dict[str, str]]:
+    """:return: effects that are parameters already, by name and index of their place"""
+    found = {}
+    for link in mechanism.links:
+        if len(link.dofs) == 1:
+            found["viscous_friction", link.v] = {"b": f"{link.joint}_damping"}
+            found["coulomb_friction", link.v] = {"tau_c": f"{link.joint}_frictionloss"}
+    command = 0
+    for drive in mechanism.drives:
+        if drive.role == "motor":
+            found["torque_gain", command] = {"gain": f"{drive.name}_gain"}
+        command += len(drive.inputs)
+    return found
+
+
+def _of_link(
+    link: Link, inertias: np.ndarray, torques: np.ndarray
+) -> dict[str, Parameter]:
+    """Of a floating base, only what the model has."""
+    turns = link.kind != SLIDE
+    i, free = link.dofs[-1], link.kind == FREE
+    torque = float(torques[i]) or 1.0
+    units = (
+        ("N m s/rad", "N m", "kg m2", "N m/rad") if turns else ("N s/m", "N", "kg", "N/m")
+    )
+    values = (
+        link.damping[0][0] if link.damping[0] else 0.0,
+        link.friction[0],
+        link.armature[0],
+        link.stiffness[0] if link.stiffness else 0.0,
+    )
+    scales = (
+        _OF_TORQUE_PER_SPEED * torque,
+        _OF_TORQUE * torque,
+        _OF_INERTIA * float(inertias[i]),
+        0.0,
+    )
+    found = {}
+    names = ("damping", "frictionloss", "armature", "stiffness")
+    for name, value, scale, unit in zip(names, values, scales, units, strict=True):
+        wanted = scale > 0.0 and not free
+        if wanted or value:
+            scale = max(scale, _OF_ITSELF * abs(value))
+            found[f"{link.joint}_{name}"] = Parameter(value, scale, unit, min(value, 0.0))
+    return found
+
+
+def _of_drive(drive: Drive, link: Link) -> dict[str, Parameter]:
+    force = "N" if link.kind == SLIDE else "N m"
+    length, positive = ("m" if link.kind == SLIDE else "rad"), (0.0, math.inf)
+    speed = f"{force} s/{length}"
+    kp, kv = (-value for value in drive.bias[1:])
+    motor = dict(drive.motor)
+    found: dict[str, tuple[float, str, tuple[float, float]]] = {
+        "motor": {"gain": (drive.gain[0], "1", (-math.inf, math.inf))},
+        "position": {"kp": (kp, f"{force}/{length}", positive), "kv": (kv, speed, positive)},
+        "velocity": {"kv": (kv, speed, positive)},
+        "dcmotor": {
+            "motorconst": (motor.get("constant", 0.0), "N m/A", positive),
+            "resistance": (motor.get("resistance", 1.0), "ohm", (1e-9, math.inf)),
+        },
+        "general": {},
+    }[drive.role]
+    other = kp if drive.role == "position" else 1.0
+    return {
+        f"{drive.name}_{name}": Parameter(
+            value, _OF_ITSELF * abs(value) or _OF_ITSELF * abs(other), unit, min(low, value), high
+        )
+        for name, (value, unit, (low, high)) in found.items()
+    }
+
+
+def _of_body(body: Body) -> dict[str, Parameter]:
+    """Any values make a possible body: a positive mass, and an inertia that some shape has."""
+    found = {f"{body.name}_mass": Parameter(body.mass, 0.1 * body.mass, "kg", 1e-3 * body.mass)}
+    for axis, value in zip(_AXES, centre_in_body(body), strict=True):
+        found[f"{body.name}_com_{axis}"] = Parameter(value, _SHIFT, "m")
+    for axis in _AXES:
+        found[f"{body.name}_stretch_{axis}"] = Parameter(0.0, _STRETCH, "1", -3.0, 3.0)
+    for plane in ("xy", "xz", "yz"):
+        found[f"{body.name}_shear_{plane}"] = Parameter(0.0, _STRETCH, "1", -10.0, 10.0)
+    return found
+
+
+# --- what they change
+
+
+def tilts(mechanism: Mechanism) -> list[str]:
+    """:return: by which horizontal axes the world may be turned, against a mount that is askew"""
+    size = np.abs(mechanism.gravity)
+    if not size.any():
+        return []
+    return [f"tilt_{_AXES[i]}" for i in range(3) if i != int(size.argmax())]
+
+
+def gravity_of(mechanism: Mechanism, p: Values) -> Vector:
+    """:return: gravity turned about the world's axes, the later one first [m/s2]"""
+    found: Vector = mechanism.gravity  # type: ignore[assignment]
+    for name in reversed(tilts(mechanism)):
+        i = _AXES.index(name[-1])
+        j, k = (i + 1) % 3, (i + 2) % 3
+        c, d = s.cos(p[name]), s.sin(p[name])
+        new = list(found)
+        new[j] = s.sub(s.mul(c, found[j]), s.mul(d, found[k]))
+        new[k] = s.add(s.mul(d, found[j]), s.mul(c, found[k]))
+        found = tuple(new)  # type: ignore[assignment]
+    return found
+
+
+def inertias_of(
+    mechanism: Mechanism, payload: Place | None, masses: bool, p: Values
+) -> list[Inertia]:
+    """:return: of each link, with its payload"""
+    found = []
+    for i, link in enumerate(mechanism.links):
+        own = Inertia(0.0, s.ZERO, (0.0,) * 6)
+        if link.body is not None:
+            own = _changed(link.body, p) if masses else _inertia(link.body)
+        if payload is not None and payload.link == i:
+            mass = p[f"{payload.name}_payload"]
+            offset = tuple(p[f"{payload.name}_payload_{axis}"] for axis in _AXES)
+            place = s.vadd(payload.position, s.apply(payload.rotation, offset))
+            load = _about_origin(mass, place, (0.0,) * 6)
+            own = Inertia(
+                s.add(own.mass, load.mass),
+                s.vadd(own.moment, load.moment),
+                s.sadd(own.about, load.about),
+                own.held,
+            )
+        found.append(own)
+    return found
+
+
+def _inertia(body: Body) -> Inertia:
+    held = None if body.held is None else (body.held[0], body.held[1:])
+    return _about_origin(body.mass, body.centre, body.inertia)._replace(held=held)
+
+
+def _changed(body: Body, p: Values) -> Inertia:
+    r"""
+    Log-Cholesky: the second moments of mass about the centre, per unit of mass, become
+    :math:`U \Sigma U^T` with an upper triangular :math:`U` of positive diagonal.
+
+    Source: Rucker and Wensing, *Smooth parameterization of rigid-body inertia*, IEEE RA-L 2022.
+    """
+    name, turn = body.name, body.rotation
+    mass = p[f"{name}_mass"]
+    centre = tuple(p[f"{name}_com_{axis}"] for axis in _AXES)
+    stretch = [s.exp(p[f"{name}_stretch_{axis}"]) for axis in _AXES]
+    xy, xz, yz = (p[f"{name}_shear_{plane}"] for plane in ("xy", "xz", "yz"))
+    shape = (stretch[0], xy, xz), (0.0, stretch[1], yz), (0.0, 0.0, stretch[2])
+    spread = s.congruent(s.product(turn, shape), _second_moments(body))
+    sum_of = s.total(spread[:3])
+    inertia = tuple(s.mul(mass, s.sub(sum_of, own)) for own in spread[:3])
+    products = tuple(s.mul(mass, s.neg(own)) for own in spread[3:])
+    centre = s.vadd(body.origin, s.apply(turn, centre))
+    return _about_origin(mass, centre, (*inertia, *products))
+
+
+def _second_moments(body: Body) -> s.Symmetric:
+    """About the centre, in the body's axes, per unit of mass [m2]."""
+    turn = np.array(body.rotation)
+    inertia = turn.T @ np.array(s.full(body.inertia)) @ turn
+    spread = (0.5 * np.trace(inertia) * np.eye(3) - inertia) / body.mass
+    return tuple(float(spread[i, j]) for i, j in s.PLACES)
+
+
+def centre_in_body(body: Body) -> tuple[float, ...]:
+    """:return: the centre of mass in the body's frame [m]"""
+    way = np.array(body.rotation).T @ (np.array(body.centre) - np.array(body.origin))
+    return tuple(float(x) for x in way)
+
+
+def _about_origin(mass: Number, centre: Vector, inertia: s.Symmetric) -> Inertia:
+    x, y, z = moment = s.scale(mass, centre)
+    xx, yy, zz = s.mul(x, centre[0]), s.mul(y, centre[1]), s.mul(z, centre[2])
+    xy, xz, yz = s.mul(x, centre[1]), s.mul(x, centre[2]), s.mul(y, centre[2])
+    far = (s.add(yy, zz), s.add(xx, zz), s.add(xx, yy), s.neg(xy), s.neg(xz), s.neg(yz))
+    return Inertia(mass, moment, s.sadd(inertia, far))
+
+
+# --- what is typical
+
+
+def typical(mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray]:
+    """
+    :return: for each degree of freedom, the smallest inertia that a force there moves [kg m2] or
+        [kg], and the largest force of gravity [N m] or [N], over random positions
+    """
+    links, n = mechanism.links, mechanism.n_v
+    q = random_positions(mechanism, _N_POSES)
+    pose = poses(links, q)
+    inertia = inertias_of(mechanism, None, False, {})
+    load = inverse_dynamics(links, pose, inertia, [0.0] * n, mechanism.gravity)
+    weight = np.array([np.abs(np.broadcast_to(x, _N_POSES)).max() for x in load])
+    matrix = np.zeros((_N_POSES, n, n))
+    for (i, j), entry in mass_matrix(links, pose, inertia).items():
+        matrix[:, i, j] = matrix[:, j, i] = entry
+    armature = np.concatenate([link.armature for link in links])
+    matrix += np.diag(armature)
+    felt = 1.0 / np.diagonal(np.linalg.inv(matrix), axis1=1, axis2=2)
+    return felt.min(0), weight
+
+
+def random_positions(mechanism: Mechanism, n: int, seed: int = 0) -> list[np.ndarray]:
+    """:return: one array of ``n`` samples for each number of a position"""
+    rng = np.random.default_rng(seed)
+    found: list[np.ndarray] = []
+    for link in mechanism.links:
+        if link.kind in (BALL, FREE):
+            turns = rng.normal(size=(4, n))
+            found += [*rng.normal(size=(3, n))] * (link.kind == FREE)
+            found += [*(turns / np.linalg.norm(turns, axis=0))]
+        elif link.kind == SLIDE:
+            low, high = link.limit or (-0.5, 0.5)
+            found.append(rng.uniform(low, high, n))
+        else:
+            low, high = link.limit or (-math.pi, math.pi)
+            found.append(rng.uniform(low, high, n))
+    return found
+
+
+def place_of(mechanism: Mechanism, name: str) -> Place:
+    """
+    :raises ParameterError: for a site or body that is none, or that does not move
+    """
+    found = {place.name: place for place in mechanism.places}
+    if name not in found:
+        raise ParameterError(
+            f"{mechanism.name} has no site or body '{name}' for a payload."
+            f"{did_you_mean(name, found)} It has: {', '.join(found) or 'none'}."
+        )
+    if found[name].link < 0:
+        moving = [place.name for place in found.values() if place.link >= 0]
+        raise ParameterError(
+            f"A payload at '{name}' of {mechanism.name} would not move, so no data tell of it. "
+            f"Choose one of: {', '.join(moving) or 'none'}."
+        )
+    return found[name]
+
+
+def dof_names(mechanism: Mechanism) -> list[tuple[str, str]]:
+    """:return: name and unit of each degree of freedom"""
+    found = []
+    for link in mechanism.links:
+        for suffix in SUFFIXES[link.kind]:
+            straight = link.kind == SLIDE or (link.kind == FREE and "r" not in suffix)
+            found.append((f"{link.joint}{suffix}", "m" if straight else "rad"))
+    return found
