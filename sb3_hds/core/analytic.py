@@ -62,15 +62,16 @@ class AnalyticTwin(Twin):
         return q + way
 
     def accelerate(
-        self, state: State, now: Moment, force: Force, command: Action, params: Params
+        self, state: State, command: Action, added: Force, params: Params
     ) -> Velocity:
         """
-        :param now: the system in this state
-        :param force: of actuators and effects together, shape ``(dof,)``
         :param command: what reaches the actuators
+        :param added: force besides that of the actuators, shape ``(dof,)``
         :return: the acceleration; override where the equation of motion is solved another way
         """
-        return solve_spd(now.mass_matrix, force - now.load)
+        force = self.actuate(state, command, params) + added
+        load = self.bias(state.q, state.v, params)
+        return solve_spd(self.mass_matrix(state.q, params), force - load)
 
     def limit_velocity(self, v: Velocity) -> Velocity:
         """Where the environment clips speeds."""
@@ -96,17 +97,21 @@ class AnalyticTwin(Twin):
                 load, mass_matrix = self.bias(q, v, params), self.mass_matrix(q, params)
                 return Moment(self.coordinates(q), v, actuator, load, mass_matrix, h)
 
-            held, middle = effects.held(moment, state.q, state.v, memory, h, self.displace)
+            still = jnp.zeros_like(state.v)
+            held, middle = still, None
+            if effects.has_forces:
+                held, middle = effects.held(moment, state.q, state.v, memory, h, self.displace)
 
             def acceleration(q: Position, v: Velocity) -> Velocity:
-                now, there = moment(q, v), State(q, v, state.memory)
-                force = now.actuator + held + effects.force(now, memory)
-                return self.accelerate(there, now, force, command, params)
+                added = effects.force(moment(q, v), memory) if effects.has_forces else still
+                return self.accelerate(State(q, v, state.memory), command, held + added, params)
 
             q, v = self.integrator(
                 acceleration, state.q, state.v, h, self.limit_velocity, self.displace
             )
             q, v = self.limit(q, v)
+            if middle is None:
+                return State(q, v, memory), None
             # With the new velocity: an elastic memory then keeps energy, as the twin itself does.
             return State(q, v, effects.advance(middle, moment(q, v), memory)), None
 

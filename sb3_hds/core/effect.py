@@ -365,6 +365,11 @@ class EffectChain:
         both._forces = self._forces + other._forces
         return both
 
+    @property
+    def has_forces(self) -> bool:
+        """:return: whether any effect acts in the equation of motion"""
+        return bool(self._forces)
+
     def act(
         self, action: Action, memory: dict[str, Memory], h: float
     ) -> tuple[Action, dict[str, Memory]]:

@@ -1,151 +1,218 @@
-"""
+r"""
 Commands to forces, as MuJoCo's actuators have it: motors, servos and DC motors without memory.
+
+All actuators of a kind are computed side by side. With their gears as the rows of :math:`T`,
+lengths are :math:`T q`, speeds :math:`T v`, and generalised forces :math:`T^T f`.
 
 Source: MuJoCo documentation, *Computation*, Actuation model; *MuJoCo DC motor model*, Google
 DeepMind 2026, sections 1.1, 1.2 and 2.5.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import Array, Float
 
-from sb3_hds.core import Action, Params, Position, Velocity
-from sb3_hds.twins.mujoco import scalars as s
-from sb3_hds.twins.mujoco.mechanism import BALL, FREE, Drive, Link, Mechanism
+from sb3_hds.core import Action, Force, MassMatrix, Params, Position, Velocity
+from sb3_hds.core.types import Coordinates
+from sb3_hds.twins.mujoco import algebra
+from sb3_hds.twins.mujoco.mechanism import BALL, FREE, Drive, Mechanism
 
-_ALIGNED = (1.0, 0.0, 0.0, 0.0)
+Each = Float[Array, " drives"]
+
+
+class Moving(NamedTuple):
+    """What actuators see of the mechanism: a joint's position is a turn where it is a ball."""
+
+    q: Position
+    coordinates: Coordinates
+    v: Velocity
 
 
 class Pull(NamedTuple):
     """
-    What one actuator does.
-
-    :param force: before the gear
-    :param by_speed: its slope by the actuator's own speed; 0 where a limit holds the force
-    :param gear: by degree of freedom of the link that it drives, shape ``(n,)``
+    :param force: of each actuator, before its gear
+    :param by_speed: slope of that by its own speed; 0 where a limit holds it
+    :param gear: shape ``(drives, dof)``
     """
 
-    force: Array
-    by_speed: Array
-    gear: Array
+    force: Each
+    by_speed: Each
+    gear: Float[Array, "drives dof"]
 
 
-def pulls(
-    mechanism: Mechanism, q: Position, v: Velocity, command: Action, p: Params
-) -> list[Pull]:
-    """:return: of each actuator"""
-    found, first = [], 0
-    for drive in mechanism.drives:
-        link = mechanism.links[drive.link]
-        given = command[first : first + len(drive.inputs)]
-        first += len(drive.inputs)
-        gear, length, speed = _transmission(drive, link, q, v)
-        inputs = {
-            name: u if limits is None else jnp.clip(u, *limits)
-            for name, u, limits in zip(drive.inputs, given, drive.ranges, strict=True)
-        }
-        if drive.kind == "dcmotor":
-            force, by_speed = _dc_motor(drive, inputs, length, speed, p)
-        else:
-            force, by_speed = _servo(drive, link, inputs, length, speed, p)
-        if drive.force_limit is not None:
-            low, high = drive.force_limit
-            by_speed = jnp.where((force <= low) | (force >= high), 0.0, by_speed)
-            force = jnp.clip(force, low, high)
-        motor = dict(drive.motor)
-        if motor.get("cogging"):
+class Actuation:
+    """All actuators of a mechanism."""
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        first = np.cumsum([0, *(len(drive.inputs) for drive in mechanism.drives)])
+        numbered = list(zip(first.tolist(), mechanism.drives, strict=False))
+        kinds = (("affine", _Servos), ("pid", _Servos), ("dcmotor", _Motors))
+        found = ((made, [x for x in numbered if x[1].kind == kind]) for kind, made in kinds)
+        self.kinds = [made(mechanism, drives) for made, drives in found if drives]
+        limits = [link.force_limit or (-math.inf, math.inf) for link in mechanism.links for _ in link.dofs]
+        self.limits = np.array(limits) if np.isfinite(limits).any() else None
+
+    def force(self, moving: Moving, command: Action, p: Params) -> Force:
+        """:return: generalised force of all actuators"""
+        total = jnp.zeros_like(moving.v)
+        for pull in self._pulls(moving, command, p):
+            total = total + pull.force @ pull.gear
+        if self.limits is None:
+            return total
+        return jnp.clip(total, *self.limits.T.astype(total.dtype))
+
+    def slope(self, moving: Moving, command: Action, p: Params) -> MassMatrix:
+        """:return: of the force by the velocity, as an implicit integrator takes it"""
+        total = jnp.zeros((moving.v.shape[0],) * 2, moving.v.dtype)
+        for pull in self._pulls(moving, command, p):
+            total = total + (pull.gear.T * pull.by_speed) @ pull.gear
+        return total
+
+    def _pulls(self, moving: Moving, command: Action, p: Params) -> list[Pull]:
+        return [kind.pull(moving, command, p) for kind in self.kinds]
+
+
+class _Drives:
+    """
+    Actuators of one kind.
+
+    :param drives: after the index of their first command
+    """
+
+    def __init__(self, mechanism: Mechanism, drives: Sequence[tuple[int, Drive]]) -> None:
+        self.drives = [drive for _, drive in drives]
+        self.links = [mechanism.links[drive.link] for drive in self.drives]
+        self.n = len(drives)
+        self.gear = np.zeros((self.n, mechanism.n_v))
+        for row, link, drive in zip(self.gear, self.links, self.drives, strict=True):
+            row[list(link.dofs)] = drive.gear
+        self.floating = np.array([link.kind == FREE for link in self.links])
+        self.limits = np.array([drive.force_limit or (-math.inf, math.inf) for drive in self.drives]).T
+        #: of each input: rows that have it, index among all commands, and limits
+        self.inputs: dict[str, list[tuple[int, int, tuple[float, float]]]] = {}
+        for row, (first, drive) in enumerate(drives):
+            for j, (name, limits) in enumerate(zip(drive.inputs, drive.ranges, strict=True)):
+                place = (row, first + j, limits or (-math.inf, math.inf))
+                self.inputs.setdefault(name, []).append(place)
+
+    def given(self, name: str, command: Action) -> Each:
+        """:return: one input of each, zero where it has none"""
+        if name not in self.inputs:
+            return jnp.zeros(self.n, command.dtype)
+        rows, index, limits = zip(*self.inputs[name], strict=True)
+        u = jnp.clip(command[np.array(index)], *np.array(limits, command.dtype).T)
+        return u if len(rows) == self.n else jnp.zeros(self.n, u.dtype).at[np.array(rows)].set(u)
+
+    def geared(self, moving: Moving) -> tuple[Any, Each, Each]:
+        """:return: gears, lengths and speeds"""
+        gear: Any = self.gear.astype(moving.v.dtype)
+        for i, (link, drive) in enumerate(zip(self.links, self.drives, strict=True)):
+            if drive.outer and link.kind in (BALL, FREE):
+                start, turning = link.q + link.n_q - 4, np.array(link.dofs[-3:])
+                rows = algebra.rotation(tuple(moving.q[start : start + 4]))
+                axis = jnp.stack([jnp.sum(jnp.stack(x) * gear[i, turning]) for x in zip(*rows, strict=True)])
+                gear = jnp.asarray(gear).at[i, turning].set(axis)
+        length = jnp.where(self.floating, 0.0, gear @ moving.coordinates)
+        return gear, length, gear @ moving.v
+
+    def of(self, p: Params, name: str, otherwise: Any, like: Array) -> Each:
+        """:return: a parameter of each actuator, or a number where it is none"""
+        return jnp.stack(
+            [
+                jnp.asarray(p.get(f"{drive.name}_{name}", number), like.dtype)
+                for drive, number in zip(self.drives, otherwise, strict=True)
+            ]
+        )
+
+    def limited(self, force: Each, by_speed: Each) -> tuple[Each, Each]:
+        low, high = self.limits.astype(force.dtype)
+        if not np.isfinite(self.limits).any():
+            return force, by_speed
+        held = (force <= low) | (force >= high)
+        return jnp.clip(force, low, high), jnp.where(held, 0.0, by_speed)
+
+
+class _Servos(_Drives):
+    """A gain times the command, and a bias; both affine in length and speed."""
+
+    def __init__(self, mechanism: Mechanism, drives: Sequence[tuple[int, Drive]]) -> None:
+        super().__init__(mechanism, drives)
+        self.gain, self.bias = (
+            np.array([getattr(drive, name) for drive in self.drives]).T for name in ("gain", "bias")
+        )
+        # At a ball joint, targets that are whole turns apart are the same.
+        self.period = np.array(
+            [
+                2.0 * math.pi * math.hypot(*drive.gear)
+                if link.kind == BALL and drive.role == "position"
+                else 0.0
+                for link, drive in zip(self.links, self.drives, strict=True)
+            ]
+        )
+
+    def pull(self, moving: Moving, command: Action, p: Params) -> Pull:
+        gear, length, speed = self.geared(moving)
+        (g0, g1, g2), (b0, b1, b2) = (x.astype(length.dtype) for x in (self.gain, self.bias))
+        g0, b1, b2 = g0 + 0.0 * length, b1 + 0.0 * length, b2 + 0.0 * length
+        roles = [drive.role for drive in self.drives]
+        if "motor" in roles:
+            g0 = self.of(p, "gain", g0, length)
+        if "position" in roles:
+            b1, g0 = (sign * self.of(p, "kp", sign * x, length) for sign, x in ((-1.0, b1), (1.0, g0)))
+        if {"position", "velocity"} & set(roles):
+            b2 = -self.of(p, "kv", -b2, length)
+        if "velocity" in roles:
+            g0 = jnp.where(np.array([role == "velocity" for role in roles]), -b2, g0)
+        bias = b0 + b1 * length + b2 * speed
+        if self.drives[0].kind == "pid":
+            pos, vel, ff = (self.given(name, command) for name in ("pos", "vel", "ff"))
+            force = bias - b1 * self._nearest(pos, length) - b2 * vel + ff
+            return Pull(*self.limited(force, b2), gear)
+        u = self._nearest(self.given("", command), length)
+        force = (g0 + g1 * length + g2 * speed) * u + bias
+        return Pull(*self.limited(force, g2 * u + b2), gear)
+
+    def _nearest(self, wanted: Each, length: Each) -> Each:
+        if not self.period.any():
+            return wanted
+        period = np.where(self.period > 0.0, self.period, 1.0).astype(length.dtype)
+        nearest = wanted - period * jnp.round((wanted - length) / period)
+        return jnp.where(self.period > 0.0, nearest, wanted)
+
+
+class _Motors(_Drives):
+    r"""Torque :math:`K (V - K \omega) / R`, and the controller that sets the voltage, if any."""
+
+    def __init__(self, mechanism: Mechanism, drives: Sequence[tuple[int, Drive]]) -> None:
+        super().__init__(mechanism, drives)
+        names = dict(self.drives[0].motor)
+        self.motor = {name: np.array([dict(d.motor)[name] for d in self.drives]) for name in names}
+        self.driven = np.array([bool({"pos", "vel", "ff"} & set(d.inputs)) for d in self.drives])
+
+    def pull(self, moving: Moving, command: Action, p: Params) -> Pull:
+        gear, length, speed = self.geared(moving)
+        motor = {name: x.astype(length.dtype) for name, x in self.motor.items()}
+        constant = self.of(p, "motorconst", motor["constant"], length)
+        resistance = self.of(p, "resistance", motor["resistance"], length)
+        voltage, by_speed = self.given("voltage", command), -constant
+        if self.driven.any():
+            pos, vel, ff = (self.given(name, command) for name in ("pos", "vel", "ff"))
+            torque = motor["kp"] * (pos - length) + motor["kd"] * (vel - speed) + ff
+            per_torque = resistance / jnp.where(self.driven, constant, 1.0)
+            wanted = per_torque * torque + constant * speed
+            supply = np.where(motor["supply"] > 0.0, motor["supply"], np.inf).astype(length.dtype)
+            own = jnp.clip(wanted, -supply, supply)
+            voltage = voltage + jnp.where(self.driven, own, 0.0)
+            damped = constant - motor["kd"] * per_torque
+            by_speed = by_speed + jnp.where(self.driven, damped, 0.0)
+        gain = constant / resistance
+        force = gain * (voltage - constant * speed)
+        force, by_speed = self.limited(force, gain * by_speed)
+        if motor["cogging"].any():
             phase = motor["poles"] * length + motor["phase"]
             force = force + motor["cogging"] * jnp.sin(phase)
-        found.append(Pull(force, by_speed, gear))
-    return found
-
-
-def forces(mechanism: Mechanism, pulled: list[Pull], like: Velocity) -> Array:
-    """:return: generalised force of all actuators, shape ``(dof,)``"""
-    found: list[Any] = [jnp.zeros_like(like[0])] * mechanism.n_v
-    for drive, pull in zip(mechanism.drives, pulled, strict=True):
-        for i, dof in enumerate(mechanism.links[drive.link].dofs):
-            found[dof] = found[dof] + pull.gear[i] * pull.force
-    for link in mechanism.links:
-        if link.force_limit is not None:
-            found[link.v] = jnp.clip(found[link.v], *link.force_limit)
-    return jnp.stack(found)
-
-
-def _transmission(
-    drive: Drive, link: Link, q: Position, v: Velocity
-) -> tuple[Array, Array, Array]:
-    """Gear by degree of freedom, length and speed of an actuator."""
-    gear = jnp.asarray(drive.gear, q.dtype)
-    moving = v[link.v : link.v + len(drive.gear)]
-    if link.kind not in (BALL, FREE):
-        return gear, gear[0] * q[link.q], gear[0] * moving[0]
-    start = link.q + (3 if link.kind == FREE else 0)
-    turn = q[start : start + 4]
-    if drive.outer:
-        rows = jnp.stack([jnp.stack(row) for row in s.rotation(tuple(turn))])
-        gear = jnp.concatenate([gear[:-3], rows.T @ gear[-3:]])
-    speed = jnp.sum(gear * moving)
-    if link.kind == FREE:
-        return gear, jnp.zeros_like(speed), speed
-    away = s.turn_between(turn, jnp.asarray(_ALIGNED, q.dtype))
-    return gear, jnp.sum(gear * away), speed
-
-
-def _servo(
-    drive: Drive, link: Link, inputs: dict[str, Array], length: Array, speed: Array, p: Params
-) -> tuple[Array, Array]:
-    """A gain times the command, and a bias; both affine in length and speed."""
-    (g0, g1, g2), (b0, b1, b2) = drive.gain, drive.bias
-    given = {name.removeprefix(f"{drive.name}_"): p[name] for name in _own(drive)}
-    if drive.role == "position":
-        b1, b2 = -given["kp"], -given["kv"]
-        g0 = given["kp"]
-    elif drive.role == "velocity":
-        b2, g0 = -given["kv"], given["kv"]
-    elif drive.role == "motor":
-        g0 = given["gain"]
-    bias = b0 + b1 * length + b2 * speed
-    if drive.kind == "pid":
-        wanted = _nearest(drive, link, inputs.get("pos", jnp.zeros_like(length)), length)
-        force = bias - b1 * wanted - b2 * inputs.get("vel", 0.0) + inputs.get("ff", 0.0)
-        return force, b2 + 0.0 * speed
-    u = inputs[""]
-    if drive.role == "position":
-        u = _nearest(drive, link, u, length)
-    force = (g0 + g1 * length + g2 * speed) * u + bias
-    return force, g2 * u + b2 + 0.0 * speed
-
-
-def _nearest(drive: Drive, link: Link, wanted: Array, length: Array) -> Array:
-    """At a ball joint, targets that are whole turns apart are the same."""
-    if link.kind != BALL:
-        return wanted
-    period = 2.0 * math.pi * math.sqrt(sum(g**2 for g in drive.gear))
-    return wanted - period * jnp.round((wanted - length) / period)
-
-
-def _dc_motor(
-    drive: Drive, inputs: dict[str, Array], length: Array, speed: Array, p: Params
-) -> tuple[Array, Array]:
-    r"""Torque :math:`K (V - K \omega) / R`, and the controller that sets the voltage."""
-    motor = dict(drive.motor)
-    constant, resistance = p[f"{drive.name}_motorconst"], p[f"{drive.name}_resistance"]
-    voltage, by_speed = jnp.zeros_like(length), -constant + 0.0 * speed
-    if {"pos", "vel", "ff"} & set(inputs):
-        torque = motor["kp"] * (inputs.get("pos", 0.0) - length)
-        torque = torque + motor["kd"] * (inputs.get("vel", 0.0) - speed) + inputs.get("ff", 0.0)
-        voltage = resistance / constant * torque + constant * speed
-        by_speed = by_speed - motor["kd"] * resistance / constant + constant
-        if motor["supply"] > 0.0:
-            voltage = jnp.clip(voltage, -motor["supply"], motor["supply"])
-    voltage = voltage + inputs.get("voltage", 0.0)
-    gain = constant / resistance
-    return gain * (voltage - constant * speed), gain * by_speed
-
-
-def _own(drive: Drive) -> list[str]:
-    names = {"motor": ("gain",), "position": ("kp", "kv"), "velocity": ("kv",)}
-    return [f"{drive.name}_{name}" for name in names.get(drive.role, ())]
+        return Pull(force, by_speed, gear)

@@ -1,246 +1,379 @@
+r"""
+Rigid-body dynamics of a tree, and its derivatives, with all degrees of freedom side by side.
+
+Everything is told in the axes of the world, about a point that does not move at that instant: so a
+sum over what a joint carries, or over what carries it, is a product with a matrix of ones and
+zeros, and only orientations are computed joint by joint.
+
+Source: Featherstone, *Rigid Body Dynamics Algorithms*, Springer 2008, chapters 2, 5 and 6; Singh,
+Russell and Wensing, *Efficient analytical derivatives of rigid-body dynamics using spatial vector
+algebra*, IEEE RA-L 7(2), 2022.
 """
-Rigid-body dynamics of a tree of links, written out in scalars.
 
-Recursive Newton-Euler for inverse dynamics, composite rigid bodies for the mass matrix, and a
-factorisation that keeps the tree's zeros. All quantities of a link are in its own frame.
-
-Source: Featherstone, *Rigid Body Dynamics Algorithms*, Springer 2008, sections 5.3, 6.2 and 6.5.
-"""
-
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from sb3_hds.twins.mujoco import scalars as s
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sb3_hds.twins.mujoco import algebra as alg
+from sb3_hds.twins.mujoco.algebra import Matrix, Number, Symmetric, Vector
 from sb3_hds.twins.mujoco.mechanism import BALL, FREE, HINGE, SLIDE, Link
-from sb3_hds.twins.mujoco.scalars import Matrix, Number, Symmetric, Vector
 
-#: lower triangle of a symmetric matrix by row and column; what is missing is zero
-Triangle = dict[tuple[int, int], Number]
-
-_AXIS: Vector = (0.0, 0.0, 1.0)
+_UNIT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-class Pose(NamedTuple):
-    """Where a link's frame is in its parent's."""
+class Motion(NamedTuple):
+    """A velocity or an acceleration: of rotation, and of what is at the common point."""
 
-    rotation: Matrix
-    origin: Vector
+    turn: Vector
+    move: Vector
+
+
+class Wrench(NamedTuple):
+    """A force or a momentum, about the common point."""
+
+    torque: Vector
+    force: Vector
 
 
 class Inertia(NamedTuple):
     """
+    Of one body in its link's frame, or of many about the common point.
+
     :param mass: [kg]
-    :param moment: mass times the centre of mass [kg m]
-    :param about: the origin of the link [kg m2]
-    :param held: likewise of ``moment``, of the mass whose weight is compensated; None: none
+    :param moment: mass times its place [kg m]
+    :param spread: second moments of mass [kg m2]
     """
 
     mass: Number
     moment: Vector
-    about: Symmetric
-    held: tuple[Number, Vector] | None = None
+    spread: Symmetric
 
 
-def poses(links: Sequence[Link], q: Any) -> list[Pose]:
-    """:param q: position, indexed like a vector: an array, or a list of numbers"""
-    found = []
-    for link in links:
-        turn, origin = link.rotation, link.origin
+class Frames(NamedTuple):
+    """
+    :param axes: the motion that a unit of speed makes, one entry for each degree of freedom
+    :param inertia: of each body
+    :param held: of the mass whose weight is compensated, without its spread; None: none
+    """
+
+    axes: Motion
+    inertia: Inertia
+    held: Inertia | None
+
+
+class Tree:
+    """
+    Which link carries which.
+
+    A free joint is three slides along the world's axes and a ball.
+
+    :param links: parents before children
+    """
+
+    def __init__(self, links: Sequence[Link], dtype: Any = float) -> None:
+        self.links, self.dtype = links, dtype
+        self.n = sum(len(link.dofs) for link in links)
+        self.bodies = [i for i, link in enumerate(links) if link.body]
+        same, self.before = np.eye(self.n), np.zeros((self.n, self.n))
+        carrying: list[list[int]] = []
+        for link in links:
+            above = list(carrying[link.parent]) if link.parent >= 0 else []
+            for i in link.dofs:
+                ball = link.kind == BALL or (link.kind == FREE and i >= link.v + 3)
+                if ball:
+                    first = link.dofs[-3]
+                    same[i, first : first + 3] = 1.0
+                    self.before[i, above + list(range(link.v, first))] = 1.0
+                else:
+                    self.before[i, above + list(range(link.v, i))] = 1.0
+            carrying.append(above + list(link.dofs))
+        #: rows: a degree of freedom; columns: those that move what it moves, its own joint among
+        #: them
+        self.before = self.before.astype(dtype)
+        self.upto = self.before + same.astype(dtype)
+        #: rows: a body; columns: what moves it
+        self.carried = self.upto[[links[i].dofs[-1] for i in self.bodies]]
+        self.curved = any(link.kind in (BALL, FREE) for link in links)
+
+
+def frames(
+    tree: Tree,
+    q: Sequence[Number],
+    inertias: Sequence[Inertia],
+    held: Sequence[Inertia | None],
+) -> Frames:
+    """
+    :param q: numbers of the position
+    :param inertias: of each body in its link's frame, about its centre, the place of which is told
+        instead of its moment
+    :param held: likewise, of masses whose weight is compensated
+    """
+    turned: list[Matrix] = []
+    places: list[Vector] = []
+    adrift: list[bool] = []  # what carries it only slides: where it is does not matter
+    axes: list[Motion] = []
+    for link in tree.links:
+        above, place, loose = _UNIT, alg.ZERO, True
+        if link.parent >= 0:
+            above, loose = turned[link.parent], adrift[link.parent]
+            if not loose:
+                place = alg.vadd(places[link.parent], alg.apply(above, link.origin))
         if link.kind == FREE:
-            rotation = s.rotation(tuple(q[link.q + 3 + i] for i in range(4)))
-            found.append(Pose(rotation, tuple(q[link.q + i] for i in range(3))))
-        elif link.kind == BALL:
-            own = s.rotation(tuple(q[link.q + i] for i in range(4)))
-            found.append(Pose(s.product(turn, own), origin))
-        elif link.kind == SLIDE:
-            way = s.sub(q[link.q], link.reference)
-            found.append(Pose(turn, s.vadd(origin, s.scale(way, s.transpose(turn)[2]))))
+            axes += [Motion(alg.ZERO, unit) for unit in _UNIT]
         else:
-            angle = s.sub(q[link.q], link.reference)
-            c, d = s.cos(angle), s.sin(angle)
-            rows = tuple(
-                (s.add(s.mul(x, c), s.mul(y, d)), s.sub(s.mul(y, c), s.mul(x, d)), z)
-                for x, y, z in turn
+            above = alg.product(above, link.rotation)
+        x, y, z = columns = alg.transpose(above)
+        if link.kind == SLIDE:
+            axes.append(Motion(alg.ZERO, z))
+            if not loose:
+                way = alg.sub(q[link.q], link.reference)
+                place = alg.vadd(place, alg.scale(way, z))
+        elif link.kind == HINGE:
+            axes.append(_about(z, place))
+            angle = alg.sub(q[link.q], link.reference)
+            c, d = alg.cos(angle), alg.sin(angle)
+            columns = (
+                alg.vadd(alg.scale(c, x), alg.scale(d, y)),
+                alg.vadd(alg.scale(c, y), alg.scale(alg.neg(d), x)),
+                z,
             )
-            found.append(Pose(rows, origin))
-    return found
+        else:
+            start = link.q + (3 if link.kind == FREE else 0)
+            columns = alg.transpose(alg.product(above, alg.rotation(q[start : start + 4])))
+            axes += [_about(axis, place) for axis in columns]
+        turned.append(alg.transpose(columns))
+        places.append(place)
+        adrift.append(loose and link.kind == SLIDE)
+    rotation = _gathered([turned[i] for i in tree.bodies], tree.dtype)
+    place = _gathered([places[i] for i in tree.bodies], tree.dtype)
+    compensated = None
+    if any(held):
+        nothing = Inertia(0.0, alg.ZERO, (0.0,) * 6)
+        own = _gathered([each or nothing for each in held], tree.dtype)
+        centre = alg.vadd(place, alg.apply(rotation, own.moment))
+        compensated = own._replace(moment=alg.scale(own.mass, centre))
+    own = _about_the_point(_gathered(inertias, tree.dtype), rotation, place)
+    return Frames(_gathered(axes, tree.dtype), own, compensated)
+
+
+def mass_matrix(tree: Tree, at: Frames) -> Number:
+    """:return: without armature, shape ``(n, n)``"""
+    momentum = _momentum(_summed(at.inertia, tree.carried), at.axes)
+    above = _pairs(at.axes, momentum, tree.n)
+    return tree.upto.T * above + tree.before * above.swapaxes(-1, -2)
 
 
 def inverse_dynamics(
-    links: Sequence[Link],
-    pose: Sequence[Pose],
-    inertia: Sequence[Inertia],
-    v: Any,
-    gravity: Vector,
-    a: Any = None,
-) -> list[Number]:
+    tree: Tree, at: Frames, v: Number, gravity: Vector, a: Number | None = None
+) -> Number:
     """
-    :param v: velocity, indexed like a vector
+    :param v: velocity, shape ``(n,)``
     :param gravity: acceleration of what falls, in the world's frame [m/s2]
-    :param a: acceleration; None: none
-    :return: the force under which that happens, by degree of freedom
+    :param a: acceleration, shape ``(n,)``; None: none
+    :return: the force under which that happens, shape ``(n,)``
     """
-    turning, spinning, moving = [], [], []  # velocity, acceleration; acceleration of the origin
-    falling: list[Vector] = []  # gravity in the link's frame
-    force: list[Vector] = []
-    torque: list[Vector] = []
-    held = any(each.held for each in inertia)
-    for link, (rotation, origin), own in zip(links, pose, inertia, strict=True):
-        inwards = s.transpose(rotation)
-        if link.parent < 0:
-            w, dw, dv, g = s.ZERO, s.ZERO, s.scale(-1.0, gravity), gravity
-        else:
-            w, dw, dv = turning[link.parent], spinning[link.parent], moving[link.parent]
-            g = falling[link.parent] if held else s.ZERO
-            dv = s.vadd(dv, s.vadd(s.cross(dw, origin), s.cross(w, s.cross(w, origin))))
-        speed = tuple(v[i] for i in link.dofs)
-        gain = None if a is None else tuple(a[i] for i in link.dofs)
-        if link.kind == FREE:
-            dv = dv if gain is None else s.vadd(dv, gain[:3])
-            w, dw = speed[3:], s.ZERO if gain is None else gain[3:]
-            dv = s.apply(inwards, dv)
-        else:
-            w, dw, dv = s.apply(inwards, w), s.apply(inwards, dw), s.apply(inwards, dv)
-            along = speed if link.kind == BALL else (0.0, 0.0, speed[0])
-            more = s.ZERO if gain is None else gain if link.kind == BALL else (0.0, 0.0, gain[0])
-            if link.kind == SLIDE:
-                dv = s.vadd(dv, s.vadd(s.scale(2.0, s.cross(w, along)), more))
-            else:
-                dw = s.vadd(s.vadd(dw, s.cross(w, along)), more)
-                w = s.vadd(w, along)
-        turning.append(w)
-        spinning.append(dw)
-        moving.append(dv)
-        f = s.vadd(s.scale(own.mass, dv), s.cross(dw, own.moment))
-        f = s.vadd(f, s.cross(w, s.cross(w, own.moment)))
-        about = s.full(own.about)
-        t = s.vadd(s.apply(about, dw), s.cross(w, s.apply(about, w)))
-        t = s.vadd(t, s.cross(own.moment, dv))
-        if held:
-            falling.append(s.apply(inwards, g))
-            mass, moment = own.held or (0.0, s.ZERO)
-            f = s.vadd(f, s.scale(mass, falling[-1]))
-            t = s.vadd(t, s.cross(moment, falling[-1]))
-        force.append(f)
-        torque.append(t)
-    found: list[Number] = [0.0] * sum(len(link.dofs) for link in links)
-    for j in reversed(range(len(links))):
-        link, (rotation, origin) = links[j], pose[j]
-        needed = _along(link, rotation, force[j], torque[j])
-        for i, component in zip(link.dofs, needed, strict=True):
-            found[i] = component
-        if link.parent >= 0:
-            f, t = _outwards(rotation, origin, force[j], torque[j])
-            force[link.parent] = s.vadd(force[link.parent], f)
-            torque[link.parent] = s.vadd(torque[link.parent], t)
-    return found
+    flow = _flow(tree, at, v, gravity, a)
+    needed = alg.dot(_flat(at.axes), _flat(_summed(flow.force, tree.carried)))
+    return needed + 0.0 * v
 
 
-def mass_matrix(
-    links: Sequence[Link], pose: Sequence[Pose], inertia: Sequence[Inertia]
-) -> Triangle:
-    """:return: without armature"""
-    whole = [Inertia(*each[:3]) for each in inertia]
-    found: Triangle = {}
-    for j in reversed(range(len(links))):
-        link, (rotation, origin) = links[j], pose[j]
-        mass, moment, about = whole[j][:3]
-        for place, (turn, way) in zip(link.dofs, _motions(link, rotation), strict=True):
-            f = s.vadd(s.scale(mass, way), s.cross(turn, moment))
-            t = s.vadd(s.apply(s.full(about), turn), s.cross(moment, way))
-            _fill(found, place, link, rotation, f, t)
-            k = j
-            while links[k].parent >= 0:
-                f, t = _outwards(*pose[k], f, t)
-                k = links[k].parent
-                _fill(found, place, links[k], pose[k].rotation, f, t)
-        if link.parent >= 0:
-            whole[link.parent] = _joined(whole[link.parent], rotation, origin, whole[j])
-    return found
-
-
-def factor(matrix: Mapping[tuple[int, int], Number], n: int) -> Triangle:
+def slopes(
+    tree: Tree, at: Frames, v: Number, gravity: Vector, a: Number
+) -> tuple[Number, Number]:
     """
-    :param matrix: symmetric positive definite
-    :return: ``L`` below the diagonal and ``D`` on it, of ``L^T D L``: from the tips to the root no
-        zero is filled
+    :return: of the force that is needed, by position and by velocity, shape ``(n, n)``: rows are
+        forces, columns degrees of freedom, a ball's and a free joint's as in a velocity
     """
-    rest = dict(matrix)
-    for k in reversed(range(n)):
-        above = [i for i in range(k) if (k, i) in rest]
-        for place, i in reversed(list(enumerate(above))):
-            share = s.div(rest[k, i], rest[k, k])
-            for j in above[: place + 1]:
-                rest[i, j] = s.sub(rest.get((i, j), 0.0), s.mul(share, rest[k, j]))
-            rest[k, i] = share
-    return rest
-
-
-def solve(factors: Mapping[tuple[int, int], Number], right: Sequence[Number]) -> list[Number]:
-    """:return: ``x`` of ``L^T D L x = right``"""
-    x, n = list(right), len(right)
-    for k in reversed(range(n)):
-        for i in range(k):
-            if (k, i) in factors:
-                x[i] = s.sub(x[i], s.mul(factors[k, i], x[k]))
-        x[k] = s.div(x[k], factors[k, k])
-    for k in range(n):
-        for i in range(k):
-            if (k, i) in factors:
-                x[k] = s.sub(x[k], s.mul(factors[k, i], x[i]))
-    return x
-
-
-def _motions(link: Link, rotation: Matrix) -> list[tuple[Vector, Vector]]:
-    """Of each degree of freedom: how a unit of it turns the link and moves its origin."""
-    axes = s.UNIT
-    if link.kind == HINGE:
-        return [(_AXIS, s.ZERO)]
-    if link.kind == SLIDE:
-        return [(s.ZERO, _AXIS)]
-    turns = [(axis, s.ZERO) for axis in axes]
-    return turns if link.kind == BALL else [(s.ZERO, row) for row in rotation] + turns
-
-
-def _along(link: Link, rotation: Matrix, f: Vector, t: Vector) -> tuple[Number, ...]:
-    """What a force and a torque at the link's origin do along its degrees of freedom."""
-    if link.kind == HINGE:
-        return (t[2],)
-    if link.kind == SLIDE:
-        return (f[2],)
-    return t if link.kind == BALL else (*s.apply(rotation, f), *t)
-
-
-def _fill(
-    found: Triangle, place: int, link: Link, rotation: Matrix, f: Vector, t: Vector
-) -> None:
-    for i, component in zip(link.dofs, _along(link, rotation, f, t), strict=True):
-        if i <= place:
-            found[place, i] = component
-
-
-def _outwards(rotation: Matrix, origin: Vector, f: Vector, t: Vector) -> tuple[Vector, Vector]:
-    """The same force and torque at the parent's origin, in its frame."""
-    f = s.apply(rotation, f)
-    return f, s.vadd(s.apply(rotation, t), s.cross(origin, f))
-
-
-def _joined(parent: Inertia, rotation: Matrix, origin: Vector, child: Inertia) -> Inertia:
-    """The inertia of a link and of what it carries, as one body."""
-    mass, moment, about = child[:3]
-    moment, about = s.apply(rotation, moment), s.congruent(rotation, about)
-    x, y, z = origin
-    weighed = s.scale(mass, origin)
-
-    def spread(a: int, b: int) -> Number:
-        far = s.add(s.mul(origin[a], weighed[b]), s.mul(origin[a], moment[b]))
-        return s.add(far, s.mul(moment[a], origin[b]))
-
-    xx, yy, zz = spread(0, 0), spread(1, 1), spread(2, 2)
-    xy, xz, yz = (s.neg(spread(a, b)) for a, b in ((0, 1), (0, 2), (1, 2)))
-    shift = (s.add(yy, zz), s.add(xx, zz), s.add(xx, yy), xy, xz, yz)
-    return Inertia(
-        s.add(parent.mass, mass),
-        s.vadd(parent.moment, s.vadd(moment, weighed)),
-        s.sadd(parent.about, s.sadd(about, shift)),
+    flow, axes = _flow(tree, at, v, gravity, a), at.axes
+    carried = tree.carried
+    inertia, force = _summed(at.inertia, carried), _summed(flow.force, carried)
+    bend = _summed(_bends(at.inertia, flow.speed), carried)
+    # How each axis changes, with what carries it and with what it moves; and once more.
+    spin = _motion_cross(flow.before, axes)
+    both = _sum(spin, flow.spin)
+    curl = _sum(_motion_cross(flow.gain, axes), _motion_cross(flow.before, spin))
+    momentum, bent = _momentum(inertia, axes), _bent(bend, axes)
+    by_q = _sum(_momentum(inertia, curl), _bending(bend, spin), _force_cross(axes, force))
+    by_v = _sum(_momentum(inertia, both), _bending(bend, axes))
+    n = tree.n
+    q_below = _pairs((momentum, bent), (curl, spin.turn), n)
+    v_below = _pairs((momentum, bent), (both, axes.turn), n)
+    if at.held is not None:
+        held = _summed(at.held, carried)
+        lift = _motion_cross(Motion(alg.ZERO, gravity), axes)
+        by_q = _sum(by_q, _momentum(held, lift))
+        q_below = q_below + _pairs(_momentum(held, axes), lift, n)
+    over, under = tree.before.T, tree.upto
+    return (
+        over * _pairs(axes, by_q, n) + under * q_below,
+        over * _pairs(axes, by_v, n) + under * v_below,
     )
+
+
+class _Flow(NamedTuple):
+    """
+    How everything moves.
+
+    :param before: velocity of what carries each joint
+    :param gain: acceleration of what carries each joint
+    :param spin: how fast the axes change
+    :param speed: velocity of each body
+    :param force: that each body needs
+    """
+
+    before: Motion
+    gain: Motion
+    spin: Motion
+    speed: Motion
+    force: Wrench
+
+
+def _flow(tree: Tree, at: Frames, v: Number, gravity: Vector, a: Number | None) -> _Flow:
+    ways = _times(v, at.axes)
+    before = _summed(ways, tree.before.T)
+    spin = _motion_cross(_summed(ways, tree.upto.T) if tree.curved else before, at.axes)
+    gains = _times(v, spin)
+    if a is not None:
+        gains = _sum(gains, _times(a, at.axes))
+    rising = Motion(alg.ZERO, alg.scale(-1.0, gravity))
+    speed = _summed(ways, tree.carried.T)
+    gain = _sum(_summed(gains, tree.carried.T), rising)
+    turning = _force_cross(speed, _momentum(at.inertia, speed))
+    force = _sum(_momentum(at.inertia, gain), turning)
+    if at.held is not None:
+        force = _sum(force, _momentum(at.held, Motion(alg.ZERO, gravity)))
+    return _Flow(before, _sum(_summed(gains, tree.before.T), rising), spin, speed, force)
+
+
+# --- spatial algebra
+
+
+def _about(axis: Vector, place: Vector) -> Motion:
+    return Motion(axis, alg.cross(place, axis))
+
+
+def _motion_cross(a: Motion, b: Motion) -> Motion:
+    return Motion(
+        alg.cross(a.turn, b.turn), alg.vadd(alg.cross(a.turn, b.move), alg.cross(a.move, b.turn))
+    )
+
+
+def _force_cross(a: Motion, b: Wrench) -> Wrench:
+    return Wrench(
+        alg.vadd(alg.cross(a.turn, b.torque), alg.cross(a.move, b.force)),
+        alg.cross(a.turn, b.force),
+    )
+
+
+def _momentum(inertia: Inertia, motion: Motion) -> Wrench:
+    trace = alg.total(inertia.spread[:3])
+    spread = alg.apply(alg.full(inertia.spread), motion.turn)
+    own = alg.vadd(alg.scale(trace, motion.turn), alg.scale(-1.0, spread))
+    return Wrench(
+        alg.vadd(own, alg.cross(inertia.moment, motion.move)),
+        alg.vadd(alg.scale(inertia.mass, motion.move), alg.cross(motion.turn, inertia.moment)),
+    )
+
+
+class _Bend(NamedTuple):
+    r"""
+    The slope of a body's force by its velocity, beside what its rotation makes: of a motion
+    :math:`(\alpha, \beta)`, :math:`2 (\alpha \times l, -D \alpha)` as force and torque.
+    """
+
+    matrix: Matrix
+    momentum: Vector
+
+
+def _bends(inertia: Inertia, speed: Motion) -> _Bend:
+    w, u, h = speed.turn, speed.move, inertia.moment
+    columns = [alg.cross(w, column) for column in alg.full(inertia.spread)]
+    least = alg.neg(alg.dot(h, u))
+    rows = tuple(
+        tuple(
+            alg.total((columns[j][i], alg.mul(u[i], h[j]), least if i == j else 0.0))
+            for j in range(3)
+        )
+        for i in range(3)
+    )
+    return _Bend(rows, _momentum(inertia, speed).force)  # type: ignore[arg-type]
+
+
+def _bending(bend: _Bend, motion: Motion) -> Wrench:
+    torque = alg.scale(-2.0, alg.apply(bend.matrix, motion.turn))
+    return Wrench(torque, alg.scale(2.0, alg.cross(motion.turn, bend.momentum)))
+
+
+def _bent(bend: _Bend, motion: Motion) -> Vector:
+    """The transpose of that, of which no more than three numbers are not zero."""
+    back = alg.apply(alg.transpose(bend.matrix), motion.turn)
+    return alg.scale(2.0, alg.vadd(alg.cross(bend.momentum, motion.move), alg.scale(-1.0, back)))
+
+
+def _about_the_point(own: Inertia, rotation: Matrix, place: Vector) -> Inertia:
+    """Of bodies in their links' frames; ``moment`` is the place of their centre there."""
+    centre = alg.vadd(place, alg.apply(rotation, own.moment))
+    weighed = alg.scale(own.mass, centre)
+    far = alg.outer(weighed, alg.scale(0.5, centre))
+    spread = tuple(map(alg.add, alg.congruent(rotation, own.spread), far))
+    return Inertia(own.mass, weighed, spread)  # type: ignore[arg-type]
+
+
+# --- numbers of all joints or bodies side by side
+
+
+def _flat(tree: Any) -> list[Number]:
+    return [x for part in tree for x in (_flat(part) if isinstance(part, tuple) else [part])]
+
+
+def _like(tree: Any, numbers: list[Number]) -> Any:
+    """The same tuples of tuples, with other numbers."""
+    parts = [
+        _like(part, numbers) if isinstance(part, tuple) else numbers.pop(0) for part in tree
+    ]
+    return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+
+
+def _sum(*trees: Any) -> Any:
+    return _like(trees[0], [alg.total(parts) for parts in zip(*map(_flat, trees), strict=True)])
+
+
+def _times(factor: Number, tree: Any) -> Any:
+    return _like(tree, [alg.mul(factor, x) for x in _flat(tree)])
+
+
+def _gathered(trees: Sequence[Any], dtype: Any) -> Any:
+    """Of each joint or body the same tuples: one of them, along a new last axis."""
+    columns = zip(*map(_flat, trees), strict=True)
+    return _like(trees[0], [alg.gathered(column, dtype) for column in columns])
+
+
+def _summed(tree: Any, matrix: np.ndarray) -> Any:
+    """Every number times a matrix of ones and zeros, along the last axis."""
+    numbers = _flat(tree)
+    live = [i for i, x in enumerate(numbers) if not isinstance(x, float)]
+    numbers = [x if i in live or x == 0.0 else x * matrix.sum(0) for i, x in enumerate(numbers)]
+    if live:
+        parts = [numbers[i] for i in live]
+        library = jnp if any(isinstance(x, jax.Array) for x in parts) else np
+        found = library.stack(library.broadcast_arrays(*parts), -2) @ matrix
+        for place, i in enumerate(live):
+            numbers[i] = found[..., place, :]
+    return _like(tree, numbers)
+
+
+def _pairs(a: Any, b: Any, n: int) -> Number:
+    """Entry ``(i, j)``: the product of number i of one with number j of the other."""
+    found: Number = 0.0
+    for x, y in zip(_flat(a), _flat(b), strict=True):
+        rows = x if isinstance(x, float) else x[..., :, None]
+        columns = y if isinstance(y, float) else y[..., None, :]
+        found = alg.add(found, alg.mul(rows, columns))
+    shape = np.shape(found)
+    if shape[-2:] == (n, n):
+        return found
+    library = jnp if isinstance(found, jax.Array) else np
+    return library.broadcast_to(found, (*shape[:-2], n, n))

@@ -27,7 +27,7 @@ class Body:
     :param inertia: about the centre of mass, in the link's axes [kg m2]: xx, yy, zz, xy, xz, yz
     :param origin: of the body's own frame, in the link's [m]
     :param rotation: of the body's own frame in the link's, rows
-    :param held: mass whose weight the model compensates [kg], and that times its centre [kg m]
+    :param held: mass whose weight the model compensates [kg], and its centre [m]
     """
 
     name: str
@@ -79,6 +79,11 @@ class Link:
     friction: tuple[float, ...]
     force_limit: tuple[float, float] | None = None
     limit: tuple[float, float] | None = None
+
+    @property
+    def n_q(self) -> int:
+        """:return: how many numbers it has in a position"""
+        return SIZES[self.kind][0]
 
     @property
     def dofs(self) -> tuple[int, ...]:
@@ -179,11 +184,11 @@ class Mechanism:
 
     @property
     def n_q(self) -> int:
-        return sum(SIZES[link.kind][0] for link in self.links)
+        return sum(link.n_q for link in self.links)
 
     @property
     def n_v(self) -> int:
-        return sum(SIZES[link.kind][1] for link in self.links)
+        return sum(len(link.dofs) for link in self.links)
 
     def to_spec(self) -> dict[str, Any]:
         """:return: plain data"""

@@ -12,8 +12,8 @@ import numpy as np
 
 from sb3_hds.core import Parameter
 from sb3_hds.errors import ParameterError, did_you_mean
-from sb3_hds.twins.mujoco import scalars as s
-from sb3_hds.twins.mujoco.dynamics import Inertia, inverse_dynamics, mass_matrix, poses
+from sb3_hds.twins.mujoco import algebra as s
+from sb3_hds.twins.mujoco.dynamics import Inertia, Tree, frames, inverse_dynamics, mass_matrix
 from sb3_hds.twins.mujoco.mechanism import (
     BALL,
     FREE,
@@ -25,7 +25,7 @@ from sb3_hds.twins.mujoco.mechanism import (
     Mechanism,
     Place,
 )
-from sb3_hds.twins.mujoco.scalars import Matrix, Number, Vector
+from sb3_hds.twins.mujoco.algebra import Number, Symmetric, Vector
 
 Values = Mapping[str, Number]
 
@@ -181,30 +181,40 @@ def gravity_of(mechanism: Mechanism, p: Values) -> Vector:
 def inertias_of(
     mechanism: Mechanism, payload: Place | None, masses: bool, p: Values
 ) -> list[Inertia]:
-    """:return: of each link, with its payload"""
+    """:return: of each body about its centre, with its payload; its place instead of its moment"""
     found = []
     for i, link in enumerate(mechanism.links):
-        own = Inertia(0.0, s.ZERO, (0.0,) * 6)
-        if link.body is not None:
-            own = _changed(link.body, p) if masses else _inertia(link.body)
+        if link.body is None:
+            continue
+        own = _changed(link.body, p) if masses else Inertia(
+            link.body.mass, link.body.centre, _spread(link.body.inertia)
+        )
         if payload is not None and payload.link == i:
             mass = p[f"{payload.name}_payload"]
-            offset = tuple(p[f"{payload.name}_payload_{axis}"] for axis in _AXES)
+            offset = [p[f"{payload.name}_payload_{axis}"] for axis in _AXES]
             place = s.vadd(payload.position, s.apply(payload.rotation, offset))
-            load = _about_origin(mass, place, (0.0,) * 6)
-            own = Inertia(
-                s.add(own.mass, load.mass),
-                s.vadd(own.moment, load.moment),
-                s.sadd(own.about, load.about),
-                own.held,
-            )
+            own = _joined(own, mass, place)
         found.append(own)
     return found
 
 
-def _inertia(body: Body) -> Inertia:
-    held = None if body.held is None else (body.held[0], body.held[1:])
-    return _about_origin(body.mass, body.centre, body.inertia)._replace(held=held)
+def held_of(mechanism: Mechanism) -> list[Inertia | None]:
+    """:return: of each body, the mass whose weight is compensated"""
+    every = (link.body for link in mechanism.links if link.body is not None)
+    return [
+        body.held and Inertia(body.held[0], body.held[1:], (0.0,) * 6)  # type: ignore[misc]
+        for body in every
+    ]
+
+
+def _joined(own: Inertia, mass: Number, place: Vector) -> Inertia:
+    """A body and a point mass, about their common centre."""
+    whole = s.add(own.mass, mass)
+    share = s.div(mass, whole)
+    way = s.vadd(place, s.scale(-1.0, own.moment))
+    centre = s.vadd(own.moment, s.scale(share, way))
+    between = s.outer(s.scale(s.mul(own.mass, share), way), s.scale(0.5, way))
+    return Inertia(whole, centre, tuple(map(s.add, own.spread, between)))  # type: ignore[arg-type]
 
 
 def _changed(body: Body, p: Values) -> Inertia:
@@ -216,38 +226,32 @@ def _changed(body: Body, p: Values) -> Inertia:
     """
     name, turn = body.name, body.rotation
     mass = p[f"{name}_mass"]
-    centre = tuple(p[f"{name}_com_{axis}"] for axis in _AXES)
+    centre = [p[f"{name}_com_{axis}"] for axis in _AXES]
     stretch = [s.exp(p[f"{name}_stretch_{axis}"]) for axis in _AXES]
     xy, xz, yz = (p[f"{name}_shear_{plane}"] for plane in ("xy", "xz", "yz"))
     shape = (stretch[0], xy, xz), (0.0, stretch[1], yz), (0.0, 0.0, stretch[2])
     spread = s.congruent(s.product(turn, shape), _second_moments(body))
-    sum_of = s.total(spread[:3])
-    inertia = tuple(s.mul(mass, s.sub(sum_of, own)) for own in spread[:3])
-    products = tuple(s.mul(mass, s.neg(own)) for own in spread[3:])
-    centre = s.vadd(body.origin, s.apply(turn, centre))
-    return _about_origin(mass, centre, (*inertia, *products))
+    place = s.vadd(body.origin, s.apply(turn, centre))
+    return Inertia(mass, place, tuple(s.mul(mass, x) for x in spread))  # type: ignore[arg-type]
 
 
-def _second_moments(body: Body) -> s.Symmetric:
+def _spread(inertia: Symmetric) -> Symmetric:
+    """Second moments of mass of a body with these moments and products of inertia."""
+    half = 0.5 * sum(inertia[:3])
+    return (*(half - x for x in inertia[:3]), *(-x for x in inertia[3:]))  # type: ignore[return-value]
+
+
+def _second_moments(body: Body) -> Symmetric:
     """About the centre, in the body's axes, per unit of mass [m2]."""
     turn = np.array(body.rotation)
-    inertia = turn.T @ np.array(s.full(body.inertia)) @ turn
-    spread = (0.5 * np.trace(inertia) * np.eye(3) - inertia) / body.mass
-    return tuple(float(spread[i, j]) for i, j in s.PLACES)
+    spread = turn.T @ np.array(s.full(_spread(body.inertia))) @ turn / body.mass
+    return tuple(float(spread[i, j]) for i, j in s.PLACES)  # type: ignore[return-value]
 
 
 def centre_in_body(body: Body) -> tuple[float, ...]:
     """:return: the centre of mass in the body's frame [m]"""
     way = np.array(body.rotation).T @ (np.array(body.centre) - np.array(body.origin))
     return tuple(float(x) for x in way)
-
-
-def _about_origin(mass: Number, centre: Vector, inertia: s.Symmetric) -> Inertia:
-    x, y, z = moment = s.scale(mass, centre)
-    xx, yy, zz = s.mul(x, centre[0]), s.mul(y, centre[1]), s.mul(z, centre[2])
-    xy, xz, yz = s.mul(x, centre[1]), s.mul(x, centre[2]), s.mul(y, centre[2])
-    far = (s.add(yy, zz), s.add(xx, zz), s.add(xx, yy), s.neg(xy), s.neg(xz), s.neg(yz))
-    return Inertia(mass, moment, s.sadd(inertia, far))
 
 
 # --- what is typical
@@ -258,17 +262,12 @@ def typical(mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray]:
     :return: for each degree of freedom, the smallest inertia that a force there moves [kg m2] or
         [kg], and the largest force of gravity [N m] or [N], over random positions
     """
-    links, n = mechanism.links, mechanism.n_v
-    q = random_positions(mechanism, _N_POSES)
-    pose = poses(links, q)
-    inertia = inertias_of(mechanism, None, False, {})
-    load = inverse_dynamics(links, pose, inertia, [0.0] * n, mechanism.gravity)
-    weight = np.array([np.abs(np.broadcast_to(x, _N_POSES)).max() for x in load])
-    matrix = np.zeros((_N_POSES, n, n))
-    for (i, j), entry in mass_matrix(links, pose, inertia).items():
-        matrix[:, i, j] = matrix[:, j, i] = entry
-    armature = np.concatenate([link.armature for link in links])
-    matrix += np.diag(armature)
+    tree, q = Tree(mechanism.links), random_positions(mechanism, _N_POSES)
+    at = frames(tree, q, inertias_of(mechanism, None, False, {}), held_of(mechanism))
+    still = np.zeros((_N_POSES, tree.n))
+    weight = np.abs(inverse_dynamics(tree, at, still, mechanism.gravity)).max(0)
+    armature = np.concatenate([link.armature for link in mechanism.links])
+    matrix = mass_matrix(tree, at) + np.diag(armature)
     felt = 1.0 / np.diagonal(np.linalg.inv(matrix), axis1=1, axis2=2)
     return felt.min(0), weight
 

@@ -166,7 +166,7 @@ def _body(
     inertia = frame.T @ inertia @ frame
     inertia[np.abs(inertia) < _OF_INERTIA * np.abs(inertia).max()] = 0.0
     held = masses * model.body_gravcomp[bodies]
-    where = frame.T @ (held @ (data.xipos[bodies] - origin))
+    where = frame.T @ (held @ (data.xipos[bodies] - origin)) / (held.sum() or 1.0)
     first = bodies[0]
     return Body(
         name=model.body(first).name or f"body{first}",

@@ -21,7 +21,6 @@ from sb3_hds.core import (
     Force,
     Joint,
     MassMatrix,
-    Moment,
     Obs,
     Params,
     Position,
@@ -34,10 +33,8 @@ from sb3_hds.core import (
 )
 from sb3_hds.core.types import Coordinates
 from sb3_hds.errors import ParameterError
-from sb3_hds.twins.mujoco import scalars
-from sb3_hds.twins.mujoco.actuators import Pull, forces, pulls
-from sb3_hds.twins.mujoco.dynamics import Triangle
-from sb3_hds.twins.mujoco.equation import Equation, damping, resistance
+from sb3_hds.twins.mujoco.actuators import Actuation, Moving
+from sb3_hds.twins.mujoco.equation import Equation
 from sb3_hds.twins.mujoco.mechanism import BALL, FREE, SLIDE, Link, Mechanism
 from sb3_hds.twins.mujoco.parameters import (
     dof_names,
@@ -46,6 +43,7 @@ from sb3_hds.twins.mujoco.parameters import (
     place_of,
     typical,
 )
+from sb3_hds.twins.mujoco.quaternions import normalized, turn_between, turned
 
 # How far an episode begins from where the model stands [rad] or [m].
 _NEAR_START = 0.1
@@ -106,6 +104,7 @@ class MechanismTwin(AnalyticTwin):
         self.masses = bool(masses)
         self.payload = None if payload is None else place_of(mechanism, payload)
         self.equation = Equation(mechanism, self.payload, self.masses)
+        self.actuation = Actuation(mechanism)
         self.parameters = self.equation.parameters | of_drives(mechanism)
         self.native_effects = native_effects(mechanism)
         self.joints = tuple(Joint(*joint) for joint in dof_names(mechanism))
@@ -122,7 +121,7 @@ class MechanismTwin(AnalyticTwin):
     # --- dynamics
 
     def actuate(self, state: State, action: Action, params: Params) -> Force:
-        return forces(self.mechanism, self._pulls(state, action, params), state.v)
+        return self.actuation.force(self._moving(state), action, params)
 
     def mass_matrix(self, q: Position, params: Params) -> MassMatrix:
         return self.equation.mass_matrix(q, params)
@@ -131,40 +130,26 @@ class MechanismTwin(AnalyticTwin):
         return self.equation.bias(q, v, params)
 
     def accelerate(
-        self, state: State, now: Moment, force: Force, command: Action, params: Params
+        self, state: State, command: Action, added: Force, params: Params
     ) -> Velocity:
+        force = self.actuate(state, command, params) + added
         coupling = self._coupling(state, command, params)
         return self.equation.acceleration(state.q, state.v, force, coupling, params)
 
-    def _coupling(self, state: State, command: Action, params: Params) -> Triangle:
-        """What the integrator adds to the mass matrix: the step times slopes by velocities."""
+    def _coupling(self, state: State, command: Action, params: Params) -> MassMatrix:
+        """The step times slopes by velocities, of what the integrator takes at its end."""
         mechanism, h = self.mechanism, self.dt / self.substeps
-        found: Triangle = {}
-        if mechanism.integrator == "rk4":
-            return found
-        p = {name: jnp.asarray(params[name], state.v.dtype) for name in self.parameters}
-        if mechanism.integrator == "implicitfast" or mechanism.implicit_damping:
-            for link in mechanism.links:
-                for axis, i in enumerate(link.dofs):
-                    v = state.v[i]
-                    slope = resistance(link, axis, v, p) - damping(link, axis, v, p)
-                    slope = slope + damping(link, axis, v, p, slope=True)
-                    if not isinstance(slope, float):
-                        found[i, i] = h * slope
-        if mechanism.integrator == "implicitfast":
-            pulled = self._pulls(state, command, params)
-            for drive, pull in zip(mechanism.drives, pulled, strict=True):
-                if not drive.follows_speed:
-                    continue
-                dofs = mechanism.links[drive.link].dofs
-                for a, i in enumerate(dofs):
-                    for b, j in enumerate(dofs[: a + 1]):
-                        more = -h * pull.by_speed * pull.gear[a] * pull.gear[b]
-                        found[i, j] = found.get((i, j), 0.0) + more
+        implicit = mechanism.integrator == "implicitfast"
+        slope = jnp.zeros_like(state.v)
+        if implicit or (mechanism.integrator == "euler" and mechanism.implicit_damping):
+            slope = h * self.equation.resistance(state.v, params)[1]
+        found = jnp.diag(slope)
+        if implicit and any(drive.follows_speed for drive in mechanism.drives):
+            found = found - h * self.actuation.slope(self._moving(state), command, params)
         return found
 
-    def _pulls(self, state: State, action: Action, params: Params) -> list[Pull]:
-        return pulls(self.mechanism, state.q, state.v, action, params)
+    def _moving(self, state: State) -> Moving:
+        return Moving(state.q, self.coordinates(state.q), state.v)
 
     def typical_forces(self) -> tuple[float, ...]:
         """Gravity's at random positions, and the limits of actuators, or what commands ask."""
@@ -190,9 +175,9 @@ class MechanismTwin(AnalyticTwin):
         for link in self.mechanism.links:
             here, ahead = _q(link, q), way[link.v : link.v + len(link.dofs)]
             if link.kind == FREE:
-                parts += [here[:3] + ahead[:3], scalars.turned(here[3:], ahead[3:])]
+                parts += [here[:3] + ahead[:3], turned(here[3:], ahead[3:])]
             elif link.kind == BALL:
-                parts.append(scalars.turned(here, ahead))
+                parts.append(turned(here, ahead))
             else:
                 parts.append(here + ahead)
         return jnp.concatenate(parts) if self._curved else q + way
@@ -219,10 +204,10 @@ class MechanismTwin(AnalyticTwin):
         for link in self.mechanism.links:
             here, there = _q(link, q), _q(link, reference)
             if link.kind == FREE:
-                turn = scalars.turn_between(here[3:], there[3:])
+                turn = turn_between(here[3:], there[3:])
                 parts += [here[:3] - there[:3], turn]
             elif link.kind == BALL:
-                parts.append(scalars.turn_between(here, there))
+                parts.append(turn_between(here, there))
             else:
                 parts.append(here - there)
         return jnp.concatenate(parts)
@@ -249,8 +234,7 @@ class MechanismTwin(AnalyticTwin):
         for link in self.mechanism.links if self._curved else ():
             if link.kind in (BALL, FREE):
                 at = link.q + (3 if link.kind == FREE else 0)
-                turn = q[at : at + 4]
-                q = q.at[at : at + 4].set(turn / jnp.sqrt(jnp.sum(turn**2)))
+                q = q.at[at : at + 4].set(normalized(q[at : at + 4]))
         v = obs[n:] if self.observed == "qv" else jnp.zeros(self.mechanism.n_v, obs.dtype)
         return State(q, v, {})
 
