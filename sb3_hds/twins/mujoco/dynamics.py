@@ -203,7 +203,7 @@ def slopes(
     v_below = _pairs((momentum, bent), (both, axes.turn), n)
     if at.held is not None:
         held = _summed(at.held, carried)
-        lift = _motion_cross(Motion(alg.ZERO, gravity), axes)
+        lift = _motion_cross(_repeated(Motion(alg.ZERO, gravity), n), axes)
         by_q = _sum(by_q, _momentum(held, lift))
         q_below = q_below + _pairs(_momentum(held, axes), lift, n)
     over, under = tree.before.T, tree.upto
@@ -240,12 +240,14 @@ def _flow(tree: Tree, at: Frames, v: Number, gravity: Vector, a: Number | None) 
         gains = _sum(gains, _times(a, at.axes))
     rising = Motion(alg.ZERO, alg.scale(-1.0, gravity))
     speed = _summed(ways, tree.carried.T)
-    gain = _sum(_summed(gains, tree.carried.T), rising)
+    gain = _sum(_summed(gains, tree.carried.T), _repeated(rising, len(tree.bodies)))
     turning = _force_cross(speed, _momentum(at.inertia, speed))
     force = _sum(_momentum(at.inertia, gain), turning)
     if at.held is not None:
-        force = _sum(force, _momentum(at.held, Motion(alg.ZERO, gravity)))
-    return _Flow(before, _sum(_summed(gains, tree.before.T), rising), spin, speed, force)
+        falling = _repeated(Motion(alg.ZERO, gravity), len(tree.bodies))
+        force = _sum(force, _momentum(at.held, falling))
+    gain_before = _sum(_summed(gains, tree.before.T), _repeated(rising, tree.n))
+    return _Flow(before, gain_before, spin, speed, force)
 
 
 # --- spatial algebra
@@ -349,6 +351,12 @@ def _gathered(trees: Sequence[Any], dtype: Any) -> Any:
     """Of each joint or body the same tuples: one of them, along a new last axis."""
     columns = zip(*map(_flat, trees), strict=True)
     return _like(trees[0], [alg.gathered(column, dtype) for column in columns])
+
+
+def _repeated(tree: Any, n: int) -> Any:
+    """Numbers that all joints or bodies share, side by side."""
+    numbers = [x if isinstance(x, float) else jnp.broadcast_to(x, (n,)) for x in _flat(tree)]
+    return _like(tree, numbers)
 
 
 def _summed(tree: Any, matrix: np.ndarray) -> Any:
