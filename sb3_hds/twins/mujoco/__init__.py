@@ -1,6 +1,7 @@
 """Twins of robots from their model files."""
 
+from sb3_hds.twins.mujoco.from_mujoco import from_mujoco
 from sb3_hds.twins.mujoco.mechanism import Mechanism
 from sb3_hds.twins.mujoco.twin import MechanismTwin
 
-__all__ = ["Mechanism", "MechanismTwin"]
+__all__ = ["Mechanism", "MechanismTwin", "from_mujoco"]

@@ -7,6 +7,7 @@ likewise, ``elbow_servo_kp``.
 
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,7 +32,9 @@ Values = Mapping[str, Number]
 
 _AXES = "xyz"
 # Typical deviations: shares of what is typical at a joint, and of a parameter's own value.
-_OF_TORQUE, _OF_TORQUE_PER_SPEED, _OF_INERTIA, _OF_ITSELF = 0.05, 0.02, 0.1, 0.1
+_OF_FORCE, _OF_FORCE_PER_SPEED, _OF_INERTIA, _OF_ITSELF = 0.05, 0.02, 0.1, 0.1
+# Motors are stronger than what they do.
+_OF_DRIVE = 0.1
 # A payload is a share of the mass that moves [1], at some distance from its place [m].
 _OF_MASS, _NEAR = 0.05, 0.05
 _TILT = 0.02  # [rad]
@@ -45,10 +48,11 @@ def of_plant(mechanism: Mechanism, payload: Place | None, masses: bool) -> dict[
     :param masses: whether mass, centre and inertia of each body are parameters
     :return: all that the equation of motion has
     """
-    inertias, torques = typical(mechanism)
+    usual = typical(mechanism)
+    forces = usual.weight + _OF_DRIVE * usual.drive
     found = {name: Parameter(0.0, _TILT, "rad", -1.0, 1.0) for name in tilts(mechanism)}
     for link in mechanism.links:
-        found |= _of_link(link, inertias, torques)
+        found |= _of_link(link, usual.inertia, forces)
     moving = [link.body for link in mechanism.links if link.body]
     if payload is not None:
         scale = _OF_MASS * sum(body.mass for body in moving)
@@ -84,13 +88,11 @@ def native_effects(mechanism: Mechanism) -> dict[tuple[str, int], dict[str, str]
     return found
 
 
-def _of_link(
-    link: Link, inertias: np.ndarray, torques: np.ndarray
-) -> dict[str, Parameter]:
+def _of_link(link: Link, inertias: np.ndarray, forces: np.ndarray) -> dict[str, Parameter]:
     """Of a floating base, only what the model has."""
     turns = link.kind != SLIDE
     i, free = link.dofs[-1], link.kind == FREE
-    torque = float(torques[i]) or 1.0
+    force = float(forces[i]) or 1.0
     units = (
         ("N m s/rad", "N m", "kg m2", "N m/rad") if turns else ("N s/m", "N", "kg", "N/m")
     )
@@ -101,8 +103,8 @@ def _of_link(
         link.stiffness[0] if link.stiffness else 0.0,
     )
     scales = (
-        _OF_TORQUE_PER_SPEED * torque,
-        _OF_TORQUE * torque,
+        _OF_FORCE_PER_SPEED * force,
+        _OF_FORCE * force,
         _OF_INERTIA * float(inertias[i]),
         0.0,
     )
@@ -257,11 +259,22 @@ def centre_in_body(body: Body) -> tuple[float, ...]:
 # --- what is typical
 
 
-def typical(mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray]:
+class Typical(NamedTuple):
     """
-    :return: for each degree of freedom, the smallest inertia that a force there moves [kg m2] or
-        [kg], and the largest force of gravity [N m] or [N], over random positions
+    For each degree of freedom.
+
+    :param inertia: the smallest that a force there moves, over random positions [kg m2] or [kg]
+    :param weight: the largest force of gravity there, likewise [N m] or [N]
+    :param drive: the largest force that actuators are said to exert [N m] or [N]; 0 if they do not
+        say
     """
+
+    inertia: np.ndarray
+    weight: np.ndarray
+    drive: np.ndarray
+
+
+def typical(mechanism: Mechanism) -> Typical:
     tree, q = Tree(mechanism.links), random_positions(mechanism, _N_POSES)
     at = frames(tree, q, inertias_of(mechanism, None, False, {}), held_of(mechanism))
     still = np.zeros((_N_POSES, tree.n))
@@ -269,7 +282,20 @@ def typical(mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray]:
     armature = np.concatenate([link.armature for link in mechanism.links])
     matrix = mass_matrix(tree, at) + np.diag(armature)
     felt = 1.0 / np.diagonal(np.linalg.inv(matrix), axis1=1, axis2=2)
-    return felt.min(0), weight
+    drive = np.zeros(tree.n)
+    for each in mechanism.drives:
+        link = mechanism.links[each.link]
+        drive[list(link.dofs)] += np.abs(each.gear) * _largest(each, link)
+    return Typical(felt.min(0), weight, drive)
+
+
+def _largest(drive: Drive, link: Link) -> float:
+    limits = [drive.force_limit, link.force_limit]
+    if drive.role == "motor" and drive.ranges[0] is not None:
+        low, high = drive.ranges[0]
+        limits.append((drive.gain[0] * low, drive.gain[0] * high))
+    known = [max(map(abs, limit)) for limit in limits if limit is not None]
+    return min(known, default=0.0)
 
 
 def random_positions(mechanism: Mechanism, n: int, seed: int = 0) -> list[np.ndarray]:

@@ -143,7 +143,7 @@ def _of_actuators(model: Any, j: int) -> tuple[float, Any]:
     if not hasattr(model, "actuator_armature"):
         return 0.0, 0.0
     of_joint = np.isin(model.actuator_trntype, (0, 1)) & (model.actuator_trnid[:, 0] == j)
-    squared = np.array([_gear(model, i)[0] ** 2 for i in np.flatnonzero(of_joint)])
+    squared = np.array([_gear(model, i)[0] ** 2 for i in np.flatnonzero(of_joint).tolist()])
     damping = _with_powers(model, "actuator_damping")[of_joint]
     return float(squared @ model.actuator_armature[of_joint]), squared @ damping
 

@@ -85,7 +85,7 @@ class MechanismTwin(AnalyticTwin):
 
     def __init__(
         self,
-        mechanism: Mechanism | Mapping[str, Any],
+        mechanism: Mechanism | Mapping[str, Any] | None = None,
         *,
         observe: str = "qv",
         payload: str | None = None,
@@ -96,6 +96,10 @@ class MechanismTwin(AnalyticTwin):
         terminated: Terminated | None = None,
         **settings: Any,
     ) -> None:
+        if mechanism is None:
+            raise ParameterError(
+                "A twin of this kind needs a model: twins.from_mujoco(path of an MJCF or URDF)."
+            )
         if not isinstance(mechanism, Mechanism):
             mechanism = Mechanism.from_spec(mechanism)
         if observe not in ("q", "qv"):
@@ -152,23 +156,15 @@ class MechanismTwin(AnalyticTwin):
         return Moving(state.q, self.coordinates(state.q), state.v)
 
     def typical_forces(self) -> tuple[float, ...]:
-        """Gravity's at random positions, and the limits of actuators, or what commands ask."""
-        _, found = typical(self.mechanism)
-        for drive in self.mechanism.drives:
-            link = self.mechanism.links[drive.link]
-            limits = [drive.force_limit, link.force_limit]
-            if drive.role == "motor" and drive.ranges[0] is not None:
-                limits.append(tuple(drive.gain[0] * u for u in drive.ranges[0]))
-            known = [max(map(abs, limit)) for limit in limits if limit is not None]
-            for i, gear in zip(link.dofs, drive.gear, strict=True):
-                found[i] += abs(gear) * min(known) if known else 0.0
-        return tuple(float(force) for force in found)
+        """Gravity's at random positions, and the most that actuators are said to exert."""
+        usual = typical(self.mechanism)
+        return tuple((usual.weight + usual.drive).tolist())
 
     # --- positions
 
     def coordinates(self, q: Position) -> Coordinates:
         """Where a joint has a quaternion: the rotation vector from its reference."""
-        return self._between(q, self._reference(q))
+        return self._between(q, self._reference(q)) if self._curved else q
 
     def displace(self, q: Position, way: Velocity) -> Position:
         parts = []

@@ -1,0 +1,112 @@
+"""From whatever describes a robot to a compiled model of MuJoCo."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sb3_hds.errors import ModelFileError
+
+class Loaded(NamedTuple):
+    """
+    :param model: an ``MjModel``
+    :param dt: control interval, where an environment has one [s]
+    :param urdf: whether it comes from a URDF, which names neither drives nor an integrator
+    :param mimics: joints of a URDF that follow another, which older versions of MuJoCo leave free
+    """
+
+    model: Any
+    dt: float | None = None
+    urdf: bool = False
+    mimics: tuple[str, ...] = ()
+
+
+def load(source: Any) -> Loaded:
+    """
+    :param source: path of an MJCF or URDF file, or its text; an ``MjSpec`` or ``MjModel``; or an
+        environment of Gymnasium that has a model of MuJoCo
+    :raises ModelFileError: if there is no such file, or MuJoCo refuses it
+    """
+    import mujoco
+
+    if isinstance(source, mujoco.MjModel):
+        return Loaded(source)
+    if isinstance(source, mujoco.MjSpec):
+        return Loaded(_compiled(source.copy, "this MjSpec"))
+    if isinstance(source, str | os.PathLike):
+        return _from_text_or_file(source)
+    model = getattr(getattr(source, "unwrapped", None), "model", None)
+    if isinstance(model, mujoco.MjModel):
+        return Loaded(model, float(source.unwrapped.dt))
+    raise ModelFileError(
+        "A model is the path of an MJCF or URDF file, an MjSpec, an MjModel, or an environment of "
+        f"Gymnasium with MuJoCo inside, got {type(source).__name__}."
+    )
+
+
+def _from_text_or_file(source: str | os.PathLike[str]) -> Loaded:
+    text = str(source).lstrip()
+    inline = text.startswith("<")
+    where = "this text" if inline else f"'{source}'"
+    if not inline:
+        path = Path(source)
+        if not path.is_file():
+            raise ModelFileError(f"There is no file {where}. Pass the path of an MJCF or URDF file.")
+        text = path.read_text(errors="replace")
+    urdf = "<robot" in text
+
+    def parsed() -> Any:
+        import mujoco
+
+        read = mujoco.MjSpec.from_string if inline else mujoco.MjSpec.from_file
+        spec = read(text if inline else str(source))
+        if urdf:
+            # Tools and flanges keep their names: a payload may be there.
+            spec.compiler.fusestatic = False
+        return spec
+
+    return Loaded(_compiled(parsed, where), urdf=urdf, mimics=tuple(_mimics(text)) if urdf else ())
+
+
+def _compiled(parsed: Callable[[], Any], where: str) -> Any:
+    """Without what only shows or touches, if files for that are missing: inertials suffice."""
+    import mujoco
+
+    try:
+        return parsed().compile()
+    except ValueError as error:
+        if not _is_about_files(error):
+            raise ModelFileError(f"MuJoCo refuses {where}: {_first_line(error)}.") from None
+    spec = parsed()
+    shapes = [getattr(mujoco.mjtGeom, name) for name in ("mjGEOM_MESH", "mjGEOM_HFIELD", "mjGEOM_SDF")]
+    shaped = [geom for geom in spec.geoms if geom.type in shapes]
+    bare = {geom.parent.name for geom in shaped if not geom.parent.explicitinertial}
+    for part in (*shaped, *spec.skins, *spec.meshes, *spec.hfields, *spec.materials, *spec.textures):
+        spec.delete(part)
+    try:
+        return spec.compile()
+    except ValueError as error:
+        hint = (
+            f" No inertial says what {', '.join(sorted(bare))} weighs, and its mesh is missing."
+            if bare
+            else ""
+        )
+        raise ModelFileError(f"MuJoCo refuses {where}: {_first_line(error)}.{hint}") from None
+
+
+def _is_about_files(error: Exception) -> bool:
+    return any(word in str(error).lower() for word in ("file", "mesh", "texture", "resource"))
+
+
+def _mimics(text: str) -> list[str]:
+    from xml.etree import ElementTree
+
+    try:
+        joints = ElementTree.fromstring(text).iter("joint")
+    except ElementTree.ParseError:
+        return []
+    return [joint.get("name", "") for joint in joints if joint.find("mimic") is not None]
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0].removeprefix("Error: ").rstrip(".")
