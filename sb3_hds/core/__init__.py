@@ -38,6 +38,7 @@ from sb3_hds.core.transformed import TransformedTwin, seen_through
 from sb3_hds.core.twin import State, Twin
 from sb3_hds.core.types import (
     Action,
+    Coordinates,
     Flag,
     Force,
     MassMatrix,
@@ -61,6 +62,7 @@ __all__ = [
     "Barrier",
     "Channel",
     "Continuity",
+    "Coordinates",
     "Delay",
     "Effect",
     "EffectChain",

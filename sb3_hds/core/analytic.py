@@ -53,17 +53,11 @@ class AnalyticTwin(Twin):
     def bias(self, q: Position, v: Velocity, params: Params) -> Force:
         """:return: the force that would keep the system from accelerating, shape ``(dof,)``"""
 
-    def coordinates(self, q: Position) -> Coordinates:
-        """:return: the position of each joint, as effects there see it; override for quaternions"""
-        return q
-
     def displace(self, q: Position, way: Velocity) -> Position:
         """:return: the position after a velocity times a time; override for quaternions"""
         return q + way
 
-    def accelerate(
-        self, state: State, command: Action, added: Force, params: Params
-    ) -> Velocity:
+    def accelerate(self, state: State, command: Action, added: Force, params: Params) -> Velocity:
         """
         :param command: what reaches the actuators
         :param added: force besides that of the actuators, shape ``(dof,)``
@@ -106,9 +100,10 @@ class AnalyticTwin(Twin):
                 added = effects.force(moment(q, v), memory) if effects.has_forces else still
                 return self.accelerate(State(q, v, state.memory), command, held + added, params)
 
-            q, v = self.integrator(
-                acceleration, state.q, state.v, h, self.limit_velocity, self.displace
-            )
+            # Integrators of one's own need not know of quaternions.
+            curved = type(self).displace is not AnalyticTwin.displace
+            own = {"displace": self.displace} if curved else {}
+            q, v = self.integrator(acceleration, state.q, state.v, h, self.limit_velocity, **own)
             q, v = self.limit(q, v)
             if middle is None:
                 return State(q, v, memory), None

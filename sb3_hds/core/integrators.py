@@ -1,7 +1,9 @@
 """
 One sub-step of ``dq/dt = v, dv/dt = a(q, v)``, as the environments that twins mirror do it.
 
-``displace`` moves a position along a velocity times a time: a sum, but for quaternions.
+An integrator is called with the acceleration, ``q``, ``v``, the step and what limits velocities;
+and, by a twin whose positions hold quaternions, with ``displace``, which moves a position along a
+velocity times a time.
 """
 
 import operator
@@ -16,9 +18,7 @@ from sb3_hds.core.types import Position, Velocity
 Acceleration: TypeAlias = Callable[[Position, Velocity], Velocity]
 LimitVelocity: TypeAlias = Callable[[Velocity], Velocity]
 Displace: TypeAlias = Callable[[Position, Velocity], Position]
-Integrator: TypeAlias = Callable[
-    [Acceleration, Position, Velocity, float, LimitVelocity, Displace], tuple[Position, Velocity]
-]
+Integrator: TypeAlias = Callable[..., tuple[Position, Velocity]]
 
 
 def semi_implicit_euler(

@@ -17,6 +17,7 @@ from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.signals import Actuator, Channel, Joint
 from sb3_hds.core.types import (
     Action,
+    Coordinates,
     Flag,
     Memory,
     Obs,
@@ -83,7 +84,8 @@ class Twin(abc.ABC):
     differentiability: str = "reverse"
     #: False where the reward is flat almost everywhere: then override ``planning_reward``.
     reward_has_gradient: bool = True
-    #: (effect name, index of its place) -> {its parameter: the twin's parameter that it adds to}
+    #: (effect name, index of its place) -> {its parameter: the twin's parameter that it adds to, or
+    #: multiplies where the effect is absent at one}
     native_effects: Mapping[tuple[str, int], Mapping[str, str]] = {}
     #: Structural choices with their defaults, set by keyword: ``{"goal": "stop"}``.
     options: ClassVar[Mapping[str, Any]] = {}
@@ -231,10 +233,17 @@ class Twin(abc.ABC):
         """Whether the episode ends in this state for a reason of the task, not of time."""
         return jnp.zeros((), bool)
 
+    def coordinates(self, q: Position) -> Coordinates:
+        """
+        :return: the position of each joint, which is what effects see and what is told of a motion;
+            override it for quaternions
+        """
+        return q
+
     def difference(self, state: State, reference: State) -> Tangent:
         """
-        :return: tangent vector from ``reference`` to ``state``, memory included; override it for
-            quaternions
+        :return: tangent vector from ``reference`` to ``state``: of positions and of velocities one
+            number for each joint, then the memory; override it for quaternions
         """
         return ravel_pytree(state)[0] - ravel_pytree(reference)[0]
 

@@ -19,6 +19,7 @@ from sb3_hds.core import (
     Twin,
 )
 from sb3_hds.core.effect import Attached, Chosen
+from sb3_hds.core.extended import with_native
 from sb3_hds.core.layers import layers_of, plant_of
 from sb3_hds.effects import NAMELESS, ConstantForce, NeuralForce, SignFlip, reversed_joint
 from sb3_hds.errors import CalibrationError, EffectError
@@ -153,7 +154,8 @@ class Hypotheses:
             if name in native:
                 # The twin has some of it already: there may be less than it believes.
                 target = native[name]
-                lower[i] = twin.parameters[target].lower - twin.values[target]
+                if every[name].null == 0.0:
+                    lower[i] = twin.parameters[target].lower - twin.values[target]
         upper = np.array([every[name].upper for name in moving], float)
         prior = np.full(len(moving), np.inf)
         for i, (name, belief) in enumerate(beliefs.items()):
@@ -239,7 +241,8 @@ class Hypotheses:
     def added_to(self, name: str) -> float:
         """:return: what the twin as it came has already of an effect's parameter"""
         target = _native_targets(self.believed, self.candidates).get(name)
-        return 0.0 if target is None else self.believed.values[target]
+        adds = target is not None and self.twin.parameters[name].null == 0.0
+        return self.believed.values[target] if adds else 0.0
 
     def extended_by(self, causes: Sequence[str], theta: Float[np.ndarray, " p"]) -> Twin:
         """
@@ -253,7 +256,9 @@ class Hypotheses:
         native = _native_targets(self.believed, chosen)
         for name in (name for c in chosen for name in c.parameters):
             if name in native:
-                own[native[name]] = self.believed.values[native[name]] + value[name]
+                own[native[name]] = with_native(
+                    self.believed.values[native[name]], value[name], self.twin.parameters[name]
+                )
             elif name in self.believed.parameters:
                 own[name] = value[name]
         there = {a.key for a in _attached_of(self.believed)}

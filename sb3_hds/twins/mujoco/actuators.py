@@ -53,7 +53,9 @@ class Actuation:
         kinds = (("affine", _Servos), ("pid", _Servos), ("dcmotor", _Motors))
         found = ((made, [x for x in numbered if x[1].kind == kind]) for kind, made in kinds)
         self.kinds = [made(mechanism, drives) for made, drives in found if drives]
-        limits = [link.force_limit or (-math.inf, math.inf) for link in mechanism.links for _ in link.dofs]
+        limits = [
+            link.force_limit or (-math.inf, math.inf) for link in mechanism.links for _ in link.dofs
+        ]
         self.limits = np.array(limits) if np.isfinite(limits).any() else None
 
     def force(self, moving: Moving, command: Action, p: Params) -> Force:
@@ -91,7 +93,9 @@ class _Drives:
         for row, link, drive in zip(self.gear, self.links, self.drives, strict=True):
             row[list(link.dofs)] = drive.gear
         self.floating = np.array([link.kind == FREE for link in self.links])
-        self.limits = np.array([drive.force_limit or (-math.inf, math.inf) for drive in self.drives]).T
+        self.limits = np.array(
+            [drive.force_limit or (-math.inf, math.inf) for drive in self.drives]
+        ).T
         #: of each input: rows that have it, index among all commands, and limits
         self.inputs: dict[str, list[tuple[int, int, tuple[float, float]]]] = {}
         for row, (first, drive) in enumerate(drives):
@@ -114,7 +118,9 @@ class _Drives:
             if drive.outer and link.kind in (BALL, FREE):
                 start, turning = link.q + link.n_q - 4, np.array(link.dofs[-3:])
                 rows = algebra.rotation(tuple(moving.q[start : start + 4]))
-                axis = jnp.stack([jnp.sum(jnp.stack(x) * gear[i, turning]) for x in zip(*rows, strict=True)])
+                axis = jnp.stack(
+                    [jnp.sum(jnp.stack(x) * gear[i, turning]) for x in zip(*rows, strict=True)]
+                )
                 gear = jnp.asarray(gear).at[i, turning].set(axis)
         length = jnp.where(self.floating, 0.0, gear @ moving.coordinates)
         return gear, length, gear @ moving.v
@@ -162,7 +168,9 @@ class _Servos(_Drives):
         if "motor" in roles:
             g0 = self.of(p, "gain", g0, length)
         if "position" in roles:
-            b1, g0 = (sign * self.of(p, "kp", sign * x, length) for sign, x in ((-1.0, b1), (1.0, g0)))
+            b1, g0 = (
+                sign * self.of(p, "kp", sign * x, length) for sign, x in ((-1.0, b1), (1.0, g0))
+            )
         if {"position", "velocity"} & set(roles):
             b2 = -self.of(p, "kv", -b2, length)
         if "velocity" in roles:

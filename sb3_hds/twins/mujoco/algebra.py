@@ -24,6 +24,7 @@ Matrix: TypeAlias = tuple[Vector, Vector, Vector]
 Symmetric: TypeAlias = tuple[Number, Number, Number, Number, Number, Number]
 
 ZERO: Vector = (0.0, 0.0, 0.0)
+NOTHING: Symmetric = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 #: row and column of the entries of a symmetric matrix
 PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
@@ -113,6 +114,10 @@ def congruent(r: Sequence[Sequence[Number]], s: Symmetric) -> Symmetric:
     """:return: ``r s r^T``"""
     half = product(r, full(s))
     return tuple(dot(half[i], r[j]) for i, j in PLACES)  # type: ignore[return-value]
+
+
+def sadd(a: Symmetric, b: Symmetric) -> Symmetric:
+    return tuple(map(add, a, b))  # type: ignore[return-value]
 
 
 def outer(a: Sequence[Number], b: Sequence[Number]) -> Symmetric:

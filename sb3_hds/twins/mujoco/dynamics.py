@@ -1,9 +1,10 @@
 r"""
-Rigid-body dynamics of a tree, and its derivatives, with all degrees of freedom side by side.
+Rigid-body dynamics of a tree, and its derivatives, for all degrees of freedom side by side.
 
-Everything is told in the axes of the world, about a point that does not move at that instant: so a
-sum over what a joint carries, or over what carries it, is a product with a matrix of ones and
-zeros, and only orientations are computed joint by joint.
+Spatial vectors are expressed in the axes of the world, about one point at rest. A sum over the
+bodies that a joint moves, or over the joints that move a body, is then a product with a constant
+matrix of zeros and ones, and only orientations are computed joint by joint: the program hardly
+grows with the number of joints.
 
 Source: Featherstone, *Rigid Body Dynamics Algorithms*, Springer 2008, chapters 2, 5 and 6; Singh,
 Russell and Wensing, *Efficient analytical derivatives of rigid-body dynamics using spatial vector
@@ -21,18 +22,18 @@ from sb3_hds.twins.mujoco import algebra as alg
 from sb3_hds.twins.mujoco.algebra import Matrix, Number, Symmetric, Vector
 from sb3_hds.twins.mujoco.mechanism import BALL, FREE, HINGE, SLIDE, Link
 
-_UNIT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+_UNIT: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Motion(NamedTuple):
-    """A velocity or an acceleration: of rotation, and of what is at the common point."""
+    """A spatial velocity or acceleration."""
 
-    turn: Vector
-    move: Vector
+    angular: Vector
+    linear: Vector
 
 
 class Wrench(NamedTuple):
-    """A force or a momentum, about the common point."""
+    """A spatial force or momentum."""
 
     torque: Vector
     force: Vector
@@ -40,288 +41,339 @@ class Wrench(NamedTuple):
 
 class Inertia(NamedTuple):
     """
-    Of one body in its link's frame, or of many about the common point.
-
     :param mass: [kg]
-    :param moment: mass times its place [kg m]
-    :param spread: second moments of mass [kg m2]
+    :param first_moment: mass times the centre of mass [kg m]
+    :param second_moments: of mass, about the origin [kg m2]
     """
 
     mass: Number
-    moment: Vector
-    spread: Symmetric
+    first_moment: Vector
+    second_moments: Symmetric
 
 
-class Frames(NamedTuple):
+class Body(NamedTuple):
     """
-    :param axes: the motion that a unit of speed makes, one entry for each degree of freedom
+    A rigid body in the frame of its link.
+
+    :param mass: [kg]
+    :param centre: of mass [m]
+    :param second_moments: of mass, about the centre [kg m2]
+    """
+
+    mass: Number
+    centre: Vector
+    second_moments: Symmetric
+
+
+class Configuration(NamedTuple):
+    """
+    A position of the tree.
+
+    :param axes: motion at unit speed of each degree of freedom
     :param inertia: of each body
-    :param held: of the mass whose weight is compensated, without its spread; None: none
+    :param compensated: mass of each body whose weight something else carries; None: none
     """
 
     axes: Motion
     inertia: Inertia
-    held: Inertia | None
+    compensated: Inertia | None
 
 
 class Tree:
     """
-    Which link carries which.
+    Which joints move which bodies, as matrices of zeros and ones.
 
-    A free joint is three slides along the world's axes and a ball.
+    A free joint counts as three slides and a ball.
 
-    :param links: parents before children
+    :param links: parents first
+    :param dtype: of the matrices
     """
+
+    #: row i: the degrees of freedom of the joints below that of i
+    below: np.ndarray
+    #: row i: those, and the ones of its own joint
+    upto: np.ndarray
+    #: row b: the degrees of freedom that move body b
+    moving: np.ndarray
 
     def __init__(self, links: Sequence[Link], dtype: Any = float) -> None:
         self.links, self.dtype = links, dtype
         self.n = sum(len(link.dofs) for link in links)
         self.bodies = [i for i, link in enumerate(links) if link.body]
-        same, self.before = np.eye(self.n), np.zeros((self.n, self.n))
-        carrying: list[list[int]] = []
+        self.has_balls = any(link.kind in (BALL, FREE) for link in links)
+        self.below, own = np.zeros((self.n, self.n), dtype), np.eye(self.n, dtype=dtype)
+        carriers: list[list[int]] = []
         for link in links:
-            above = list(carrying[link.parent]) if link.parent >= 0 else []
+            carrier = carriers[link.parent] if link.parent >= 0 else []
             for i in link.dofs:
-                ball = link.kind == BALL or (link.kind == FREE and i >= link.v + 3)
-                if ball:
-                    first = link.dofs[-3]
-                    same[i, first : first + 3] = 1.0
-                    self.before[i, above + list(range(link.v, first))] = 1.0
-                else:
-                    self.before[i, above + list(range(link.v, i))] = 1.0
-            carrying.append(above + list(link.dofs))
-        #: rows: a degree of freedom; columns: those that move what it moves, its own joint among
-        #: them
-        self.before = self.before.astype(dtype)
-        self.upto = self.before + same.astype(dtype)
-        #: rows: a body; columns: what moves it
-        self.carried = self.upto[[links[i].dofs[-1] for i in self.bodies]]
-        self.curved = any(link.kind in (BALL, FREE) for link in links)
+                in_ball = link.kind == BALL or (link.kind == FREE and i >= link.v + 3)
+                first = link.dofs[-3] if in_ball else i
+                own[i, first : first + 3 if in_ball else i + 1] = 1.0
+                self.below[i, [*carrier, *range(link.v, first)]] = 1.0
+            carriers.append([*carrier, *link.dofs])
+        self.upto = self.below + own
+        self.moving = self.upto[[links[i].dofs[-1] for i in self.bodies]]
 
 
-def frames(
-    tree: Tree,
-    q: Sequence[Number],
-    inertias: Sequence[Inertia],
-    held: Sequence[Inertia | None],
-) -> Frames:
+def configuration(
+    tree: Tree, q: Sequence[Number], bodies: Sequence[Body], compensated: Sequence[Body | None]
+) -> Configuration:
     """
+    Forward kinematics.
+
+    Where a tree is along the slides at its root does not matter, so it is left out: the common
+    point moves along.
+
     :param q: numbers of the position
-    :param inertias: of each body in its link's frame, about its centre, the place of which is told
-        instead of its moment
-    :param held: likewise, of masses whose weight is compensated
+    :param bodies: in the order of ``tree.bodies``
+    :param compensated: likewise, masses whose weight something else carries
     """
-    turned: list[Matrix] = []
-    places: list[Vector] = []
-    adrift: list[bool] = []  # what carries it only slides: where it is does not matter
+    rotations: list[Matrix] = []
+    origins: list[Vector] = []
+    sliding: list[bool] = []
     axes: list[Motion] = []
     for link in tree.links:
-        above, place, loose = _UNIT, alg.ZERO, True
+        rotation, origin, at_root = _UNIT, alg.ZERO, True
         if link.parent >= 0:
-            above, loose = turned[link.parent], adrift[link.parent]
-            if not loose:
-                place = alg.vadd(places[link.parent], alg.apply(above, link.origin))
-        if link.kind == FREE:
-            axes += [Motion(alg.ZERO, unit) for unit in _UNIT]
-        else:
-            above = alg.product(above, link.rotation)
-        x, y, z = columns = alg.transpose(above)
-        if link.kind == SLIDE:
-            axes.append(Motion(alg.ZERO, z))
-            if not loose:
-                way = alg.sub(q[link.q], link.reference)
-                place = alg.vadd(place, alg.scale(way, z))
-        elif link.kind == HINGE:
-            axes.append(_about(z, place))
-            angle = alg.sub(q[link.q], link.reference)
-            c, d = alg.cos(angle), alg.sin(angle)
-            columns = (
-                alg.vadd(alg.scale(c, x), alg.scale(d, y)),
-                alg.vadd(alg.scale(c, y), alg.scale(alg.neg(d), x)),
-                z,
-            )
-        else:
-            start = link.q + (3 if link.kind == FREE else 0)
-            columns = alg.transpose(alg.product(above, alg.rotation(q[start : start + 4])))
-            axes += [_about(axis, place) for axis in columns]
-        turned.append(alg.transpose(columns))
-        places.append(place)
-        adrift.append(loose and link.kind == SLIDE)
-    rotation = _gathered([turned[i] for i in tree.bodies], tree.dtype)
-    place = _gathered([places[i] for i in tree.bodies], tree.dtype)
-    compensated = None
-    if any(held):
-        nothing = Inertia(0.0, alg.ZERO, (0.0,) * 6)
-        own = _gathered([each or nothing for each in held], tree.dtype)
-        centre = alg.vadd(place, alg.apply(rotation, own.moment))
-        compensated = own._replace(moment=alg.scale(own.mass, centre))
-    own = _about_the_point(_gathered(inertias, tree.dtype), rotation, place)
-    return Frames(_gathered(axes, tree.dtype), own, compensated)
+            rotation, origin, at_root = (x[link.parent] for x in (rotations, origins, sliding))
+        rotation, mounted = _mounted(link, rotation, origin)
+        origin = alg.ZERO if at_root else mounted
+        rotation, moved, own = _through_joint(link, rotation, origin, q)
+        axes += own
+        rotations.append(rotation)
+        origins.append(alg.ZERO if at_root else moved)
+        sliding.append(at_root and link.kind == SLIDE)
+    rotation = _side_by_side([rotations[i] for i in tree.bodies], tree.dtype)
+    origin = _side_by_side([origins[i] for i in tree.bodies], tree.dtype)
+    inertia = _placed(_side_by_side(bodies, tree.dtype), rotation, origin)
+    carried = None
+    if any(compensated):
+        none = Body(0.0, alg.ZERO, alg.NOTHING)
+        every = _side_by_side([each or none for each in compensated], tree.dtype)
+        carried = _placed(every, rotation, origin)
+    return Configuration(_side_by_side(axes, tree.dtype), inertia, carried)
 
 
-def mass_matrix(tree: Tree, at: Frames) -> Number:
+def origins_of(links: Sequence[Link], q: Sequence[Number]) -> list[Vector]:
+    """:return: where the frame of each link is in the world [m]"""
+    rotations: list[Matrix] = []
+    origins: list[Vector] = []
+    for link in links:
+        rotation, origin = _UNIT, alg.ZERO
+        if link.parent >= 0:
+            rotation, origin = rotations[link.parent], origins[link.parent]
+        rotation, origin, _ = _through_joint(link, *_mounted(link, rotation, origin), q)
+        rotations.append(rotation)
+        origins.append(origin)
+    return origins
+
+
+def _mounted(link: Link, rotation: Matrix, origin: Vector) -> tuple[Matrix, Vector]:
+    """The frame of a link where its joint is at its reference, from that of its parent."""
+    place = alg.vadd(origin, alg.apply(rotation, link.origin))
+    return alg.product(rotation, link.rotation), place
+
+
+def _through_joint(
+    link: Link, rotation: Matrix, origin: Vector, q: Sequence[Number]
+) -> tuple[Matrix, Vector, list[Motion]]:
+    """The frame of a link, and the motions that its joint allows."""
+    x, y, z = alg.transpose(rotation)
+    if link.kind == SLIDE:
+        way = alg.sub(q[link.q], link.reference)
+        return rotation, alg.vadd(origin, alg.scale(way, z)), [Motion(alg.ZERO, z)]
+    if link.kind == HINGE:
+        angle = alg.sub(q[link.q], link.reference)
+        c, s = alg.cos(angle), alg.sin(angle)
+        turned = (
+            alg.vadd(alg.scale(c, x), alg.scale(s, y)),
+            alg.vadd(alg.scale(c, y), alg.scale(alg.neg(s), x)),
+            z,
+        )
+        return alg.transpose(turned), origin, [_rotation_about(z, origin)]
+    last = link.q + link.n_q
+    rotation = alg.product(rotation, alg.rotation(q[last - 4 : last]))
+    axes = [_rotation_about(axis, origin) for axis in alg.transpose(rotation)]
+    if link.kind == FREE:
+        origin = alg.vadd(origin, q[link.q : link.q + 3])
+        axes = [*(Motion(alg.ZERO, unit) for unit in _UNIT), *axes]
+    return rotation, origin, axes
+
+
+def mass_matrix(tree: Tree, at: Configuration) -> Number:
     """:return: without armature, shape ``(n, n)``"""
-    momentum = _momentum(_summed(at.inertia, tree.carried), at.axes)
-    above = _pairs(at.axes, momentum, tree.n)
-    return tree.upto.T * above + tree.before * above.swapaxes(-1, -2)
+    momentum = _momentum(_sum_over(tree.moving, at.inertia), at.axes)
+    entries = _outer(at.axes, momentum, tree.n)
+    return tree.upto.T * entries + tree.below * entries.swapaxes(-1, -2)
 
 
 def inverse_dynamics(
-    tree: Tree, at: Frames, v: Number, gravity: Vector, a: Number | None = None
+    tree: Tree, at: Configuration, v: Number, gravity: Vector, a: Number | None = None
 ) -> Number:
     """
     :param v: velocity, shape ``(n,)``
-    :param gravity: acceleration of what falls, in the world's frame [m/s2]
-    :param a: acceleration, shape ``(n,)``; None: none
-    :return: the force under which that happens, shape ``(n,)``
+    :param gravity: [m/s2]
+    :param a: acceleration, shape ``(n,)``; None: zero
+    :return: generalised force, shape ``(n,)``
     """
-    flow = _flow(tree, at, v, gravity, a)
-    needed = alg.dot(_flat(at.axes), _flat(_summed(flow.force, tree.carried)))
-    return needed + 0.0 * v
+    force = _sum_over(tree.moving, _forward(tree, at, v, gravity, a).force)
+    return alg.dot(_flat(at.axes), _flat(force)) + 0.0 * v
 
 
-def slopes(
-    tree: Tree, at: Frames, v: Number, gravity: Vector, a: Number
+def derivatives(
+    tree: Tree, at: Configuration, v: Number, gravity: Vector, a: Number
 ) -> tuple[Number, Number]:
+    r"""
+    :return: of inverse dynamics, by position (in the tangent space) and by velocity, both of shape
+        ``(n, n)``
+
+    With the subtree's inertia :math:`I`, force :math:`F` and :math:`B = \partial F / \partial v`
+    of a body that does not turn, and :math:`S` for axes, :math:`\dot\Psi = v_\lambda \times S`,
+    :math:`\ddot\Psi = a_\lambda \times S + v_\lambda \times \dot\Psi`:
+
+    .. math::
+        \partial\tau_i / \partial q_j &= S_i \cdot (I \ddot\Psi_j + B \dot\Psi_j
+            + [S_j \times^* F_j]_{i < j}) \\
+        \partial\tau_i / \partial v_j &= S_i \cdot (I (\dot\Psi_j + \dot S_j) + B S_j)
+
+    where :math:`I, B` are those of the later of the two joints.
     """
-    :return: of the force that is needed, by position and by velocity, shape ``(n, n)``: rows are
-        forces, columns degrees of freedom, a ball's and a free joint's as in a velocity
-    """
-    flow, axes = _flow(tree, at, v, gravity, a), at.axes
-    carried = tree.carried
-    inertia, force = _summed(at.inertia, carried), _summed(flow.force, carried)
-    bend = _summed(_bends(at.inertia, flow.speed), carried)
-    # How each axis changes, with what carries it and with what it moves; and once more.
-    spin = _motion_cross(flow.before, axes)
-    both = _sum(spin, flow.spin)
-    curl = _sum(_motion_cross(flow.gain, axes), _motion_cross(flow.before, spin))
-    momentum, bent = _momentum(inertia, axes), _bent(bend, axes)
-    by_q = _sum(_momentum(inertia, curl), _bending(bend, spin), _force_cross(axes, force))
-    by_v = _sum(_momentum(inertia, both), _bending(bend, axes))
-    n = tree.n
-    q_below = _pairs((momentum, bent), (curl, spin.turn), n)
-    v_below = _pairs((momentum, bent), (both, axes.turn), n)
-    if at.held is not None:
-        held = _summed(at.held, carried)
-        lift = _motion_cross(_repeated(Motion(alg.ZERO, gravity), n), axes)
-        by_q = _sum(by_q, _momentum(held, lift))
-        q_below = q_below + _pairs(_momentum(held, axes), lift, n)
-    over, under = tree.before.T, tree.upto
+    motion, axes, n = _forward(tree, at, v, gravity, a), at.axes, tree.n
+    inertia, force = _sum_over(tree.moving, at.inertia), _sum_over(tree.moving, motion.force)
+    coriolis = _sum_over(tree.moving, _coriolis(at.inertia, motion.body_velocity))
+    psi_dot = _cross(motion.velocity, axes)
+    psi_ddot = _add(_cross(motion.acceleration, axes), _cross(motion.velocity, psi_dot))
+    both = _add(psi_dot, motion.axis_rate)
+    # Rows are those of the later joint here, ...
+    momentum, transposed = _momentum(inertia, axes), _coriolis_transposed(coriolis, axes)
+    later_q = _outer((momentum, transposed), (psi_ddot, psi_dot.angular), n)
+    later_v = _outer((momentum, transposed), (both, axes.angular), n)
+    # ... and columns here.
+    by_q = _add(_momentum(inertia, psi_ddot), _coriolis_wrench(coriolis, psi_dot))
+    by_q = _add(by_q, _cross_force(axes, force))
+    by_v = _add(_momentum(inertia, both), _coriolis_wrench(coriolis, axes))
+    if at.compensated is not None:
+        carried = _sum_over(tree.moving, at.compensated)
+        turned = _cross(_repeated(Motion(alg.ZERO, gravity), n), axes)
+        by_q = _add(by_q, _momentum(carried, turned))
+        later_q = later_q + _outer(_momentum(carried, axes), turned, n)
+    earlier, later = tree.below.T, tree.upto
     return (
-        over * _pairs(axes, by_q, n) + under * q_below,
-        over * _pairs(axes, by_v, n) + under * v_below,
+        earlier * _outer(axes, by_q, n) + later * later_q,
+        earlier * _outer(axes, by_v, n) + later * later_v,
     )
 
 
-class _Flow(NamedTuple):
+class _Kinematics(NamedTuple):
     """
-    How everything moves.
-
-    :param before: velocity of what carries each joint
-    :param gain: acceleration of what carries each joint
-    :param spin: how fast the axes change
-    :param speed: velocity of each body
+    :param velocity: of what each joint is mounted on
+    :param acceleration: of what each joint is mounted on, minus gravity
+    :param axis_rate: time derivative of each axis
+    :param body_velocity: of each body
     :param force: that each body needs
     """
 
-    before: Motion
-    gain: Motion
-    spin: Motion
-    speed: Motion
+    velocity: Motion
+    acceleration: Motion
+    axis_rate: Motion
+    body_velocity: Motion
     force: Wrench
 
 
-def _flow(tree: Tree, at: Frames, v: Number, gravity: Vector, a: Number | None) -> _Flow:
-    ways = _times(v, at.axes)
-    before = _summed(ways, tree.before.T)
-    spin = _motion_cross(_summed(ways, tree.upto.T) if tree.curved else before, at.axes)
-    gains = _times(v, spin)
+def _forward(
+    tree: Tree, at: Configuration, v: Number, gravity: Vector, a: Number | None
+) -> _Kinematics:
+    """The outward pass of the recursive Newton-Euler algorithm."""
+    rates = _times(v, at.axes)
+    velocity = _sum_over(tree.below.T, rates)
+    own = _sum_over(tree.upto.T, rates) if tree.has_balls else velocity
+    axis_rate = _cross(own, at.axes)
+    gains = _times(v, axis_rate)
     if a is not None:
-        gains = _sum(gains, _times(a, at.axes))
-    rising = Motion(alg.ZERO, alg.scale(-1.0, gravity))
-    speed = _summed(ways, tree.carried.T)
-    gain = _sum(_summed(gains, tree.carried.T), _repeated(rising, len(tree.bodies)))
-    turning = _force_cross(speed, _momentum(at.inertia, speed))
-    force = _sum(_momentum(at.inertia, gain), turning)
-    if at.held is not None:
-        falling = _repeated(Motion(alg.ZERO, gravity), len(tree.bodies))
-        force = _sum(force, _momentum(at.held, falling))
-    gain_before = _sum(_summed(gains, tree.before.T), _repeated(rising, tree.n))
-    return _Flow(before, gain_before, spin, speed, force)
+        gains = _add(gains, _times(a, at.axes))
+    upwards = Motion(alg.ZERO, alg.scale(-1.0, gravity))
+    mounted = _add(_sum_over(tree.below.T, gains), _repeated(upwards, tree.n))
+    n_bodies = len(tree.bodies)
+    speed = _sum_over(tree.moving.T, rates)
+    gain = _add(_sum_over(tree.moving.T, gains), _repeated(upwards, n_bodies))
+    gyroscopic = _cross_force(speed, _momentum(at.inertia, speed))
+    force = _add(_momentum(at.inertia, gain), gyroscopic)
+    if at.compensated is not None:
+        downwards = _repeated(Motion(alg.ZERO, gravity), n_bodies)
+        force = _add(force, _momentum(at.compensated, downwards))
+    return _Kinematics(velocity, mounted, axis_rate, speed, force)
 
 
 # --- spatial algebra
 
 
-def _about(axis: Vector, place: Vector) -> Motion:
-    return Motion(axis, alg.cross(place, axis))
+def _rotation_about(axis: Vector, origin: Vector) -> Motion:
+    return Motion(axis, alg.cross(origin, axis))
 
 
-def _motion_cross(a: Motion, b: Motion) -> Motion:
-    return Motion(
-        alg.cross(a.turn, b.turn), alg.vadd(alg.cross(a.turn, b.move), alg.cross(a.move, b.turn))
-    )
+def _cross(a: Motion, b: Motion) -> Motion:
+    mixed = alg.vadd(alg.cross(a.angular, b.linear), alg.cross(a.linear, b.angular))
+    return Motion(alg.cross(a.angular, b.angular), mixed)
 
 
-def _force_cross(a: Motion, b: Wrench) -> Wrench:
-    return Wrench(
-        alg.vadd(alg.cross(a.turn, b.torque), alg.cross(a.move, b.force)),
-        alg.cross(a.turn, b.force),
-    )
+def _cross_force(a: Motion, b: Wrench) -> Wrench:
+    torque = alg.vadd(alg.cross(a.angular, b.torque), alg.cross(a.linear, b.force))
+    return Wrench(torque, alg.cross(a.angular, b.force))
 
 
 def _momentum(inertia: Inertia, motion: Motion) -> Wrench:
-    trace = alg.total(inertia.spread[:3])
-    spread = alg.apply(alg.full(inertia.spread), motion.turn)
-    own = alg.vadd(alg.scale(trace, motion.turn), alg.scale(-1.0, spread))
+    angular, h = motion.angular, inertia.first_moment
+    trace = alg.total(inertia.second_moments[:3])
+    second = alg.apply(alg.full(inertia.second_moments), angular)
+    own = alg.vadd(alg.scale(trace, angular), alg.scale(-1.0, second))
     return Wrench(
-        alg.vadd(own, alg.cross(inertia.moment, motion.move)),
-        alg.vadd(alg.scale(inertia.mass, motion.move), alg.cross(motion.turn, inertia.moment)),
+        alg.vadd(own, alg.cross(h, motion.linear)),
+        alg.vadd(alg.scale(inertia.mass, motion.linear), alg.cross(angular, h)),
     )
 
 
-class _Bend(NamedTuple):
+class _Coriolis(NamedTuple):
     r"""
-    The slope of a body's force by its velocity, beside what its rotation makes: of a motion
-    :math:`(\alpha, \beta)`, :math:`2 (\alpha \times l, -D \alpha)` as force and torque.
+    :math:`B` of a body with linear momentum :math:`l`: a motion :math:`(\alpha, \beta)` becomes the
+    torque :math:`-2 D \alpha` and the force :math:`2 \alpha \times l`.
     """
 
     matrix: Matrix
     momentum: Vector
 
 
-def _bends(inertia: Inertia, speed: Motion) -> _Bend:
-    w, u, h = speed.turn, speed.move, inertia.moment
-    columns = [alg.cross(w, column) for column in alg.full(inertia.spread)]
-    least = alg.neg(alg.dot(h, u))
-    rows = tuple(
-        tuple(
-            alg.total((columns[j][i], alg.mul(u[i], h[j]), least if i == j else 0.0))
-            for j in range(3)
-        )
-        for i in range(3)
-    )
-    return _Bend(rows, _momentum(inertia, speed).force)  # type: ignore[arg-type]
+def _coriolis(inertia: Inertia, velocity: Motion) -> _Coriolis:
+    r""":math:`D = [\omega] \Sigma + u h^T - (h \cdot u) 1`"""
+    w, u, h = velocity.angular, velocity.linear, inertia.first_moment
+    columns = [alg.cross(w, column) for column in alg.full(inertia.second_moments)]
+    diagonal = alg.neg(alg.dot(h, u))
+
+    def entry(i: int, j: int) -> Number:
+        own = alg.add(columns[j][i], alg.mul(u[i], h[j]))
+        return alg.add(own, diagonal) if i == j else own
+
+    x, y, z = ((entry(i, 0), entry(i, 1), entry(i, 2)) for i in range(3))
+    return _Coriolis((x, y, z), _momentum(inertia, velocity).force)
 
 
-def _bending(bend: _Bend, motion: Motion) -> Wrench:
-    torque = alg.scale(-2.0, alg.apply(bend.matrix, motion.turn))
-    return Wrench(torque, alg.scale(2.0, alg.cross(motion.turn, bend.momentum)))
+def _coriolis_wrench(coriolis: _Coriolis, motion: Motion) -> Wrench:
+    torque = alg.scale(-2.0, alg.apply(coriolis.matrix, motion.angular))
+    return Wrench(torque, alg.scale(2.0, alg.cross(motion.angular, coriolis.momentum)))
 
 
-def _bent(bend: _Bend, motion: Motion) -> Vector:
-    """The transpose of that, of which no more than three numbers are not zero."""
-    back = alg.apply(alg.transpose(bend.matrix), motion.turn)
-    return alg.scale(2.0, alg.vadd(alg.cross(bend.momentum, motion.move), alg.scale(-1.0, back)))
+def _coriolis_transposed(coriolis: _Coriolis, motion: Motion) -> Vector:
+    """The transpose, of whose six numbers the last three are zero."""
+    back = alg.apply(alg.transpose(coriolis.matrix), motion.angular)
+    force = alg.cross(coriolis.momentum, motion.linear)
+    return alg.scale(2.0, alg.vadd(force, alg.scale(-1.0, back)))
 
 
-def _about_the_point(own: Inertia, rotation: Matrix, place: Vector) -> Inertia:
-    """Of bodies in their links' frames; ``moment`` is the place of their centre there."""
-    centre = alg.vadd(place, alg.apply(rotation, own.moment))
-    weighed = alg.scale(own.mass, centre)
-    far = alg.outer(weighed, alg.scale(0.5, centre))
-    spread = tuple(map(alg.add, alg.congruent(rotation, own.spread), far))
-    return Inertia(own.mass, weighed, spread)  # type: ignore[arg-type]
+def _placed(body: Body, rotation: Matrix, origin: Vector) -> Inertia:
+    """Inertia about the common point, in the axes of the world."""
+    centre = alg.vadd(origin, alg.apply(rotation, body.centre))
+    first = alg.scale(body.mass, centre)
+    own = alg.congruent(rotation, body.second_moments)
+    return Inertia(body.mass, first, alg.sadd(own, alg.outer(first, alg.scale(0.5, centre))))
 
 
 # --- numbers of all joints or bodies side by side
@@ -332,35 +384,33 @@ def _flat(tree: Any) -> list[Number]:
 
 
 def _like(tree: Any, numbers: list[Number]) -> Any:
-    """The same tuples of tuples, with other numbers."""
-    parts = [
-        _like(part, numbers) if isinstance(part, tuple) else numbers.pop(0) for part in tree
-    ]
+    """The same tuples of tuples with other numbers."""
+    parts = [_like(part, numbers) if isinstance(part, tuple) else numbers.pop(0) for part in tree]
     return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
 
 
-def _sum(*trees: Any) -> Any:
-    return _like(trees[0], [alg.total(parts) for parts in zip(*map(_flat, trees), strict=True)])
+def _add(a: Any, b: Any) -> Any:
+    return _like(a, [alg.add(x, y) for x, y in zip(_flat(a), _flat(b), strict=True)])
 
 
 def _times(factor: Number, tree: Any) -> Any:
     return _like(tree, [alg.mul(factor, x) for x in _flat(tree)])
 
 
-def _gathered(trees: Sequence[Any], dtype: Any) -> Any:
-    """Of each joint or body the same tuples: one of them, along a new last axis."""
+def _side_by_side(trees: Sequence[Any], dtype: Any) -> Any:
+    """Tuples of each joint or body as one tuple of arrays."""
     columns = zip(*map(_flat, trees), strict=True)
     return _like(trees[0], [alg.gathered(column, dtype) for column in columns])
 
 
 def _repeated(tree: Any, n: int) -> Any:
-    """Numbers that all joints or bodies share, side by side."""
+    """What all joints or bodies have in common, side by side."""
     numbers = [x if isinstance(x, float) else jnp.broadcast_to(x, (n,)) for x in _flat(tree)]
     return _like(tree, numbers)
 
 
-def _summed(tree: Any, matrix: np.ndarray) -> Any:
-    """Every number times a matrix of ones and zeros, along the last axis."""
+def _sum_over(matrix: np.ndarray, tree: Any) -> Any:
+    """Numbers along the last axis times a matrix."""
     numbers = _flat(tree)
     live = [i for i, x in enumerate(numbers) if not isinstance(x, float)]
     numbers = [x if i in live or x == 0.0 else x * matrix.sum(0) for i, x in enumerate(numbers)]
@@ -373,8 +423,8 @@ def _summed(tree: Any, matrix: np.ndarray) -> Any:
     return _like(tree, numbers)
 
 
-def _pairs(a: Any, b: Any, n: int) -> Number:
-    """Entry ``(i, j)``: the product of number i of one with number j of the other."""
+def _outer(a: Any, b: Any, n: int) -> Number:
+    """Entry ``(i, j)``: the scalar product of number i of ``a`` and number j of ``b``."""
     found: Number = 0.0
     for x, y in zip(_flat(a), _flat(b), strict=True):
         rows = x if isinstance(x, float) else x[..., :, None]

@@ -1,6 +1,5 @@
 """The equation of motion of a mechanism, and its derivative."""
 
-from collections.abc import Callable
 from functools import cache
 from itertools import zip_longest
 from typing import Any
@@ -13,20 +12,23 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
 from sb3_hds.core import Force, MassMatrix, Params, Position, Velocity
+from sb3_hds.core.linear import solve_factored
 from sb3_hds.twins.mujoco.dynamics import (
-    Frames,
+    Configuration,
     Tree,
-    frames,
+    configuration,
+    derivatives,
     inverse_dynamics,
     mass_matrix,
-    slopes,
 )
 from sb3_hds.twins.mujoco.mechanism import BALL, FREE, Link, Mechanism, Place
-from sb3_hds.twins.mujoco.parameters import gravity_of, held_of, inertias_of, of_plant
+from sb3_hds.twins.mujoco.parameters import bodies_of, compensated, gravity_of, of_plant, typical
 from sb3_hds.twins.mujoco.quaternions import turn_between, turning
 
 # Speed over which dry friction builds up [rad/s] or [m/s].
 _STANDSTILL = 0.01
+# Of joints, besides their armature.
+_OF_JOINTS = ("damping", "frictionloss", "stiffness")
 # Squared speed, in units of that, below which the series of tanh(x) / x is exact to 1e-16.
 _SMALL = 1e-6
 
@@ -53,35 +55,57 @@ class Equation:
 
     def __init__(self, mechanism: Mechanism, payload: Place | None, masses: bool) -> None:
         self.mechanism, self.payload, self.masses = mechanism, payload, masses
-        self.parameters = of_plant(mechanism, payload, masses)
-        self.tree_of = cache(lambda dtype: Tree(mechanism.links, dtype))
-        self._held = held_of(mechanism)
+        self.typical = typical(mechanism)
+        self.parameters = of_plant(mechanism, self.typical, payload, masses)
+        joints = {f"{link.joint}_{name}" for link in mechanism.links for name in _OF_JOINTS}
+        self._inertial = tuple(name for name in self.parameters if name not in joints)
+        self._compensated = compensated(mechanism)
         powers = [row[1:] for link in mechanism.links for row in link.damping]
         #: coefficients of powers of the speed, from the second on, by degree of freedom
         self._powers = np.array(list(zip_longest(*powers, fillvalue=0.0)))
+        self._tree_of = cache(lambda dtype: Tree(mechanism.links, dtype))
         self.mass_matrix = jax.jit(self._mass_matrix)
-        self.bias = jax.jit(self._bias)
-        self._solved = jax.jit(self._with_derivative())
+        self._inverse_dynamics = jax.jit(self._inverse)
+        self._forward_dynamics = jax.jit(self._with_derivative())
+
+    def bias(self, q: Position, v: Velocity, params: Params, step: float) -> Force:
+        """
+        :param step: see :meth:`resistance`
+        :return: the force that would keep the mechanism from accelerating
+        """
+        load = self._inverse_dynamics(q, v, self._typed(params, q))
+        return load + self._load_of_joints(q, v, params, step)
 
     def acceleration(
-        self, q: Position, v: Velocity, force: Force, coupling: MassMatrix, params: Params
+        self,
+        q: Position,
+        v: Velocity,
+        force: Force,
+        coupling: MassMatrix,
+        params: Params,
+        step: float,
     ) -> Velocity:
         r"""
-        :param force: generalised, of all but the equation's own
+        :param force: generalised, besides damping, friction and springs
         :param coupling: :math:`C`, symmetric: what an implicit integrator adds to the mass matrix
+        :param step: see :meth:`resistance`
         :return: the acceleration
         """
-        return self._solved(q, v, force, coupling, self._typed(params, q))
+        force = force - self._load_of_joints(q, v, params, step)
+        return self._forward_dynamics(q, v, force, coupling, self._typed(params, q))
 
-    def resistance(self, v: Velocity, params: Params) -> tuple[Force, Force]:
+    def resistance(self, v: Velocity, params: Params, step: float) -> tuple[Force, Force]:
         """
-        :return: the force of damping and dry friction at each joint, per speed; and what its slope
-            by the speed is taken to be, which is the force itself, per speed, for dry friction
+        :param step: length of the explicit step [s]: dry friction is smoothed over what that can
+            stop; 0 where the integrator takes it at the end of its step
+        :return: damping and dry friction of each joint, per speed; and the slope by the speed that
+            an implicit integrator takes: of dry friction the secant, which never overshoots
         """
-        p, powers = self._typed(params, v), self._powers.astype(v.dtype)
-        steady = self._by_dof(p, "damping", v) + self._by_dof(p, "frictionloss", v) * _tanh_per(v)
-        size, power = jnp.abs(v), jnp.ones_like(v)
-        slope = steady
+        powers = self._powers.astype(v.dtype)
+        dry = self._by_dof(params, "frictionloss", v)
+        width = dry * (step / self.typical.inertia).astype(v.dtype)
+        steady = self._by_dof(params, "damping", v) + dry * _tanh_per(v, width)
+        size, power, slope = jnp.abs(v), jnp.ones_like(v), steady
         for order, coefficients in enumerate(powers, 2):
             power = power * size
             steady, slope = steady + coefficients * power, slope + order * coefficients * power
@@ -89,20 +113,15 @@ class Equation:
 
     def _mass_matrix(self, q: Position, params: Params) -> MassMatrix:
         p = self._typed(params, q)
-        matrix = mass_matrix(self.tree_of(q.dtype), self._frames(q, p))
+        matrix = mass_matrix(self._tree_of(q.dtype), self._configuration(q, p))
         return matrix + jnp.diag(self._by_dof(p, "armature", q))
-
-    def _bias(self, q: Position, v: Velocity, params: Params) -> Force:
-        p = self._typed(params, q)
-        load = self._inverse(self._frames(q, p), v, p)
-        return load + self._joints(q, v, p)
 
     def _solve(
         self, q: Array, v: Array, force: Array, coupling: Array, p: Any
     ) -> tuple[Array, Array]:
         """The acceleration, and the Cholesky factor of the matrix that was solved."""
         factor = lax.linalg.cholesky(self._mass_matrix(q, p) + coupling, symmetrize_input=False)
-        return _solved(factor, force - self._bias(q, v, p)), factor
+        return solve_factored(factor, force - self._inverse(q, v, p)), factor
 
     def _with_derivative(self) -> Any:
         """Forward dynamics, whose derivative is that of inverse dynamics."""
@@ -112,38 +131,32 @@ class Equation:
             return self._solve(q, v, force, coupling, p)[0]
 
         def rule(primals: Any, tangents: Any) -> tuple[Array, Array]:
-            q, v, _, coupling, p = primals
-            dq, dv, df = tangents[:3]
+            q, v, _, _, p = primals
+            dq, dv, df, dc, dp = tangents
             a, factor = self._solve(*primals)
             right = jnp.zeros_like(v) if _zero(df) else df
             if not (_zero(dq) and _zero(dv)):
-                gravity = gravity_of(self.mechanism, p)
-                tree, at = self.tree_of(q.dtype), self._frames(q, p)
-                by_q, by_v = slopes(tree, at, v, gravity, a)
+                tree, gravity = self._tree_of(q.dtype), gravity_of(self.mechanism, p)
+                by_q, by_v = derivatives(tree, self._configuration(q, p), v, gravity, a)
                 if not _zero(dq):
                     right = right - jnp.sum(by_q * self.way_of(q, dq), -1)
                 if not _zero(dv):
                     right = right - jnp.sum(by_v * dv, -1)
-            inertial = not all(map(_zero, jax.tree.leaves(tangents[4])))
-
-            def rest(there: Any) -> Array:
-                """What :func:`slopes` leaves out."""
-                q_there, v_there, coupling, p = there
-                load = self._joints(q_there, v_there, p) + self._by_dof(p, "armature", q) * a
-                if inertial:
-                    load = load + self._inverse(self._frames(q, p), v, p, a)
-                return load + jnp.sum(coupling * a, -1)
-
-            more = _along(rest, (q, v, coupling, p), (dq, dv, *tangents[3:]))
-            right = right if more is None else right - more
-            return a, _solved(factor, right)
+            if not _zero(dc):
+                right = right - jnp.sum(dc * a, -1)
+            changes = {name: way for name, way in dp.items() if not _zero(way)}
+            if changes:
+                values = {name: p[name] for name in changes}
+                needed = lambda own: self._inverse(q, v, p | own, a)  # noqa: E731
+                right = right - jax.jvp(needed, (values,), (changes,))[1]
+            return a, solve_factored(factor, right)
 
         acceleration.defjvp(rule, symbolic_zeros=True)
         return acceleration
 
     def way_of(self, q: Position, change: Array) -> Array:
         """:return: the ways and turns that a change of the numbers of a position makes"""
-        if not self.tree_of(q.dtype).curved:
+        if not self._tree_of(q.dtype).has_balls:
             return change
         parts = []
         for link in self.mechanism.links:
@@ -159,30 +172,32 @@ class Equation:
     # --- its parts
 
     def _typed(self, params: Params, like: Array) -> dict[str, Array]:
-        return {name: jnp.asarray(params[name], like.dtype) for name in self.parameters}
+        return {name: jnp.asarray(params[name], like.dtype) for name in self._inertial}
 
-    def _frames(self, q: Array, p: Any) -> Frames:
-        inertias = inertias_of(self.mechanism, self.payload, self.masses, p)
-        return frames(self.tree_of(q.dtype), _unstacked(q), inertias, self._held)
+    def _configuration(self, q: Array, p: Any) -> Configuration:
+        bodies = bodies_of(self.mechanism, self.payload, self.masses, p)
+        return configuration(self._tree_of(q.dtype), _unstacked(q), bodies, self._compensated)
 
-    def _inverse(self, at: Frames, v: Array, p: Any, a: Array | None = None) -> Array:
-        gravity = gravity_of(self.mechanism, p)
-        return inverse_dynamics(self.tree_of(v.dtype), at, v, gravity, a)
+    def _inverse(self, q: Array, v: Array, p: Any, a: Array | None = None) -> Array:
+        """Inverse dynamics, with armatures."""
+        at, gravity = self._configuration(q, p), gravity_of(self.mechanism, p)
+        force = inverse_dynamics(self._tree_of(v.dtype), at, v, gravity, a)
+        return force if a is None else force + self._by_dof(p, "armature", v) * a
+
+    def _load_of_joints(self, q: Array, v: Array, params: Params, step: float) -> Array:
+        """Damping, dry friction and springs."""
+        load = self.resistance(v, params, step)[0] * v
+        for link in self.mechanism.links:
+            if link.stiffness:
+                linear = params.get(f"{link.joint}_stiffness", link.stiffness[0])
+                load = load.at[np.array(link.dofs)].add(_spring(link, q, linear))
+        return load
 
     def _by_dof(self, p: Any, name: str, like: Array) -> Array:
         """A parameter of joints, zero where they have none."""
-        zero = jnp.zeros((), like.dtype)
-        links = self.mechanism.links
-        return jnp.stack([p.get(f"{x.joint}_{name}", zero) for x in links for _ in x.dofs])
-
-    def _joints(self, q: Array, v: Array, p: Any) -> Array:
-        """The load of damping, dry friction and springs."""
-        load = self.resistance(v, p)[0] * v
-        for link in self.mechanism.links:
-            if link.stiffness:
-                spring = _spring(link, q, p.get(f"{link.joint}_stiffness", link.stiffness[0]))
-                load = load.at[np.array(link.dofs)].add(spring)
-        return load
+        every = [(f"{link.joint}_{name}", len(link.dofs)) for link in self.mechanism.links]
+        values = [p.get(full, 0.0) for full, n in every for _ in range(n)]
+        return jnp.stack([jnp.asarray(value, like.dtype) for value in values])
 
 
 def _spring(link: Link, q: Array, linear: Any) -> Array:
@@ -206,40 +221,17 @@ def _spring(link: Link, q: Array, linear: Any) -> Array:
     return jnp.concatenate([pull(way, size(way)) for way in ways])
 
 
-def _tanh_per(v: Array) -> Array:
-    """``tanh(v / w) / v`` for ``w = _STANDSTILL``, smooth at standstill."""
-    x = v / _STANDSTILL
+def _tanh_per(v: Array, width: Array) -> Array:
+    """``tanh(v / w) / v``, smooth at standstill, where ``w`` is at least ``_STANDSTILL``."""
+    w = jnp.maximum(width, _STANDSTILL)
+    x = v / w
     near = x**2 < _SMALL
     away = jnp.where(near, 1.0, x)
-    return jnp.where(near, 1.0 - x**2 / 3.0, jnp.tanh(away) / away) / _STANDSTILL
-
-
-def _solved(factor: Array, right: Array) -> Array:
-    """``x`` of ``L L^T x = right``."""
-    half = lax.linalg.triangular_solve(factor, right[:, None], left_side=True, lower=True)
-    whole = lax.linalg.triangular_solve(
-        factor, half, left_side=True, lower=True, transpose_a=True
-    )
-    return whole[:, 0]
+    return jnp.where(near, 1.0 - x**2 / 3.0, jnp.tanh(away) / away) / w
 
 
 def _zero(tangent: Any) -> bool:
     return isinstance(tangent, SymbolicZero)
-
-
-def _along(function: Callable[[Any], Array], where: Any, ways: Any) -> Array | None:
-    """The derivative of a function of a tree, along those ways that are not nothing."""
-    here, form = jax.tree.flatten(where)
-    leaves = jax.tree.leaves(ways)
-    moving = [i for i, way in enumerate(leaves) if not _zero(way)]
-    if not moving:
-        return None
-
-    def moved(*numbers: Array) -> Array:
-        there = dict(enumerate(here)) | dict(zip(moving, numbers, strict=True))
-        return function(jax.tree.unflatten(form, list(there.values())))
-
-    return jax.jvp(moved, [here[i] for i in moving], [leaves[i] for i in moving])[1]
 
 
 def _unstacked(x: Array) -> list[Array]:

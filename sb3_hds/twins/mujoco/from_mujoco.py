@@ -99,7 +99,7 @@ def from_mujoco(
 def _drives(mechanism: Mechanism, wanted: str | Mapping[str, Any]) -> list[Drive]:
     """One at each hinge and slide."""
     given = {"kind": wanted} if isinstance(wanted, str) else dict(wanted)
-    kind = given.pop("kind", None)
+    kind = str(given.pop("kind", None))
     gains = {"torque": (), "position": ("kp", "kv"), "velocity": ("kv",)}.get(kind)
     if gains is None:
         raise ParameterError(

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.twins.mujoco.dynamics import Tree, frames, inverse_dynamics
-from sb3_hds.twins.mujoco.parameters import gravity_of, held_of, inertias_of, random_positions
+from sb3_hds.twins.mujoco.dynamics import Tree, configuration, inverse_dynamics
+from sb3_hds.twins.mujoco.parameters import bodies_of, compensated, gravity_of, random_positions
 
 if TYPE_CHECKING:
     from sb3_hds.twins.mujoco.twin import MechanismTwin
@@ -30,7 +30,9 @@ def unidentifiable(twin: "MechanismTwin") -> str:
     names = inertial(twin)
     slopes = regressor(twin, names)
     size = np.linalg.norm(slopes, axis=0)
-    nothing = [name for name, length in zip(names, size, strict=True) if length < _RANK * size.max()]
+    nothing = [
+        name for name, length in zip(names, size, strict=True) if length < _RANK * size.max()
+    ]
     seen = [i for i, name in enumerate(names) if name not in nothing]
     _, values, ways = np.linalg.svd(slopes[:, seen] / size[seen], full_matrices=True)
     rank = int(np.sum(values > _RANK * values[0]))
@@ -81,8 +83,8 @@ def regressor(twin: "MechanismTwin", names: list[str]) -> Float[np.ndarray, "row
         forces = []
         for way in (step, -step):
             p = values | {name: values[name] + way}
-            inertias = inertias_of(mechanism, twin.payload, True, p)
-            at = frames(tree, q, inertias, held_of(mechanism))
+            bodies = bodies_of(mechanism, twin.payload, True, p)
+            at = configuration(tree, q, bodies, compensated(mechanism))
             forces.append(inverse_dynamics(tree, at, v, gravity_of(mechanism, p), a))
         columns.append((forces[0] - forces[1]).ravel() / (2.0 * _STEP))
     return np.stack(columns, 1)

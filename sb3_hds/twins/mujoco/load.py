@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_hds.errors import ModelFileError
+from sb3_hds.twins.mujoco.library import mujoco
+
 
 class Loaded(NamedTuple):
     """
@@ -27,16 +29,15 @@ def load(source: Any) -> Loaded:
         environment of Gymnasium that has a model of MuJoCo
     :raises ModelFileError: if there is no such file, or MuJoCo refuses it
     """
-    import mujoco
-
-    if isinstance(source, mujoco.MjModel):
+    mj = mujoco()
+    if isinstance(source, mj.MjModel):
         return Loaded(source)
-    if isinstance(source, mujoco.MjSpec):
+    if isinstance(source, mj.MjSpec):
         return Loaded(_compiled(source.copy, "this MjSpec"))
     if isinstance(source, str | os.PathLike):
         return _from_text_or_file(source)
     model = getattr(getattr(source, "unwrapped", None), "model", None)
-    if isinstance(model, mujoco.MjModel):
+    if isinstance(model, mj.MjModel):
         return Loaded(model, float(source.unwrapped.dt))
     raise ModelFileError(
         "A model is the path of an MJCF or URDF file, an MjSpec, an MjModel, or an environment of "
@@ -51,14 +52,15 @@ def _from_text_or_file(source: str | os.PathLike[str]) -> Loaded:
     if not inline:
         path = Path(source)
         if not path.is_file():
-            raise ModelFileError(f"There is no file {where}. Pass the path of an MJCF or URDF file.")
+            raise ModelFileError(
+                f"There is no file {where}. Pass the path of an MJCF or URDF file."
+            )
         text = path.read_text(errors="replace")
     urdf = "<robot" in text
 
     def parsed() -> Any:
-        import mujoco
-
-        read = mujoco.MjSpec.from_string if inline else mujoco.MjSpec.from_file
+        mj = mujoco()
+        read = mj.MjSpec.from_string if inline else mj.MjSpec.from_file
         spec = read(text if inline else str(source))
         if urdf:
             # Tools and flanges keep their names: a payload may be there.
@@ -70,18 +72,24 @@ def _from_text_or_file(source: str | os.PathLike[str]) -> Loaded:
 
 def _compiled(parsed: Callable[[], Any], where: str) -> Any:
     """Without what only shows or touches, if files for that are missing: inertials suffice."""
-    import mujoco
-
+    mj = mujoco()
     try:
         return parsed().compile()
     except ValueError as error:
         if not _is_about_files(error):
             raise ModelFileError(f"MuJoCo refuses {where}: {_first_line(error)}.") from None
     spec = parsed()
-    shapes = [getattr(mujoco.mjtGeom, name) for name in ("mjGEOM_MESH", "mjGEOM_HFIELD", "mjGEOM_SDF")]
+    shapes = [getattr(mj.mjtGeom, name) for name in ("mjGEOM_MESH", "mjGEOM_HFIELD", "mjGEOM_SDF")]
     shaped = [geom for geom in spec.geoms if geom.type in shapes]
     bare = {geom.parent.name for geom in shaped if not geom.parent.explicitinertial}
-    for part in (*shaped, *spec.skins, *spec.meshes, *spec.hfields, *spec.materials, *spec.textures):
+    for part in (
+        *shaped,
+        *spec.skins,
+        *spec.meshes,
+        *spec.hfields,
+        *spec.materials,
+        *spec.textures,
+    ):
         spec.delete(part)
     try:
         return spec.compile()

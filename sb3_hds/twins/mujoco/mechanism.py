@@ -27,7 +27,7 @@ class Body:
     :param inertia: about the centre of mass, in the link's axes [kg m2]: xx, yy, zz, xy, xz, yz
     :param origin: of the body's own frame, in the link's [m]
     :param rotation: of the body's own frame in the link's, rows
-    :param held: mass whose weight the model compensates [kg], and its centre [m]
+    :param gravcomp: mass whose weight the model compensates [kg], and its centre [m]
     """
 
     name: str
@@ -36,7 +36,7 @@ class Body:
     inertia: tuple[float, float, float, float, float, float]
     origin: tuple[float, float, float]
     rotation: tuple[tuple[float, ...], ...]
-    held: tuple[float, float, float, float] | None = None
+    gravcomp: tuple[float, float, float, float] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,7 +176,7 @@ class Mechanism:
     links: tuple[Link, ...]
     drives: tuple[Drive, ...]
     places: tuple[Place, ...]
-    gravity: tuple[float, ...]
+    gravity: tuple[float, float, float]
     timestep: float
     integrator: str
     implicit_damping: bool

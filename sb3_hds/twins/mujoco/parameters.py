@@ -13,8 +13,10 @@ import numpy as np
 
 from sb3_hds.core import Parameter
 from sb3_hds.errors import ParameterError, did_you_mean
-from sb3_hds.twins.mujoco import algebra as s
-from sb3_hds.twins.mujoco.dynamics import Inertia, Tree, frames, inverse_dynamics, mass_matrix
+from sb3_hds.twins.mujoco import algebra as alg
+from sb3_hds.twins.mujoco import dynamics
+from sb3_hds.twins.mujoco.algebra import Number, Symmetric, Vector
+from sb3_hds.twins.mujoco.dynamics import Tree, configuration, inverse_dynamics, mass_matrix
 from sb3_hds.twins.mujoco.mechanism import (
     BALL,
     FREE,
@@ -26,7 +28,6 @@ from sb3_hds.twins.mujoco.mechanism import (
     Mechanism,
     Place,
 )
-from sb3_hds.twins.mujoco.algebra import Number, Symmetric, Vector
 
 Values = Mapping[str, Number]
 
@@ -42,13 +43,14 @@ _SHIFT, _STRETCH = 0.02, 0.1  # of a body's centre [m], and of its shape, as a l
 _N_POSES = 64
 
 
-def of_plant(mechanism: Mechanism, payload: Place | None, masses: bool) -> dict[str, Parameter]:
+def of_plant(
+    mechanism: Mechanism, usual: "Typical", payload: Place | None, masses: bool
+) -> dict[str, Parameter]:
     """
     :param payload: where an unknown mass may be
     :param masses: whether mass, centre and inertia of each body are parameters
     :return: all that the equation of motion has
     """
-    usual = typical(mechanism)
     forces = usual.weight + _OF_DRIVE * usual.drive
     found = {name: Parameter(0.0, _TILT, "rad", -1.0, 1.0) for name in tilts(mechanism)}
     for link in mechanism.links:
@@ -93,9 +95,7 @@ def _of_link(link: Link, inertias: np.ndarray, forces: np.ndarray) -> dict[str, 
     turns = link.kind != SLIDE
     i, free = link.dofs[-1], link.kind == FREE
     force = float(forces[i]) or 1.0
-    units = (
-        ("N m s/rad", "N m", "kg m2", "N m/rad") if turns else ("N s/m", "N", "kg", "N/m")
-    )
+    units = ("N m s/rad", "N m", "kg m2", "N m/rad") if turns else ("N s/m", "N", "kg", "N/m")
     values = (
         link.damping[0][0] if link.damping[0] else 0.0,
         link.friction[0],
@@ -168,58 +168,63 @@ def tilts(mechanism: Mechanism) -> list[str]:
 
 def gravity_of(mechanism: Mechanism, p: Values) -> Vector:
     """:return: gravity turned about the world's axes, the later one first [m/s2]"""
-    found: Vector = mechanism.gravity  # type: ignore[assignment]
+    found: Vector = mechanism.gravity
     for name in reversed(tilts(mechanism)):
         i = _AXES.index(name[-1])
         j, k = (i + 1) % 3, (i + 2) % 3
-        c, d = s.cos(p[name]), s.sin(p[name])
-        new = list(found)
-        new[j] = s.sub(s.mul(c, found[j]), s.mul(d, found[k]))
-        new[k] = s.add(s.mul(d, found[j]), s.mul(c, found[k]))
-        found = tuple(new)  # type: ignore[assignment]
+        c, d = alg.cos(p[name]), alg.sin(p[name])
+        turned = {
+            i: found[i],
+            j: alg.sub(alg.mul(c, found[j]), alg.mul(d, found[k])),
+            k: alg.add(alg.mul(d, found[j]), alg.mul(c, found[k])),
+        }
+        found = turned[0], turned[1], turned[2]
     return found
 
 
-def inertias_of(
+def bodies_of(
     mechanism: Mechanism, payload: Place | None, masses: bool, p: Values
-) -> list[Inertia]:
-    """:return: of each body about its centre, with its payload; its place instead of its moment"""
+) -> list[dynamics.Body]:
+    """:return: of each link that has one, with its payload"""
     found = []
     for i, link in enumerate(mechanism.links):
         if link.body is None:
             continue
-        own = _changed(link.body, p) if masses else Inertia(
-            link.body.mass, link.body.centre, _spread(link.body.inertia)
-        )
+        own = _with_values(link.body, p) if masses else _as_given(link.body)
         if payload is not None and payload.link == i:
-            mass = p[f"{payload.name}_payload"]
             offset = [p[f"{payload.name}_payload_{axis}"] for axis in _AXES]
-            place = s.vadd(payload.position, s.apply(payload.rotation, offset))
-            own = _joined(own, mass, place)
+            place = alg.vadd(payload.position, alg.apply(payload.rotation, offset))
+            own = _loaded(own, p[f"{payload.name}_payload"], place)
         found.append(own)
     return found
 
 
-def held_of(mechanism: Mechanism) -> list[Inertia | None]:
-    """:return: of each body, the mass whose weight is compensated"""
-    every = (link.body for link in mechanism.links if link.body is not None)
-    return [
-        body.held and Inertia(body.held[0], body.held[1:], (0.0,) * 6)  # type: ignore[misc]
-        for body in every
-    ]
+def compensated(mechanism: Mechanism) -> list[dynamics.Body | None]:
+    """:return: of each link that has a body, the mass whose weight something else carries"""
+    found: list[dynamics.Body | None] = []
+    for link in mechanism.links:
+        if link.body is not None:
+            mass, *centre = link.body.gravcomp or (0.0, 0.0, 0.0, 0.0)
+            point = dynamics.Body(mass, (centre[0], centre[1], centre[2]), alg.NOTHING)
+            found.append(point if link.body.gravcomp else None)
+    return found
 
 
-def _joined(own: Inertia, mass: Number, place: Vector) -> Inertia:
-    """A body and a point mass, about their common centre."""
-    whole = s.add(own.mass, mass)
-    share = s.div(mass, whole)
-    way = s.vadd(place, s.scale(-1.0, own.moment))
-    centre = s.vadd(own.moment, s.scale(share, way))
-    between = s.outer(s.scale(s.mul(own.mass, share), way), s.scale(0.5, way))
-    return Inertia(whole, centre, tuple(map(s.add, own.spread, between)))  # type: ignore[arg-type]
+def _as_given(body: Body) -> dynamics.Body:
+    return dynamics.Body(body.mass, body.centre, _second_moments(body.inertia))
 
 
-def _changed(body: Body, p: Values) -> Inertia:
+def _loaded(own: dynamics.Body, mass: Number, place: Vector) -> dynamics.Body:
+    """A body and a point mass as one."""
+    whole = alg.add(own.mass, mass)
+    share = alg.div(mass, whole)
+    way = alg.vadd(place, alg.scale(-1.0, own.centre))
+    apart = alg.outer(alg.scale(alg.mul(own.mass, share), way), alg.scale(0.5, way))
+    centre = alg.vadd(own.centre, alg.scale(share, way))
+    return dynamics.Body(whole, centre, alg.sadd(own.second_moments, apart))
+
+
+def _with_values(body: Body, p: Values) -> dynamics.Body:
     r"""
     Log-Cholesky: the second moments of mass about the centre, per unit of mass, become
     :math:`U \Sigma U^T` with an upper triangular :math:`U` of positive diagonal.
@@ -229,25 +234,23 @@ def _changed(body: Body, p: Values) -> Inertia:
     name, turn = body.name, body.rotation
     mass = p[f"{name}_mass"]
     centre = [p[f"{name}_com_{axis}"] for axis in _AXES]
-    stretch = [s.exp(p[f"{name}_stretch_{axis}"]) for axis in _AXES]
+    x, y, z = (alg.exp(p[f"{name}_stretch_{axis}"]) for axis in _AXES)
     xy, xz, yz = (p[f"{name}_shear_{plane}"] for plane in ("xy", "xz", "yz"))
-    shape = (stretch[0], xy, xz), (0.0, stretch[1], yz), (0.0, 0.0, stretch[2])
-    spread = s.congruent(s.product(turn, shape), _second_moments(body))
-    place = s.vadd(body.origin, s.apply(turn, centre))
-    return Inertia(mass, place, tuple(s.mul(mass, x) for x in spread))  # type: ignore[arg-type]
+    stretch = ((x, xy, xz), (0.0, y, yz), (0.0, 0.0, z))
+    axes = np.array(turn)
+    nominal = axes.T @ np.array(alg.full(_second_moments(body.inertia))) @ axes / body.mass
+    own = tuple(float(nominal[i, j]) for i, j in alg.PLACES)
+    shape = alg.congruent(alg.product(turn, stretch), own)  # type: ignore[arg-type]
+    second = tuple(alg.mul(mass, entry) for entry in shape)
+    place = alg.vadd(body.origin, alg.apply(turn, centre))
+    return dynamics.Body(mass, place, second)  # type: ignore[arg-type]
 
 
-def _spread(inertia: Symmetric) -> Symmetric:
-    """Second moments of mass of a body with these moments and products of inertia."""
-    half = 0.5 * sum(inertia[:3])
-    return (*(half - x for x in inertia[:3]), *(-x for x in inertia[3:]))  # type: ignore[return-value]
-
-
-def _second_moments(body: Body) -> Symmetric:
-    """About the centre, in the body's axes, per unit of mass [m2]."""
-    turn = np.array(body.rotation)
-    spread = turn.T @ np.array(s.full(_spread(body.inertia))) @ turn / body.mass
-    return tuple(float(spread[i, j]) for i, j in s.PLACES)  # type: ignore[return-value]
+def _second_moments(inertia: Symmetric) -> Symmetric:
+    """Of mass, of a body with these moments and products of inertia."""
+    xx, yy, zz, xy, xz, yz = inertia
+    half = 0.5 * (xx + yy + zz)
+    return half - xx, half - yy, half - zz, -xy, -xz, -yz
 
 
 def centre_in_body(body: Body) -> tuple[float, ...]:
@@ -276,7 +279,7 @@ class Typical(NamedTuple):
 
 def typical(mechanism: Mechanism) -> Typical:
     tree, q = Tree(mechanism.links), random_positions(mechanism, _N_POSES)
-    at = frames(tree, q, inertias_of(mechanism, None, False, {}), held_of(mechanism))
+    at = configuration(tree, q, bodies_of(mechanism, None, False, {}), compensated(mechanism))
     still = np.zeros((_N_POSES, tree.n))
     weight = np.abs(inverse_dynamics(tree, at, still, mechanism.gravity)).max(0)
     armature = np.concatenate([link.armature for link in mechanism.links])

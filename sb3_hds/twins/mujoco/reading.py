@@ -1,10 +1,11 @@
 """Read the numbers of a mechanism from a compiled model of MuJoCo."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sb3_hds.errors import ParameterError
+from sb3_hds.twins.mujoco.library import mujoco
 from sb3_hds.twins.mujoco.mechanism import (
     BALL,
     FREE,
@@ -18,9 +19,6 @@ from sb3_hds.twins.mujoco.mechanism import (
     Place,
 )
 
-if TYPE_CHECKING:
-    import mujoco
-
 # Of mjtJoint.
 _KINDS = (FREE, BALL, SLIDE, HINGE)
 #: inputs of servos and motors with several, in their order: the bits of mjtInput
@@ -31,18 +29,17 @@ _ROUNDING = 1e-10
 _OF_INERTIA = 1e-13
 
 
-def read(model: "mujoco.MjModel", *, integrator: str | None = None) -> Mechanism:
+def read(model: Any, *, integrator: str | None = None) -> Mechanism:
     """
     :param model: compiled; what the dynamics cannot do has been refused already
     :param integrator: instead of the model's: ``"euler"``, ``"implicitfast"`` or ``"rk4"``
     :raises ParameterError: for another integrator
     """
-    import mujoco
-
-    data = mujoco.MjData(model)
+    mj = mujoco()
+    data = mj.MjData(model)
     data.qpos[:] = model.qpos0
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
+    mj.mj_kinematics(model, data)
+    mj.mj_comPos(model, data)
     off = _disabled(model)
     frames: dict[int, tuple[np.ndarray, np.ndarray]] = {-1: (np.eye(3), np.zeros(3))}
     links: list[dict[str, Any]] = []
@@ -70,7 +67,7 @@ def read(model: "mujoco.MjModel", *, integrator: str | None = None) -> Mechanism
         links=tuple(Link(**link, body=body) for link, body in zip(links, bodies, strict=True)),
         drives=tuple(_drives(model, link_of_joint, off)),
         places=tuple(_places(model, data, link_of_body, frames)),
-        gravity=(0.0,) * 3 if "GRAVITY" in off else _numbers(model.opt.gravity),
+        gravity=(0.0, 0.0, 0.0) if "GRAVITY" in off else _numbers(model.opt.gravity),
         timestep=float(model.opt.timestep),
         integrator=_integrator(model, integrator),
         implicit_damping="EULERDAMP" not in off,
@@ -78,14 +75,13 @@ def read(model: "mujoco.MjModel", *, integrator: str | None = None) -> Mechanism
     )
 
 
-def integrator_of(model: "mujoco.MjModel") -> str:
+def integrator_of(model: Any) -> str:
     """:return: name of the model's integrator, in lower case"""
-    import mujoco
+    mj = mujoco()
+    return mj.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_").lower()
 
-    return mujoco.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_").lower()
 
-
-def _integrator(model: "mujoco.MjModel", wanted: str | None) -> str:
+def _integrator(model: Any, wanted: str | None) -> str:
     found = integrator_of(model) if wanted is None else str(wanted).lower()
     if found not in ("euler", "implicitfast", "rk4"):
         raise ParameterError(
@@ -95,10 +91,9 @@ def _integrator(model: "mujoco.MjModel", wanted: str | None) -> str:
     return found
 
 
-def _disabled(model: "mujoco.MjModel") -> set[str]:
-    import mujoco
-
-    bits = mujoco.mjtDisableBit
+def _disabled(model: Any) -> set[str]:
+    mj = mujoco()
+    bits = mj.mjtDisableBit
     names = ("SPRING", "DAMPER", "GRAVITY", "CLAMPCTRL", "ACTUATION", "EULERDAMP")
     return {name for name in names if model.opt.disableflags & getattr(bits, f"mjDSBL_{name}")}
 
@@ -175,21 +170,20 @@ def _body(
         origin=_numbers(_rounded(frame.T @ (data.xpos[first] - origin))),
         rotation=_rows(_rounded(frame.T @ data.xmat[first].reshape(3, 3))),
         inertia=_numbers(inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]),
-        held=(float(held.sum()), *_numbers(_rounded(where))) if held.any() else None,
+        gravcomp=(float(held.sum()), *_numbers(_rounded(where))) if held.any() else None,
     )
 
 
 def _drives(model: Any, link_of_joint: dict[int, int], off: set[str]) -> list[Drive]:
-    import mujoco
-
+    mj = mujoco()
     found = []
     for i in range(n_actuators(model)):
         joint = int(model.actuator_trnid[i, 0])
         width = {FREE: 6, BALL: 3}.get(_KINDS[int(model.jnt_type[joint])], 1)
-        kind = mujoco.mjtGain(model.actuator_gaintype[i]).name.removeprefix("mjGAIN_").lower()
+        kind = mj.mjtGain(model.actuator_gaintype[i]).name.removeprefix("mjGAIN_").lower()
         inputs, first = _inputs(model, i, kind)
         gain, bias = model.actuator_gainprm[i], model.actuator_biasprm[i]
-        biased = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
+        biased = model.actuator_biastype[i] == mj.mjtBias.mjBIAS_AFFINE
         dead = "ACTUATION" in off or model.opt.disableactuator & 1 << int(model.actuator_group[i])
         found.append(
             Drive(
@@ -197,7 +191,7 @@ def _drives(model: Any, link_of_joint: dict[int, int], off: set[str]) -> list[Dr
                 kind=kind if kind in ("pid", "dcmotor") else "affine",
                 link=link_of_joint[joint],
                 gear=(0.0,) * width if dead else _numbers(_gear(model, i)[:width]),
-                outer=int(model.actuator_trntype[i]) == mujoco.mjtTrn.mjTRN_JOINTINPARENT,
+                outer=int(model.actuator_trntype[i]) == mj.mjtTrn.mjTRN_JOINTINPARENT,
                 inputs=inputs,
                 ranges=tuple(
                     _numbers(model.actuator_ctrlrange[k])
@@ -220,7 +214,7 @@ def _inputs(model: Any, i: int, kind: str) -> tuple[tuple[str, ...], int]:
     """Names of an actuator's commands, and the index of the first."""
     if not hasattr(model, "actuator_ctrladr"):
         return ("",), i
-    n, first = int(model.actuator_ctrlnum[i]), int(model.actuator_ctrladr[i])
+    first = int(model.actuator_ctrladr[i])
     if kind not in ("pid", "dcmotor"):
         return ("",), first
     names = [name for name, bit in _INPUTS.items() if model.actuator_ctrlspec[i] & bit]

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from sb3_hds.errors import ModelFileError
+from sb3_hds.twins.mujoco.library import mujoco
 from sb3_hds.twins.mujoco.reading import n_actuators
 
 #: what may be left out of a twin on request
@@ -44,7 +45,9 @@ def _ignorable(model: Any) -> dict[str, str]:
             f"Contacts can happen ({_some(touching)}), which the twin does not simulate."
         )
     if _enabled(model, "EQUALITY") and model.neq and np.any(model.eq_active0):
-        active = [model.equality(i).name or f"equality {i}" for i in np.flatnonzero(model.eq_active0)]
+        active = [
+            model.equality(i).name or f"equality {i}" for i in np.flatnonzero(model.eq_active0)
+        ]
         found["equality"] = (
             f"Constraints close chains or couple joints ({_some(active)}), which the twin does not "
             "simulate: joints would move apart."
@@ -62,8 +65,7 @@ def _ignorable(model: Any) -> dict[str, str]:
 
 def _never(model: Any, integrator: str) -> list[str]:
     """What cannot be left out either."""
-    import mujoco
-
+    mj = mujoco()
     found = []
     if model.nflex:
         found.append("Bodies that bend (flex) are no rigid bodies. Remove them from the model.")
@@ -75,7 +77,7 @@ def _never(model: Any, integrator: str) -> list[str]:
             f"MuJoCo's implicitfast is another one for a body that floats alone ({_some(alone)}). "
             "Pass integrator='euler' or 'rk4'."
         )
-    on = {mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT}
+    on = {mj.mjtTrn.mjTRN_JOINT, mj.mjtTrn.mjTRN_JOINTINPARENT}
     kinds = {
         "with internal dynamics": model.actuator_actnum > 0,
         "that are not attached to a joint": ~np.isin(model.actuator_trntype, [int(k) for k in on]),
@@ -142,16 +144,18 @@ def _floating_alone(model: Any) -> list[str]:
 
 
 def _special_gains() -> list[Any]:
-    import mujoco
-
-    gains = mujoco.mjtGain
-    return [getattr(gains, f"mjGAIN_{n}") for n in ("MUSCLE", "SO3", "USER") if hasattr(gains, f"mjGAIN_{n}")]
+    mj = mujoco()
+    gains = mj.mjtGain
+    return [
+        getattr(gains, f"mjGAIN_{n}")
+        for n in ("MUSCLE", "SO3", "USER")
+        if hasattr(gains, f"mjGAIN_{n}")
+    ]
 
 
 def _enabled(model: Any, name: str) -> bool:
-    import mujoco
-
-    return not model.opt.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")
+    mj = mujoco()
+    return not model.opt.disableflags & getattr(mj.mjtDisableBit, f"mjDSBL_{name}")
 
 
 def _some(names: list[str]) -> str:

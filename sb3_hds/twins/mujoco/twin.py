@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.core import (
     Action,
@@ -34,6 +34,7 @@ from sb3_hds.core import (
 from sb3_hds.core.types import Coordinates
 from sb3_hds.errors import ParameterError
 from sb3_hds.twins.mujoco.actuators import Actuation, Moving
+from sb3_hds.twins.mujoco.dynamics import origins_of
 from sb3_hds.twins.mujoco.equation import Equation
 from sb3_hds.twins.mujoco.mechanism import BALL, FREE, SLIDE, Link, Mechanism
 from sb3_hds.twins.mujoco.parameters import (
@@ -41,7 +42,6 @@ from sb3_hds.twins.mujoco.parameters import (
     native_effects,
     of_drives,
     place_of,
-    typical,
 )
 from sb3_hds.twins.mujoco.quaternions import normalized, turn_between, turned
 
@@ -62,10 +62,11 @@ class MechanismTwin(AnalyticTwin):
               = \tau(q, v, u)
 
     Equals MuJoCo's ``Euler``, ``implicitfast`` and ``RK4`` while nothing touches, no joint is at
-    its limit and nothing rubs. Dry friction of :math:`\tau_c \tanh(v / 0.01)` is taken at the end
-    of the step, as damping is (but by ``RK4``): it slows to a creep under a load, where MuJoCo's
-    sticks. Orientations are quaternions in positions, and rotation vectors in the tangent; at a
-    ball or free joint, velocities are MuJoCo's: of the rotation, in the body's frame.
+    its limit and nothing rubs. Dry friction is :math:`\tau_c \tanh(v / 0.01)`, taken at the end of
+    the step as damping is (by ``RK4`` at its beginning, smoothed over what a step can stop): under
+    a load a joint creeps where MuJoCo's sticks. Orientations are quaternions in positions, and
+    rotation vectors in tangents; the velocity of a ball or free joint is MuJoCo's: its rotation in
+    the body's frame.
 
     Made by ``twins.from_mujoco``.
 
@@ -131,33 +132,39 @@ class MechanismTwin(AnalyticTwin):
         return self.equation.mass_matrix(q, params)
 
     def bias(self, q: Position, v: Velocity, params: Params) -> Force:
-        return self.equation.bias(q, v, params)
+        return self.equation.bias(q, v, params, self._explicit_step)
 
-    def accelerate(
-        self, state: State, command: Action, added: Force, params: Params
-    ) -> Velocity:
+    def accelerate(self, state: State, command: Action, added: Force, params: Params) -> Velocity:
         force = self.actuate(state, command, params) + added
         coupling = self._coupling(state, command, params)
-        return self.equation.acceleration(state.q, state.v, force, coupling, params)
+        q, v, step = state.q, state.v, self._explicit_step
+        return self.equation.acceleration(q, v, force, coupling, params, step)
 
     def _coupling(self, state: State, command: Action, params: Params) -> MassMatrix:
         """The step times slopes by velocities, of what the integrator takes at its end."""
         mechanism, h = self.mechanism, self.dt / self.substeps
         implicit = mechanism.integrator == "implicitfast"
         slope = jnp.zeros_like(state.v)
-        if implicit or (mechanism.integrator == "euler" and mechanism.implicit_damping):
-            slope = h * self.equation.resistance(state.v, params)[1]
+        if not self._explicit_step:
+            slope = h * self.equation.resistance(state.v, params, self._explicit_step)[1]
         found = jnp.diag(slope)
         if implicit and any(drive.follows_speed for drive in mechanism.drives):
             found = found - h * self.actuation.slope(self._moving(state), command, params)
         return found
+
+    @property
+    def _explicit_step(self) -> float:
+        """The step [s] where damping is taken at its beginning, 0 where it is at its end."""
+        euler = self.mechanism.integrator == "euler" and self.mechanism.implicit_damping
+        implicit = euler or self.mechanism.integrator == "implicitfast"
+        return 0.0 if implicit else self.dt / self.substeps
 
     def _moving(self, state: State) -> Moving:
         return Moving(state.q, self.coordinates(state.q), state.v)
 
     def typical_forces(self) -> tuple[float, ...]:
         """Gravity's at random positions, and the most that actuators are said to exert."""
-        usual = typical(self.mechanism)
+        usual = self.equation.typical
         return tuple((usual.weight + usual.drive).tolist())
 
     # --- positions
@@ -246,6 +253,23 @@ class MechanismTwin(AnalyticTwin):
         if self._terminated is None:
             return super().terminated(state, params)
         return self._terminated(state, params)
+
+    def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
+        """The mechanism seen along y: from the world to each joint, and back."""
+        zero = jnp.zeros_like(state.v[0])
+        places = [
+            jnp.stack([zero + place[0], zero + place[2]])
+            for place in origins_of(self.mechanism.links, list(state.q))
+        ]
+        points, base = [], jnp.stack([zero, zero])
+        for i in range(len(self.mechanism.links)):
+            chain = [i]
+            while self.mechanism.links[chain[-1]].parent >= 0:
+                chain.append(self.mechanism.links[chain[-1]].parent)
+            if not any(other.parent == i for other in self.mechanism.links):
+                outwards = [base, *(places[j] for j in reversed(chain))]
+                points += [*outwards, *reversed(outwards[:-1])]
+        return jnp.stack(points)
 
     # --- plain data
 
