@@ -5,7 +5,8 @@ import mujoco
 _FREE_OF_CONTACT = '<default><geom contype="0" conaffinity="0" density="900"/></default>'
 
 
-def _robot(name, body, actuators="", *, option="", more=""):
+def robot(name, body, actuators="", *, option="", more=""):
+    """:param more: elements beside the world and the actuators"""
     return f"""<mujoco model="{name}">
   <compiler angle="radian" autolimits="true"/>
   <option timestep="0.002" {option}/>
@@ -16,10 +17,10 @@ def _robot(name, body, actuators="", *, option="", more=""):
 </mujoco>"""
 
 
-def chain(n, *, option="", actuator="motor", more="", **attributes):
+def chain(n, *, option="", actuator="motor", drives="", more="", **attributes):
     """An arm of ``n`` hinges that turn about z, y, y, x, y, x, ... with a site at its tip."""
     axes = ["0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0", "0 1 0"]
-    opening, closing, drives = "", "", ""
+    opening, closing = "", ""
     for i in range(n):
         length = 0.35 - 0.03 * i if i < 8 else 0.12
         joint = {"damping": 0.1 * (i + 1), "armature": 0.01 * (1 + i % 3)} | attributes
@@ -31,7 +32,7 @@ def chain(n, *, option="", actuator="motor", more="", **attributes):
         closing += "</body>"
         drives += _drive(actuator, i)
     tip = '<site name="tip" pos="0.01 0 0.2" euler="0.1 0.2 0.3"/>'
-    return _robot(f"arm{n}", opening + tip + closing, drives, option=option, more=more)
+    return robot(f"arm{n}", opening + tip + closing, drives, option=option, more=more)
 
 
 def _drive(kind, i):
@@ -44,7 +45,7 @@ def _drive(kind, i):
     }[kind]
 
 
-CART_POLE = _robot(
+CART_POLE = robot(
     "cart_pole",
     """<body name="cart" pos="0 0 1">
       <joint name="rail" type="slide" axis="1 0 0" damping="0.5"/>
@@ -58,7 +59,7 @@ CART_POLE = _robot(
     option='integrator="RK4"',
 )
 
-GRIPPER = _robot(
+GRIPPER = robot(
     "gripper",
     """<body name="wrist" pos="0 0 0.5">
       <joint name="lift" type="slide" axis="0 0 1" damping="5" stiffness="200" springref="0.05"/>
@@ -115,12 +116,12 @@ def quadruped(base="", *, option="", actuator="position"):
     trunk = f"""<body name="trunk" pos="0 0 0.6">{base}
       <geom type="box" size="0.2 0.06 0.05" pos="0.01 0 0.005" mass="7"/>
       <site name="back" pos="-0.1 0 0.06"/>{legs}</body>"""
-    return _robot("quadruped", trunk, drives, option=option)
+    return robot("quadruped", trunk, drives, option=option)
 
 
 FREE_BASE = '<freejoint name="base"/>'
 
-BALL = _robot(
+BALL = robot(
     "ball",
     """<body name="upper" pos="0 0 1" quat="0.9 0.1 -0.2 0.3" gravcomp="0.5">
       <joint name="shoulder" type="ball" damping="0.05" stiffness="0.6" armature="0.01"/>

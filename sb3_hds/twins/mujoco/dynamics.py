@@ -135,7 +135,8 @@ def configuration(
     for link in tree.links:
         rotation, origin, at_root = _UNIT, alg.ZERO, True
         if link.parent >= 0:
-            rotation, origin, at_root = (x[link.parent] for x in (rotations, origins, sliding))
+            rotation, origin = rotations[link.parent], origins[link.parent]
+            at_root = sliding[link.parent]
         rotation, mounted = _mounted(link, rotation, origin)
         origin = alg.ZERO if at_root else mounted
         rotation, moved, own = _through_joint(link, rotation, origin, q)

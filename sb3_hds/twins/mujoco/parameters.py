@@ -283,7 +283,8 @@ def typical(mechanism: Mechanism) -> Typical:
     still = np.zeros((_N_POSES, tree.n))
     weight = np.abs(inverse_dynamics(tree, at, still, mechanism.gravity)).max(0)
     armature = np.concatenate([link.armature for link in mechanism.links])
-    matrix = mass_matrix(tree, at) + np.diag(armature)
+    matrix = np.broadcast_to(mass_matrix(tree, at), (_N_POSES, tree.n, tree.n))
+    matrix = matrix + np.diag(armature)
     felt = 1.0 / np.diagonal(np.linalg.inv(matrix), axis1=1, axis2=2)
     drive = np.zeros(tree.n)
     for each in mechanism.drives:
