@@ -1,7 +1,8 @@
 """Twins of robots from their model files."""
 
 from sb3_hds.twins.mujoco.from_mujoco import from_mujoco
+from sb3_hds.twins.mujoco.matching import Matching, arranged, match
 from sb3_hds.twins.mujoco.mechanism import Mechanism
 from sb3_hds.twins.mujoco.twin import MechanismTwin
 
-__all__ = ["Mechanism", "MechanismTwin", "from_mujoco"]
+__all__ = ["Matching", "Mechanism", "MechanismTwin", "arranged", "from_mujoco", "match"]
