@@ -86,7 +86,8 @@ class Effect(abc.ABC):
     """
     Something real hardware does and the twin does not. It vanishes when its parameters are null.
 
-    :param where: index or name of the joint, actuator or channel that it acts on
+    :param where: index or name of the joint, actuator or channel that it acts on; ``"all"`` for an
+        effect on commands that is the same for all actuators
     :param values: values of its parameters by name; default: null, where it changes nothing
     :raises EffectError: for an unknown parameter
     :raises ParameterError: for a value out of bounds
@@ -286,6 +287,10 @@ class SensorEffect(Effect):
         return memory
 
 
+#: the place of an ``ActionEffect`` that all actuators share, with one set of parameters
+ALL_PLACES = "all"
+
+
 @dataclasses.dataclass(frozen=True)
 class Attached:
     """
@@ -293,12 +298,17 @@ class Attached:
 
     :param key: full name, ``"viscous_friction.hinge"``: prefix of its parameters, key of its memory
     :param effect: the effect
-    :param index: index of the joint, actuator or channel
+    :param index: index of the joint, actuator or channel; -1 for all actuators
     """
 
     key: str
     effect: Effect
     index: int
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether it acts on all actuators alike."""
+        return self.index < 0
 
     def own(self, params: Params) -> Params:
         """:return: the effect's own parameters and tensors, without prefix"""
@@ -375,8 +385,14 @@ class EffectChain:
     ) -> tuple[Action, dict[str, Memory]]:
         """:return: the command that reaches the plant for ``h`` seconds, and the memory after it"""
         for attached, effect, params in self._actions:
-            command, after = effect.act(action[attached.index], memory[attached.key], h, params)
-            action, memory = action.at[attached.index].set(command), memory | {attached.key: after}
+            before = memory[attached.key]
+            if attached.everywhere:
+                act = jax.vmap(effect.act, (0, 0, None, None))
+                action, after = act(action, before, h, params)
+            else:
+                command, after = effect.act(action[attached.index], before, h, params)
+                action = action.at[attached.index].set(command)
+            memory = memory | {attached.key: after}
         return action, memory
 
     def force(self, moment: Moment, memory: dict[str, Memory], held: bool = False) -> Force:

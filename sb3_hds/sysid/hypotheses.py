@@ -18,10 +18,17 @@ from sb3_hds.core import (
     SensorEffect,
     Twin,
 )
-from sb3_hds.core.effect import Attached, Chosen
+from sb3_hds.core.effect import ALL_PLACES, Attached, Chosen
 from sb3_hds.core.extended import with_native
 from sb3_hds.core.layers import layers_of, plant_of
-from sb3_hds.effects import NAMELESS, ConstantForce, NeuralForce, SignFlip, reversed_joint
+from sb3_hds.effects import (
+    NAMELESS,
+    ActionDelay,
+    ConstantForce,
+    NeuralForce,
+    SignFlip,
+    reversed_joint,
+)
 from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.priors import Belief, prior_of
 from sb3_hds.sysid.shooting import remembered_for
@@ -38,7 +45,8 @@ class Candidate:
     :param name: of the effect; ``"parameter.mass"`` for a parameter of the twin
     :param slot: ``"joint"``, ``"actuator"``, ``"channel"`` or ``"parameter"``
     :param place: name of the joint, actuator or channel; of the parameter
-    :param index: of the joint, actuator or channel; of the parameter among those of the twin
+    :param index: of the joint, actuator or channel, -1 for all actuators; of the parameter among
+        those of the twin
     :param parameters: full names in the extended twin
     :param explanation: one sentence for people
     :param equivalents: names of effects that data may not tell from this one, and when
@@ -241,8 +249,9 @@ class Hypotheses:
     def added_to(self, name: str) -> float:
         """:return: what the twin as it came has already of an effect's parameter"""
         target = _native_targets(self.believed, self.candidates).get(name)
-        adds = target is not None and self.twin.parameters[name].null == 0.0
-        return self.believed.values[target] if adds else 0.0
+        if target is None or self.twin.parameters[name].null != 0.0:
+            return 0.0
+        return self.believed.values[target]
 
     def extended_by(self, causes: Sequence[str], theta: Float[np.ndarray, " p"]) -> Twin:
         """
@@ -278,6 +287,8 @@ class Hypotheses:
         return {"slot": candidate.slot, "index": candidate.index, "name": candidate.place}
 
 
+# What one bus, or one clock, does to all commands.
+_COMMON = (ActionDelay,)
 _OF_PARAMETER = "The twin's {} is not that of the system."
 _OF_DIRECTION = "The direction of the joint is taken the wrong way round, in position and velocity."
 
@@ -296,6 +307,8 @@ def _attached(twin: Twin, effects: Sequence[type[Effect]]) -> tuple[Twin, list[C
         for i, place in enumerate(places[kind.slot]):
             if f"{kind.name}.{place.name}" not in there:
                 wanted.append(kind(i))
+        if kind in _COMMON and len(twin.actuators) > 1:
+            wanted += [kind(ALL_PLACES)] * (f"{kind.name}.{ALL_PLACES}" not in there)
     extended = twin.extend(*wanted) if wanted else twin
     candidates = []
     for a in _attached_of(extended):
@@ -305,7 +318,7 @@ def _attached(twin: Twin, effects: Sequence[type[Effect]]) -> tuple[Twin, list[C
             Candidate(
                 a.effect.name,
                 a.effect.slot,
-                places[a.effect.slot][a.index].name,
+                ALL_PLACES if a.everywhere else places[a.effect.slot][a.index].name,
                 a.index,
                 tuple(f"{a.key}.{name}" for name in a.effect.parameters),
                 a.effect.explanation,

@@ -88,8 +88,9 @@ def _unseen(h: Hypotheses, data: Trajectories, moved: _Moved) -> Float[np.ndarra
         for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
             unit = h.twin.parameters[name].unit
             if candidate.slot == "actuator":
-                if unit == h.twin.actuators[candidate.index].unit and commands[candidate.index]:
-                    scale[i] = _OF_COMMAND * commands[candidate.index]
+                largest = commands.max() if candidate.index < 0 else commands[candidate.index]
+                if unit == h.twin.actuators[candidate.index].unit and largest:
+                    scale[i] = _OF_COMMAND * largest
             elif candidate.slot == "joint":
                 joint = h.twin.joints[candidate.index]
                 if unit == f"{joint.unit}/s" and speeds[candidate.index]:

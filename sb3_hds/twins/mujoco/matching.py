@@ -128,8 +128,8 @@ def arranged(twin: MechanismTwin, data: Trajectories) -> Trajectories:
     found = match(twin, [*report.obs, *(f"{name} command" for name in report.actions)])
     found.check()
     actions = [f"{name} command" for name in report.actions]
-    obs_at = [report.obs.index(name) for name in found.obs]
-    actions_at = [actions.index(name) for name in found.actions]
+    obs_at = [report.obs.index(str(name)) for name in found.obs]
+    actions_at = [actions.index(str(name)) for name in found.actions]
     return dataclasses.replace(
         data,
         obs=np.ascontiguousarray(data.obs[:, :, obs_at]),

@@ -47,7 +47,7 @@ from sb3_hds.twins.mujoco.quaternions import normalized, turn_between, turned
 
 # How far an episode begins from where the model stands [rad] or [m].
 _NEAR_START = 0.1
-_IDENTITY = (1.0, 0.0, 0.0, 0.0)
+_UNLIMITED = (-math.inf, math.inf)
 
 #: reward(state, action, next_state, params), and terminated(state, params)
 Reward = Callable[[State, Action, State, Params], Scalar]
@@ -112,7 +112,10 @@ class MechanismTwin(AnalyticTwin):
         self.actuation = Actuation(mechanism)
         self.parameters = self.equation.parameters | of_drives(mechanism)
         self.native_effects = native_effects(mechanism)
-        self.joints = tuple(Joint(*joint) for joint in dof_names(mechanism))
+        limits = [link.limit or _UNLIMITED for link in mechanism.links for _ in link.dofs]
+        self.joints = tuple(
+            Joint(*joint, *limit) for joint, limit in zip(dof_names(mechanism), limits, strict=True)
+        )
         self.actuators = tuple(_actuators(mechanism))
         self.channels = (*_positions(mechanism), *(_velocities(mechanism) * (observe == "qv")))
         self._reward, self._terminated = reward, terminated
