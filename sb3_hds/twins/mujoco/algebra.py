@@ -37,7 +37,7 @@ def mul(a: Number, b: Number) -> Number:
             return 0.0
         if b in (1.0, -1.0):
             return a if b == 1.0 else neg(a)
-    return lax.mul(a, b) if _alike(a, b) else a * b
+    return lax.mul(*_typed(a, b)) if _alike(a, b) else a * b
 
 
 def add(a: Number, b: Number) -> Number:
@@ -45,7 +45,7 @@ def add(a: Number, b: Number) -> Number:
         return b
     if isinstance(b, float) and b == 0.0:
         return a
-    return lax.add(a, b) if _alike(a, b) else a + b
+    return lax.add(*_typed(a, b)) if _alike(a, b) else a + b
 
 
 def sub(a: Number, b: Number) -> Number:
@@ -53,7 +53,7 @@ def sub(a: Number, b: Number) -> Number:
         return neg(b)
     if isinstance(b, float) and b == 0.0:
         return a
-    return lax.sub(a, b) if _alike(a, b) else a - b
+    return lax.sub(*_typed(a, b)) if _alike(a, b) else a - b
 
 
 def neg(a: Number) -> Number:
@@ -171,6 +171,12 @@ def _alike(a: Number, b: Number) -> bool:
     if not (isinstance(a, jax.Array) or isinstance(b, jax.Array)):
         return False
     return isinstance(a, float) or isinstance(b, float) or np.shape(a) == np.shape(b)
+
+
+def _typed(a: Number, b: Number) -> tuple[Number, Number]:
+    """Floats in the precision of the other number."""
+    a = b.dtype.type(a) if isinstance(a, float) else a
+    return a, a.dtype.type(b) if isinstance(b, float) else b
 
 
 def _library(x: Number) -> Any:

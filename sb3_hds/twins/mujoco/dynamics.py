@@ -155,8 +155,8 @@ def configuration(
     return Configuration(_side_by_side(axes, tree.dtype), inertia, carried)
 
 
-def origins_of(links: Sequence[Link], q: Sequence[Number]) -> list[Vector]:
-    """:return: where the frame of each link is in the world [m]"""
+def frames_of(links: Sequence[Link], q: Sequence[Number]) -> list[tuple[Matrix, Vector]]:
+    """:return: of each link, rotation and origin in the world [m]"""
     rotations: list[Matrix] = []
     origins: list[Vector] = []
     for link in links:
@@ -166,7 +166,7 @@ def origins_of(links: Sequence[Link], q: Sequence[Number]) -> list[Vector]:
         rotation, origin, _ = _through_joint(link, *_mounted(link, rotation, origin), q)
         rotations.append(rotation)
         origins.append(origin)
-    return origins
+    return list(zip(rotations, origins, strict=True))
 
 
 def _mounted(link: Link, rotation: Matrix, origin: Vector) -> tuple[Matrix, Vector]:

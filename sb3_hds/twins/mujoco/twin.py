@@ -33,8 +33,9 @@ from sb3_hds.core import (
 )
 from sb3_hds.core.types import Coordinates
 from sb3_hds.errors import ParameterError
+from sb3_hds.twins.mujoco import algebra as alg
 from sb3_hds.twins.mujoco.actuators import Actuation, Moving
-from sb3_hds.twins.mujoco.dynamics import origins_of
+from sb3_hds.twins.mujoco.dynamics import frames_of
 from sb3_hds.twins.mujoco.equation import Equation
 from sb3_hds.twins.mujoco.mechanism import BALL, FREE, SLIDE, Link, Mechanism
 from sb3_hds.twins.mujoco.parameters import (
@@ -258,20 +259,22 @@ class MechanismTwin(AnalyticTwin):
         return self._terminated(state, params)
 
     def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
-        """The mechanism seen along y: from the world to each joint, and back."""
-        zero = jnp.zeros_like(state.v[0])
-        places = [
-            jnp.stack([zero + place[0], zero + place[2]])
-            for place in origins_of(self.mechanism.links, list(state.q))
-        ]
-        points, base = [], jnp.stack([zero, zero])
-        for i in range(len(self.mechanism.links)):
+        """The mechanism seen along y: from the world through all joints to each last body."""
+        links, zero = self.mechanism.links, jnp.zeros_like(state.v[0])
+        frames = frames_of(links, list(state.q))
+        seen = lambda place: jnp.stack([zero + place[0], zero + place[2]])  # noqa: E731
+        places = [seen(origin) for _, origin in frames]
+        points = [jnp.stack([zero, zero])]
+        for i, link in enumerate(links):
+            if any(other.parent == i for other in links):
+                continue
             chain = [i]
-            while self.mechanism.links[chain[-1]].parent >= 0:
-                chain.append(self.mechanism.links[chain[-1]].parent)
-            if not any(other.parent == i for other in self.mechanism.links):
-                outwards = [base, *(places[j] for j in reversed(chain))]
-                points += [*outwards, *reversed(outwards[:-1])]
+            while links[chain[-1]].parent >= 0:
+                chain.append(links[chain[-1]].parent)
+            rotation, origin = frames[i]
+            tip = alg.vadd(origin, alg.apply(rotation, link.body.centre if link.body else alg.ZERO))
+            outwards = [*(places[j] for j in reversed(chain)), seen(tip)]
+            points += [*outwards, *reversed(outwards[:-1]), points[0]]
         return jnp.stack(points)
 
     # --- plain data
