@@ -15,9 +15,11 @@ import pytest
 import small_robots as robots
 from jax.flatten_util import ravel_pytree
 
-from sb3_hds import effects, twins
+from sb3_hds import Trajectories, effects, twins
 from sb3_hds.core import State, rollout
+from sb3_hds.data import audit
 from sb3_hds.errors import ModelFileError, ParameterError
+from sb3_hds.sysid.hypotheses import Hypotheses
 
 pytestmark = pytest.mark.usefixtures("quick_compilation", "x64")
 
@@ -552,3 +554,38 @@ def test_the_sketch_leads_through_all_joints():
     points = twin.sketch(State(jnp.array([0.5, 0.3]), jnp.zeros(2), {}), twin.params)
 
     np.testing.assert_allclose(points[:3], [[0.0, 0.0], [0.5, 1.0], [0.5, 1.0]], atol=1e-12)
+
+
+# --- data
+
+
+def test_recordings_at_a_limit_of_a_joint_are_a_caveat():
+    twin = twins.from_mujoco(robots.chain(2, range="-1.5 1.2"), dt=0.01)
+    time = np.linspace(0.0, 8.0, 801)
+    obs = np.stack([0.5 * np.sin(time), np.minimum(1.4 * np.sin(2.0 * time), 1.2)], 1)
+    obs = np.concatenate([obs, np.gradient(obs, 0.01, axis=0)], 1)
+    data = Trajectories.from_arrays([obs], [np.ones((800, 2))], dt=0.01)
+
+    found = [f for f in audit(data, twin=twin).findings if type(f).__name__ == "ReachedLimit"]
+
+    # 1.4 sin(2 t) reaches 1.2, less 0.2 % of the range, within 0.274 s of three tops in 8 s: 20 %.
+    assert [finding.channel for finding in found] == ["j1"] and not found[0].blocks
+    assert "Joint 'j1' is at its limit of 1.2 rad in 20 % of the samples" in str(found[0])
+    ignoring = twins.from_mujoco(robots.chain(2, range="-1.5 1.2"), ignore=["limits"])
+    assert all(np.isinf(joint.high) for joint in ignoring.joints)
+
+
+def test_what_is_asked_of_a_robot():
+    """A delay of the whole bus once; of a servo's own damping, friction is the candidate."""
+    twin = twins.from_mujoco(robots.chain(2, actuator="position"))
+    kinds = (effects.ActionDelay, effects.ViscousFriction, effects.CoulombFriction)
+
+    asked = Hypotheses.about(twin, kinds, ())
+
+    keys = {candidate.key for candidate in asked.candidates}
+    assert "action_delay.all" in keys and "parameter.m0_kp" in keys
+    assert "viscous_friction.j0" in keys and "coulomb_friction.j1" in keys
+    assert not keys & {"parameter.m0_kv", "parameter.j0_damping", "parameter.j1_frictionloss"}
+    lower = dict(zip(asked.names, asked.lower, strict=True))
+    # There may be less friction than the model has.
+    assert lower["viscous_friction.j0.b"] == -twin.values["j0_damping"]

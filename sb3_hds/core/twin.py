@@ -87,6 +87,9 @@ class Twin(abc.ABC):
     #: (effect name, index of its place) -> {its parameter: the twin's parameter that it adds to, or
     #: multiplies where the effect is absent at one}
     native_effects: Mapping[tuple[str, int], Mapping[str, str]] = {}
+    #: Parameters that someone has set and knows: a diagnosis does not question them, and a
+    #: calibration leaves them alone unless they are named.
+    known_parameters: frozenset[str] = frozenset()
     #: Structural choices with their defaults, set by keyword: ``{"goal": "stop"}``.
     options: ClassVar[Mapping[str, Any]] = {}
     #: Learned arrays of attached effects, by full name: pytrees that travel with the parameters.
@@ -305,6 +308,7 @@ class Twin(abc.ABC):
         self.differentiability = base.differentiability
         self.reward_has_gradient = base.reward_has_gradient
         self.parameters, self.values = base.parameters, dict(base.values)
+        self.known_parameters = base.known_parameters
         self.tensors = dict(base.tensors)
 
     def _set(self, values: Mapping[str, Any]) -> None:

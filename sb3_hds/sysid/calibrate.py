@@ -61,7 +61,7 @@ def calibrate(
 
     :param twin: whose values are where the search begins, and stay where they are not ``free``
     :param data: measured trajectories, sampled at the twin's ``dt``
-    :param free: names of the parameters to estimate; default: all of them
+    :param free: names of the parameters to estimate; default: all but ``twin.known_parameters``
     :param window: steps per window; default: half a second, between 5 and 50 steps, and not longer
         than the longest recording
     :param loss: ``"huber"``, for which outliers count less, or ``"linear"`` for plain squares
@@ -194,10 +194,11 @@ def _other_unit(ratio: float) -> str:
 
 
 def every_name(twin: Twin) -> tuple[str, ...]:
-    """:return: names of all parameters but the share of a learned force"""
+    """:return: names of all parameters but known ones and the share of a learned force"""
     force = force_of(twin)
     learned = () if force is None else (f"{force[0]}.share",)
-    return tuple(name for name in twin.parameters if name not in learned)
+    kept = {*learned, *twin.known_parameters}
+    return tuple(name for name in twin.parameters if name not in kept)
 
 
 def free_names(twin: Twin, free: Iterable[str] | None) -> tuple[str, ...]:

@@ -132,6 +132,7 @@ class Hypotheses:
                 f"Its parameters are: {', '.join(twin.parameters) or 'none'}."
             )
         own = tuple(name for name in twin.parameters if not name.endswith(".share"))
+        known = twin.known_parameters
         pushed = () if ConstantForce in effects else (ConstantForce,)
         rivals = tuple(kind for kind in NAMELESS if kind not in effects)
         extended, found = _attached(twin, (*effects, *pushed, *rivals))
@@ -145,7 +146,7 @@ class Hypotheses:
         candidates = [
             Candidate(f"parameter.{name}", PARAMETER, name, i, (name,), _OF_PARAMETER.format(name))
             for i, name in enumerate(own)
-            if name not in {*calibrate, *native.values(), *there}
+            if name not in {*calibrate, *native.values(), *there, *known}
         ]
         candidates += [
             c

@@ -113,6 +113,11 @@ class MechanismTwin(AnalyticTwin):
         self.actuation = Actuation(mechanism)
         self.parameters = self.equation.parameters | of_drives(mechanism)
         self.native_effects = native_effects(mechanism)
+        # What a drive is told to damp it knows; viscous friction would do just the same.
+        servos = ("position", "velocity")
+        self.known_parameters = frozenset(
+            f"{drive.name}_kv" for drive in mechanism.drives if drive.role in servos
+        )
         limits = [link.limit or _UNLIMITED for link in mechanism.links for _ in link.dofs]
         self.joints = tuple(
             Joint(*joint, *limit) for joint, limit in zip(dof_names(mechanism), limits, strict=True)
