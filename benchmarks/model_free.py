@@ -9,7 +9,8 @@ Ours run with their file in `hyperparams/`, the others with what RL Zoo has for 
 on that environment (those of -v4 for -v5; SBX's DroQ: that of SAC with its documented arguments;
 SB3's gSDE: that of SAC with what ours has on Pendulum-v1).
 `sac` is our GSDESAC without gSDE, `bro_fast` BRO with two updates per step; the critics of
-`crossq_jax_narrow` have an eighth of the paper's width, those of `simba_narrow` (with four times
+`crossq_jax_512` have the default width of the constructor, a quarter of the paper's, those of
+`crossq_jax_narrow` an eighth of it, those of `simba_narrow` (with four times
 the learning rate) and `bro_fast_narrow` a quarter, those of `tqc_jax_narrow` two layers of 256 for
 three of 512, which two cores can bear. HDS, which knows a simulation of Pendulum-v1,
 stands beside them with the few steps of its own file. Each run is a fresh process; training stops
@@ -93,6 +94,7 @@ OURS = {
     "simba_narrow": Ours("simba", _widths([128], [128, 128]) | {"learning_rate": 4e-4}, _SAC),
     "tqc_jax_narrow": Ours("tqc_jax", _widths([256, 256], [256, 256]), ("contrib_tqc", "sbx_tqc")),
     "bro_fast_narrow": Ours("bro", {"gradient_steps": 2} | _widths([256], [128, 128]), _SAC),
+    "crossq_jax_512": Ours("crossq_jax", _widths([256, 256], [512, 512]), _SAC),
 }
 _DROQ = {
     "policy_kwargs": {"dropout_rate": 0.01, "layer_norm": True},
@@ -124,6 +126,7 @@ _WIDE = ("Hopper-v5", "HalfCheetah-v5")
 ONLY_ON = (
     {"hds": (PENDULUM,)}
     | dict.fromkeys([method for method in OURS if method.endswith("_narrow")], _WIDE)
+    | {"crossq_jax_512": (PENDULUM, *_WIDE)}
     | dict.fromkeys(PEERS, _IN_THE_ZOO)
     | dict.fromkeys(("sb3_gsde_sac", "sbx_droq"), _WITHOUT_SDE)
 )

@@ -268,6 +268,10 @@ def draw_curves(panels: Sequence["Axes"], table: pd.DataFrame, env: str, with_ba
         panels[1].xaxis.set_minor_formatter("")
 
 
+# Lines of critics that are narrower than in the papers.
+_NARROW: dict[str, Any] = {"narrow": "-.", "512": (0, (6, 1))}
+
+
 def style_of(method: str) -> dict[str, Any]:
     """:return: colour by algorithm, line by library, or for narrow critics"""
     from matplotlib import colormaps
@@ -276,10 +280,10 @@ def style_of(method: str) -> dict[str, Any]:
     line = "-" if method in OURS else "--" if method.startswith("sbx") else ":"
     return {
         "color": colormaps["tab10"](list(OURS).index(same)),
-        "linestyle": line if plain(method) == method else "-.",
+        "linestyle": line if plain(method) == method else _NARROW[method.rpartition("_")[2]],
     }
 
 
 def plain(method: str) -> str:
     """:return: the method that has this one's algorithm and the widths of its paper"""
-    return method.removesuffix("_narrow")
+    return method.removesuffix("_narrow").removesuffix("_512")

@@ -21,6 +21,7 @@ from sb3_hds.sysid.evidence import Evidence, Point
 from sb3_hds.sysid.guesses import newton
 from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
 from sb3_hds.sysid.naming import Naming
+from sb3_hds.sysid.progress import Bar
 from sb3_hds.sysid.remainder import MissingForce, remainder
 from sb3_hds.sysid.search import Half, Search, _Reached
 from sb3_hds.sysid.shooting import shots_of
@@ -681,7 +682,7 @@ def test_windows_of_both_halves_count_alike_where_all_the_data_choose():
     )
 
     def chosen(order, parameters):
-        search = Search(*(halves[i] for i in order), effort=None, progress=False)
+        search = Search(*(halves[i] for i in order), effort=None, bar=Bar(False))
         base, tried = (
             SimpleNamespace(point=points[order[0]], kept=points[order[1]])
             for points in (before, after)

@@ -19,7 +19,6 @@ from sb3_hds.effects import (
     SensorDelay,
     TorqueGain,
 )
-from sb3_hds.errors import EffectError
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -178,26 +177,3 @@ def test_while_it_moves_one_way_dry_friction_is_a_constant_force(x64):
     np.testing.assert_allclose(
         *(moved(twin, pushes, speed=1.0).obs for twin in (dry, offset)), rtol=1e-12
     )
-
-
-def test_a_delay_of_all_actuators_is_the_same_delay_of_each(x64):
-    plain = twins.make("PayloadPendulum")
-    actions = np.random.default_rng(0).uniform(-0.5, 0.5, (20, len(plain.actuators)))
-    actions = jnp.asarray(actions)
-    common = plain.extend(ActionDelay("all", delay=0.03))
-    each = plain.extend(*(ActionDelay(i, delay=0.03) for i in range(len(plain.actuators))))
-
-    obs = [
-        rollout(twin, twin.params, twin.initial(jax.random.key(0), twin.params), actions).obs
-        for twin in (common, each)
-    ]
-
-    assert len(plain.actuators) > 1 and list(common.values)[-1] == "action_delay.all.delay"
-    np.testing.assert_allclose(*obs, rtol=1e-12)
-    back = twins.from_spec(common.to_spec(), [ActionDelay])
-    assert back == common and back != each
-
-
-def test_only_commands_have_an_effect_in_common():
-    with pytest.raises(EffectError, match="Effect 'coulomb_friction' names joint 'all', but Mass"):
-        Mass().extend(CoulombFriction("all"))

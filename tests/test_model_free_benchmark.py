@@ -81,6 +81,7 @@ def test_every_setting_of_a_method_is_an_argument_of_its_class(method):
     ("name", "arch", "other"),
     [
         ("tqc_jax", {"pi": [256, 256], "qf": [256, 256]}, {}),
+        ("crossq_jax", {"pi": [256, 256], "qf": [256, 256]}, {}),
         ("simba", {"pi": [128], "qf": [128, 128]}, {"learning_rate": 4e-4}),
     ],
 )
@@ -90,6 +91,19 @@ def test_narrow_critics_are_all_that_differs_but_for_the_learning_rate_of_simba(
     own = wide.get("policy_kwargs", {})
     assert narrow == wide | {"policy_kwargs": own | {"net_arch": arch}} | other
     assert own.get("net_arch") != arch
+
+
+@pytest.mark.parametrize(
+    ("method", "file"), [("crossq_jax_512", "CrossQ"), ("simba_narrow", "SimbaSAC")]
+)
+def test_defaults_are_what_was_measured(method, file):
+    algorithm, settings = model_free.made_of("HalfCheetah-v5", method)
+    default = algorithm(env="Pendulum-v1", buffer_size=10)
+
+    assert algorithm.__name__ == file
+    arch = settings["policy_kwargs"]["net_arch"]
+    assert default.policy.widths == (tuple(arch["pi"]), tuple(arch["qf"]))
+    assert default.learning_rate == settings.get("learning_rate", default.learning_rate)
 
 
 def test_what_a_narrow_layer_loses_of_its_steps_a_greater_learning_rate_makes_up_for():

@@ -21,7 +21,7 @@ WORN = ("hds_parts", "wrong twin", "ceiling")
 LEARNED = {
     "gsde_sac": ("sb3_gsde_sac", "sac", "sb3_sac", "sbx_sac"),
     "droq": ("sbx_droq", "sac"),
-    "crossq_jax": ("crossq_jax_narrow", "contrib_crossq", "sbx_crossq", "sac"),
+    "crossq_jax": ("crossq_jax_512", "crossq_jax_narrow", "contrib_crossq", "sbx_crossq", "sac"),
     "tqc_jax": ("contrib_tqc", "sbx_tqc", "sac"),
     "simba": ("simba_narrow", "sac", "sb3_sac", "sbx_sac"),
     "td7": ("sac", "sb3_sac", "sbx_sac"),

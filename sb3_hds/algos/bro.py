@@ -80,11 +80,11 @@ class BRO(SoftActorCritic):
     Their first values are no arguments (optimism 1, regulariser 0.25). As in the authors' code (MIT
     licence), fresh starts include the temperature, the multipliers and all optimisers, and the
     logarithms of multipliers and of the deviation of actions are squashed into their limits by
-    :math:`\tanh`: actions start
-    with a deviation near :math:`e^{-4}`, not near 1 as with SAC. Its quantile loss is a sum over
-    quantiles where this is their mean, a factor that Adam takes out again. The loss of the
-    entropy coefficient has the coefficient itself, as theirs. With ``use_sde=True``, which the
-    paper does not have, the optimistic actor explores by gSDE's noise. SBX has no BRO.
+    :math:`\tanh`: actions start with a deviation near :math:`e^{-4}`, not near 1 as with SAC. Its
+    quantile loss is a sum over quantiles where this is their mean, a factor that Adam takes out
+    again. The loss of the entropy coefficient has the coefficient itself, as theirs. With
+    ``use_sde=True``, which the paper does not have, the optimistic actor explores by gSDE's noise.
+    SBX has no BRO.
 
     :param policy: see :class:`~sb3_hds.algos.soft_actor_critic.SoftActorCritic`
     :param env: likewise

@@ -12,12 +12,14 @@ import gymnasium as gym
 import jax
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
+from gymnasium.vector import VectorEnv
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_hds.algos.epoch import PLANNERS
+from sb3_hds.algos.mistakes import check_action_space, checked_env
 from sb3_hds.errors import EnvironmentMismatchError, did_you_mean
 
 if TYPE_CHECKING:
@@ -83,16 +85,16 @@ def policy_and_env(
     :param check: raises for observations that the algorithm cannot use
     :param monitor_wrapper: whether SB3 may wrap a lone environment in its ``Monitor``
     :return: policy and environment in SB3's order; the environment made, if it was a string
-    :raises EnvironmentMismatchError: for observations that the algorithm cannot use
+    :raises EnvironmentMismatchError: for what is no environment, and for observations and actions
+        that the algorithm cannot use
     :raises ValueError: for a policy that it cannot use
     """
-    aliases = algorithm.policy_aliases
-    if env is None and (
-        isinstance(policy, gym.Env | VecEnv) or (isinstance(policy, str) and policy not in aliases)
-    ):
+    names_env = isinstance(policy, str) and not policy.endswith("Policy")
+    if env is None and (names_env or isinstance(policy, gym.Env | VecEnv | VectorEnv)):
         policy, env = None, policy
     if env is not None:
-        env = maybe_make_env(env, 0)
+        env = checked_env(algorithm, env)
+        check_action_space(algorithm, env.action_space)
         check(env.observation_space)
         of_several = isinstance(env.observation_space, spaces.Dict)
         policy = policy or ("MultiInputPolicy" if of_several else "MlpPolicy")

@@ -76,6 +76,8 @@ def learn_compiled(
     :raises SeedsDivergedError: if a seed diverged, when the others are done; it has what they
         learned
     """
+    if not isinstance(seeds, Iterable):
+        raise ValueError(f"learn_compiled(seeds={seeds!r}): pass several, such as range(4).")
     seeds = [int(seed) for seed in seeds]
     _refuse_what_needs_python(model, total_timesteps, seeds)
     models = [_copy_of(model, seed) for seed in seeds]

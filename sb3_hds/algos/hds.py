@@ -15,6 +15,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_hds.algos.correction import Correction, Since, Wishes, correct, names_to_estimate
 from sb3_hds.algos.log import record_correction
 from sb3_hds.algos.measured import Measured, data_from
+from sb3_hds.algos.mistakes import as_list
 from sb3_hds.algos.model import check_known, missing_effects, nulls_of, required
 from sb3_hds.algos.pretraining import meanwhile, nothing
 from sb3_hds.algos.twin_algorithm import TwinAlgorithm
@@ -215,8 +216,9 @@ class HDS(TwinAlgorithm):
         _init_setup_model: bool = True,
     ) -> None:
         self.calibrated = calibrated
-        self.effects = [e if isinstance(e, str) else e.to_spec() for e in effects]
-        self.suspected = tuple(suspected)
+        several = as_list("effects", effects, Effect)
+        self.effects = [e if isinstance(e, str) else e.to_spec() for e in several]
+        self.suspected = tuple(as_list("suspected", suspected, str))
         self.residual = residual
         self.residual_kwargs = residual_kwargs
         self.beta = beta

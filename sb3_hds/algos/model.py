@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from sb3_hds import effects, twins
+from sb3_hds.algos.mistakes import in_one_line
 from sb3_hds.core import Effect, Twin
 from sb3_hds.core.layers import plant_of
 from sb3_hds.errors import NoTwinError, RewardError
@@ -25,6 +26,22 @@ def check_reward(twin: Twin) -> None:
             f"The reward of {twin.name} is flat almost everywhere, so its gradient tells nothing. "
             "Implement `planning_reward`: a smooth surrogate that is best where the reward is best."
         )
+
+
+def twin_given(twin: Any) -> Twin | None:
+    """
+    :param twin: one, its name, or None
+    :raises NoTwinError: for a name that is not registered
+    :raises TypeError: for anything else
+    """
+    if twin is None or isinstance(twin, Twin):
+        return twin
+    if isinstance(twin, str):
+        return twins.make(twin)
+    raise TypeError(
+        f"twin={in_one_line(twin)}: twin must be a twin, as from twins.make('Pendulum'), its name, "
+        "or None for that of the environment."
+    )
 
 
 def required(twin: Twin | None, spec: dict[str, Any] | None) -> Twin:

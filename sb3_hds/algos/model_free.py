@@ -4,7 +4,6 @@ import inspect
 import itertools
 import math
 import numbers
-import operator
 import warnings
 from abc import abstractmethod
 from collections import ChainMap
@@ -157,7 +156,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             tensorboard_log=tensorboard_log,
             verbose=verbose,
             # Python's own generator, which SB3 seeds as well, takes no number of NumPy.
-            seed=None if seed is None else operator.index(seed),
+            seed=None if seed is None else int(seed),
             use_sde=use_sde,
             sde_sample_freq=sde_sample_freq,
             use_sde_at_warmup=use_sde_at_warmup,
@@ -208,9 +207,15 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         :param gradient_steps: how many
         :param batch_size: transitions in each
         :raises DivergedError: if one of them diverged; the model keeps its last good state
+        :raises ValueError: if there is nothing to learn from
         """
         self._maybe_reset_params()
         rate, qf_rate = self.learning_rates()
+        if gradient_steps > 0 and self.replay_buffer.size() == 0:  # type: ignore[union-attr]
+            raise ValueError(
+                f"{type(self).__name__} has nothing to learn from: its replay buffer is empty. "
+                "Call learn(), or load_replay_buffer(path) first."
+            )
         before = int(self.policy.learner.n_updates)
         try:
             report = self._updates(gradient_steps, batch_size)
@@ -385,9 +390,9 @@ class ModelFreeAlgorithm(TensorAlgorithm):
 
     def _check_collection(self) -> None:
         freq: Any = self.train_freq
-        fewest = freq[0] if isinstance(freq, tuple) and freq else freq
-        # SB3 refuses what is no number of steps or episodes.
-        fine = not isinstance(fewest, int) or fewest >= 1
+        fewest, unit = freq if isinstance(freq, tuple) and len(freq) == 2 else (freq, "step")
+        units = [each.value for each in TrainFrequencyUnit]
+        fine = is_count(fewest, 1) and getattr(unit, "value", unit) in units
         self.refuse_unless(fine, "train_freq", "a number of at least 1, or (n, 'episode')")
         fine = self.action_noise is None or isinstance(self.action_noise, ActionNoise)
         self.refuse_unless(fine, "action_noise", "None or an ActionNoise of SB3")

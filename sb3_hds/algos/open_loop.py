@@ -27,6 +27,7 @@ from sb3_hds.algos.call_forms import (
 )
 from sb3_hds.algos.gait_space import Constants, GaitSpace
 from sb3_hds.algos.gait_trials import Trial, Trials
+from sb3_hds.algos.mistakes import check_log_interval, whole_steps
 from sb3_hds.algos.oscillator_policy import OscillatorPolicy
 from sb3_hds.algos.persistence import TensorPolicy
 from sb3_hds.algos.saving import SavesTensors
@@ -367,7 +368,8 @@ class OpenLoop(SavesTensors):
         :param reset_num_timesteps: False goes on counting
         :param progress_bar: show one
         """
-        total = self.default_timesteps if total_timesteps is None else total_timesteps
+        check_log_interval(log_interval)
+        total = whole_steps(self.default_timesteps if total_timesteps is None else total_timesteps)
         name = tb_log_name or type(self).__name__
         total_timesteps, callback = self._setup_learn(
             total, callback, reset_num_timesteps, name, progress_bar

@@ -122,6 +122,8 @@ def existing(path: Any, suffix: str = "zip") -> Any:
 
 def _opened(path: Any) -> contextlib.AbstractContextManager[Any]:
     path = existing(path)
+    if not (isinstance(path, Path) or hasattr(path, "seek")):
+        raise TypeError(f"Expected the path of a file, or an open file, got {path!r}.")
     return path.open("rb") if isinstance(path, Path) else contextlib.nullcontext(path)
 
 
@@ -210,6 +212,11 @@ def refuse_odd(observation: Any) -> None:
             "`obs, info = env.reset()`, or `obs = vec_env.reset()`."
         )
     parts = observation.values() if isinstance(observation, dict) else [observation]
+    if not all(np.asarray(part).dtype.kind in "biuf" for part in parts):
+        raise ValueError(
+            f"predict() got {observation!s:.100}, which is no observation: pass what reset() and "
+            "step() return, an array of numbers."
+        )
     if not all(np.isfinite(part).all() for part in parts):
         raise ValueError(
             f"predict() got an observation that is not finite: {observation}. No "

@@ -1,15 +1,25 @@
 """Saving and loading of every algorithm: tensors, in files that are whole or not there."""
 
+import contextlib
 import io
 import pathlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any, Self
 
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import load_from_zip_file
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_hds.algos.call_forms import device_or_cpu
+from sb3_hds.algos.mistakes import (
+    callbacks_of,
+    check_given,
+    check_has_env,
+    checked_env,
+    in_one_line,
+    whole_steps,
+)
 from sb3_hds.algos.persistence import (
     by_names,
     damage_reported,
@@ -18,12 +28,33 @@ from sb3_hds.algos.persistence import (
     write_whole,
 )
 from sb3_hds.algos.policy_description import described
+from sb3_hds.errors import EnvironmentMismatchError
+
+
+@contextlib.contextmanager
+def _misfits_told() -> Iterator[None]:
+    """
+    :raises EnvironmentMismatchError: where SB3 finds other spaces, in one line
+    """
+    try:
+        yield
+    except ValueError as error:
+        if "spaces do not match" not in str(error):
+            raise
+        raise EnvironmentMismatchError(
+            f"{in_one_line(error)}: this model learned in an environment with the former. Pass one "
+            "like it, or make a new model."
+        ) from error
 
 
 class SavesTensors(BaseAlgorithm):
     """Abstract: an algorithm whose policy is a :class:`~sb3_hds.algos.persistence.TensorPolicy`."""
 
     policy_description: dict[str, Any] | None
+
+    def __new__(cls, *args: Any, **given: Any) -> Self:
+        check_given(cls, given)
+        return super().__new__(cls)
 
     def save(
         self,
@@ -61,12 +92,35 @@ class SavesTensors(BaseAlgorithm):
         :param env: to go on training in; none is needed to predict
         :param device: where to; ``"cuda"`` means the CPU where there is none, with a warning
         :raises ValueError: for a damaged file, or one that another algorithm saved
+        :raises TypeError: for an argument that neither this nor the constructor has
         """
+        check_given(cls, kwargs, loading=True)
+        env = None if env is None else checked_env(cls, env)
         if kwargs.get("policy_kwargs"):
             kwargs["policy_kwargs"] = by_names(kwargs["policy_kwargs"])
         refuse_damaged(path, "data", "policy.pth")
-        with damage_reported(path):
+        with damage_reported(path), _misfits_told():
             return super().load(path, env, device_or_cpu(device), *args, **kwargs)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        SB3's ``set_env``.
+
+        :param env: with the spaces of the one before, or its id
+        :param force_reset: False goes on from where the environment is
+        :raises EnvironmentMismatchError: for one with other spaces, and for what is none
+        """
+        with _misfits_told():
+            super().set_env(checked_env(type(self), env), force_reset)
+
+    def _setup_learn(
+        self, total_timesteps: int, *args: Any, **kwargs: Any
+    ) -> tuple[int, BaseCallback]:
+        check_has_env(self)
+        return super()._setup_learn(whole_steps(total_timesteps), *args, **kwargs)
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        return super()._init_callback(callbacks_of(callback), progress_bar)  # type: ignore[arg-type]
 
     def check_weights(self) -> None:
         """

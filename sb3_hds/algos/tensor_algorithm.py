@@ -14,9 +14,11 @@ from stable_baselines3.common.type_aliases import MaybeCallback, RolloutReturn
 
 from sb3_hds.algos.call_forms import check_origin, check_policy_kwargs
 from sb3_hds.algos.executed_actions import executed
+from sb3_hds.algos.mistakes import check_buffer, check_buffer_class, check_log_interval
 from sb3_hds.algos.pace import Pace
 from sb3_hds.algos.persistence import TensorPolicy, by_names, damaged, write_whole
 from sb3_hds.algos.saving import SavesTensors
+from sb3_hds.errors import EnvironmentMismatchError
 
 _STATISTICS = ("obs_rms", "ret_rms", "returns")
 
@@ -77,6 +79,7 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         :param reset_num_timesteps: False goes on counting
         :param progress_bar: show one
         """
+        check_log_interval(log_interval)
         if total_timesteps is None:
             total_timesteps = self.default_timesteps
         learned = super().learn(
@@ -170,18 +173,24 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
 
         :param path: of a file that ``save_replay_buffer`` wrote; ``.pkl`` may be left out
         :param truncate_last_traj: of a buffer of HER, whether its last episode has ended
-        :raises ValueError: for a damaged file; the buffer of before is then still there
+        :raises ValueError: for a damaged file, and for a buffer of another environment; that of
+            before is then still there
         """
-        before = self.replay_buffer
+        before: Any = getattr(self, "replay_buffer", None)
         try:
             super().load_replay_buffer(path, truncate_last_traj)
         except (OSError, AssertionError):
             raise
         # Where pickle meets damage, it may raise anything.
         except Exception as error:
-            if self.replay_buffer is not before:
+            if getattr(self, "replay_buffer", None) is not before:
                 raise
             raise damaged(path, error) from error
+        try:
+            check_buffer(self, self.replay_buffer, path)
+        except EnvironmentMismatchError:
+            self.replay_buffer = before
+            raise
         # SBX marks the buffer as the CPU's, where SB3 has the model's device.
         self.replay_buffer.device = self.device  # type: ignore[union-attr]
 
@@ -190,7 +199,14 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         check_policy_kwargs(self.policy_class, self.policy_kwargs)
         self.policy_kwargs = by_names(self.policy_kwargs)
         self.check_arguments()
-        super()._setup_model()
+        check_buffer_class(type(self), self.replay_buffer_class, self.observation_space)
+        try:
+            super()._setup_model()
+        except MemoryError as error:
+            raise MemoryError(
+                f"{type(self).__name__}(buffer_size={self.buffer_size}): the replay buffer does "
+                f"not fit into memory ({error}). Pass a smaller buffer_size."
+            ) from error
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_statistics", "_pace"]

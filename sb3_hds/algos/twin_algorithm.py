@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import (
@@ -27,7 +27,6 @@ from stable_baselines3.common.type_aliases import (
     TrainFreq,
 )
 
-from sb3_hds import twins
 from sb3_hds.algos.arguments import knobs_of, settings_of
 from sb3_hds.algos.call_forms import (
     check_arguments,
@@ -45,7 +44,8 @@ from sb3_hds.algos.learner import (
     longest_episode,
 )
 from sb3_hds.algos.log import record_epoch
-from sb3_hds.algos.model import check_reward, required, twin_from_spec
+from sb3_hds.algos.mistakes import callbacks_of
+from sb3_hds.algos.model import check_reward, required, twin_from_spec, twin_given
 from sb3_hds.algos.normalisation import prepare_statistics, view_of
 from sb3_hds.algos.persistence import Tensors
 from sb3_hds.algos.pretraining import Pretraining, meanwhile, nothing
@@ -156,7 +156,7 @@ class TwinAlgorithm(TensorAlgorithm):
             support_multi_env=True,
         )
         self.value_learning_rate = value_learning_rate
-        self.twin: Twin | None = twins.make(twin) if isinstance(twin, str) else twin
+        self.twin: Twin | None = twin_given(twin)
         self.twin_spec: dict[str, Any] | None = None
         self.pretrain_epochs = pretrain_epochs
         self.n_rollouts = n_rollouts
@@ -323,8 +323,8 @@ class TwinAlgorithm(TensorAlgorithm):
     def _setup_twin(self) -> None:
         """The twin that was passed, or saved because it had been, or the environment's own."""
         given: Any = self.twin  # a name, where one was passed to `load`
-        if isinstance(given, str):
-            self.twin = twins.make(given)
+        if given is not None and not isinstance(given, Twin):
+            self.twin = twin_given(given)
         elif given is None and self.twin_spec is not None:
             self.twin = twin_from_spec(self.twin_spec)
         if self.twin is not None:
@@ -441,13 +441,8 @@ class TwinAlgorithm(TensorAlgorithm):
         self._epochs_done += planned - 1 - self.pretraining_due
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        if callback is None:
-            given = []
-        elif isinstance(callback, list):
-            given = callback
-        else:
-            given = [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
-        return super()._init_callback(Pretraining(given, progress_bar), progress_bar)
+        around = Pretraining(callbacks_of(callback), progress_bar)
+        return super()._init_callback(around, progress_bar)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names, variables = super()._get_torch_save_params()

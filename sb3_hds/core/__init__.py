@@ -13,6 +13,7 @@ from sb3_hds.core.effect import (
     JointEffect,
     JointMoment,
     Moment,
+    Ranges,
     SensorEffect,
 )
 from sb3_hds.core.extended import ExtendedTwin
@@ -83,6 +84,7 @@ __all__ = [
     "Parameter",
     "Params",
     "Position",
+    "Ranges",
     "RateLimit",
     "RescaleAction",
     "RescaleObservation",

@@ -3,6 +3,7 @@
 import abc
 import math
 from functools import lru_cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -66,6 +67,9 @@ class AnalyticTwin(Twin):
         force = self.actuate(state, command, params) + added
         load = self.bias(state.q, state.v, params)
         return solve_spd(self.mass_matrix(state.q, params), force - load)
+
+    def structure(self) -> tuple[Any, ...]:
+        return (*super().structure(), self.integrator)
 
     def limit_velocity(self, v: Velocity) -> Velocity:
         """Where the environment clips speeds."""

@@ -82,12 +82,33 @@ class JointMoment(NamedTuple):
     h: float
 
 
+class Ranges(NamedTuple):
+    """
+    What the data of one place cover, for grids of parameters.
+
+    :param excursion: how far the joint moves [rad] or [m]
+    :param speed: how fast it moves, root mean square [rad/s] or [m/s]
+    :param command: root mean square of the command, in its unit
+    :param largest: largest command
+    :param dt: sampling interval [s]
+    :param period: of the motion [s]
+    :param turn: a whole turn of the joint, or infinity where it slides
+    """
+
+    excursion: float
+    speed: float
+    command: float
+    largest: float
+    dt: float
+    period: float
+    turn: float
+
+
 class Effect(abc.ABC):
     """
     Something real hardware does and the twin does not. It vanishes when its parameters are null.
 
-    :param where: index or name of the joint, actuator or channel that it acts on; ``"all"`` for an
-        effect on commands that is the same for all actuators
+    :param where: index or name of the joint, actuator or channel that it acts on
     :param values: values of its parameters by name; default: null, where it changes nothing
     :raises EffectError: for an unknown parameter
     :raises ParameterError: for a value out of bounds
@@ -109,7 +130,14 @@ class Effect(abc.ABC):
     #: parameters of which none may be smaller than the one before, or a diagnosis does not give the
     #: effect's name to what it fitted
     ascending: ClassVar[tuple[str, ...]] = ()
-    #: after how long its memory, if it has one, no longer tells how it began [s]
+    #: the one parameter that it has, if it is not linear in it: an equation error interpolates
+    #: between the values of ``grid``
+    chained: ClassVar[str] = ""
+    #: a parameter that two slopes, taken at two values of it, stand for: where a spring rests, the
+    #: phase of a wave
+    blended: ClassVar[str] = ""
+    #: after how long its memory, if it has one, no longer tells how it began, in periods of the
+    #: motion
     forgets: ClassVar[float] = 0.4
     #: learned arrays by name, pytrees that travel with the parameters; most effects have none
     tensors: Mapping[str, Any] = MappingProxyType({})
@@ -146,6 +174,24 @@ class Effect(abc.ABC):
             and many optima elsewhere: values by name; empty for effects that one start serves
         """
         return ()
+
+    def grid(self, ranges: Ranges) -> tuple[Mapping[str, float], ...]:
+        """
+        :param ranges: what the data cover
+        :return: values by name between which an equation error interpolates (``chained``), or at
+            which it takes slopes by the other parameters; empty where slopes at the null will do
+        """
+        return self.starts(ranges.excursion, 2.0 * ranges.speed)
+
+    def blend(
+        self, sizes: tuple[float, float], settings: tuple[Mapping[str, float], Mapping[str, float]]
+    ) -> dict[str, float]:
+        """
+        :param sizes: of the effect's first parameter in two settings that differ in ``blended``
+        :param settings: values by name
+        :return: values of the one effect that does what both do together
+        """
+        raise NotImplementedError(f"{self.name} is no blend of two settings.")
 
     def doubt(self, twin: "Twin", state: Any, action: Action, base: Params, own: Params) -> Scalar:
         """
@@ -287,10 +333,6 @@ class SensorEffect(Effect):
         return memory
 
 
-#: the place of an ``ActionEffect`` that all actuators share, with one set of parameters
-ALL_PLACES = "all"
-
-
 @dataclasses.dataclass(frozen=True)
 class Attached:
     """
@@ -298,17 +340,12 @@ class Attached:
 
     :param key: full name, ``"viscous_friction.hinge"``: prefix of its parameters, key of its memory
     :param effect: the effect
-    :param index: index of the joint, actuator or channel; -1 for all actuators
+    :param index: index of the joint, actuator or channel
     """
 
     key: str
     effect: Effect
     index: int
-
-    @property
-    def everywhere(self) -> bool:
-        """Whether it acts on all actuators alike."""
-        return self.index < 0
 
     def own(self, params: Params) -> Params:
         """:return: the effect's own parameters and tensors, without prefix"""
@@ -385,14 +422,8 @@ class EffectChain:
     ) -> tuple[Action, dict[str, Memory]]:
         """:return: the command that reaches the plant for ``h`` seconds, and the memory after it"""
         for attached, effect, params in self._actions:
-            before = memory[attached.key]
-            if attached.everywhere:
-                act = jax.vmap(effect.act, (0, 0, None, None))
-                action, after = act(action, before, h, params)
-            else:
-                command, after = effect.act(action[attached.index], before, h, params)
-                action = action.at[attached.index].set(command)
-            memory = memory | {attached.key: after}
+            command, after = effect.act(action[attached.index], memory[attached.key], h, params)
+            action, memory = action.at[attached.index].set(command), memory | {attached.key: after}
         return action, memory
 
     def force(self, moment: Moment, memory: dict[str, Memory], held: bool = False) -> Force:

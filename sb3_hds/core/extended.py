@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.core.effect import (
-    ALL_PLACES,
     NO_EFFECTS,
     ActionEffect,
     Attached,
@@ -205,10 +204,6 @@ class ExtendedTwin(Twin):
         for a in self._simulated:
             if isinstance(a.effect, ForceEffect | ActionEffect):
                 memory[a.key] = a.effect.memory(self.base)
-            if a.everywhere:
-                n = len(self.base.actuators)
-                each = lambda leaf: jnp.broadcast_to(leaf, (n, *jnp.shape(leaf)))  # noqa: B023, E731
-                memory[a.key] = jax.tree.map(each, memory[a.key])
         obs = self.base.observe(state, self._base_params(params))
         for a, sensor in self._sensors:
             memory[a.key] = sensor.memory(obs[a.index], self.base)
@@ -241,8 +236,6 @@ def _attach(effect: Effect, twin: Twin) -> Attached:
         effect.slot
     ]
     names = [place.name for place in places]
-    if effect.where == ALL_PLACES not in names and isinstance(effect, ActionEffect):
-        return Attached(f"{effect.name}.{ALL_PLACES}", effect.fitted_to(twin), -1)
     index = names.index(effect.where) if effect.where in names else effect.where
     if not isinstance(index, int) or not 0 <= index < len(names):
         raise EffectError(
@@ -267,8 +260,8 @@ def _in_units_of(parameter: Parameter, twin: Twin, attached: Attached) -> Parame
     if parameter.unit == "channel unit":
         return dataclasses.replace(parameter, unit=twin.channels[index].unit)
     if parameter.unit == "command unit":
-        meant = twin.actuators if attached.everywhere else (twin.actuators[index],)
-        largest = max(max(abs(actuator.low), abs(actuator.high)) for actuator in meant)
+        actuator = twin.actuators[index]
+        largest = max(abs(actuator.low), abs(actuator.high))
         scale = parameter.scale * (largest if 0.0 < largest < math.inf else 1.0)
-        return dataclasses.replace(parameter, unit=meant[0].unit, scale=scale)
+        return dataclasses.replace(parameter, unit=actuator.unit, scale=scale)
     return parameter

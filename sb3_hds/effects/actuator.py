@@ -1,22 +1,28 @@
 """What happens to a command on its way to the plant."""
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 
-from sb3_hds.core import ActionEffect, Memory, Parameter, Params, Scalar
-from sb3_hds.effects.shapes import beyond
+from sb3_hds.core import ActionEffect, Memory, Parameter, Params, Ranges, Scalar
+from sb3_hds.effects.shapes import beyond, limited
 
 if TYPE_CHECKING:
     from sb3_hds.core import Twin
 
 # A command that no drive has yet received.
 _AT_REST = 0.0
-# Longest delay that can be simulated [s].
+# Longest delay that can be simulated where nobody says [s].
 _LONGEST_DELAY = 0.2
 # Time constants below this share of a sub-step leave nothing of the past: exp(-1000) is zero.
 _INSTANT = 1e-3
+# Between which equation errors interpolate: lags and delays in intervals and as shares of a period
+# of the motion, widths in root mean square commands, limits in the largest one.
+_LAGS = (0.0, 0.5, 1.0, 1.6, 2.5, 4.0, 6.0, 9.0, 13.0, 18.0)
+_LONGEST_SHARE = 0.3
+_WIDTHS = (0.0, 0.1, 0.2, 0.36, 0.56, 0.84, 1.2, 1.7, 2.4)
+_LIMITS = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)
 
 
 class TorqueGain(ActionEffect):
@@ -60,7 +66,13 @@ class MotorLag(ActionEffect):
     parameters = {"time_constant": Parameter(null=0.0, scale=0.02, unit="s", lower=0.0, upper=2.0)}
     explanation = "The drive takes time to reach what it is told, as a motor with inductance does."
     source = "Åström and Murray 2021, section 3"
+    chained = "time_constant"
     equivalents = {"action_delay": "where commands change slowly compared with either"}
+
+    def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
+        longest = min(_LONGEST_SHARE * ranges.period, self.parameters["time_constant"].upper)
+        values = [lag * ranges.dt for lag in _LAGS]
+        return tuple({"time_constant": t} for t in values if t <= max(longest, ranges.dt))
 
     def memory(self, twin: "Twin") -> Memory:
         return jnp.asarray(_AT_REST)
@@ -88,6 +100,9 @@ class ActionDelay(ActionEffect):
     growing delay.
 
     Source: Åström and Murray, *Feedback Systems*, Princeton University Press 2021, section 10.
+
+    :param longest: option; longest delay that can be simulated [s]
+    :raises EffectError: unless it is positive
     """
 
     name = "action_delay"
@@ -96,14 +111,34 @@ class ActionDelay(ActionEffect):
     }
     explanation = "Commands reach the drive late, as over a bus or a radio link."
     source = "Åström and Murray 2021, section 10"
+    chained = "delay"
     equivalents = {
         "motor_lag": "where commands change slowly compared with either",
         "sensor_delay": "where every channel is as late and nothing is fed back",
     }
 
+    def __init__(
+        self, where: int | str = 0, *, longest: float = _LONGEST_DELAY, **values: float
+    ) -> None:
+        self.longest, own = limited(self, "delay", longest)
+        self.parameters = own  # type: ignore[misc]  # with a limit of its own
+        super().__init__(where, **values)
+
+    def structure(self) -> tuple[Any, ...]:
+        return (*super().structure(), self.longest)
+
+    def to_spec(self) -> dict[str, Any]:
+        return super().to_spec() | {"options": {"longest": self.longest}}
+
+    def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
+        """Exact for what lies between: a held command that comes a part of an interval later."""
+        longest = min(_LONGEST_SHARE * ranges.period, self.longest)
+        n = max(1, min(int(longest / ranges.dt + 1e-9), 24))
+        return tuple({"delay": k * ranges.dt} for k in range(n + 1))
+
     def memory(self, twin: "Twin") -> Memory:
         """The commands of the last control intervals, the latest first, and a clock."""
-        intervals = math.ceil(_LONGEST_DELAY / twin.dt - 1e-9) + 1
+        intervals = math.ceil(self.longest / twin.dt - 1e-9) + 1
         return {
             "commands": jnp.full(intervals, _AT_REST),
             "elapsed": jnp.asarray(twin.dt),
@@ -177,7 +212,13 @@ class DeadZone(ActionEffect):
     parameters = {"width": Parameter(null=0.0, scale=0.1, unit="command unit", lower=0.0)}
     explanation = "Small commands do not move the drive, and larger ones lose as much."
     source = "Slotine and Li 1991, section 5.2"
+    chained = "width"
     equivalents = {"coulomb_friction": "while the joint moves the way it is driven"}
+
+    def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
+        """None is wider than the largest command: that would be a gain of zero."""
+        widths = [share * ranges.command for share in _WIDTHS]
+        return tuple({"width": w} for w in widths if w < ranges.largest)
 
     def act(
         self, command: Scalar, memory: Memory, h: float, params: Params
@@ -206,6 +247,10 @@ class Saturation(ActionEffect):
         "The drive does not reach the largest commands, because of its current or voltage."
     )
     source = "Slotine and Li 1991, section 5.2"
+    chained = "limit"
+
+    def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
+        return tuple({"limit": share * ranges.largest} for share in _LIMITS if ranges.largest)
 
     def act(
         self, command: Scalar, memory: Memory, h: float, params: Params

@@ -1,12 +1,17 @@
 """Friction and drag at a joint."""
 
+import dataclasses
+import math
+from typing import Any
+
 import jax.numpy as jnp
 
 from sb3_hds.core import JointEffect, JointMoment, Memory, Parameter, Params, Scalar
-from sb3_hds.effects.shapes import dry_friction
+from sb3_hds.effects.shapes import STANDSTILL, dry_friction
+from sb3_hds.errors import EffectError
 
-# Smallest speed at which friction can be said to fall [rad/s] or [m/s]: there it is smoothed.
-_SLOWEST = 0.01
+# Speed at which friction falls before data say, in units of that below which it is smoothed.
+_FALLS = 10.0
 # Of the speed of a motion: up to where its friction may fall.
 _SHARES = (0.03, 0.1, 0.3, 1.0)
 
@@ -68,17 +73,45 @@ class DirectionalViscousFriction(JointEffect):
         return -jnp.minimum(b, joint.inertia / joint.h) * joint.v
 
 
-class CoulombFriction(JointEffect):
+class DryFriction(JointEffect):
+    """
+    A force against the motion that jumps at standstill, smoothed so that it can be simulated.
+
+    :param standstill: option; speed below which it is smoothed [rad/s] or [m/s]
+    :raises EffectError: unless that is positive
+    """
+
+    def __init__(
+        self, where: int | str = 0, *, standstill: float = STANDSTILL, **values: float
+    ) -> None:
+        if not (isinstance(standstill, int | float) and 0.0 < standstill < math.inf):
+            raise EffectError(f"standstill is a positive speed, got {standstill!r}.")
+        self.standstill = float(standstill)
+        super().__init__(where, **values)
+
+    def against(self, joint: JointMoment, level: Scalar | float) -> Scalar:
+        """:return: a force of this size against the motion"""
+        return dry_friction(joint, level, self.standstill)
+
+    def structure(self) -> tuple[Any, ...]:
+        return (*super().structure(), self.standstill)
+
+    def to_spec(self) -> dict[str, Any]:
+        return super().to_spec() | {"options": {"standstill": self.standstill}}
+
+
+class CoulombFriction(DryFriction):
     r"""
     Dry friction: opposes motion with a force that does not depend on speed.
 
-    .. math:: \tau = -\tau_c \tanh(v / w), \qquad w = \max(0.01\ \mathrm{rad/s},\; \tau_c h / I)
+    .. math:: \tau = -\tau_c \tanh(v / w), \qquad w = \max(w_0,\; \tau_c h / I)
 
-    The sign function is smoothed over :math:`w`, which never falls below what a sub-step :math:`h`
-    can stop (:math:`I` is the joint's effective inertia): so friction at one joint does not
-    overshoot standstill at any step length. What this costs: a joint never sticks; under a load
-    :math:`f < \tau_c` it creeps at :math:`w\,\mathrm{artanh}(f / \tau_c)` instead. Dry friction at
-    several strongly coupled joints at once may chatter around standstill if :math:`h` is long.
+    The sign function is smoothed over :math:`w`: at least :math:`w_0`, the option ``standstill``,
+    and never less than what a sub-step :math:`h` can stop (:math:`I` is the joint's effective
+    inertia): so friction at one joint does not overshoot standstill at any step length. What this
+    costs: a joint never sticks; under a load :math:`f < \tau_c` it creeps at
+    :math:`w\,\mathrm{artanh}(f / \tau_c)` instead. Dry friction at several strongly coupled
+    joints at once may chatter around standstill if :math:`h` is long.
 
     Source: Olsson et al., *Friction models and friction compensation*, European Journal of Control
     4(3), 1998, section 2.
@@ -99,10 +132,10 @@ class CoulombFriction(JointEffect):
     }
 
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
-        return dry_friction(joint, params["tau_c"])
+        return self.against(joint, params["tau_c"])
 
 
-class DirectionalCoulombFriction(JointEffect):
+class DirectionalCoulombFriction(DryFriction):
     r"""
     Dry friction that is stronger in one direction than in the other.
 
@@ -132,10 +165,10 @@ class DirectionalCoulombFriction(JointEffect):
     }
 
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
-        return dry_friction(joint, jnp.where(joint.v > 0.0, params["tau_pos"], params["tau_neg"]))
+        return self.against(joint, jnp.where(joint.v > 0.0, params["tau_pos"], params["tau_neg"]))
 
 
-class StribeckFriction(JointEffect):
+class StribeckFriction(DryFriction):
     r"""
     Dry friction that falls as the joint begins to move.
 
@@ -156,24 +189,36 @@ class StribeckFriction(JointEffect):
     parameters = {
         "tau_c": Parameter(null=0.0, scale=0.1, unit="N m", lower=0.0),
         "tau_s": Parameter(null=0.0, scale=0.15, unit="N m", lower=0.0),
-        "v_s": Parameter(null=0.1, scale=0.1, unit="rad/s", lower=_SLOWEST),
+        "v_s": Parameter(
+            null=_FALLS * STANDSTILL, scale=_FALLS * STANDSTILL, unit="rad/s", lower=STANDSTILL
+        ),
     }
     explanation = "The joint resists most just as it begins to move, and less once it slides."
     source = "Olsson et al. 1998, section 2"
     equivalents = {"coulomb_friction": "while the joint moves several times faster than v_s"}
     ascending = ("tau_c", "tau_s")
 
+    def __init__(
+        self, where: int | str = 0, *, standstill: float = STANDSTILL, **values: float
+    ) -> None:
+        # Friction cannot be seen to fall at a speed at which it is smoothed.
+        falls = _FALLS * standstill
+        own = dict(type(self).parameters)
+        own["v_s"] = dataclasses.replace(own["v_s"], null=falls, scale=falls, lower=standstill)
+        self.parameters = own  # type: ignore[misc]  # of this instance
+        super().__init__(where, standstill=standstill, **values)
+
     def starts(self, excursion: float, speed: float) -> tuple[dict[str, float], ...]:
         """From a hump that is narrower than any motion, nothing leads to a wider one."""
-        return tuple({"v_s": max(share * speed, _SLOWEST)} for share in _SHARES)
+        return tuple({"v_s": max(share * speed, self.standstill)} for share in _SHARES)
 
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
         sticking = jnp.exp(-((joint.v / params["v_s"]) ** 2))
         level = params["tau_c"] + (params["tau_s"] - params["tau_c"]) * sticking
-        return dry_friction(joint, level)
+        return self.against(joint, level)
 
 
-class LoadDependentFriction(JointEffect):
+class LoadDependentFriction(DryFriction):
     r"""
     Dry friction that grows with what the joint transmits, as between the teeth of a gear.
 
@@ -201,7 +246,7 @@ class LoadDependentFriction(JointEffect):
 
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
         transmitted = joint.actuator + joint.load
-        return dry_friction(joint, params["tau_c"] + params["mu"] * jnp.abs(transmitted))
+        return self.against(joint, params["tau_c"] + params["mu"] * jnp.abs(transmitted))
 
 
 class QuadraticDrag(JointEffect):

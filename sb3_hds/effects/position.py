@@ -1,15 +1,21 @@
 """Forces that depend on where a joint is, or on nothing."""
 
 import math
+from collections.abc import Mapping
 
 import jax.numpy as jnp
 
-from sb3_hds.core import JointEffect, JointMoment, Memory, Parameter, Params, Scalar
+from sb3_hds.core import JointEffect, JointMoment, Memory, Parameter, Params, Ranges, Scalar
 
 # Periods that the range of motion may hold, close enough that a fit finds those in between; and
 # parts of a period by which the force may be shifted.
 _CYCLES = (0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0)
 _TURNS = (0.0, 0.25, 0.5, 0.75)
+# The same where nothing is fitted in between, in shares of the longest: that fits twice into the
+# range of motion, since slower waves are springs, and four times into a turn, since gravity's wave
+# is a whole one.
+_WAVES = (*(1.0 + 0.125 * k for k in range(17)), *(3.25 + 0.25 * k for k in range(20)))
+_COARSEST = 0.25
 
 
 class Stiffness(JointEffect):
@@ -32,10 +38,21 @@ class Stiffness(JointEffect):
     }
     explanation = "Something elastic, such as a cable or a hose, pulls the joint to one position."
     source = "Rao 2011, section 1.7"
+    blended = "q0"
     equivalents = {
         "constant_force": "where the joint hardly moves",
         "parameter.gravity": "where a joint under gravity swings but little",
     }
+
+    def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
+        return {"q0": -ranges.excursion}, {"q0": ranges.excursion}
+
+    def blend(
+        self, sizes: tuple[float, float], settings: tuple[Mapping[str, float], Mapping[str, float]]
+    ) -> dict[str, float]:
+        k = sum(sizes)
+        moment = sum(size * at["q0"] for size, at in zip(sizes, settings, strict=True))
+        return {"k": k, "q0": moment / k if k else 0.0}
 
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
         k = jnp.minimum(params["k"], joint.inertia / joint.h**2)
@@ -83,17 +100,32 @@ class Cogging(JointEffect):
     parameters = {
         "amplitude": Parameter(null=0.0, scale=0.1, unit="N m", lower=0.0),
         # One sixth of a turn: the coarsest that motors are built with.
-        "period": Parameter(null=math.pi / 3.0, scale=0.2, unit="rad", lower=0.01),
+        "period": Parameter(null=math.pi / 3.0, scale=0.2, unit="rad", lower=1e-9),
         "phase": Parameter(null=0.0, scale=0.2, unit="rad"),
     }
     explanation = "The joint snaps to equally spaced positions, as motors with magnets do."
     source = "MuJoCo DC motor model 2026, section 1.2"
+    blended = "phase"
 
     def starts(self, excursion: float, speed: float) -> tuple[dict[str, float], ...]:
         periods = [excursion / n for n in _CYCLES]
         return tuple(
             {"period": period, "phase": turn * period} for period in periods for turn in _TURNS
         )
+
+    def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
+        longest = min(0.5 * ranges.excursion, _COARSEST * ranges.turn)
+        periods = [longest / n for n in _WAVES if longest > 0.0]
+        return tuple(
+            {"period": period, "phase": turn * period} for period in periods for turn in (0.0, 0.25)
+        )
+
+    def blend(
+        self, sizes: tuple[float, float], settings: tuple[Mapping[str, float], Mapping[str, float]]
+    ) -> dict[str, float]:
+        period, phase = settings[0]["period"], settings[0]["phase"]
+        ahead = period * math.atan2(sizes[1], sizes[0]) / (2.0 * math.pi)
+        return {"amplitude": math.hypot(*sizes), "period": period, "phase": phase + ahead}
 
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
         per_period = 2.0 * math.pi / params["period"]

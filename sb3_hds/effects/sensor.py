@@ -1,7 +1,7 @@
 """What happens to a measurement on its way out of the plant."""
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +9,13 @@ import numpy as np
 
 from sb3_hds.core import Memory, Parameter, Params, Scalar, SensorEffect
 from sb3_hds.core.layers import plant_of
+from sb3_hds.effects.shapes import limited
 from sb3_hds.errors import EffectError
 
 if TYPE_CHECKING:
     from sb3_hds.core import Twin
 
-# Longest delay that can be simulated [s].
+# Longest delay that can be simulated where nobody says [s].
 _LONGEST_DELAY = 0.2
 
 
@@ -79,6 +80,9 @@ class SensorDelay(SensorEffect):
     where it was found: there one report tells the truth, and later it does not.
 
     Source: Åström and Murray, *Feedback Systems*, Princeton University Press 2021, section 10.
+
+    :param longest: option; longest delay that can be simulated [s]
+    :raises EffectError: unless it is positive
     """
 
     name = "sensor_delay"
@@ -89,9 +93,22 @@ class SensorDelay(SensorEffect):
     source = "Åström and Murray 2021, section 10"
     equivalents = {"action_delay": "where every channel is as late and nothing is fed back"}
 
+    def __init__(
+        self, where: int | str = 0, *, longest: float = _LONGEST_DELAY, **values: float
+    ) -> None:
+        self.longest, own = limited(self, "delay", longest)
+        self.parameters = own  # type: ignore[misc]  # with a limit of its own
+        super().__init__(where, **values)
+
+    def structure(self) -> tuple[Any, ...]:
+        return (*super().structure(), self.longest)
+
+    def to_spec(self) -> dict[str, Any]:
+        return super().to_spec() | {"options": {"longest": self.longest}}
+
     def memory(self, measured: Scalar, twin: "Twin") -> Memory:
         """The last measurements, the latest first."""
-        return jnp.full(math.ceil(_LONGEST_DELAY / twin.dt - 1e-9) + 1, measured)
+        return jnp.full(math.ceil(self.longest / twin.dt - 1e-9) + 1, measured)
 
     def sense(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Scalar:
         # Whoever moves a state without its memory sees the new one at once.

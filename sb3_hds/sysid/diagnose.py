@@ -12,6 +12,7 @@ from sb3_hds.sysid.calibrate import check_fits
 from sb3_hds.sysid.diagnosis import Diagnosis
 from sb3_hds.sysid.inquiry import EFFORTS, Inquiry
 from sb3_hds.sysid.priors import Belief
+from sb3_hds.sysid.progress import Bar
 
 _DESCRIBED = ("name", "slot", "parameters", "explanation")  # what a finding is told with
 
@@ -50,7 +51,7 @@ def diagnose(
         one ends at a bound, nothing is named.
     :param seed: of the split
     :param budget: ``"full"``, or ``"quick"``: fewer candidates are fitted to the end
-    :param progress: whether a bar shows how far it is
+    :param progress: whether a bar shows how far it is, with an estimate of the time left
     :return: verdict, findings, what was rejected, what cannot be told apart, the extended twin
     :raises CalibrationError: for other channels or another interval than the twin's, or an unknown
         name in ``calibrate``
@@ -70,9 +71,10 @@ def diagnose(
     if not isinstance(seed, Integral) or seed < 0:
         raise CalibrationError(f"seed must be a whole number of at least 0, got {seed!r}.")
     kinds, nuisances = classes_of(effects), _beliefs_of(calibrate)
-    inquiry = Inquiry(twin, data, kinds, nuisances, int(seed), budget, progress)
-    reason = inquiry.poor()
-    return inquiry.refused(reason) if reason else inquiry.run()
+    with Bar(progress) as bar:
+        inquiry = Inquiry(twin, data, kinds, nuisances, int(seed), budget, bar)
+        reason = inquiry.poor()
+        return inquiry.refused(reason) if reason else inquiry.run()
 
 
 def _beliefs_of(calibrate: str | Iterable[str] | Mapping[str, Belief]) -> dict[str, Belief]:

@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -12,11 +12,14 @@ from sb3_hds.core import Params, Twin
 from sb3_hds.sysid import wording
 from sb3_hds.sysid.pictures import Pictures
 from sb3_hds.sysid.results import Estimate, plain
+from sb3_hds.sysid.sentence import several_in_words, spoken
 from sb3_hds.sysid.units import sizes_in_words, with_unit
 
 Verdict = Literal["named", "ambiguous", "none", "unknown", "not_identifiable"]
 
 _WIDTH = 80
+# Causes beyond which they are told in one sentence and a table.
+_MANY = 3
 # Candidates whose smallest sizes are printed; all are in the report.
 _MOST_SHOWN = 12
 # Rejected candidates that get a line of their own.
@@ -52,6 +55,8 @@ class Finding:
         proposed it if nothing were wrong
     :param gain: share by which it lowers the mean square error of held-out recordings
     :param explanation: one sentence for people
+    :param share: of the force at its joint that it carries, root mean squares; None where that was
+        not computed
     """
 
     effect: str
@@ -62,6 +67,7 @@ class Finding:
     family_p_value: float
     gain: float
     explanation: str
+    share: float | None = None
 
     @property
     def key(self) -> str:
@@ -161,11 +167,13 @@ class Diagnosis:
         """The verdict in one sentence."""
         if self.verdict == "ambiguous":
             first, *others = self.findings
-            choice = " or ".join(map(_spoken, (first.key, *first.alternatives)))
+            choice = " or ".join(map(spoken, (first.key, *first.alternatives)))
             also = f", and {' and '.join(map(_choice, others))}" if others else ""
             return f"The simulation is wrong about {choice}{also}: the data cannot tell which."
         if self.verdict != "named":
             return SENTENCES[self.verdict]
+        if len(self.findings) > _MANY:
+            return several_in_words(self.findings, [j.name for j in self.believed.joints])
         new = [f for f in self.findings if self._is_new(f)]
         said = {"lacks": new, "is wrong about": [f for f in self.findings if f not in new]}
         parts = [
@@ -181,8 +189,11 @@ class Diagnosis:
     def summary(self) -> str:
         """:return: all of it in 80 columns"""
         lines = [*_wrapped(f"{self.verdict}: {self.sentence}"), "=" * _WIDTH]
-        for finding in self.findings:
-            lines += _of_finding(finding)
+        if len(self.findings) > _MANY:
+            lines += _table_of(self.findings)
+        else:
+            for finding in self.findings:
+                lines += _of_finding(finding)
         if self.findings:
             lines += _wrapped(wording.explained_in_words(self.explained))
         if self.verdict == "none":
@@ -311,6 +322,32 @@ class Diagnosis:
     __repr__ = __str__
 
 
+def _table_of(findings: Sequence[Finding]) -> list[str]:
+    """Many causes, one line for each size."""
+    rows = []
+    for finding in findings:
+        name = spoken(finding.key).replace(f" at {finding.where['name']}", "")
+        own = finding.where["slot"] == "parameter"
+        place = "" if own else finding.where["name"]
+        share = "" if finding.share is None else f"{finding.share:.0%}"
+        for e in finding.parameters.values():
+            rows.append(
+                (place, name, wording.size_in_words(e), wording.interval_in_words(e), share)
+            )
+    head = ("joint", "cause", "size", "90 % interval", "of force")
+    widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
+    lines = [
+        "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in [head, *rows]
+    ]
+    alike = [
+        f"{spoken(f.key)}: the data cannot tell it from {' or '.join(map(spoken, f.alternatives))}."
+        for f in findings
+        if f.alternatives
+    ]
+    return [*lines, *(line for text in alike for line in _wrapped(text))]
+
+
 def _of_finding(finding: Finding) -> list[str]:
     own, place = finding.where["slot"] == "parameter", finding.where["name"]
     lines = [finding.effect if own else f"{finding.effect} at {finding.where['slot']} {place}"]
@@ -324,17 +361,9 @@ def _of_finding(finding: Finding) -> list[str]:
     return lines
 
 
-def _spoken(key: str) -> str:
-    """A candidate, for people: ``"coulomb_friction.hinge"`` is Coulomb friction at hinge."""
-    name, _, place = key.partition(".")
-    for person in ("coulomb", "stribeck"):
-        name = name.replace(person, person.title())
-    return place if name == "parameter" else f"{name.replace('_', ' ')} at {place}"
-
-
 def _choice(finding: Finding) -> str:
     """With what cannot be told from it."""
-    names = [_spoken(key) for key in (finding.key, *finding.alternatives)]
+    names = [spoken(key) for key in (finding.key, *finding.alternatives)]
     return names[0] if len(names) == 1 else f"either {' or '.join(names)}"
 
 

@@ -228,7 +228,7 @@ class Evidence:
         h = self.hypotheses
         active = theta != h.null
         # What is absent remembers nothing, but its slope may need the last few commands.
-        begins = np.where(active, h.forgets, np.minimum(h.forgets, Effect.forgets))
+        begins = np.where(active, h.forgets, np.minimum(h.forgets, Effect.forgets * h.period))
         active[index] = True
         longest = max(h.always, float(begins[active].max(initial=0.0)))
         return min(n_steps_of(longest, h.twin.dt), self._most_known)
@@ -255,6 +255,7 @@ class Evidence:
                 found = _look(
                     h.twin,
                     h.names,
+                    tuple(h.ties.items()),
                     h.fixed,
                     shots,
                     theta,
@@ -288,10 +289,11 @@ def _in_groups(index: np.ndarray, width: int, nothing: int) -> Iterator[np.ndarr
         yield np.concatenate([own, np.full(width - len(own), nothing)])
 
 
-@partial(jax.jit, static_argnums=(0, 1), compiler_options=QUICK_COMPILATION)
+@partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=QUICK_COMPILATION)
 def _look(
     twin: Twin,
     names: tuple[str, ...],
+    ties: tuple[tuple[str, tuple[str, ...]], ...],
     fixed: Params,
     shots: Shots,
     theta: Float[Array, " p"],
@@ -302,6 +304,7 @@ def _look(
     chosen: Chosen,
 ) -> tuple[Array, Array, Array]:
     """
+    :param ties: parameters that share one number, by the name of that number
     :param n_lead: steps before each window that matter to what is remembered
     :param chosen: the effects that may do something under these parameters
     :return: simulated minus measured, and its slopes by start state and by the parameters that
@@ -315,6 +318,9 @@ def _look(
             step = jnp.zeros(len(names) + 1, theta.dtype).at[index].set(both[n:])
             values = theta + scale * step[:-1]
             params = fixed | {name: values[i] for i, name in enumerate(names)}
+            for name, own in ties:
+                for single in own:
+                    params[single] = params[single] + params[name] - fixed[single]
             return simulate(twin, params, shot, offset + both[:n], n_lead, effects) - shot.obs
 
         error, slopes = with_slopes(of, jnp.zeros(n + index.shape[0], theta.dtype))

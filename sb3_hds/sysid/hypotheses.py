@@ -1,8 +1,9 @@
 """What may be wrong with a twin: all candidates at once, each switched by its parameters."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from functools import cached_property
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import cached_property, partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,25 +15,31 @@ from sb3_hds.core import (
     Effect,
     ExtendedTwin,
     ForceEffect,
+    Parameter,
     Params,
     SensorEffect,
     Twin,
 )
-from sb3_hds.core.effect import ALL_PLACES, Attached, Chosen
+from sb3_hds.core.effect import Attached, Chosen
 from sb3_hds.core.extended import with_native
 from sb3_hds.core.layers import layers_of, plant_of
 from sb3_hds.effects import (
     NAMELESS,
     ActionDelay,
     ConstantForce,
+    DryFriction,
     NeuralForce,
+    SensorDelay,
     SignFlip,
     reversed_joint,
 )
 from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.priors import Belief, prior_of
-from sb3_hds.sysid.shooting import remembered_for
+from sb3_hds.sysid.shooting import remembered_for, remembers_for
 
+# Longest delay, in periods of the motion, and the speed below which dry friction is smoothed, in
+# root mean square ones.
+_LATEST, _STANDSTILL = 0.3, 0.01
 #: the slot of a twin's own parameter, beside those of effects
 PARAMETER = "parameter"
 
@@ -91,6 +98,8 @@ class Hypotheses:
         infinite for all other parameters
     :param pushes: index of a constant force at each joint, to measure what force is missing
     :param nameless: forces that no finding is, and that findings have to beat
+    :param ties: parameters of which one number is shared, by the name of that number
+    :param period: of the motion [s]
     :param starts: for candidates by key, values by full name at which a search may begin
     """
 
@@ -106,6 +115,8 @@ class Hypotheses:
     prior: Float[np.ndarray, " p"]
     pushes: tuple[int, ...]
     nameless: tuple[Candidate, ...] = ()
+    ties: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    period: float = 1.0
     starts: Mapping[str, tuple[Mapping[str, float], ...]] = dataclasses.field(default_factory=dict)
 
     @classmethod
@@ -114,10 +125,19 @@ class Hypotheses:
         twin: Twin,
         effects: Sequence[type[Effect]],
         calibrate: Sequence[str] | Mapping[str, Belief],
+        only: Collection[str] | None = None,
+        nameless_at: Collection[str] | None = None,
+        period: float = 1.0,
+        speeds: Sequence[float] = (),
     ) -> "Hypotheses":
         """
         :param twin: as it is believed
         :param effects: classes that are tried at every place
+        :param only: keys of the candidates that are kept; default: all
+        :param nameless_at: joints at which forces without a name are tried; default: all
+        :param period: of the motion [s]: what is later than a third of it is no delay
+        :param speeds: root mean square velocity of each joint, in which dry friction is smoothed;
+            default: as the effects have it
         :param calibrate: parameters of the twin that are not believed, and not worth a finding; see
             :func:`~sb3_hds.sysid.priors.prior_of`
         :raises CalibrationError: for a name in ``calibrate`` that the twin does not have, or a
@@ -135,7 +155,16 @@ class Hypotheses:
         known = twin.known_parameters
         pushed = () if ConstantForce in effects else (ConstantForce,)
         rivals = tuple(kind for kind in NAMELESS if kind not in effects)
-        extended, found = _attached(twin, (*effects, *pushed, *rivals))
+        wanted = None if only is None else _single(only, twin)
+        kept = lambda kind, place: (  # noqa: E731
+            (nameless_at is None or place in nameless_at)
+            if kind in rivals
+            else wanted is None or kind in pushed or f"{kind.name}.{place}" in wanted
+        )
+        if wanted is not None and ConstantForce in effects:
+            kept = _with_pushes(kept)
+        options = partial(_options, period, speeds)
+        extended, found = _attached(twin, (*effects, *pushed, *rivals), kept, options)
         nameless = tuple(c for c in found if c.name in {kind.name for kind in rivals})
         found = [c for c in found if c not in nameless]
         pushes = tuple(f"{ConstantForce.name}.{joint.name}.tau_0" for joint in twin.joints)
@@ -153,11 +182,14 @@ class Hypotheses:
             for c in found
             if native.get(c.parameters[0]) not in calibrate and not {*c.parameters} <= {*calibrate}
         ]
+        if only is not None:
+            candidates = [c for c in candidates if c.key in only]
         moving = (*calibrate, *dict.fromkeys(p for c in candidates for p in c.parameters))
         moving += tuple(name for name in pushes if name not in moving)
         moving += tuple(name for c in nameless for name in c.parameters)
-        every = {name: extended.parameters[name] for name in moving}
-        values = np.array([extended.values[name] for name in moving], float)
+        ties = _ties(twin, candidates, found)
+        every = {name: extended.parameters[ties.get(name, (name,))[0]] for name in moving}
+        values = np.array([extended.values[ties.get(name, (name,))[0]] for name in moving], float)
         lower = np.array([every[name].lower for name in moving], float)
         for i, name in enumerate(moving):
             if name in native:
@@ -183,6 +215,8 @@ class Hypotheses:
             prior=prior,
             pushes=tuple(moving.index(name) for name in pushes),
             nameless=nameless,
+            ties=ties,
+            period=period,
         )
 
     @cached_property
@@ -195,12 +229,19 @@ class Hypotheses:
     def forgets(self) -> Float[np.ndarray, " p"]:
         """:return: after how long the memory that each parameter shapes is forgotten [s]"""
         found = {
-            f"{a.key}.{name}": a.effect.forgets
+            f"{a.key}.{name}": remembers_for(a.effect, self.period)
             for a in _attached_of(self.twin)
             if _remembers(a.effect, self.twin)
             for name in a.effect.parameters
         }
-        return np.array([found.get(name, 0.0) for name in self.names])
+        return np.array([found.get(self._single(name), 0.0) for name in self.names])
+
+    def parameter(self, name: str) -> Parameter:
+        """:return: unit, scale and bounds of a parameter, or of a number that several share"""
+        return self.twin.parameters[self._single(name)]
+
+    def _single(self, name: str) -> str:
+        return self.ties[name][0] if name in self.ties else name
 
     def chosen(self, theta: Float[np.ndarray, " p"], index: Int[np.ndarray, " k"]) -> Chosen:
         """
@@ -223,11 +264,16 @@ class Hypotheses:
     @cached_property
     def always(self) -> float:
         """:return: the same for what the twin as it came remembers [s]"""
-        return remembered_for(self.believed)
+        return remembered_for(self.believed, self.period)
 
     def effect_of(self, candidate: Candidate) -> Effect | None:
         """:return: the effect that the candidate is; None for a parameter, or several effects"""
-        found = [a.effect for a in _attached_of(self.twin) if a.key == candidate.key]
+        shared = bool({*candidate.parameters} & {*self.ties})
+        found = [
+            a.effect
+            for a in _attached_of(self.twin)
+            if a.key == candidate.key or (shared and a.effect.name == candidate.name)
+        ]
         return found[0] if found else None
 
     def remembers(self, candidate: Candidate) -> bool:
@@ -254,6 +300,11 @@ class Hypotheses:
             return 0.0
         return self.believed.values[target]
 
+    def scaled(self, scales: Mapping[str, float]) -> "Hypotheses":
+        """:return: the same with these typical deviations, by full name"""
+        scale = [scales.get(n, s) for n, s in zip(self.names, self.scale, strict=True)]
+        return dataclasses.replace(self, scale=np.array(scale))
+
     def extended_by(self, causes: Sequence[str], theta: Float[np.ndarray, " p"]) -> Twin:
         """
         :param causes: names and places of candidates
@@ -262,6 +313,12 @@ class Hypotheses:
         """
         value = dict(zip(self.names, map(float, theta), strict=True))
         chosen = [c for c in self.candidates if c.key in causes]
+        names = [name for c in chosen for name in c.parameters]
+        for tie in (name for name in names if name in self.ties):
+            for single in self.ties[tie]:
+                null = self.parameter(single).null
+                value[single] = value.get(single, null) + value[tie] - null
+        singles = [single for name in names for single in self.ties.get(name, (name,))]
         own = {self.names[i]: value[self.names[i]] for i in self.nuisances}
         native = _native_targets(self.believed, chosen)
         for name in (name for c in chosen for name in c.parameters):
@@ -272,7 +329,7 @@ class Hypotheses:
             elif name in self.believed.parameters:
                 own[name] = value[name]
         there = {a.key for a in _attached_of(self.believed)}
-        wanted = {name.rpartition(".")[0] for c in chosen for name in c.parameters}
+        wanted = {name.rpartition(".")[0] for name in singles}
         new = [
             a.effect.with_values(**{n: value[f"{a.key}.{n}"] for n in a.effect.parameters})
             for a in _attached_of(self.twin)
@@ -288,14 +345,51 @@ class Hypotheses:
         return {"slot": candidate.slot, "index": candidate.index, "name": candidate.place}
 
 
-# What one bus, or one clock, does to all commands.
-_COMMON = (ActionDelay,)
+#: where something acts that all actuators share
+EVERY = "all"
+# What they may share: a bus, a controller.
+_SHARED = ("action_delay", "motor_lag")
+# What a velocity takes over from the position that it is derived from.
+_DERIVED = ("sensor_scale", "sensor_delay")
 _OF_PARAMETER = "The twin's {} is not that of the system."
 _OF_DIRECTION = "The direction of the joint is taken the wrong way round, in position and velocity."
 
 
-def _attached(twin: Twin, effects: Sequence[type[Effect]]) -> tuple[Twin, list[Candidate]]:
-    """Every effect at every place where it is not already."""
+def _single(keys: Collection[str], twin: Twin) -> set[str]:
+    """:return: keys of what is attached: of a cause at several places, what is at each"""
+    found = set(keys)
+    for key in keys:
+        name, _, place = key.partition(".")
+        if place == EVERY:
+            found |= {f"{name}.{actuator.name}" for actuator in twin.actuators}
+        if name in (SignFlip.name, *_DERIVED):
+            found |= {f"{name}.{channel.name}" for channel in twin.channels}
+    return found
+
+
+def _with_pushes(kept: Callable[[type[Effect], str], bool]) -> Callable[[type[Effect], str], bool]:
+    """Constant forces serve to measure what force is missing."""
+    return lambda kind, place: kind is ConstantForce or kept(kind, place)
+
+
+def _options(
+    period: float, speeds: Sequence[float], kind: type[Effect], place: int
+) -> dict[str, float]:
+    """Scales of the motion in the place of seconds and radians that suit most machines."""
+    if issubclass(kind, ActionDelay | SensorDelay):
+        return {"longest": _LATEST * period}
+    if issubclass(kind, DryFriction) and len(speeds) and speeds[place] > 0.0:
+        return {"standstill": _STANDSTILL * speeds[place]}
+    return {}
+
+
+def _attached(
+    twin: Twin,
+    effects: Sequence[type[Effect]],
+    kept: Callable[[type[Effect], str], bool],
+    options: Callable[[type[Effect], int], dict[str, float]],
+) -> tuple[Twin, list[Candidate]]:
+    """Every effect that is wanted at every place where it is not already."""
     there = {a.key for a in _attached_of(twin)}
     wanted: list[Effect] = []
     places = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}
@@ -306,10 +400,8 @@ def _attached(twin: Twin, effects: Sequence[type[Effect]]) -> tuple[Twin, list[C
                 "reported by itself."
             )
         for i, place in enumerate(places[kind.slot]):
-            if f"{kind.name}.{place.name}" not in there:
-                wanted.append(kind(i))
-        if kind in _COMMON and len(twin.actuators) > 1:
-            wanted += [kind(ALL_PLACES)] * (f"{kind.name}.{ALL_PLACES}" not in there)
+            if f"{kind.name}.{place.name}" not in there and kept(kind, place.name):
+                wanted.append(kind(i, **options(kind, i)))
     extended = twin.extend(*wanted) if wanted else twin
     candidates = []
     for a in _attached_of(extended):
@@ -319,7 +411,7 @@ def _attached(twin: Twin, effects: Sequence[type[Effect]]) -> tuple[Twin, list[C
             Candidate(
                 a.effect.name,
                 a.effect.slot,
-                ALL_PLACES if a.everywhere else places[a.effect.slot][a.index].name,
+                places[a.effect.slot][a.index].name,
                 a.index,
                 tuple(f"{a.key}.{name}" for name in a.effect.parameters),
                 a.effect.explanation,
@@ -329,7 +421,102 @@ def _attached(twin: Twin, effects: Sequence[type[Effect]]) -> tuple[Twin, list[C
         )
     if SignFlip in effects:
         candidates += _reversed_joints(twin)
-    return extended, candidates
+    return extended, candidates + _shared(twin, candidates)
+
+
+def _shared(twin: Twin, candidates: Sequence[Candidate]) -> list[Candidate]:
+    """One bus or one power supply behind all actuators: one size for all of them."""
+    found = _of_encoders(twin, candidates)
+    for name in _SHARED:
+        own = [c for c in candidates if c.name == name and c.slot == "actuator"]
+        if len(own) > 1 and len(own) == len(twin.actuators):
+            tie = f"{name}.{EVERY}"
+            names = tuple(f"{tie}.{p.rpartition('.')[2]}" for p in own[0].parameters)
+            found.append(dataclasses.replace(own[0], place=EVERY, index=-1, parameters=names))
+    return found
+
+
+def _of_encoders(twin: Twin, candidates: Sequence[Candidate]) -> list[Candidate]:
+    """What is wrong with a sensor is wrong with the velocity, too, that is derived from it."""
+    found = []
+    for j, encoder in encoders(twin).items():
+        for name in _DERIVED:
+            own = [c for c in candidates if c.name == name and c.slot == "channel"]
+            if encoder.velocity is None or not {*encoder.channels} <= {c.index for c in own}:
+                continue
+            (first,) = (c for c in own if c.index == encoder.position)
+            place = twin.joints[j].name
+            names = tuple(f"{name}.{place}.{p.rpartition('.')[2]}" for p in first.parameters)
+            found.append(
+                dataclasses.replace(first, slot="joint", place=place, index=j, parameters=names)
+            )
+    return found
+
+
+class Encoder(NamedTuple):
+    """
+    :param position: index of the channel that reports a joint's position
+    :param velocity: of the one that reports its velocity; None if there is none
+    """
+
+    position: int
+    velocity: int | None
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """Indices of all channels that it feeds."""
+        return (self.position,) if self.velocity is None else (self.position, self.velocity)
+
+
+def encoders(twin: Twin) -> dict[int, Encoder]:
+    """:return: by joint, where channels are positions and velocities themselves"""
+    twin = plant_of(twin)
+    dof = len(twin.joints)
+    state = twin.initial(jax.random.key(0), twin.params)
+    if state.q.shape != (dof,):
+        return {}
+
+    def seen(x: jax.Array) -> jax.Array:
+        return twin.observe(state._replace(q=x[:dof], v=x[dof:]), twin.params)
+
+    here = jnp.concatenate([0.3 + 0.1 * jnp.arange(dof), 0.7 - 0.1 * jnp.arange(dof)])
+    slopes, values = np.asarray(jax.jacfwd(seen)(here)), np.asarray(seen(here))
+    unit = np.abs(np.abs(slopes).sum(1) - 1.0) < 1e-6
+    found = {}
+    for j in range(dof):
+        places = [
+            [
+                i
+                for i in np.flatnonzero(unit)
+                if np.isclose(slopes[i, k], 1.0) and np.isclose(values[i], here[k], atol=1e-5)
+            ]
+            for k in (j, dof + j)
+        ]
+        if len(places[0]) == 1 and len(places[1]) <= 1:
+            velocity = int(places[1][0]) if places[1] else None
+            found[j] = Encoder(int(places[0][0]), velocity)
+    return found
+
+
+def _ties(
+    twin: Twin, candidates: Sequence[Candidate], single: Sequence[Candidate]
+) -> dict[str, tuple[str, ...]]:
+    """:return: by the name of a shared number, the parameters that take it"""
+    found = {}
+    for shared in candidates:
+        if shared.place == EVERY:
+            own = [c for c in single if c.name == shared.name and c.slot == "actuator"]
+            own = [c for c in own if c.place != EVERY]
+        elif shared.slot == "joint" and shared.name in _DERIVED:
+            channels = encoders(twin)[shared.index].channels
+            own = [c for c in single if c.name == shared.name and c.slot == "channel"]
+            own = [c for c in own if c.index in channels]
+        else:
+            continue
+        for name in shared.parameters:
+            short = name.rpartition(".")[2]
+            found[name] = tuple(f"{c.key}.{short}" for c in own)
+    return found
 
 
 def _reversed_joints(twin: Twin) -> list[Candidate]:

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_hds.core import Effect, Trajectories, Twin
+from sb3_hds.core import AnalyticTwin, Effect, Trajectories, Twin
+from sb3_hds.core.layers import plant_of
 from sb3_hds.data import Audit, audit
 from sb3_hds.data.findings import BackwardDifference, Glitches, Outliers
 from sb3_hds.sysid.account import (
@@ -19,11 +20,15 @@ from sb3_hds.sysid.adequacy import distances, far_in_words, noise_of
 from sb3_hds.sysid.calibrate import spread_of
 from sb3_hds.sysid.comparison import Comparison, split
 from sb3_hds.sysid.constancy import Change, change
+from sb3_hds.sysid.conventions import Convention, other_convention
 from sb3_hds.sysid.diagnosis import Diagnosis, Rejected
+from sb3_hds.sysid.equation.motion import motion
 from sb3_hds.sysid.evidence import Evidence, Point, portion_for
 from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
+from sb3_hds.sysid.leapfrog import in_step_with_the_log, stepping_by
 from sb3_hds.sysid.naming import Naming, keys_of
 from sb3_hds.sysid.priors import Belief, at_limit
+from sb3_hds.sysid.progress import Bar
 from sb3_hds.sysid.remainder import (
     MissingForce,
     Remainder,
@@ -33,11 +38,14 @@ from sb3_hds.sysid.remainder import (
     short_windows,
     weighed,
 )
+from sb3_hds.sysid.screening import Screened, screen
 from sb3_hds.sysid.search import Base, Effort, Half, Search, Tried
+from sb3_hds.sysid.several import confirmed_set
 from sb3_hds.sysid.shooting import Shots, shots_of
 from sb3_hds.sysid.sizes import sized
 from sb3_hds.sysid.telling import (
     NO_CONSTANT,
+    SMALL,
     Accepted,
     contradiction,
     errs_more,
@@ -54,9 +62,11 @@ from sb3_hds.sysid.telling import (
 from sb3_hds.sysid.thinning import thinned
 from sb3_hds.sysid.timing import in_step
 
-# Length of a window [s], within these numbers of steps; it is half as long where there would be
-# fewer windows than that.
-_WINDOW, _SHORTEST, _LONGEST, _FEW = 1.0, 8, 200, 24
+# Length of a window in periods of the motion, within these numbers of steps; it is half as long
+# where there would be fewer windows than that.
+_WINDOW, _SHORTEST, _LONGEST, _FEW = 0.75, 8, 200, 24
+# Several causes that explain less than this share of what can be explained are not believed.
+_LEAST_OF_SEVERAL = 0.5
 # A cause that explains less than this share of what can be explained is not the cause.
 _LEAST_SHARE = 0.9
 # The same of a cause and of how its size changes with time: a force whose form is a little wrong
@@ -105,7 +115,7 @@ class Inquiry:
     :param calibrate: names of nuisances, or what is believed of each
     :param seed: of the split
     :param budget: how long to search: a key of ``EFFORTS``
-    :param progress: whether bars show how far it is
+    :param progress: whether a bar shows how far it is, or that bar
     """
 
     def __init__(
@@ -116,20 +126,41 @@ class Inquiry:
         calibrate: Sequence[str] | Mapping[str, Belief],
         seed: int,
         budget: str,
-        progress: bool,
+        progress: bool | Bar,
     ) -> None:
         self.believed, self.seed = twin, seed
+        self.bar = progress if isinstance(progress, Bar) else Bar(progress)
+        self.bar.stage("reading the log")
         self.data_hash = _hash(data)
         data, self.audit, corrected = _without_glitches(twin, data)
-        data, moved = in_step(twin, data)
+        data, in_time = in_step(twin, data)
         self.sensor_noise = noise_of(data)
-        self.corrected = (*corrected, *moved)
-        coarse, self.data, self.every = thinned(twin, data)
-        self.hypotheses = Hypotheses.about(coarse, effects, calibrate)
+        twin, data, as_logged = in_step_with_the_log(twin, data)
+        self.corrected = (*corrected, *in_time, *as_logged)
+        moved = motion(twin, data)
+        coarse, self.data, self.every = thinned(twin, data, moved.fastest)
+        self.period = moved.typical_period
+        self.convention = self.screened = None
+        if not self.audit.reason:
+            self.bar.stage("trying conventions")
+            self.convention = other_convention(twin, moved, tuple(calibrate))
+        if not self.audit.reason and self.convention is None:
+            self.bar.stage("equation of motion")
+            self.screened = screen(twin, moved, effects, calibrate)
+        only = self.screened and self.screened.keys
+        where = self.screened and self.screened.nameless_at
+        self.hypotheses = Hypotheses.about(
+            coarse, effects, calibrate, only, where, moved.typical_period, tuple(moved.speed)
+        )
         self.spread = spread_of(self.data)
-        self.shots, self.origin = shots_of(self.data, _window_of(self.data), self.hypotheses.twin)
+        self.shots, self.origin = shots_of(
+            self.data,
+            _window_of(self.data, self.period),
+            self.hypotheses.twin,
+            period=self.period,
+        )
         self.parts = split(self.data, self.origin, seed)
-        self.effort, self.progress = EFFORTS[budget], progress
+        self.effort = EFFORTS[budget]
         self.turned_down: dict[str, str] = {}
 
     def poor(self) -> str:
@@ -153,9 +184,13 @@ class Inquiry:
             self.hypotheses,
             shots[0],
             self.spread,
-            width=len(self.hypotheses.nuisances) + _WIDEST,
+            width=len(self.hypotheses.nuisances) + max(_WIDEST, self._n_proposed()),
             portion=portion_for(max(own.n for own in shots)),
         )
+        if self.screened:
+            evidence = dataclasses.replace(
+                evidence, hypotheses=self.hypotheses.scaled(self.screened.scales)
+            )
         self.hypotheses = sized(evidence, self.data)
         evidence = dataclasses.replace(
             evidence, hypotheses=self.hypotheses, noise=_FIRST_NOISE * self.spread
@@ -164,16 +199,24 @@ class Inquiry:
             Half(evidence.on(own), self.parts.unit[chosen], _IRRELEVANT * self.spread)
             for own, chosen in zip(shots, rows, strict=True)
         ]
-        self.search = Search(halves[0], halves[1], self.effort, self.progress)
+        self.search = Search(halves[0], halves[1], self.effort, self.bar)
 
     def run(self) -> Diagnosis:
+        if self.convention is not None:
+            return self.in_other_words(self.convention)
         self.prepare()
         self.settle_noise()
         start = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
-        naming = Naming(self.search, start, self.seed)
+        self.bar.stage("comparing causes")
+        if self.screened and len(self.screened.members) > 1:
+            several = self._several(self.screened, start)
+            if several is not None:
+                return several
+        naming = Naming(self.search, start, self.seed, family=self._family())
         firsts = self.search.finalists(start, [])
         rejected = self._weighed(firsts, start)
         found, base = naming.one_by_one(firsts)
+        self.bar.stage("confirming causes")
         before = left = self._left(start)
         nearest = ""
         if found:
@@ -182,6 +225,7 @@ class Inquiry:
             pair = naming.pair(found[0], base, firsts) or naming.several_as_confirmed(firsts)
             if pair is not None and (rest := self._left_by(*pair)) is not None:
                 found, base, left = *pair, rest
+        self.bar.stage("what is left")
         found, base, force = naming.outdone(found, base)
         if force is not None:
             left = self._left(base)
@@ -206,6 +250,33 @@ class Inquiry:
             nearest = self._far_off(base)
         return self._told(found, rejected, start, base, before, left, nearest)
 
+    def _n_proposed(self) -> int:
+        members = self.screened.members if self.screened else ()
+        return sum(len(self.screened.problem.items[m.item].candidate.parameters) for m in members)  # type: ignore[union-attr]
+
+    def _family(self) -> float:
+        """:return: candidates that there were, for each that is simulated"""
+        if not self.screened:
+            return 1.0
+        return len(self.screened.hypotheses.candidates) / max(len(self.hypotheses.candidates), 1)
+
+    def _several(self, screened: Screened, start: Base) -> Diagnosis | None:
+        """:return: a diagnosis of several causes at once, if held-out recordings confirm them"""
+        found, base = confirmed_set(self.search, screened, start)
+        if len(found) < 2:
+            return None
+        self.bar.stage("what is left")
+        before, left = self._left(start), self._left(base)
+        if self._explained(found, start, base, before, left) < _LEAST_OF_SEVERAL:
+            return None
+        nearest = ""
+        self._set_noise(base.point)
+        start, base = map(self.search.again, (start, base))
+        if stuck := self._stuck(base):
+            found, base, left, nearest = [], start, before, stuck
+        self.turned_down = {key: SMALL for key in screened.hints}
+        return self._told(found, [], start, base, before, left, nearest)
+
     def _weighed(self, firsts: Sequence[Tried], start: Base) -> list[tuple[Candidate, Comparison]]:
         """:return: every candidate alone, on the half that confirms"""
         weighed = [(t.candidate, self.search.confirmed(t.kept, start.kept)) for t in firsts]
@@ -225,8 +296,25 @@ class Inquiry:
             seed=self.seed,
         )
 
+    def in_other_words(self, convention: Convention) -> Diagnosis:
+        """:return: that the log is not written in the model's conventions"""
+        return Diagnosis(
+            verdict="unknown",
+            believed=self.believed,
+            unexplained=(
+                f"The log is not written as the model has it. {convention.words} The equation of "
+                f"motion then leaves {convention.after:.2g} times the noise, not "
+                f"{convention.before:.2g} times. No cause was looked for."
+            ),
+            caveats=(*map(str, self.audit.findings), *self.corrected),
+            twin=self.believed,
+            data_hash=self.data_hash,
+            seed=self.seed,
+        )
+
     def settle_noise(self) -> None:
         """What is left under the best explanation, of whatever kind, is the noise."""
+        self.bar.stage("settling the noise")
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
         self._set_noise(base.point)
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
@@ -280,12 +368,12 @@ class Inquiry:
     def _gone(self, one: Accepted, base: Base, left: _Left) -> float:
         """:return: by which a cause lowers the cost of short windows"""
         theta = self.search.without(one.tried.candidate, base).point.theta
-        without = short_windows(self.search.select.evidence, theta, self.data)
+        without = short_windows(self.search.select.evidence, theta, self.data, self.period)
         return without.point.cost - left.short.point.cost
 
     def _left(self, base: Base) -> _Left:
         """:return: what the twin leaves as it is believed now"""
-        short = short_windows(self.search.select.evidence, base.point.theta, self.data)
+        short = short_windows(self.search.select.evidence, base.point.theta, self.data, self.period)
         missing = missing_force(short, self.data)
         joints = tuple(joint.name for joint in self.hypotheses.twin.joints)
         power = float(np.mean(np.sum(weighed(missing) ** 2, 1)))
@@ -296,6 +384,19 @@ class Inquiry:
         unit = float(np.mean((missing.noise / self.search.noise) ** 2))
         predicted = 0.0 if found is None else unit * found.power
         return _Left(found, predicted, unit * power, missing, short)
+
+    def _detectable(self, start: Base) -> dict[str, dict[str, float]]:
+        """:return: by candidate; where there is no equation of motion, by simulation"""
+        simulated = detectable(self.search.select, start.point)
+        return {**simulated, **(self.screened.detectable if self.screened else {})}
+
+    def _extended(self, causes: Sequence[str], theta: np.ndarray) -> Twin:
+        """:return: the twin as it came, at its own interval, with these causes in it"""
+        twin = self.hypotheses.extended_by(causes, theta)
+        plant, own = plant_of(twin), plant_of(self.believed)
+        if isinstance(own, AnalyticTwin) and plant.structure()[-1] != own.structure()[-1]:
+            twin = stepping_by(twin, own.integrator)
+        return twin.at_interval(self.believed.dt, self.believed.substeps)
 
     def _stuck(self, base: Base) -> str:
         """:return: a sentence on nuisances that end at a bound, if any does"""
@@ -344,6 +445,7 @@ class Inquiry:
         left: _Left,
         nearest: str,
     ) -> Diagnosis:
+        self.bar.stage("sizes and intervals")
         select, confirm = self.search.select, self.search.confirm
         every, point = self.search.whole(base)
         findings = tuple(
@@ -364,7 +466,7 @@ class Inquiry:
             unexplained=unexplained,
             gain=gain,
             explained=self._explained(found, start, base, before, left) if findings else 0.0,
-            detectable=detectable(select, start.point),
+            detectable=self._detectable(start),
             rejected=tuple(
                 Rejected(one.key, c.gain, c.p_value, why(c, self.turned_down.get(one.key)))
                 for one, c in sorted(rejected, key=lambda pair: -pair[1].gain)
@@ -377,9 +479,7 @@ class Inquiry:
                 *out_of_reach(confirm, base.kept, self.origin[self.parts.confirm]),
                 *(errs_more(gain) if findings else ()),
             ),
-            twin=self.hypotheses.extended_by(keys_of(found), point.theta).at_interval(
-                self.believed.dt, self.believed.substeps
-            ),
+            twin=self._extended(keys_of(found), point.theta),
             data_hash=self.data_hash,
             seed=self.seed,
             pictures=pictures_of(
@@ -414,10 +514,10 @@ def _share(before: _Left, left: _Left) -> float:
     return gone / (gone + left.predicted) if gone + left.predicted else 1.0
 
 
-def _window_of(data: Trajectories) -> int:
+def _window_of(data: Trajectories, period: float) -> int:
     """:return: steps of a window, so that windows fill a typical recording"""
     rows = int(np.median(data.lengths)) + 1
-    steps = min(int(np.clip(round(_WINDOW / data.dt), _SHORTEST, _LONGEST)), rows - 1)
+    steps = min(int(np.clip(round(_WINDOW * period / data.dt), _SHORTEST, _LONGEST)), rows - 1)
 
     def filling(steps: int) -> int:
         return rows // max(round(rows / (steps + 1)), 1) - 1

@@ -39,12 +39,16 @@ class Naming:
     :param search: candidates on two halves of the evidence
     :param start: what is believed at first
     :param seed: of the bootstrap
+    :param family: candidates of the whole catalogue for each that is asked about here
     :param by_all: whether all the data say which of several confirmed candidates is the cause, or
         it is the one that was confirmed first
     """
 
-    def __init__(self, search: Search, start: Base, seed: int, by_all: bool = True) -> None:
+    def __init__(
+        self, search: Search, start: Base, seed: int, by_all: bool = True, family: float = 1.0
+    ) -> None:
         self.search, self.start, self.seed, self.by_all = search, start, seed, by_all
+        self.family = family
         self.turned_down: dict[str, str] = {}
         # Whether all the data ever said something else than what was confirmed first.
         self._overruled = False
@@ -99,7 +103,7 @@ class Naming:
         """
         if not self._overruled:
             return None
-        plain = Naming(self.search, self.start, self.seed, by_all=False)
+        plain = Naming(self.search, self.start, self.seed, False, self.family)
         found, base = plain.one_by_one(firsts)
         if len(found) == 1:
             return plain.pair(found[0], base, firsts)
@@ -241,7 +245,8 @@ class Naming:
         own = [h.indices(c) for c in left]
         fitted = (*base.free, *h.indices(best.candidate))
         gain = base.point.cost - best.point.cost
-        return chance_of_the_best(slopes, own, base.free, fitted, gain, self.seed)
+        chance = chance_of_the_best(slopes, own, base.free, fitted, gain, self.seed)
+        return min(1.0, self.family * chance)
 
     def _pruned(self, found: list[Accepted], base: Base) -> tuple[list[Accepted], Base]:
         """Without causes that later ones have made superfluous."""

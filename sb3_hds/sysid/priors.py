@@ -8,6 +8,8 @@ from sb3_hds.errors import CalibrationError
 
 # A value that is off by more than this factor belongs to another machine, or to a wrong model.
 _FACTOR = 20.0
+# Least standard deviation of a prior, as a share of the value.
+_SHARE = 0.2
 
 #: None for the default prior, a factor that widens it, or a pair of hard bounds
 Belief: TypeAlias = float | tuple[float, float] | None
@@ -30,8 +32,8 @@ def prior_of(name: str, parameter: Parameter, value: float, belief: Belief = Non
     The prior of a parameter that is refitted.
 
     Its standard deviation is the parameter's ``scale``, in proportion to the value where that is
-    larger than the parameter's null. Where nothing else is said, a value that is not zero stays
-    within a factor of 20.
+    larger than the parameter's null, and a fifth of the value at least. Where nothing else is said,
+    a value that is not zero stays within a factor of 20.
 
     :param name: of the parameter, for messages
     :param parameter: unit, scale and bounds
@@ -40,7 +42,8 @@ def prior_of(name: str, parameter: Parameter, value: float, belief: Belief = Non
         high)``, in the unit of the parameter, that contain the value
     :raises CalibrationError: for a belief that is neither
     """
-    deviation = parameter.scale * max(1.0, abs(value / parameter.null) if parameter.null else 1.0)
+    larger = abs(value / parameter.null) if parameter.null else 1.0
+    deviation = max(parameter.scale * max(1.0, larger), _SHARE * abs(value))
     lower, upper = limits_of(parameter, value)
     if isinstance(belief, tuple | list):
         if len(belief) != 2 or not belief[0] <= value <= belief[1]:

@@ -12,8 +12,9 @@ from sb3_hds.sysid.evidence import Evidence, Point, Slopes
 from sb3_hds.sysid.motion import motion_of
 from sb3_hds.sysid.shooting import Shots, shots_of
 
-# Length of a window over which the missing force counts as constant [s], and in steps.
-_WINDOW, _SHORTEST, _LONGEST = 0.25, 4, 25
+# Length of a window over which the missing force counts as constant, in periods of the motion, and
+# in steps.
+_WINDOW, _SHORTEST, _LONGEST = 0.2, 4, 25
 # Steps of the fit of their start states.
 _STEPS = 5
 # Windows that a smooth function is learned from; more cost memory in its square.
@@ -100,15 +101,16 @@ class _Predicted(NamedTuple):
 
 
 def short_windows(
-    evidence: Evidence, theta: Float[np.ndarray, " p"], data: Trajectories
+    evidence: Evidence, theta: Float[np.ndarray, " p"], data: Trajectories, period: float
 ) -> ShortWindows:
     """
     :param evidence: whose program simulates short windows too
     :param theta: all parameters that may move, shape ``(p,)``; they stay as they are
     :param data: measured
+    :param period: of the motion [s]
     """
     longest = evidence.shots.actions.shape[1]
-    steps = min(int(np.clip(round(_WINDOW / data.dt), _SHORTEST, _LONGEST)), longest)
+    steps = min(int(np.clip(round(_WINDOW * period / data.dt), _SHORTEST, _LONGEST)), longest)
     shots, origin = shots_of(data, steps, evidence.hypotheses.twin)
     counted = (np.arange(longest + 1) <= steps).astype(float)
     short = evidence.on(_lengthened(shots, longest), counted)

@@ -5,13 +5,13 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
-from rich.progress import track
 
 from sb3_hds.sysid.comparison import Comparison, by_scores, confirm, effective_size
 from sb3_hds.sysid.evidence import Evidence, Point, in_threads
 from sb3_hds.sysid.guesses import Here, Places, guesses
 from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
 from sb3_hds.sysid.imitation import imitators
+from sb3_hds.sysid.progress import Bar
 from sb3_hds.sysid.shooting import Shots
 
 # What confirms a candidate: by which share the mean square error of held-out recordings falls, at
@@ -121,11 +121,11 @@ class Search:
     :param select: on which candidates are fitted and ranked
     :param confirm: on which the best is confirmed
     :param effort: how long to search
-    :param progress: whether a bar shows how far it is
+    :param bar: shows how far it is
     """
 
-    def __init__(self, select: Half, confirm: Half, effort: Effort, progress: bool) -> None:
-        self.select, self.confirm, self.effort, self.progress = select, confirm, effort, progress
+    def __init__(self, select: Half, confirm: Half, effort: Effort, bar: Bar) -> None:
+        self.select, self.confirm, self.effort, self.bar = select, confirm, effort, bar
         self._reached: dict[str, _Reached] = {}
         self._far: set[str] = set()
         # Of searches with several starts, the best one, by what is believed.
@@ -209,7 +209,7 @@ class Search:
             steps = self.effort.steps * (2 if candidate.key in self._far else 1)
             return evidence.fit(theta, [*base.free, *own], offsets, steps)
 
-        points = self._each(glance, likely, f"comparing {len(likely)} causes")
+        points = self._each(glance, likely)
         ranked = sorted(zip(likely, points, strict=True), key=lambda pair: pair[1].cost)
         for candidate, point in ranked:
             self._reached[candidate.key] = _Reached(point.theta, point.offsets, base.free)
@@ -233,7 +233,7 @@ class Search:
             kept = half.fit(point.theta, (), offsets, _KEPT_STEPS)
             return Tried(candidate, point, kept, self.criterion([candidate], point, base.point))
 
-        tried = self._each(finish, candidates, f"fitting {len(candidates)} likely causes")
+        tried = self._each(finish, candidates)
         return sorted(tried, key=lambda t: -t.criterion)
 
     def nameless(self, base: Base) -> list[Tried]:
@@ -270,7 +270,7 @@ class Search:
             kept = half.fit(theta, (), offsets, _ROUGH_STEPS)
             return self.confirmed(kept, base.kept)
 
-        return list(zip(rest, self._each(verdict, rest, "weighing the others"), strict=True))
+        return list(zip(rest, self._each(verdict, rest), strict=True))
 
     def pairs(
         self, firsts: Sequence[Tried], base: Base, known: Candidate
@@ -427,12 +427,8 @@ class Search:
             point = point._replace(offsets=point.offsets[sample])
         return Here(evidence, point, base.free, self.effort.steps)
 
-    def _each(
-        self, work: Callable[[_Given], _Told], given: Sequence[_Given], what: str
-    ) -> list[_Told]:
-        done = in_threads(work, given)
-        shown = track(done, what, total=len(given), transient=True, disable=not self.progress)
-        return list(shown)
+    def _each(self, work: Callable[[_Given], _Told], given: Sequence[_Given]) -> list[_Told]:
+        return list(self.bar.over(in_threads(work, given), len(given)))
 
 
 def _information(before: float, after: float, n: float, n_parameters: int) -> float:

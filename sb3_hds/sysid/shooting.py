@@ -32,7 +32,8 @@ from sb3_hds.errors import TrajectoryError
 _NOT_FINITE = 1e6
 # Added to the normal equations of a start state, relative to their diagonal.
 _DAMPING = 1e-9
-# For how long before a window memory of unknown kind, as of a wrapper, is filled [s].
+# For how long before a window memory of unknown kind, as of a wrapper, is filled, in periods of the
+# motion.
 _LEAD = Effect.forgets
 
 Offset = Float[Array, " tangent"]
@@ -69,6 +70,7 @@ def shots_of(
     twin: Twin,
     n_rows: int | None = None,
     seed: int | None = 0,
+    period: float = 1.0,
 ) -> tuple[Shots, np.ndarray]:
     """
     Cut recordings into windows that share no measurement, so that their errors are independent.
@@ -79,13 +81,14 @@ def shots_of(
     :param n_rows: fixed number of rows: a random choice of more windows, or padding of fewer. A
         compiled program then serves again when more data have come.
     :param seed: of that choice; None takes the latest windows instead
+    :param period: of the motion [s], in which the twin's memory forgets
     :return: the windows, in order of recording and time, and for each the recording that it is
         from; padding has -1
     :raises TrajectoryError: if no recording is long enough
     """
     cuts = _windows_in(data, length)
     n = len(cuts) if n_rows is None else n_rows
-    lead = n_steps_of(remembered_for(twin), data.dt)
+    lead = n_steps_of(remembered_for(twin, period), data.dt)
     cuts = [cuts[i] for i in _chosen(len(cuts), n, seed)]
     rows = [_cut(data, i, k, length, lead) for i, k in cuts]
     padding = [rows[0]._replace(weight=np.zeros(()))] * (n - len(rows))
@@ -276,13 +279,22 @@ def _moved(twin: Twin, state: State, offset: Offset) -> State:
     return twin.retract(state, jnp.concatenate([offset, jnp.zeros_like(rest)]))
 
 
-def remembered_for(twin: Twin) -> float:
-    """:return: how long before a window what the twin remembers may have begun to differ [s]"""
+def remembered_for(twin: Twin, period: float = 1.0) -> float:
+    """
+    :param period: of the motion [s]
+    :return: how long before a window what the twin remembers may have begun to differ [s]
+    """
     obs = jnp.zeros(len(twin.channels))
     if not jax.tree.leaves(jax.eval_shape(lambda: twin.infer(obs, twin.params).memory)):
         return 0.0
     extended = (layer for layer in layers_of(twin) if isinstance(layer, ExtendedTwin))
-    return max([_LEAD, *(a.effect.forgets for layer in extended for a in layer.attached)])
+    attached = (a.effect for layer in extended for a in layer.attached)
+    return max([_LEAD * period, *(remembers_for(effect, period) for effect in attached)])
+
+
+def remembers_for(effect: Effect, period: float) -> float:
+    """:return: how long an effect's memory tells how it began [s]"""
+    return max(effect.forgets * period, getattr(effect, "longest", 0.0))
 
 
 def n_steps_of(seconds: float, dt: float) -> int:

@@ -86,11 +86,12 @@ def _unseen(h: Hypotheses, data: Trajectories, moved: _Moved) -> Float[np.ndarra
         springs = torques / (_STRETCH * excursions)
     for candidate in (*h.candidates, *h.nameless):
         for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
-            unit = h.twin.parameters[name].unit
+            unit = h.parameter(name).unit
             if candidate.slot == "actuator":
-                largest = commands.max() if candidate.index < 0 else commands[candidate.index]
-                if unit == h.twin.actuators[candidate.index].unit and largest:
-                    scale[i] = _OF_COMMAND * largest
+                if candidate.index < 0:
+                    continue
+                if unit == h.twin.actuators[candidate.index].unit and commands[candidate.index]:
+                    scale[i] = _OF_COMMAND * commands[candidate.index]
             elif candidate.slot == "joint":
                 joint = h.twin.joints[candidate.index]
                 if unit == f"{joint.unit}/s" and speeds[candidate.index]:

@@ -38,12 +38,14 @@ class Accepted(NamedTuple):
 
     :param alternatives: what the data cannot tell from it
     :param chance: that the best of all candidates would gain as much if nothing were wrong
+    :param share: of the force at its joint that it carries; None where that is not known
     """
 
     tried: Tried
     verdict: Comparison
     alternatives: tuple[str, ...]
     chance: float
+    share: float | None = None
 
 
 def finding(
@@ -71,7 +73,7 @@ def finding(
             stderr=float(stderr[i]),
             low=low,
             high=high,
-            unit=h.twin.parameters[name].unit,
+            unit=h.parameter(name).unit,
             before=float(h.null[i]),
             at_bound=bool(theta[i] <= h.lower[i] or theta[i] >= h.upper[i]),
             added_to=h.added_to(name),
@@ -85,6 +87,7 @@ def finding(
         one.chance,
         one.verdict.gain,
         candidate.explanation,
+        one.share,
     )
 
 
@@ -216,7 +219,7 @@ def nameless_in_words(
     """
     force, values = tried.candidate, []
     for name, i in zip(force.parameters, hypotheses.indices(force), strict=True):
-        unit = hypotheses.twin.parameters[name].unit
+        unit = hypotheses.parameter(name).unit
         size = f"{name.rpartition('.')[2]} = {tried.point.theta[i]:.3g}"
         values.append(size if unit == "1" else f"{size} {unit}")
     does = f"does better than {' and '.join(causes)}" if causes else "explains what is missing"

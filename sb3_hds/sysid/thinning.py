@@ -9,14 +9,14 @@ import numpy as np
 from sb3_hds.core import Trajectories, Twin, rk4
 from sb3_hds.core.layers import plant_of
 
-# Interval that windows of a second need at most, and sub-steps that Runge-Kutta needs [s].
-_INTERVAL, _SUBSTEP = 0.01, 0.005
+# Samples and sub-steps of Runge-Kutta that a period of the motion needs.
+_SAMPLES, _SUBSTEPS = 100, 200
 
 
 class Thinned(NamedTuple):
     """
     :param twin: with the longer interval
-    :param data: every so manieth observation, and the mean of the commands in between
+    :param data: every n-th observation, and the mean of the commands in between
     :param every: 1 where nothing was changed
     """
 
@@ -25,21 +25,23 @@ class Thinned(NamedTuple):
     every: int
 
 
-def thinned(twin: Twin, data: Trajectories) -> Thinned:
+def thinned(twin: Twin, data: Trajectories, period: float) -> Thinned:
     """
-    A hundred samples a second tell as much about a mechanism as a thousand, at a tenth of the cost.
+    A hundred samples of a period tell as much about a mechanism as a thousand, at a tenth of the
+    cost.
 
-    Where the twin integrates by Runge-Kutta, its sub-steps may become longer, up to 5 ms; those of
-    other integrators, whose error is a part of the model, stay as they are.
+    Where the twin integrates by Runge-Kutta, its sub-steps may become longer, up to a two-hundredth
+    of a period; those of other integrators, whose error is a part of the model, stay as they are.
 
     :param data: sampled at the twin's ``dt``
+    :param period: of the fastest motion in them [s]
     """
-    every = min(round(_INTERVAL / data.dt), int(data.lengths.min()))
+    every = min(round(period / _SAMPLES / data.dt), int(data.lengths.min()))
     if every <= 1:
         return Thinned(twin, data, 1)
     dt, inner = every * data.dt, twin.dt / twin.substeps
     if getattr(plant_of(twin), "integrator", None) is rk4:
-        inner = max(inner, _SUBSTEP)
+        inner = max(inner, period / _SUBSTEPS)
     pieces = [_every(*data.episode(i), every) for i in range(len(data))]
     obs, actions = (list(leaves) for leaves in zip(*pieces, strict=True))
     coarse = Trajectories.from_arrays(obs, actions, dt=dt, conditions=data.conditions)

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from sb3_hds.core import AnalyticTwin, Params, State, Twin
 from sb3_hds.core.compilation import QUICKEST_COMPILATION
-from sb3_hds.core.contract import check_now
+from sb3_hds.core.contract import check_methods, check_now
 from sb3_hds.core.layers import layers_of, plant_of
 from sb3_hds.errors import TwinError
 from sb3_hds.twins import registry
@@ -52,10 +52,13 @@ def check(twin: Twin | type[Twin] | str, *, seed: int = 0) -> TwinCheck:
     :param twin: a twin, its class, or the name under which one is registered
     :param seed: of what is drawn
     :raises NoTwinError: for a name that is not registered
+    :raises TypeError: for what is no twin
     """
     if isinstance(twin, str):
         twin = registry.get(twin)
-    made = twin() if isinstance(twin, type) else twin
+    made: Any = twin() if isinstance(twin, type) else twin
+    if not isinstance(made, Twin):
+        raise TypeError(f"twins.check takes a twin, its class or its name, got {twin!r}.")
     contract = _contract(made)
     if not contract.ok:
         return TwinCheck(made.name, (contract,), "everything else, before that is mended")
@@ -195,6 +198,7 @@ def _limits(twin: Twin) -> tuple[np.ndarray, np.ndarray]:
 def _contract(twin: Twin) -> CheckItem:
     name = "shapes and dtypes"
     try:
+        check_methods(twin)
         for layer in reversed(list(layers_of(twin))):
             check_now(layer)
     except TwinError as error:

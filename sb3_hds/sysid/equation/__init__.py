@@ -1,0 +1,1 @@
+"""Equation errors in weak form: which causes explain the force that a model lacks, all at once."""

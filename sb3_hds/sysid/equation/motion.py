@@ -1,0 +1,278 @@
+"""How the joints moved in a set of recordings, at an interval that suits the system."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.signal import savgol_filter
+
+from sb3_hds.core import Trajectories, Twin, explicit_euler, semi_implicit_euler
+from sb3_hds.core.layers import plant_of
+from sb3_hds.sysid.equation.smoothing import smooth
+from sb3_hds.sysid.motion import motion_of
+
+# Samples from which it is told whether a velocity is measured.
+_SOME = 50
+# Samples that a period of the motion needs; what comes faster is thinned.
+_PER_PERIOD = 100
+# Of a period, over which positions and velocities are compared; errors by which they must be apart,
+# and the share of the speed or scale that matters.
+_PART, _SURE, _SCALE = 0.25, 4.0, 0.005
+# Share of a joint's excursion in noise above which it does not move.
+_STILL = 3.0
+
+
+class Moved(NamedTuple):
+    """
+    One recording in joint space, every leaf of shape ``(rows, dof)`` but the actions.
+
+    :param q: smoothed positions [rad] or [m]
+    :param v: smoothed velocities
+    :param a: smoothed accelerations
+    :param raw: velocities as they were measured, or central differences of positions
+    :param actions: held from row to row, shape ``(rows - 1, n_act)``
+    """
+
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    raw: np.ndarray
+    actions: np.ndarray
+
+
+class Motion(NamedTuple):
+    """
+    :param recordings: in order
+    :param origin: recording that each trajectory is from, shape ``(n,)``
+    :param dt: interval of the rows [s]
+    :param every: samples of the data in one interval
+    :param measured: whether a joint's velocity is measured, shape ``(dof,)``
+    :param noise_q: of each joint's position sensor
+    :param noise_v: of each joint's velocity sensor, or of the differences that stand for it
+    :param error_v: standard error of the smoothed velocities
+    :param period: of each joint's motion, ``2 pi rms(v) / rms(a)`` [s]
+    :param blurred: intervals over which smoothing blurs a start or a stop, of each joint
+    :param seen: share of an interval within which the twin's integrator evaluates forces
+    :param turn: of each joint, a whole turn, or infinity where it slides
+    :param agrees: whether a measured velocity is the derivative of its position
+    """
+
+    recordings: tuple[Moved, ...]
+    origin: np.ndarray
+    dt: float
+    every: int
+    measured: np.ndarray
+    noise_q: np.ndarray
+    noise_v: np.ndarray
+    error_v: np.ndarray
+    period: np.ndarray
+    blurred: np.ndarray
+    seen: float
+    turn: np.ndarray
+    agrees: np.ndarray
+
+    @property
+    def speed(self) -> Float[np.ndarray, " dof"]:
+        """Root mean square velocity of each joint."""
+        return _rms([r.v for r in self.recordings])
+
+    @property
+    def excursion(self) -> Float[np.ndarray, " dof"]:
+        """Range of each joint's positions over all recordings."""
+        every = np.concatenate([r.q for r in self.recordings])
+        return np.ptp(every, axis=0)
+
+    @property
+    def fastest(self) -> float:
+        """Period of the fastest joint that moves [s]; where none does, that of the recordings."""
+        own = self.moves & np.isfinite(self.period)
+        return float(np.min(self.period[own], initial=self._length))
+
+    @property
+    def typical_period(self) -> float:
+        """Geometric mean over the joints that move [s]; where none does, that of the recordings."""
+        own = self.period[self.moves & np.isfinite(self.period) & (self.period > 0.0)]
+        return float(np.exp(np.mean(np.log(own)))) if len(own) else self._length
+
+    @property
+    def _length(self) -> float:
+        return float(np.median([len(r.actions) for r in self.recordings])) * self.dt
+
+    @property
+    def moves(self) -> np.ndarray:
+        """Whether a joint moves by more than its sensor's noise."""
+        return self.excursion > _STILL * self.noise_q
+
+
+def motion(twin: Twin, data: Trajectories) -> Motion:
+    """
+    :param twin: reads positions and velocities from observations
+    :param data: measured, sampled at the twin's ``dt``
+    """
+    shift = lag_of(twin)
+    actions = [np.asarray(data.episode(i)[1], float) for i in range(len(data))]
+    raws = [(*pair, u) for pair, u in zip(joint_motion(twin, data), actions, strict=True)]
+    measured = _measured(twin, data)
+    found = []
+    for q, v, _ in raws:
+        columns = [
+            smooth(q[:, j], v[:, j] if measured[j] else None, data.dt, shift)
+            for j in range(q.shape[1])
+        ]
+        found.append(columns)
+    values = [
+        tuple(np.stack([getattr(c, name) for c in columns], 1) for name in ("q", "v", "a"))
+        for columns in found
+    ]
+    mean = lambda name: np.median([[getattr(c, name) for c in cs] for cs in found], axis=0)  # noqa: E731
+    period = 2.0 * np.pi * _rms([v[1] for v in values]) / (_rms([v[2] for v in values]) + 1e-300)
+    every = max(
+        1, int(np.min(period[np.isfinite(period)], initial=np.inf) / (_PER_PERIOD * data.dt))
+    )
+    every = min(every, max(1, int(data.lengths.min()) // _PER_PERIOD))
+    recordings = []
+    for (q, v, commands), smoothed in zip(raws, values, strict=True):
+        raw = v.copy()
+        still = ~measured
+        if still.any():
+            raw[:, still] = np.gradient(q[:, still], data.dt, axis=0)
+        recordings.append(_thinned(smoothed, raw, commands, every))
+    noise_q, noise_v = mean("noise_q"), mean("noise_v")
+    noise_v = np.where(measured, noise_v, noise_q / (np.sqrt(2.0) * data.dt))
+    return Motion(
+        tuple(recordings),
+        np.asarray(data.origin),
+        every * data.dt,
+        every,
+        measured,
+        noise_q,
+        noise_v / np.sqrt(every),
+        mean("error_v"),
+        period,
+        np.maximum(np.ceil(0.5 * mean("half") / every), 2.0).astype(int),
+        1.0 if lag_of(twin) == 0.0 else 1.0 - 1.0 / (twin.substeps * every),
+        np.array([2.0 * np.pi if joint.unit == "rad" else np.inf for joint in twin.joints]),
+        measured & kinematics([(q, v) for q, v, _ in raws], data.dt, period).agrees,
+    )
+
+
+def joint_motion(twin: Twin, data: Trajectories) -> list[tuple[np.ndarray, np.ndarray]]:
+    """:return: positions and velocities of each recording as measured, each ``(rows, dof)``"""
+    found = []
+    for i in range(len(data)):
+        obs = np.asarray(data.episode(i)[0], float)[None]
+        q, v = (leaf[0] for leaf in motion_of(twin, obs, data.dt))
+        found.append((_unwrapped(twin, q), v))
+    return found
+
+
+class Kinematics(NamedTuple):
+    """
+    Measured velocities beside the derivatives of their positions, of each joint.
+
+    :param scale: of the velocity, in units of that of the derivative
+    :param zero: of the velocity [rad/s] or [m/s]
+    :param lag: when a velocity is true, in intervals after its position
+    :param agrees: whether scale and zero are right
+    """
+
+    scale: np.ndarray
+    zero: np.ndarray
+    lag: np.ndarray
+    agrees: np.ndarray
+
+
+def kinematics(
+    recordings: Sequence[tuple[np.ndarray, np.ndarray]], dt: float, period: np.ndarray
+) -> Kinematics:
+    """
+    Differences of positions over parts of a period, regressed on integrals of the velocity, on the
+    time and on differences of the velocity; errors are clustered by recording.
+
+    :param recordings: positions and velocities as measured, each of shape ``(rows, dof)``
+    """
+    dof = len(period)
+    theta, agrees = np.zeros((dof, 3)), np.zeros(dof, bool)
+    for j in range(dof):
+        steps = max(2, round(_PART * period[j] / dt)) if np.isfinite(period[j]) else 2
+        tables, rights = [], []
+        for q, v in recordings:
+            places = np.arange(0, len(q), steps)
+            if len(places) < 2:
+                continue
+            trapezoids = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:, j] + v[:-1, j]))]) * dt
+            summed, change = np.diff(trapezoids[places]), np.diff(v[places, j]) * dt
+            tables.append(np.stack([summed, np.full_like(summed, steps * dt), change], 1))
+            rights.append(np.diff(q[places, j]))
+        if not tables:
+            continue
+        table, right = np.concatenate(tables), np.concatenate(rights)
+        size = np.sqrt(np.mean(table**2, 0)) + 1e-300
+        inverse = np.linalg.pinv((table / size).T @ (table / size))
+        theta[j] = inverse @ (table / size).T @ right / size
+        clusters = [x.T @ (y - x @ theta[j]) / size for x, y in zip(tables, rights, strict=True)]
+        spread = inverse @ sum(np.outer(c, c) for c in clusters) @ inverse
+        n = len(clusters)
+        error = np.sqrt(np.diag(spread) * n / max(n - 1, 1)) / size
+        speed = np.sqrt(np.mean(right**2)) / (steps * dt)
+        agrees[j] = abs(theta[j, 0] - 1.0) <= max(_SURE * error[0], _SCALE) and abs(
+            theta[j, 1]
+        ) <= max(_SURE * error[1], _SCALE * speed)
+    return Kinematics(
+        1.0 / np.where(theta[:, 0], theta[:, 0], np.inf), -theta[:, 1], -theta[:, 2], agrees
+    )
+
+
+def lag_of(twin: Twin) -> float:
+    """
+    :return: when a velocity of the twin's is true, in intervals after its position: Euler's rules
+        step the one with the other a sub-step apart
+    """
+    integrator = getattr(plant_of(twin), "integrator", None)
+    if integrator is semi_implicit_euler:
+        return -0.5 / twin.substeps
+    return 0.5 / twin.substeps if integrator is explicit_euler else 0.0
+
+
+def _unwrapped(twin: Twin, q: np.ndarray) -> np.ndarray:
+    """Angles that stay within a turn may be wrapped; others count turns, or degrees."""
+    q = q.copy()
+    for j, joint in enumerate(twin.joints):
+        inside = np.abs(q[:, j] - (np.pi if q[:, j].min() >= 0.0 else 0.0)) <= np.pi + 1e-3
+        if joint.unit == "rad" and inside.all():
+            q[:, j] = np.unwrap(q[:, j])
+    return q
+
+
+def _measured(twin: Twin, data: Trajectories) -> np.ndarray:
+    """Which velocities come from a sensor: where none does, ``infer`` says zero."""
+    obs = jnp.asarray(data.episode(0)[0][:_SOME])
+    speeds = jax.vmap(lambda row: twin.infer(row, twin.params).v)(obs)
+    return np.any(np.asarray(speeds), axis=0)
+
+
+def _thinned(
+    smoothed: tuple[np.ndarray, ...], raw: np.ndarray, actions: np.ndarray, every: int
+) -> Moved:
+    q, v, a = smoothed
+    if every == 1:
+        return Moved(q, v, a, raw, actions)
+    n = len(actions) // every
+    rows = slice(0, n * every + 1, every)
+    held = actions[: n * every].reshape(n, every, actions.shape[1]).mean(1)
+    # A cubic through its neighbours: noise is averaged, motion is not.
+    averaged = np.stack([smooth_mean(x, every) for x in raw.T], 1)
+    return Moved(q[rows], v[rows], a[rows], averaged[rows], held)
+
+
+def smooth_mean(x: np.ndarray, half: int) -> np.ndarray:
+    """:return: the value of a local cubic in windows of ``2 half + 1`` samples"""
+    width = min(2 * half + 1, len(x) - (1 - len(x) % 2))
+    return np.asarray(savgol_filter(x, width, 3, mode="interp")) if width > 3 else x
+
+
+def _rms(pieces: list[np.ndarray]) -> np.ndarray:
+    return np.sqrt(np.mean(np.concatenate(pieces) ** 2, axis=0))

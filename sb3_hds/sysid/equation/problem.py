@@ -1,0 +1,396 @@
+"""Sets of candidates on normal equations: their sizes, what they explain, what they cost."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sb3_hds.core import ActionEffect
+from sb3_hds.sysid.equation.columns import Equation, Item
+from sb3_hds.sysid.equation.plausibility import plausibility
+from sb3_hds.sysid.equation.weak_form import Grams
+from sb3_hds.sysid.hypotheses import PARAMETER, Hypotheses
+
+# Variance of a size in units of what it would be alone: beyond that, columns cannot be told apart.
+_MOST_INFLATION = 200.0
+# Least share of changes of the logged command, or of the inertia, that a set may leave.
+_LEAST_LEFT = 0.02
+_RIDGE = 1e-9
+# Numbers that what is not linear costs beside its coefficients: a speed, a period.
+_HIDDEN = {"stribeck_friction": 1, "cogging": 1}
+
+
+class Solution(NamedTuple):
+    """
+    :param rss: residual sum of squares, in units of the noise
+    :param free: columns whose coefficients were estimated
+    :param theta: coefficients
+    :param inverse: of their normal matrix
+    :param weights: of all columns in the residual; the last is that of the missing force
+    :param held: columns whose coefficients stand at a bound
+    """
+
+    rss: float
+    free: list[int]
+    theta: np.ndarray
+    inverse: np.ndarray
+    weights: np.ndarray
+    held: tuple[int, ...]
+
+    @property
+    def value(self) -> dict[int, float]:
+        """Coefficients by column."""
+        found = dict(zip(self.free, map(float, self.theta), strict=True))
+        return found | {c: -float(self.weights[c]) for c in self.held}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Problem:
+    """
+    :param items: candidates, several with different settings
+    :param grams: normal equations
+    :param lower: smallest coefficient of each column
+    :param upper: largest
+    :param prior: of each column, the inverse variance of what is believed of its coefficient
+    :param force: typical force of each joint [N m] or [N]
+    :param shares: of each column, its root mean square at each joint, shape ``(dof, columns)``
+    :param passes: of items that cut commands off, the share of changes that still passes
+    :param mass: some mass matrices, shape ``(n, dof, dof)``
+    :param slopes: of these by inertial parameters, by key
+    :param always: items that belong to every set: what is refitted anyway
+    """
+
+    items: tuple[Item, ...]
+    grams: Grams
+    lower: np.ndarray
+    upper: np.ndarray
+    prior: np.ndarray
+    force: np.ndarray
+    shares: np.ndarray
+    passes: dict[int, float]
+    mass: np.ndarray
+    slopes: dict[str, np.ndarray]
+    always: tuple[int, ...]
+    total: np.ndarray
+    cost: float
+
+    @property
+    def dof(self) -> int:
+        return len(self.grams.effective)
+
+    def place(self, i: int) -> tuple[str, int]:
+        candidate = self.items[i].candidate
+        return candidate.slot, candidate.index
+
+    def family(self, i: int) -> tuple:
+        """Of items with an equal family, a set has one at most."""
+        item = self.items[i]
+        known = plausibility(item.candidate.name)
+        if item.candidate.slot == PARAMETER:
+            return (item.key,)
+        return known.family, *self.place(i)
+
+    def clashes(self, keys: Sequence[int]) -> bool:
+        families = [self.family(i) for i in keys]
+        if len(set(families)) < len(families):
+            return True
+        common = {f[0] for f in families if f[1:] == ("actuator", -1)}
+        return any(f[0] in common and f[1:2] == ("actuator",) and f[2] >= 0 for f in families)
+
+    def joints(self, i: int) -> np.ndarray:
+        """:return: where an item acts"""
+        columns = list(self.items[i].columns)
+        return np.flatnonzero(self.shares[:, columns].max(1) > 0.0)
+
+    def price(self, i: int) -> float:
+        if i in self.always:
+            return 0.0
+        item = self.items[i]
+        count = len(item.free) + _HIDDEN.get(item.candidate.name, 0)
+        return count * self.cost + 2.0 * plausibility(item.candidate.name).rarity
+
+    def solve(self, keys: Sequence[int], total: np.ndarray | None = None) -> Solution:
+        """
+        Least squares within bounds: what would leave its bounds, the farthest first, stays there.
+
+        :param total: normal equations; default: those of all data
+        """
+        gram = self.total if total is None else total
+        items = [self.items[i] for i in keys]
+        free = [c for item in items for c in item.free]
+        weights = np.zeros(len(gram))
+        weights[-1] = 1.0
+        for item in items:
+            for c, value in zip(item.columns, item.fixed, strict=True):
+                if value is not None:
+                    weights[c] = -value
+        bounded = {c for item in items if item.rule != "chain" for c in item.free}
+        held: list[int] = []
+        while True:
+            theta, inverse = self._least_squares(gram, weights, free)
+            if inverse is None:
+                return Solution(np.inf, free, theta, np.zeros((len(free),) * 2), weights, ())
+            if not held and (common := self._stood_in_for(keys, free, inverse)):
+                return self.solve([i for i in keys if i not in common], total)
+            beyond = np.maximum(self.lower[free] - theta, theta - self.upper[free])
+            beyond = np.where([c in bounded for c in free], beyond, -np.inf)
+            beyond = beyond * np.sqrt(np.maximum(np.diag(self.total)[free], 0.0))
+            if not len(free) or beyond.max() <= 0.0:
+                break
+            worst = int(np.argmax(beyond))
+            c = free.pop(worst)
+            weights[c] = -np.clip(theta[worst], self.lower[c], self.upper[c])
+            held.append(c)
+        weights[free] = -theta
+        rss = float(weights @ gram @ weights)
+        return Solution(rss, free, theta, inverse, weights, tuple(held))
+
+    def _least_squares(
+        self, gram: np.ndarray, weights: np.ndarray, free: list[int]
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """:return: coefficients, and the inverse of their normal matrix; None if there is none"""
+        if not free:
+            return np.zeros(0), np.zeros((0, 0))
+        fixed = weights.copy()
+        fixed[free] = 0.0
+        inner = gram[np.ix_(free, free)] + np.diag(self.prior[free])
+        size = np.sqrt(np.diag(inner)) + 1e-300
+        scaled = inner / np.outer(size, size) + _RIDGE * np.eye(len(free))
+        try:
+            inverse = np.linalg.inv(scaled)
+        except np.linalg.LinAlgError:
+            return np.zeros(len(free)), None
+        theta = inverse @ ((gram @ fixed)[free] / size) / size
+        if not np.isfinite(theta).all():
+            return np.zeros(len(free)), None
+        return theta, inverse / np.outer(size, size)
+
+    def _stood_in_for(
+        self, keys: Sequence[int], free: Sequence[int], inverse: np.ndarray
+    ) -> set[int]:
+        """What is refitted anyway, and cannot be told from members: these stand in for it."""
+        if not len(free):
+            return set()
+        inflation = dict(zip(free, self._inflation(free, inverse), strict=True))
+        if max(inflation.values()) <= _MOST_INFLATION:
+            return set()
+        members = [i for i in keys if i not in self.always]
+        beyond = {
+            i: max(inflation[c] for c in self.items[i].free)
+            for i in keys
+            if i in self.always and any(set(self.joints(i)) & set(self.joints(m)) for m in members)
+        }
+        worst = max(beyond, key=lambda i: beyond[i], default=-1)
+        return {worst} if worst >= 0 and beyond[worst] > _MOST_INFLATION else set()
+
+    def _inflation(self, free: Sequence[int], inverse: np.ndarray) -> np.ndarray:
+        """:return: variance of each coefficient, in units of what it would be alone"""
+        own = list(free)
+        return np.diag(inverse) * (np.diag(self.total)[own] + self.prior[own])
+
+    def admissible(self, keys: Sequence[int], found: Solution) -> bool:
+        """Whether no member stands at its bounds alone, and all can be told apart."""
+        if not np.isfinite(found.rss):
+            return False
+        if found.free and self._inflation(found.free, found.inverse).max() > _MOST_INFLATION:
+            return False
+        value = found.value
+        for i in keys:
+            item = self.items[i]
+            if i in self.always or not item.free:
+                continue
+            if item.rule == "chain":
+                (c,) = item.free
+                if not 0.0 <= value[c] <= 1.0:
+                    return False
+            elif item.rule == "blend":
+                if item.candidate.name != "cogging" and sum(value[c] for c in item.free) < 0.0:
+                    return False
+            elif all(c in found.held for c in item.free):
+                return False
+            elif item.candidate.ascending:
+                by_name = dict(zip(item.names, (value[c] for c in item.free), strict=True))
+                shorts = (name.rpartition(".")[2] for name in item.candidate.ascending)
+                if np.any(np.diff([by_name.get(short, 0.0) for short in shorts]) < 0.0):
+                    return False
+        return True
+
+    def score(self, keys: Sequence[int], priced: bool = True) -> float:
+        """:return: Schwarz's criterion with prior odds; infinite for what cannot be"""
+        found = self.solve(keys)
+        if not self.admissible(keys, found):
+            return np.inf
+        rss = self.by_joint(found.weights, self.grams.by_joint)
+        n = self.grams.effective
+        left = np.log(np.maximum(rss, 1e-9) / n) - self.taken_away(keys, found)
+        prior = float(np.sum(self.prior[found.free] * found.theta**2))
+        prices = sum(map(self.price, keys)) if priced else 0.0
+        return float(np.sum(n * left)) + prior + prices
+
+    @staticmethod
+    def by_joint(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
+        on = np.flatnonzero(weights)
+        return np.einsum("i,...ik,k->...", weights[on], gram[..., on[:, None], on], weights[on])
+
+    def taken_away(self, keys: Sequence[int], found: Solution) -> np.ndarray:
+        """
+        Twice the logarithm of how much of the equation a set takes away, by joint, at most zero.
+
+        The equation is homogeneous: without torque (a gain of zero, a dead zone as wide as the
+        commands, saturation at the level of dry friction) and without inertia it says that nothing
+        equals nothing, and fits. So residuals count relative to what is left of the logged command
+        and of the inertia.
+        """
+        out, value = np.zeros(self.dof), found.value
+        for i in keys:
+            item = self.items[i]
+            if i in self.passes:
+                out[self.joints(i)] += 2.0 * np.log(max(self.passes[i], _LEAST_LEFT))
+            elif item.candidate.name in ("torque_gain", "directional_gain"):
+                changes = [value[c] for c in item.free if c in value]
+                left = max(1.0 + min(changes), _LEAST_LEFT)
+                out[self.joints(i)] += 2.0 * min(0.0, np.log(left))
+        return out + min(0.0, 2.0 * self._inertia_left(keys, value) / self.dof)
+
+    def _inertia_left(self, keys: Sequence[int], value: dict[int, float]) -> float:
+        """:return: by how much the logarithm of the determinant of the mass matrix changes"""
+        changes = [
+            value.get(self.items[i].columns[0], 0.0) * self.slopes[self.items[i].key]
+            for i in keys
+            if self.items[i].key in self.slopes
+        ]
+        if not changes:
+            return 0.0
+        sign, now = np.linalg.slogdet(self.mass + sum(changes))
+        return (
+            float(now.mean() - np.linalg.slogdet(self.mass)[1].mean())
+            if (sign > 0).all()
+            else -np.inf
+        )
+
+    def held_out(self, keys: Sequence[int]) -> Float[np.ndarray, "folds dof"]:
+        """:return: residual sum of squares of each fold, coefficients from the others"""
+        out = []
+        for fold in self.grams.folds:
+            found = self.solve(keys, self.total - fold.sum(0))
+            rss = self.by_joint(found.weights, fold)
+            taken = np.maximum(self.taken_away(keys, found), -6.0)
+            out.append(rss * np.exp(-taken))
+        return np.array(out)
+
+    def ranking(self, keys: Sequence[int], among: Sequence[int] | None = None) -> list[int]:
+        """:return: items by what they would take off the residual, best first"""
+        found = self.solve(keys)
+        if not np.isfinite(found.rss):
+            return []
+        r = self.total @ found.weights
+        cross = self.total[:, found.free]
+        diagonal = np.diag(self.total)
+        left = np.maximum(diagonal - np.einsum("ij,jk,ik->i", cross, found.inverse, cross), 1e-9)
+        told = left > 1e-5 * diagonal
+        drop = np.where(told, r**2 / left, 0.0)
+        pool = (
+            [i for i in range(len(self.items)) if i not in keys] if among is None else list(among)
+        )
+        gains = []
+        for i in pool:
+            item = self.items[i]
+            if item.rule != "chain":
+                gains.append(float(drop[list(item.free)].sum()))
+                continue
+            whole, part = item.columns
+            value = 2.0 * r[whole] - left[whole]
+            mixed = self.total[whole, part] - cross[whole] @ found.inverse @ cross[part]
+            if left[part] > 0.0:
+                share = np.clip((r[part] - mixed) / left[part], 0.0, 1.0)
+                value += 2.0 * share * (r[part] - mixed) - share**2 * left[part]
+            gains.append(float(value))
+        order = np.argsort(gains)[::-1]
+        return [pool[k] for k in order if gains[k] > 0.5 * self.cost]
+
+    def carried(self, keys: Sequence[int]) -> np.ndarray:
+        """:return: of each member, the largest share of a joint's force that it carries"""
+        found = self.solve(keys)
+        return np.array([float(np.max(self.force_of(i, found) / self.force)) for i in keys])
+
+    def force_of(self, i: int, found: Solution) -> np.ndarray:
+        """:return: root mean square force of a member at each joint"""
+        value, item = found.value, self.items[i]
+        total = np.zeros(self.dof)
+        for c, fixed in zip(item.columns, item.fixed, strict=True):
+            total += (value.get(c, fixed or 0.0) * self.shares[:, c]) ** 2
+        return np.sqrt(total)
+
+
+def problem(hypotheses: Hypotheses, equation: Equation, made: Grams) -> Problem:
+    """:param made: normal equations of the equation"""
+    items, n = tuple(equation.items), len(equation.columns)
+    lower, upper, prior = np.full(n, -np.inf), np.full(n, np.inf), np.zeros(n + 1)
+    always = []
+    for number, item in enumerate(items):
+        if item.candidate.slot == PARAMETER and item.candidate.index < 0:
+            always.append(number)
+        for c, name in zip(item.columns, item.names, strict=True):
+            if item.rule == "chain":
+                lower[c], upper[c] = 0.0, 1.0
+            elif item.rule == "linear":
+                lower[c], upper[c] = _bounds(hypotheses, item, name)
+    for number in always:
+        (column,), name = items[number].columns, items[number].candidate.place
+        prior[column] = hypotheses.prior[hypotheses.names.index(name)] ** -2.0
+    dof = equation.missing.shape[1]
+    shares = np.zeros((dof, n))
+    for c, column in enumerate(equation.columns):
+        own = slice(None) if column.joint is None else column.joint
+        shares[own, c] = np.sqrt(np.mean(column.values**2, axis=0))
+    force = np.sqrt(np.mean(equation.actuator**2, axis=0))
+    force = np.maximum(force, np.sqrt(np.mean(equation.load**2, axis=0))) + 1e-300
+    some = np.linspace(0, len(equation.mass) - 1, min(32, len(equation.mass))).astype(int)
+    total = made.by_joint.sum(0)
+    return Problem(
+        items=items,
+        grams=made,
+        lower=lower,
+        upper=upper,
+        prior=prior,
+        force=force,
+        shares=shares,
+        passes=_passing(hypotheses, equation, items),
+        mass=equation.mass[some],
+        slopes={key: slope[some] for key, slope in equation.slopes.items()},
+        always=tuple(always),
+        total=total,
+        cost=float(np.log(made.effective.mean())),
+    )
+
+
+def _bounds(h: Hypotheses, item: Item, name: str) -> tuple[float, float]:
+    """Of a change from the null: what physics allows, and what machines have."""
+    known = plausibility(item.candidate.name)
+    if item.candidate.slot == PARAMETER:
+        place = item.candidate.place
+        i = h.names.index(place)
+        value = h.believed.values[place]
+        return h.lower[i] - value, h.upper[i] - value
+    full = next(p for p in item.candidate.parameters if p.rpartition(".")[2] == name)
+    i = h.names.index(full)
+    low, high = h.lower[i] - h.null[i], h.upper[i] - h.null[i]
+    return max(low, known.lower if known.lower != 0.0 else low), min(high, known.upper)
+
+
+def _passing(h: Hypotheses, equation: Equation, items: Sequence[Item]) -> dict[int, float]:
+    found = {}
+    commands = np.concatenate([r.actions for r in equation.motion.recordings])
+    for number, item in enumerate(items):
+        if item.candidate.name not in ("saturation", "dead_zone"):
+            continue
+        effect = h.effect_of(item.candidate)
+        assert isinstance(effect, ActionEffect)
+        low, high = (at[effect.chained] for at in item.settings)
+        size = np.abs(commands[:, item.candidate.index])
+        middle = 0.5 * (low + high)
+        passing = size < middle if item.candidate.name == "saturation" else size > 0.5 * middle
+        found[number] = float(np.mean(passing))
+    return found

@@ -1,0 +1,127 @@
+"""What the nominal model says of measured motion: one step of the twin from every row."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sb3_hds.core import AnalyticTwin, Params, State, Twin
+from sb3_hds.core.compilation import QUICKEST_COMPILATION
+from sb3_hds.core.layers import plant_of
+
+# Rows that are evaluated at a time: programs are compiled for one shape.
+_ROWS = 4096
+
+
+class Terms(NamedTuple):
+    """
+    The nominal model along one recording, each leaf with a row for each interval.
+
+    :param change: of the velocity over an interval, as the twin steps, shape ``(n, dof)``
+    :param mass: mass matrix where the interval begins, shape ``(n, dof, dof)``
+    :param actuator: force of the actuators there, shape ``(n, dof)``
+    :param bias: force that gravity and inertia take there, shape ``(n, dof)``
+    """
+
+    change: np.ndarray
+    mass: np.ndarray
+    actuator: np.ndarray
+    bias: np.ndarray
+
+
+def terms(
+    twin: Twin,
+    params: Params,
+    q: Float[np.ndarray, "n dof"],
+    v: Float[np.ndarray, "n dof"],
+    actions: Float[np.ndarray, "n act"],
+) -> Terms:
+    """
+    :param twin: whose interval is that of the rows; what it remembers is filled from the first row
+    :param params: its parameters
+    :param q: positions where intervals begin
+    :param v: velocities there
+    :param actions: held over each interval
+    """
+    with jax.enable_x64(True):
+        params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), dict(params))
+        if _remembers(twin):
+            given = (jnp.asarray(x, jnp.float64) for x in (q, v, actions))
+            return Terms(*map(np.asarray, _one_after_the_other(twin, params, *given)))
+        n, parts = len(q), []
+        size = min(_ROWS, n)
+        for first in range(0, n, size):
+            index = np.minimum(np.arange(first, first + size), n - 1)
+            given = (jnp.asarray(x[index], jnp.float64) for x in (q, v, actions))
+            found = _side_by_side(twin, params, *given)
+            parts.append([np.asarray(leaf)[: n - first] for leaf in found])
+    return Terms(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def forces(
+    twin: Twin,
+    params: Params,
+    q: Float[np.ndarray, "n dof"],
+    v: Float[np.ndarray, "n dof"],
+    actions: Float[np.ndarray, "m n act"],
+) -> Float[np.ndarray, "m n dof"]:
+    """:return: force of the actuators under other commands in the same states"""
+    plant = plant_of(twin)
+    assert isinstance(plant, AnalyticTwin)
+    with jax.enable_x64(True):
+        params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), dict(params))
+        given = (jnp.asarray(x, jnp.float64) for x in (q, v, actions))
+        return np.asarray(_actuated(plant, params, *given))
+
+
+def _remembers(twin: Twin) -> bool:
+    obs = jnp.zeros(len(twin.channels))
+    return bool(jax.tree.leaves(jax.eval_shape(lambda: twin.infer(obs, twin.params).memory)))
+
+
+def _one_step(twin: Twin, params: Params, state: State, action: Array) -> tuple[State, tuple]:
+    plant = plant_of(twin)
+    after = twin.step(state, action, params)
+    if isinstance(plant, AnalyticTwin):
+        found = (
+            plant.mass_matrix(state.q, params),
+            plant.actuate(state, action, params),
+            plant.bias(state.q, state.v, params),
+        )
+    else:
+        still = jnp.zeros_like(state.v)
+        found = jnp.eye(len(state.v), dtype=state.v.dtype), still, still
+    return after, (after.v - state.v, *found)
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
+def _side_by_side(twin: Twin, params: Params, q: Array, v: Array, actions: Array) -> tuple:
+    nothing = _memory_of(twin, params, q.dtype)
+    one = lambda q, v, u: _one_step(twin, params, State(q, v, nothing), u)[1]  # noqa: E731
+    return jax.vmap(one)(q, v, actions)
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
+def _one_after_the_other(twin: Twin, params: Params, q: Array, v: Array, actions: Array) -> tuple:
+    obs = twin.observe(State(q[0], v[0], _memory_of(twin, params, q.dtype)), params)
+    first = twin.infer(obs, params).memory
+
+    def advance(memory: dict, row: tuple) -> tuple[dict, tuple]:
+        after, found = _one_step(twin, params, State(row[0], row[1], memory), row[2])
+        return after.memory, found
+
+    return jax.lax.scan(advance, first, (q, v, actions))[1]
+
+
+def _memory_of(twin: Twin, params: Params, dtype: np.dtype) -> dict:
+    obs = jnp.zeros(len(twin.channels), dtype)
+    return twin.infer(obs, params).memory
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
+def _actuated(plant: AnalyticTwin, params: Params, q: Array, v: Array, actions: Array) -> Array:
+    one = lambda q, v, action: plant.actuate(State(q, v, {}), action, params)  # noqa: E731
+    return jax.vmap(lambda each: jax.vmap(one)(q, v, each))(actions)

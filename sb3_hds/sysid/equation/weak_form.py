@@ -1,0 +1,260 @@
+"""
+The equation against test functions: noise of velocities averages out, accelerations are not formed.
+
+The missing force is an impulse for each interval, and the measured velocities in it telescope where
+the mass matrix is constant: multiplied by a smooth bump and summed, only slopes of the bump meet
+their noise. Overlapping bumps are the rows; Huber weights and blocks of data follow.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sb3_hds.sysid.equation.columns import Equation, Item
+from sb3_hds.sysid.hypotheses import PARAMETER
+
+# Width of a bump, in periods of the joint's motion, and its least number of intervals.
+_WIDTH, _LEAST = 0.3, 6
+# Below this share of the root mean square speed, or so many of its errors, a joint is at rest: dry
+# friction is then whatever it has to be, and says nothing. Intervals around a reversal, which
+# smoothing blurs, likewise.
+_REST, _ERRORS = 0.02, 3.0
+# Rows per column of the rich model that must be left, or bumps become narrower, or rest stays in.
+_ENOUGH = 4.0
+# Huber's threshold, in units of the noise, and how often weights are found anew.
+_HUBER, _PASSES = 2.0, 4
+# Blocks of data that agree or not: recordings, or pieces of them where they are fewer.
+_BLOCKS, _FOLDS = 16, 8
+# How much wider cluster-robust errors may be than naive ones.
+_MOST_DEFLATION = 10.0
+# What the rich model of the noise leaves out: with it, nothing equals nothing.
+_SCALES = ("torque_gain", "directional_gain", "dead_zone", "saturation", "sensor_scale")
+_RANK = 1e-6
+
+
+class Rows(NamedTuple):
+    """
+    The equation of one joint, in units of its noise.
+
+    :param y: missing force, shape ``(n,)``
+    :param x: columns, shape ``(n, used)``
+    :param used: indices of the columns
+    :param block: of data that each row is from, shape ``(n,)``
+    :param scale: noise of a row [N m] or [N]
+    :param floor: what the noise of the velocities alone would leave, in units of ``scale``
+    :param gain: by which a constant force is larger in a row than at an instant
+    """
+
+    y: np.ndarray
+    x: np.ndarray
+    used: np.ndarray
+    block: np.ndarray
+    scale: float
+    floor: float
+    gain: float
+
+
+def weak_rows(equation: Equation) -> list[Rows]:
+    """:return: of each joint"""
+    return [_joint(equation, j) for j in range(equation.missing.shape[1])]
+
+
+def rich_columns(items: list[Item], used: np.ndarray, joint: int | None = None) -> np.ndarray:
+    """
+    :return: places among ``used`` of the columns of a rich linear model, what it leaves being noise
+    """
+    wanted: dict[str, tuple[int, ...]] = {}
+    for item in items:
+        if item.rule in ("linear", "blend") and item.candidate.name not in _SCALES:
+            # Of what has several settings, the one in the middle stands for all.
+            wanted.setdefault(item.key, item.columns)
+    columns = {c for cs in wanted.values() for c in cs}
+    return np.flatnonzero(np.isin(used, list(columns)))
+
+
+def _joint(equation: Equation, j: int) -> Rows:
+    columns, motion = equation.columns, equation.motion
+    pairs = [(i, values) for i, c in enumerate(columns) if (values := c.at(j)) is not None]
+    pairs = [(i, values) for i, values in pairs if np.abs(values).max() > 0.0]
+    used = np.array([i for i, _ in pairs], int)
+    table = np.stack([equation.missing[:, j], *(values for _, values in pairs)], 1)
+    still = _at_rest(equation, j)
+    rich = rich_columns(equation.items, used)
+    period = motion.period[j] if np.isfinite(motion.period[j]) else 1.0
+    width = max(_WIDTH * period, _LEAST * motion.dt)
+    for half, masked in ((width / 2, True), (width / 4, True), (width / 2, False)):
+        n_half = max(2, round(half / motion.dt))
+        projected, pieces = _against_bumps(table, equation.recording, still & masked, n_half)
+        if len(projected) > _ENOUGH * len(rich):
+            break
+    if not len(projected):
+        return Rows(np.zeros(0), np.zeros((0, len(used))), used, np.zeros(0, int), 1.0, 0.0, 1.0)
+    y, x = projected[:, 0], projected[:, 1:]
+    weight, scale = _huber(y, x[:, rich])
+    slope = np.linalg.norm(np.diff(_bump(n_half), prepend=0.0, append=0.0))
+    mass = float(np.median(equation.mass[:, j, j]))
+    floor = mass * motion.noise_v[j] * slope / motion.dt / scale
+    return Rows(
+        weight * y / scale,
+        weight[:, None] * x / scale,
+        used,
+        _blocks(pieces, equation.recording),
+        scale,
+        float(floor),
+        float(_bump(n_half).sum()),
+    )
+
+
+def _at_rest(equation: Equation, j: int) -> np.ndarray:
+    v, motion = equation.v[:, j], equation.motion
+    slow = np.abs(v) < max(_ERRORS * motion.error_v[j], _REST * motion.speed[j])
+    turns = np.abs(np.diff(np.sign(v), prepend=np.sign(v[:1]))) > 0
+    around = np.ones(2 * int(motion.blurred[j]) + 1)
+    return np.convolve(slow | turns, around, "same") > 0
+
+
+def _bump(half: int) -> np.ndarray:
+    s = np.arange(-half, half + 1) / (half + 1)
+    phi = (1.0 - s**2) ** 2
+    return phi / np.linalg.norm(phi)
+
+
+def _against_bumps(
+    table: np.ndarray, recording: np.ndarray, left_out: np.ndarray, half: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """:return: sums against bumps a half width apart, and the middle of each"""
+    phi = _bump(half)
+    rows, middles = [], []
+    for begin, end in _runs(recording, left_out):
+        if end - begin < len(phi):
+            continue
+        first = np.arange(begin, end - len(phi) + 1, half)
+        for k in first:
+            rows.append(phi @ table[k : k + len(phi)])
+            middles.append(k + half)
+    return (np.array(rows) if rows else np.zeros((0, table.shape[1]))), np.array(middles, int)
+
+
+def _runs(recording: np.ndarray, left_out: np.ndarray) -> list[tuple[int, int]]:
+    """:return: begin and end of stretches of one recording without anything left out"""
+    cut = np.flatnonzero(np.diff(recording)) + 1
+    kept = ~left_out
+    edges = np.diff(np.concatenate([[0], kept.astype(int), [0]]))
+    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    runs = []
+    for begin, end in zip(begins, ends, strict=True):
+        inner = cut[(cut > begin) & (cut < end)]
+        bounds = [begin, *inner.tolist(), end]
+        runs += list(itertools.pairwise(bounds))
+    return runs
+
+
+def _huber(y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, float]:
+    """Weights of rows that even the rich model misses, and the noise of the others."""
+    weight, scale = np.ones(len(y)), 1.0
+    for _ in range(_PASSES):
+        left = y - x @ _least_squares(weight[:, None] * x, weight * y)
+        scale = float(np.median(np.abs(left)) / 0.6745) + 1e-300
+        weight = np.sqrt(np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(left), 1e-300)))
+    freedom = max(len(y) - x.shape[1], len(y) // 3, 1)
+    return weight, scale * float(np.sqrt(len(y) / freedom))
+
+
+def _least_squares(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    size = np.sqrt(np.mean(x**2, axis=0)) + 1e-300
+    return np.linalg.lstsq(x / size, y, rcond=_RANK)[0] / size
+
+
+def _blocks(middles: np.ndarray, recording: np.ndarray) -> np.ndarray:
+    """Recordings, or pieces of equal length of fewer."""
+    names = np.unique(recording)
+    pieces = max(1, -(-_BLOCKS // len(names)))
+    place = np.arange(len(recording)) - np.searchsorted(recording, recording)
+    length = np.bincount(recording, minlength=names.max() + 1)[recording]
+    piece = np.minimum(place * pieces // np.maximum(length, 1), pieces - 1)
+    return (recording * pieces + piece)[middles]
+
+
+class Grams(NamedTuple):
+    """
+    Normal equations, by joint and block of data: any set of columns is solved in a millisecond.
+
+    :param blocks: shape ``(blocks, columns + 1, columns + 1)``; the last row is the missing force
+    :param by_joint: shape ``(dof, columns + 1, columns + 1)``
+    :param folds: of held-out data, shape ``(folds, dof, columns + 1, columns + 1)``
+    :param effective: number of independent rows of each joint
+    :param floor: what the noise of velocities alone would leave of each joint's rows, in their unit
+    :param scale: noise of a row of each joint [N m] or [N]
+    :param gain: by which a constant force is larger in a row of each joint than at an instant
+    :param n_blocks: number of blocks
+    """
+
+    blocks: np.ndarray
+    by_joint: np.ndarray
+    folds: np.ndarray
+    effective: Float[np.ndarray, " dof"]
+    floor: Float[np.ndarray, " dof"]
+    scale: Float[np.ndarray, " dof"]
+    gain: Float[np.ndarray, " dof"]
+    n_blocks: int
+
+    @property
+    def total(self) -> np.ndarray:
+        return self.by_joint.sum(0)
+
+
+def grams(equation: Equation, rows: list[Rows]) -> Grams:
+    """
+    Blocks that agree less than their rows would: then each row counts as less than one, by the
+    ratio of cluster-robust to naive variances of the rich model's coefficients.
+    """
+    n_columns, dof = len(equation.columns), len(rows)
+    pieces = max(1, -(-_BLOCKS // len(np.unique(equation.recording))))
+    n_blocks = (int(equation.recording.max()) + 1) * pieces
+    blocks = np.zeros((n_blocks, n_columns + 1, n_columns + 1))
+    by_joint = np.zeros((dof, n_columns + 1, n_columns + 1))
+    n_folds = min(_FOLDS, n_blocks)
+    order = np.arange(n_blocks)
+    fold_of = order % n_folds if pieces == 1 else order * n_folds // n_blocks
+    folds = np.zeros((n_folds, dof, n_columns + 1, n_columns + 1))
+    effective, floor = np.full(dof, 5.0), np.zeros(dof)
+    scale, gain = np.ones(dof), np.ones(dof)
+    for j, own in enumerate(rows):
+        scale[j], gain[j] = own.scale, own.gain
+        if not len(own.y):
+            continue
+        index = np.ix_([*own.used, n_columns], [*own.used, n_columns])
+        z = np.concatenate([own.x, own.y[:, None]], 1)
+        local = np.stack([z[own.block == b].T @ z[own.block == b] for b in range(n_blocks)])
+        deflation = _deflation(local, rich_columns(equation.items, own.used))
+        local = local / deflation
+        effective[j], floor[j] = max(len(own.y) / deflation, 5.0), own.floor
+        for b in range(n_blocks):
+            blocks[b][index] += local[b]
+            folds[fold_of[b], j][index] += local[b]
+        by_joint[j][index] = local.sum(0)
+    return Grams(blocks, by_joint, folds, effective, floor, scale, gain, n_blocks)
+
+
+def _deflation(local: np.ndarray, rich: np.ndarray) -> float:
+    if not len(rich):
+        return 1.0
+    total = local.sum(0)
+    size = np.sqrt(np.diag(total)[rich]) + 1e-300
+    values, vectors = np.linalg.eigh(total[np.ix_(rich, rich)] / np.outer(size, size))
+    well = values > 1e-6 * values[-1]
+    inverse = (vectors[:, well] / values[well]) @ vectors[:, well].T
+    theta = inverse @ (total[rich, -1] / size)
+    among = local[:, rich][:, :, rich] / np.outer(size, size)
+    scores = local[:, rich, -1] / size - np.einsum("bij,j->bi", among, theta)
+    robust = inverse @ (scores.T @ scores) @ inverse
+    ratio = np.diag(robust) / np.maximum(np.diag(inverse), 1e-12)
+    n = len(local)
+    free = n / max(n - int(well.sum()), n / 2)
+    return float(np.clip(np.median(ratio) * free, 1.0, _MOST_DEFLATION))
+
+
+def is_parameter(item: Item) -> bool:
+    return item.candidate.slot == PARAMETER

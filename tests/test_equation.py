@@ -1,0 +1,144 @@
+"""Equation errors in weak form: sets of causes, kinematics, conventions, on small data."""
+
+import first_users
+import numpy as np
+import pytest
+
+from sb3_hds import Trajectories, effects, twins
+from sb3_hds.sysid.conventions import other_convention
+from sb3_hds.sysid.equation.motion import kinematics, motion
+from sb3_hds.sysid.equation.smoothing import smooth, white_noise
+from sb3_hds.sysid.leapfrog import in_step_with_the_log
+from sb3_hds.sysid.screening import screen
+
+
+def proposed(twin, data, calibrate=()):
+    """Sizes of the causes that are proposed, by key and short name."""
+    twin, data, _ = in_step_with_the_log(twin, data)
+    found = screen(twin, motion(twin, data), effects.ALL, calibrate)
+    return {m.key: m.sizes for m in found.members}
+
+
+def rubbing_axis(length=1.0, time=1.0, force=1.0, cut=None):
+    """
+    A mass of 2 kg with viscous and dry friction, stepped finely; in other units of length, time and
+    force, or with recordings cut at another place.
+    """
+    rng, fine, n, every = np.random.default_rng(1), 1e-4, 60_000, 100
+    obs, actions = [], []
+    for _ in range(4):
+        frequencies, phases = rng.uniform(0.3, 1.0, 3), rng.uniform(0.0, 6.0, 3)
+        t = fine * every * np.arange(n // every)
+        u = 6.0 * np.sin(2.0 * np.pi * frequencies * t[:, None] + phases).sum(1)
+        q, v, rows = 0.0, 0.0, []
+        for k in range(n):
+            if k % every == 0:
+                rows.append((q, v))
+            push = u[k // every] - 3.0 * v
+            slide = v + fine * push / 2.0
+            v = np.sign(slide) * max(abs(slide) - fine * 1.5 / 2.0, 0.0)
+            q += fine * v
+        rows = np.array([*rows, (q, v)]) + rng.standard_normal((n // every + 1, 2)) * [1e-4, 2e-3]
+        obs.append(rows * [length, length / time])
+        actions.append(force * u[:, None])
+    if cut:
+        obs = [piece for o in obs for piece in (o[: cut + 1], o[cut:])]
+        actions = [piece for a in actions for piece in (a[:cut], a[cut:])]
+    dt = fine * every * time
+    twin = twins.make("LinearAxis", mass=2.0 * force * time**2 / length, dt=dt)
+    return twin, Trajectories.from_arrays(obs, actions, dt=dt)
+
+
+@pytest.fixture(scope="module")
+def as_it_is():
+    return proposed(*rubbing_axis())
+
+
+def test_viscous_and_dry_friction_are_proposed_together(as_it_is):
+    assert as_it_is == {
+        "viscous_friction.axis": {"b": pytest.approx(3.0, rel=0.02)},
+        "coulomb_friction.axis": {"tau_c": pytest.approx(1.5, rel=0.02)},
+    }
+
+
+@pytest.mark.parametrize(
+    "units", [{"length": 1e3}, {"time": 1e-3}, {"time": 1e3}, {"force": 1e-3}, {"cut": 250}]
+)
+def test_the_same_data_in_other_units_give_the_same_causes(as_it_is, units):
+    found = proposed(*rubbing_axis(**units))
+    length, time, force = (units.get(name, 1.0) for name in ("length", "time", "force"))
+
+    assert found.keys() == as_it_is.keys()
+    per_speed = force * time / length
+    assert found["viscous_friction.axis"]["b"] == pytest.approx(3.0 * per_speed, rel=0.03)
+    assert found["coulomb_friction.axis"]["tau_c"] == pytest.approx(1.5 * force, rel=0.03)
+
+
+@pytest.mark.parametrize("believed, calibrate", [(5.0, []), (8.0, ["mass"])])
+def test_a_joint_whose_friction_carries_the_torque(believed, calibrate):
+    found = proposed(*first_users.joint_with_friction(believed), calibrate)
+
+    assert found.keys() == {"viscous_friction.axis", "coulomb_friction.axis"}
+    assert found["viscous_friction.axis"]["b"] == pytest.approx(22.0, rel=0.05)
+    assert found["coulomb_friction.axis"]["tau_c"] == pytest.approx(13.0, rel=0.05)
+
+
+def test_an_encoder_that_counts_too_much_scales_position_and_velocity():
+    found = proposed(*first_users.scaled_angle(), ["inertia", "damping"])
+
+    assert found == {"sensor_scale.hinge": {"scale": pytest.approx(1.04, abs=0.005)}}
+
+
+@pytest.mark.parametrize("slower", [1.0, 50.0])
+def test_a_spring_that_hardens_is_one_whatever_the_clock(slower):
+    given = first_users.fast_oscillator(slower)
+    found = proposed(*given, ["stiffness", "damping"])
+
+    assert found.keys() == {"cubic_stiffness.mass"}
+    assert found["cubic_stiffness.mass"]["k3"] == pytest.approx(6e5 / slower**2, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    "given, name",
+    [
+        (first_users.free_pendulum, None),
+        (lambda: first_users.free_pendulum(zero="up"), "zero"),
+        (lambda: first_users.free_pendulum(factor=180.0 / np.pi), "degrees"),
+        (first_users.flipped_command, "direction"),
+    ],
+)
+def test_a_log_in_other_conventions_is_told_before_any_cause(given, name):
+    twin, data = given()
+    found = other_convention(twin, motion(twin, data), ())
+
+    assert (found and found.name) == name
+
+
+def test_velocities_are_compared_with_differences_of_positions():
+    rng, dt = np.random.default_rng(0), 0.01
+    recordings = []
+    for phase in range(4):
+        t = dt * np.arange(1001)
+        q, late = np.sin(2.0 * t + phase), t - 0.5 * dt
+        v = 1.03 * 2.0 * np.cos(2.0 * late + phase) + 0.02
+        noise = rng.standard_normal((2, 1001, 1)) * [[[1e-5]], [[1e-3]]]
+        recordings.append((q[:, None] + noise[0], v[:, None] + noise[1]))
+    found = kinematics(recordings, dt, np.array([np.pi]))
+
+    assert found.scale == pytest.approx([1.03], rel=1e-3)
+    assert found.zero == pytest.approx([0.02], rel=0.05)
+    assert found.lag == pytest.approx([-0.5], abs=0.05)
+    assert not found.agrees[0]
+
+
+def test_smoothing_takes_noise_away_and_no_motion():
+    rng, dt = np.random.default_rng(0), 0.01
+    t = dt * np.arange(1001)
+    q, v = np.sin(2.0 * t), 2.0 * np.cos(2.0 * t)
+    noisy_q, noisy_v = (x + s * rng.standard_normal(1001) for x, s in ((q, 1e-3), (v, 0.05)))
+    found = smooth(noisy_q, noisy_v, dt)
+
+    assert white_noise(noisy_v) == pytest.approx(0.05, rel=0.1)
+    assert found.noise_v == pytest.approx(0.05, rel=0.1)
+    assert np.std(found.v - v) < 2.0 * found.error_v < 0.02
+    assert np.std(found.a + 4.0 * q) < 0.2

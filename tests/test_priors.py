@@ -1,0 +1,57 @@
+"""What is believed of a parameter that data refit."""
+
+import numpy as np
+import pytest
+
+from sb3_hds import Trajectories
+from sb3_hds.core import Channel, Parameter
+from sb3_hds.errors import CalibrationError
+from sb3_hds.sysid.adequacy import distances, far_in_words, noise_of
+from sb3_hds.sysid.priors import at_limit, prior_of
+
+MASS = Parameter(null=1.0, scale=0.1, unit="kg", lower=1e-6)
+DAMPING = Parameter(null=0.0, scale=0.1, unit="N s/m", lower=0.0)
+
+
+def test_a_prior_is_as_wide_as_the_scale_in_proportion_to_the_value():
+    assert prior_of("mass", MASS, 8.0).deviation == pytest.approx(1.6)
+    assert prior_of("mass", MASS, 0.1).deviation == pytest.approx(0.1)
+    assert prior_of("damping", DAMPING, 200.0).deviation == pytest.approx(40.0)
+    assert prior_of("mass", MASS, 1.0, belief=3.0).deviation == pytest.approx(0.6)
+
+
+def test_a_value_stays_within_a_factor_of_twenty_unless_bounds_are_given():
+    assert prior_of("mass", MASS, 2.0)[1:] == pytest.approx((0.1, 40.0))
+    assert prior_of("mass", MASS, 2.0, belief=(1.0, 3.0))[1:] == (1.0, 3.0)
+    assert prior_of("damping", DAMPING, 0.0)[1:] == (0.0, np.inf)
+
+
+@pytest.mark.parametrize("belief", [0.0, -1.0, True, "much", (3.0, 4.0), (1.0,)])
+def test_what_is_no_belief_is_refused(belief):
+    with pytest.raises(CalibrationError, match="mass"):
+        prior_of("mass", MASS, 2.0, belief=belief)
+
+
+def test_a_bound_where_the_value_was_believed_to_be_is_no_news():
+    assert at_limit(40.0, 0.1, 40.0, believed=2.0)
+    assert not at_limit(0.0, 0.0, np.inf, believed=0.0)
+    assert not at_limit(2.1, 0.1, 40.0, believed=2.0)
+
+
+def test_noise_is_told_from_a_smooth_motion():
+    rng, t = np.random.default_rng(0), 0.01 * np.arange(2001)
+    obs = np.stack([np.sin(3.0 * t), 3.0 * np.cos(3.0 * t)], 1)
+    noisy = obs + rng.standard_normal(obs.shape) * [1e-3, 0.05]
+    data = Trajectories.from_arrays([noisy], [np.zeros((2000, 0))], dt=0.01)
+
+    assert noise_of(data) == pytest.approx([1e-3, 0.05], rel=0.1)
+
+
+def test_what_is_far_off_is_told_in_the_unit_of_the_channel_and_in_shares():
+    channels = Channel("angle", "rad"), Channel("speed", "rad/s")
+    raw = np.broadcast_to([0.5, 0.02], (4, 10, 2))
+    found = distances(channels, raw, np.array([0.01, 0.01]), np.array([1.0, 1.0]))
+
+    assert [one.near for one in found] == [False, True]
+    assert "angle by 0.5 rad, 50% of its standard deviation" in far_in_words(found)
+    assert far_in_words(found[1:]) == ""
