@@ -23,9 +23,8 @@ def run(given: argparse.Namespace) -> None:
     from sb3_hds.sysid import diagnose
 
     _check_targets(given)
-    twin = measured.twin_of(given)
+    twin, data = measured.question(given)
     measure = None if given.env is None else _policy_question(given, twin)
-    data = measured.data_of(given)
     corrections: tuple[str, ...] = ()
     if given.correct:
         checked = audit(data, twin=twin)
@@ -50,6 +49,7 @@ def run(given: argparse.Namespace) -> None:
         plain["policy_gain"] = gain = bought.to_dict()
     if given.json:
         measured.write_json(given.json, plain)
+    measured.write_twin(given, found.twin)
     if given.report:
         print(f"The report is {found.to_html(given.report, gain)}.")
 
@@ -58,8 +58,9 @@ def _check_targets(given: argparse.Namespace) -> None:
     """What would fail after minutes fails now."""
     from sb3_hds.core.storage import check_target
 
-    if given.json:
-        check_target(given.json)
+    for target in filter(None, (given.json, given.write)):
+        check_target(target)
+    measured.check_write(given)
     if given.report:
         from sb3_hds.sysid.report import check_installed, check_page
 

@@ -13,7 +13,7 @@ from sb3_hds.twins.inverted_pendulum import InvertedPendulum
 from sb3_hds.twins.inverted_pendulum_friction import InvertedPendulumFriction
 from sb3_hds.twins.linear_axis import LinearAxis
 from sb3_hds.twins.mountain_car import MountainCar
-from sb3_hds.twins.mujoco import MechanismTwin, from_mujoco
+from sb3_hds.twins.mujoco import MechanismTwin, Written, from_mujoco, write_model
 from sb3_hds.twins.payload_pendulum import PayloadPendulum
 from sb3_hds.twins.pendulum import Pendulum
 from sb3_hds.twins.pendulum_real import PendulumReal
@@ -61,6 +61,7 @@ __all__ = [
     "Rig",
     "ServoPendulum",
     "TwinCheck",
+    "Written",
     "all_ids",
     "check",
     "from_env",
@@ -70,4 +71,5 @@ __all__ = [
     "make",
     "names",
     "register",
+    "write_model",
 ]

@@ -33,7 +33,7 @@ def load(source: Any) -> Loaded:
     if isinstance(source, mj.MjModel):
         return Loaded(source)
     if isinstance(source, mj.MjSpec):
-        return Loaded(_compiled(source.copy, "this MjSpec"))
+        return Loaded(_compiled(source.copy, "this MjSpec")[0])
     if isinstance(source, str | os.PathLike):
         return _from_text_or_file(source)
     model = getattr(getattr(source, "unwrapped", None), "model", None)
@@ -46,6 +46,34 @@ def load(source: Any) -> Loaded:
 
 
 def _from_text_or_file(source: str | os.PathLike[str]) -> Loaded:
+    text, urdf, parsed, where = _parser_of(source)
+    mimics = tuple(_mimics(text)) if urdf else ()
+    return Loaded(_compiled(parsed, where)[0], urdf=urdf, mimics=mimics)
+
+
+def spec_of(source: Any) -> tuple[Any, Any, bool]:
+    """
+    :param source: path of an MJCF or URDF file, or its text; or an ``MjSpec``
+    :return: an ``MjSpec`` that compiles, its model, and whether it comes from a URDF
+    :raises ModelFileError: if there is no such file, or MuJoCo refuses it
+    """
+    if isinstance(source, mujoco().MjSpec):
+        model, spec = _compiled(source.copy, "this MjSpec")
+        return spec, model, False
+    if not isinstance(source, str | os.PathLike):
+        raise ModelFileError(
+            "A model is written into a copy of its source: the path of an MJCF or URDF file, its "
+            f"text, or an MjSpec; got {type(source).__name__}."
+        )
+    _, urdf, parsed, where = _parser_of(source)
+    model, spec = _compiled(parsed, where)
+    return spec, model, urdf
+
+
+def _parser_of(
+    source: str | os.PathLike[str],
+) -> tuple[str, bool, Callable[[], Any], str]:
+    """Its text, whether that is a URDF, what makes an ``MjSpec`` of it, and how to call it."""
     text = str(source).lstrip()
     inline = text.startswith("<")
     where = "this text" if inline else f"'{source}'"
@@ -67,14 +95,15 @@ def _from_text_or_file(source: str | os.PathLike[str]) -> Loaded:
             spec.compiler.fusestatic = False
         return spec
 
-    return Loaded(_compiled(parsed, where), urdf=urdf, mimics=tuple(_mimics(text)) if urdf else ())
+    return text, urdf, parsed, where
 
 
-def _compiled(parsed: Callable[[], Any], where: str) -> Any:
+def _compiled(parsed: Callable[[], Any], where: str) -> tuple[Any, Any]:
     """Without what only shows or touches, if files for that are missing: inertials suffice."""
     mj = mujoco()
+    spec = parsed()
     try:
-        return parsed().compile()
+        return spec.compile(), spec
     except ValueError as error:
         if not _is_about_files(error):
             raise ModelFileError(f"MuJoCo refuses {where}: {_first_line(error)}.") from None
@@ -92,7 +121,7 @@ def _compiled(parsed: Callable[[], Any], where: str) -> Any:
     ):
         spec.delete(part)
     try:
-        return spec.compile()
+        return spec.compile(), spec
     except ValueError as error:
         hint = (
             f" No inertial says what {', '.join(sorted(bare))} weighs, and its mesh is missing."
