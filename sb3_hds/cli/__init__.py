@@ -106,6 +106,7 @@ def parser() -> argparse.ArgumentParser:
     ask.add_argument("--budget", choices=("full", "quick"), default="full")
     ask.add_argument("--seed", type=int, default=0)
     ask.add_argument("--report", help="HTML page to write")
+    ask.add_argument("--animate", help="MP4 film to write: measured and predicted motion")
     ask.add_argument("--json", help="JSON file to write")
     measured.add_write(ask)
     worth = ask.add_argument_group("what it buys", "policies from both twins, on the real system")

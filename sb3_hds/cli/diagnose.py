@@ -50,6 +50,10 @@ def run(given: argparse.Namespace) -> None:
     if given.json:
         measured.write_json(given.json, plain)
     measured.write_twin(given, found.twin)
+    if given.animate and found.pictures is None:
+        print("Nothing was simulated, so there is no film.")
+    elif given.animate:
+        print(f"The film is {found.to_film(given.animate)}.")
     if given.report:
         print(f"The report is {found.to_html(given.report, gain)}.")
 
@@ -61,6 +65,10 @@ def _check_targets(given: argparse.Namespace) -> None:
     for target in filter(None, (given.json, given.write)):
         check_target(target)
     measured.check_write(given)
+    if given.animate:
+        from sb3_hds.sysid.film import check_film
+
+        check_film(given.animate)
     if given.report:
         from sb3_hds.sysid.report import check_installed, check_page
 

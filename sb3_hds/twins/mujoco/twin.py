@@ -263,6 +263,30 @@ class MechanismTwin(AnalyticTwin):
             return super().terminated(state, params)
         return self._terminated(state, params)
 
+    def skeleton(self, state: State) -> Float[Array, "capsules 2 3"]:
+        """
+        :return: both ends of a capsule for each link: from its parent's frame to its own, and from
+            the frame of a last link to its centre of mass, or the farthest site or body there [m]
+        """
+        links, zero = self.mechanism.links, jnp.zeros_like(state.v[0])
+        frames = frames_of(links, list(state.q))
+        place = lambda point: jnp.stack([zero + x for x in point])  # noqa: E731
+        found = []
+        for i, link in enumerate(links):
+            if link.parent >= 0:
+                found.append(jnp.stack([place(frames[link.parent][1]), place(frames[i][1])]))
+            elif link.kind != FREE:
+                found.append(jnp.stack([place(alg.ZERO), place(frames[i][1])]))
+            if any(other.parent == i for other in links):
+                continue
+            here = [p.position for p in self.mechanism.places if p.link == i]
+            ends = here + ([link.body.centre] if link.body else [])
+            tip = max(ends, key=lambda end: sum(x * x for x in end), default=alg.ZERO)
+            rotation, origin = frames[i]
+            outwards = alg.vadd(origin, alg.apply(rotation, tip))
+            found.append(jnp.stack([place(origin), place(outwards)]))
+        return jnp.stack(found)
+
     def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
         """The mechanism seen along y: from the world through all joints to each last body."""
         links, zero = self.mechanism.links, jnp.zeros_like(state.v[0])
