@@ -266,7 +266,7 @@ def film_frames(
         lines = [stage.plot([], [], **style)[0] for _ in moving.lines[p, 0]]
         lines[0].set_label(label)
         drawn.append(lines)
-    legend = stage.legend(loc="upper left", frameon=False)
+    legend = stage.legend(loc="lower left", frameon=False)
     for handle in legend.get_lines():
         handle.set_linewidth(6.0)
     cursors = []
