@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 TESTS ?= tests
 
-.PHONY: install format lint type test test-all test-expensive docs commit-checks demo clean
+.PHONY: install format lint type test test-all test-expensive test-lowest test-newest docs commit-checks demo clean
 
 install: $(VENV)/.installed-dev
 
@@ -57,6 +57,19 @@ test-all: install
 test-expensive: install
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "expensive and not measured" $(TESTS)
 
+# The ranges of pyproject.toml: the lowest versions that it allows, and the newest that there are.
+# torch, which only keeps books, stays as tested, so that neither pulls its builds for CUDA.
+test-lowest: RESOLUTION := lowest-direct
+test-newest: RESOLUTION := highest
+test-lowest test-newest: test-%:
+	test -x $(VENV)-$*/bin/python || $(PYTHON) -m venv $(VENV)-$*
+	$(VENV)-$*/bin/python -m pip --disable-pip-version-check install --quiet --no-compile \
+		--constraint constraints.txt --extra-index-url $(TORCH_INDEX) torch
+	$(VENV)-$*/bin/python -m pip --disable-pip-version-check install --quiet uv
+	$(VENV)-$*/bin/uv pip install --python $(VENV)-$*/bin/python --resolution $(RESOLUTION) \
+		--editable ".[zoo,report,dev]"
+	$(VENV)-$*/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not expensive" $(TESTS)
+
 docs: install
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 
@@ -65,4 +78,4 @@ demo: $(VENV)/.installed-demo
 	$(BIN)/python examples/demo_diagnosis.py --folder demo
 
 clean:
-	rm -rf $(VENV) build dist demo docs/_build .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(VENV)-lowest $(VENV)-newest build dist demo docs/_build .pytest_cache .ruff_cache

@@ -40,10 +40,10 @@ def descend(loss: Callable[[Weights], float], weights: Weights, rate: float) -> 
 
 
 class Adam:
-    """Kingma and Ba, 2015, algorithm 1; ``decay`` is AdamW's (Loshchilov and Hutter, 2019)."""
+    """Kingma and Ba, 2015, algorithm 1."""
 
-    def __init__(self, rate: float, b1: float = 0.9, decay: float = 0.0) -> None:
-        self.rate, self.b1, self.decay = rate, b1, decay
+    def __init__(self, rate: float, b1: float = 0.9) -> None:
+        self.rate, self.b1 = rate, b1
         self.t, self.m, self.v = 0, 0.0, 0.0
 
     def step(self, w: Any, g: Any) -> Any:
@@ -51,7 +51,7 @@ class Adam:
         self.m = self.b1 * self.m + (1.0 - self.b1) * g
         self.v = 0.999 * self.v + 0.001 * g**2
         m, v = self.m / (1.0 - self.b1**self.t), self.v / (1.0 - 0.999**self.t)
-        return w - self.rate * (m / (np.sqrt(v) + 1e-8) + self.decay * w)
+        return w - self.rate * m / (np.sqrt(v) + 1e-8)
 
 
 def member(weights: Weights, i: int) -> Weights:
@@ -113,22 +113,13 @@ def gaussian(
     w: Weights,
     latent: np.ndarray,
     log_std_of: Callable[[np.ndarray], np.ndarray] = clipped,
-    matrix_std_of: Callable[[np.ndarray], np.ndarray] = np.exp,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """
-    :param matrix_std_of: gSDE: of the parameter, the deviation of the noise matrix
-    :return: mean and deviation; with gSDE (Raffin et al., CoRL 2021, equation 6) or without
-    """
+    """:return: mean and deviation; with gSDE (Raffin et al., CoRL 2021, equation 6) or without"""
     mean = dense(w["Dense_0"], latent)
     if "log_std" in w:
-        variance = latent**2 @ matrix_std_of(w["log_std"]) ** 2
+        variance = latent**2 @ np.exp(w["log_std"]) ** 2
         return np.clip(mean, -2.0, 2.0), np.sqrt(variance + 1e-6)
     return mean, np.exp(log_std_of(dense(w["Dense_1"], latent)))
-
-
-def expln(raw: np.ndarray) -> np.ndarray:
-    """An exponential that grows slowly above 0; 1e-6 is what SB3 adds there."""
-    return np.where(raw > 0.0, np.log1p(np.maximum(raw, 0.0) + 1e-6) + 1.0, np.exp(raw))
 
 
 def squashed(mean: np.ndarray, std: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,9 +1,12 @@
 """Every algorithm, so small that a test of it takes moments: tests ask whether, not how well."""
 
 import io
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -60,24 +63,20 @@ NAMES = list(algos.ALL)
 PLANNERS = [name for name in NAMES if issubclass(algos.ALL[name], TwinAlgorithm)]
 #: the algorithms that learn from a replay buffer, by gradients
 OFF_POLICY = [name for name in NAMES if issubclass(algos.ALL[name], OffPolicyAlgorithm)]
+MODEL_FREE = [name for name in OFF_POLICY if name not in PLANNERS]
+
+#: observations of Pendulum-v1
+STATES = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, -2.0]], np.float32)
 
 
-def _mostly_expensive(representatives: tuple[str, ...]) -> list[Any]:
-    quick = {*PLANNERS, *representatives}
-    mark = pytest.mark.expensive
-    return [name if name in quick else pytest.param(name, marks=mark) for name in NAMES]
+def _or_expensive(name: str) -> Any:
+    quick = name in ("hds", "droq", "td7", "openloop")
+    return name if quick else pytest.param(name, marks=pytest.mark.expensive)
 
 
-def _id_of(name: Any) -> str:
-    return name if isinstance(name, str) else name.values[0]
-
-
-#: all; of the model-free ones, those that share every line with one that is here are among the
-#: expensive tests
-EVERY_NAME = _mostly_expensive(("droq", "td7", "openloop"))
-EVERY_OFF_POLICY = [name for name in EVERY_NAME if _id_of(name) in OFF_POLICY]
-#: all, for tests that take long
-QUICK_NAMES = _mostly_expensive(("droq", "openloop"))
+#: all; those that share every line with one of these four are among the expensive tests
+EVERY_NAME = [_or_expensive(name) for name in NAMES]
+EVERY_OFF_POLICY = [_or_expensive(name) for name in OFF_POLICY]
 
 
 def small(name: str, env: Any = "Pendulum-v1", **changes: Any) -> BaseAlgorithm:
@@ -92,13 +91,17 @@ class Lines(KVWriter):
         self.lines: list[dict[str, Any]] = []
 
     def write(self, key_values, key_excluded, step: int = 0) -> None:
-        self.lines.append(dict(key_values))
+        self.lines.append({"step": step, **key_values})
 
     def close(self) -> None:
         self.lines = []
 
     def column(self, key: str) -> list[Any]:
         return [line[key] for line in self.lines if key in line]
+
+    def steps(self, key: str) -> list[int]:
+        """:return: where a curve of it has its points"""
+        return [line["step"] for line in self.lines if key in line]
 
 
 def logged(model: BaseAlgorithm) -> Lines:
@@ -123,6 +126,26 @@ def saved(model: BaseAlgorithm) -> io.BytesIO:
     model.save(file)
     file.seek(0)
     return file
+
+
+def repacked(model: BaseAlgorithm, part: str, change: Callable[[bytes], bytes]) -> io.BytesIO:
+    """:return: the model's zip file, of which one part was changed"""
+    old, file = zipfile.ZipFile(saved(model)), io.BytesIO()
+    with zipfile.ZipFile(file, "w") as new:
+        for name in old.namelist():
+            new.writestr(name, change(old.read(name)) if name == part else old.read(name))
+    file.seek(0)
+    return file
+
+
+def reloaded(model: BaseAlgorithm, **changes: Any) -> BaseAlgorithm:
+    """:return: the model saved and loaded, with an environment unless another is given"""
+    return type(model).load(saved(model), **({"env": "Pendulum-v1"} | changes))
+
+
+def greedy(actor: Any, obs: Any = STATES) -> np.ndarray:
+    """:return: what a model, or a policy, does where it explores nothing"""
+    return actor.predict(obs, deterministic=True)[0]
 
 
 def steps_of(checkpoint: Path) -> int:

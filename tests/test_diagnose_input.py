@@ -113,15 +113,6 @@ def test_less_of_what_the_twin_has_is_told_as_what_is_added_to_it():
     assert found.to_dict()["findings"][0]["parameters"]["b"]["added_to"] == pytest.approx(0.003)
 
 
-def test_a_joint_the_wrong_way_round_keeps_both_of_its_parameters():
-    twin, data = swinging()
-
-    found = asked(twin, changed(data, lambda obs: -obs), (*FRICTION, effects.SignFlip))
-
-    names = {estimate.name for estimate in found.findings[0].parameters.values()}
-    assert names == {"sign_flip.hinge_position.flipped", "sign_flip.hinge_velocity.flipped"}
-
-
 class Deaf(Twin):
     """A pendulum of one's own, whose step takes effects and does nothing with them."""
 

@@ -3,20 +3,24 @@
 import gymnasium
 import numpy as np
 import pytest
-from small_models import OFF_POLICY, PLANNERS, same, saved, small
+from odd_envs import Dead
+from small_models import MODEL_FREE, greedy, reloaded, small
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_hds import HDS, TD7, TQC, CrossQ, DroQ, SimbaSAC
-from sb3_hds.algos.gaussian_policy import CrossQPolicy, GaussianPolicy
+from sb3_hds import HDS, TD7, TQC, CrossQ
+from sb3_hds.algos.gaussian_policy import GaussianPolicy
 from sb3_hds.algos.networks import finite_leaves
 from sb3_hds.algos.td7 import TD7Policy
 from sb3_hds.errors import DivergedError
 
-MODEL_FREE = [name for name in OFF_POLICY if name not in PLANNERS]
-REPRESENTATIVES = ("gsde_sac", "droq", "td7", "bro")
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+REPRESENTATIVES = ("droq", "td7")
+
+
 every_algorithm = pytest.mark.parametrize(
     "name",
     [
@@ -28,23 +32,6 @@ every_algorithm = pytest.mark.parametrize(
 
 def finite(model) -> bool:
     return finite_leaves(model.policy.weights)
-
-
-class Dead(gymnasium.Wrapper):
-    """An environment whose sensor, or reward, is ``value`` from the tenth step on."""
-
-    def __init__(self, value: float, of_reward: bool) -> None:
-        super().__init__(gymnasium.make("Pendulum-v1"))
-        self.value, self.of_reward, self.n_steps = value, of_reward, 0
-
-    def step(self, action):
-        self.n_steps += 1
-        obs, reward, *ends = super().step(action)
-        if self.n_steps >= 10 and self.of_reward:
-            reward = self.value
-        elif self.n_steps >= 10:
-            obs = np.full_like(obs, self.value)
-        return obs, reward, *ends
 
 
 class Watched(gymnasium.Wrapper):
@@ -67,6 +54,8 @@ def test_an_update_that_diverges_is_an_error_and_leaves_the_last_good_weights():
     before = model.get_parameters()["policy"]
     model.replay_buffer.rewards[:] = 1e38
 
+    # RL Zoo prunes trials for the latter.
+    assert issubclass(DivergedError, FloatingPointError) and issubclass(DivergedError, ValueError)
     with pytest.raises(DivergedError, match="diverged"):
         for _ in range(20):
             model.train(gradient_steps=4, batch_size=16)
@@ -74,11 +63,6 @@ def test_an_update_that_diverges_is_an_error_and_leaves_the_last_good_weights():
     after = model.get_parameters()["policy"]
     assert finite(model) and before.keys() == after.keys()
     assert model._n_updates == int(model.policy.learner.n_updates)
-
-
-def test_a_diverged_trial_is_no_reason_to_end_a_search():
-    """RL Zoo prunes trials for the latter."""
-    assert issubclass(DivergedError, FloatingPointError) and issubclass(DivergedError, ValueError)
 
 
 def infinite_step(name: str, env, monkeypatch):
@@ -151,9 +135,15 @@ def test_updates_are_counted_where_they_are_interrupted(name, monkeypatch):
 # --- Sensors that die
 
 
-@pytest.mark.parametrize("name", ["droq", "hds"])
-@pytest.mark.parametrize("of_reward", [False, True])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize(
+    ("name", "of_reward", "value"),
+    [
+        ("droq", False, np.nan),
+        ("droq", True, np.inf),
+        ("hds", False, np.inf),
+        ("hds", True, np.nan),
+    ],
+)
 def test_statistics_of_vec_normalize_survive_a_dead_sensor(name, of_reward, value):
     env = Dead(value, of_reward)
     normalizer = VecNormalize(DummyVecEnv([lambda: env]))
@@ -163,6 +153,7 @@ def test_statistics_of_vec_normalize_survive_a_dead_sensor(name, of_reward, valu
         model.learn(100)
 
     assert np.isfinite(normalizer.obs_rms.mean).all() and np.isfinite(normalizer.ret_rms.var)
+    assert model.replay_buffer.pos == 9 and np.isfinite(greedy(model)).all()
     # Nine steps and what the environment began with; HDS has counted steps of its twin before.
     assert name == "hds" or normalizer.obs_rms.count == pytest.approx(10.0, abs=0.01)
     env.value = 0.5
@@ -192,8 +183,10 @@ def test_an_environment_that_begins_with_no_number_is_an_error():
 
 
 def test_returns_of_n_steps_end_where_learning_began_anew():
-    model = small("droq", n_steps=3).learn(30).learn(30)
+    model = small("droq", n_steps=3, gradient_steps=0).learn(20)
+    model.learn(10, reset_num_timesteps=False).learn(30)
     buffer = model.replay_buffer
+    assert np.flatnonzero(buffer.timeouts[:60]).tolist() == [29]
 
     # One environment: of each row, the return is that of its own episode.
     batch = buffer._get_samples(np.array([27, 28, 29, 30]))
@@ -205,12 +198,6 @@ def test_returns_of_n_steps_end_where_learning_began_anew():
     # They go on to be worth something there: a cut is no end of the task.
     assert not batch.dones.any()
     np.testing.assert_array_equal(batch.next_observations[1], buffer.next_observations[29, 0])
-
-
-def test_an_episode_that_goes_on_is_not_cut_off():
-    model = small("droq").learn(30).learn(30, reset_num_timesteps=False)
-
-    assert not model.replay_buffer.timeouts[:60].any()
 
 
 def test_goals_are_not_taken_from_the_episode_after_the_cut():
@@ -242,7 +229,7 @@ def test_with_shared_memory_a_cut_counts_as_an_end():
 )
 def test_networks_start_afresh_as_what_load_was_passed_says(given, n, monkeypatch):
     model = small("droq", param_resets=[20]).learn(30)
-    other, seeds = DroQ.load(saved(model), env=model.get_env(), **given), []
+    other, seeds = reloaded(model, **given), []
     monkeypatch.setattr(other, "_restart", seeds.append)
 
     other.learn(30, reset_num_timesteps=False)
@@ -250,16 +237,10 @@ def test_networks_start_afresh_as_what_load_was_passed_says(given, n, monkeypatc
     assert len(seeds) == n
 
 
-def test_who_has_batch_normalisation_has_no_target_networks_and_is_told():
-    with pytest.warns(UserWarning, match="does not look at tau"):
-        small("tqc_jax", tau=0.05, policy_kwargs={"net_arch": [8], "renorm_warmup_steps": 10})
-
-
-@pytest.mark.parametrize("algorithm", [DroQ, TD7, HDS])
-def test_without_its_monitor_an_environment_is_left_as_it_is(algorithm):
+@pytest.mark.parametrize("name", ["droq", "hds"])
+def test_without_its_monitor_an_environment_is_left_as_it_is(name):
     watched, bare = (
-        algorithm("Pendulum-v1", monitor_wrapper=wrapped).get_env().envs[0]
-        for wrapped in (True, False)
+        small(name, monitor_wrapper=wrapped).get_env().envs[0] for wrapped in (True, False)
     )
 
     assert isinstance(watched, Monitor) and not isinstance(bare, Monitor)
@@ -272,10 +253,3 @@ def test_without_its_monitor_an_environment_is_left_as_it_is(algorithm):
 def test_a_policy_of_another_family_is_refused(algorithm, policy):
     with pytest.raises(ValueError, match=f"cannot use the policy {policy.__name__}"):
         algorithm(policy, "Pendulum-v1")
-
-
-def test_policies_of_the_same_family_may_be_swapped():
-    model = SimbaSAC(CrossQPolicy, "Pendulum-v1", policy_kwargs={"net_arch": [8]}, seed=0)
-    again = SimbaSAC.load(saved(model))
-
-    assert same(model.get_parameters(), again.get_parameters())

@@ -1,10 +1,8 @@
 """HDS and the data that it measures: what they correct, what they may not spoil, what is kept."""
 
 import dataclasses
-import os
-import signal
-import subprocess
-import sys
+from types import SimpleNamespace
+from typing import Any
 
 import gymnasium
 import jax
@@ -12,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from measuring import measured
-from small_models import logged, small, steps_of
-from stable_baselines3.common.env_util import make_vec_env
+from small_models import PLANNERS, logged, reloaded, small
 
 from sb3_hds import HDS, PODS, effects, twins
 from sb3_hds.algos.arguments import knobs_of
 from sb3_hds.algos.correction import Correction, Wishes, correct
 from sb3_hds.algos.epoch import plan_ahead
-from sb3_hds.algos.hds import _effects_of
+from sb3_hds.algos.hds import _effects_of, _native_of
 from sb3_hds.algos.log import record_correction
+from sb3_hds.algos.windows import Since
 from sb3_hds.core import Trajectories
 from sb3_hds.effects import force_of
 from sb3_hds.errors import CalibrationError, EffectError, TrajectoryError
@@ -31,8 +29,9 @@ REAL = "sb3_hds/PendulumReal-v1"
 
 
 def wishes(twin, **changes):
-    names = tuple(twin.parameters)
-    plain = {"names": names, "residual": False, "residual_kwargs": {}, "beta": "auto", "seed": 0}
+    plain = {"names": tuple(twin.parameters), "residual": False, "residual_kwargs": {}, "seed": 0}
+    # Of the model itself: what is estimated alike is one program.
+    plain |= {"beta": "auto", "suspected": ("coulomb_friction", "action_delay")}
     return Wishes(nominal=dict(twin.values), **(plain | changes))
 
 
@@ -45,6 +44,21 @@ def heavier():
     return measured(twins.make("PendulumReal", mass=1.3, damping=0.1), noise=0.01)
 
 
+@pytest.fixture(scope="module")
+def found(heavier):
+    """What the data of the heavier pendulum correct."""
+    return corrected(twins.make("PendulumReal"), heavier)
+
+
+def inertia(twin) -> float:
+    return (twin.values["mass"] / 3.0 + twin.values["payload"]) * twin.values["length"] ** 2
+
+
+def real(**settings) -> HDS:
+    """:return: a model that plans in the twin of the real system, without a learned force"""
+    return small("hds", REAL, twin="PendulumReal", residual=False, **settings)
+
+
 # --- what is corrected
 
 
@@ -52,36 +66,26 @@ def test_a_twin_that_is_exact_is_left_alone():
     twin = twins.make("PendulumReal")
     found = corrected(twin, measured(twin))
 
-    assert found.twin is twin and not found.changed and found.fit is None
+    assert found.twin is twin and not found.changed and found.fit is None and not found.attached
     assert found.error_twin < 1e-4
 
 
-def test_parameters_are_corrected_and_plans_made_anew(heavier):
-    found = corrected(twins.make("PendulumReal"), heavier)
-
-    twin = found.twin
-    inertia = (twin.values["mass"] / 3.0 + twin.values["payload"]) * twin.values["length"] ** 2
+def test_parameters_are_corrected_and_plans_made_anew(found):
     assert found.changed
     assert found.error_calibrated < 0.5 * found.error_twin
-    assert inertia == pytest.approx(1.3 / 3.0, rel=0.02)
-    assert twin.values["damping"] == pytest.approx(0.1, rel=0.1)
+    assert inertia(found.twin) == pytest.approx(1.3 / 3.0, rel=0.02)
+    assert found.twin.values["damping"] == pytest.approx(0.1, rel=0.1)
 
 
-def test_once_corrected_nothing_changes_any_more(heavier):
-    first = corrected(twins.make("PendulumReal"), heavier)
-    again = correct(
-        first.twin, heavier, wishes(twins.make("PendulumReal")), 0.0, learn_force=False, n_new=1000
-    )
+def test_once_corrected_nothing_changes_any_more(found, heavier):
+    own = wishes(twins.make("PendulumReal"))
+    again = correct(found.twin, heavier, own, 0.0, learn_force=False, n_new=1000)
 
     assert not again.changed
-    assert again.error_calibrated <= first.error_calibrated * 1.001
+    assert again.error_calibrated <= found.error_calibrated * 1.001
 
 
-def test_a_nuisance_that_may_not_be_corrected_stays(heavier):
-    found = corrected(twins.make("PendulumReal"), heavier, names=("damping",))
-    assert found.twin.values["mass"] == 1.0
-
-
+@pytest.fixture(scope="module")
 def held_fast():
     """A pendulum that dry friction holds near the top: it looks like a heavier one."""
     env = gymnasium.make(REAL, friction=0.3, noise=0.01, max_episode_steps=200)
@@ -91,64 +95,42 @@ def held_fast():
         actions.append(np.clip([-8.0 * angle - 2.0 * speed], -2.0, 2.0))
         obs.append(env.step(actions[-1])[0])
     assert np.abs(np.array(obs)[50:, 1]).max() < 0.2
-    return Trajectories.from_arrays([obs], [actions], dt=0.05)
+    data = Trajectories.from_arrays([obs], [actions], dt=0.05)
+    return corrected(twins.make("PendulumReal"), data, suspected=())
 
 
-def test_a_system_that_friction_holds_fast_is_not_taken_for_a_heavier_one():
+def test_a_system_that_friction_holds_fast_is_not_taken_for_a_heavier_one(held_fast):
+    assert held_fast.fit["mass"].estimate > 1.5
+    assert held_fast.twin == twins.make("PendulumReal") and not held_fast.changed
+
+
+@pytest.mark.parametrize(
+    ("effect", "name", "size"),
+    [
+        (effects.CoulombFriction(0, tau_c=0.3), "coulomb_friction.hinge.tau_c", 0.3),
+        (effects.ActionDelay(0, delay=0.1), "action_delay.torque.delay", 0.1),
+    ],
+    ids=str,
+)
+def test_suspected_effects_that_explain_something_are_attached(effect, name, size):
     twin = twins.make("PendulumReal")
-    found = corrected(twin, held_fast())
 
-    assert found.fit["mass"].estimate > 1.5
-    assert found.twin.values == twin.values and not found.changed
+    found = corrected(twin, measured(twin.extend(effect), noise=0.01))
 
-
-def test_suspected_effects_are_attached_once_the_twin_proves_inexact():
-    twin = twins.make("PendulumReal")
-    suspected = {"suspected": ("coulomb_friction",)}
-    name = "coulomb_friction.hinge.tau_c"
-
-    exact = corrected(twin, measured(twin), **suspected)
-    assert exact.twin is twin and not exact.attached
-
-    rubbing = twin.extend(effects.CoulombFriction(0, tau_c=0.3))
-    found = corrected(twin, measured(rubbing, noise=0.01), **suspected)
     assert found.attached == {name: 0.0}
-    assert found.fit[name].estimate == pytest.approx(0.3, rel=0.1)
+    assert found.fit[name].estimate == pytest.approx(size, rel=0.1)
     assert found.twin.values[name] == found.fit[name].estimate
     assert found.error_calibrated < 0.6 * found.error_twin
 
 
-def test_what_was_suspected_and_explains_nothing_is_let_go(heavier):
-    twin = twins.make("PendulumReal")
-    suspected = ("coulomb_friction", "action_delay")
+def test_what_was_suspected_and_explains_nothing_is_let_go_and_not_logged(found):
+    line = recorded(found)
 
-    found = corrected(twin, heavier, suspected=suspected)
-
-    assert "action_delay.torque.delay" in [estimate.name for estimate in found.fit.estimates]
-    assert not found.attached and found.twin.structure() == twin.structure()
-    assert found.error_calibrated < 0.5 * found.error_twin
-
-    late = measured(twin.extend(effects.ActionDelay(0, delay=0.1)), noise=0.01)
-    found = corrected(twin, late, suspected=suspected)
-
-    assert found.attached == {"action_delay.torque.delay": 0.0}
-    assert found.twin.values["action_delay.torque.delay"] == pytest.approx(0.1, rel=0.1)
-
-
-@pytest.mark.expensive
-def test_what_is_suspected_is_estimated_with_the_rest_and_travels(tmp_path):
-    rubbing = twins.make("PendulumReal").extend(effects.CoulombFriction(0, tau_c=0.3))
-    data = measured(rubbing, noise=0.01)
-    model = small("hds", REAL, pretrain_data=data, residual=False).learn(0)
-    name = "coulomb_friction.hinge.tau_c"
-
-    assert model.nominal[name] == 0.0
-    assert model.twin.values[name] == pytest.approx(0.3, rel=0.1)
-    model.save(tmp_path / "model")
-    assert HDS.load(tmp_path / "model", env=model.get_env()).twin.values == model.twin.values
-    # Whoever says which parameters are corrected means no others.
-    only_mass = small("hds", REAL, pretrain_data=data, residual=False, calibrated=["mass"])
-    assert name not in only_mass.learn(0).twin.values
+    assert found.fit["action_delay.torque.delay"] and not found.attached
+    assert found.twin.structure() == twins.make("PendulumReal").structure()
+    assert line["model/damping"] == found.twin.values["damping"]
+    assert line["model/damping_low"] < 0.1 < line["model/damping_high"]
+    assert not [key for key in line if "action_delay" in key]
 
 
 @pytest.mark.expensive
@@ -166,27 +148,11 @@ def test_what_has_no_parameter_is_left_to_the_learned_force():
 TINY = {"residual": True, "residual_kwargs": {"n_members": 2, "net_arch": [4]}}
 
 
-@pytest.mark.expensive
-def test_a_share_that_was_fixed_is_planned_in_the_force_where_that_helps(heavier):
-    twin = twins.make("PendulumReal")
-    data = measured(twin.extend(effects.CoulombFriction(0, tau_c=0.4)), noise=0.005, n=10)
-
-    helps, does_not = (
-        correct(twin, seen, wishes(twin, **how, beta=0.3), 0.0, learn_force=True, n_new=10_000)
-        for seen, how in ((data, {"residual": True}), (heavier, TINY))
-    )
-
-    ((key, _),) = [force_of(helps.twin)]
-    assert helps.beta == 0.3 and helps.twin.values[f"{key}.share"] == 1.0
-    assert does_not.beta == 0.0 and force_of(does_not.twin) is None
-
-
-@pytest.mark.parametrize("beta", ["auto", 0.3])
-def test_an_attached_force_that_no_longer_helps_is_switched_off(heavier, beta):
+def test_an_attached_force_that_no_longer_helps_is_switched_off(heavier):
     """Its weights are random here: what it learned is no longer true."""
     plain = twins.make("PendulumReal", mass=1.3, damping=0.1)
     twin = plain.extend(effects.NeuralForce(n_members=2, net_arch=(4,), share=1.0))
-    own = wishes(plain, **TINY | {"beta": beta})
+    own = wishes(plain, names=(), suspected=(), **TINY)
 
     found = correct(twin, heavier, own, 1.0, learn_force=False, n_new=1000)
 
@@ -197,7 +163,8 @@ def test_an_attached_force_that_no_longer_helps_is_switched_off(heavier, beta):
 
 
 def test_a_learned_force_that_does_not_help_is_not_even_attached(heavier):
-    found = corrected(twins.make("PendulumReal"), heavier, **TINY)
+    exact = twins.make("PendulumReal", mass=1.3, damping=0.1)
+    found = corrected(exact, heavier, names=(), suspected=(), **TINY)
 
     assert found.residual is not None and not found.residual.accepted
     assert found.beta == 0.0 and force_of(found.twin) is None
@@ -228,10 +195,7 @@ def test_a_load_that_comes_and_goes_is_followed():
     for payload in (0.0, 0.5, 0.0):
         env.unwrapped.set_payload(payload)
         model.learn(360, reset_num_timesteps=False)
-        twin = model.twin
-        rod, load = twin.values["mass"] / 3.0, twin.values["payload"]
-        inertia = (rod + load) * twin.values["length"] ** 2
-        assert inertia == pytest.approx(1.0 / 3.0 + payload, rel=0.02)
+        assert inertia(model.twin) == pytest.approx(1.0 / 3.0 + payload, rel=0.02)
     assert [c.forgotten for c in corrections].count(True) == 2
 
 
@@ -245,12 +209,6 @@ def test_a_wrong_twin_is_seen_though_the_system_mostly_rests():
 
     assert found.changed
     assert found.error_calibrated < 0.1 * found.error_twin
-
-
-def test_too_few_data_change_nothing():
-    twin = twins.make("PendulumReal")
-    found = corrected(twin, measured(twins.make("PendulumReal", mass=2.0), n=1, n_steps=4))
-    assert found.twin is twin and not found.changed
 
 
 # --- in the algorithm
@@ -287,19 +245,6 @@ def return_of(model, env, n=20):
     return total / n
 
 
-@pytest.mark.expensive
-def test_what_the_data_say_is_logged():
-    env = gymnasium.make(REAL, mass=1.4, noise=0.01)
-    model = small("hds", env, twin="PendulumReal", train_freq=100)
-    lines = logged(model)
-
-    model.learn(200, log_interval=1)
-
-    errors = ("error_twin", "error_calibrated", "error_hybrid")
-    for key in (*errors, "beta", "disagreement", "forgotten", "mass", "mass_low", "mass_high"):
-        assert lines.column(f"model/{key}"), key
-
-
 def recorded(found):
     model = small("hds", REAL)
     lines = logged(model)
@@ -309,53 +254,35 @@ def recorded(found):
     return {key: value for key, value in line.items() if key.startswith("model/")}
 
 
-def test_beta_is_logged_of_an_exact_twin_and_without_calibration_too(heavier):
+def test_beta_is_logged_of_an_exact_twin_and_without_calibration_too():
     twin = twins.make("PendulumReal")
-    exact = corrected(twin, measured(twin))
-    assert recorded(exact) == {
-        "model/error_twin": exact.error_twin,
+    assert recorded(Correction(twin, 0.0, changed=False, error_twin=1e-5)) == {
+        "model/error_twin": 1e-5,
         "model/beta": 0.0,
         "model/forgotten": 0,
     }
 
-    found = corrected(twin, heavier, names=(), **TINY)
-    assert found.fit is None
-    assert recorded(found) == {
-        "model/error_twin": found.error_twin,
-        "model/error_hybrid": found.error_hybrid,
-        "model/beta": found.beta,
+    residual: Any = SimpleNamespace(disagreement=0.3, accepted=True)
+    errors = {"error_twin": 0.2, "error_hybrid": 0.1}
+    assert recorded(Correction(twin, 0.5, changed=True, residual=residual, **errors)) == {
+        "model/error_twin": 0.2,
+        "model/error_hybrid": 0.1,
+        "model/beta": 0.5,
         "model/forgotten": 0,
-        "model/disagreement": found.residual.disagreement,
+        "model/disagreement": 0.3,
     }
 
 
-def test_values_that_were_not_taken_over_are_not_logged_as_those_of_the_model():
-    data = held_fast()
-    twin = twins.make("PendulumReal")
-    found = corrected(twin, data)
-    assert found.fit["mass"].estimate > 1.5 and found.twin.values["mass"] == 1.0
+def test_values_that_were_not_taken_over_are_not_logged_as_those_of_the_model(held_fast):
+    line = recorded(held_fast)
 
-    line = recorded(found)
-
-    assert line["model/mass"] == 1.0
+    assert held_fast.fit["mass"].estimate > 1.5 and line["model/mass"] == 1.0
     assert not [key for key in line if key.endswith(("_low", "_high"))]
 
 
-def test_effects_that_were_let_go_are_not_logged(heavier):
-    found = corrected(twins.make("PendulumReal"), heavier, suspected=("action_delay",))
-    assert found.fit["action_delay.torque.delay"] and not found.attached
-
-    line = recorded(found)
-
-    assert line["model/damping"] == found.twin.values["damping"] == pytest.approx(0.1, rel=0.1)
-    assert line["model/damping_low"] < 0.1 < line["model/damping_high"]
-    assert not [key for key in line if "action_delay" in key]
-
-
+@pytest.mark.expensive  # a whole diagnosis
 def test_a_model_diagnoses_its_data_sheet_by_what_it_has_measured(heavier):
-    model = small("hds", REAL, twin="PendulumReal", pretrain_data=heavier, residual=False)
-    with pytest.raises(TrajectoryError, match="learn"):
-        small("hds", REAL).diagnose()
+    model = real(pretrain_data=heavier)
     model.learn(0)
 
     found = model.diagnose(effects=[effects.CoulombFriction], calibrate=["mass"], progress=False)
@@ -364,11 +291,23 @@ def test_a_model_diagnoses_its_data_sheet_by_what_it_has_measured(heavier):
     assert found.twin.values["mass"] == pytest.approx(1.3, rel=0.05)
 
 
+def test_what_is_diagnosed_is_the_twin_as_it_was_before_any_data(heavier, monkeypatch):
+    model = real(pretrain_data=heavier)
+    model.twin = model.twin.with_parameters(mass=1.3)
+    monkeypatch.setattr("sb3_hds.algos.hds.diagnose", lambda *given, **_: given)
+
+    twin, data = model.diagnose()
+
+    assert twin.values["mass"] == 1.0 and data.n_steps == heavier.n_steps
+    with pytest.raises(TrajectoryError, match="learn"):
+        small("hds", REAL).diagnose()
+
+
 @pytest.mark.expensive
 def test_what_the_data_name_is_attached_and_estimated_from_then_on(tmp_path):
     rubbing = twins.make("PendulumReal").extend(effects.CoulombFriction(0, tau_c=0.3))
     data = measured(rubbing, n=10, n_steps=100, noise=0.01)
-    model = small("hds", REAL, twin="PendulumReal", pretrain_data=data, residual=False)
+    model = real(pretrain_data=data)
     assert small("hds", REAL, twin="PendulumReal").extend_model() is None
 
     found = model.extend_model(effects=[effects.CoulombFriction, effects.ActionDelay])
@@ -384,6 +323,7 @@ def test_what_the_data_name_is_attached_and_estimated_from_then_on(tmp_path):
     assert HDS.load(tmp_path / "model", env=model.get_env()).twin == model.twin
 
 
+@pytest.mark.expensive  # a whole diagnosis
 def test_less_of_what_the_twin_has_is_less_of_it():
     """An effect that the twin has as a parameter cannot be attached with a negative size."""
     data = measured(twins.make("PendulumReal"), n=10, n_steps=100, noise=0.01)
@@ -397,13 +337,15 @@ def test_less_of_what_the_twin_has_is_less_of_it():
     assert model.nominal["damping"] == model.twin.values["damping"]
 
 
+def finding(effect: str) -> Finding:
+    place = {"slot": "joint", "index": 0, "name": "hinge"}
+    return Finding(effect, place, {}, (), 0.0, 0.0, 1.0, "")
+
+
 def test_a_joint_that_is_measured_the_wrong_way_round_is_turned():
     pushed = twins.make("FreePendulum", driven=True, dt=0.02)
-    found = Finding(
-        "sign_flip", {"slot": "joint", "index": 0, "name": "hinge"}, {}, (), 0.0, 0.0, 1.0, ""
-    )
 
-    flips = _effects_of(found, pushed)
+    flips = _effects_of(finding("sign_flip"), pushed)
 
     assert {a.key for a in pushed.extend(*flips).attached} == {
         "sign_flip.hinge_position",
@@ -411,12 +353,11 @@ def test_a_joint_that_is_measured_the_wrong_way_round_is_turned():
     }
 
 
-def test_diagnoses_come_as_often_as_asked_for():
-    model = small("hds", REAL, twin="PendulumReal", diagnose_freq=2, train_freq=10)
-    asked = []
-    model.extend_model = lambda: asked.append(model.num_timesteps)
-    model.learn(60)
-    assert asked == [20, 40, 60]
+def test_an_effect_that_the_twin_has_as_a_parameter_is_that_parameter():
+    twin = twins.make("PendulumReal", damping=0.02)
+
+    assert _native_of(finding("viscous_friction"), twin) == {"damping": 0.02}
+    assert _native_of(finding("quadratic_drag"), twin) == {}
 
 
 def test_a_share_of_the_rollouts_is_in_the_learned_model():
@@ -427,7 +368,6 @@ def test_a_share_of_the_rollouts_is_in_the_learned_model():
         (chosen,) = model.varied(model.twin).values()
         assert sorted(set(np.asarray(chosen).tolist())) in ([0.0], [0.0, 1.0], [1.0])
         assert chosen.mean() == share
-    model.learn(0)
 
 
 def test_rollouts_differ_under_domain_randomisation():
@@ -436,7 +376,6 @@ def test_rollouts_differ_under_domain_randomisation():
 
     assert set(drawn) == set(model.twin.parameters)
     assert np.std(drawn["mass"]) > 0.05
-    model.learn(0)
     assert small("pods").varied(model.twin) == {}
 
 
@@ -480,19 +419,6 @@ def test_effects_are_attached_by_name_or_as_they_are():
         small("hds", REAL, calibrated=["weight"])
 
 
-def test_data_from_a_file_correct_the_model_before_the_first_plan(tmp_path, heavier):
-    path = heavier.save(tmp_path / "log")
-    model = small("hds", REAL, twin="PendulumReal", pretrain_data=str(path), residual=False)
-
-    model.learn(0)
-
-    assert model.twin.values["damping"] == pytest.approx(0.1, rel=0.15)
-    with pytest.raises(TrajectoryError, match="no file"):
-        small("hds", REAL, pretrain_data=str(tmp_path / "missing.npz"))
-    with pytest.raises(TrajectoryError, match="Trajectories or the path"):
-        small("hds", REAL, pretrain_data=3)
-
-
 # --- what is kept
 
 
@@ -505,72 +431,62 @@ def columns(model):
     }
 
 
-@pytest.mark.expensive
-def test_data_and_corrections_travel_with_the_model(tmp_path, heavier):
-    model = small("hds", REAL, twin="PendulumReal", pretrain_data=heavier, residual=False)
-    model.learn(125).save(tmp_path / "model")
+def test_data_from_a_file_correct_the_model_and_travel_with_it(tmp_path, heavier):
+    path = heavier.save(tmp_path / "log")
+    model = real(pretrain_data=str(path), refit_freq=0).learn(50)
+    assert model.twin.values["damping"] == pytest.approx(0.1, rel=0.15)
 
-    loaded = HDS.load(tmp_path / "model", env=gymnasium.make(REAL))
+    loaded = reloaded(model, env=REAL)
 
     for name, values in columns(model).items():
         np.testing.assert_array_equal(columns(loaded)[name], values, err_msg=name)
     assert loaded.twin.values == model.twin.values
     assert loaded.nominal == model.nominal
-    assert loaded.measured.trajectories().n_steps == heavier.n_steps + 125
+    assert loaded.measured.trajectories().n_steps == heavier.n_steps + 50
     loaded.learn(25, reset_num_timesteps=False)
-    assert loaded.replay_buffer.size() == 150
+    assert loaded.replay_buffer.size() == 75
+    with pytest.raises(TrajectoryError, match="no file"):
+        small("hds", REAL, pretrain_data=str(tmp_path / "missing.npz"))
+    with pytest.raises(TrajectoryError, match="Trajectories or the path"):
+        small("hds", REAL, pretrain_data=3)
 
 
-def test_a_learned_force_travels_as_tensors(tmp_path):
-    twin = twins.make("PendulumReal").extend(effects.NeuralForce(share=1.0))
-    model = small("hds", REAL, twin=twin)
-    model.save(tmp_path / "model")
-
-    loaded = HDS.load(tmp_path / "model")
-
-    (key,) = {name for name in twin.tensors if name.endswith("weights")}
-    for one, other in zip(
-        *(m.twin.tensors[key]["Dense_0"].values() for m in (model, loaded)), strict=True
-    ):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_a_model_without_learned_force_is_no_model_with_one(tmp_path):
-    model = small("pods", REAL)
-    assert all(model.get_parameters().values())
-    model.save(tmp_path / "model")
-
-    with pytest.raises(ValueError, match=r"does not fit this model.*learned_force"):
-        PODS.load(tmp_path / "model", twin=twins.make("PendulumReal").extend(effects.NeuralForce()))
-
-
-def test_pods_keeps_the_weights_of_a_learned_force_too(tmp_path):
+@pytest.mark.parametrize("name", PLANNERS)
+def test_a_learned_force_travels_as_tensors(name):
     twin = twins.make("PendulumReal")
     force = effects.NeuralForce(share=1.0).fitted_to(twin)
     twin = twin.extend(force.with_tensors(**force.fresh(jax.random.key(7))))
-    small("pods", REAL, twin=twin).save(tmp_path / "model")
 
-    loaded = PODS.load(tmp_path / "model")
+    loaded = reloaded(small(name, REAL, twin=twin), env=REAL)
 
-    for one, other in zip(
-        jax.tree.leaves(twin.tensors), jax.tree.leaves(loaded.twin.tensors), strict=True
-    ):
-        np.testing.assert_array_equal(one, other)
+    kept, expected = jax.tree.leaves(loaded.twin.tensors), jax.tree.leaves(twin.tensors)
+    assert expected and all(map(np.array_equal, kept, expected))
 
 
-def test_data_count_since_the_change_though_learn_starts_counting_again():
-    env = gymnasium.make(REAL)
-    model = small("hds", env, twin="PendulumReal", residual=False, train_freq=120, replan_epochs=1)
-    model.learn(360)
-    env.unwrapped.set_payload(0.5)
-    model.learn(360)
-    model.learn(120)
+def test_a_model_without_learned_force_is_no_model_with_one():
+    model = small("pods", REAL)
+    assert all(model.get_parameters().values())
 
-    assert model.num_timesteps == 120 and model.real_timesteps == 840
-    twin = model.twin
-    inertia = (twin.values["mass"] / 3.0 + twin.values["payload"]) * twin.values["length"] ** 2
-    assert inertia == pytest.approx(1.0 / 3.0 + 0.5, rel=0.02)
-    assert model.measured.trajectories(model.real_timesteps - model._changed_at).n_steps == 480
+    with pytest.raises(ValueError, match=r"does not fit this model.*learned_force"):
+        reloaded(model, twin=twins.make("PendulumReal").extend(effects.NeuralForce()), env=None)
+
+
+def test_what_counts_since_a_change_is_remembered_in_real_steps(monkeypatch):
+    counted = []
+
+    def changed_once(twin, data, *_, since, **__):
+        counted.append(since)
+        found = Correction(twin, 0.0, changed=False, attached={"friction": 0.0})
+        return dataclasses.replace(found, since=Since(15, 0) if len(counted) == 2 else None)
+
+    monkeypatch.setattr("sb3_hds.algos.hds.correct", changed_once)
+    model = real(train_freq=10).learn(10).learn(20)
+
+    assert (model.num_timesteps, model.real_timesteps) == (20, 30)
+    # Fifteen of the first twenty steps, and the ten that came after.
+    assert counted == [None, None, Since(25, 0)]
+    # What was believed of effects that were attached is known from then on.
+    assert model.nominal["friction"] == 0.0
 
 
 def test_planning_anew_is_no_block_of_its_own(monkeypatch):
@@ -581,19 +497,10 @@ def test_planning_anew_is_no_block_of_its_own(monkeypatch):
         return Correction(twin, 0.0, changed=True)
 
     monkeypatch.setattr("sb3_hds.algos.hds.correct", always_changed)
-    model = small("hds", train_freq=10, replan_epochs=2, gradient_steps=3).learn(30)
+    model = real(train_freq=10, replan_epochs=2, gradient_steps=3).learn(30)
 
     assert asked == [10, 20, 30]
     assert model._n_updates == 3 * (2 + 1) * 3
-
-
-def test_the_data_sheet_is_that_of_the_environment_that_came_last(tmp_path):
-    model = small("hds", gymnasium.make(REAL), residual=False)
-    assert model.nominal["mass"] == 1.0
-
-    model.set_env(gymnasium.make(REAL, mass=1.4))
-
-    assert model.nominal["mass"] == model.twin.values["mass"] == 1.4
 
 
 @pytest.mark.parametrize(
@@ -612,31 +519,25 @@ def test_settings_of_learning_from_data_are_checked_at_the_door(name, value, exp
         small("hds", REAL, **{name: value})
 
 
-def test_how_much_is_saved_may_be_limited(tmp_path):
-    for name, settings, kept in (
-        ("some", {"max_saved_steps": 40}, 40),
-        ("none", {"save_data": False}, 0),
-    ):
-        model = small("hds", **settings).learn(60)
-        model.save(tmp_path / name)
-        loaded = HDS.load(tmp_path / name, env=gymnasium.make("Pendulum-v1"))
+def test_how_much_is_saved_may_be_limited():
+    for settings, kept in (({"max_saved_steps": 40}, 40), ({"save_data": False}, 0)):
+        model = real(refit_freq=0, **settings).learn(60)
+        loaded = reloaded(model, env=REAL)
         assert loaded.replay_buffer.size() == kept
-        if kept:
-            latest = columns(model)["observations"][-kept:]
-            np.testing.assert_array_equal(columns(loaded)["observations"], latest)
+        latest = columns(model)["observations"][model.replay_buffer.size() - kept :]
+        np.testing.assert_array_equal(columns(loaded)["observations"], latest)
 
 
 @pytest.mark.parametrize(
-    ("limit", "n_real", "n_early"), [(1000, 60, 180), (200, 60, 120), (90, 60, 30), (40, 40, 0)]
+    ("limit", "n_real", "n_early"), [(200, 60, 120), (90, 60, 30), (40, 40, 0)]
 )
-def test_data_from_before_share_the_limit_and_the_latest_stay(tmp_path, limit, n_real, n_early):
+def test_data_from_before_share_the_limit_and_the_latest_stay(limit, n_real, n_early):
     """Recordings of 60 steps: as many whole ones as there is room for, or the end of the last."""
     data = measured(twins.make("PendulumReal"), n=3)
     settings = {"twin": "PendulumReal", "train_freq": 20, "refit_freq": 0}
     model = small("hds", REAL, pretrain_data=data, max_saved_steps=limit, **settings).learn(60)
-    model.save(tmp_path / "model")
 
-    loaded = HDS.load(tmp_path / "model", env=gymnasium.make(REAL))
+    loaded = reloaded(model, env=REAL)
 
     assert loaded.replay_buffer.size() == n_real
     found = loaded.measured.recordings()
@@ -646,28 +547,6 @@ def test_data_from_before_share_the_limit_and_the_latest_stay(tmp_path, limit, n
         np.testing.assert_array_equal(
             found.episode(len(found) - 2)[0], data.obs[2][-1 - min(n_early, 60) :]
         )
-
-
-def test_data_from_before_keep_their_labels_and_what_belongs_together(tmp_path):
-    data = measured(twins.make("PendulumReal"), n=2)
-    data = dataclasses.replace(data, conditions=("bare", "1 kg ± 10 g")).windows(20)
-    model = small("hds", REAL, twin="PendulumReal", pretrain_data=data, refit_freq=0)
-    model.save(tmp_path / "model")
-
-    loaded = HDS.load(tmp_path / "model", env=gymnasium.make(REAL)).measured.earlier
-
-    assert loaded.conditions == ("bare",) * 3 + ("1 kg ± 10 g",) * 3
-    assert loaded.origin.tolist() == [0, 0, 0, 1, 1, 1]
-    assert loaded.dt == data.dt
-
-
-def test_another_number_of_copies_takes_the_data_too(tmp_path):
-    model = small("hds", make_vec_env("Pendulum-v1", 2, seed=0)).learn(100)
-    model.save(tmp_path / "model")
-
-    loaded = HDS.load(tmp_path / "model", env=gymnasium.make("Pendulum-v1"))
-
-    assert loaded.measured.trajectories().n_steps == 100
 
 
 def test_an_episode_that_was_ended_by_hand_is_truncated():
@@ -688,75 +567,9 @@ def test_an_episode_that_was_ended_by_hand_is_truncated():
     assert model.measured.trajectories().lengths.tolist() == [11, 14]
 
 
-SCRIPT = """
-import glob, os, signal, sys
-import gymnasium, jax, numpy as np, torch
-from measuring import measured
-from small_models import small
-from stable_baselines3.common.callbacks import CheckpointCallback, ConvertCallback
-
-from sb3_hds import effects, twins
-
-write, calls = torch.save, []
-
-def deadly(*args, **kwargs):
-    calls.append(len(glob.glob(sys.argv[1] + "/*.zip")))
-    if calls.count(2) == 4:
-        buffer = model.replay_buffer
-        columns = {name: getattr(buffer, name)[:200] for name in sys.argv[2:]}
-        np.savez(sys.argv[1] + "/buffer.npz", **columns)
-        os.kill(os.getpid(), signal.SIGKILL)
-    write(*args, **kwargs)
-
-def keep(known, _):
-    if model.num_timesteps == 200:
-        leaves = [*jax.tree.leaves(model.twin.tensors), list(model.twin.values.values())]
-        np.savez(sys.argv[1] + "/twin.npz", *map(np.asarray, leaves))
-    return True
-
-torch.save = deadly
-env = gymnasium.make("sb3_hds/PendulumReal-v1", mass=1.3, noise=0.01)
-force = effects.NeuralForce(n_members=2, net_arch=(4,))
-model = small(
-    "hds",
-    env,
-    twin=twins.make("PendulumReal").extend(force),
-    pretrain_data=measured(twins.make("PendulumReal", mass=1.3), n=3, noise=0.01),
-    suspected=(),
-    replan_epochs=1,
-    train_freq=50,
-)
-model.learn(1_000, callback=[CheckpointCallback(100, sys.argv[1]), ConvertCallback(keep)])
-"""
-
-
-@pytest.mark.expensive
-def test_a_killed_run_resumes_with_nothing_lost(tmp_path):
-    environ = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    names = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-    killed = subprocess.run([sys.executable, "-c", SCRIPT, str(tmp_path), *names], env=environ)
-
-    assert killed.returncode == -signal.SIGKILL
-    last = max(tmp_path.glob("*.zip"), key=steps_of)
-    model = HDS.load(last, env=gymnasium.make(REAL, mass=1.3, noise=0.01))
-    assert model.num_timesteps == steps_of(last) == 200
-    assert model.replay_buffer.size() == 200
-    for name, values in np.load(tmp_path / "buffer.npz").items():
-        kept = getattr(model.replay_buffer, name)[:200]
-        np.testing.assert_array_equal(kept, values, err_msg=name)
-    early = measured(twins.make("PendulumReal", mass=1.3), n=3, noise=0.01)
-    np.testing.assert_array_equal(model.measured.earlier.obs, early.obs)
-    np.testing.assert_array_equal(model.measured.earlier.actions, early.actions)
-
-    *force, values = np.load(tmp_path / "twin.npz").values()
-    assert list(model.twin.values.values()) == values.tolist()
-    fresh = twins.make("PendulumReal").extend(effects.NeuralForce(n_members=2, net_arch=(4,)))
-    kept, random = jax.tree.leaves(model.twin.tensors), jax.tree.leaves(fresh.tensors)
-    assert all(map(np.array_equal, force, kept)) and len(force) == len(kept)
-    assert not all(map(np.array_equal, force, random))
-    inertia = model.twin.values["mass"] / 3.0 * model.twin.values["length"] ** 2
-    inertia += model.twin.values["payload"] * model.twin.values["length"] ** 2
-    assert inertia == pytest.approx(1.3 / 3.0, rel=0.02)
-
-    model.learn(50, reset_num_timesteps=False)
-    assert model.replay_buffer.size() == 250
+def test_diagnoses_come_as_often_as_asked_for():
+    model = small("hds", REAL, twin="PendulumReal", diagnose_freq=2, train_freq=10)
+    asked = []
+    model.extend_model = lambda: asked.append(model.num_timesteps)
+    model.learn(60)
+    assert asked == [20, 40, 60]

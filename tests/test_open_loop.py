@@ -14,9 +14,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     SubprocVecEnv,
-    VecExtractDictObs,
     VecFrameStack,
-    VecMonitor,
     VecNormalize,
 )
 
@@ -100,7 +98,10 @@ def test_the_published_gait_swims_as_far_as_published():
 
 def test_the_published_gait_runs_as_fast_as_published():
     model = OpenLoop("MlpPolicy", "HalfCheetah-v5", seed=0).set_constants(**HALF_CHEETAH)
+    other = OpenLoop("MlpPolicy", "HalfCheetah-v5", seed=1)
+    other.set_constants(**json.loads(json.dumps(model.constants)))
 
+    assert other.constants == model.constants
     assert 3_500.0 < np.mean(returns(model, "HalfCheetah-v5")) < 4_200.0
 
 
@@ -117,9 +118,7 @@ def test_joints_of_the_ant_are_those_that_its_actuators_are_named_after():
     assert joints.position.tolist() == [7 + in_state.index(name) for name in joints.names]
 
 
-@pytest.mark.parametrize(
-    "env_id", ["Swimmer-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5"]
-)
+@pytest.mark.parametrize("env_id", ["Swimmer-v5", "Walker2d-v5", "Ant-v5"])
 def test_joints_are_found_in_the_observation(env_id):
     env = make_vec_env(env_id, seed=3)
     model = OpenLoop("MlpPolicy", env, seed=3)
@@ -172,6 +171,9 @@ def test_the_state_that_predict_returns_carries_the_phase():
     model.set_constants(amplitude=1.5, phase=0.7, omega_swing=3.0, omega_stance=5.0)
     gait = Gait(*map(jnp.asarray, ([1.5], [0.0], [0.7], 3.0, 5.0)))
     obs, state, start = np.zeros((2, 3), np.float32), None, np.ones(2, bool)
+    model.predict(obs)
+    with pytest.warns(UserWarning, match="without the state that it returned"):
+        model.predict(obs)
 
     for k in range(60):
         actions, state = model.predict(obs, state, start)
@@ -180,14 +182,6 @@ def test_the_state_that_predict_returns_carries_the_phase():
         expected = [target_at(gait, 0.05 * time)[0] for time in times]
         np.testing.assert_allclose(actions[:, 0], expected, atol=1e-4)
         start = np.array([False, k == 39])
-
-
-def test_predicting_twice_without_the_state_is_warned_of():
-    model, obs = small("openloop"), np.zeros(3, np.float32)
-    model.predict(obs)
-
-    with pytest.warns(UserWarning, match="without the state that it returned"):
-        model.predict(obs)
 
 
 def test_a_search_finds_the_gait_that_is_rewarded():
@@ -304,12 +298,6 @@ def test_the_ranking_prefers_what_is_good_on_fresh_resets_to_what_was_lucky():
     np.testing.assert_allclose(model.constants["amplitude"], [0.5], atol=1e-6)
 
 
-def test_steps_of_all_copies_count_and_nothing_runs_beyond_the_budget():
-    model = small("openloop", make_vec_env("Pendulum-v1", n_envs=4)).learn(60)
-
-    assert model.num_timesteps == 60
-
-
 def test_a_log_line_has_the_usual_keys_and_those_of_the_search():
     model = OpenLoop("MlpPolicy", Tune(), seed=0, population_size=2, n_resets=1, ranking_share=0.6)
     lines = logged(model)
@@ -323,26 +311,6 @@ def test_a_log_line_has_the_usual_keys_and_those_of_the_search():
     for key in ("rollout/ep_rew_mean", "search/mean_return", "search/best_return", "search/sigma"):
         assert np.isfinite(lines.column(key)).all() and lines.column(key)
     assert lines.column("search/best_whole_episodes")
-
-
-def test_constants_make_a_round_trip_as_plain_data():
-    model = OpenLoop("MlpPolicy", "Swimmer-v5", seed=0).learn(50)
-
-    other = OpenLoop("MlpPolicy", "Swimmer-v5", seed=1)
-    other.set_constants(**json.loads(json.dumps(model.constants)))
-
-    assert other.constants == model.constants
-
-
-def test_a_search_starts_from_the_constants_that_were_set_and_keeps_them_until_it_ranked():
-    model = OpenLoop("MlpPolicy", "Swimmer-v5", seed=0, frequency=(0.2, 3.0), gain_factor=1.0)
-    model.set_constants(**SWIMMER)
-    at_start = model.gait_space.decode(model.policy.search.mean)
-
-    model.learn(100)
-
-    assert float(at_start.omega_swing) == pytest.approx(TAU * 0.62)
-    assert model.constants["phase"] == SWIMMER["phase"]
 
 
 def test_legs_that_do_the_same_are_searched_as_one_each_ahead_by_its_lead():
@@ -395,17 +363,6 @@ def test_points_and_gaits_are_two_names_of_the_same():
     assert space.dim == 2 + 2 + 1 + 2 + 2
 
 
-def test_the_ablations_of_the_paper_search_fewer_numbers():
-    model = OpenLoop("MlpPolicy", "HalfCheetah-v5", gain_factor=1.0)
-    fewer = OpenLoop(
-        "MlpPolicy", "HalfCheetah-v5", gain_factor=1.0, same_frequency=True, phases=False
-    )
-
-    assert (model.gait_space.dim, fewer.gait_space.dim) == (19, 13)
-    found = fewer.gait_space.decode(np.ones(13))
-    assert found.omega_swing == found.omega_stance and (found.phase == 0.0).all()
-
-
 @pytest.mark.parametrize(
     "settings",
     [{"horizon": None}, {"population_size": 1}, {"n_resets": 0}, {"frequency": [2.0, 1.0]},
@@ -432,23 +389,18 @@ def test_constants_of_another_body_are_refused():
 
 
 def test_observations_that_are_normalised_do_not_show_joints_and_are_refused():
-    env = make_vec_env("Swimmer-v5")
-
     with pytest.raises(ValueError, match="norm_obs=False"):
-        OpenLoop("MlpPolicy", VecNormalize(env))
-    assert OpenLoop("MlpPolicy", VecNormalize(env, norm_obs=False), horizon=5).learn(20)
+        OpenLoop("MlpPolicy", VecNormalize(make_vec_env("Swimmer-v5")))
 
 
 def test_returns_are_judged_in_the_rewards_of_the_environment():
     env = VecNormalize(make_vec_env(Tune), norm_obs=False)
     settings = {"seed": 0, "population_size": 4, "n_resets": 1, "ranking_share": 0.0}
 
-    scaled = OpenLoop("MlpPolicy", env, **settings).learn(40 * 8)
-    raw = OpenLoop("MlpPolicy", Tune(), **settings).learn(40 * 8)
+    found = [OpenLoop("MlpPolicy", each, **settings).learn(320) for each in (env, Tune())]
 
-    np.testing.assert_allclose(
-        scaled.policy.search.elite_returns, raw.policy.search.elite_returns, rtol=1e-5
-    )
+    scaled, raw = (model.policy.search.elite_returns for model in found)
+    np.testing.assert_allclose(scaled, raw, rtol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["frames", "twin"])
@@ -462,45 +414,6 @@ def test_where_single_copies_cannot_be_reset_whole_episodes_are_run(kind):
 
     assert int(model.policy.search.generation) == 1
     assert model.num_timesteps == 2 * steps + 2
-
-
-def test_episodes_that_were_cut_off_are_not_added_up_in_a_monitor_above():
-    env = VecMonitor(DummyVecEnv([Tune, Tune]))
-    # The last of three resets leaves one copy to itself until its episode ends.
-    model = OpenLoop("MlpPolicy", env, seed=0, population_size=3, n_resets=1, horizon=30)
-
-    model.learn(1000)
-
-    told = [episode["l"] for episode in model.ep_info_buffer]
-    assert told and max(told) <= 40
-
-
-class Labelled(gymnasium.ObservationWrapper):
-    """A dictionary around what is observed."""
-
-    def __init__(self, env):
-        super().__init__(env)
-        self.observation_space = spaces.Dict({"state": env.observation_space})
-
-    def observation(self, observation):
-        return {"state": observation}
-
-
-def test_commands_come_from_where_joints_are_below_a_chosen_entry(monkeypatch):
-    env = DummyVecEnv([lambda: Labelled(gymnasium.make("Swimmer-v5", max_episode_steps=30))])
-    settings = {"seed": 0, "population_size": 3, "n_resets": 1, "joints": "observation"}
-    model = OpenLoop("MlpPolicy", VecExtractDictObs(env, "state"), horizon=20, **settings)
-    command, stale = model.policy.command, []
-
-    def watched(targets, observations, kp, kd):
-        true = env.envs[0].unwrapped.data.qpos[2:5]
-        stale.append(np.abs(observations[0, :3] - true).max() > 1e-6)
-        return command(targets, observations, kp, kd)
-
-    monkeypatch.setattr(model.policy, "command", watched)
-    model.learn(200)
-
-    assert len(stale) == 200 and not any(stale)
 
 
 def test_a_reward_that_is_not_finite_is_an_error_and_no_result():

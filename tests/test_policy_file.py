@@ -2,39 +2,35 @@
 
 import re
 import traceback
-import zipfile
-from collections.abc import Callable
-from pathlib import Path
 
 import flax.linen as nn
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from small_models import NAMES, saved, small
+from odd_envs import AnySpaces
+from small_models import NAMES, STATES, greedy, reloaded, repacked, saved, small
 from stable_baselines3 import SAC
 
 import sb3_hds
 from sb3_hds.algos.policy_description import space_from_plain, space_to_plain
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_policy_alone_acts_as_its_model_and_nothing_is_unpickled(name, tmp_path, no_pickle):
+def test_a_policy_alone_acts_as_its_model_and_nothing_is_unpickled(name, no_pickle):
     model = small(name, seed=3)
-    obs = np.array([[1.0, 0.0, 0.5], [-0.6, 0.8, -7.0]], np.float32)
     if name == "simba":
-        model.policy.observed(obs)
-    model.save(tmp_path / "model")
+        model.policy.observed(STATES)
 
-    policy = sb3_hds.load_policy(tmp_path / "model")
+    policy = sb3_hds.load_policy(saved(model))
 
-    expected, _ = model.predict(obs, deterministic=True)
-    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], expected)
-    explored, _ = policy.predict(obs)
-    assert explored.shape == expected.shape and np.abs(explored).max() <= 2.0
+    np.testing.assert_array_equal(greedy(policy), greedy(model))
+    explored, _ = policy.predict(STATES)
+    assert explored.shape == (2, 1) and np.abs(explored).max() <= 2.0
     assert policy.observation_space == model.observation_space
     assert policy.action_space == model.action_space
 
@@ -46,41 +42,27 @@ def test_checkpoints_of_td7_act_in_the_policy_alone(no_pickle):
     actor = jax.tree.map(lambda weight: weight + 0.1, learner.checkpoint.actor)
     other = learner.checkpoint._replace(actor=actor)
     model.policy.learner = learner._replace(checkpoint=other)
-    obs = model.observation_space.sample()
 
     policy = sb3_hds.load_policy(saved(model))
 
-    expected, _ = model.predict(obs, deterministic=True)
-    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], expected)
+    np.testing.assert_array_equal(greedy(policy), greedy(model))
     model.policy.drop_checkpoint()
-    assert (model.predict(obs, deterministic=True)[0] != expected).any()
-
-
-class Choices(gymnasium.Env):
-    """Observations that are numbers and choices, in an order that is not the alphabet's."""
-
-    observation_space = spaces.Dict(
-        [("speed", spaces.Box(-np.inf, np.inf, (2,))), ("gear", spaces.Discrete(3, start=1))]
-    )
-    action_space = spaces.Box(-1.0, 1.0, (2, 2))
-
-    def reset(self, **settings):
-        super().reset(**settings)
-        return self.observation_space.sample(), {}
-
-    def step(self, action):
-        return self.observation_space.sample(), float(action.sum()), False, False, {}
+    assert (greedy(model) != greedy(policy)).any()
 
 
 def test_observations_of_several_parts_keep_their_order(no_pickle):
-    model = small("droq", Choices(), policy="MultiInputPolicy", seed=3)
+    # In an order that is not the alphabet's.
+    space = spaces.Dict(
+        [("speed", spaces.Box(-np.inf, np.inf, (2,))), ("gear", spaces.Discrete(3, start=1))]
+    )
+    env = AnySpaces(space, spaces.Box(-1.0, 1.0, (2, 2)))
+    model = small("droq", env, policy="MultiInputPolicy", seed=3)
     obs = {"speed": np.array([0.3, -2.0], np.float32), "gear": 2}
 
     policy = sb3_hds.load_policy(saved(model))
 
-    expected, _ = model.predict(obs, deterministic=True)
-    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], expected)
-    assert expected.shape == (2, 2)
+    np.testing.assert_array_equal(greedy(policy, obs), greedy(model, obs))
+    assert greedy(model, obs).shape == (2, 2)
 
 
 @pytest.mark.parametrize(
@@ -116,12 +98,16 @@ def test_numbers_of_numpy_are_plain(name, no_pickle):
     if name == "td7":
         kwargs |= {"n_critics": np.int32(2), "embedding_size": np.int64(4)}
     model = small(name, policy_kwargs=kwargs)
-    obs = np.array([[1.0, 0.0, 0.5]], np.float32)
 
     policy = sb3_hds.load_policy(saved(model))
 
-    expected, _ = model.predict(obs, deterministic=True)
-    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], expected)
+    np.testing.assert_array_equal(greedy(policy), greedy(model))
+
+
+def test_widths_in_an_array_are_loaded_again():
+    model = small("td7", policy_kwargs={"net_arch": np.array([8, 8])})
+
+    assert reloaded(model).policy_kwargs["net_arch"] == [8, 8]
 
 
 def test_a_function_of_ones_own_is_no_plain_data():
@@ -132,47 +118,23 @@ def test_a_function_of_ones_own_is_no_plain_data():
         sb3_hds.load_policy(file)
 
 
-def test_a_missing_file_and_files_of_others_are_reported(tmp_path):
-    with pytest.raises(FileNotFoundError, match="nowhere"):
-        sb3_hds.load_policy(tmp_path / "nowhere")
-    (tmp_path / "text.zip").write_text("no zip file")
-    with pytest.raises(ValueError, match="damaged, or is no saved model"):
-        sb3_hds.load_policy(tmp_path / "text.zip")
+def test_a_file_of_another_library_is_reported(tmp_path):
     SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [8]}).save(tmp_path / "sac")
     with pytest.raises(ValueError, match="another library saved it"):
         sb3_hds.load_policy(tmp_path / "sac.zip")
 
 
-def changed(folder: Path, part: str, change: Callable[[bytes], bytes]) -> Path:
-    """A saved model, of which one part was changed afterwards."""
-    small("droq").save(folder / "old.zip")
-    with zipfile.ZipFile(folder / "old.zip") as old:
-        parts = {name: old.read(name) for name in old.namelist()}
-    with zipfile.ZipFile(folder / "new.zip", "w") as new:
-        for name, content in parts.items():
-            new.writestr(name, change(content) if name == part else content)
-    return folder / "new.zip"
-
-
-def test_a_description_of_a_newer_version_is_reported(tmp_path):
+def test_a_description_of_a_newer_version_is_reported():
     newer = lambda data: data.replace(b'"GaussianPolicy"', b'"TransformerPolicy"')  # noqa: E731
 
     with pytest.raises(ValueError, match=r"TransformerPolicy.*newer"):
-        sb3_hds.load_policy(changed(tmp_path, "data", newer))
+        sb3_hds.load_policy(repacked(small("droq"), "data", newer))
 
 
-@pytest.mark.parametrize(
-    ("part", "change"),
-    [
-        ("policy.pth", lambda content: b"no tensors"),
-        ("policy.pth", lambda content: content[: len(content) // 2]),
-        ("data", lambda content: b"[]"),
-        ("data", lambda content: re.sub(rb'"net_arch": \[[^]]*\]', b'"net_arch": [3]', content)),
-    ],
-    ids=["garbage", "half", "list", "other widths"],
-)
-def test_a_damaged_file_is_no_reason_to_unpickle_it(tmp_path, part, change):
+def test_widths_that_do_not_fit_the_weights_are_damage_and_no_reason_to_unpickle():
+    other = lambda data: re.sub(rb'"net_arch": \[[^]]*\]', b'"net_arch": [3]', data)  # noqa: E731
+
     with pytest.raises(ValueError, match="damaged, or") as caught:
-        sb3_hds.load_policy(changed(tmp_path, part, change))
+        sb3_hds.load_policy(repacked(small("droq"), "data", other))
 
     assert "weights_only" not in "".join(traceback.format_exception(caught.value))

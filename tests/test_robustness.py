@@ -2,6 +2,7 @@
 
 import csv
 import functools
+import shlex
 import zipfile
 
 import gymnasium
@@ -48,17 +49,6 @@ def test_they_matter_where_the_loop_sees_what_the_policy_sees(swimmer):
 
     assert found.share("noise 0.5") < 0.9
     assert swimmer.policy.read_states is None
-
-
-def test_they_matter_to_a_policy_that_has_eyes():
-    model = small("droq")
-    kinds = {name: PERTURBATIONS[name] for name in ("none", "sensor constant")}
-
-    found = measure_robustness(
-        model, "Pendulum-v1", perturbations=kinds, n_episodes=2, progress=False
-    )
-
-    assert (found.returns["sensor constant"] != found.returns["none"]).any()
 
 
 def test_a_table_has_shares_of_the_return_without_perturbation():
@@ -174,14 +164,14 @@ def test_the_command_takes_what_the_environment_was_made_and_wrapped_with(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("name", "path"),
+    ("name", "package"),
     [
-        ("tqc", "sb3_contrib.TQC"),
-        ("sbx.SAC", "sbx.SAC"),
-        pytest.param("ppo_lstm", None, marks=pytest.mark.expensive),
+        ("sbx.SAC", "sbx"),
+        pytest.param("tqc", "sb3_contrib", marks=pytest.mark.expensive),
+        pytest.param("ppo_lstm", "sb3_contrib", marks=pytest.mark.expensive),
     ],
 )
-def test_the_command_runs_models_of_the_packages_around(name, path, tmp_path):
+def test_the_command_runs_models_of_the_packages_around(name, package, tmp_path):
     pytest.importorskip("sb3_contrib")
     algorithm = classes.algorithm(name)
     policy = "MlpLstmPolicy" if name == "ppo_lstm" else "MlpPolicy"
@@ -191,54 +181,39 @@ def test_the_command_runs_models_of_the_packages_around(name, path, tmp_path):
     done = cli.main(["robustness", *words, "--episodes", "1", "--csv", str(tmp_path / "t.csv")])
 
     assert done == 0 and len(rows_of(tmp_path / "t.csv")) == len(PERTURBATIONS) - 1
-    assert path is None or f"{algorithm.__module__.split('.')[0]}." in path
+    assert algorithm.__module__.startswith(f"{package}.")
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--algo", "sbx.Nothing"], "no class 'sbx.Nothing'"),
-        (["--algo", "sbx.common"], "loads no model"),
-        (["--env-wrapper", "nowhere.Wrapper"], "no class 'nowhere.Wrapper'"),
-        (["--env-wrapper", "[1, 2]"], "--env-wrapper takes package.Wrapper"),
-        (["--env-wrapper", "sb3_hds.wrappers.LowPassAction: 4"], "--env-wrapper takes"),
-        (["--env-kwargs", "g=5"], "--env-kwargs takes NAME:VALUE"),
-        (["--env-kwargs", "weight:5"], "There is no 'Pendulum-v1' with {'weight': 5}"),
-        (["--env", "Nothing-v0"], "There is no 'Nothing-v0'"),
+        ("--algo opneloop", "no algorithm 'opneloop'. Did you mean 'openloop'?"),
+        ("--algo sbx.Nothing", "no class 'sbx.Nothing'"),
+        ("--algo sbx.common", "loads no model"),
+        ("--env-wrapper nowhere.Wrapper", "no class 'nowhere.Wrapper'"),
+        ("--env-wrapper [1,2]", "--env-wrapper takes package.Wrapper"),
+        ("--env-wrapper 'sb3_hds.wrappers.LowPassAction: 4'", "--env-wrapper takes"),
+        ("--env-kwargs g=5", "--env-kwargs takes NAME:VALUE"),
+        ("--env-kwargs weight:5", "There is no 'Pendulum-v1' with {'weight': 5}"),
+        ("--env Nothing-v0", "There is no 'Nothing-v0'"),
+        (
+            "--model FOLDER/modle.zip",
+            "is no model 'FOLDER/modle.zip'. Did you mean 'FOLDER/model.zip'?",
+        ),
+        ("--model FOLDER/modle", "There is no model 'FOLDER/modle'. Did you mean"),
+        ("--model FOLDER/text.zip", "text.zip holds no model of droq: "),
+        ("--model FOLDER/other.zip", "other.zip holds no model of droq: "),
     ],
 )
 def test_the_command_says_in_one_line_what_it_does_not_know(words, message, tmp_path, capsys):
     small("droq").save(tmp_path / "model")
-    known = ["--algo", "droq", "--model", str(tmp_path / "model.zip"), "--env", "Pendulum-v1"]
-
-    assert cli.main(["robustness", *known, *words]) == 1
-    assert message in capsys.readouterr().err
-
-
-def test_the_command_names_an_algorithm_that_there_is_not(capsys):
-    words = ["--algo", "opneloop", "--model", "model.zip", "--env", "Swimmer-v5"]
-
-    assert cli.main(["robustness", *words]) == 1
-    assert "no algorithm 'opneloop'. Did you mean 'openloop'?" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("path", "message"),
-    [
-        ("modle.zip", "There is no model '{folder}/modle.zip'. Did you mean '{folder}/model.zip'?"),
-        ("modle", "There is no model '{folder}/modle'. Did you mean"),
-        ("text.zip", "text.zip holds no model of droq: "),
-        ("other.zip", "other.zip holds no model of droq: "),
-    ],
-)
-def test_a_model_that_there_is_not_is_told_in_one_line(path, message, tmp_path, capsys):
-    (tmp_path / "model.zip").touch()
     (tmp_path / "text.zip").write_text("no archive")
     with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
         archive.writestr("data", "{}")
-    words = ["--algo", "droq", "--model", str(tmp_path / path), "--env", "Pendulum-v1"]
+    known = f"--algo droq --model {tmp_path / 'model.zip'} --env Pendulum-v1"
+    given = words.replace("FOLDER", str(tmp_path))
 
-    assert cli.main(["robustness", *words]) == 1
+    assert cli.main(["robustness", *known.split(), *shlex.split(given)]) == 1
     told = capsys.readouterr().err
-    assert message.format(folder=tmp_path) in told and ".zip.zip" not in told
+    assert message.replace("FOLDER", str(tmp_path)) in told and ".zip.zip" not in told
     assert told.count("\n") == 1

@@ -30,24 +30,6 @@ def test_speed_ups_stand_beside_what_they_shall_be():
     assert shown["reached"].tolist() == ["yes", "no", "yes", "yes", "yes"]
 
 
-def test_what_sbx_gains_over_sb3_is_the_ratio_of_what_ours_gains_over_both():
-    shown = speed.sbx_beside_sb3(measured()).set_index(["name", "ratio"])["sbx_times_sb3"]
-
-    assert shown.to_dict() == pytest.approx({("sac", 1): 4.0, ("sac", 20): 7.5})
-
-
-def test_matrix_products_take_a_share_of_the_whole():
-    rows = pd.DataFrame([("sac", 20, "products", 0.9, 0.8, 0.95)])
-    rows.columns = ["name", "ratio", "peer", "speed_up", "low", "high"]
-
-    [row] = speed.products(pd.concat([measured(), rows])).to_dict("records")
-
-    assert row == {"name": "sac", "ratio": 20, "share_of_products": 0.9, "low": 0.8, "high": 0.95}
-    alone = speed.Products(ratio=2)
-    alone.learn(3)
-    assert all(np.isfinite(part).all() for part in alone._carry)
-
-
 def test_the_speed_up_is_that_of_neighbouring_blocks(monkeypatch):
     # The machine slows down; ours takes half the time of the peer but in one block.
     blocks = [[0.5 * i, 1.0 * i] for i in range(1, speed.N_BLOCKS)] + [[9.0, 3.0]]
@@ -82,12 +64,3 @@ def test_one_measures_while_others_wait(monkeypatch, tmp_path):
     waiting.join(10.0)
 
     assert order == ["first", "another"]
-
-
-def test_an_accelerator_is_measured_beside_the_same_peers(monkeypatch):
-    on_both = set(speed.rows("cpu")) & set(speed.rows("cuda"))
-    assert on_both == set(speed.rows("cuda"))
-    assert {(name, ratio, "sbx") for name in speed.PAIRS for ratio in speed.RATIOS} <= on_both
-
-    monkeypatch.setenv("JAX_PLATFORMS", "cuda,cpu")
-    assert speed.device() == "cuda"

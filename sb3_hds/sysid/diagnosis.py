@@ -33,6 +33,7 @@ SENTENCES = {
     "unknown": "Something is there that none of the candidates explains.",
     "not_identifiable": "These data cannot support a verdict.",
 }
+OTHER_CONVENTION = "The log is not written in the conventions of the model."
 
 
 class _Plain(Protocol):
@@ -129,6 +130,9 @@ class Diagnosis:
     :param seed: of the split and of what else was drawn
     :param findings: causes, in the order in which they were found
     :param unexplained: what remains after them, in words; empty if nothing does
+    :param convention: what kind of convention of the model the log does not follow (``"zero"``,
+        ``"direction"``, ``"command"``, ``"degrees"``, ``"order"``), or empty; ``unexplained`` says
+        what to write
     :param gain: by horizon in steps
     :param explained: share that the findings explain of the force that is missing and can be
         predicted, or 0
@@ -148,6 +152,7 @@ class Diagnosis:
     seed: int
     findings: tuple[Finding, ...] = ()
     unexplained: str = ""
+    convention: str = ""
     gain: Mapping[int, HorizonGain] = dataclasses.field(default_factory=dict)
     explained: float = 0.0
     detectable: Mapping[str, Mapping[str, float]] = dataclasses.field(default_factory=dict)
@@ -171,6 +176,8 @@ class Diagnosis:
             choice = " or ".join(map(spoken, (first.key, *first.alternatives)))
             also = f", and {' and '.join(map(_choice, others))}" if others else ""
             return f"The simulation is wrong about {choice}{also}: the data cannot tell which."
+        if self.convention:
+            return OTHER_CONVENTION
         if self.verdict != "named":
             return SENTENCES[self.verdict]
         if len(self.findings) > _MANY:

@@ -22,6 +22,7 @@ from sb3_hds.sysid.comparison import Comparison, split
 from sb3_hds.sysid.constancy import Change, change
 from sb3_hds.sysid.conventions import Convention, other_convention
 from sb3_hds.sysid.diagnosis import Diagnosis, Rejected
+from sb3_hds.sysid.divergence import divergence_rate
 from sb3_hds.sysid.equation.motion import motion
 from sb3_hds.sysid.evidence import Evidence, Point, portion_for
 from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
@@ -65,6 +66,9 @@ from sb3_hds.sysid.timing import in_step
 # Length of a window in periods of the motion, within these numbers of steps; it is half as long
 # where there would be fewer windows than that.
 _WINDOW, _SHORTEST, _LONGEST, _FEW = 0.75, 8, 200, 24
+# Logarithm of how much an error of a start state may grow within a window: where it grows more,
+# some windows are fitted by another motion than the one that was measured.
+_GROWTH = 4.0
 # Several causes that explain less than this share of what can be explained are not believed.
 _LEAST_OF_SEVERAL = 0.5
 # A cause that explains less than this share of what can be explained is not the cause.
@@ -155,13 +159,19 @@ class Inquiry:
         self.spread = spread_of(self.data)
         self.shots, self.origin = shots_of(
             self.data,
-            _window_of(self.data, self.period),
+            self._window(),
             self.hypotheses.twin,
             period=self.period,
         )
         self.parts = split(self.data, self.origin, seed)
         self.effort = EFFORTS[budget]
         self.turned_down: dict[str, str] = {}
+
+    def _window(self) -> int:
+        """:return: steps of the windows that are simulated"""
+        rate = divergence_rate(self.hypotheses.twin, self.data)
+        span = _WINDOW * self.period
+        return _window_of(self.data, min(span, _GROWTH / rate) if rate else span)
 
     def poor(self) -> str:
         """:return: why these data cannot support a verdict; empty if they may"""
@@ -221,7 +231,7 @@ class Inquiry:
         nearest = ""
         if found:
             found, base, left, nearest = self._constant(found, base)
-        if len(found) == 1 and left.remainder is not None:
+        if len(found) == 1 and left.remainder is not None and self.screened is None:
             pair = naming.pair(found[0], base, firsts) or naming.several_as_confirmed(firsts)
             if pair is not None and (rest := self._left_by(*pair)) is not None:
                 found, base, left = *pair, rest
@@ -301,10 +311,10 @@ class Inquiry:
         return Diagnosis(
             verdict="unknown",
             believed=self.believed,
+            convention=convention.name,
             unexplained=(
-                f"The log is not written as the model has it. {convention.words} The equation of "
-                f"motion then leaves {convention.after:.2g} times the noise, not "
-                f"{convention.before:.2g} times. No cause was looked for."
+                f"{convention.words} The equation of motion then leaves {convention.after:.1f} "
+                f"times the noise, not {convention.before:.0f} times. No cause was looked for."
             ),
             caveats=(*map(str, self.audit.findings), *self.corrected),
             twin=self.believed,
@@ -514,10 +524,13 @@ def _share(before: _Left, left: _Left) -> float:
     return gone / (gone + left.predicted) if gone + left.predicted else 1.0
 
 
-def _window_of(data: Trajectories, period: float) -> int:
-    """:return: steps of a window, so that windows fill a typical recording"""
+def _window_of(data: Trajectories, span: float) -> int:
+    """
+    :param span: that is aimed at [s]
+    :return: steps of a window, so that windows fill a typical recording
+    """
     rows = int(np.median(data.lengths)) + 1
-    steps = min(int(np.clip(round(_WINDOW * period / data.dt), _SHORTEST, _LONGEST)), rows - 1)
+    steps = min(int(np.clip(round(span / data.dt), _SHORTEST, _LONGEST)), rows - 1)
 
     def filling(steps: int) -> int:
         return rows // max(round(rows / (steps + 1)), 1) - 1

@@ -63,10 +63,15 @@ def prior_of(name: str, parameter: Parameter, value: float, belief: Belief = Non
 
 
 def limits_of(parameter: Parameter, value: float) -> tuple[float, float]:
-    """:return: within a factor of 20 of the value, unless the parameter is bounded more closely"""
+    """
+    :return: within a factor of 20 of the value, unless the parameter is bounded more closely; what
+        may as well not be there, such as friction, may vanish
+    """
     if value == 0.0:
         return parameter.lower, parameter.upper
     small, large = abs(value) / _FACTOR, abs(value) * _FACTOR
+    if parameter.null == 0.0:
+        small = 0.0
     if parameter.lower >= 0.0:
         return max(parameter.lower, small), min(parameter.upper, large)
     return max(parameter.lower, -large), min(parameter.upper, large)
@@ -74,9 +79,9 @@ def limits_of(parameter: Parameter, value: float) -> tuple[float, float]:
 
 def at_limit(value: float, lower: float, upper: float, believed: float) -> bool:
     """
-    :return: whether a refitted value stands at a bound that is not where it was believed to be: no
-        damping in a twin without any is no news
+    :return: whether a refitted value stands at a bound that is neither zero (a machine without
+        friction, a load that is not there) nor where it was believed to be
     """
     reach = 1e-6 * max(abs(lower if math.isfinite(lower) else 0.0), abs(value), 1e-300)
     near = [bound for bound in (lower, upper) if abs(value - bound) <= reach]
-    return any(bound != believed for bound in near)
+    return any(bound not in (0.0, believed) for bound in near)

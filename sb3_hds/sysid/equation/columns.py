@@ -185,7 +185,7 @@ def equation(hypotheses: Hypotheses, motion: Motion) -> Equation:
             continue
         if candidate.slot == PARAMETER:
             _add_parameter(made, hypotheses, candidate, rows, smooth, typical)
-        elif isinstance(effect, JointEffect):
+        elif isinstance(effect, JointEffect) and not jax.tree.leaves(effect.memory(twin)):
             _add_force(made, candidate, effect, found, rows)
         elif isinstance(effect, ActionEffect) and candidate.index >= 0:
             _add_command(made, hypotheses, candidate, effect, rows)
@@ -280,10 +280,7 @@ def _add_force(
     nulls = {name: p.null for name, p in effect.parameters.items()}
     given = settings or ({},)
     values = np.array([[{**nulls, **at}[name] for name in names] for at in given])
-    try:
-        slopes = _force_slopes(effect.at(0), values, nodes, motion.dt)
-    except _NoColumnError:
-        return
+    slopes = _force_slopes(effect.at(0), values, nodes, motion.dt)
     if settings and effect.blended:
         # By pairs: the slope by the first parameter at two values of the blended one.
         for first in range(0, len(settings) - 1, 2):
@@ -310,10 +307,6 @@ def _add_force(
                     tuple(names[i] for i in useful),
                 )
             )
-
-
-class _NoColumnError(Exception):
-    """An effect that remembers has none."""
 
 
 def _nodes(made: Equation, rows: _Rows, found: Terms, joint: int) -> dict[str, np.ndarray]:

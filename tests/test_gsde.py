@@ -1,0 +1,179 @@
+"""Exploration by state-dependent noise, beside SB3's and by what it does."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch as th
+from small_models import STATES, logged, small
+from stable_baselines3.common.distributions import (
+    StateDependentNoiseDistribution,
+)
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_hds.algos import learn_compiled
+from sb3_hds.algos.heads import ExploringActor
+from sb3_hds.algos.off_policy import (
+    act,
+)
+from sb3_hds.algos.squashed import Gaussian, exploration_std, log_probability, marginal_std
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+
+def both_noises(full_std: bool, use_expln: bool) -> tuple[Gaussian, np.ndarray, Any]:
+    """:return: our Gaussian, actions before tanh, and SB3's distribution in double precision"""
+    rng = np.random.default_rng(0)
+    latent, means, before = rng.normal(size=(3, 7, 5))
+    means, before = means[:, :2], 2.0 * before[:, :2]
+    before[0, 0] = 5.0  # where the action is 1 but for 1e-4
+    log_std = rng.normal(size=(5, 2 if full_std else 1)) - 1.0
+    theirs = StateDependentNoiseDistribution(
+        2, full_std, use_expln=use_expln, squash_output=True, learn_features=True
+    )
+    theirs.latent_sde_dim = 5
+    theirs.sample_weights(th.as_tensor(log_std), 7)
+    # SB3 expands a single column by ones of single precision; these are of double.
+    wide = th.as_tensor(np.broadcast_to(log_std, (5, 2)).copy())
+    theirs.full_std = True
+    theirs.proba_distribution(th.as_tensor(means), wide, th.as_tensor(latent))
+    std = exploration_std(jnp.broadcast_to(jnp.asarray(log_std), (5, 2)), use_expln)
+    return (
+        Gaussian(jnp.asarray(means), marginal_std(jnp.asarray(latent), std), latent),
+        before,
+        theirs,
+    )
+
+
+@pytest.mark.parametrize(("full_std", "use_expln"), [(False, True), (True, False)])
+def test_state_dependent_noise_is_that_of_stable_baselines(full_std, use_expln, x64):
+    gaussian, before, theirs = both_noises(full_std, use_expln)
+    actions = th.tanh(th.as_tensor(before))
+
+    # SB3 has to find these from rounded actions again, which costs digits where they are near 1.
+    np.testing.assert_allclose(gaussian.std, theirs.distribution.stddev, rtol=1e-12)
+    np.testing.assert_allclose(jnp.tanh(gaussian.mean), theirs.mode(), rtol=1e-12)
+    np.testing.assert_allclose(
+        log_probability(gaussian, before), theirs.log_prob(actions), rtol=1e-9
+    )
+
+
+def test_single_precision_does_not_cost_log_probabilities_their_digits():
+    gaussian, before, theirs = both_noises(full_std=True, use_expln=True)
+    expected = theirs.log_prob(th.tanh(th.as_tensor(before)))
+
+    found = log_probability(gaussian, jnp.asarray(before))
+
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_noise_depends_on_the_state_and_stays_until_it_is_drawn_again():
+    model = small("gsde_sac", policy_kwargs={"net_arch": [8], "log_std_init": 0.0})
+
+    def deviations() -> np.ndarray:
+        explored, without = (
+            np.arctanh(np.clip(model.predict(STATES, deterministic=way)[0] / 2.0, -0.999, 0.999))
+            for way in (False, True)
+        )
+        return explored - without
+
+    model.policy.reset_noise()
+    first, again = deviations(), deviations()
+    model.policy.reset_noise()
+
+    np.testing.assert_array_equal(first, again)
+    assert abs(first[0] - first[1]) > 1e-3
+    assert np.abs(deviations() - first).min() > 1e-3
+    assert model.policy.get_std().shape == (8, 1)
+    assert model.policy.get_std().mean() == pytest.approx(1.0)
+    told = {"net_arch": [8], "log_std_init": 1.0, "use_expln": True}
+    slower = small("gsde_sac", policy_kwargs=told).policy.get_std()
+    assert slower.mean() == pytest.approx(1.0 + np.log(2.0), rel=1e-5)
+
+
+def test_each_environment_has_its_noise_matrix_and_the_deviation_is_logged():
+    env = make_vec_env("Pendulum-v1", 3, env_kwargs={"max_episode_steps": 10})
+    model = small("gsde_sac", env, train_freq=5)
+    lines = logged(model)
+
+    model.learn(45, log_interval=1)
+
+    policy, obs = model.policy, np.ones((3, 3), np.float32)
+    gaussian, _ = act(policy.actor_network, policy.learner.actor.weights, obs)
+    noise = np.stack([gaussian.latent[0] @ matrix for matrix in policy.matrices])
+    wanted = 2.0 * np.tanh(gaussian.mean + noise)
+    np.testing.assert_allclose(model.predict(obs)[0], wanted, rtol=1e-4, atol=1e-6)
+    assert len(np.unique(wanted)) == 3
+    assert lines.column("train/std")[-1] == pytest.approx(np.exp(-3.0), rel=0.5)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_noise_matrix_lasts_over_as_many_collections_as_it_takes(compiled):
+    how = {"train_freq": 5, "sde_sample_freq": 20, "use_sde_at_warmup": True}
+    how |= {"learning_starts": 50, "policy_kwargs": {"net_arch": [8], "log_std_init": -3.0}}
+    model = small("gsde_sac", **how)
+    model = learn_compiled(model, 40)[0][0] if compiled else model.learn(40)
+
+    buffer, policy = model.replay_buffer, model.policy
+    gaussian, _ = act(
+        policy.actor_network, policy.learner.actor.weights, buffer.observations[:40, 0]
+    )
+    apart = np.arctanh(buffer.actions[:40, 0]) - gaussian.mean
+
+    def misfit(steps: slice) -> float:
+        """Of the one noise matrix that explains these steps best."""
+        latent = np.asarray(gaussian.latent[steps])
+        matrix, *_ = np.linalg.lstsq(latent, apart[steps], rcond=None)
+        return float(np.abs(latent @ matrix - apart[steps]).max())
+
+    assert misfit(slice(0, 20)) < 1e-5 and misfit(slice(20, 40)) < 1e-5
+    assert misfit(slice(10, 30)) > 1e-3
+
+
+def test_noise_that_is_drawn_at_each_step_is_warned_of():
+    with pytest.warns(UserWarning, match="draws a new noise matrix at each step"):
+        small("droq", use_sde=True, train_freq=1)
+
+
+@pytest.mark.parametrize("at_warmup", [True, False])
+def test_noise_acts_before_learning_starts_only_where_it_is_told_to(at_warmup):
+    how = {"learning_starts": 100, "train_freq": 10, "use_sde_at_warmup": at_warmup}
+    model = small("gsde_sac", **how).learn(10)
+    seen, taken = model.replay_buffer.observations[:10, 0], model.replay_buffer.actions[:10, 0]
+
+    # One matrix in the whole collection: the policy's actions can be had again.
+    explored = model.policy.scale_action(model.predict(seen)[0])
+
+    assert np.allclose(explored, taken, atol=1e-5) == at_warmup
+    assert model._n_updates == 0
+
+
+def test_state_dependent_noise_of_simba_is_not_squashed():
+    model = small("simba", use_sde=True)
+
+    assert isinstance(model.policy.actor_network, ExploringActor)
+    # The noise matrix is drawn with e^-3; a squashed logarithm would not be.
+    assert model.policy.get_std() == pytest.approx(np.exp(-3.0), rel=0.1)
+    with pytest.raises(ValueError, match=r"'squash_log_std': True.*with use_sde=True"):
+        small("simba", use_sde=True, policy_kwargs={"squash_log_std": True})
+
+
+def test_the_optimistic_actor_of_bro_explores_by_gsde_too():
+    model = small("bro", use_sde=True, std_multiplier=0.5)
+    policy, recipe = model.policy, model.policy.recipe
+    actor, extra = policy.learner.actor.weights, policy.learner.extra
+    moved = jax.tree.map(lambda weight: weight + 0.1, extra["actor"].weights)
+    extra = extra | {"actor": extra["actor"]._replace(weights=moved)}
+    policy.learner = policy.learner._replace(extra=extra)
+    gaussian, _ = act(recipe.actor, actor, STATES)
+    shift = recipe.extra.network.apply(moved, STATES, gaussian.mean)
+    policy.reset_noise()
+
+    explored = policy.scale_action(model.predict(STATES)[0])
+
+    apart = gaussian.latent @ policy.matrices[0]
+    np.testing.assert_allclose(explored, jnp.tanh(gaussian.mean + shift + 0.5 * apart), atol=1e-5)
+    assert np.abs(shift).min() > 1e-6 and np.abs(apart).min() > 1e-4
