@@ -101,8 +101,8 @@ def _parser_of(
 def _compiled(parsed: Callable[[], Any], where: str) -> tuple[Any, Any]:
     """Without what only shows or touches, if files for that are missing: inertials suffice."""
     mj = mujoco()
-    spec = parsed()
     try:
+        spec = parsed()
         return spec.compile(), spec
     except ValueError as error:
         if not _is_about_files(error):
