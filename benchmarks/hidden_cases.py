@@ -18,6 +18,7 @@ from independent_rigs import (
     COMMANDS,
     EULER,
     FORCES,
+    FROM_FILES,
     OUTSIDE,
     SENSORS,
     SYSTEMS,
@@ -49,7 +50,7 @@ SHARES = {
 NULLS = tuple(kind for kind in SHARES if kind.startswith("null"))
 #: Pendulum-v1's twin, which steps by Euler's rule, against the engine
 EULERS = "Euler's twin"
-RIGS: dict[str, System] = {**SYSTEMS, "pendulum_v1": EULER}
+RIGS: dict[str, System] = {**SYSTEMS, "pendulum_v1": EULER, **FROM_FILES}
 #: of four cases of a kind, the one that other rules are asked about
 ASKED = 4
 PARAMETER = "parameter"
@@ -82,6 +83,9 @@ _CONDITIONS = (
 )
 # How often a case that cannot be is drawn again, and for how long with the same effect.
 _TRIES, _SAME = 200, 20
+
+# Of twins from model files, within an interval of 20 ms.
+_SUBSTEPS = 5
 
 _Card = TypeVar("_Card")
 
@@ -123,16 +127,19 @@ class Case:
 
     @property
     def nuisances(self) -> tuple[str, ...]:
-        return (RIGS[self.system].base[0],) if self.wrong_base else ()
+        base = RIGS[self.system].base
+        return (base[0],) if base and self.wrong_base else ()
 
 
 def kinds(system: str) -> tuple[str, ...]:
     """:return: of a hundred cases in a row; any number of first ones has nearly the right shares"""
-    if system not in SYSTEMS:
+    if RIGS[system] is EULER:
         return (EULERS,) * 100
-    dealt: list[str] = []
+    shares, dealt = dict(SHARES), list[str]()
+    if RIGS[system].base is None:
+        shares["null"] += shares.pop("null, wrong base")
     for n in range(1, 101):
-        behind = {kind: share * n / 100 - dealt.count(kind) for kind, share in SHARES.items()}
+        behind = {kind: share * n / 100 - dealt.count(kind) for kind, share in shares.items()}
         dealt.append(max(behind, key=lambda kind: behind[kind]))
     return tuple(dealt)
 
@@ -161,6 +168,7 @@ def draw(
     factors = {"effect": (2.0, 4.0, 8.0), "pair": (2.0, 4.0, 8.0), "outside": (4.0, 8.0)}
     noise = noise or deal("noise", ("tick", "tick", "1 %", "1 %", "5 %"))
     wrong, disturbance = deal("condition", _CONDITIONS) if kind == "effect" else (False, 0.0)
+    wrong = wrong and RIGS[system].base is not None
     case = Case(
         system=system,
         number=number,
@@ -202,7 +210,8 @@ def _planted(case: Case, deal: Any, rng: np.random.Generator, again: int) -> Cas
         kind = deal("effect", plantable(rig)) if again < _SAME else rng.choice(plantable(rig))
         chosen = (str(kind),)
     elif case.kind == "pair":
-        chosen = deal("pair", (*_CONFOUNDED, *((),) * len(_CONFOUNDED)))
+        confounded = [pair for pair in _CONFOUNDED if rig.base or PARAMETER not in pair]
+        chosen = deal("pair", (*confounded, *((),) * len(confounded)))
         index = int(rng.integers(len(rig.torque))) if chosen else None
         chosen = chosen or tuple(map(str, rng.choice(plantable(rig), 2, replace=False)))
     apart = [kind for kind in chosen if kind in TRANSMISSIONS]
@@ -215,6 +224,8 @@ def _planted(case: Case, deal: Any, rng: np.random.Generator, again: int) -> Cas
         planted = (_outside(case, deal("outside", OUTSIDE), rng),)
     if not np.all(np.isfinite([value for p in planted for value in p.values.values()])):
         return None
+    if rig.base is None:
+        return dataclasses.replace(case, planted=planted)
     change = sum(p.values[rig.base[0]] for p in planted if p.effect.startswith(PARAMETER))
     if case.wrong_base:
         change = 0.1 * base_value(system) * float(rng.choice((-1.0, 1.0)))
@@ -226,7 +237,8 @@ def _planted(case: Case, deal: Any, rng: np.random.Generator, again: int) -> Cas
 def plantable(rig: System) -> tuple[str, ...]:
     """:return: what can be planted in this rig"""
     apart = tuple(TRANSMISSIONS) if rig.apart else ()
-    return (*JOINT, *COMMANDS, *SENSORS, *apart, PARAMETER)
+    own = (PARAMETER,) if rig.base else ()
+    return (*JOINT, *COMMANDS, *SENSORS, *apart, *own)
 
 
 def slot_of(effect: str) -> str:
@@ -254,6 +266,7 @@ def _effect(case: Case, kind: str, rng: np.random.Generator, index: int | None =
     limits, wide = smallest(case), spread(system)
     side = float(rng.choice((-1.0, 1.0)))
     if kind == PARAMETER:
+        assert rig.base is not None
         base = rig.base[0]
         size = limits.get(f"parameter.{base}", {}).get(base, np.nan)
         return Planted(f"parameter.{base}", 0, {base: side * factor * size})
@@ -363,11 +376,17 @@ def believed(system: str) -> Any:
     from sb3_hds import twins
 
     name, values = RIGS[system].twin
+    if system in FROM_FILES:
+        # Runge and Kutta's steps of 4 ms follow those of 1 ms, and cost a quarter.
+        made = twins.from_mujoco(RIGS[system].xml)
+        return twins.MechanismTwin(made.mechanism, dt=RIGS[system].dt, substeps=_SUBSTEPS)
     return twins.make(name, dt=RIGS[system].dt, **values)
 
 
 def base_value(system: str) -> float:
-    return believed(system).values[RIGS[system].base[0]]
+    base = RIGS[system].base
+    assert base is not None
+    return believed(system).values[base[0]]
 
 
 @functools.cache

@@ -98,7 +98,7 @@ class System:
     :param start: spread of the positions in which recordings begin
     :param dof: joints
     :param base: parameter of the twin that may be wrong, the body that it belongs to, and whether
-        it grows with the body's mass or with its inertia, one to one
+        it grows with the body's mass or with its inertia, one to one; None where none is
     :param apart: for the engine, where motor and load are two, with a place for what holds them
     :param inertia: of the rigid joint, where that is
     :param damped: whether the twin has viscous friction of its own, which counts as load
@@ -111,7 +111,7 @@ class System:
     twin: tuple[str, dict[str, Any]]
     torque: tuple[float, ...]
     start: tuple[float, ...]
-    base: tuple[str, int, str]
+    base: tuple[str, int, str] | None = None
     apart: str = ""
     inertia: float = math.nan
     damped: bool = True
@@ -215,6 +215,69 @@ EULER = System(
     rest=(math.pi,),
     seen=lambda rows: np.stack([np.cos(rows[:, 0]), np.sin(rows[:, 0]), rows[:, 1]], 1),
 )
+
+_BODIES = """<default><geom contype="0" conaffinity="0" density="1000"/></default>
+<worldbody><body name="base" pos="0 0 2">{}</body></worldbody>"""
+
+
+def _hanging(links: list[tuple[str, float, str]]) -> str:
+    """Capsules of 20 mm, one below the other: axis, length [m], and what the joint has."""
+    opening, way = "", 0.0
+    for i, (axis, length, words) in enumerate(links):
+        opening += f'''<body name="link{i}" pos="0 0 {-way}"><joint name="joint{i}" axis="{axis}"
+{words}/><geom type="capsule" fromto="0 0 0 0.01 0.01 {-length}" size="0.02"/>'''
+        way = length
+    return _BODIES.format(opening + "</body>" * len(links))
+
+
+_ARM = _hanging(
+    [
+        ("0 0 1", 0.1, 'damping="0.3" armature="0.05"'),
+        ("0 1 0", 0.3, 'damping="0.3" armature="0.05"'),
+        ("0 1 0", 0.25, 'damping="0.2" armature="0.03"'),
+        ("0 0 1", 0.1, 'damping="0.05" armature="0.01"'),
+        ("0 1 0", 0.1, 'damping="0.05" armature="0.01"'),
+        ("1 0 0", 0.1, 'damping="0.05" armature="0.01"'),
+    ]
+)
+_LEG = _hanging(
+    [
+        ("1 0 0", 0.08, 'damping="0.1" armature="0.01"'),
+        ("0 1 0", 0.2, 'damping="0.1" armature="0.01"'),
+        ("0 1 0", 0.2, 'damping="0.1" armature="0.01"'),
+    ]
+)
+
+
+def _driven(bodies: str, gains: tuple[float, ...]) -> str:
+    """With motors, or with servos of these stiffnesses, damped as a motor controller is."""
+    n = bodies.count("<joint ")
+    drives = [f'<motor name="motor{i}" joint="joint{i}"/>' for i in range(n)]
+    if gains:
+        drives = [
+            f'<position name="motor{i}" joint="joint{i}" kp="{kp}" kv="{0.05 * kp}"/>'
+            for i, kp in enumerate(gains)
+        ]
+    return f"{_HEAD}{bodies}<actuator>{''.join(drives)}</actuator></mujoco>"
+
+
+_ARM_TORQUES, _LEG_TORQUES = (0.6, 1.2, 0.8, 0.1, 0.15, 0.1), (0.5, 0.6, 0.3)
+_ARM_GAINS, _LEG_GAINS = (20.0, 40.0, 30.0, 6.0, 6.0, 6.0), (20.0, 20.0, 20.0)
+#: rigs whose twins come from their model files: each driven by torques, and by servos
+FROM_FILES = {
+    name: System(
+        _driven(bodies, gains),
+        ("MuJoCo", {}),
+        tuple(0.4 for _ in gains) or torques,
+        tuple(0.3 for _ in torques),
+    )
+    for name, bodies, torques, gains in (
+        ("arm", _ARM, _ARM_TORQUES, ()),
+        ("arm_servos", _ARM, _ARM_TORQUES, _ARM_GAINS),
+        ("leg", _LEG, _LEG_TORQUES, ()),
+        ("leg_servos", _LEG, _LEG_TORQUES, _LEG_GAINS),
+    )
+}
 
 
 class DivergedError(RuntimeError):
@@ -353,6 +416,8 @@ SENSORS = ("sensor_bias", "sensor_scale", "sensor_delay", "sign_flip", "reversed
 
 def can_change(system: System, change: float) -> bool:
     """:return: whether the body that ``base`` names stays a body if it changes by so much"""
+    if system.base is None:
+        return change == 0.0
     _, body, what = system.base
     there = getattr(mujoco.MjModel.from_xml_string(system.xml), f"body_{what}")[body]
     return bool(np.min(there) + change > 0.1 * np.min(there))
@@ -392,10 +457,11 @@ def modelled(system: System, planted: list[Planted], base_change: float = 0.0) -
         if p.effect in TRANSMISSIONS:
             xml = system.apart.format(hold=TRANSMISSIONS[p.effect](**p.values))
     model = mujoco.MjModel.from_xml_string(xml)
-    _, body, what = system.base
-    getattr(model, f"body_{what}")[body] += base_change
-    # The engine keeps inertias of simple joints from when it read the file.
-    mujoco.mj_setConst(model, mujoco.MjData(model))
+    if system.base is not None:
+        _, body, what = system.base
+        getattr(model, f"body_{what}")[body] += base_change
+        # The engine keeps inertias of simple joints from when it read the file.
+        mujoco.mj_setConst(model, mujoco.MjData(model))
     model.dof_solref[:] = _DRY
     for p in planted:
         if p.effect == "viscous_friction":
@@ -450,6 +516,8 @@ def _recording(
 
 def _moment(model: Any, data: Any, system: System, i: int, memory: dict[str, float]) -> Moment:
     motor = data.ctrl[i] if i < len(system.torque) else 0.0
+    if system.base is None:
+        motor = data.qfrc_actuator[i]
     own = model.dof_damping[i] * data.qvel[i] if system.damped else 0.0
     return Moment(data.qpos[i], data.qvel[i], motor, data.qfrc_bias[i] + own, data.time, memory)
 

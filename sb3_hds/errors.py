@@ -21,6 +21,10 @@ class ParameterError(SB3HDSError, ValueError):
     """A physical parameter is unknown, out of its bounds, or not finite."""
 
 
+class ModelFileError(SB3HDSError, ValueError):
+    """The model file of a robot cannot be read, or asks for what its twin cannot simulate."""
+
+
 class EffectError(SB3HDSError, ValueError):
     """An effect cannot be attached to a twin."""
 

@@ -185,7 +185,7 @@ def test_a_calibrated_twin_is_printed_written_and_read_again(swings, tmp_path, c
 @pytest.mark.parametrize(
     ("command", "words", "message"),
     [
-        ("audit", ["--set", "mass:1"], "--set changes the twin: name one with --twin."),
+        ("audit", ["--set", "mass:1"], "--set changes the twin: name one with --twin, or --model."),
         ("audit", ["--json", "nowhere/out.json"], "nowhere/out.json cannot be written"),
         ("audit", ["--twin", "CartPole"], "CartPole has 5 channels and 1 commands"),
         ("calibrate", ["--twin", "FreePendulum"], "steps by 0.01 s and the data are sampled every"),

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import small_robots as robots
 from free_mass import Mass
 
 from sb3_hds import effects, twins
@@ -128,8 +129,18 @@ PLACES = {"joint": "joints", "actuator": "actuators", "channel": "channels"}
 # Runge-Kutta steps; a cart-pole whose drive does not act on the hinge. Together, they also meet
 # three joints under a servo that reacts to the state.
 SYSTEMS = ("Pendulum", "PendulumReal", "InvertedPendulum")
+# And one that is made of a model file, some of whose parameters effects are.
+MODEL = "Arm"
 # These are cheap, and meet every joint and every actuator of every twin.
 EVERYWHERE = (effects.ViscousFriction, effects.TorqueGain)
+
+OF_EACH_KIND = (
+    effects.TorqueGain,
+    effects.CoulombFriction,
+    effects.Stiffness,
+    effects.JointElasticity,
+    effects.SensorDelay,
+)
 
 # Where the generic size, null + 0.7 scale, is not felt within three steps.
 SIZES = {
@@ -143,17 +154,26 @@ JUMP_AT_NULL = {"joint_elasticity", "saturation", "sign_flip"}
 WITHOUT_SLOPE = {"sign_flip.flipped"}
 
 
+@functools.cache
+def made(name):
+    if name != MODEL:
+        return twins.make(name)
+    # Delays are no multiple of its step, where their derivative is one-sided.
+    return twins.from_mujoco(robots.compiled(robots.chain(2), timestep=0.0023), dt=0.023)
+
+
 def places(effect, twin):
     return range(len(getattr(twin, PLACES[effect.slot])))
 
 
 def last_place(effect, name):
-    return places(effect, twins.make(name))[-1]
+    return places(effect, made(name))[-1]
 
 
 ENTRIES = (*effects.ALL, *effects.NAMELESS)
 CASES = [(effect, name, last_place(effect, name)) for effect in ENTRIES for name in SYSTEMS]
 CASES += [(effect, "Pendulum", 0) for effect in DOUBLES]
+CASES += [(effect, MODEL, last_place(effect, MODEL)) for effect in ENTRIES]
 CASES += [
     (effect, name, where)
     for effect in EVERYWHERE
@@ -163,7 +183,15 @@ CASES += [
 ]
 every_case = pytest.mark.parametrize(
     ("effect", "name", "where"),
-    [pytest.param(*case, id=f"{case[0].name}-{case[1]}-{case[2]}") for case in CASES],
+    [
+        pytest.param(
+            *case,
+            id=f"{case[0].name}-{case[1]}-{case[2]}",
+            # One of each kind suffices day by day: of a drive, a joint, a gear and a sensor.
+            marks=pytest.mark.expensive if case[1] == MODEL and case[0] not in OF_EACH_KIND else (),
+        )
+        for case in CASES
+    ],
 )
 every_effect = pytest.mark.parametrize(
     "effect", (*ENTRIES, *DOUBLES), ids=lambda effect: effect.name
@@ -186,7 +214,7 @@ def replay(twin):
 
 @functools.cache
 def replay_plain(name):
-    return replay(twins.make(name))
+    return replay(made(name))
 
 
 # --- the contract
@@ -194,7 +222,7 @@ def replay_plain(name):
 
 @every_case
 def test_a_null_effect_changes_nothing(x64, effect, name, where):
-    extended = twins.make(name).extend(effect(where))
+    extended = made(name).extend(effect(where))
 
     # Not bitwise: XLA fuses the two programs differently, and 50 steps of a system that falls over
     # amplify rounding of 1e-16 by up to 1e6.
@@ -249,7 +277,7 @@ def assert_gradient_is_that_of_finite_differences(outcome, at):
 
 @every_case
 def test_the_gradient_by_a_parameter_is_that_of_finite_differences(x64, effect, name, where):
-    twin = twins.make(name).extend(effect(where, **sizes(effect)))
+    twin = made(name).extend(effect(where, **sizes(effect)))
 
     slopes = assert_gradient_is_that_of_finite_differences(*outcome_of(twin))
 

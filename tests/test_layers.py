@@ -40,6 +40,7 @@ LIBRARIES = {
     "effects/neural.py": SOLVERS,
     "planning": SOLVERS,
     "sysid": SOLVERS | TABLES | {"scipy", "jinja2"},
+    "sysid/film.py": {"imageio_ffmpeg"},
     "envs": STEPPING | {"mujoco"},
     "wrappers": STEPPING,
     "wrappers/low_pass.py": {"scipy"},

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import small_robots as robots
 from jax.flatten_util import ravel_pytree
 
 from sb3_hds import effects, twins
@@ -16,7 +17,11 @@ from sb3_hds.errors import ParameterError
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
-PLAIN = [twins.make(name) for name in twins.names()]
+# Every twin that has a name, and one that is made of a model file.
+PLAIN = [twins.make(name) for name in twins.names()] + [
+    # Delays are no multiple of its step, where their derivative is one-sided.
+    twins.from_mujoco(robots.compiled(robots.chain(2), timestep=0.0023))
+]
 # One of each kind: forces, a command with memory, a measurement. Every effect has its own tests.
 ATTACHED = (
     effects.ViscousFriction,
@@ -57,6 +62,10 @@ def every_extended_twin(test):
 
 def every_plain_twin(test):
     return pytest.mark.parametrize("twin", PLAIN, ids=label)(test)
+
+
+def with_settings(twin, **settings):
+    return type(twin)(**twin.to_spec()["options"] | settings)
 
 
 def an_action(twin, share=0.65):
@@ -245,8 +254,8 @@ def test_values_do_not_make_another_program(twin):
 
 @every_plain_twin
 def test_another_time_step_makes_another_program(twin):
-    assert type(twin)(dt=2.0 * twin.dt) != twin
-    assert type(twin)(substeps=twin.substeps + 1) != twin
+    assert with_settings(twin, dt=2.0 * twin.dt) != twin
+    assert with_settings(twin, substeps=twin.substeps + 1) != twin
 
 
 @every_twin
@@ -317,9 +326,9 @@ def test_a_value_out_of_bounds_is_refused_with_the_bounds(twin):
     name, parameter = next((n, p) for n, p in twin.parameters.items() if p.lower > -math.inf)
 
     with pytest.raises(ParameterError, match=rf"{name}.*within \[{parameter.lower}, "):
-        type(twin)(**{name: parameter.lower - 1.0})
+        with_settings(twin, **{name: parameter.lower - 1.0})
     with pytest.raises(ParameterError, match="must be finite"):
-        type(twin)(**{name: math.nan})
+        with_settings(twin, **{name: math.nan})
 
 
 @every_extended_twin
@@ -376,9 +385,12 @@ def test_the_sketch_is_a_line_that_moves(twin, x64):
 
 
 def damped_joints():
-    """All but the payload's, whose drive makes up for the damping that it knows of."""
+    """
+    All but the payload's, whose drive makes up for the damping that it knows of, and those of model
+    files, which take it at the end of a step.
+    """
     for twin in PLAIN:
-        if twin.name == "PayloadPendulum":
+        if twin.name == "PayloadPendulum" or isinstance(twin, twins.MechanismTwin):
             continue
         for (effect, index), targets in twin.native_effects.items():
             if effect == "viscous_friction":

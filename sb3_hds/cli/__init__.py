@@ -4,6 +4,7 @@
     sb3-hds diagnose --twin PendulumReal --data 'logs/*.csv' --columns map.yml --report out.html
     sb3-hds diagnose --twin my_module:MyTwin --data 'logs/*.csv' --columns map.yml
     sb3-hds diagnose --twin LinearAxis --set observe:q mass:95 --data log.mat --columns map.yml
+    sb3-hds diagnose --model ur10.urdf --data bag.db3 --write corrected.xml
     sb3-hds columns log.csv > map.yml
     sb3-hds audit --data 'logs/*.csv' --columns map.yml
     sb3-hds calibrate --twin LinearAxis --data log.mat --columns map.yml --write axis.json
@@ -105,7 +106,9 @@ def parser() -> argparse.ArgumentParser:
     ask.add_argument("--budget", choices=("full", "quick"), default="full")
     ask.add_argument("--seed", type=int, default=0)
     ask.add_argument("--report", help="HTML page to write")
+    ask.add_argument("--animate", help="MP4 film to write: measured and predicted motion")
     ask.add_argument("--json", help="JSON file to write")
+    measured.add_write(ask)
     worth = ask.add_argument_group("what it buys", "policies from both twins, on the real system")
     worth.add_argument("--env", help="id of the real system")
     worth.add_argument("--env-kwargs", nargs="*", default=[], metavar="NAME:VALUE", help="of it")

@@ -20,10 +20,10 @@ def run(given: argparse.Namespace) -> None:
 
     if given.json:
         check_target(given.json)
-    if given.set and given.twin is None:
-        raise ParameterError("--set changes the twin: name one with --twin.")
-    twin = None if given.twin is None else measured.twin_of(given)
-    data = measured.data_of(given)
+    alone = given.twin is None and given.model is None
+    if given.set and alone:
+        raise ParameterError("--set changes the twin: name one with --twin, or --model.")
+    twin, data = (None, measured.data_of(given)) if alone else measured.question(given)
     plain: dict[str, Any] = {}
     if data.report is not None:
         plain["reading"] = data.report.to_dict()

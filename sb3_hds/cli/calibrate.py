@@ -2,17 +2,34 @@
 
 import argparse
 import textwrap
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING
 
 from sb3_hds.cli import measured
 from sb3_hds.cli.settings import names
+
+if TYPE_CHECKING:
+    from sb3_hds.core import Twin
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """:param command: that is to understand them"""
     measured.add_arguments(command)
     command.add_argument(
-        "--free", nargs="*", default=[], help="parameters to estimate; default: all of the twin"
+        "--free",
+        nargs="*",
+        default=[],
+        help="parameters to estimate, or patterns in quotes, '*_damping'; default: all of the twin",
     )
+    command.add_argument(
+        "--errors",
+        choices=("simulation", "force"),
+        default="simulation",
+        help="that are made small: of simulated windows (the default), or of the equation of "
+        "motion, for logs of torques that the twin explains worse than its sensors measure",
+    )
+    command.add_argument("--window", type=int, help="steps of a window; default: half a second")
     command.add_argument(
         "--prior",
         type=float,
@@ -24,7 +41,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--level", type=float, default=0.95, help="of the confidence intervals; default: 0.95"
     )
     command.add_argument("--json", help="JSON file to write")
-    command.add_argument("--write", help="JSON file to write the calibrated twin to, for --twin")
+    measured.add_write(command)
 
 
 def run(given: argparse.Namespace) -> None:
@@ -37,9 +54,9 @@ def run(given: argparse.Namespace) -> None:
 
     for target in filter(None, (given.json, given.write)):
         check_target(target)
-    twin = measured.twin_of(given)
-    free = free_names(twin, names(given.free) or None)
-    data = measured.data_of(given)
+    measured.check_write(given)
+    twin, data = measured.question(given)
+    free = free_names(twin, _spelt_out(names(given.free), twin) or None)
     check_fits(twin, data)
     found, caveats = audit(data, twin=twin), []
     if given.correct and found.corrections:
@@ -49,12 +66,28 @@ def run(given: argparse.Namespace) -> None:
     if not found.usable:
         raise TrajectoryError(f"No parameter can be estimated from these data. {found.reason}")
     caveats += [str(finding) for finding in found.findings]
-    fit = calibrate(twin, data, free=free, prior=given.prior, level=given.level)
+    fit = calibrate(
+        twin,
+        data,
+        free=free,
+        prior=given.prior,
+        level=given.level,
+        errors=given.errors,
+        window=given.window,
+    )
     print(fit)
     for caveat in caveats:
         print("\n".join(textwrap.wrap(f"Caveat: {caveat}", 80, subsequent_indent="  ")))
     spec = {"twin": fit.twin.to_spec()}
     if given.json:
         measured.write_json(given.json, fit.to_dict() | spec | {"data_caveats": caveats})
-    if given.write:
-        measured.write_json(given.write, spec)
+    measured.write_twin(given, fit.twin)
+
+
+def _spelt_out(patterns: Sequence[str], twin: "Twin") -> list[str]:
+    """Patterns as the names that they mean; what means none stays, and is refused as a name."""
+    found: dict[str, None] = {}
+    for pattern in patterns:
+        hits = [name for name in twin.parameters if fnmatchcase(name, pattern)]
+        found |= dict.fromkeys(hits or [pattern])
+    return list(found)

@@ -23,9 +23,8 @@ def run(given: argparse.Namespace) -> None:
     from sb3_hds.sysid import diagnose
 
     _check_targets(given)
-    twin = measured.twin_of(given)
+    twin, data = measured.question(given)
     measure = None if given.env is None else _policy_question(given, twin)
-    data = measured.data_of(given)
     corrections: tuple[str, ...] = ()
     if given.correct:
         checked = audit(data, twin=twin)
@@ -50,6 +49,11 @@ def run(given: argparse.Namespace) -> None:
         plain["policy_gain"] = gain = bought.to_dict()
     if given.json:
         measured.write_json(given.json, plain)
+    measured.write_twin(given, found.twin)
+    if given.animate and found.pictures is None:
+        print("Nothing was simulated, so there is no film.")
+    elif given.animate:
+        print(f"The film is {found.to_film(given.animate)}.")
     if given.report:
         print(f"The report is {found.to_html(given.report, gain)}.")
 
@@ -58,8 +62,13 @@ def _check_targets(given: argparse.Namespace) -> None:
     """What would fail after minutes fails now."""
     from sb3_hds.core.storage import check_target
 
-    if given.json:
-        check_target(given.json)
+    for target in filter(None, (given.json, given.write)):
+        check_target(target)
+    measured.check_write(given)
+    if given.animate:
+        from sb3_hds.sysid.film import check_film
+
+        check_film(given.animate)
     if given.report:
         from sb3_hds.sysid.report import check_installed, check_page
 

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from sb3_hds.cli import model_files
 from sb3_hds.cli.settings import settings
 
 if TYPE_CHECKING:
@@ -22,15 +23,21 @@ _COLUMNS = """Say what the columns mean in a yml file, --columns map.yml:
 
 def add_arguments(command: argparse.ArgumentParser, *, twin_required: bool = True) -> None:
     """
-    :param command: to which ``--twin``, ``--data``, ``--columns``, ``--correct`` and ``--set`` are
-        added
+    :param command: to which ``--twin`` or ``--model``, ``--data``, ``--columns``, ``--correct`` and
+        ``--set`` are added
     :param twin_required: whether it makes no sense without a twin
     """
-    command.add_argument(
+    either = command.add_mutually_exclusive_group(required=twin_required)
+    either.add_argument(
         "--twin",
-        required=twin_required,
         help="name or environment id, see 'sb3-hds twins'; module:Name for one of your own; or the "
         "file that --json or --write wrote, for the twin that was extended or calibrated there",
+    )
+    either.add_argument(
+        "--model",
+        metavar="FILE",
+        help="MJCF or URDF file of a robot, as a twin of the data's interval; columns of the log "
+        "are matched to its joints by name",
     )
     command.add_argument("--data", required=True, nargs="+", help="files, or patterns in quotes")
     command.add_argument("--columns", help="yml file: what the columns of a log mean")
@@ -44,9 +51,31 @@ def add_arguments(command: argparse.ArgumentParser, *, twin_required: bool = Tru
         metavar="NAME:VALUE",
         help="parameters and options of the twin: mass:0.3 observe:q driven:true",
     )
+    model_files.add_arguments(command)
+
+
+def question(given: argparse.Namespace) -> "tuple[Twin, Trajectories]":
+    """
+    The twin that ``--twin`` or ``--model`` names, and the data.
+
+    :raises ParameterError: for words about a model where there is none
+    """
+    from sb3_hds.errors import ParameterError
+
+    if given.model is not None:
+        return model_files.question(given)
+    for option in ("actuators", "ignore"):
+        if getattr(given, option):
+            raise ParameterError(f"--{option} is about a model file: name one with --model.")
+    return twin_of(given), data_of(given)
 
 
 def data_of(given: argparse.Namespace) -> "Trajectories":
+    """What ``--data`` names, under the map of ``--columns``."""
+    return loaded(given, given.columns)
+
+
+def loaded(given: argparse.Namespace, columns: Any) -> "Trajectories":
     """What ``--data`` names; what is wrong with the map of columns is said in yml."""
     from sb3_hds.data import Trajectories
     from sb3_hds.data.columns import FORM
@@ -55,7 +84,7 @@ def data_of(given: argparse.Namespace) -> "Trajectories":
 
     files: str | Sequence[str] = given.data[0] if len(given.data) == 1 else given.data
     try:
-        return Trajectories.load(files, columns=given.columns)
+        return Trajectories.load(files, columns=columns)
     except TrajectoryError as error:
         told = str(error)
         for python in (FORM, WITHOUT_COLUMNS):
@@ -74,6 +103,8 @@ def twin_called(name: str, values: Mapping[str, Any]) -> "Twin":
     from sb3_hds.errors import NoTwinError
     from sb3_hds.twins import get
 
+    if name.endswith(model_files.SUFFIXES):
+        return model_files.twin_of_model(name, values, {})
     if name.endswith(".json"):
         return _twin_in(name).with_parameters(**values)
     if ":" in name and "" not in sys.path:
@@ -106,6 +137,38 @@ def _twin_in(path: str) -> "Twin":
             f"{path} holds no twin: it has to be what 'sb3-hds diagnose --json' or 'sb3-hds "
             "calibrate --write' wrote."
         ) from error
+
+
+def add_write(command: argparse.ArgumentParser) -> None:
+    """:param command: to which ``--write`` is added"""
+    command.add_argument(
+        "--write",
+        help="file to write the corrected twin to: .json, for --twin; .xml, the file of --model "
+        "corrected, as MJCF; or .urdf where that is one",
+    )
+
+
+def check_write(given: argparse.Namespace) -> None:
+    """:raises ParameterError: for a model file to write where none was read"""
+    from sb3_hds.errors import ParameterError
+
+    if given.write and given.write.endswith(model_files.SUFFIXES) and given.model is None:
+        raise ParameterError(
+            f"{given.write} would be a corrected model file: name the file with --model. A twin "
+            "without one is written as .json."
+        )
+
+
+def write_twin(given: argparse.Namespace, twin: "Twin") -> None:
+    """What ``--write`` asks for, if anything."""
+    if not given.write:
+        return
+    if not given.write.endswith(model_files.SUFFIXES):
+        write_json(given.write, {"twin": twin.to_spec()})
+        return
+    from sb3_hds.twins import write_model
+
+    print(write_model(twin, given.write, given.model))
 
 
 def write_json(path: str, plain: Mapping[str, Any]) -> None:

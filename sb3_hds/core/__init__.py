@@ -39,6 +39,7 @@ from sb3_hds.core.transformed import TransformedTwin, seen_through
 from sb3_hds.core.twin import State, Twin
 from sb3_hds.core.types import (
     Action,
+    Coordinates,
     Flag,
     Force,
     MassMatrix,
@@ -62,6 +63,7 @@ __all__ = [
     "Barrier",
     "Channel",
     "Continuity",
+    "Coordinates",
     "Delay",
     "Effect",
     "EffectChain",

@@ -14,7 +14,15 @@ from sb3_hds.core.effect import NO_EFFECTS, EffectChain, Moment
 from sb3_hds.core.integrators import Integrator, semi_implicit_euler
 from sb3_hds.core.linear import solve_spd
 from sb3_hds.core.twin import State, Twin
-from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Velocity
+from sb3_hds.core.types import (
+    Action,
+    Coordinates,
+    Force,
+    MassMatrix,
+    Params,
+    Position,
+    Velocity,
+)
 
 # Turns of a rotary joint at which its load is asked for: at one of them gravity pulls hard.
 _TURNS = (0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi)
@@ -46,6 +54,20 @@ class AnalyticTwin(Twin):
     def bias(self, q: Position, v: Velocity, params: Params) -> Force:
         """:return: the force that would keep the system from accelerating, shape ``(dof,)``"""
 
+    def displace(self, q: Position, way: Velocity) -> Position:
+        """:return: the position after a velocity times a time; override for quaternions"""
+        return q + way
+
+    def accelerate(self, state: State, command: Action, added: Force, params: Params) -> Velocity:
+        """
+        :param command: what reaches the actuators
+        :param added: force besides that of the actuators, shape ``(dof,)``
+        :return: the acceleration; override where the equation of motion is solved another way
+        """
+        force = self.actuate(state, command, params) + added
+        load = self.bias(state.q, state.v, params)
+        return solve_spd(self.mass_matrix(state.q, params), force - load)
+
     def structure(self) -> tuple[Any, ...]:
         return (*super().structure(), self.integrator)
 
@@ -70,19 +92,25 @@ class AnalyticTwin(Twin):
 
             def moment(q: Position, v: Velocity) -> Moment:
                 actuator = self.actuate(State(q, v, state.memory), command, params)
-                return Moment(
-                    q, v, actuator, self.bias(q, v, params), self.mass_matrix(q, params), h
-                )
+                load, mass_matrix = self.bias(q, v, params), self.mass_matrix(q, params)
+                return Moment(self.coordinates(q), v, actuator, load, mass_matrix, h)
 
-            held, middle = effects.held(moment, state.q, state.v, memory, h)
+            still = jnp.zeros_like(state.v)
+            held, middle = still, None
+            if effects.has_forces:
+                held, middle = effects.held(moment, state.q, state.v, memory, h, self.displace)
 
             def acceleration(q: Position, v: Velocity) -> Velocity:
-                now = moment(q, v)
-                added = held + effects.force(now, memory)
-                return solve_spd(now.mass_matrix, now.actuator + added - now.load)
+                added = effects.force(moment(q, v), memory) if effects.has_forces else still
+                return self.accelerate(State(q, v, state.memory), command, held + added, params)
 
-            q, v = self.integrator(acceleration, state.q, state.v, h, self.limit_velocity)
+            # Integrators of one's own need not know of quaternions.
+            curved = type(self).displace is not AnalyticTwin.displace
+            own = {"displace": self.displace} if curved else {}
+            q, v = self.integrator(acceleration, state.q, state.v, h, self.limit_velocity, **own)
             q, v = self.limit(q, v)
+            if middle is None:
+                return State(q, v, memory), None
             # With the new velocity: an elastic memory then keeps energy, as the twin itself does.
             return State(q, v, effects.advance(middle, moment(q, v), memory)), None
 
@@ -107,8 +135,8 @@ def _typical_forces(twin: AnalyticTwin) -> tuple[float, ...]:
         start = twin.initial(key, params)
         standing = start._replace(v=jnp.zeros_like(start.v))
 
-        def at(turn: Position) -> Force:
-            state = standing._replace(q=start.q + turn)
+        def at(turn: Coordinates) -> Force:
+            state = standing._replace(q=twin.displace(start.q, turn))
             driven = twin.actuate(state, largest, params)
             return jnp.abs(driven) + jnp.abs(twin.bias(state.q, state.v, params))
 

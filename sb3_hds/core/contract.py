@@ -118,21 +118,23 @@ def _check_returns(twin: Twin, dtype: Any) -> None:
     call = _Caller(twin, dtype)
 
     state = call("initial", key, params)
-    call.expect_state("initial", state, dof, per_joint, any_float=True)
-    state = State(array(dof), array(dof), jax.tree.map(in_dtype, state.memory))
+    n_q = _n_positions(twin, state, dof)
+    call.expect_state("initial", state, dof, per_joint, n_q, any_float=True)
+    state = State(array(n_q), array(dof), jax.tree.map(in_dtype, state.memory))
     obs, action = array(len(twin.channels)), array(len(twin.actuators))
 
     inferred = call("infer", obs, params)
-    call.expect_state("infer", inferred, dof, per_joint)
+    call.expect_state("infer", inferred, dof, per_joint, n_q)
     seen = call("observe", state, params)
     call.expect("observe", seen, obs, f"one entry for each {channels}")
     if isinstance(twin, AnalyticTwin):
         q, v = state.q, state.v
         force = f"one generalised force for each {joints}, zero where nothing pushes"
-        call.expect("actuate", call("actuate", state, action, params), q, force)
+        call.expect("actuate", call("actuate", state, action, params), v, force)
         square = f"a row and a column for each {joints}"
         call.expect("mass_matrix", call("mass_matrix", q, params), array(dof, dof), square)
-        call.expect("bias", call("bias", q, v, params), q, force)
+        call.expect("bias", call("bias", q, v, params), v, force)
+        call.expect("coordinates", call("coordinates", q), v, per_joint)
         call.expect("limit_velocity", call("limit_velocity", v), v, per_joint)
         limited = call("limit", q, v)
         if not (isinstance(limited, tuple) and len(limited) == 2):
@@ -140,7 +142,7 @@ def _check_returns(twin: Twin, dtype: Any) -> None:
         for part, like in zip(limited, (q, v), strict=True):
             call.expect("limit", part, like, per_joint)
     after = call("step", state, action, params)
-    call.expect_state("step", after, dof, per_joint, memory=state.memory)
+    call.expect_state("step", after, dof, per_joint, n_q, memory=state.memory)
     number = "one number; over joints, take jnp.sum(...) or an entry"
     for method in ("reward", "planning_reward"):
         call.expect(method, call(method, state, action, state, params), array(), number)
@@ -152,10 +154,22 @@ def _check_returns(twin: Twin, dtype: Any) -> None:
         call.refuse("difference", _described(tangent), "a vector")
     call.expect("difference", tangent, tangent, "a vector")
     moved = call("retract", state, tangent)
-    call.expect_state("retract", moved, dof, per_joint, memory=state.memory)
+    call.expect_state("retract", moved, dof, per_joint, n_q, memory=state.memory)
     points = call("sketch", state, params)
     if getattr(points, "shape", ())[1:] != (2,):
         call.refuse("sketch", _described(points), "shape (points, 2): two coordinates of each")
+
+
+def _n_positions(twin: Twin, state: Any, dof: int) -> int:
+    """Numbers of a position: one for each joint, or more where differences say so: quaternions."""
+    shape = getattr(getattr(state, "q", None), "shape", None)
+    if not isinstance(state, State) or not shape or len(shape) != 1 or shape[0] <= dof:
+        return dof
+    try:
+        own = state._replace(memory={})
+        return shape[0] if jax.eval_shape(twin.difference, own, own).shape == (2 * dof,) else dof
+    except Exception:  # what is wrong with it is told where it is called
+        return dof
 
 
 class _Caller:
@@ -188,20 +202,22 @@ class _Caller:
         found: Any,
         dof: int,
         meaning: str,
+        n_q: int,
         *,
         memory: Any = None,
         any_float: bool = False,
     ) -> None:
         """
+        :param n_q: numbers of a position
         :param memory: what the state's has to be like; None: anything
         :param any_float: whether another precision will do
         """
         if not isinstance(found, State):
             self.refuse(method, _described(found), "State(q, v, memory)")
-        for part in ("q", "v"):
+        for part, size in (("q", n_q), ("v", dof)):
             entry = getattr(found, part)
             other = any_float and jnp.issubdtype(getattr(entry, "dtype", int), jnp.floating)
-            like = jax.ShapeDtypeStruct((dof,), entry.dtype if other else self.dtype)
+            like = jax.ShapeDtypeStruct((size,), entry.dtype if other else self.dtype)
             self.expect(f"{method}(...).{part}", entry, like, meaning)
         if not isinstance(found.memory, dict):
             self.refuse(

@@ -23,6 +23,7 @@ from sb3_hds.core.linear import solve_spd
 from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.types import (
     Action,
+    Coordinates,
     Force,
     MassMatrix,
     Memory,
@@ -45,7 +46,7 @@ class Moment(NamedTuple):
     """
     The mechanical system at one evaluation of ``M a + load = actuator + effects``.
 
-    :param q: generalised position, shape ``(dof,)``
+    :param q: position of each joint, shape ``(dof,)``
     :param v: generalised velocity, shape ``(dof,)``
     :param actuator: generalised force of the actuators, shape ``(dof,)``
     :param load: generalised force that gravity and inertia take (``bias``), shape ``(dof,)``
@@ -53,7 +54,7 @@ class Moment(NamedTuple):
     :param h: length of the sub-step [s]
     """
 
-    q: Position
+    q: Coordinates
     v: Velocity
     actuator: Force
     load: Force
@@ -411,6 +412,11 @@ class EffectChain:
         both._forces = self._forces + other._forces
         return both
 
+    @property
+    def has_forces(self) -> bool:
+        """:return: whether any effect acts in the equation of motion"""
+        return bool(self._forces)
+
     def act(
         self, action: Action, memory: dict[str, Memory], h: float
     ) -> tuple[Action, dict[str, Memory]]:
@@ -443,11 +449,13 @@ class EffectChain:
         v: Velocity,
         memory: dict[str, Memory],
         h: float,
+        displace: Callable[[Position, Velocity], Position],
     ) -> tuple[Force, Moment]:
         """
         :param moment: the system at a position and a velocity
         :param q: at the start of the sub-step
         :param v: at the start of the sub-step
+        :param displace: moves a position along a velocity times a time
         :return: the sum of all force effects that are held, ``(dof,)``, and the middle of the
             sub-step, where they are evaluated: reached with what they are at its start
         """
@@ -455,7 +463,7 @@ class EffectChain:
             return jnp.zeros_like(v), moment(q, v)
 
         def towards(now: tuple[Force, Velocity], ahead: Scalar) -> tuple[Any, Any]:
-            place = q + ahead * v, v + ahead * now[1]
+            place = displace(q, ahead * v), v + ahead * now[1]
             there = moment(*place)
             force = self.force(there, memory, held=True)
             total = there.actuator + force - there.load

@@ -24,7 +24,16 @@ from sb3_hds.core.effect import (
 from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.transformed import TransformedTwin
 from sb3_hds.core.twin import State, Twin
-from sb3_hds.core.types import Action, Flag, Obs, Params, Scalar, Tangent
+from sb3_hds.core.types import (
+    Action,
+    Coordinates,
+    Flag,
+    Obs,
+    Params,
+    Position,
+    Scalar,
+    Tangent,
+)
 from sb3_hds.errors import EffectError
 
 
@@ -33,8 +42,9 @@ class ExtendedTwin(Twin):
     A twin plus effects. Parameters of an effect are named ``effect.place.parameter``, for example
     ``"viscous_friction.hinge.b"``.
 
-    Where the base twin has a parameter for the same thing (``native_effects``), the effect adds to
-    that parameter instead of computing a force of its own. Extending an extended twin flattens.
+    Where the base twin has a parameter for the same thing (``native_effects``), the effect changes
+    that parameter instead of computing anything of its own: it adds to it, or multiplies it where
+    the effect is absent at one. Extending an extended twin flattens.
 
     :param base: the twin to extend
     :param effects: effects to attach, in the order in which a signal meets them
@@ -140,6 +150,9 @@ class ExtendedTwin(Twin):
     def terminated(self, state: State, params: Params) -> Flag:
         return self.base.terminated(state, self._base_params(params))
 
+    def coordinates(self, q: Position) -> Coordinates:
+        return self.base.coordinates(q)
+
     def difference(self, state: State, reference: State) -> Tangent:
         return self.base.difference(state, reference)
 
@@ -181,7 +194,8 @@ class ExtendedTwin(Twin):
         own = {name: params[name] for name in self.base.parameters}
         for a in self._native:
             for name, target in self.base.native_effects[a.effect.name, a.index].items():
-                own[target] = own[target] + params[f"{a.key}.{name}"]
+                added = a.effect.parameters[name]
+                own[target] = with_native(own[target], params[f"{a.key}.{name}"], added)
         return own
 
     def _remember(self, state: State, params: Params) -> State:
@@ -197,6 +211,16 @@ class ExtendedTwin(Twin):
             obs = obs.at[a.index].set(reported)
         memory = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), memory)
         return state._replace(memory=state.memory | memory)
+
+
+def with_native(own: Any, value: Any, parameter: Parameter) -> Any:
+    """
+    :param own: the twin's parameter
+    :param value: of an effect's parameter for the same thing
+    :param parameter: the latter
+    :return: both together: their sum, or their product where an effect is absent at one
+    """
+    return own * value if parameter.null == 1.0 else own + value
 
 
 def _holding(attached: Attached, params: Params) -> Effect:

@@ -1,5 +1,12 @@
-"""One sub-step of ``dq/dt = v, dv/dt = a(q, v)``, as the environments that twins mirror do it."""
+"""
+One sub-step of ``dq/dt = v, dv/dt = a(q, v)``, as the environments that twins mirror do it.
 
+An integrator is called with the acceleration, ``q``, ``v``, the step and what limits velocities;
+and, by a twin whose positions hold quaternions, with ``displace``, which moves a position along a
+velocity times a time.
+"""
+
+import operator
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -10,31 +17,45 @@ from sb3_hds.core.types import Position, Velocity
 
 Acceleration: TypeAlias = Callable[[Position, Velocity], Velocity]
 LimitVelocity: TypeAlias = Callable[[Velocity], Velocity]
-Integrator: TypeAlias = Callable[
-    [Acceleration, Position, Velocity, float, LimitVelocity], tuple[Position, Velocity]
-]
+Displace: TypeAlias = Callable[[Position, Velocity], Position]
+Integrator: TypeAlias = Callable[..., tuple[Position, Velocity]]
 
 
 def semi_implicit_euler(
-    acceleration: Acceleration, q: Position, v: Velocity, h: float, limit: LimitVelocity
+    acceleration: Acceleration,
+    q: Position,
+    v: Velocity,
+    h: float,
+    limit: LimitVelocity,
+    displace: Displace = operator.add,
 ) -> tuple[Position, Velocity]:
     """Velocity first, then position with the new velocity. First order, symplectic."""
     v = limit(v + h * acceleration(q, v))
-    return q + h * v, v
+    return displace(q, h * v), v
 
 
 def explicit_euler(
-    acceleration: Acceleration, q: Position, v: Velocity, h: float, limit: LimitVelocity
+    acceleration: Acceleration,
+    q: Position,
+    v: Velocity,
+    h: float,
+    limit: LimitVelocity,
+    displace: Displace = operator.add,
 ) -> tuple[Position, Velocity]:
     """Position with the old velocity. First order; gains energy in oscillations."""
-    return q + h * v, limit(v + h * acceleration(q, v))
+    return displace(q, h * v), limit(v + h * acceleration(q, v))
 
 
 def rk4(
-    acceleration: Acceleration, q: Position, v: Velocity, h: float, limit: LimitVelocity
+    acceleration: Acceleration,
+    q: Position,
+    v: Velocity,
+    h: float,
+    limit: LimitVelocity,
+    displace: Displace = operator.add,
 ) -> tuple[Position, Velocity]:
     """
-    The classical Runge-Kutta method; in joint coordinates MuJoCo's ``RK4`` is the same.
+    The classical Runge-Kutta method; MuJoCo's ``RK4`` is the same.
 
     The four stages are one loop: written out, they take four times as long to compile.
     """
@@ -42,12 +63,12 @@ def rk4(
     share = jnp.array([1.0, 2.0, 2.0, 1.0], v.dtype) * (h / 6.0)
 
     def stage(carry, now):
-        q_dot, v_dot, q_new, v_new = carry
+        q_dot, v_dot, way, v_new = carry
         delay, weight = now
-        q_there, v_there = q + delay * q_dot, v + delay * v_dot
+        q_there, v_there = displace(q, delay * q_dot), v + delay * v_dot
         a = acceleration(q_there, v_there)
-        return (v_there, a, q_new + weight * v_there, v_new + weight * a), None
+        return (v_there, a, way + weight * v_there, v_new + weight * a), None
 
     still = jnp.zeros_like(v)
-    (_, _, q_new, v_new), _ = jax.lax.scan(stage, (still, still, q, v), (ahead, share))
-    return q_new, limit(v_new)
+    (_, _, way, v_new), _ = jax.lax.scan(stage, (still, still, still, v), (ahead, share))
+    return displace(q, way), limit(v_new)

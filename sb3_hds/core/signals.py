@@ -9,10 +9,14 @@ class Joint(NamedTuple):
 
     :param name: unique within the twin
     :param unit: unit of its position: ``"rad"`` for a hinge, ``"m"`` for a slider
+    :param low: where a stop of the machine begins that the twin does not simulate
+    :param high: likewise
     """
 
     name: str
     unit: str = "rad"
+    low: float = float("-inf")
+    high: float = float("inf")
 
 
 class Actuator(NamedTuple):

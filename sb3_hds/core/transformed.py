@@ -17,7 +17,17 @@ from sb3_hds.core.transform import (
     transform_to_spec,
 )
 from sb3_hds.core.twin import State, Twin
-from sb3_hds.core.types import Action, Flag, Memory, Obs, Params, Scalar, Tangent
+from sb3_hds.core.types import (
+    Action,
+    Coordinates,
+    Flag,
+    Memory,
+    Obs,
+    Params,
+    Position,
+    Scalar,
+    Tangent,
+)
 from sb3_hds.errors import ParameterError
 
 
@@ -120,6 +130,9 @@ class TransformedTwin(Twin):
 
     def terminated(self, state: State, params: Params) -> Flag:
         return self.base.terminated(state, params)
+
+    def coordinates(self, q: Position) -> Coordinates:
+        return self.base.coordinates(q)
 
     def difference(self, state: State, reference: State) -> Tangent:
         return self.base.difference(state, reference)

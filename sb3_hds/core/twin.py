@@ -17,6 +17,7 @@ from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.signals import Actuator, Channel, Joint
 from sb3_hds.core.types import (
     Action,
+    Coordinates,
     Flag,
     Memory,
     Obs,
@@ -40,7 +41,8 @@ class State(NamedTuple):
     """
     Everything that the next step depends on besides the action and the parameters.
 
-    :param q: generalised position [rad] or [m], shape ``(dof,)``
+    :param q: generalised position [rad] or [m], shape ``(dof,)``; longer where quaternions are
+        among its numbers
     :param v: generalised velocity [rad/s] or [m/s], shape ``(dof,)``
     :param memory: what attached effects remember, keyed by the effect's full name
     """
@@ -82,8 +84,12 @@ class Twin(abc.ABC):
     differentiability: str = "reverse"
     #: False where the reward is flat almost everywhere: then override ``planning_reward``.
     reward_has_gradient: bool = True
-    #: (effect name, index of its place) -> {its parameter: the twin's parameter that it adds to}
+    #: (effect name, index of its place) -> {its parameter: the twin's parameter that it adds to, or
+    #: multiplies where the effect is absent at one}
     native_effects: Mapping[tuple[str, int], Mapping[str, str]] = {}
+    #: Parameters that someone has set and knows: a diagnosis does not question them, and a
+    #: calibration leaves them alone unless they are named.
+    known_parameters: frozenset[str] = frozenset()
     #: Structural choices with their defaults, set by keyword: ``{"goal": "stop"}``.
     options: ClassVar[Mapping[str, Any]] = {}
     #: Learned arrays of attached effects, by full name: pytrees that travel with the parameters.
@@ -230,10 +236,17 @@ class Twin(abc.ABC):
         """Whether the episode ends in this state for a reason of the task, not of time."""
         return jnp.zeros((), bool)
 
+    def coordinates(self, q: Position) -> Coordinates:
+        """
+        :return: the position of each joint, which is what effects see and what is told of a motion;
+            override it for quaternions
+        """
+        return q
+
     def difference(self, state: State, reference: State) -> Tangent:
         """
-        :return: tangent vector from ``reference`` to ``state``, memory included; override it for
-            quaternions
+        :return: tangent vector from ``reference`` to ``state``: of positions and of velocities one
+            number for each joint, then the memory; override it for quaternions
         """
         return ravel_pytree(state)[0] - ravel_pytree(reference)[0]
 
@@ -295,6 +308,7 @@ class Twin(abc.ABC):
         self.differentiability = base.differentiability
         self.reward_has_gradient = base.reward_has_gradient
         self.parameters, self.values = base.parameters, dict(base.values)
+        self.known_parameters = base.known_parameters
         self.tensors = dict(base.tensors)
 
     def _set(self, values: Mapping[str, Any]) -> None:

@@ -4,7 +4,8 @@ from typing import Any, TypeAlias
 
 from jaxtyping import Array, Bool, Float
 
-Position: TypeAlias = Float[Array, " dof"]  # [rad] or [m]
+Position: TypeAlias = Float[Array, " position"]  # [rad], [m], quaternions; else one for each dof
+Coordinates: TypeAlias = Float[Array, " dof"]  # a position told joint by joint, [rad] or [m]
 Velocity: TypeAlias = Float[Array, " dof"]  # [rad/s] or [m/s]
 Force: TypeAlias = Float[Array, " dof"]  # generalised force, [N m] or [N]
 MassMatrix: TypeAlias = Float[Array, "dof dof"]

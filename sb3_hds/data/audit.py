@@ -24,6 +24,7 @@ from sb3_hds.data.findings import (
     WithinNoise,
 )
 from sb3_hds.data.glitches import glitches
+from sb3_hds.data.limits import reached_limits
 from sb3_hds.data.outliers import outliers
 from sb3_hds.data.report import Reading
 from sb3_hds.data.resolution import resolutions
@@ -44,14 +45,14 @@ def audit(
     """
     Look for defects of the recording, which physics would have to explain otherwise.
 
-    Uneven, repeated and missing samples; channels that are stuck or cut off; a state that was put
-    back inside a recording; values beyond all measure; a velocity that comes late or early, or in
-    other units than its position; the noise while standing still; too little motion. Where the
-    data were read from logs, rows are checked as they were measured. Velocities are found by their
-    correlation with the derivatives of others, none in data that hardly move; where channels have
-    units, these say which may be one, and positions and velocities that are swapped are found.
-    What is judged by its motion is not judged in data without any, nor beside values beyond all
-    measure.
+    Uneven, repeated and missing samples; channels that are stuck or cut off; joints at stops that
+    the twin does not have; a state that was put back inside a recording; values beyond all measure;
+    a velocity that comes late or early, or in other units than its position; the noise while
+    standing still; too little motion. Where the data were read from logs, rows are checked as they
+    were measured. Velocities are found by their correlation with the derivatives of others, none in
+    data that hardly move; where channels have units, these say which may be one, and positions and
+    velocities that are swapped are found. What is judged by its motion is not judged in data
+    without any, nor beside values beyond all measure.
 
     :param data: of any kind
     :param channels: names of the observation channels, or a twin's ``channels``; default: those of
@@ -85,6 +86,7 @@ def audit(
         matches = matches_of(data, names)
         found += [
             *(mistaken_units(data, twin, named, columns) if twin else ()),
+            *(reached_limits(rows, twin) if twin else ()),
             *continuity.reinitialised(rows, names, resolution),
             *other_units(data, named, matches),
             *swapped(data, named, matches),

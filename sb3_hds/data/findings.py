@@ -563,3 +563,28 @@ class DependentCommand(Finding):
         "Feedback and dynamics cannot be told apart from this: add a signal to the command, or "
         "change the set point."
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class ReachedLimit(Finding):
+    """
+    :param value: end of the joint's range
+    :param unit: of that
+    :param share: of the samples that are there
+    """
+
+    value: float
+    unit: str
+    share: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"Joint '{self.channel}' is at its limit of {self.value:.4g} {self.unit} in "
+            f"{percent(self.share)} of the samples ({listed(self.places)})."
+        )
+
+    remedy = (
+        "The twin has no stops, so what happens there is none of its forces: leave these samples "
+        "out, or correct the range in the model file."
+    )

@@ -87,6 +87,20 @@ def _loaded(files: Files, columns: Any) -> Trajectories:
     return dataclasses.replace(data, origin=np.array(steps.origin), report=report)
 
 
+def first_log(files: Files, said: Columns | None) -> Log | None:
+    """
+    :param said: what is known of the columns; None: nothing
+    :return: what the first file holds; None if ``Trajectories.save`` wrote it
+    :raises TrajectoryError: if it cannot be read
+    """
+    path = _paths(files)[0]
+    if said is None and _is_own(path):
+        return None
+    if path.startswith(PREFIX):
+        return Log(*read_minari(path.removeprefix(PREFIX)))
+    return read_log(Path(path), said or Columns())
+
+
 class _Read(NamedTuple):
     """
     What all files hold.

@@ -141,6 +141,18 @@ def _map(log: Log, columns: Sequence[_Column]) -> list[str]:
     return lines
 
 
+def guessed_time(log: Log) -> Entry | None:
+    """:return: what looks like the time stamps of a log, with their unit"""
+    columns = [_column(name, log) for name in _names(log)]
+    found = _guessed_time([c for c in columns if not np.isnan(c.lowest)])
+    if found is None:
+        return None
+    said = unit_of(log.units.get(found.name, ""))
+    named = said is not None and said.name == "s"
+    unit = None if named else _time_unit(log.tables[0], found)
+    return Entry(found.name, found.name, unit=None if unit in (None, "s") else unit)
+
+
 def _guessed_time(columns: Sequence[_Column]) -> _Column | None:
     """What increases and is called so; or else what increases steadily."""
     rising = [c for c in columns if c.step > 0.0]

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from sb3_hds.core.signals import Channel
@@ -53,7 +54,7 @@ def mistaken_units(
     :param columns: their names in the log
     """
     units = [u for u in _UNITS if _spans(data, twin, u)]
-    stretches = stretches_in(data) if units else None
+    stretches = stretches_in(data) if units and not _has_quaternions(twin) else None
     if stretches is None or len(stretches.obs) < _FEWEST:
         return []
     channel_of = position_channels(twin, stretches)
@@ -99,3 +100,10 @@ def _spans(data: Trajectories, twin: Twin, unit: _Unit) -> bool:
 
 def _is_of(channel: Channel, unit: str) -> bool:
     return channel.unit in (unit, f"{unit}/s")
+
+
+def _has_quaternions(twin: Twin) -> bool:
+    """Whether positions are longer than velocities, so that they have no unit of their own."""
+    obs = jax.ShapeDtypeStruct((len(twin.channels),), float)
+    state = jax.eval_shape(lambda obs: twin.infer(obs, twin.params), obs)
+    return state.q.shape != state.v.shape

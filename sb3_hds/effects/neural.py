@@ -13,13 +13,13 @@ from jaxtyping import Array, Float
 
 from sb3_hds.core import (
     Action,
+    Coordinates,
     Force,
     ForceEffect,
     Memory,
     Moment,
     Parameter,
     Params,
-    Position,
     Scalar,
     Velocity,
 )
@@ -112,7 +112,7 @@ class NeuralForce(ForceEffect):
             "output_scale": jnp.ones(n_out),
         }
 
-    def inputs(self, q: Position, v: Velocity, actuator: Force) -> Float[Array, " inputs"]:
+    def inputs(self, q: Coordinates, v: Velocity, actuator: Force) -> Float[Array, " inputs"]:
         """:return: what the networks see, before it is normalised"""
         sliders = [i for i, hinge in enumerate(self.hinges) if not hinge]
         hinges = [i for i, hinge in enumerate(self.hinges) if hinge]
@@ -120,7 +120,7 @@ class NeuralForce(ForceEffect):
         return jnp.concatenate([slid, jnp.cos(turned), jnp.sin(turned), v, actuator])
 
     def forces(
-        self, q: Position, v: Velocity, actuator: Force, own: Params
+        self, q: Coordinates, v: Velocity, actuator: Force, own: Params
     ) -> Float[Array, "members dof"]:
         """:return: what each member says [N m] or [N], whole, whatever the share"""
         seen = (self.inputs(q, v, actuator) - own["input_mean"]) / own["input_scale"]
@@ -128,14 +128,14 @@ class NeuralForce(ForceEffect):
         said = jax.vmap(say)(own["weights"])
         return own["output_scale"] * _LARGEST * jnp.tanh(said / _LARGEST)
 
-    def force_at(self, q: Position, v: Velocity, actuator: Force, own: Params) -> Force:
+    def force_at(self, q: Coordinates, v: Velocity, actuator: Force, own: Params) -> Force:
         """:return: the ensemble's mean, as much of it as acts [N m] or [N]"""
         return own["share"] * jnp.mean(self.forces(q, v, actuator, own), 0)
 
     def force(self, moment: Moment, index: int, memory: Memory, params: Params) -> Force:
         return self.force_at(moment.q, moment.v, moment.actuator, params)
 
-    def disagreement(self, q: Position, v: Velocity, actuator: Force, own: Params) -> Scalar:
+    def disagreement(self, q: Coordinates, v: Velocity, actuator: Force, own: Params) -> Scalar:
         """
         :return: standard deviation of the members, in units of the normalised output; the largest
             over the joints
@@ -147,7 +147,8 @@ class NeuralForce(ForceEffect):
         if not self.caution:
             return jnp.zeros(())
         actuator = twin.actuate(state, action, base)  # type: ignore[attr-defined]
-        return self.caution * own["share"] * self.disagreement(state.q, state.v, actuator, own)
+        q = twin.coordinates(state.q)
+        return self.caution * own["share"] * self.disagreement(q, state.v, actuator, own)
 
     def structure(self) -> tuple[Any, ...]:
         return (*super().structure(), self.n_members, self.net_arch, self.hinges, self.caution)

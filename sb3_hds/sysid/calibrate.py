@@ -1,8 +1,9 @@
 """Estimate the parameters of a twin from measured data."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +16,9 @@ from sb3_hds.core.episodes import same_interval
 from sb3_hds.data.report import Reading
 from sb3_hds.effects import force_of
 from sb3_hds.errors import CalibrationError
-from sb3_hds.sysid.bounds import bounds_of
-from sb3_hds.sysid.covariance import covariance_of
+from sb3_hds.sysid.bounds import Bounds, bounds_of
+from sb3_hds.sysid.covariance import Spread, covariance_of
+from sb3_hds.sysid.inverse_dynamics import Forces, by_inverse_dynamics
 from sb3_hds.sysid.motion import first_offsets
 from sb3_hds.sysid.projection import Errors, Solution, evaluate, solve
 from sb3_hds.sysid.results import Estimate, Fit
@@ -40,6 +42,7 @@ def calibrate(
     *,
     free: Iterable[str] | None = None,
     window: int | None = None,
+    errors: str = "simulation",
     loss: str = "huber",
     prior: float = 0.0,
     level: float = 0.95,
@@ -61,9 +64,13 @@ def calibrate(
 
     :param twin: whose values are where the search begins, and stay where they are not ``free``
     :param data: measured trajectories, sampled at the twin's ``dt``
-    :param free: names of the parameters to estimate; default: all of them
+    :param free: names of the parameters to estimate; default: all but ``twin.known_parameters``
     :param window: steps per window; default: half a second, between 5 and 50 steps, and not longer
         than the longest recording
+    :param errors: that are made small: ``"simulation"``, of the channels over a window; or
+        ``"force"``, of the equation of motion, which suits logs of torques that the twin explains
+        worse than its sensors measure. Where simulations with the twin's own values run away, what
+        forces say is where the search begins.
     :param loss: ``"huber"``, for which outliers count less, or ``"linear"`` for plain squares
     :param prior: how firmly to believe the twin's own values: its reciprocal is the standard
         deviation of that belief, in units of each parameter's ``scale``. 0: not at all.
@@ -74,7 +81,8 @@ def calibrate(
     :param seed: of the choice of windows
     :return: estimates with standard errors and units, and the calibrated twin
     :raises CalibrationError: for an unknown or missing parameter, other channels or another
-        interval than the twin's, or fewer measurements than unknowns
+        interval than the twin's, fewer measurements than unknowns, or forces of a twin that is no
+        ``AnalyticTwin``
     :raises TrajectoryError: if no recording is as long as a window
     :raises TwinError: for a twin whose methods do not return what they have to
     """
@@ -83,21 +91,27 @@ def calibrate(
     check_fits(twin, data)
     if loss not in ("huber", "linear"):
         raise CalibrationError(f"loss must be 'huber' or 'linear', got {loss!r}.")
+    if errors not in ("simulation", "force"):
+        raise CalibrationError(f"errors must be 'simulation' or 'force', got {errors!r}.")
     if not 0.0 <= prior < math.inf:
         raise CalibrationError(f"prior must be at least 0 (no belief), got {prior}.")
     if not 0.0 < level < 1.0:
         raise CalibrationError(f"level must lie between 0 and 1, got {level}.")
     shots, origin = shots_of(data, window or default_window(data), twin, n_windows, seed)
+    threshold = _HUBER if loss == "huber" else None
+    if errors == "force":
+        return _fit_forces(twin, names, data, shots, origin, threshold, level)
     return fit_windows(
         twin,
         names,
         shots,
         origin,
         spread_of(data),
-        threshold=_HUBER if loss == "huber" else None,
+        threshold=threshold,
         prior=prior,
         level=level,
         max_steps=max_steps,
+        elsewhere=lambda: by_inverse_dynamics(twin, names, data, threshold),
     )
 
 
@@ -113,6 +127,7 @@ def fit_windows(
     believed: Float[np.ndarray, " p"] | None = None,
     level: float = 0.95,
     max_steps: int = 100,
+    elsewhere: Callable[[], Forces | None] | None = None,
 ) -> Fit:
     """
     :func:`calibrate` on windows that were cut already.
@@ -123,6 +138,8 @@ def fit_windows(
     :param spread: of each channel over the data
     :param threshold: of the Huber loss, in units of the noise; None for plain squares
     :param believed: centre of the prior; default: the twin's own values
+    :param elsewhere: where else the search may begin, asked where simulations with the twin's own
+        values miss a channel by more than it varies
     :raises CalibrationError: for fewer measurements than unknowns
     """
     _check_enough(twin, names, shots)
@@ -135,6 +152,12 @@ def fit_windows(
         begin = first_offsets(twin, np.asarray(shots.obs), twin.dt)
         at = look(values, jnp.asarray(begin), noise)
         before = np.asarray(at.raw)
+        astray = np.any(_rms(before[origin >= 0]) > spread)
+        other = elsewhere() if elsewhere is not None and astray else None
+        if other is not None:
+            there = look(other.values, jnp.asarray(begin), noise)
+            if np.sum(np.asarray(there.bent) ** 2) < np.sum(np.asarray(at.bent) ** 2):
+                values, at = other.values, there
         search = partial(solve, twin, names, threshold, max_steps, fixed)
         for _ in range(_PASSES):
             begin = bounds_of([twin.parameters[name] for name in names]).inside(values)
@@ -144,6 +167,44 @@ def fit_windows(
             noise = _noise(at.raw, shots, len(names), n_free(twin), spread)
         errors = jax.tree.map(np.asarray, look(values, at.offsets, noise))
     return _fit(twin, names, errors, before, origin, values, noise, found, level, prior)
+
+
+def _fit_forces(
+    twin: Twin,
+    names: tuple[str, ...],
+    data: Trajectories,
+    shots: Shots,
+    origin: np.ndarray,
+    threshold: float | None,
+    level: float,
+) -> Fit:
+    found = by_inverse_dynamics(twin, names, data, threshold)
+    if found is None:
+        raise CalibrationError(
+            f"errors='force' asks for the equation of motion of an AnalyticTwin, and {twin.name} "
+            "has more than that, or none. Calibrate the twin without effects, or leave errors out."
+        )
+    errors, slopes, recording = found.windows(shots.actions.shape[1])
+    bounds = bounds_of([twin.parameters[name] for name in names])
+    spread = covariance_of(errors, slopes, recording, bounds.scale, 0.0, 0)
+    values = dict(zip(names, found.values.tolist(), strict=True))
+    with jax.enable_x64(True):
+        scale = _FIRST_NOISE * spread_of(data)
+        own = Shots(*map(jnp.asarray, shots))
+        begin = jnp.asarray(first_offsets(twin, np.asarray(shots.obs), twin.dt))
+        raws = [
+            np.asarray(evaluate(twin, (), threshold, p, own, jnp.zeros(0), begin, scale).raw)
+            for p in (_doubles(twin.params), _doubles(twin.with_parameters(**values).params))
+        ]
+    real = origin >= 0
+    noise = _noise(raws[1], shots, 0, n_free(twin), spread_of(data))
+    told = _Told(raws[0][real], raws[1][real], noise, True, 1, "force")
+    return _result(twin, names, found.values, spread, bounds, told, level)
+
+
+def _rms(raw: np.ndarray) -> np.ndarray:
+    with np.errstate(over="ignore"):
+        return np.sqrt(np.mean(raw**2, (0, 1)))
 
 
 def default_window(data: Trajectories) -> int:
@@ -194,10 +255,11 @@ def _other_unit(ratio: float) -> str:
 
 
 def every_name(twin: Twin) -> tuple[str, ...]:
-    """:return: names of all parameters but the share of a learned force"""
+    """:return: names of all parameters but known ones and the share of a learned force"""
     force = force_of(twin)
     learned = () if force is None else (f"{force[0]}.share",)
-    return tuple(name for name in twin.parameters if name not in learned)
+    kept = {*learned, *twin.known_parameters}
+    return tuple(name for name in twin.parameters if name not in kept)
 
 
 def free_names(twin: Twin, free: Iterable[str] | None) -> tuple[str, ...]:
@@ -232,7 +294,9 @@ def _doubles(params: Params) -> Params:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
 
 
-def _noise(raw: Array, shots: Shots, n_params: int, n_start: int, spread: np.ndarray) -> np.ndarray:
+def _noise(
+    raw: Array | np.ndarray, shots: Shots, n_params: int, n_start: int, spread: np.ndarray
+) -> np.ndarray:
     """Standard deviation of each channel's error, by the median, so that outliers do not matter."""
     real = np.asarray(shots.weight) > 0.0
     error = np.asarray(raw)[real].reshape(-1, raw.shape[-1])
@@ -253,11 +317,36 @@ def _fit(
     level: float,
     prior: float,
 ) -> Fit:
-    parameters = [twin.parameters[name] for name in names]
-    bounds, real = bounds_of(parameters), origin >= 0
+    bounds, real = bounds_of([twin.parameters[name] for name in names]), origin >= 0
     spread = covariance_of(
         errors.bent[real], errors.slopes[real], origin[real], bounds.scale, prior, n_free(twin)
     )
+    solved = bool(found.converged), int(found.n_steps)
+    told = _Told(before[real], errors.raw[real], noise, *solved, "simulation")
+    return _result(twin, names, values, spread, bounds, told, level)
+
+
+class _Told(NamedTuple):
+    """What a fit is told with: errors of simulations, shape ``(n, rows, n_obs)``, and the rest."""
+
+    before: np.ndarray
+    after: np.ndarray
+    noise: np.ndarray
+    converged: bool
+    n_steps: int
+    errors: str
+
+
+def _result(
+    twin: Twin,
+    names: tuple[str, ...],
+    values: np.ndarray,
+    spread: Spread,
+    bounds: Bounds,
+    told: _Told,
+    level: float,
+) -> Fit:
+    parameters = [twin.parameters[name] for name in names]
     margin = spread.quantile(level) * spread.stderr
     estimates = tuple(
         Estimate(
@@ -274,22 +363,22 @@ def _fit(
             names, parameters, values, spread.stderr, margin, bounds.reached(values), strict=True
         )
     )
-    rms = lambda raw: np.sqrt(np.mean(raw[real] ** 2, (0, 1)))  # noqa: E731
     return Fit(
         twin=twin.with_parameters(**dict(zip(names, values.tolist(), strict=True))),
         estimates=estimates,
         covariance=spread.covariance,
         channels=tuple((channel.name, channel.unit) for channel in twin.channels),
-        error_before=rms(before),
-        error_after=rms(errors.raw),
-        noise=noise,
-        n_windows=int(real.sum()),
-        window=errors.raw.shape[1] - 1,
+        error_before=_rms(told.before),
+        error_after=_rms(told.after),
+        noise=told.noise,
+        n_windows=len(told.after),
+        window=told.after.shape[1] - 1,
         n_groups=spread.n_groups,
         level=level,
-        converged=bool(found.converged),
-        n_steps=int(found.n_steps),
+        converged=told.converged,
+        n_steps=told.n_steps,
         undetermined=tuple(_in_words(names, row) for row in spread.undetermined),
+        errors=told.errors,
     )
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from sb3_hds.core import Params, Twin
+from sb3_hds.errors import ParameterError
 from sb3_hds.sysid import wording
 from sb3_hds.sysid.pictures import Pictures
 from sb3_hds.sysid.results import Estimate, plain
@@ -310,6 +311,23 @@ class Diagnosis:
 
         plain = policy_gain if isinstance(policy_gain, Mapping | None) else policy_gain.to_dict()
         return write_report(self, path, plain)
+
+    def to_film(self, path: str | os.PathLike[str]) -> Path:
+        """
+        Write the machine's motion over a held-out recording, measured and as both twins predict it.
+
+        :param path: of the film, which ends in ``.mp4``; a file of that name is replaced as a whole
+        :return: its path
+        :raises ImportError: without imageio-ffmpeg and matplotlib
+        :raises ParameterError: for another ending, or where nothing was simulated
+        :raises OSError: if there is no folder to write it in
+        """
+        from sb3_hds.sysid.film import write_film
+        from sb3_hds.sysid.moving import moving_of
+
+        if self.pictures is None:
+            raise ParameterError(f"Nothing was simulated, so nothing moves: {self.sentence}")
+        return write_film(moving_of(self.believed, self.twin, self.pictures.replay), path)
 
     def save_pictures(self, folder: str | os.PathLike[str]) -> list[Path]:
         """

@@ -21,6 +21,7 @@ from sb3_hds.core import (
     Twin,
 )
 from sb3_hds.core.effect import Attached, Chosen
+from sb3_hds.core.extended import with_native
 from sb3_hds.core.layers import layers_of, plant_of
 from sb3_hds.effects import (
     NAMELESS,
@@ -51,7 +52,8 @@ class Candidate:
     :param name: of the effect; ``"parameter.mass"`` for a parameter of the twin
     :param slot: ``"joint"``, ``"actuator"``, ``"channel"`` or ``"parameter"``
     :param place: name of the joint, actuator or channel; of the parameter
-    :param index: of the joint, actuator or channel; of the parameter among those of the twin
+    :param index: of the joint, actuator or channel, -1 for all actuators; of the parameter among
+        those of the twin
     :param parameters: full names in the extended twin
     :param explanation: one sentence for people
     :param equivalents: names of effects that data may not tell from this one, and when
@@ -150,6 +152,7 @@ class Hypotheses:
                 f"Its parameters are: {', '.join(twin.parameters) or 'none'}."
             )
         own = tuple(name for name in twin.parameters if not name.endswith(".share"))
+        known = twin.known_parameters
         pushed = () if ConstantForce in effects else (ConstantForce,)
         rivals = tuple(kind for kind in NAMELESS if kind not in effects)
         wanted = None if only is None else _single(only, twin)
@@ -172,7 +175,7 @@ class Hypotheses:
         candidates = [
             Candidate(f"parameter.{name}", PARAMETER, name, i, (name,), _OF_PARAMETER.format(name))
             for i, name in enumerate(own)
-            if name not in {*calibrate, *native.values(), *there}
+            if name not in {*calibrate, *native.values(), *there, *known}
         ]
         candidates += [
             c
@@ -192,7 +195,8 @@ class Hypotheses:
             if name in native:
                 # The twin has some of it already: there may be less than it believes.
                 target = native[name]
-                lower[i] = twin.parameters[target].lower - twin.values[target]
+                if every[name].null == 0.0:
+                    lower[i] = twin.parameters[target].lower - twin.values[target]
         upper = np.array([every[name].upper for name in moving], float)
         prior = np.full(len(moving), np.inf)
         for i, (name, belief) in enumerate(beliefs.items()):
@@ -292,7 +296,9 @@ class Hypotheses:
     def added_to(self, name: str) -> float:
         """:return: what the twin as it came has already of an effect's parameter"""
         target = _native_targets(self.believed, self.candidates).get(name)
-        return 0.0 if target is None else self.believed.values[target]
+        if target is None or self.twin.parameters[name].null != 0.0:
+            return 0.0
+        return self.believed.values[target]
 
     def scaled(self, scales: Mapping[str, float]) -> "Hypotheses":
         """:return: the same with these typical deviations, by full name"""
@@ -317,7 +323,9 @@ class Hypotheses:
         native = _native_targets(self.believed, chosen)
         for name in (name for c in chosen for name in c.parameters):
             if name in native:
-                own[native[name]] = self.believed.values[native[name]] + value[name]
+                own[native[name]] = with_native(
+                    self.believed.values[native[name]], value[name], self.twin.parameters[name]
+                )
             elif name in self.believed.parameters:
                 own[name] = value[name]
         there = {a.key for a in _attached_of(self.believed)}

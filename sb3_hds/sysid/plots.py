@@ -1,7 +1,7 @@
 """Pictures of results; matplotlib is imported only here, and only when one is drawn."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from sb3_hds.sysid.wording import TRAINED_IN, share_in_words
 
 if TYPE_CHECKING:
     from sb3_hds.sysid.diagnosis import Diagnosis
+    from sb3_hds.sysid.moving import Moving
     from sb3_hds.sysid.pictures import Pictures
     from sb3_hds.sysid.results import Fit
 
@@ -238,3 +239,49 @@ def _draw_errors(axes: Any, fit: "Fit") -> None:
     axes.set_xlabel("error over a window, in units of the noise")
     axes.set_title("prediction error", fontsize=10)
     axes.legend(fontsize=8, frameon=False)
+
+
+def film_frames(
+    moving: "Moving", players: Sequence[tuple[str, str]], frames: np.ndarray
+) -> Iterator[np.ndarray]:
+    """
+    :param players: label and colour of each
+    :param frames: indices of those that are drawn
+    :return: pictures of 1,280 x 720 points, shape ``(720, 1280, 3)``
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    n = len(moving.names)
+    figure = Figure(figsize=(12.8, 7.2), dpi=100)
+    canvas = FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(max(n, 1), 2, width_ratios=(3, 2), left=0.02, right=0.98)
+    stage = figure.add_subplot(grid[:, 0])
+    stage.set(xlim=(0, 100), ylim=(100, 0), aspect="equal")
+    stage.axis("off")
+    drawn = []
+    for p, (label, colour) in enumerate(players):
+        width = 3.5 * moving.width * (1.6, 1.0, 0.6)[p]
+        style = {"color": colour, "lw": width, "solid_capstyle": "round", "alpha": 0.9}
+        lines = [stage.plot([], [], **style)[0] for _ in moving.lines[p, 0]]
+        lines[0].set_label(label)
+        drawn.append(lines)
+    legend = stage.legend(loc="lower left", frameon=False)
+    for handle in legend.get_lines():
+        handle.set_linewidth(6.0)
+    cursors = []
+    for j, name in enumerate(moving.names):
+        axes = figure.add_subplot(grid[j, 1])
+        for values, (_, colour) in zip(moving.errors, players[1:], strict=True):
+            axes.plot(moving.time, values[:, j], color=colour, lw=1)
+        axes.set_ylabel(name, rotation=0, ha="right", fontsize=7)
+        axes.tick_params(labelsize=6, labelbottom=j == n - 1)
+        cursors.append(axes.axvline(0.0, color="#2b2a27", lw=0.8))
+    for frame in frames.tolist():
+        for lines, places in zip(drawn, moving.lines[:, frame], strict=True):
+            for line, ends in zip(lines, places, strict=True):
+                line.set_data(ends[:, 0], ends[:, 1])
+        for cursor in cursors:
+            cursor.set_xdata([moving.time[frame]] * 2)
+        canvas.draw()
+        yield np.asarray(canvas.buffer_rgba())[..., :3]

@@ -13,6 +13,8 @@ from sb3_hds.core.storage import check_target, write_bytes
 from sb3_hds.errors import ParameterError
 from sb3_hds.sysid import plots, wording
 from sb3_hds.sysid.diagnosis import Diagnosis
+from sb3_hds.sysid.film import STYLE, section_of
+from sb3_hds.sysid.moving import moving_of
 from sb3_hds.sysid.units import sizes_in_words, with_unit
 
 _INSTALL = "A report needs matplotlib and jinja2: pip install 'sb3-hds[report]'."
@@ -43,6 +45,7 @@ table { border-collapse: collapse; width: 100%; font-size: .95rem; }
 th, td { text-align: left; padding: .25rem .8rem .25rem 0; border-bottom: 1px solid #eceae3;
   vertical-align: top; font-variant-numeric: tabular-nums; overflow-wrap: anywhere; }
 th { font-weight: 600; font-size: .9rem; overflow-wrap: normal; }
+{{ style | safe }}
 td.short { white-space: nowrap; }
 @media screen and (max-width: 40rem) { h1 { font-size: 1.35rem; } table { font-size: .8rem; }
   th, td { padding-right: .4rem; } th { font-size: .8rem; } }
@@ -78,6 +81,7 @@ td.short { white-space: nowrap; }
 {% if findings %}<p>{{ explained }}</p>{% endif %}
 {% if d.unexplained %}<p><strong>Unexplained:</strong> {{ d.unexplained }}</p>{% endif %}
 {% for caveat in d.caveats %}<p><strong>Caveat:</strong> {{ caveat }}</p>{% endfor %}
+{{ moving | safe }}
 {% for picture in pictures %}<section class="picture"><h2>{{ picture.title }}</h2>
 {{ shown(picture) }}{% if picture.rows %}<p class="quiet">{{ wording.HORIZONS }}:</p>
 {{ table(("steps", "before", "after", "90 % interval of the gain"), picture.rows) }}{% endif %}
@@ -151,7 +155,11 @@ def write_report(
     pictures = [_inlined(picture) for picture in _pictures(diagnosis)]
     page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     text = page.from_string(_PAGE).render(
-        **_content(diagnosis), pictures=pictures, policy=_policy(policy_gain)
+        **_content(diagnosis),
+        pictures=pictures,
+        policy=_policy(policy_gain),
+        style=STYLE,
+        moving=_moving(diagnosis),
     )
     return write_bytes(path, text.encode())
 
@@ -171,6 +179,13 @@ def write_pictures(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list
         )
         for picture in _pictures(diagnosis)
     ]
+
+
+def _moving(d: Diagnosis) -> str:
+    """Nothing where nothing was simulated."""
+    return (
+        "" if d.pictures is None else section_of(moving_of(d.believed, d.twin, d.pictures.replay))
+    )
 
 
 def _content(d: Diagnosis) -> dict[str, Any]:

@@ -215,7 +215,8 @@ def _seen(twin: Twin, shots: Shots) -> tuple[Array, Array, Array]:
 
     def one(obs: Array, action: Array) -> tuple[Array, Array, Array]:
         state: State = twin.infer(obs, params)
-        return state.q, state.v, plant.actuate(state, _command(twin, state, action, params), params)
+        force = plant.actuate(state, _command(twin, state, action, params), params)
+        return plant.coordinates(state.q), state.v, force
 
     obs = jnp.asarray(shots.obs[:, :-1], jnp.float32)
     return jax.vmap(jax.vmap(one))(obs, jnp.asarray(shots.actions, jnp.float32))

@@ -59,6 +59,7 @@ class Fit:
     :param converged: whether the solver says so
     :param n_steps: that it took
     :param undetermined: groups of parameters of which the data determine only combinations
+    :param errors: that were made small: ``"simulation"`` or ``"force"``
     """
 
     twin: Twin
@@ -75,6 +76,7 @@ class Fit:
     converged: bool
     n_steps: int
     undetermined: tuple[str, ...]
+    errors: str = "simulation"
 
     @property
     def params(self) -> Params:
@@ -128,6 +130,7 @@ class Fit:
             "window": self.window,
             "n_groups": self.n_groups,
             "level": self.level,
+            "errors": self.errors,
             "converged": self.converged,
             "n_steps": self.n_steps,
             "caveats": list(self.caveats),
@@ -135,8 +138,9 @@ class Fit:
 
     def __repr__(self) -> str:
         share = f"{100.0 * self.level:g} %"
+        of = "the forces of " if self.errors == "force" else ""
         lines = [
-            f"Fit of {self.twin.name} to {self.n_windows} windows of {self.window} steps",
+            f"Fit of {self.twin.name} to {of}{self.n_windows} windows of {self.window} steps",
             "",
             f"{'parameter':<26}{'before':>10}{'estimate':>11}{'+-':>9}   {share} interval",
         ]

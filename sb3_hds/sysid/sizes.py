@@ -111,11 +111,12 @@ def _motion(h: Hypotheses, data: Trajectories) -> _Moved:
     q, v = (np.concatenate([part[k][0] for part in parts]) for k in (0, 1))
     change = np.concatenate([np.diff(part[1][0], axis=0) for part in parts]) / data.dt
     speeds, faster = (np.quantile(np.abs(x), 0.98, axis=0) for x in (v, change))
-    return _Moved(speeds, q.max(0) - q.min(0), faster * _inertias(h.believed, q[0]))
+    return _Moved(speeds, q.max(0) - q.min(0), faster * _inertias(h.believed, data))
 
 
-def _inertias(twin: Twin, q: np.ndarray) -> np.ndarray:
+def _inertias(twin: Twin, data: Trajectories) -> np.ndarray:
     plant = plant_of(twin)
     if not isinstance(plant, AnalyticTwin):
-        return np.full(len(q), np.nan)
-    return np.diag(np.asarray(plant.mass_matrix(jnp.asarray(q), plant.params)))
+        return np.full(len(twin.joints), np.nan)
+    start = twin.infer(jnp.asarray(data.obs[0, 0]), twin.params)
+    return np.diag(np.asarray(plant.mass_matrix(start.q, plant.params)))

@@ -13,6 +13,7 @@ from sb3_hds.twins.inverted_pendulum import InvertedPendulum
 from sb3_hds.twins.inverted_pendulum_friction import InvertedPendulumFriction
 from sb3_hds.twins.linear_axis import LinearAxis
 from sb3_hds.twins.mountain_car import MountainCar
+from sb3_hds.twins.mujoco import MechanismTwin, Written, from_mujoco, write_model
 from sb3_hds.twins.payload_pendulum import PayloadPendulum
 from sb3_hds.twins.pendulum import Pendulum
 from sb3_hds.twins.pendulum_real import PendulumReal
@@ -38,6 +39,7 @@ for _twin in (
     ServoPendulum,
 ):
     register(_twin)
+register(MechanismTwin, listed=False)
 
 __all__ = [
     "Acrobot",
@@ -51,6 +53,7 @@ __all__ = [
     "InvertedPendulum",
     "InvertedPendulumFriction",
     "LinearAxis",
+    "MechanismTwin",
     "MountainCar",
     "PayloadPendulum",
     "Pendulum",
@@ -58,12 +61,15 @@ __all__ = [
     "Rig",
     "ServoPendulum",
     "TwinCheck",
+    "Written",
     "all_ids",
     "check",
     "from_env",
+    "from_mujoco",
     "from_spec",
     "get",
     "make",
     "names",
     "register",
+    "write_model",
 ]

@@ -10,14 +10,16 @@ from sb3_hds.core.contract import check_methods, missing_methods
 from sb3_hds.errors import NoTwinError, TwinError, did_you_mean
 
 _TWINS: dict[str, type[Twin]] = {}
+_UNLISTED: set[str] = set()
 _VARIADIC = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
-def register(twin: type[Twin]) -> type[Twin]:
+def register(twin: type[Twin], *, listed: bool = True) -> type[Twin]:
     """
     Make a twin known under its ``name`` and its ``env_id``. Usable as a class decorator.
 
     :param twin: a concrete subclass of ``Twin``
+    :param listed: whether its name is all that it takes; otherwise only :func:`from_spec` makes it
     :return: the class itself
     :raises TypeError: for anything but a subclass of ``Twin``
     :raises ValueError: if another class has the name or the id already
@@ -46,6 +48,8 @@ def register(twin: type[Twin]) -> type[Twin]:
     if _has_defaults(twin):
         check_methods(twin())
     _TWINS.update(dict.fromkeys(keys, twin))
+    if not listed:
+        _UNLISTED.add(twin.name)
     return twin
 
 
@@ -58,7 +62,7 @@ def _has_defaults(twin: type[Twin]) -> bool:
 
 def names() -> list[str]:
     """:return: the names of all twins, sorted"""
-    return sorted({twin.name for twin in _TWINS.values()})
+    return sorted({twin.name for twin in _TWINS.values()} - _UNLISTED)
 
 
 def all_ids() -> list[str]:

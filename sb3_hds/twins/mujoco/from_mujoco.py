@@ -1,0 +1,163 @@
+"""Make a twin of a robot from its model file."""
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+from sb3_hds.errors import ModelFileError, ParameterError, did_you_mean
+from sb3_hds.twins.mujoco.identifiability import unidentifiable
+from sb3_hds.twins.mujoco.load import load
+from sb3_hds.twins.mujoco.mechanism import BALL, FREE, Drive, Link, Mechanism
+from sb3_hds.twins.mujoco.reading import integrator_of, n_actuators, read
+from sb3_hds.twins.mujoco.refusals import refuse
+from sb3_hds.twins.mujoco.twin import MechanismTwin, Reward, Terminated
+
+_KINDS = ("torque", "position", "velocity")
+
+
+def from_mujoco(
+    model_or_path_or_env: Any,
+    *,
+    engine: str = "auto",
+    actuators: str | Mapping[str, Any] | None = None,
+    dt: float | None = None,
+    integrator: str | None = None,
+    observe: str = "qv",
+    payload: str | None = None,
+    masses: bool = False,
+    reward: Reward | None = None,
+    terminated: Terminated | None = None,
+    ignore: Collection[str] = (),
+) -> MechanismTwin:
+    """
+    A twin of whatever MuJoCo can load, as long as nothing touches.
+
+    Its parameters carry the names and words of the file: ``elbow_damping``, ``elbow_frictionloss``,
+    ``elbow_armature``, ``elbow_servo_kp``.
+
+    :param model_or_path_or_env: path or text of an MJCF or URDF file (meshes may be missing where
+        inertials are given), an ``MjSpec`` or ``MjModel``, or a MuJoCo environment of Gymnasium
+    :param engine: ``"smooth"``, or ``"auto"``, which is the same
+    :param actuators: for a model that names none, or to replace them: ``"torque"`` (the default of
+        a URDF) for a motor at each hinge and slide, within its effort limit; or a mapping such as
+        ``{"kind": "position", "kp": 20.0, "kv": 1.5}``, whose commands are targets. Each value is
+        one number, or a mapping from joints to numbers; ``limit`` is of the force.
+    :param dt: control interval [s]; default: the environment's, or the model's time step
+    :param integrator: ``"euler"``, ``"implicitfast"`` or ``"rk4"``; default: the model's, or
+        ``"implicitfast"`` for a URDF
+    :param observe: ``"qv"`` for positions and velocities, ``"q"`` for positions only
+    :param payload: name of a site or body: an unknown mass may be there, or near it
+    :param masses: whether mass, centre and inertia of each body are parameters, too; a warning says
+        which of them no motion can tell
+    :param reward: of a task: ``reward(state, action, next_state, params)``
+    :param terminated: when a task ends: ``terminated(state, params)``
+    :param ignore: what the model has and the twin may do without: ``"contacts"`` where nothing
+        touches in the data, ``"equality"``, ``"fluid"``, ``"limits"``, ``"tendons"``
+    :raises ModelFileError: for a file that cannot be read, or a model with more than that
+    :raises ParameterError: for actuators, an integrator or a payload that make no sense
+    """
+    if engine not in ("auto", "smooth"):
+        raise ParameterError(
+            "engine must be 'smooth' or 'auto': MuJoCo's own engine, with contacts, does not serve "
+            f"as a twin yet; got {engine!r}. Where nothing touches, pass ignore=['contacts']."
+        )
+    loaded = load(model_or_path_or_env)
+    if integrator is None:
+        integrator = "implicitfast" if loaded.urdf else integrator_of(loaded.model)
+    ignore = (ignore,) if isinstance(ignore, str) else tuple(ignore)
+    refuse(loaded.model, integrator, ignore)
+    if loaded.mimics and not loaded.model.neq and "equality" not in ignore:
+        raise ModelFileError(
+            f"Joints follow others ({', '.join(loaded.mimics)}), which the twin does not simulate: "
+            "they would move apart. To leave that out, pass ignore=['equality']."
+        )
+    mechanism = read(loaded.model, integrator=integrator)
+    if "limits" in ignore:
+        links = (dataclasses.replace(link, limit=None) for link in mechanism.links)
+        mechanism = dataclasses.replace(mechanism, links=tuple(links))
+    if actuators is None and not n_actuators(loaded.model):
+        actuators = "torque"
+    if actuators is not None:
+        drives = tuple(_drives(mechanism, actuators))
+        mechanism = dataclasses.replace(mechanism, drives=drives)
+    twin = MechanismTwin(
+        mechanism,
+        observe=observe,
+        payload=payload,
+        masses=masses,
+        dt=loaded.dt if dt is None else dt,
+        reward=reward,
+        terminated=terminated,
+    )
+    if masses and (words := unidentifiable(twin)):
+        warnings.warn(words, stacklevel=2)
+    return twin
+
+
+def _drives(mechanism: Mechanism, wanted: str | Mapping[str, Any]) -> list[Drive]:
+    """One at each hinge and slide."""
+    given = {"kind": wanted} if isinstance(wanted, str) else dict(wanted)
+    kind = str(given.pop("kind", None))
+    gains = {"torque": (), "position": ("kp", "kv"), "velocity": ("kv",)}.get(kind)
+    if gains is None:
+        raise ParameterError(
+            f"actuators is one of {', '.join(map(repr, _KINDS))}, alone or as the 'kind' of a "
+            f"mapping such as {{'kind': 'position', 'kp': 20.0, 'kv': 1.5}}, got {wanted!r}."
+        )
+    unknown = [name for name in given if name not in (*gains, "limit")]
+    missing = [name for name in gains[:1] if name not in given]
+    if unknown or missing:
+        raise ParameterError(
+            f"actuators of kind '{kind}' take {', '.join((*gains, 'limit'))}"
+            + (f", not {', '.join(unknown)}." if unknown else f"; {missing[0]} is missing.")
+        )
+    joints = [link for link in mechanism.links if link.kind not in (BALL, FREE)]
+    values = {name: _by_joint(name, value, joints) for name, value in given.items()}
+    index = {link.joint: i for i, link in enumerate(mechanism.links)}
+    found = []
+    for link in joints:
+        kp, kv, limit = (values.get(name, {}).get(link.joint) for name in ("kp", "kv", "limit"))
+        kp, kv = kp or 0.0, kv or 0.0
+        force = None if limit is None else (-limit, limit)
+        found.append(
+            Drive(
+                name=link.joint,
+                kind="affine",
+                link=index[link.joint],
+                gear=(1.0,),
+                outer=False,
+                inputs=("",),
+                ranges=((force or link.force_limit) if kind == "torque" else None,),
+                gain=({"torque": 1.0, "position": kp, "velocity": kv}[kind], 0.0, 0.0),
+                bias=(0.0, -kp, -kv),
+                force_limit=force,
+            )
+        )
+    return found
+
+
+def _by_joint(name: str, value: Any, joints: Sequence[Link]) -> dict[str, float]:
+    """A number for each joint, from one for all or a mapping."""
+    known = [link.joint for link in joints]
+    if not isinstance(value, Mapping):
+        value = dict.fromkeys(known, value)
+    unknown = [joint for joint in value if joint not in known]
+    missing = [joint for joint in known if joint not in value]
+    if unknown or missing:
+        raise ParameterError(
+            f"{name} of actuators is one number or a number for each joint: "
+            + (
+                f"there is no joint '{unknown[0]}'.{did_you_mean(unknown[0], known)}"
+                if unknown
+                else f"{', '.join(missing)} is missing."
+            )
+        )
+    try:
+        found = {joint: float(number) for joint, number in value.items()}
+    except (TypeError, ValueError):
+        raise ParameterError(f"{name} of actuators must be numbers, got {value!r}.") from None
+    if not all(math.isfinite(number) and number >= 0.0 for number in found.values()):
+        raise ParameterError(f"{name} of actuators must be finite and not below 0, got {found}.")
+    return found

@@ -1,0 +1,93 @@
+"""Which inertial parameters the motion of a mechanism can tell, whatever it does."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from sb3_hds.twins.mujoco.dynamics import Tree, configuration, inverse_dynamics
+from sb3_hds.twins.mujoco.parameters import bodies_of, compensated, gravity_of, random_positions
+
+if TYPE_CHECKING:
+    from sb3_hds.twins.mujoco.twin import MechanismTwin
+
+_N_MOTIONS = 64
+# Of a parameter's scale, along the imaginary axis: the derivative is exact to rounding.
+_STEP = 1e-20
+# Shares of the largest singular value, and of a direction, that are rounding.
+_RANK, _SHARE = 1e-9, 1e-5
+_FEW = 6
+
+
+def unidentifiable(twin: "MechanismTwin") -> str:
+    """
+    :return: in a sentence, which masses, centres, inertias and armatures no data can tell, or only
+        together with others; empty if there are none
+
+    Source: Khalil and Dombre, *Modeling, Identification and Control of Robots*, Kogan Page 2002,
+    section 9.4.
+    """
+    names = inertial(twin)
+    slopes = regressor(twin, names)
+    size = np.linalg.norm(slopes, axis=0)
+    nothing = [
+        name for name, length in zip(names, size, strict=True) if length < _RANK * size.max()
+    ]
+    seen = [i for i, name in enumerate(names) if name not in nothing]
+    _, values, ways = np.linalg.svd(slopes[:, seen] / size[seen], full_matrices=True)
+    rank = int(np.sum(values > _RANK * values[0]))
+    alone = np.linalg.norm(ways[rank:], axis=0) < _SHARE
+    together = [names[i] for i, free in zip(seen, alone, strict=True) if not free]
+    parts = []
+    if nothing:
+        parts.append(f"{len(nothing)} change nothing ({_some(nothing)})")
+    if together:
+        parts.append(
+            f"{len(together)} act only in {len(together) - (len(seen) - rank)} combinations "
+            f"({_some(together)})"
+        )
+    if not parts:
+        return ""
+    return (
+        f"Of {len(names)} inertial parameters of {twin.name}, {', and '.join(parts)}: no data tell "
+        "these one by one. Free fewer of them, or calibrate with a prior."
+    )
+
+
+def inertial(twin: "MechanismTwin") -> list[str]:
+    """:return: names of the parameters that shape masses and inertias"""
+    mechanism = twin.mechanism
+    bodies = [link.body.name for link in mechanism.links if link.body]
+    ends = ["mass", *(f"com_{x}" for x in "xyz"), *(f"stretch_{x}" for x in "xyz")]
+    ends += ["shear_xy", "shear_xz", "shear_yz"]
+    found = [f"{body}_{end}" for body in bodies for end in ends]
+    found += [f"{link.joint}_armature" for link in mechanism.links]
+    return [name for name in found if name in twin.parameters]
+
+
+def regressor(twin: "MechanismTwin", names: list[str]) -> Float[np.ndarray, "rows p"]:
+    """:return: slopes of the forces that random motions need, by parameters in their scales"""
+    mechanism = twin.mechanism
+    tree, rng = Tree(mechanism.links), np.random.default_rng(0)
+    q = random_positions(mechanism, _N_MOTIONS)
+    v, a = rng.normal(size=(2, _N_MOTIONS, tree.n))
+    values = {name: float(value) for name, value in twin.values.items()}
+    columns = []
+    for name in names:
+        if name.endswith("_armature"):
+            link = next(x for x in mechanism.links if f"{x.joint}_armature" == name)
+            dofs = np.isin(np.arange(tree.n), link.dofs)
+            columns.append((a * dofs * twin.parameters[name].scale).ravel())
+            continue
+        p = values | {name: np.asarray(values[name] + 1j * _STEP * twin.parameters[name].scale)}
+        at = configuration(
+            tree, q, bodies_of(mechanism, twin.payload, True, p), compensated(mechanism)
+        )
+        force = inverse_dynamics(tree, at, v, gravity_of(mechanism, values), a)
+        columns.append(np.imag(force).ravel() / _STEP)
+    return np.stack(columns, 1)
+
+
+def _some(names: list[str]) -> str:
+    more = f" and {len(names) - _FEW} more" if len(names) > _FEW else ""
+    return ", ".join(names[:_FEW]) + more

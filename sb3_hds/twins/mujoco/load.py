@@ -1,0 +1,149 @@
+"""From whatever describes a robot to a compiled model of MuJoCo."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sb3_hds.errors import ModelFileError
+from sb3_hds.twins.mujoco.library import mujoco
+
+
+class Loaded(NamedTuple):
+    """
+    :param model: an ``MjModel``
+    :param dt: control interval, where an environment has one [s]
+    :param urdf: whether it comes from a URDF, which names neither drives nor an integrator
+    :param mimics: joints of a URDF that follow another, which older versions of MuJoCo leave free
+    """
+
+    model: Any
+    dt: float | None = None
+    urdf: bool = False
+    mimics: tuple[str, ...] = ()
+
+
+def load(source: Any) -> Loaded:
+    """
+    :param source: path of an MJCF or URDF file, or its text; an ``MjSpec`` or ``MjModel``; or an
+        environment of Gymnasium that has a model of MuJoCo
+    :raises ModelFileError: if there is no such file, or MuJoCo refuses it
+    """
+    mj = mujoco()
+    if isinstance(source, mj.MjModel):
+        return Loaded(source)
+    if isinstance(source, mj.MjSpec):
+        return Loaded(_compiled(source.copy, "this MjSpec")[0])
+    if isinstance(source, str | os.PathLike):
+        return _from_text_or_file(source)
+    model = getattr(getattr(source, "unwrapped", None), "model", None)
+    if isinstance(model, mj.MjModel):
+        return Loaded(model, float(source.unwrapped.dt))
+    raise ModelFileError(
+        "A model is the path of an MJCF or URDF file, an MjSpec, an MjModel, or an environment of "
+        f"Gymnasium with MuJoCo inside, got {type(source).__name__}."
+    )
+
+
+def _from_text_or_file(source: str | os.PathLike[str]) -> Loaded:
+    text, urdf, parsed, where = _parser_of(source)
+    mimics = tuple(_mimics(text)) if urdf else ()
+    return Loaded(_compiled(parsed, where)[0], urdf=urdf, mimics=mimics)
+
+
+def spec_of(source: Any) -> tuple[Any, Any, bool]:
+    """
+    :param source: path of an MJCF or URDF file, or its text; or an ``MjSpec``
+    :return: an ``MjSpec`` that compiles, its model, and whether it comes from a URDF
+    :raises ModelFileError: if there is no such file, or MuJoCo refuses it
+    """
+    if isinstance(source, mujoco().MjSpec):
+        model, spec = _compiled(source.copy, "this MjSpec")
+        return spec, model, False
+    if not isinstance(source, str | os.PathLike):
+        raise ModelFileError(
+            "A model is written into a copy of its source: the path of an MJCF or URDF file, its "
+            f"text, or an MjSpec; got {type(source).__name__}."
+        )
+    _, urdf, parsed, where = _parser_of(source)
+    model, spec = _compiled(parsed, where)
+    return spec, model, urdf
+
+
+def _parser_of(
+    source: str | os.PathLike[str],
+) -> tuple[str, bool, Callable[[], Any], str]:
+    """Its text, whether that is a URDF, what makes an ``MjSpec`` of it, and how to call it."""
+    text = str(source).lstrip()
+    inline = text.startswith("<")
+    where = "this text" if inline else f"'{source}'"
+    if not inline:
+        path = Path(source)
+        if not path.is_file():
+            raise ModelFileError(
+                f"There is no file {where}. Pass the path of an MJCF or URDF file."
+            )
+        text = path.read_text(errors="replace")
+    urdf = "<robot" in text
+
+    def parsed() -> Any:
+        mj = mujoco()
+        read = mj.MjSpec.from_string if inline else mj.MjSpec.from_file
+        spec = read(text if inline else str(source))
+        if urdf:
+            # Tools and flanges keep their names: a payload may be there.
+            spec.compiler.fusestatic = False
+        return spec
+
+    return text, urdf, parsed, where
+
+
+def _compiled(parsed: Callable[[], Any], where: str) -> tuple[Any, Any]:
+    """Without what only shows or touches, if files for that are missing: inertials suffice."""
+    mj = mujoco()
+    try:
+        spec = parsed()
+        return spec.compile(), spec
+    except ValueError as error:
+        if not _is_about_files(error):
+            raise ModelFileError(f"MuJoCo refuses {where}: {_first_line(error)}.") from None
+    spec = parsed()
+    shapes = [getattr(mj.mjtGeom, name) for name in ("mjGEOM_MESH", "mjGEOM_HFIELD", "mjGEOM_SDF")]
+    shaped = [geom for geom in spec.geoms if geom.type in shapes]
+    bare = {geom.parent.name for geom in shaped if not geom.parent.explicitinertial}
+    for part in (
+        *shaped,
+        *spec.skins,
+        *spec.meshes,
+        *spec.hfields,
+        *spec.materials,
+        *spec.textures,
+    ):
+        spec.delete(part)
+    try:
+        return spec.compile(), spec
+    except ValueError as error:
+        hint = (
+            f" No inertial says what {', '.join(sorted(bare))} weighs, and its mesh is missing."
+            if bare
+            else ""
+        )
+        raise ModelFileError(f"MuJoCo refuses {where}: {_first_line(error)}.{hint}") from None
+
+
+def _is_about_files(error: Exception) -> bool:
+    return any(word in str(error).lower() for word in ("file", "mesh", "texture", "resource"))
+
+
+def _mimics(text: str) -> list[str]:
+    from xml.etree import ElementTree
+
+    try:
+        joints = ElementTree.fromstring(text).iter("joint")
+    except ElementTree.ParseError:
+        return []
+    return [joint.get("name", "") for joint in joints if joint.find("mimic") is not None]
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0].removeprefix("Error: ").rstrip(".")

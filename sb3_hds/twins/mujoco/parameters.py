@@ -1,0 +1,349 @@
+"""
+The parameters of a mechanism: names, units, bounds, and what they change.
+
+Joints keep their names in MJCF's words, ``elbow_damping`` and ``elbow_frictionloss``; actuators
+likewise, ``elbow_servo_kp``.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_hds.core import Parameter
+from sb3_hds.errors import ParameterError, did_you_mean
+from sb3_hds.twins.mujoco import algebra as alg
+from sb3_hds.twins.mujoco import dynamics
+from sb3_hds.twins.mujoco.algebra import Number, Symmetric, Vector
+from sb3_hds.twins.mujoco.dynamics import Tree, configuration, inverse_dynamics, mass_matrix
+from sb3_hds.twins.mujoco.mechanism import (
+    BALL,
+    FREE,
+    SLIDE,
+    SUFFIXES,
+    Body,
+    Drive,
+    Link,
+    Mechanism,
+    Place,
+)
+
+Values = Mapping[str, Number]
+
+_AXES = "xyz"
+# Typical deviations: shares of what is typical at a joint, and of a parameter's own value.
+_OF_FORCE, _OF_FORCE_PER_SPEED, _OF_INERTIA, _OF_ITSELF = 0.05, 0.02, 0.1, 0.1
+# Motors are stronger than what they do.
+_OF_DRIVE = 0.1
+# A payload is a share of the mass that moves [1], at some distance from its place [m].
+_OF_MASS, _NEAR = 0.05, 0.05
+_TILT = 0.02  # [rad]
+_SHIFT, _STRETCH = 0.02, 0.1  # of a body's centre [m], and of its shape, as a logarithm
+_N_POSES = 64
+
+
+def of_plant(
+    mechanism: Mechanism, usual: "Typical", payload: Place | None, masses: bool
+) -> dict[str, Parameter]:
+    """
+    :param payload: where an unknown mass may be
+    :param masses: whether mass, centre and inertia of each body are parameters
+    :return: all that the equation of motion has
+    """
+    forces = usual.weight + _OF_DRIVE * usual.drive
+    found = {name: Parameter(0.0, _TILT, "rad", -1.0, 1.0) for name in tilts(mechanism)}
+    for link in mechanism.links:
+        found |= _of_link(link, usual.inertia, forces)
+    moving = [link.body for link in mechanism.links if link.body]
+    if payload is not None:
+        scale = _OF_MASS * sum(body.mass for body in moving)
+        found[f"{payload.name}_payload"] = Parameter(0.0, scale, "kg", 0.0)
+        for axis in _AXES:
+            found[f"{payload.name}_payload_{axis}"] = Parameter(0.0, _NEAR, "m")
+    if masses:
+        for body in moving:
+            found |= _of_body(body)
+    return found
+
+
+def of_drives(mechanism: Mechanism) -> dict[str, Parameter]:
+    """:return: all that turns commands into forces"""
+    found = {}
+    for drive in mechanism.drives:
+        found |= _of_drive(drive, mechanism.links[drive.link])
+    return found
+
+
+def native_effects(mechanism: Mechanism) -> dict[tuple[str, int], dict[str, str]]:
+    """:return: effects that are parameters already, by name and index of their place"""
+    found = {}
+    for link in mechanism.links:
+        if len(link.dofs) == 1:
+            found["viscous_friction", link.v] = {"b": f"{link.joint}_damping"}
+            found["coulomb_friction", link.v] = {"tau_c": f"{link.joint}_frictionloss"}
+    command = 0
+    for drive in mechanism.drives:
+        if drive.role == "motor":
+            found["torque_gain", command] = {"gain": f"{drive.name}_gain"}
+        command += len(drive.inputs)
+    return found
+
+
+def _of_link(link: Link, inertias: np.ndarray, forces: np.ndarray) -> dict[str, Parameter]:
+    """Of a floating base, only what the model has."""
+    turns = link.kind != SLIDE
+    i, free = link.dofs[-1], link.kind == FREE
+    force = float(forces[i]) or 1.0
+    units = ("N m s/rad", "N m", "kg m2", "N m/rad") if turns else ("N s/m", "N", "kg", "N/m")
+    values = (
+        link.damping[0][0] if link.damping[0] else 0.0,
+        link.friction[0],
+        link.armature[0],
+        link.stiffness[0] if link.stiffness else 0.0,
+    )
+    scales = (
+        _OF_FORCE_PER_SPEED * force,
+        _OF_FORCE * force,
+        _OF_INERTIA * float(inertias[i]),
+        0.0,
+    )
+    found = {}
+    names = ("damping", "frictionloss", "armature", "stiffness")
+    for name, value, scale, unit in zip(names, values, scales, units, strict=True):
+        wanted = scale > 0.0 and not free
+        if wanted or value:
+            scale = max(scale, _OF_ITSELF * abs(value))
+            found[f"{link.joint}_{name}"] = Parameter(value, scale, unit, min(value, 0.0))
+    return found
+
+
+def _of_drive(drive: Drive, link: Link) -> dict[str, Parameter]:
+    force = "N" if link.kind == SLIDE else "N m"
+    length, positive = ("m" if link.kind == SLIDE else "rad"), (0.0, math.inf)
+    speed = f"{force} s/{length}"
+    kp, kv = (-value for value in drive.bias[1:])
+    motor = dict(drive.motor)
+    found: dict[str, tuple[float, str, tuple[float, float]]] = {
+        "motor": {"gain": (drive.gain[0], "1", (-math.inf, math.inf))},
+        "position": {"kp": (kp, f"{force}/{length}", positive), "kv": (kv, speed, positive)},
+        "velocity": {"kv": (kv, speed, positive)},
+        "dcmotor": {
+            "motorconst": (motor.get("constant", 0.0), "N m/A", positive),
+            "resistance": (motor.get("resistance", 1.0), "ohm", (1e-9, math.inf)),
+        },
+        "general": {},
+    }[drive.role]
+    other = kp if drive.role == "position" else 1.0
+    return {
+        f"{drive.name}_{name}": Parameter(
+            value, _OF_ITSELF * abs(value) or _OF_ITSELF * abs(other), unit, min(low, value), high
+        )
+        for name, (value, unit, (low, high)) in found.items()
+    }
+
+
+def _of_body(body: Body) -> dict[str, Parameter]:
+    """Any values make a possible body: a positive mass, and an inertia that some shape has."""
+    found = {f"{body.name}_mass": Parameter(body.mass, 0.1 * body.mass, "kg", 1e-3 * body.mass)}
+    for axis, value in zip(_AXES, centre_in_body(body), strict=True):
+        found[f"{body.name}_com_{axis}"] = Parameter(value, _SHIFT, "m")
+    for axis in _AXES:
+        found[f"{body.name}_stretch_{axis}"] = Parameter(0.0, _STRETCH, "1", -3.0, 3.0)
+    for plane in ("xy", "xz", "yz"):
+        found[f"{body.name}_shear_{plane}"] = Parameter(0.0, _STRETCH, "1", -10.0, 10.0)
+    return found
+
+
+# --- what they change
+
+
+def tilts(mechanism: Mechanism) -> list[str]:
+    """:return: by which horizontal axes the world may be turned, against a mount that is askew"""
+    size = np.abs(mechanism.gravity)
+    if not size.any():
+        return []
+    return [f"tilt_{_AXES[i]}" for i in range(3) if i != int(size.argmax())]
+
+
+def gravity_of(mechanism: Mechanism, p: Values) -> Vector:
+    """:return: gravity turned about the world's axes, the later one first [m/s2]"""
+    found: Vector = mechanism.gravity
+    for name in reversed(tilts(mechanism)):
+        i = _AXES.index(name[-1])
+        j, k = (i + 1) % 3, (i + 2) % 3
+        c, d = alg.cos(p[name]), alg.sin(p[name])
+        turned = {
+            i: found[i],
+            j: alg.sub(alg.mul(c, found[j]), alg.mul(d, found[k])),
+            k: alg.add(alg.mul(d, found[j]), alg.mul(c, found[k])),
+        }
+        found = turned[0], turned[1], turned[2]
+    return found
+
+
+def bodies_of(
+    mechanism: Mechanism, payload: Place | None, masses: bool, p: Values
+) -> list[dynamics.Body]:
+    """:return: of each link that has one, with its payload"""
+    found = []
+    for i, link in enumerate(mechanism.links):
+        if link.body is None:
+            continue
+        own = _with_values(link.body, p) if masses else _as_given(link.body)
+        if payload is not None and payload.link == i:
+            offset = [p[f"{payload.name}_payload_{axis}"] for axis in _AXES]
+            place = alg.vadd(payload.position, alg.apply(payload.rotation, offset))
+            own = _loaded(own, p[f"{payload.name}_payload"], place)
+        found.append(own)
+    return found
+
+
+def compensated(mechanism: Mechanism) -> list[dynamics.Body | None]:
+    """:return: of each link that has a body, the mass whose weight something else carries"""
+    found: list[dynamics.Body | None] = []
+    for link in mechanism.links:
+        if link.body is not None:
+            mass, *centre = link.body.gravcomp or (0.0, 0.0, 0.0, 0.0)
+            point = dynamics.Body(mass, (centre[0], centre[1], centre[2]), alg.NOTHING)
+            found.append(point if link.body.gravcomp else None)
+    return found
+
+
+def _as_given(body: Body) -> dynamics.Body:
+    return dynamics.Body(body.mass, body.centre, _second_moments(body.inertia))
+
+
+def _loaded(own: dynamics.Body, mass: Number, place: Vector) -> dynamics.Body:
+    """A body and a point mass as one."""
+    whole = alg.add(own.mass, mass)
+    share = alg.div(mass, whole)
+    way = alg.vadd(place, alg.scale(-1.0, own.centre))
+    apart = alg.outer(alg.scale(alg.mul(own.mass, share), way), alg.scale(0.5, way))
+    centre = alg.vadd(own.centre, alg.scale(share, way))
+    return dynamics.Body(whole, centre, alg.sadd(own.second_moments, apart))
+
+
+def _with_values(body: Body, p: Values) -> dynamics.Body:
+    r"""
+    Log-Cholesky: the second moments of mass about the centre, per unit of mass, become
+    :math:`U \Sigma U^T` with an upper triangular :math:`U` of positive diagonal.
+
+    Source: Rucker and Wensing, *Smooth parameterization of rigid-body inertia*, IEEE RA-L 2022.
+    """
+    name, turn = body.name, body.rotation
+    mass = p[f"{name}_mass"]
+    centre = [p[f"{name}_com_{axis}"] for axis in _AXES]
+    x, y, z = (alg.exp(p[f"{name}_stretch_{axis}"]) for axis in _AXES)
+    xy, xz, yz = (p[f"{name}_shear_{plane}"] for plane in ("xy", "xz", "yz"))
+    stretch = ((x, xy, xz), (0.0, y, yz), (0.0, 0.0, z))
+    axes = np.array(turn)
+    nominal = axes.T @ np.array(alg.full(_second_moments(body.inertia))) @ axes / body.mass
+    own = tuple(float(nominal[i, j]) for i, j in alg.PLACES)
+    shape = alg.congruent(alg.product(turn, stretch), own)  # type: ignore[arg-type]
+    second = tuple(alg.mul(mass, entry) for entry in shape)
+    place = alg.vadd(body.origin, alg.apply(turn, centre))
+    return dynamics.Body(mass, place, second)  # type: ignore[arg-type]
+
+
+def _second_moments(inertia: Symmetric) -> Symmetric:
+    """Of mass, of a body with these moments and products of inertia."""
+    xx, yy, zz, xy, xz, yz = inertia
+    half = 0.5 * (xx + yy + zz)
+    return half - xx, half - yy, half - zz, -xy, -xz, -yz
+
+
+def centre_in_body(body: Body) -> tuple[float, ...]:
+    """:return: the centre of mass in the body's frame [m]"""
+    way = np.array(body.rotation).T @ (np.array(body.centre) - np.array(body.origin))
+    return tuple(float(x) for x in way)
+
+
+# --- what is typical
+
+
+class Typical(NamedTuple):
+    """
+    For each degree of freedom.
+
+    :param inertia: the smallest that a force there moves, over random positions [kg m2] or [kg]
+    :param weight: the largest force of gravity there, likewise [N m] or [N]
+    :param drive: the largest force that actuators are said to exert [N m] or [N]; 0 if they do not
+        say
+    """
+
+    inertia: np.ndarray
+    weight: np.ndarray
+    drive: np.ndarray
+
+
+def typical(mechanism: Mechanism) -> Typical:
+    tree, q = Tree(mechanism.links), random_positions(mechanism, _N_POSES)
+    at = configuration(tree, q, bodies_of(mechanism, None, False, {}), compensated(mechanism))
+    still = np.zeros((_N_POSES, tree.n))
+    weight = np.abs(inverse_dynamics(tree, at, still, mechanism.gravity)).max(0)
+    armature = np.concatenate([link.armature for link in mechanism.links])
+    matrix = np.broadcast_to(mass_matrix(tree, at), (_N_POSES, tree.n, tree.n))
+    matrix = matrix + np.diag(armature)
+    felt = 1.0 / np.diagonal(np.linalg.inv(matrix), axis1=1, axis2=2)
+    drive = np.zeros(tree.n)
+    for each in mechanism.drives:
+        link = mechanism.links[each.link]
+        drive[list(link.dofs)] += np.abs(each.gear) * _largest(each, link)
+    return Typical(felt.min(0), weight, drive)
+
+
+def _largest(drive: Drive, link: Link) -> float:
+    limits = [drive.force_limit, link.force_limit]
+    if drive.role == "motor" and drive.ranges[0] is not None:
+        low, high = drive.ranges[0]
+        limits.append((drive.gain[0] * low, drive.gain[0] * high))
+    known = [max(map(abs, limit)) for limit in limits if limit is not None]
+    return min(known, default=0.0)
+
+
+def random_positions(mechanism: Mechanism, n: int, seed: int = 0) -> list[np.ndarray]:
+    """:return: one array of ``n`` samples for each number of a position"""
+    rng = np.random.default_rng(seed)
+    found: list[np.ndarray] = []
+    for link in mechanism.links:
+        if link.kind in (BALL, FREE):
+            turns = rng.normal(size=(4, n))
+            found += [*rng.normal(size=(3, n))] * (link.kind == FREE)
+            found += [*(turns / np.linalg.norm(turns, axis=0))]
+        elif link.kind == SLIDE:
+            low, high = link.limit or (-0.5, 0.5)
+            found.append(rng.uniform(low, high, n))
+        else:
+            low, high = link.limit or (-math.pi, math.pi)
+            found.append(rng.uniform(low, high, n))
+    return found
+
+
+def place_of(mechanism: Mechanism, name: str) -> Place:
+    """
+    :raises ParameterError: for a site or body that is none, or that does not move
+    """
+    found = {place.name: place for place in mechanism.places}
+    if name not in found:
+        raise ParameterError(
+            f"{mechanism.name} has no site or body '{name}' for a payload."
+            f"{did_you_mean(name, found)} It has: {', '.join(found) or 'none'}."
+        )
+    if found[name].link < 0:
+        moving = [place.name for place in found.values() if place.link >= 0]
+        raise ParameterError(
+            f"A payload at '{name}' of {mechanism.name} would not move, so no data tell of it. "
+            f"Choose one of: {', '.join(moving) or 'none'}."
+        )
+    return found[name]
+
+
+def dof_names(mechanism: Mechanism) -> list[tuple[str, str]]:
+    """:return: name and unit of each degree of freedom"""
+    found = []
+    for link in mechanism.links:
+        for suffix in SUFFIXES[link.kind]:
+            straight = link.kind == SLIDE or (link.kind == FREE and "r" not in suffix)
+            found.append((f"{link.joint}{suffix}", "m" if straight else "rad"))
+    return found

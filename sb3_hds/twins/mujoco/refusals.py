@@ -1,0 +1,163 @@
+"""What a model asks for and its twin does not simulate: refused in a line, with the way out."""
+
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+
+from sb3_hds.errors import ModelFileError
+from sb3_hds.twins.mujoco.library import mujoco
+from sb3_hds.twins.mujoco.reading import n_actuators
+
+#: what may be left out of a twin on request
+IGNORABLE = ("contacts", "equality", "fluid", "limits", "tendons")
+
+_FEW = 3
+
+
+def refuse(model: Any, integrator: str, ignore: Collection[str]) -> None:
+    """
+    :param model: compiled
+    :param integrator: that the twin will have
+    :param ignore: of :data:`IGNORABLE`
+    :raises ModelFileError: for all that stands against a twin, a line each
+    """
+    unknown = [name for name in ignore if name not in IGNORABLE]
+    if unknown:
+        raise ModelFileError(
+            f"ignore takes {', '.join(IGNORABLE)}, got {', '.join(map(str, unknown))}."
+        )
+    found = [
+        f"{reason} To leave them out, pass ignore=['{name}']."
+        for name, reason in _ignorable(model).items()
+        if name not in ignore
+    ]
+    found += _never(model, integrator)
+    if found:
+        raise ModelFileError("This model cannot become a twin:\n" + "\n".join(found))
+
+
+def _ignorable(model: Any) -> dict[str, str]:
+    found = {}
+    touching = contacts(model)
+    if touching:
+        found["contacts"] = (
+            f"Contacts can happen ({_some(touching)}), which the twin does not simulate."
+        )
+    if _enabled(model, "EQUALITY") and model.neq and np.any(model.eq_active0):
+        active = [
+            model.equality(i).name or f"equality {i}" for i in np.flatnonzero(model.eq_active0)
+        ]
+        found["equality"] = (
+            f"Constraints close chains or couple joints ({_some(active)}), which the twin does not "
+            "simulate: joints would move apart."
+        )
+    if model.ntendon:
+        names = [model.tendon(i).name or f"tendon {i}" for i in range(model.ntendon)]
+        found["tendons"] = f"Tendons pull ({_some(names)}), which the twin does not simulate."
+    if model.opt.density or model.opt.viscosity:
+        found["fluid"] = (
+            f"A medium of density {model.opt.density:g} and viscosity {model.opt.viscosity:g} "
+            "resists, and the twin has none (the effect quadratic_drag may serve)."
+        )
+    return found
+
+
+def _never(model: Any, integrator: str) -> list[str]:
+    """What cannot be left out either."""
+    mj = mujoco()
+    found = []
+    if model.nflex:
+        found.append("Bodies that bend (flex) are no rigid bodies. Remove them from the model.")
+    if getattr(model, "nplugin", 0):
+        found.append("Plugins are programs that the twin does not have. Remove them.")
+    alone = _floating_alone(model)
+    if alone and integrator == "implicitfast":
+        found.append(
+            f"MuJoCo's implicitfast is another one for a body that floats alone ({_some(alone)}). "
+            "Pass integrator='euler' or 'rk4'."
+        )
+    on = {mj.mjtTrn.mjTRN_JOINT, mj.mjtTrn.mjTRN_JOINTINPARENT}
+    kinds = {
+        "with internal dynamics": model.actuator_actnum > 0,
+        "that are not attached to a joint": ~np.isin(model.actuator_trntype, [int(k) for k in on]),
+        "that are muscles or turn an orientation": np.isin(
+            model.actuator_gaintype, [int(k) for k in _special_gains()]
+        ),
+        "with a delay": getattr(model, "actuator_delay", np.zeros(n_actuators(model))) > 0.0,
+    }
+    hints = {
+        "with internal dynamics": "A filter is the effect motor_lag: make it a motor or servo.",
+        "with a delay": "Remove it and attach the effect action_delay.",
+    }
+    for words, wrong in kinds.items():
+        names = [model.actuator(i).name or f"actuator {i}" for i in np.flatnonzero(wrong)]
+        if names:
+            hint = hints.get(words, "Use motors, position, velocity or dcmotor on joints.")
+            found.append(f"The twin has no actuators {words} ({_some(names)}). {hint}")
+    gravcomp = np.flatnonzero(
+        getattr(model, "jnt_actgravcomp", np.zeros(model.njnt)) & model.jnt_actfrclimited
+    )
+    if len(gravcomp) and np.any(model.body_gravcomp):
+        names = [model.joint(int(j)).name for j in gravcomp]
+        found.append(
+            f"Actuators with a limit compensate gravity ({_some(names)}). Set actgravcomp='false'."
+        )
+    return found
+
+
+def contacts(model: Any) -> list[str]:
+    """:return: pairs of geoms, or of their bodies, that may touch"""
+    if not (_enabled(model, "CONTACT") and _enabled(model, "CONSTRAINT")):
+        return []
+    body, weld = model.geom_bodyid, model.body_weldid
+    own, other = np.triu_indices(model.ngeom, 1)
+    kinds, affinities = model.geom_contype, model.geom_conaffinity
+    meeting = (kinds[own] & affinities[other]) | (kinds[other] & affinities[own])
+    one, two = weld[body[own]], weld[body[other]]
+    apart = one != two
+    if _enabled(model, "FILTERPARENT"):
+        parent = weld[model.body_parentid[weld]]
+        above = (one != 0) & (two != 0)
+        apart &= ~(above & ((one == parent[body[other]]) | (two == parent[body[own]])))
+    low, high = np.minimum(body[own], body[other]), np.maximum(body[own], body[other])
+    pair = (low.astype(np.int64) << 16) + high
+    apart &= ~np.isin(pair, model.exclude_signature[: model.nexclude])
+    found = [(int(own[i]), int(other[i])) for i in np.flatnonzero((meeting > 0) & apart)]
+    found += [(int(model.pair_geom1[i]), int(model.pair_geom2[i])) for i in range(model.npair)]
+    return [f"{_geom(model, a)} and {_geom(model, b)}" for a, b in found]
+
+
+def _geom(model: Any, i: int) -> str:
+    body = int(model.geom_bodyid[i])
+    return model.geom(i).name or model.body(body).name or f"body {body}"
+
+
+def _floating_alone(model: Any) -> list[str]:
+    """Bodies with a free joint that carry no joint."""
+    found = []
+    for j in np.flatnonzero(model.jnt_type == 0):
+        body = int(model.jnt_bodyid[j])
+        if model.body_subtreemass[body] == model.body_mass[body]:
+            found.append(model.body(body).name or f"body {body}")
+    return found
+
+
+def _special_gains() -> list[Any]:
+    mj = mujoco()
+    gains = mj.mjtGain
+    return [
+        getattr(gains, f"mjGAIN_{n}")
+        for n in ("MUSCLE", "SO3", "USER")
+        if hasattr(gains, f"mjGAIN_{n}")
+    ]
+
+
+def _enabled(model: Any, name: str) -> bool:
+    mj = mujoco()
+    return not model.opt.disableflags & getattr(mj.mjtDisableBit, f"mjDSBL_{name}")
+
+
+def _some(names: list[str]) -> str:
+    more = f" and {len(names) - _FEW} more" if len(names) > _FEW else ""
+    return ", ".join(names[:_FEW]) + more

@@ -1,0 +1,367 @@
+"""A twin made of a model file."""
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from sb3_hds.core import (
+    Action,
+    Actuator,
+    AnalyticTwin,
+    Channel,
+    Flag,
+    Force,
+    Joint,
+    MassMatrix,
+    Obs,
+    Params,
+    Position,
+    Scalar,
+    State,
+    Tangent,
+    Velocity,
+    rk4,
+    semi_implicit_euler,
+)
+from sb3_hds.core.types import Coordinates
+from sb3_hds.errors import ParameterError
+from sb3_hds.twins.mujoco import algebra as alg
+from sb3_hds.twins.mujoco.actuators import Actuation, Moving
+from sb3_hds.twins.mujoco.dynamics import frames_of
+from sb3_hds.twins.mujoco.equation import Equation
+from sb3_hds.twins.mujoco.mechanism import BALL, FREE, SLIDE, Link, Mechanism
+from sb3_hds.twins.mujoco.parameters import (
+    dof_names,
+    native_effects,
+    of_drives,
+    place_of,
+)
+from sb3_hds.twins.mujoco.quaternions import normalized, turn_between, turned
+
+# How far an episode begins from where the model stands [rad] or [m].
+_NEAR_START = 0.1
+_UNLIMITED = (-math.inf, math.inf)
+
+#: reward(state, action, next_state, params), and terminated(state, params)
+Reward = Callable[[State, Action, State, Params], Scalar]
+Terminated = Callable[[State, Params], Flag]
+
+
+class MechanismTwin(AnalyticTwin):
+    r"""
+    A tree of rigid bodies with hinges, slides, ball and free joints, as a model file describes it.
+
+    .. math:: M(q)\,\dot v + c(q, v) + \tau_\text{damping} + \tau_\text{dry} + \tau_\text{spring}
+              = \tau(q, v, u)
+
+    Equals MuJoCo's ``Euler``, ``implicitfast`` and ``RK4`` while nothing touches, no joint is at
+    its limit and nothing rubs. Dry friction is :math:`\tau_c \tanh(v / 0.01)`, taken at the end of
+    the step as damping is (by ``RK4`` at its beginning, smoothed over what a step can stop): under
+    a load a joint creeps where MuJoCo's sticks. Orientations are quaternions in positions, and
+    rotation vectors in tangents; the velocity of a ball or free joint is MuJoCo's: its rotation in
+    the body's frame.
+
+    Made by ``twins.from_mujoco``.
+
+    :param mechanism: the numbers of the model, or their plain data
+    :param observe: ``"qv"`` for positions and velocities, ``"q"`` for positions only, where
+        :meth:`infer` says that velocities are zero
+    :param payload: name of the site or body that may carry an unknown mass
+    :param masses: whether mass, centre and inertia of each body are parameters
+    :param dt: control interval [s]; default: the model's time step
+    :param substeps: default: as many as keep to the model's time step
+    :param reward: of a task; None: zero
+    :param terminated: when a task ends; None: never
+    :param settings: values of parameters
+    """
+
+    name = "MuJoCo"
+
+    def __init__(
+        self,
+        mechanism: Mechanism | Mapping[str, Any] | None = None,
+        *,
+        observe: str = "qv",
+        payload: str | None = None,
+        masses: bool = False,
+        dt: float | None = None,
+        substeps: int | None = None,
+        reward: Reward | None = None,
+        terminated: Terminated | None = None,
+        **settings: Any,
+    ) -> None:
+        if mechanism is None:
+            raise ParameterError(
+                "A twin of this kind needs a model: twins.from_mujoco(path of an MJCF or URDF)."
+            )
+        if not isinstance(mechanism, Mechanism):
+            mechanism = Mechanism.from_spec(mechanism)
+        if observe not in ("q", "qv"):
+            raise ParameterError(f"{mechanism.name} can observe 'q' or 'qv', got {observe!r}.")
+        self.mechanism, self.name, self.observed = mechanism, mechanism.name, observe
+        self.masses = bool(masses)
+        self.payload = None if payload is None else place_of(mechanism, payload)
+        self.equation = Equation(mechanism, self.payload, self.masses)
+        self.actuation = Actuation(mechanism)
+        self.parameters = self.equation.parameters | of_drives(mechanism)
+        self.native_effects = native_effects(mechanism)
+        # What a drive is told to damp it knows; viscous friction would do just the same.
+        servos = ("position", "velocity")
+        self.known_parameters = frozenset(
+            f"{drive.name}_kv" for drive in mechanism.drives if drive.role in servos
+        )
+        limits = [link.limit or _UNLIMITED for link in mechanism.links for _ in link.dofs]
+        self.joints = tuple(
+            Joint(*joint, *limit) for joint, limit in zip(dof_names(mechanism), limits, strict=True)
+        )
+        self.actuators = tuple(_actuators(mechanism))
+        self.channels = (*_positions(mechanism), *(_velocities(mechanism) * (observe == "qv")))
+        self._reward, self._terminated = reward, terminated
+        self.integrator = rk4 if mechanism.integrator == "rk4" else semi_implicit_euler
+        self._digest = hashlib.sha1(json.dumps(mechanism.to_spec()).encode()).hexdigest()
+        dt = mechanism.timestep if dt is None else dt
+        if substeps is None and dt > 0.0:
+            substeps = max(1, math.ceil(dt / mechanism.timestep - 1e-6))
+        super().__init__(dt=dt, substeps=substeps, **settings)
+
+    # --- dynamics
+
+    def actuate(self, state: State, action: Action, params: Params) -> Force:
+        return self.actuation.force(self._moving(state), action, params)
+
+    def mass_matrix(self, q: Position, params: Params) -> MassMatrix:
+        return self.equation.mass_matrix(q, params)
+
+    def bias(self, q: Position, v: Velocity, params: Params) -> Force:
+        return self.equation.bias(q, v, params, self._explicit_step)
+
+    def accelerate(self, state: State, command: Action, added: Force, params: Params) -> Velocity:
+        force = self.actuate(state, command, params) + added
+        coupling = self._coupling(state, command, params)
+        q, v, step = state.q, state.v, self._explicit_step
+        return self.equation.acceleration(q, v, force, coupling, params, step)
+
+    def _coupling(self, state: State, command: Action, params: Params) -> MassMatrix:
+        """The step times slopes by velocities, of what the integrator takes at its end."""
+        mechanism, h = self.mechanism, self.dt / self.substeps
+        implicit = mechanism.integrator == "implicitfast"
+        slope = jnp.zeros_like(state.v)
+        if not self._explicit_step:
+            slope = h * self.equation.resistance(state.v, params, self._explicit_step)[1]
+        found = jnp.diag(slope)
+        if implicit and any(drive.follows_speed for drive in mechanism.drives):
+            found = found - h * self.actuation.slope(self._moving(state), command, params)
+        return found
+
+    @property
+    def _explicit_step(self) -> float:
+        """The step [s] where damping is taken at its beginning, 0 where it is at its end."""
+        euler = self.mechanism.integrator == "euler" and self.mechanism.implicit_damping
+        implicit = euler or self.mechanism.integrator == "implicitfast"
+        return 0.0 if implicit else self.dt / self.substeps
+
+    def _moving(self, state: State) -> Moving:
+        return Moving(state.q, self.coordinates(state.q), state.v)
+
+    def typical_forces(self) -> tuple[float, ...]:
+        """Gravity's at random positions, and the most that actuators are said to exert."""
+        usual = self.equation.typical
+        return tuple((usual.weight + usual.drive).tolist())
+
+    # --- positions
+
+    def coordinates(self, q: Position) -> Coordinates:
+        """Where a joint has a quaternion: the rotation vector from its reference."""
+        return self._between(q, self._reference(q)) if self._curved else q
+
+    def displace(self, q: Position, way: Velocity) -> Position:
+        parts = []
+        for link in self.mechanism.links:
+            here, ahead = _q(link, q), way[link.v : link.v + len(link.dofs)]
+            if link.kind == FREE:
+                parts += [here[:3] + ahead[:3], turned(here[3:], ahead[3:])]
+            elif link.kind == BALL:
+                parts.append(turned(here, ahead))
+            else:
+                parts.append(here + ahead)
+        return jnp.concatenate(parts) if self._curved else q + way
+
+    def difference(self, state: State, reference: State) -> Tangent:
+        rest = ravel_pytree(state.memory)[0] - ravel_pytree(reference.memory)[0]
+        way = self._between(state.q, reference.q)
+        return jnp.concatenate([way, state.v - reference.v, rest])
+
+    def retract(self, state: State, tangent: Tangent) -> State:
+        n = self.mechanism.n_v
+        memory, unravel = ravel_pytree(state.memory)
+        q = self.displace(state.q, tangent[:n])
+        return State(q, state.v + tangent[n : 2 * n], unravel(memory + tangent[2 * n :]))
+
+    @property
+    def _curved(self) -> bool:
+        return self.mechanism.n_q != self.mechanism.n_v
+
+    def _between(self, q: Position, reference: Position) -> Coordinates:
+        if not self._curved:
+            return q - reference
+        parts = []
+        for link in self.mechanism.links:
+            here, there = _q(link, q), _q(link, reference)
+            if link.kind == FREE:
+                turn = turn_between(here[3:], there[3:])
+                parts += [here[:3] - there[:3], turn]
+            elif link.kind == BALL:
+                parts.append(turn_between(here, there))
+            else:
+                parts.append(here - there)
+        return jnp.concatenate(parts)
+
+    def _reference(self, q: Position) -> Position:
+        """Zero of every joint, and no rotation."""
+        zero = np.zeros(self.mechanism.n_q)
+        for link in self.mechanism.links:
+            if link.kind in (BALL, FREE):
+                zero[link.q + (3 if link.kind == FREE else 0)] = 1.0
+        return jnp.asarray(zero, q.dtype)
+
+    # --- measurements
+
+    def initial(self, key: PRNGKeyArray, params: Params) -> State:
+        """At rest near where the model stands: its first keyframe, or its reference position."""
+        start, n = jnp.array(self.mechanism.start), self.mechanism.n_v
+        way = jax.random.uniform(key, (n,), minval=-_NEAR_START, maxval=_NEAR_START)
+        return State(self.displace(start, way.astype(start.dtype)), jnp.zeros(n, start.dtype), {})
+
+    def infer(self, obs: Obs, params: Params) -> State:
+        n = self.mechanism.n_q
+        q = obs[:n]
+        for link in self.mechanism.links if self._curved else ():
+            if link.kind in (BALL, FREE):
+                at = link.q + (3 if link.kind == FREE else 0)
+                q = q.at[at : at + 4].set(normalized(q[at : at + 4]))
+        v = obs[n:] if self.observed == "qv" else jnp.zeros(self.mechanism.n_v, obs.dtype)
+        return State(q, v, {})
+
+    def observe(self, state: State, params: Params) -> Obs:
+        return jnp.concatenate([state.q, state.v]) if self.observed == "qv" else state.q
+
+    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
+        if self._reward is None:
+            return super().reward(state, action, next_state, params)
+        return self._reward(state, action, next_state, params)
+
+    def terminated(self, state: State, params: Params) -> Flag:
+        if self._terminated is None:
+            return super().terminated(state, params)
+        return self._terminated(state, params)
+
+    def skeleton(self, state: State) -> Float[Array, "capsules 2 3"]:
+        """
+        :return: both ends of a capsule for each link: from its parent's frame to its own, and from
+            the frame of a last link to its centre of mass, or the farthest site or body there [m]
+        """
+        links, zero = self.mechanism.links, jnp.zeros_like(state.v[0])
+        frames = frames_of(links, list(state.q))
+        place = lambda point: jnp.stack([zero + x for x in point])  # noqa: E731
+        found = []
+        for i, link in enumerate(links):
+            if link.parent >= 0:
+                found.append(jnp.stack([place(frames[link.parent][1]), place(frames[i][1])]))
+            elif link.kind != FREE:
+                found.append(jnp.stack([place(alg.ZERO), place(frames[i][1])]))
+            if any(other.parent == i for other in links):
+                continue
+            here = [p.position for p in self.mechanism.places if p.link == i]
+            ends = here + ([link.body.centre] if link.body else [])
+            tip = max(ends, key=lambda end: sum(x * x for x in end), default=alg.ZERO)
+            rotation, origin = frames[i]
+            outwards = alg.vadd(origin, alg.apply(rotation, tip))
+            found.append(jnp.stack([place(origin), place(outwards)]))
+        return jnp.stack(found)
+
+    def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
+        """The mechanism seen along y: from the world through all joints to each last body."""
+        links, zero = self.mechanism.links, jnp.zeros_like(state.v[0])
+        frames = frames_of(links, list(state.q))
+        seen = lambda place: jnp.stack([zero + place[0], zero + place[2]])  # noqa: E731
+        places = [seen(origin) for _, origin in frames]
+        points = [jnp.stack([zero, zero])]
+        for i, link in enumerate(links):
+            if any(other.parent == i for other in links):
+                continue
+            chain = [i]
+            while links[chain[-1]].parent >= 0:
+                chain.append(links[chain[-1]].parent)
+            rotation, origin = frames[i]
+            tip = alg.vadd(origin, alg.apply(rotation, link.body.centre if link.body else alg.ZERO))
+            outwards = [*(places[j] for j in reversed(chain)), seen(tip)]
+            points += [*outwards, *reversed(outwards[:-1]), points[0]]
+        return jnp.stack(points)
+
+    # --- plain data
+
+    def to_spec(self) -> dict[str, Any]:
+        """Without reward and termination, which are programs."""
+        options = {
+            "mechanism": self.mechanism.to_spec(),
+            "observe": self.observed,
+            "payload": self.payload and self.payload.name,
+            "masses": self.masses,
+            "dt": self.dt,
+            "substeps": self.substeps,
+        }
+        return {"twin": "MuJoCo", "options": options, "parameters": dict(self.values)}
+
+    def structure(self) -> tuple[Any, ...]:
+        own = (self._digest, self.observed, self.payload, self.masses)
+        return (*super().structure(), *own, self._reward, self._terminated)
+
+
+def _q(link: Link, q: Position) -> Any:
+    return q[link.q : link.q + {FREE: 7, BALL: 4}.get(link.kind, 1)]
+
+
+def _actuators(mechanism: Mechanism) -> list[Actuator]:
+    found = []
+    for drive in mechanism.drives:
+        straight = mechanism.links[drive.link].kind == SLIDE
+        for name, limits in zip(drive.inputs, drive.ranges, strict=True):
+            low, high = limits or (-math.inf, math.inf)
+            full = f"{drive.name}_{name}" if len(drive.inputs) > 1 else drive.name
+            found.append(Actuator(full, _unit_of(drive, name, straight), low, high))
+    return found
+
+
+def _unit_of(drive: Any, name: str, straight: bool) -> str:
+    force, length = ("N", "m") if straight else ("N m", "rad")
+    geared = drive.gear != (1.0,)
+    if drive.kind == "affine":
+        name = {"position": "pos", "velocity": "vel"}.get(drive.role, "")
+        if drive.role == "motor" and drive.gain[0] == 1.0 and not geared:
+            return force
+    units = {"pos": length, "vel": f"{length}/s", "ff": force, "voltage": "V"}
+    return "1" if geared and name != "voltage" else units.get(name, "1")
+
+
+def _positions(mechanism: Mechanism) -> list[Channel]:
+    found = []
+    for link in mechanism.links:
+        if link.kind == FREE:
+            found += [Channel(f"{link.joint}_{axis}", "m") for axis in "xyz"]
+        if link.kind in (BALL, FREE):
+            found += [Channel(f"{link.joint}_q{part}", "1") for part in "wxyz"]
+        else:
+            found.append(Channel(f"{link.joint}_position", "m" if link.kind == SLIDE else "rad"))
+    return found
+
+
+def _velocities(mechanism: Mechanism) -> list[Channel]:
+    return [Channel(f"{name}_velocity", f"{unit}/s") for name, unit in dof_names(mechanism)]

@@ -1,0 +1,107 @@
+"""Robots that others measured, from their URDF through the command line."""
+
+import json
+import os
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from sb3_hds import cli, twins
+from sb3_hds.core import rollout
+from sb3_hds.data.columns import Columns
+from sb3_hds.data.reading import read_log
+from sb3_hds.sysid.equation.smoothing import smooth
+
+pytestmark = [
+    pytest.mark.measured,
+    pytest.mark.skipif("SB3_HDS_DATA" not in os.environ, reason="data outside the repository"),
+    pytest.mark.usefixtures("quick_compilation"),
+]
+UR10 = Path(os.environ.get("SB3_HDS_DATA", "."), "ur10")
+# Of SOURCE.txt: least squares on inverse dynamics, accelerations by a Savitzky-Golay filter.
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+COULOMB = (12.7, 14.7, 8.4, 2.9, 2.5, 3.0)  # [N m]
+VISCOUS = (19.2, 22.7, 8.6, 3.2, 3.0, 3.0)  # [N m s/rad]
+TRAINED, STEPS = 2400, 25
+
+
+BAG = UR10 / "ur10_exciting_trajectory.db3"
+
+
+def calibrated(folder, log):
+    words = [
+        *("calibrate", "--model", UR10 / "ur10.urdf", "--data", log, "--errors", "force"),
+        *("--free", "*_damping", "*_frictionloss"),
+        *("--json", folder / "fit.json", "--write", folder / "corrected.xml"),
+    ]
+    assert cli.main([str(word) for word in words]) == 0
+    return json.loads((folder / "fit.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def ur10(tmp_path_factory):
+    """Calibrated on the first 19 s of 27.5: the twin, the corrected file, and all signals."""
+    folder = tmp_path_factory.mktemp("ur10")
+    table = read_log(BAG, Columns()).tables[0]
+    names = [name for name in table if "[" in name or "stamp" in name]
+    rows = np.stack([table[name] for name in names], 1)[:TRAINED]
+    np.savetxt(folder / "a.csv", rows, "%.9f", ",", header=",".join(names), comments="")
+    told = calibrated(folder, folder / "a.csv")
+    signals = {
+        kind: np.stack([table[f"/joint_states:{kind}[{j}_joint]"] for j in JOINTS], 1)
+        for kind in ("position", "velocity", "effort")
+    }
+    return twins.from_spec(told["twin"], ()), folder / "corrected.xml", signals
+
+
+def test_friction_of_a_ur10_is_that_of_its_publishers_within_a_quarter(tmp_path):
+    found = {e["name"]: e["estimate"] for e in calibrated(tmp_path, BAG)["estimates"]}
+
+    for joint, coulomb, viscous in zip(JOINTS, COULOMB, VISCOUS, strict=True):
+        assert found[f"{joint}_joint_frictionloss"] == pytest.approx(coulomb, rel=0.25)
+        assert found[f"{joint}_joint_damping"] == pytest.approx(viscous, rel=0.25)
+
+
+def test_its_corrected_file_predicts_held_out_seconds_as_well_as_the_twin(ur10, x64):
+    """Windows of 0.2 s from measured states, in units of what each joint moves in them."""
+    corrected, file, signals = ur10
+    q, v, effort = (signals[kind] for kind in ("position", "velocity", "effort"))
+    v = np.stack([smooth(q[:, j], v[:, j], 0.008).v for j in range(6)], 1)
+    begins = np.arange(TRAINED, len(q) - STEPS - 1, STEPS)
+    model = mujoco.MjModel.from_xml_path(str(file))
+    data = mujoco.MjData(model)
+    nominal = twins.from_mujoco(UR10 / "ur10.urdf", dt=0.008)
+
+    def of(twin):
+        params = {name: jnp.asarray(value, jnp.float64) for name, value in twin.values.items()}
+
+        def one(start, actions):
+            return rollout(twin, params, twin.infer(start, params), actions).obs
+
+        actions = np.stack([effort[k : k + STEPS] for k in begins])
+        starts = np.concatenate([q[begins], v[begins]], 1)
+        return np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(starts), jnp.asarray(actions)))
+
+    def stepped(k):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:] = q[k], v[k]
+        seen = []
+        for action in effort[k : k + STEPS]:
+            data.ctrl[:] = action
+            for _ in range(corrected.substeps):
+                mujoco.mj_step(model, data)
+            seen.append(data.qpos.copy())
+        return seen
+
+    measured = np.stack([q[k + 1 : k + 1 + STEPS] for k in begins])
+    scale = np.std(measured - q[begins][:, None], (0, 1))
+    error = lambda found: np.sqrt(np.mean(((found - measured) / scale) ** 2))  # noqa: E731
+    ours, before = (error(of(twin)[:, 1:, :6]) for twin in (corrected, nominal))
+    theirs = error(np.array([stepped(k) for k in begins]))
+
+    assert ours < 0.5 < before
+    assert theirs < 1.1 * ours

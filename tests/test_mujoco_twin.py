@@ -1,0 +1,591 @@
+"""Twins of model files: against MuJoCo's own steps, and in what they read, refuse and derive."""
+
+import functools
+import json
+import os
+import re
+import warnings
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import small_robots as robots
+from jax.flatten_util import ravel_pytree
+
+from sb3_hds import Trajectories, effects, twins
+from sb3_hds.core import State, rollout
+from sb3_hds.data import audit
+from sb3_hds.errors import ModelFileError, ParameterError
+from sb3_hds.sysid.hypotheses import Hypotheses
+
+pytestmark = pytest.mark.usefixtures("quick_compilation", "x64")
+
+GYMNASIUM = os.path.join(os.path.dirname(gymnasium.__file__), "envs/mujoco/assets")
+OFF = mujoco.mjtDisableBit
+# What a twin leaves out, where it is told to.
+NOTHING_TOUCHES = int(OFF.mjDSBL_CONTACT) | int(OFF.mjDSBL_LIMIT)
+INTEGRATORS = {"euler": 0, "rk4": 1, "implicitfast": 3}
+
+
+def shipped(name):
+    model = mujoco.MjModel.from_xml_path(os.path.join(GYMNASIUM, name))
+    model.opt.disableflags |= NOTHING_TOUCHES
+    return model
+
+
+MODELS = {
+    "reacher": lambda: shipped("reacher.xml"),
+    "half cheetah": lambda: shipped("half_cheetah.xml"),
+    "cart-pole": lambda: robots.compiled(robots.CART_POLE),
+    "gripper": lambda: robots.compiled(robots.GRIPPER),
+    "ball joint": lambda: robots.compiled(robots.BALL),
+    "arm of 6 servos": lambda: robots.compiled(robots.chain(6, actuator="position")),
+    "arm of 7 motors": lambda: robots.compiled(robots.chain(7)),
+    "arm of 3 speeds": lambda: robots.compiled(robots.chain(3, actuator="velocity")),
+    "held quadruped": lambda: robots.compiled(robots.quadruped()),
+    "free quadruped": lambda: robots.compiled(robots.quadruped(robots.FREE_BASE)),
+}
+# The others run now and then: what differs is the program of every pair.
+QUICK = {
+    ("reacher", "rk4"),
+    ("cart-pole", "rk4"),
+    ("gripper", "implicitfast"),
+    ("ball joint", "euler"),
+    ("arm of 6 servos", "implicitfast"),
+    ("arm of 3 speeds", "implicitfast"),
+    ("held quadruped", "euler"),
+}
+
+
+def commands_for(model, n, seed=0):
+    """Random, and beyond their limits now and then."""
+    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-1, 1)).T
+    return np.random.default_rng(seed).uniform(1.2 * low, 1.2 * high, (n, model.nu))
+
+
+def start_of(model, seed=0):
+    """Somewhere, in motion."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(seed)
+    mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 0.5)
+    data.qvel[:] = rng.normal(size=model.nv)
+    return data
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def simulated(twin, params, q, v, actions):
+    states = rollout(twin, params, State(q, v, {}), actions).states
+    return states.q, states.v
+
+
+def assert_follows(twin, model, n=200, seed=0, tolerance=1e-12):
+    data, actions = start_of(model, seed), commands_for(model, n, seed)
+    q, v = simulated(twin, twin.params, jnp.array(data.qpos), jnp.array(data.qvel), actions)
+    for k, action in enumerate(actions):
+        data.ctrl[:] = action
+        mujoco.mj_step(model, data)
+        theirs, ours = np.r_[data.qpos, data.qvel], np.r_[q[k + 1], v[k + 1]]
+        # Rounding of 1e-16 per operation, grown along 200 steps.
+        np.testing.assert_allclose(ours, theirs, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize(
+    ("name", "integrator"),
+    [
+        pytest.param(
+            name,
+            integrator,
+            marks=[] if (name, integrator) in QUICK else pytest.mark.expensive,
+        )
+        for name in MODELS
+        for integrator in INTEGRATORS
+    ],
+)
+def test_a_twin_steps_as_mujoco_does(name, integrator):
+    model = MODELS[name]()
+    model.opt.integrator = INTEGRATORS[integrator]
+
+    assert_follows(twins.from_mujoco(model), model)
+
+
+def one_step(twin, model, values, n=3):
+    """Accelerations of the twin under these values and of the model, at a few states."""
+    found = []
+    for seed in range(n):
+        data = start_of(model, seed)
+        q, v, action = data.qpos.copy(), data.qvel.copy(), commands_for(model, 1, seed)
+        data.ctrl[:] = action[0]
+        mujoco.mj_step(model, data)
+        _, ours = simulated(twin, values, jnp.array(q), jnp.array(v), action)
+        found.append((np.asarray(ours[1]) - v, data.qvel - v))
+    return np.stack(found, 1) / model.opt.timestep
+
+
+def turned(axis, angle, vector):
+    quaternion = np.zeros(4)
+    mujoco.mju_axisAngle2Quat(quaternion, np.eye(3)[axis], angle)
+    found = np.zeros(3)
+    mujoco.mju_rotVecQuat(found, np.asarray(vector), quaternion)
+    return found
+
+
+def set_row(field, row, value, column=None):
+    def change(model):
+        place = row if column is None else (row, column)
+        getattr(model, field)[place] = value
+
+    return change
+
+
+# In arm of 3 servos: parameter, value, and the same number in the model.
+NUMBERS = {
+    "j1_damping": (0.7, set_row("dof_damping", 1, 0.7)),
+    "j2_armature": (0.2, set_row("dof_armature", 2, 0.2)),
+    "j0_stiffness": (9.0, set_row("jnt_stiffness", 0, 9.0)),
+    "m1_kv": (7.0, set_row("actuator_biasprm", 1, -7.0, 2)),
+    "tilt_x": (0.3, lambda model: set_gravity(model, turned(0, 0.3, (0.0, 0.0, -9.81)))),
+    "tilt_y": (-0.2, lambda model: set_gravity(model, turned(1, -0.2, (0.0, 0.0, -9.81)))),
+    "link1_mass": (3.0, set_row("body_mass", 2, 3.0)),
+}
+
+
+def set_gravity(model, gravity):
+    model.opt.gravity[:] = gravity
+
+
+def set_gain(model):
+    model.actuator_gainprm[2, 0], model.actuator_biasprm[2, 1] = 80.0, -80.0
+
+
+@functools.cache
+def servo_arm():
+    xml = robots.chain(3, actuator="position", stiffness=4.0, springref=0.3)
+    xml = re.sub(r'forcerange="[^"]*"', "", xml)
+    model = robots.compiled(xml, integrator=3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return xml, twins.from_mujoco(model, payload="tip", masses=True)
+
+
+@pytest.mark.parametrize("name", [*NUMBERS, "m2_kp"])
+def test_a_parameter_is_the_number_of_the_model(name):
+    xml, twin = servo_arm()
+    value, change = NUMBERS.get(name, (80.0, set_gain))
+    model = robots.compiled(xml, integrator=3)
+    plain = one_step(twin, model, twin.params)
+    change(model)
+    if name == "link1_mass":
+        model.body_inertia[2] *= 3.0 / twin.values[name]  # the shape stays
+
+    ours, theirs = one_step(twin, model, twin.params | {name: value})
+
+    np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)  # differences over 2 ms
+    assert np.abs(ours - plain[0]).max() > 1e-3
+
+
+def test_a_payload_is_a_point_mass_near_its_site():
+    xml, twin = servo_arm()
+    spec = mujoco.MjSpec.from_string(xml)
+    spec.option.integrator = 3
+    site = spec.site("tip")
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, robots.compiled(xml).site("tip").quat)
+    offset = np.array([0.03, -0.02, 0.05])
+    load = site.parent.add_body(pos=site.pos + rotation.reshape(3, 3) @ offset)
+    load.mass, load.inertia, load.ipos, load.explicitinertial = 0.4, [1e-14] * 3, [0.0] * 3, True
+    values = dict(zip("xyz", offset, strict=True))
+    values = {f"tip_payload_{axis}": x for axis, x in values.items()} | {"tip_payload": 0.4}
+
+    ours, theirs = one_step(twin, spec.compile(), twin.params | values)
+
+    np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
+
+
+def test_any_values_of_a_body_make_a_possible_inertia():
+    """Second moments of mass stay those of some shape: here they are computed beside the twin."""
+    xml, twin = servo_arm()
+    model = robots.compiled(xml, integrator=3)
+    body, rng = model.body("link2").id, np.random.default_rng(3)
+    stretch, shear, centre = rng.uniform(-0.8, 0.8, 3), rng.uniform(-1, 1, 3), [0.02, 0.03, 0.1]
+    values = {f"link2_stretch_{axis}": x for axis, x in zip("xyz", stretch, strict=True)}
+    values |= {f"link2_shear_{p}": x for p, x in zip(("xy", "xz", "yz"), shear, strict=True)}
+    values |= {f"link2_com_{axis}": x for axis, x in zip("xyz", centre, strict=True)}
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, model.body_iquat[body])
+    principal = turn.reshape(3, 3) @ np.diag(model.body_inertia[body]) @ turn.reshape(3, 3).T
+    moments = 0.5 * np.trace(principal) * np.eye(3) - principal
+    upper = np.diag(np.exp(stretch))
+    upper[0, 1], upper[0, 2], upper[1, 2] = shear
+    moments = upper @ moments @ upper.T
+    inertia, axes = np.linalg.eigh(np.trace(moments) * np.eye(3) - moments)
+    axes[:, 0] *= np.linalg.det(axes)
+    model.body_inertia[body], model.body_ipos[body] = inertia, centre
+    mujoco.mju_mat2Quat(model.body_iquat[body], axes.ravel())
+
+    ours, theirs = one_step(twin, model, twin.params | values)
+
+    np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
+    assert np.linalg.eigvalsh(moments).min() > 0.0
+
+
+def test_a_dc_motor_has_its_constant_and_resistance():
+    model = robots.compiled(robots.GRIPPER)
+    twin = twins.from_mujoco(model)
+    values = twin.params | {"spin_motorconst": 0.08, "spin_resistance": 3.0}
+    i = model.actuator("spin").id
+    model.actuator_gainprm[i, 0], model.actuator_gainprm[i, 1] = 3.0, 0.08
+
+    ours, theirs = one_step(twin, model, values)
+
+    np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
+
+
+# --- dry friction
+
+
+SLIDER = """<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody><body>
+<joint name="rail" type="slide" axis="1 0 0" frictionloss="{}"/><geom size="0.1" mass="2"/></body>
+</worldbody></mujoco>"""
+
+
+def test_dry_friction_brings_a_slider_to_rest_as_mujocos_does():
+    model = mujoco.MjModel.from_xml_string(SLIDER.format(3.0))
+    twin, data = twins.from_mujoco(model), mujoco.MjData(model)
+    assert twin.values["rail_frictionloss"] == 3.0
+    _, v = simulated(twin, twin.params, jnp.zeros(1), jnp.ones(1), np.zeros((500, 1)))
+
+    data.qvel[:] = 1.0
+    for k in range(1, 501):
+        mujoco.mj_step(model, data)
+        # It stops after m v / tau_c = 2 / 3 s; MuJoCo's own is soft, too.
+        assert v[k, 0] == pytest.approx(max(1.0 - 1.5 * 0.002 * k, 0.0), abs=0.02)
+        assert v[k, 0] == pytest.approx(data.qvel[0], abs=0.02)
+    assert abs(v[-1, 0]) < 1e-3
+
+
+def test_dry_friction_as_an_effect_adds_to_that_of_the_model():
+    model = mujoco.MjModel.from_xml_string(SLIDER.format(1.0))
+    twin = twins.from_mujoco(model)
+
+    added = effects.CoulombFriction("rail", tau_c=2.0), effects.ViscousFriction("rail", b=1.0)
+    extended = twin.extend(*added)
+    more = twin.with_parameters(rail_frictionloss=3.0, rail_damping=1.0)
+
+    start = State(jnp.zeros(1), jnp.ones(1), {})
+    after = [t.step(start, jnp.zeros(1), t.params).v for t in (extended, more)]
+    assert after[0] == after[1] and not extended.infer(jnp.zeros(2), extended.params).memory
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_strong_dry_friction_does_not_shake_a_light_joint(integrator):
+    """A force that could stop the joint a hundred times within one step."""
+    model = mujoco.MjModel.from_xml_string(SLIDER.format(0.0))
+    twin = twins.from_mujoco(model, integrator=integrator)
+    params = twin.params | {"rail_frictionloss": 1e4}
+
+    _, v = simulated(twin, params, jnp.zeros(1), jnp.ones(1), np.zeros((50, 1)))
+
+    assert np.all(np.diff(np.abs(v[:, 0])) <= 0.0) and abs(v[-1, 0]) < 0.1
+
+
+def test_a_gain_as_an_effect_multiplies_that_of_a_motor():
+    twin = twins.from_mujoco(robots.compiled(robots.chain(1)))
+    gained = twin.extend(effects.TorqueGain("m0", gain=0.8))
+
+    start, action = State(jnp.zeros(1), jnp.zeros(1), {}), jnp.array([0.5])
+    expected = twin.step(start, action, twin.params | {"m0_gain": 0.8})
+    assert gained.step(start, action, gained.params) == expected
+
+
+# --- derivatives
+
+
+def perturbed(twin, seed=0):
+    """A step as a function of small changes of state, action and parameters; and where."""
+    rng = np.random.default_rng(seed)
+    scales = {name: p.scale for name, p in twin.parameters.items()}
+    values = {
+        name: np.clip(twin.values[name] + 0.3 * rng.normal() * p.scale, p.lower, p.upper)
+        for name, p in twin.parameters.items()
+    }
+    start = twin.initial(jax.random.key(seed), values)
+    start = start._replace(v=jnp.asarray(rng.normal(size=len(twin.joints))))
+    action = jnp.asarray(rng.uniform(-0.5, 0.5, len(twin.actuators)))
+
+    def moved(change):
+        tangent, push, shift = change
+        params = {name: values[name] + shift[name] * scales[name] for name in scales}
+        after = twin.step(twin.retract(start, tangent), action + push, params)
+        return twin.difference(after, start)
+
+    still = jnp.zeros(2 * len(twin.joints)), jnp.zeros_like(action)
+    return moved, (*still, {name: jnp.zeros(()) for name in scales})
+
+
+@pytest.mark.parametrize(
+    ("make", "options"),
+    [
+        pytest.param(lambda: robots.GRIPPER, {"payload": "pad"}, id="gripper"),
+        pytest.param(
+            lambda: robots.BALL, {"payload": "lower", "integrator": "euler"}, id="ball joint"
+        ),
+        pytest.param(lambda: robots.chain(2), {"payload": "tip", "masses": True}, id="masses"),
+        pytest.param(
+            lambda: robots.quadruped(robots.FREE_BASE),
+            {"payload": "back"},
+            id="free quadruped",
+            marks=pytest.mark.expensive,
+        ),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:Of .* inertial parameters")
+def test_derivatives_are_those_of_finite_differences_both_ways(make, options):
+    twin = twins.from_mujoco(robots.compiled(make()), **options)
+    function, where = perturbed(twin)
+    here, unflatten = ravel_pytree(where)
+    flat = lambda x: function(unflatten(x))  # noqa: E731
+    along = jax.jit(lambda x, way: jax.jvp(flat, (x,), (way,)))
+    weights = jnp.asarray(np.random.default_rng(1).normal(size=2 * len(twin.joints)))
+
+    slopes = np.stack([along(here, way)[1] for way in np.eye(len(here))], 1)
+    reverse = jax.jit(lambda w: jax.vjp(flat, here)[1](w)[0])(weights)
+
+    np.testing.assert_allclose(weights @ slopes, reverse, rtol=1e-9, atol=1e-11)
+    width, still = 1e-6, np.zeros(len(here))
+    ends = [
+        [along(here + sign * width * e, still)[0] for e in np.eye(len(here))] for sign in (1, -1)
+    ]
+    differences = (np.stack(ends[0], 1) - np.stack(ends[1], 1)) / (2.0 * width)
+    # Rounding of 1e-16 over 1e-6, and curvature of dry friction.
+    np.testing.assert_allclose(slopes, differences, rtol=1e-6, atol=1e-7)
+
+
+def test_a_difference_of_orientations_leads_from_one_to_the_other():
+    twin = twins.from_mujoco(robots.compiled(robots.quadruped(robots.FREE_BASE)))
+    one, other = (twin.initial(jax.random.key(i), twin.params) for i in range(2))
+    n = len(twin.joints)
+    assert one.q.shape == (n + 1,) and len(twin.channels) == 2 * n + 1
+
+    way = twin.difference(other, one)
+    again = twin.retract(one, way)
+
+    np.testing.assert_allclose(again.q, other.q, rtol=0.0, atol=1e-14)
+    model, theirs = robots.compiled(robots.quadruped(robots.FREE_BASE)), np.zeros(n)
+    mujoco.mj_differentiatePos(model, theirs, 1.0, np.asarray(one.q), np.asarray(other.q))
+    np.testing.assert_allclose(way[:n], theirs, rtol=0.0, atol=1e-14)
+    # Effects see one number per joint: here of a turn by 0.3 rad about y.
+    home = jnp.array(model.qpos0).at[3:7].set([np.cos(0.15), 0.0, np.sin(0.15), 0.0])
+    np.testing.assert_allclose(twin.coordinates(home)[3:6], [0.0, 0.3, 0.0], atol=1e-15)
+
+
+def test_derivatives_are_finite_in_single_precision():
+    with jax.enable_x64(False):
+        twin = twins.from_mujoco(robots.compiled(robots.BALL))
+        start = twin.initial(jax.random.key(0), twin.params)
+        loss = lambda v: jnp.sum(twin.step(start._replace(v=v), jnp.zeros(6), twin.params).q)  # noqa: E731
+
+        slope = jax.jit(jax.grad(loss))(start.v)
+
+    assert slope.dtype == jnp.float32 and np.isfinite(slope).all()
+
+
+# --- effects
+
+
+def test_effects_attach_to_every_joint_actuator_and_channel():
+    """Those of a joint of three degrees of freedom, too; and a spring there sees its turn."""
+    twin = twins.from_mujoco(robots.compiled(robots.BALL))
+    at = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}
+    kinds = (*effects.ALL, *effects.NAMELESS)
+    wanted = [kind(i) for kind in kinds for i in range(len(at[kind.slot]))]
+
+    extended = twin.extend(*wanted)
+    spring = twin.extend(effects.Stiffness("shoulder_ry", k=2.0))
+
+    assert len(extended.attached) == len(wanted)
+    assert extended.parameters["viscous_friction.shoulder_rx.b"].unit == "N m s/rad"
+    start = extended.initial(jax.random.key(0), extended.params)
+    after = jax.eval_shape(extended.step, start, jnp.zeros(6), extended.params)
+    assert after.q.shape == (5,)
+    q, v = jnp.array([np.cos(0.2), 0.0, np.sin(0.2), 0.0, 0.0]), jnp.zeros(4)
+    action = jnp.zeros(6)
+    start = State(q, v, spring.infer(jnp.r_[q, v], spring.params).memory)
+    pulled = spring.step(start, action, spring.params).v
+    pulled -= twin.step(State(q, v, {}), action, twin.params).v
+    # Turned by 0.4 rad about y. The integrator's damping and feedback belong to the inertia.
+    matrix = twin.mass_matrix(q, twin.params) + twin._coupling(start, action, twin.params)
+    np.testing.assert_allclose(matrix @ pulled / twin.dt, [0.0, -2.0 * 0.4, 0.0, 0.0], atol=1e-12)
+
+
+# --- files
+
+
+URDF = """<robot name="two">
+  <link name="base"><visual><geometry><mesh filename="package://r/base.dae"/></geometry></visual>
+    <collision><geometry><mesh filename="package://r/base.stl"/></geometry></collision></link>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
+    <origin xyz="0 0 1" rpy="1.57079632679 0 0"/><axis xyz="0 1 0"/>
+    <limit lower="-1" upper="2" effort="10" velocity="2"/>
+    <dynamics damping="0.3" friction="0.2"/></joint>
+  <link name="upper"><inertial><mass value="1"/><origin xyz="0 0 0.2"/>
+    <inertia ixx="0.01" iyy="0.02" izz="0.03" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><mesh filename="package://r/upper.stl"/></geometry></collision></link>
+  <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/>
+    <origin xyz="0 0 0.4"/><axis xyz="0 1 0"/>{mimic}</joint>
+  <link name="lower"><inertial><mass value="0.5"/><origin xyz="0 0 0.1"/>
+    <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="flange" type="fixed"><parent link="lower"/><child link="tool"/>
+    <origin xyz="0 0 0.2"/></joint>
+  <link name="tool"/>
+</robot>"""
+
+
+def test_a_urdf_without_its_meshes_has_motors_and_its_tool():
+    twin = twins.from_mujoco(URDF.format(mimic=""), payload="tool")
+
+    assert twin.name == "two" and [joint.name for joint in twin.joints] == ["shoulder", "elbow"]
+    assert twin.actuators[0] == ("shoulder", "N m", -10.0, 10.0)
+    assert twin.actuators[1] == ("elbow", "N m", -np.inf, np.inf)
+    assert (twin.values["shoulder_damping"], twin.values["shoulder_frictionloss"]) == (0.3, 0.2)
+    # Along the link, whose z axis is the hinge's.
+    assert twin.payload.link == 1 and np.hypot(*twin.payload.position[:2]) == pytest.approx(0.2)
+    assert twin.mechanism.integrator == "implicitfast" and twin.dt == 0.002
+
+
+def test_targets_of_joints_are_actions_where_a_controller_closes_the_loop():
+    gains = {"kind": "position", "kp": {"shoulder": 20.0, "elbow": 8.0}, "kv": 1.5, "limit": 6.0}
+    twin = twins.from_mujoco(URDF.format(mimic=""), actuators=gains)
+    state = State(jnp.array([0.1, -0.3]), jnp.array([0.5, 2.0]), {})
+
+    torque = twin.actuate(state, jnp.array([0.3, 1.0]), twin.params)
+
+    # kp (target - q) - kv v, and at most 6 N m.
+    expected = [20.0 * 0.2 - 1.5 * 0.5, min(8.0 * 1.3 - 1.5 * 2.0, 6.0)]
+    np.testing.assert_allclose(torque, expected, rtol=1e-12)
+    assert twin.values["elbow_kp"] == 8.0 and twin.parameters["elbow_kv"].unit == "N m s/rad"
+
+
+def test_the_interval_of_an_environment_is_the_twins():
+    env = gymnasium.make("Reacher-v5")
+
+    twin = twins.from_mujoco(env)
+
+    assert (twin.dt, twin.substeps) == (0.02, 2) and twin.name == "reacher"
+    assert twins.from_mujoco(env, dt=0.025).substeps == 3  # no longer than the model's 10 ms
+
+
+TOUCHING = robots.quadruped().replace('="0" conaffinity="0"', '="1" conaffinity="1"')
+BELT = '<tendon><fixed name="belt"><joint joint="j0" coef="1"/></fixed></tendon>'
+FILTER = '<general name="slow" joint="j0" dyntype="filter" dynprm="0.1"/>'
+OTHER_JOINT = {"kind": "position", "kp": {"j1": 1.0}}
+# What is passed, and a part of what is said.
+REFUSED = {
+    "contacts": (TOUCHING, {}, "Contacts can happen (trunk and FL_hip, "),
+    "joints that follow": (
+        URDF.format(mimic='<mimic joint="shoulder"/>'),
+        {},
+        "ignore=['equality']",
+    ),
+    "tendons": (robots.chain(2, more=BELT), {}, "Tendons pull (belt)"),
+    "fluid": (robots.chain(1, option='density="1.2"'), {}, "A medium of density 1.2"),
+    "memory": (robots.chain(1, actuator="none", drives=FILTER), {}, "internal dynamics (slow)"),
+    "integrator": (robots.chain(1, option='integrator="implicit"'), {}, "integrator 'implicit' is"),
+    "nothing to ignore": (robots.chain(1), {"ignore": "wind"}, "ignore takes contacts, equality"),
+    "engine": (robots.chain(1), {"engine": "engine"}, "engine must be 'smooth' or 'auto'"),
+    "actuators": (robots.chain(1), {"actuators": "servo"}, "actuators is one of 'torque'"),
+    "gain": (robots.chain(1), {"actuators": {"kind": "position"}}, "kp is missing"),
+    "other joint": (robots.chain(1), {"actuators": OTHER_JOINT}, "there is no joint 'j1'"),
+    "no place": (robots.chain(1), {"payload": "tpi"}, "no site or body 'tpi'"),
+    "observe": (robots.chain(1), {"observe": "v"}, "can observe 'q' or 'qv'"),
+    "no file": ("arm.xml", {}, "There is no file 'arm.xml'"),
+    "no model": ("<mujoco><arm/></mujoco>", {}, "MuJoCo refuses this text"),
+    "no source": (7, {}, "an environment of Gymnasium with MuJoCo inside, got int"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_a_twin_cannot_be_is_refused_with_the_way_out(name):
+    source, options, message = REFUSED[name]
+
+    with pytest.raises((ModelFileError, ParameterError), match=re.escape(message)):
+        twins.from_mujoco(source, **options)
+
+
+def test_what_is_ignored_is_left_out():
+    medium = robots.chain(1, option='density="1.2"')
+
+    assert twins.from_mujoco(medium, ignore=["fluid"]) == twins.from_mujoco(medium, ignore="fluid")
+
+
+def test_a_twin_survives_its_spec_without_the_file():
+    twin = twins.from_mujoco(robots.compiled(robots.BALL), payload="lower", dt=0.01)
+    twin = twin.with_parameters(lower_payload=0.2).extend(effects.ActionDelay("x", delay=0.03))
+
+    back = twins.from_spec(json.loads(json.dumps(twin.to_spec())), effects.KNOWN)
+
+    assert back == twin and hash(back) == hash(twin) and back.params == twin.params
+    assert back.base.channels == twin.base.channels and back.parameters == twin.parameters
+
+
+def test_models_of_other_numbers_are_other_programs_and_other_values_are_not():
+    xml = robots.chain(2)
+    light = twins.from_mujoco(xml)
+    heavy = twins.from_mujoco(xml.replace('density="900"', 'density="901"'))
+
+    assert light != heavy and light.with_parameters(j0_damping=3.0) == light
+
+
+def test_masses_that_no_motion_tells_are_named():
+    """Of a pendulum: its inertia about the hinge and two first moments."""
+    pendulum = robots.robot("pendulum", """<body><joint name="hinge" axis="0 1 0"/>
+      <inertial pos="0.01 0.02 -0.3" mass="1" fullinertia="0.02 0.03 0.04 0 0 0"/>
+      <body name="lid" pos="0 0 0.1"><geom size="0.01"/></body></body>""")  # fmt: skip
+
+    with pytest.warns(UserWarning, match=r"Of 11 inertial parameters of pendulum, 3 change nothing "
+                      r"\(body1_com_y, .*\), and 8 act only in 3 combinations"):  # fmt: skip
+        twins.from_mujoco(pendulum, masses=True)
+
+
+def test_the_sketch_leads_through_all_joints():
+    twin = twins.from_mujoco(robots.compiled(robots.CART_POLE))
+
+    points = twin.sketch(State(jnp.array([0.5, 0.3]), jnp.zeros(2), {}), twin.params)
+
+    np.testing.assert_allclose(points[:3], [[0.0, 0.0], [0.5, 1.0], [0.5, 1.0]], atol=1e-12)
+
+
+# --- data
+
+
+def test_recordings_at_a_limit_of_a_joint_are_a_caveat():
+    twin = twins.from_mujoco(robots.chain(2, range="-1.5 1.2"), dt=0.01)
+    time = np.linspace(0.0, 8.0, 801)
+    obs = np.stack([0.5 * np.sin(time), np.minimum(1.4 * np.sin(2.0 * time), 1.2)], 1)
+    obs = np.concatenate([obs, np.gradient(obs, 0.01, axis=0)], 1)
+    data = Trajectories.from_arrays([obs], [np.ones((800, 2))], dt=0.01)
+
+    found = [f for f in audit(data, twin=twin).findings if type(f).__name__ == "ReachedLimit"]
+
+    # 1.4 sin(2 t) reaches 1.2, less 0.2 % of the range, within 0.274 s of three tops in 8 s: 20 %.
+    assert [finding.channel for finding in found] == ["j1"] and not found[0].blocks
+    assert "Joint 'j1' is at its limit of 1.2 rad in 20 % of the samples" in str(found[0])
+    ignoring = twins.from_mujoco(robots.chain(2, range="-1.5 1.2"), ignore=["limits"])
+    assert all(np.isinf(joint.high) for joint in ignoring.joints)
+
+
+def test_what_is_asked_of_a_robot():
+    """A delay of the whole bus once; of a servo's own damping, friction is the candidate."""
+    twin = twins.from_mujoco(robots.chain(2, actuator="position"))
+    kinds = (effects.ActionDelay, effects.ViscousFriction, effects.CoulombFriction)
+
+    asked = Hypotheses.about(twin, kinds, ())
+
+    keys = {candidate.key for candidate in asked.candidates}
+    assert "action_delay.all" in keys and "parameter.m0_kp" in keys
+    assert "viscous_friction.j0" in keys and "coulomb_friction.j1" in keys
+    assert not keys & {"parameter.m0_kv", "parameter.j0_damping", "parameter.j1_frictionloss"}
+    lower = dict(zip(asked.names, asked.lower, strict=True))
+    # There may be less friction than the model has.
+    assert lower["viscous_friction.j0.b"] == -twin.values["j0_damping"]
