@@ -123,6 +123,8 @@ class Equation:
     :param actuator: force of the actuators, shape ``(n, dof)``
     :param mass: mass matrix, shape ``(n, dof, dof)``
     :param slopes: of the mass matrix by inertial parameters, by key of the candidate
+    :param drives: by which share of the actuators' force that changes with a unit of a parameter,
+        at each joint, likewise
     :param motion: what they come from
     """
 
@@ -136,6 +138,7 @@ class Equation:
     actuator: np.ndarray
     mass: np.ndarray
     slopes: dict[str, np.ndarray]
+    drives: dict[str, np.ndarray]
     motion: Motion
 
 
@@ -175,6 +178,7 @@ def equation(hypotheses: Hypotheses, motion: Motion) -> Equation:
         actuator=found.actuator,
         mass=found.mass,
         slopes={},
+        drives={},
         motion=motion,
     )
     typical = np.sqrt(np.mean(np.concatenate([load, found.actuator]) ** 2)) + 1e-300
@@ -266,6 +270,11 @@ def _add_parameter(
     slope = (there.mass - made.mass) / step
     if np.abs(slope).max() > 0.0:
         made.slopes[candidate.key] = slope
+    drive = np.sum((there.actuator - made.actuator) * made.actuator, axis=0) / step
+    power = np.sum(made.actuator**2, axis=0)
+    drive = np.divide(drive, power, out=np.zeros_like(drive), where=power > 0.0)
+    if np.abs(drive).max() > 0.0:
+        made.drives[candidate.key] = drive
 
 
 # ------------------------------------------------------------------------------ forces at joints

@@ -59,6 +59,7 @@ class Problem:
     :param passes: of items that cut commands off, the share of changes that still passes
     :param mass: some mass matrices, shape ``(n, dof, dof)``
     :param slopes: of these by inertial parameters, by key
+    :param drives: share of each joint's actuator force by parameters, by key
     :param always: items that belong to every set: what is refitted anyway
     """
 
@@ -72,6 +73,7 @@ class Problem:
     passes: dict[int, float]
     mass: np.ndarray
     slopes: dict[str, np.ndarray]
+    drives: dict[str, np.ndarray]
     always: tuple[int, ...]
     total: np.ndarray
     cost: float
@@ -252,6 +254,9 @@ class Problem:
                 changes = [value[c] for c in item.free if c in value]
                 left = max(1.0 + min(changes), _LEAST_LEFT)
                 out[self.joints(i)] += 2.0 * min(0.0, np.log(left))
+            elif item.key in self.drives:
+                change = value.get(item.columns[0], 0.0) * self.drives[item.key]
+                out += 2.0 * np.minimum(0.0, np.log(np.maximum(1.0 + change, _LEAST_LEFT)))
         return out + min(0.0, 2.0 * self._inertia_left(keys, value) / self.dof)
 
     def _inertia_left(self, keys: Sequence[int], value: dict[int, float]) -> float:
@@ -360,6 +365,7 @@ def problem(hypotheses: Hypotheses, equation: Equation, made: Grams) -> Problem:
         passes=_passing(hypotheses, equation, items),
         mass=equation.mass[some],
         slopes={key: slope[some] for key, slope in equation.slopes.items()},
+        drives=equation.drives,
         always=tuple(always),
         total=total,
         cost=float(np.log(made.effective.mean())),

@@ -17,6 +17,8 @@ from sb3_hds.sysid.hypotheses import PARAMETER
 
 # Width of a bump, in periods of the joint's motion, and its least number of intervals.
 _WIDTH, _LEAST = 0.3, 6
+# How often it is halved where there would be too few rows.
+_NARROWEST = 5
 # Below this share of the root mean square speed, or so many of its errors, a joint is at rest: dry
 # friction is then whatever it has to be, and says nothing. Intervals around a reversal, which
 # smoothing blurs, likewise.
@@ -83,9 +85,11 @@ def _joint(equation: Equation, j: int) -> Rows:
     still = _at_rest(equation, j)
     rich = rich_columns(equation.items, used)
     period = motion.period[j] if np.isfinite(motion.period[j]) else 1.0
-    width = max(_WIDTH * period, _LEAST * motion.dt)
-    for half, masked in ((width / 2, True), (width / 4, True), (width / 2, False)):
-        n_half = max(2, round(half / motion.dt))
+    widest = max(_WIDTH * period, _LEAST * motion.dt) / (2.0 * motion.dt)
+    halves = [round(widest / 2**k) for k in range(_NARROWEST)]
+    tried = [(n, True) for n in halves if n >= _LEAST // 2] + [(halves[0], False)]
+    for half, masked in tried:
+        n_half = max(half, 2)
         projected, pieces = _against_bumps(table, equation.recording, still & masked, n_half)
         if len(projected) > _ENOUGH * len(rich):
             break
