@@ -138,7 +138,7 @@ def test_what_has_no_parameter_is_left_to_the_learned_force():
     twin = twins.make("PendulumReal")
     data = measured(twin.extend(effects.CoulombFriction(0, tau_c=0.4)), noise=0.005, n=10)
 
-    found = corrected(twin, data, residual=True)
+    found = corrected(twin, data, residual=True, suspected=())
 
     assert found.beta > 0.0
     assert force_of(found.twin) is not None
