@@ -23,6 +23,7 @@ from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
 from sb3_hds.sysid.progress import Bar
 from sb3_hds.sysid.remainder import MissingForce, remainder
 from sb3_hds.sysid.search import Half, Search, _Reached
+from sb3_hds.sysid.sentence import several_in_words
 from sb3_hds.sysid.shooting import shots_of
 from sb3_hds.sysid.telling import ANOTHER, NAMELESS, contradiction, errs_more, out_of_reach
 
@@ -778,3 +779,26 @@ def test_no_size_is_certain_where_simulations_blow_up_nearby():
     errors = standard_errors(half, SimpleNamespace(theta=np.zeros(1)), [0])
 
     assert np.isposinf(errors).all()
+
+
+def test_several_causes_are_told_as_those_of_a_machine():
+    def finding(effect, joint, size, unit, share=None):
+        where, key = {"slot": "joint", "name": joint}, f"{effect}.{joint}"
+        estimate = SimpleNamespace(estimate=size, unit=unit, before=0.0)
+        return SimpleNamespace(
+            effect=effect, key=key, where=where, parameters={"x": estimate}, share=share
+        )
+
+    joints = ["pan", "lift", "wrist"]
+    shares = dict(zip(joints, (0.4, 0.5, 0.9), strict=True))
+    dry = [finding("coulomb_friction", j, 2.0, "N m", share) for j, share in shares.items()]
+    offset = finding("constant_force", "lift", 0.9, "N m")
+    viscous = finding("viscous_friction", "pan", 0.3, "N m s/rad", 0.3)
+
+    assert several_in_words([*dry, offset], joints) == (
+        "All three joints have Coulomb friction (they carry 40 to 90 % of the torque) that the "
+        "model lacks; lift has an offset of 0.9\N{NO-BREAK SPACE}N\N{NO-BREAK SPACE}m besides."
+    )
+    told = several_in_words([*dry, viscous], joints)
+    assert told.startswith("Lift and wrist have Coulomb friction")
+    assert "and pan has viscous and Coulomb friction (it carries 50 % of the torque)" in told

@@ -19,8 +19,8 @@ from sb3_hds.sysid.units import sizes_in_words, with_unit
 Verdict = Literal["named", "ambiguous", "none", "unknown", "not_identifiable"]
 
 _WIDTH = 80
-# Causes beyond which they are told in one sentence and a table.
-_MANY = 3
+# Causes beyond which they are told as those of a machine, and in a table.
+_MANY, _TABLE = 2, 3
 # Candidates whose smallest sizes are printed; all are in the report.
 _MOST_SHOWN = 12
 # Rejected candidates that get a line of their own.
@@ -197,7 +197,7 @@ class Diagnosis:
     def summary(self) -> str:
         """:return: all of it in 80 columns"""
         lines = [*_wrapped(f"{self.verdict}: {self.sentence}"), "=" * _WIDTH]
-        if len(self.findings) > _MANY:
+        if len(self.findings) > _TABLE:
             lines += _table_of(self.findings)
         else:
             for finding in self.findings:

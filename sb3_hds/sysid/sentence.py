@@ -94,8 +94,10 @@ def _carried(own: Sequence[Found]) -> str:
         by_joint[f.where["name"]] = by_joint.get(f.where["name"], 0.0) + f.share**2
     shares = [min(total**0.5, 1.0) for total in by_joint.values()]
     low, high = f"{min(shares):.0%}"[:-1], f"{max(shares):.0%}"[:-1]
+    units = [e.unit for f in own for e in f.parameters.values()]
+    what = "torque" if any("N m" in unit for unit in units) else "force"
     return f" ({'it carries' if len(shares) == 1 else 'they carry'} " + (
-        f"{high} % of the torque)" if low == high else f"{low} to {high} % of the torque)"
+        f"{high} % of the {what})" if low == high else f"{low} to {high} % of the {what})"
     )
 
 
