@@ -20,8 +20,8 @@ from sb3_hds.sysid.hypotheses import Hypotheses
 
 # What nearly every machine has, whatever is wrong with its log.
 _ALWAYS = (ViscousFriction, CoulombFriction, ConstantForce)
-# Rows that such a test needs, at most.
-_ROWS = 3000
+# Rows that such a test needs, at most; on fewer, all changes are ranked, and the likeliest tested.
+_ROWS, _FEW_ROWS, _LIKELIEST = 3000, 1000, 4
 # By which factor what is left, in units of the noise, has to be smaller, and what that has to be
 # worth in -2 log likelihood.
 _SMALLER, _WORTH = 2.0, 30.0
@@ -65,29 +65,44 @@ def other_convention(twin: Twin, motion: Motion, nuisances: Sequence[str]) -> Co
     if not isinstance(plant_of(twin), AnalyticTwin) or not motion.moves.any():
         return None
     motion = _fewer(motion)
-    coarse = twin
-    if motion.every > 1:
-        coarse = twin.at_interval(motion.dt, twin.substeps * motion.every)
+    coarse = motion.twin(twin)
     speeds = tuple(motion.speed)
     hypotheses = Hypotheses.about(coarse, _ALWAYS, nuisances, only=_keys(coarse), speeds=speeds)
     weight, now = _left(hypotheses, motion)
     if np.all(now < _FINE):
         return None
-    best: tuple[float, _Change, np.ndarray] | None = None
-    for change in _changes(twin, motion):
-        _, then = _left(hypotheses, _changed(motion, change))
-        if not np.isfinite(then).all():
-            continue
-        gain = float(weight @ (2.0 * np.log(np.maximum(now, 1.0) / np.maximum(then, 1.0))))
-        if best is None or gain > best[0]:
-            best = gain, change, then
-    if best is None:
+    changes = list(_changes(twin, motion))
+    few = _fewer(motion, _FEW_ROWS)
+    likely = _by_gain(hypotheses, few, changes, *_left(hypotheses, few))[:_LIKELIEST]
+    ranked = _by_gain(hypotheses, motion, [change for _, change, _ in likely], weight, now)
+    if not ranked:
         return None
-    gain, change, then = best
+    gain, change, then = ranked[0]
     before, after = (float(np.sqrt(np.mean(np.maximum(x, 1.0) ** 2))) for x in (now, then))
     if gain < _WORTH or before < _SMALLER * after:
         return None
     return Convention(".".join((change.name, *change.places)), change.words, before, after)
+
+
+def _by_gain(
+    hypotheses: Hypotheses,
+    motion: Motion,
+    changes: Sequence[_Change],
+    weight: np.ndarray,
+    now: np.ndarray,
+) -> list[tuple[float, _Change, np.ndarray]]:
+    """
+    :param weight: independent rows of each joint
+    :param now: what is left of the log as it is
+    :return: gain in -2 log likelihood, the change, and what is left under it, best first
+    """
+    found = []
+    for change in changes:
+        _, then = _left(hypotheses, _changed(motion, change))
+        if np.isfinite(then).all():
+            ratio = np.maximum(now, 1.0) / np.maximum(then, 1.0)
+            found.append((float(weight @ (2.0 * np.log(ratio))), change, then))
+    return sorted(found, key=lambda one: -one[0])
 
 
 def what_friction_leaves(twin: Twin, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
@@ -95,10 +110,10 @@ def what_friction_leaves(twin: Twin, motion: Motion) -> tuple[np.ndarray, np.nda
     :return: independent rows of each joint, and what friction and an offset leave of its equation
         of motion, in units of the noise
     """
-    motion, coarse = _fewer(motion), twin
-    if motion.every > 1:
-        coarse = twin.at_interval(motion.dt, twin.substeps * motion.every)
-    known = Hypotheses.about(coarse, _ALWAYS, (), only=_keys(coarse), speeds=tuple(motion.speed))
+    motion = _fewer(motion)
+    known = Hypotheses.about(
+        motion.twin(twin), _ALWAYS, (), only=_keys(twin), speeds=tuple(motion.speed)
+    )
     return _left(known, motion)
 
 
@@ -231,14 +246,14 @@ def _changed(motion: Motion, change: _Change) -> Motion:
     )
 
 
-def _fewer(motion: Motion) -> Motion:
+def _fewer(motion: Motion, most: int = _ROWS) -> Motion:
     """Stretches of each recording, so many rows in all."""
     n = sum(len(r.actions) for r in motion.recordings)
-    if n <= _ROWS:
+    if n <= most:
         return motion
     kept = []
     for r in motion.recordings:
-        rows = max(int(len(r.actions) * _ROWS / n), min(len(r.actions), 50))
+        rows = max(int(len(r.actions) * most / n), min(len(r.actions), 50))
         q, v, a, raw = (x[: rows + 1] for x in r[:4])
         kept.append(Moved(q, v, a, raw, r.actions[:rows]))
     return motion._replace(recordings=tuple(kept))

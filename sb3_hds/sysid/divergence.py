@@ -1,53 +1,43 @@
 """How fast motions that start side by side part, which limits how long a prediction can be."""
 
-from functools import partial
-
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from sb3_hds.core import Trajectories, Twin
-from sb3_hds.core.compilation import QUICKEST_COMPILATION
+from sb3_hds.core import Twin
+from sb3_hds.sysid.equation.motion import Motion
+from sb3_hds.sysid.equation.terms import side_by_side
 
-# Measurements at which the twin is linearised.
-_SOME = 64
+# Rows at which the twin is linearised, and finite differences in shares of the motion.
+_SOME, _STEP = 64, 1e-5
 
 
-def divergence_rate(twin: Twin, data: Trajectories) -> float:
+def divergence_rate(twin: Twin, motion: Motion) -> float:
     """
-    :param data: measured, sampled at the twin's ``dt``
+    :param twin: at the interval of the data
+    :param motion: of the joints
     :return: greatest rate [1/s] at which a small change of the state grows along the recordings,
         from eigenvalues of the linearised step; zero where none grows
     """
-    obs, actions = (np.concatenate(leaves) for leaves in zip(*_rows(data), strict=True))
-    chosen = np.linspace(0, len(actions) - 1, _SOME).astype(int)
-    slopes = np.asarray(_linearized(twin, jnp.asarray(obs[chosen]), jnp.asarray(actions[chosen])))
+    twin, dt, dof = motion.twin(twin), motion.dt, len(motion.period)
+    parts = [(r.q[:-1], r.v[:-1], r.actions) for r in motion.recordings]
+    q, v, u = map(np.concatenate, zip(*parts, strict=True))
+    chosen = np.linspace(0, len(u) - 1, min(_SOME, len(u))).astype(int)
+    q, v, u = q[chosen], v[chosen], u[chosen]
+    steps = _STEP * np.diag(np.concatenate([_positive(motion.excursion), _positive(motion.speed)]))
+    moved = [np.zeros(2 * dof), *steps]
+    states = np.concatenate([np.concatenate([q, v], 1) + step for step in moved])
+    commands = np.tile(u, (len(moved), 1))
+    pushed = side_by_side(twin, twin.params, states[:, :dof], states[:, dof:], commands).change
+    pushed = pushed.reshape(len(moved), len(u), dof)
+    by_state = (pushed[1:] - pushed[0]) / np.diag(steps)[:, None, None]
+    faster = np.concatenate([np.zeros((dof, dof)), np.eye(dof)], 1) + by_state.transpose(1, 2, 0)
+    further = np.concatenate([np.eye(dof), np.zeros((dof, dof))], 1) + dt * faster
+    slopes = np.concatenate([further, faster], 1)
     slopes = slopes[np.isfinite(slopes).all((1, 2))]
     if not len(slopes):
         return 0.0
     growth = float(np.abs(np.linalg.eigvals(slopes)).max())
-    return max(np.log(growth), 0.0) / twin.dt if growth > 0.0 else 0.0
+    return max(np.log(growth), 0.0) / dt if growth > 0.0 else 0.0
 
 
-def _rows(data: Trajectories) -> list[tuple[np.ndarray, np.ndarray]]:
-    episodes = (data.episode(i) for i in range(len(data)))
-    return [(np.asarray(obs)[:-1], np.asarray(actions)) for obs, actions in episodes]
-
-
-@partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
-def _linearized(
-    twin: Twin, obs: Float[Array, "n n_obs"], actions: Float[Array, "n n_act"]
-) -> Float[Array, "n tangent tangent"]:
-    params = twin.params
-
-    def slope(row: Array, action: Array) -> Array:
-        state = twin.infer(row, params)
-        after = twin.step(state, action, params)
-
-        def moved(tangent: Array) -> Array:
-            return twin.difference(twin.step(twin.retract(state, tangent), action, params), after)
-
-        return jax.jacfwd(moved)(jnp.zeros_like(twin.difference(state, state)))
-
-    return jax.vmap(slope)(obs, actions)
+def _positive(x: np.ndarray) -> np.ndarray:
+    return np.where(x > 0.0, x, 1.0)

@@ -23,7 +23,7 @@ from sb3_hds.sysid.constancy import Change, change
 from sb3_hds.sysid.conventions import Convention, other_convention
 from sb3_hds.sysid.diagnosis import Diagnosis, Rejected
 from sb3_hds.sysid.divergence import divergence_rate
-from sb3_hds.sysid.equation.motion import motion
+from sb3_hds.sysid.equation.motion import Motion, motion
 from sb3_hds.sysid.evidence import Evidence, Point, portion_for
 from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
 from sb3_hds.sysid.leapfrog import in_step_with_the_log, stepping_by
@@ -159,7 +159,7 @@ class Inquiry:
         self.spread = spread_of(self.data)
         self.shots, self.origin = shots_of(
             self.data,
-            self._window(),
+            self._window(twin, moved),
             self.hypotheses.twin,
             period=self.period,
         )
@@ -167,9 +167,9 @@ class Inquiry:
         self.effort = EFFORTS[budget]
         self.turned_down: dict[str, str] = {}
 
-    def _window(self) -> int:
+    def _window(self, twin: Twin, moved: Motion) -> int:
         """:return: steps of the windows that are simulated"""
-        rate = divergence_rate(self.hypotheses.twin, self.data)
+        rate = divergence_rate(twin, moved)
         span = _WINDOW * self.period
         return _window_of(self.data, min(span, _GROWTH / rate) if rate else span)
 

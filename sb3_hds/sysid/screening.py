@@ -23,7 +23,8 @@ _TOLD, _SURELY = 0.05, 6.0
 # Share of a joint's force that a typical size changes.
 _TYPICAL = 0.05
 # Machines of more joints are not asked about what has no column at every joint, but where much is
-# left that can be predicted.
+# left that can be predicted; of several causes, only these and what may stand for them are
+# simulated.
 _SMALL_MACHINE, _LEFT = 2, 0.2
 
 
@@ -117,7 +118,7 @@ def screen(
         return None
     if not moved.moves.any():
         return None
-    coarse = twin.at_interval(moved.dt, twin.substeps * moved.every) if moved.every > 1 else twin
+    coarse = moved.twin(twin)
     hypotheses = Hypotheses.about(
         coarse, effects, calibrate, period=moved.typical_period, speeds=tuple(moved.speed)
     )
@@ -130,15 +131,12 @@ def screen(
     set_of = [m for m in members(p, found.keys, by_key) if m.item not in p.always]
     left = what_is_left(p, found.keys)
     hints = tuple(p.items[i].key for i in found.hints)
-    singles = list(dict.fromkeys(p.items[i].key for i in p.ranking(list(p.always))))[:_SINGLES]
-    keys = {*singles, *hints, *(m.key for m in set_of), *(k for m in set_of for k in m.others)}
     joints = [joint.name for joint in coarse.joints]
-    where = [
-        name
-        for name, x in zip(joints, left, strict=True)
-        if len(joints) <= _SMALL_MACHINE or x.predictable > _LEFT
-    ]
-    keys |= _without_column(hypotheses, p, moved, where)
+    small = len(joints) <= _SMALL_MACHINE
+    where = [name for name, x in zip(joints, left, strict=True) if small or x.predictable > _LEFT]
+    keys = {*(m.key for m in set_of), *(k for m in set_of for k in m.others)}
+    if small or len(set_of) < 2:
+        keys |= {*_singles(p), *hints, *_without_column(hypotheses, p, moved, where)}
     return Screened(
         hypotheses=hypotheses,
         problem=p,
@@ -149,6 +147,11 @@ def screen(
         keys=frozenset(keys),
         nameless_at=tuple(where),
     )
+
+
+def _singles(p: Problem) -> list[str]:
+    """Keys of what explains most beside nothing, best first."""
+    return list(dict.fromkeys(p.items[i].key for i in p.ranking(list(p.always))))[:_SINGLES]
 
 
 def _without_column(h: Hypotheses, p: Problem, moved: Motion, where: Sequence[str]) -> set[str]:

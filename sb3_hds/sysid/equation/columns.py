@@ -24,7 +24,7 @@ from sb3_hds.core import (
 from sb3_hds.core.compilation import QUICKEST_COMPILATION
 from sb3_hds.effects import SensorDelay
 from sb3_hds.sysid.equation.motion import Motion
-from sb3_hds.sysid.equation.terms import Terms, forces, terms
+from sb3_hds.sysid.equation.terms import Terms, forces, portions, terms
 from sb3_hds.sysid.hypotheses import PARAMETER, Candidate, Hypotheses, encoders
 
 # Finite differences by a parameter or a sensor, in shares of its scale.
@@ -347,13 +347,20 @@ def _force_slopes(
     effect: JointEffect, settings: np.ndarray, nodes: Mapping[str, np.ndarray], h: float
 ) -> np.ndarray:
     """:return: derivative of the mean force by each parameter, ``(settings, parameters, n)``"""
+    weights, found = nodes["weights"], []
+    rows = {name: x for name, x in nodes.items() if name != "weights"}
     with jax.enable_x64(True):
-        given = {name: jnp.asarray(x, jnp.float64) for name, x in nodes.items()}
-        return np.asarray(_slopes_of(effect, jnp.asarray(settings), given, h))
+        for index, n in portions(len(rows["load"])):
+            given = {name: jnp.asarray(x[index], jnp.float64) for name, x in rows.items()}
+            slopes = [_slopes_of(effect, each, given, weights, h) for each in settings]
+            found.append(np.stack(slopes)[..., :n])
+    return np.concatenate(found, -1)
 
 
-@partial(jax.jit, static_argnums=(0, 3), compiler_options=QUICKEST_COMPILATION)
-def _slopes_of(effect: JointEffect, settings: Array, nodes: dict[str, Array], h: float) -> Array:
+@partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
+def _slopes_of(
+    effect: JointEffect, values: Array, nodes: dict[str, Array], weights: Array, h: float
+) -> Array:
     names = tuple(effect.parameters)
 
     def mean(values: Array, q: Array, v: Array, actuator: Array, load: Array, inertia: Array):
@@ -361,19 +368,16 @@ def _slopes_of(effect: JointEffect, settings: Array, nodes: dict[str, Array], h:
         one = lambda q, v: effect.torque(  # noqa: E731
             JointMoment(q, v, actuator, load, inertia, h), (), params
         )
-        return jnp.sum(nodes["weights"] * jax.vmap(jax.vmap(one))(q, v))
+        return jnp.sum(weights * jax.vmap(jax.vmap(one))(q, v))
 
-    def slopes(values: Array) -> Array:
-        along = lambda way: jax.jvp(  # noqa: E731
-            lambda x: jax.vmap(partial(mean, x))(
-                nodes["q"], nodes["v"], nodes["actuator"], nodes["load"], nodes["inertia"]
-            ),
-            (values,),
-            (way,),
-        )[1]
-        return jax.vmap(along)(jnp.eye(len(names), dtype=values.dtype))
-
-    return jax.lax.map(slopes, settings)
+    along = lambda way: jax.jvp(  # noqa: E731
+        lambda x: jax.vmap(partial(mean, x))(
+            nodes["q"], nodes["v"], nodes["actuator"], nodes["load"], nodes["inertia"]
+        ),
+        (values,),
+        (way,),
+    )[1]
+    return jax.vmap(along)(jnp.eye(len(names), dtype=values.dtype))
 
 
 # ------------------------------------------------------------------------------ commands

@@ -97,6 +97,10 @@ class Motion(NamedTuple):
         own = self.period[self.moves & np.isfinite(self.period) & (self.period > 0.0)]
         return float(np.exp(np.mean(np.log(own)))) if len(own) else self._length
 
+    def twin(self, twin: Twin) -> Twin:
+        """:return: a twin of the data's interval, at that of the rows"""
+        return twin.at_interval(self.dt, twin.substeps * self.every) if self.every > 1 else twin
+
     @property
     def _length(self) -> float:
         return float(np.median([len(r.actions) for r in self.recordings])) * self.dt

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -86,13 +87,18 @@ class Problem:
         candidate = self.items[i].candidate
         return candidate.slot, candidate.index
 
-    def family(self, i: int) -> tuple:
+    @cached_property
+    def families(self) -> tuple[tuple, ...]:
         """Of items with an equal family, a set has one at most."""
-        item = self.items[i]
-        known = plausibility(item.candidate.name)
-        if item.candidate.slot == PARAMETER:
-            return (item.key,)
-        return known.family, *self.place(i)
+        return tuple(
+            (item.key,)
+            if item.candidate.slot == PARAMETER
+            else (plausibility(item.candidate.name).family, *self.place(i))
+            for i, item in enumerate(self.items)
+        )
+
+    def family(self, i: int) -> tuple:
+        return self.families[i]
 
     def clashes(self, keys: Sequence[int]) -> bool:
         families = [self.family(i) for i in keys]
@@ -103,8 +109,27 @@ class Problem:
 
     def joints(self, i: int) -> np.ndarray:
         """:return: where an item acts"""
-        columns = list(self.items[i].columns)
-        return np.flatnonzero(self.shares[:, columns].max(1) > 0.0)
+        return self._joints[i]
+
+    @cached_property
+    def _joints(self) -> tuple[np.ndarray, ...]:
+        return tuple(
+            np.flatnonzero(self.shares[:, list(item.columns)].max(1) > 0.0) for item in self.items
+        )
+
+    @cached_property
+    def diagonal(self) -> np.ndarray:
+        """Of the normal equations, shape ``(columns + 1,)``."""
+        return np.diag(self.total).copy()
+
+    @cached_property
+    def _beside(self) -> list[np.ndarray]:
+        """Normal equations of all data but one fold."""
+        return [self.total - fold.sum(0) for fold in self.grams.folds]
+
+    @cached_property
+    def _inertia(self) -> float:
+        return float(np.linalg.slogdet(self.mass)[1].mean())
 
     def price(self, i: int) -> float:
         if i in self.always:
@@ -128,17 +153,21 @@ class Problem:
             for c, value in zip(item.columns, item.fixed, strict=True):
                 if value is not None:
                     weights[c] = -value
+        own = np.array([*dict.fromkeys(c for item in items for c in item.columns), len(gram) - 1])
+        local = gram[own[:, None], own]
+        at = {int(c): k for k, c in enumerate(own)}
         bounded = {c for item in items if item.rule != "chain" for c in item.free}
         held: list[int] = []
         while True:
-            theta, inverse = self._least_squares(gram, weights, free)
+            inside = [at[c] for c in free]
+            theta, inverse = self._least_squares(local, weights[own], inside, self.prior[free])
             if inverse is None:
                 return Solution(np.inf, free, theta, np.zeros((len(free),) * 2), weights, ())
             if not held and (common := self._stood_in_for(keys, free, inverse)):
                 return self.solve([i for i in keys if i not in common], total)
             beyond = np.maximum(self.lower[free] - theta, theta - self.upper[free])
             beyond = np.where([c in bounded for c in free], beyond, -np.inf)
-            beyond = beyond * np.sqrt(np.maximum(np.diag(self.total)[free], 0.0))
+            beyond = beyond * np.sqrt(np.maximum(self.diagonal[free], 0.0))
             if not len(free) or beyond.max() <= 0.0:
                 break
             worst = int(np.argmax(beyond))
@@ -146,25 +175,26 @@ class Problem:
             weights[c] = -np.clip(theta[worst], self.lower[c], self.upper[c])
             held.append(c)
         weights[free] = -theta
-        rss = float(weights @ gram @ weights)
+        rss = float(weights[own] @ local @ weights[own])
         return Solution(rss, free, theta, inverse, weights, tuple(held))
 
+    @staticmethod
     def _least_squares(
-        self, gram: np.ndarray, weights: np.ndarray, free: list[int]
+        gram: np.ndarray, weights: np.ndarray, free: list[int], prior: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """:return: coefficients, and the inverse of their normal matrix; None if there is none"""
         if not free:
             return np.zeros(0), np.zeros((0, 0))
         fixed = weights.copy()
         fixed[free] = 0.0
-        inner = gram[np.ix_(free, free)] + np.diag(self.prior[free])
+        inner = gram[np.ix_(free, free)] + np.diag(prior)
         size = np.sqrt(np.diag(inner)) + 1e-300
         scaled = inner / np.outer(size, size) + _RIDGE * np.eye(len(free))
         try:
             inverse = np.linalg.inv(scaled)
         except np.linalg.LinAlgError:
             return np.zeros(len(free)), None
-        theta = inverse @ ((gram @ fixed)[free] / size) / size
+        theta = inverse @ ((gram[free] @ fixed) / size) / size
         if not np.isfinite(theta).all():
             return np.zeros(len(free)), None
         return theta, inverse / np.outer(size, size)
@@ -190,7 +220,7 @@ class Problem:
     def _inflation(self, free: Sequence[int], inverse: np.ndarray) -> np.ndarray:
         """:return: variance of each coefficient, in units of what it would be alone"""
         own = list(free)
-        return np.diag(inverse) * (np.diag(self.total)[own] + self.prior[own])
+        return np.diag(inverse) * (self.diagonal[own] + self.prior[own])
 
     def admissible(self, keys: Sequence[int], found: Solution) -> bool:
         """Whether no member stands at its bounds alone, and all can be told apart."""
@@ -269,17 +299,13 @@ class Problem:
         if not changes:
             return 0.0
         sign, now = np.linalg.slogdet(self.mass + sum(changes))
-        return (
-            float(now.mean() - np.linalg.slogdet(self.mass)[1].mean())
-            if (sign > 0).all()
-            else -np.inf
-        )
+        return float(now.mean()) - self._inertia if (sign > 0).all() else -np.inf
 
     def held_out(self, keys: Sequence[int]) -> Float[np.ndarray, "folds dof"]:
         """:return: residual sum of squares of each fold, coefficients from the others"""
         out = []
-        for fold in self.grams.folds:
-            found = self.solve(keys, self.total - fold.sum(0))
+        for fold, beside in zip(self.grams.folds, self._beside, strict=True):
+            found = self.solve(keys, beside)
             rss = self.by_joint(found.weights, fold)
             taken = np.maximum(self.taken_away(keys, found), -6.0)
             out.append(rss * np.exp(-taken))
@@ -290,10 +316,11 @@ class Problem:
         found = self.solve(keys)
         if not np.isfinite(found.rss):
             return []
-        r = self.total @ found.weights
+        on = np.flatnonzero(found.weights)
+        r = self.total[:, on] @ found.weights[on]
         cross = self.total[:, found.free]
-        diagonal = np.diag(self.total)
-        left = np.maximum(diagonal - np.einsum("ij,jk,ik->i", cross, found.inverse, cross), 1e-9)
+        diagonal = self.diagonal
+        left = np.maximum(diagonal - ((cross @ found.inverse) * cross).sum(1), 1e-9)
         told = left > 1e-5 * diagonal
         drop = np.where(told, r**2 / left, 0.0)
         pool = (

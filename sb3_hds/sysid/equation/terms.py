@@ -1,5 +1,6 @@
 """What the nominal model says of measured motion: one step of the twin from every row."""
 
+from collections.abc import Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from sb3_hds.core.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.layers import plant_of
 
 # Rows that are evaluated at a time: programs are compiled for one shape.
-_ROWS = 4096
+ROWS = 1024
 
 
 class Terms(NamedTuple):
@@ -46,19 +47,36 @@ def terms(
     :param v: velocities there
     :param actions: held over each interval
     """
+    if not _remembers(twin):
+        return side_by_side(twin, params, q, v, actions)
     with jax.enable_x64(True):
         params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), dict(params))
-        if _remembers(twin):
-            given = (jnp.asarray(x, jnp.float64) for x in (q, v, actions))
-            return Terms(*map(np.asarray, _one_after_the_other(twin, params, *given)))
-        n, parts = len(q), []
-        size = min(_ROWS, n)
-        for first in range(0, n, size):
-            index = np.minimum(np.arange(first, first + size), n - 1)
+        given = (jnp.asarray(x, jnp.float64) for x in (q, v, actions))
+        return Terms(*map(np.asarray, _one_after_the_other(twin, params, *given)))
+
+
+def side_by_side(
+    twin: Twin,
+    params: Params,
+    q: Float[np.ndarray, "n dof"],
+    v: Float[np.ndarray, "n dof"],
+    actions: Float[np.ndarray, "n act"],
+) -> Terms:
+    """The same where nothing is remembered from row to row."""
+    parts = []
+    with jax.enable_x64(True):
+        params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), dict(params))
+        for index, n in portions(len(q)):
             given = (jnp.asarray(x[index], jnp.float64) for x in (q, v, actions))
             found = _side_by_side(twin, params, *given)
-            parts.append([np.asarray(leaf)[: n - first] for leaf in found])
+            parts.append([np.asarray(leaf)[:n] for leaf in found])
     return Terms(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def portions(n: int) -> Iterator[tuple[np.ndarray, int]]:
+    """:return: rows, always as many at a time, the last one repeated; and how many of them count"""
+    for first in range(0, n, ROWS):
+        yield np.minimum(np.arange(first, first + ROWS), n - 1), min(ROWS, n - first)
 
 
 def forces(
@@ -69,12 +87,18 @@ def forces(
     actions: Float[np.ndarray, "m n act"],
 ) -> Float[np.ndarray, "m n dof"]:
     """:return: force of the actuators under other commands in the same states"""
-    plant = plant_of(twin)
+    plant, parts = plant_of(twin), []
     assert isinstance(plant, AnalyticTwin)
     with jax.enable_x64(True):
         params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), dict(params))
-        given = (jnp.asarray(x, jnp.float64) for x in (q, v, actions))
-        return np.asarray(_actuated(plant, params, *given))
+        for index, n in portions(len(q)):
+            state = jnp.asarray(q[index], jnp.float64), jnp.asarray(v[index], jnp.float64)
+            found = [
+                np.asarray(_actuated(plant, params, *state, jnp.asarray(each[index], jnp.float64)))
+                for each in actions
+            ]
+            parts.append(np.stack(found)[:, :n])
+    return np.concatenate(parts, 1)
 
 
 def _remembers(twin: Twin) -> bool:
@@ -124,4 +148,4 @@ def _memory_of(twin: Twin, params: Params, dtype: np.dtype) -> dict:
 @partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
 def _actuated(plant: AnalyticTwin, params: Params, q: Array, v: Array, actions: Array) -> Array:
     one = lambda q, v, action: plant.actuate(State(q, v, {}), action, params)  # noqa: E731
-    return jax.vmap(lambda each: jax.vmap(one)(q, v, each))(actions)
+    return jax.vmap(one)(q, v, actions)
