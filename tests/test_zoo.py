@@ -13,7 +13,6 @@ import pytest
 import yaml
 from stable_baselines3.common.env_util import make_vec_env
 
-from rl_zoo_plugin.tables import ALGORITHMS
 from sb3_hds import HDS
 
 pytestmark = pytest.mark.skipif(find_spec("rl_zoo3") is None, reason="needs the extra 'zoo'")
@@ -29,15 +28,10 @@ class Zoo:
     """A folder to work in, and the commands in it."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.logs = folder / "logs" / "hds"
+        self.folder, self.logs = folder, folder / "logs" / "hds"
         # One compilation cache for all processes: they compile the same functions.
-        self.environ = {
-            **os.environ,
-            "SB3_HDS_CACHE": str(folder / "cache"),
-            "MPLBACKEND": "Agg",
-            "COLUMNS": "200",
-        }
+        own = {"SB3_HDS_CACHE": str(folder / "cache"), "MPLBACKEND": "Agg", "COLUMNS": "200"}
+        self.environ = {**os.environ, **own}
 
     def run(self, *words: str, **environ: str) -> subprocess.CompletedProcess:
         return subprocess.run(
@@ -87,20 +81,6 @@ def trained(zoo) -> Path:
     return zoo.logs / "Pendulum-v1_1"
 
 
-@pytest.fixture(scope="module")
-def continued(zoo, trained) -> Path:
-    """A second run, by the module instead of the start-up line, that goes on where it ended."""
-    zoo.succeeds(
-        *MODULE,
-        "rl_zoo_plugin",
-        "train",
-        *train("-n", str(N_STEPS), "--eval-freq", str(EVAL_FREQ), "--eval-episodes", "2"),
-        *("-i", str(trained / "Pendulum-v1.zip"), "--env-kwargs", "g:9.8", "-params", *QUICK),
-        SB3_HDS_NO_ZOO="1",
-    )
-    return zoo.logs / "Pendulum-v1_2"
-
-
 def test_a_run_folder_holds_what_the_zoo_always_writes(trained):
     checkpoints = {f"rl_model_{step}_steps.zip" for step in (SAVE_FREQ, 2 * SAVE_FREQ)}
     expected = {"0.monitor.csv", "best_model.zip", "evaluations.npz", "Pendulum-v1.zip"}
@@ -137,9 +117,16 @@ def test_a_timestep_is_a_step_of_the_environment_and_nothing_else(trained):
 
 
 @pytest.mark.expensive
-def test_training_continues_from_a_saved_agent(continued):
-    assert (continued / "Pendulum-v1.zip").is_file()
-    assert np.load(continued / "evaluations.npz")["timesteps"][-1] == N_STEPS
+def test_the_module_goes_on_from_a_saved_agent_without_the_start_up_line(zoo, trained):
+    zoo.succeeds(
+        *(*MODULE, "rl_zoo_plugin", "train"),
+        *train("-n", str(N_STEPS), "--eval-freq", str(EVAL_FREQ), "--eval-episodes", "2"),
+        *("-i", str(trained / "Pendulum-v1.zip"), "--env-kwargs", "g:9.8", "-params", *QUICK),
+        SB3_HDS_NO_ZOO="1",
+    )
+
+    evaluations = zoo.logs / "Pendulum-v1_2" / "evaluations.npz"
+    assert np.load(evaluations)["timesteps"][-1] == N_STEPS
 
 
 def test_enjoy_shows_the_best_agent_in_a_window_and_the_zoo_draws_curves(zoo, trained):
@@ -201,46 +188,19 @@ def test_a_gait_is_searched_and_replayed(zoo):
     assert "2 Episodes" in output and "Mean reward" in output
 
 
-_SMALL_NETWORKS = "policy_kwargs:dict(net_arch=[8])"
-_FEW_UPDATES = ("learning_starts:50", "train_freq:50", "gradient_steps:2", "batch_size:16")
-#: by id, what makes a run short; the searched gait has a test of its own
-BRIEF = {
-    "pods": QUICK,
-    "hds": QUICK,
-    **dict.fromkeys(
-        ("gsde_sac", "droq", "crossq_jax", "tqc_jax", "simba", "bro"),
-        (*_FEW_UPDATES, _SMALL_NETWORKS),
-    ),
-    "td7": (*_FEW_UPDATES, "policy_kwargs:dict(net_arch=[8],embedding_size=8)"),
-}
-
-
-def test_every_algorithm_is_tried_by_the_commands():
-    assert {*BRIEF, "openloop"} == set(ALGORITHMS)
-
-
 @pytest.mark.expensive  # two processes each; HDS, above, goes the same way
-@pytest.mark.parametrize("algo", BRIEF)
-def test_every_algorithm_is_trained_and_replayed(zoo, algo):
+@pytest.mark.parametrize("algo", ["gsde_sac", "bro", "td7"])
+def test_model_free_algorithms_are_trained_and_replayed(zoo, algo):
     agent = ("--algo", algo, "--env", "Pendulum-v1", "-f", "brief")
     budget = ("--seed", "0", "-n", "200", "--eval-freq", "-1")
+    few = ("learning_starts:50", "train_freq:50", "gradient_steps:2", "batch_size:16")
+    narrow = "policy_kwargs:dict(net_arch=[8])"
 
-    zoo.succeeds(*CONSOLE, "train", *agent, *budget, "-params", *BRIEF[algo])
+    zoo.succeeds(*CONSOLE, "train", *agent, *budget, "-params", *few, narrow)
     output = zoo.succeeds(*CONSOLE, "enjoy", *agent, "--no-render", "-n", "200")
 
     assert (zoo.folder / "brief" / algo / "Pendulum-v1_1" / "Pendulum-v1.zip").is_file()
     assert "1 Episodes" in output and "Mean reward" in output
-
-
-@pytest.mark.expensive
-@pytest.mark.parametrize("algo", [algo for algo in BRIEF if algo not in ("pods", "hds")])
-def test_what_a_model_free_algorithm_is_sampled_with_can_be_trained(zoo, algo):
-    agent = ("--algo", algo, "--env", "Pendulum-v1", "--seed", "0", "-f", "tuned")
-    budget = ("-n", "200", "--n-trials", "1", "--n-evaluations", "1", "--eval-episodes", "1")
-
-    output = zoo.succeeds(*CONSOLE, "train", *agent, "-optimize", *budget, "--no-optim-plots")
-
-    assert "Number of finished trials:  1" in output and "Value:" in output
 
 
 @pytest.mark.expensive
@@ -253,12 +213,12 @@ def test_a_trial_that_diverges_does_not_end_the_search(zoo):
         "gym.register('Huge-v0', make, max_episode_steps=200)\n"
     )
     agent = ("--algo", "droq", "--env", "Huge-v0", "--gym-packages", "huge", "-f", "huge")
-    budget = ("-n", "12000", "--n-trials", "2", "--n-evaluations", "1", "--n-startup-trials", "2")
+    budget = ("-n", "400", "--n-trials", "2", "--n-evaluations", "1", "--n-startup-trials", "2")
     path = os.pathsep.join((str(zoo.folder), os.environ.get("PYTHONPATH", "")))
 
     output = zoo.run(*CONSOLE, "train", *agent, "-optimize", *budget, PYTHONPATH=path).stdout
 
-    assert "DroQ: an update diverged" in output and "Trial 1 pruned" in output, output[-3000:]
+    assert "an update diverged" in output and "Trial 1 pruned" in output, output[-3000:]
 
 
 def test_an_unknown_key_in_a_yml_file_is_named_with_the_one_that_was_meant(zoo):
@@ -271,13 +231,12 @@ def test_an_unknown_key_in_a_yml_file_is_named_with_the_one_that_was_meant(zoo):
     assert not list(zoo.folder.glob("typo/**/*.zip"))
 
 
-def test_switched_off_the_hook_leaves_the_zoo_as_it_is(zoo):
-    output = zoo.fails(*CONSOLE, "train", *train(), SB3_HDS_NO_ZOO="1")
-
-    assert "invalid choice: 'hds'" in output
-
-
-def test_the_module_lists_the_commands_that_it_knows(zoo):
-    output = zoo.fails(*MODULE, "rl_zoo_plugin", "trian")
-
-    assert "Unknown command 'trian'" in output and "train" in output
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ((*CONSOLE, "train", *train()), "invalid choice: 'hds'"),
+        ((*MODULE, "rl_zoo_plugin", "trian"), "Unknown command 'trian'"),
+    ],
+)
+def test_without_the_hook_the_zoo_is_as_it_was_and_the_module_names_its_commands(zoo, words, told):
+    assert told in zoo.fails(*words, SB3_HDS_NO_ZOO="1")
