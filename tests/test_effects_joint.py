@@ -1,7 +1,5 @@
 """What friction, springs and constant forces do, by the formulas of mechanics."""
 
-import re
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,7 +29,6 @@ from sb3_hds.effects import (
     StribeckFriction,
     ViscousFriction,
 )
-from sb3_hds.errors import ParameterError
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -45,19 +42,12 @@ FRICTION = (
     QuadraticDrag,
 )
 every_friction = pytest.mark.parametrize("effect", FRICTION, ids=lambda effect: effect.name)
-every_integrator = pytest.mark.parametrize(
-    "integrator", [explicit_euler, semi_implicit_euler, rk4], ids=lambda i: i.__name__
-)
 
 
 def torque_of(effect, v=0.0, q=0.0, actuator=0.0, load=0.0, inertia=1.0, h=1e-3):
     """:return: what an effect with values does to a joint [N m]"""
     joint = JointMoment(*map(jnp.asarray, (q, v, actuator, load, inertia)), h)
     return float(effect.torque(joint, (), effect.values))
-
-
-def energy_of_a_mass(states, mass, potential):
-    return 0.5 * mass * states.v[:, 0] ** 2 + potential(states.q[:, 0])
 
 
 # --- friction
@@ -96,15 +86,20 @@ def coast(effect, integrator, h, v, steps=1, mass=0.5, values=None):
         start = twin.infer(jnp.stack([jnp.zeros(()), v]), params)
         return rollout(twin, params, start, jnp.zeros((steps, 1))).states.v[:, 0]
 
-    v = jnp.asarray(v)
     own = effect.values | (values or {})
-    own = {name: jnp.broadcast_to(value, v.shape) for name, value in own.items()}
-    return np.asarray(jax.jit(jax.vmap(speeds))(v, own))
+    own = {name: jnp.broadcast_to(value, np.shape(v)) for name, value in own.items()}
+    return np.asarray(jax.jit(jax.vmap(speeds))(jnp.asarray(v), own))
 
 
-@every_integrator
-@every_friction
-@pytest.mark.parametrize("h", [1e-3, 0.1, 10.0])
+@pytest.mark.parametrize(
+    ("effect", "integrator", "h"),
+    [
+        *((effect, semi_implicit_euler, 10.0) for effect in FRICTION),
+        (CoulombFriction, explicit_euler, 10.0),
+        (ViscousFriction, rk4, 0.1),
+        (StribeckFriction, rk4, 1e-3),
+    ],
+)
 def test_friction_alone_brings_to_rest_without_overshoot_at_any_step(x64, effect, integrator, h):
     v, sizes = np.repeat([-3.0, 0.02, 1e-3], 3), np.tile([0.01, 1.0, 100.0], 3)
     values = {name: sizes for name in effect.parameters if name not in ("v_s", "mu")}
@@ -116,26 +111,23 @@ def test_friction_alone_brings_to_rest_without_overshoot_at_any_step(x64, effect
     assert np.all(np.diff(np.abs(speeds), axis=1) <= 1e-14)
 
 
-@pytest.mark.parametrize(
-    ("effect", "v", "b"),
-    [
-        (ViscousFriction(b=0.4), 2.0, 0.4),
-        (DirectionalViscousFriction(b_pos=0.4, b_neg=0.9), 2.0, 0.4),
-        (DirectionalViscousFriction(b_pos=0.4, b_neg=0.9), -2.0, 0.9),
-    ],
-)
-def test_viscous_friction_decays_exponentially(x64, effect, v, b):
-    speeds = coast(effect, rk4, 0.01, [v], steps=100)[0]
+@pytest.mark.parametrize(("v", "b"), [(2.0, 0.4), (-2.0, 0.9)])
+def test_viscous_friction_decays_exponentially(x64, v, b):
+    effects = (ViscousFriction(b=b), DirectionalViscousFriction(b_pos=0.4, b_neg=0.9))
 
     exact = v * np.exp(-b * 0.01 * np.arange(101) / 0.5)
-    np.testing.assert_allclose(speeds, exact, rtol=2e-9)  # RK4: (b h / m)^5 / 120 per step
+    for effect in effects:
+        speeds = coast(effect, rk4, 0.01, [v], steps=100)[0]
+        np.testing.assert_allclose(speeds, exact, rtol=2e-9)  # RK4: (b h / m)^5 / 120 per step
 
 
 def test_viscous_friction_is_linear_up_to_what_a_sub_step_can_stop(x64):
     # One sub-step takes b h / m of the speed: the plain equation until that is all of it.
-    for b, left in ((0.5, 0.9), (2.5, 0.5), (5.0, 0.0), (50.0, 0.0)):
-        after = coast(ViscousFriction(b=b), semi_implicit_euler, 0.1, [2.0])[0, -1]
-        assert after == pytest.approx(2.0 * left, abs=1e-14)
+    b, v = [0.5, 2.5, 5.0, 50.0], np.full(4, 2.0)
+
+    after = coast(ViscousFriction(), semi_implicit_euler, 0.1, v, values={"b": np.array(b)})[:, -1]
+
+    np.testing.assert_allclose(after, [1.8, 1.0, 0.0, 0.0], atol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -186,7 +178,6 @@ def test_without_a_rise_stribeck_friction_is_coulomb_friction(x64):
 @pytest.mark.parametrize(
     ("actuator", "load", "transmitted"),
     [
-        (0.0, 0.0, 0.0),
         (0.0, -1.5, 1.5),  # the load turns a motor that is off
         (2.0, 0.0, 2.0),  # the motor accelerates an inertia
         (1.5, 1.5, 3.0),  # the motor holds the load: the teeth are pressed from both sides
@@ -213,31 +204,6 @@ def test_the_load_of_a_pendulum_is_its_weight(x64):
 
     # The bias is -4.9: actuator + bias = -5.9. Inertia 1/3.
     assert (slower[1] - slower[0]) / 1e-6 == pytest.approx(-0.1 * 5.9 * 3.0, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (
-            lambda: ViscousFriction(b=-0.1),
-            "Parameter 'viscous_friction.b' must be finite and within [0.0, inf] N m s/rad, "
-            "got -0.1.",
-        ),
-        (
-            lambda: CoulombFriction(tau_c=-0.1),
-            "Parameter 'coulomb_friction.tau_c' must be finite and within [0.0, inf] N m, "
-            "got -0.1.",
-        ),
-        (
-            lambda: LoadDependentFriction(mu=1.5),
-            "Parameter 'load_dependent_friction.mu' must be finite and within [0.0, 1.0] 1, "
-            "got 1.5.",
-        ),
-    ],
-)
-def test_friction_that_cannot_be_is_refused(make, message):
-    with pytest.raises(ParameterError, match=f"^{re.escape(message)}$"):
-        make()
 
 
 # --- springs, magnets, constant forces
@@ -279,63 +245,43 @@ def test_cogging_snaps_to_places_one_period_apart(x64):
         assert torque_of(cogging, q=rest - 0.125) == pytest.approx(0.4, rel=1e-12)
 
 
-def test_near_a_detent_cogging_is_a_spring(x64):
-    # Stiffness 2 pi A / period = 4 pi 0.4 [N/m]; 1e-3 m off is 0.6 % of a radian of its sine.
-    twin = mass_with(rk4, dt=0.02, mass=0.5).extend(Cogging(amplitude=0.4, period=0.5))
-    omega = np.sqrt(4.0 * np.pi * 0.4 / 0.5)
-
-    states = moved(twin, np.zeros(200), position=1e-3).states
-
-    exact = 1e-3 * np.cos(omega * 0.02 * np.arange(201))
-    np.testing.assert_allclose(states.q[:, 0], exact, atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("effect", "potential"),
     [
         (Stiffness(k=2.0, q0=0.3), lambda q: 1.0 * (q - 0.3) ** 2),
         (CubicStiffness(k3=2.0), lambda q: 0.5 * q**4),
-        (
-            Cogging(amplitude=0.4, period=0.5, phase=0.1),
-            lambda q: -0.4 * 0.5 / (2 * np.pi) * np.cos(2 * np.pi * (q - 0.1) / 0.5),
-        ),
+        (Cogging(amplitude=0.4, period=0.5), lambda q: -0.1 / np.pi * np.cos(4 * np.pi * q)),
         (ConstantForce(tau_0=0.2), lambda q: -0.2 * q),
     ],
-    ids=lambda x: getattr(x, "name", ""),
 )
 def test_forces_that_depend_on_position_keep_energy(x64, effect, potential):
     twin = mass_with(rk4, dt=0.01, mass=0.5).extend(effect)
 
     states = moved(twin, np.zeros(500), position=0.4, speed=1.0).states
 
-    energy = energy_of_a_mass(states, 0.5, potential)
+    energy = 0.25 * states.v[:, 0] ** 2 + potential(states.q[:, 0])
     np.testing.assert_allclose(energy, energy[0], atol=1e-6)  # RK4: 1e-9 per step at most
 
 
-@every_integrator
 @pytest.mark.parametrize(
-    "effect",
-    [Stiffness(k=1e6), CubicStiffness(k3=1e6), Cogging(amplitude=1e6, period=0.1)],
-    ids=lambda effect: effect.name,
+    ("effect", "integrator", "h", "most"),
+    [
+        (Stiffness(k=1e6), semi_implicit_euler, 10.0, 100.0),
+        (CubicStiffness(k3=1e6), rk4, 0.1, 100.0),
+        (Cogging(amplitude=1e6, period=0.1), rk4, 10.0, 100.0),
+        (Stiffness(k=1e6), explicit_euler, 0.1, 1e6),
+    ],
 )
-@pytest.mark.parametrize("h", [1e-3, 0.1, 10.0])
-def test_springs_beyond_what_a_sub_step_can_follow_do_not_run_away(x64, effect, integrator, h):
+def test_springs_beyond_what_a_sub_step_can_follow_do_not_run_away(
+    x64, effect, integrator, h, most
+):
     # The stiffest that acts is m / h^2, where omega h = 1: symplectic Euler and RK4 stay bounded;
     # explicit Euler grows by sqrt(2) per step, as it does with any spring of that frequency.
     twin = mass_with(integrator, dt=h, mass=0.5).extend(effect)
 
     q = moved(twin, np.zeros(30), position=1.0).states.q[:, 0]
 
-    assert np.isfinite(q).all()
-    assert np.abs(q).max() < (1e6 if integrator is explicit_euler else 100.0)
-
-
-def test_a_constant_force_accelerates_evenly(x64):
-    twin = Mass(mass=0.5).extend(ConstantForce(tau_0=-0.2))
-
-    states = moved(twin, np.zeros(50)).states
-
-    np.testing.assert_allclose(states.v[:, 0], -0.4 * 0.1 * np.arange(51), rtol=1e-12)
+    assert np.isfinite(q).all() and np.abs(q).max() < most
 
 
 def test_direction_dependent_friction_is_friction_and_a_constant_force_while_moving(x64):

@@ -23,9 +23,21 @@ from sb3_hds.effects import CoulombFriction, SensorBias
 from sb3_hds.twins.mechanics import Points, check_mechanics
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
+slow = pytest.mark.expensive
 
 
-@pytest.mark.parametrize("name", twins.names())
+def of_one_joint(name):
+    return len(twins.get(name).joints) == 1
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        # Those of two joints take ten seconds each; they have their parity tests, too.
+        pytest.param(name, marks=() if of_one_joint(name) or name == "CartPole" else slow)
+        for name in twins.names()
+    ],
+)
 def test_every_twin_passes(name):
     found = twins.check(name)
 
@@ -48,93 +60,78 @@ def light(mass):
     return {"mass": Parameter(1.0, 0.1, "kg", lower=mass)}
 
 
+def rest(self, key, params):
+    return State(jnp.zeros(1), jnp.zeros(1), {})
+
+
 FLAWS = {
     "shapes": (
         {"bias": lambda self, q, v, params: jnp.ones(2)},
         "shapes and dtypes",
         "Cart.bias returns shape (2,), expected (1,)",
-        "not checked: everything else",
     ),
     "nothing finite": (
         {"bias": lambda self, q, v, params: params["damping"] * v / (q - q)},
         "finite",
         "step is not finite after 1 of 20 steps with the twin's own values",
-        "division by zero",
     ),
     "a bound at which nothing works": (
-        {
-            "parameters": light(0.0),
-            "bias": lambda self, q, v, params: 0.1 * v,
-        },
+        {"parameters": light(0.0), "bias": lambda self, q, v, params: 0.1 * v},
         "finite",
         "is not finite after 1 of 20 steps with mass = 0",
-        "Move the bound of mass",
     ),
     "no derivative": (
         {
             "parameters": light(0.1),
-            "initial": lambda self, key, params: State(jnp.zeros(1), jnp.zeros(1), {}),
+            "initial": rest,
             "reward": lambda self, state, action, after, params: -jnp.sqrt(jnp.sum(state.q**2)),
             "bias": lambda self, q, v, params: 0.1 * v,
         },
         "finite",
         "the derivative of reward is not finite",
-        "write sqrt(x**2 + 1e-12)",
     ),
     "no inverse": (
         {"infer": lambda self, obs, params: State(obs[:1], 2.0 * obs[1:], {})},
         "infer inverts observe",
         "differs from obs in 'speed' by 100.0% of its largest value",
-        "put each channel back",
     ),
     "a value that is read from self": (
-        {
-            "mass_matrix": lambda self, q, params: self.values["mass"] * jnp.ones((1, 1), q.dtype),
-        },
+        {"mass_matrix": lambda self, q, params: self.values["mass"] * jnp.ones((1, 1), q.dtype)},
         "parameters",
         "without effect on motion, observation and reward: mass",
-        "take values from params, never from self",
     ),
     "a command that does nothing": (
         {"actuate": lambda self, state, action, params: 0.0 * action},
         "commands",
         "without effect on the motion: push",
-        "Use each entry of the action",
     ),
     "a mass that vanishes": (
-        {
-            "mass_matrix": lambda self, q, params: (
-                (params["mass"] - 1.2) * jnp.ones((1, 1), q.dtype)
-            ),
-        },
+        {"mass_matrix": lambda self, q, params: jnp.full((1, 1), params["mass"] - 1.2, q.dtype)},
         "mass matrix",
         "rail has an inertia of -",
-        "lower bounds",
     ),
     "damping with the wrong sign": (
         {"bias": lambda self, q, v, params: -params["damping"] * v},
         "forces of inertia",
         "they add energy: v'(dM/dt v / 2 - bias(q, v) + bias(q, 0)) is positive",
-        "damping is + d v",
     ),
     "a wall that throws back": (
         {"limit": lambda self, q, v: (q, jnp.where(q > 0.0, -1.5 * jnp.abs(v), v))},
         "energy",
         "which is no error of the integrator",
-        "limit and limit_velocity",
     ),
 }
 
 
 @pytest.mark.parametrize("flaw", FLAWS)
-def test_a_flaw_is_found_by_its_check_and_told_with_a_way_out(flaw):
-    changes, name, message, way_out = FLAWS[flaw]
+def test_a_flaw_is_found_by_its_check(flaw):
+    changes, name, message = FLAWS[flaw]
 
     found = twins.check(flawed(**changes))
 
     assert found.failed == (name,)
     told = " ".join(str(found).split())
-    assert f"FAIL {name}: " in told and message in told and way_out in told
+    assert f"FAIL {name}: " in told and message in told
     assert max(map(len, str(found).splitlines())) <= 80
 
 
@@ -199,20 +196,16 @@ def test_damping_of_its_own_dissipates(x64):
     assert all(item.ok for item in items) and "own damping dissipates" in items[2].found
 
 
+def inertia(*rows):
+    return {"mass_matrix": lambda self, q, params: jnp.array(rows)}
+
+
 @pytest.mark.parametrize(
     ("changes", "name", "message"),
     [
-        (
-            {"mass_matrix": lambda self, q, params: jnp.array([[2.0, 1.0], [0.5, 2.0]])},
-            "mass matrix",
-            "not symmetric: entry (joint1, joint2) differs from its mirror image by 25.0%",
-        ),
-        (
-            # Eigenvalues 1 - 1.5 and 1 + 1.5.
-            {"mass_matrix": lambda self, q, params: jnp.array([[1.0, 1.5], [1.5, 1.0]])},
-            "mass matrix",
-            "not positive definite: smallest eigenvalue -0.5",
-        ),
+        (inertia([2.0, 1.0], [0.5, 2.0]), "mass matrix", "not symmetric: entry (joint1, joint2)"),
+        # Eigenvalues 1 - 1.5 and 1 + 1.5.
+        (inertia([1.0, 1.5], [1.5, 1.0]), "mass matrix", "smallest eigenvalue -0.5"),
         (
             {"weight": lambda self, q: 9.81 * jnp.stack([jnp.sin(q[0] + q[1]), jnp.sin(q[1])])},
             "gravity and springs",
@@ -228,11 +221,7 @@ def test_damping_of_its_own_dissipates(x64):
             "forces of inertia",
             "they add energy",  # at high speed, where damping does not hide it
         ),
-        (
-            {"mass_matrix": lambda self, q, params: jnp.eye(2) / (q[0] - q[0])},
-            "equation of motion",
-            "mass_matrix is not finite",
-        ),
+        (inertia([np.nan, 0.0], [0.0, 1.0]), "equation of motion", "mass_matrix is not finite"),
         (
             {"integrator": staticmethod(lambda a, q, v, h, limit: (q + h * v, v * (1.0 + h)))},
             "energy",
@@ -267,7 +256,6 @@ def test_effects_and_wrappers_are_looked_through(x64):
     found = twins.check(TransformedTwin(extended, stateful=Delay(steps=2)))
 
     assert found.ok, found
-    assert "coulomb_friction" in str(found) or "least:" in str(found)
 
 
 def test_without_a_mass_matrix_there_is_no_energy_to_check():

@@ -8,7 +8,7 @@ from free_mass import Mass
 
 from sb3_hds import HDS, Trajectories, calibrate, diagnose, twins
 from sb3_hds.core import Actuator, AnalyticTwin, Channel, Joint, Parameter, State, TransformedTwin
-from sb3_hds.core.contract import check_methods, check_now
+from sb3_hds.core.contract import check_methods
 from sb3_hds.core.filters import LowPass
 from sb3_hds.effects import CoulombFriction
 from sb3_hds.envs import TwinEnv, TwinVecEnv
@@ -53,11 +53,11 @@ def broken(**changes):
     return type("Leg", (Leg,), changes)()
 
 
+# By mistake: what is changed, and a part of what is said.
 WRONG = {
     "a command that would push every joint": (
         {"actuate": lambda self, state, action, params: action},
-        "Leg.actuate returns shape (1,), expected (3,): one generalised force for each joint (hip, "
-        "knee, ankle), zero where nothing pushes.",
+        "Leg.actuate returns shape (1,), expected (3,): one generalised force for each joint",
     ),
     "a load that would pull every joint": (
         {"bias": lambda self, q, v, params: jnp.sum(q)},
@@ -65,28 +65,23 @@ WRONG = {
     ),
     "a vector in the place of a matrix": (
         {"mass_matrix": lambda self, q, params: jnp.ones(3, q.dtype)},
-        "Leg.mass_matrix returns shape (3,), expected (3, 3): a row and a column for each joint",
+        "Leg.mass_matrix returns shape (3,), expected (3, 3)",
     ),
     "a mass of whole numbers": (
         {"mass_matrix": lambda self, q, params: jnp.eye(3, dtype=int)},
-        "Leg.mass_matrix returns int32, expected float32. Write constants with a decimal point",
+        "Leg.mass_matrix returns int32, expected float32",
     ),
     "single precision where data are fitted": (
         {"bias": lambda self, q, v, params: jnp.sin(q).astype(jnp.float32)},
-        "Leg.bias returns float32, expected float64. Data are fitted in double precision",
+        "Leg.bias returns float32, expected float64",
     ),
     "a channel that is not measured": (
         {"observe": lambda self, state, params: state.q},
-        "Leg.observe returns shape (3,), expected (6,): one entry for each channel (q0, q1, q2, "
-        "v0, ...).",
+        "Leg.observe returns shape (3,), expected (6,): one entry for each channel (q0, q1, q2,",
     ),
     "a pair in the place of a state": (
         {"infer": lambda self, obs, params: (obs[:3], obs[3:])},
         "Leg.infer returns a tuple, expected State(q, v, memory).",
-    ),
-    "nothing": (
-        {"initial": lambda self, key, params: None},
-        "Leg.initial returns None, expected State(q, v, memory).",
     ),
     "a state of another size": (
         {"infer": lambda self, obs, params: State(obs, obs, {})},
@@ -99,31 +94,23 @@ WRONG = {
     "a step that forgets": (
         {
             "initial": lambda self, key, params: State(
-                jnp.zeros(3), jnp.zeros(3), {"clock": jnp.zeros(())}
+                *jnp.zeros((2, 3)), {"clock": jnp.zeros(())}
             ),
             "step": lambda self, state, action, params: State(state.q, state.v, {}),
         },
-        "Leg.step(...).memory returns {}, expected {'clock': 'float32[]'}, as it went in.",
+        "Leg.step(...).memory returns {}, expected {'clock': 'float32[]'}",
     ),
     "a reward for each joint": (
         {"reward": lambda self, state, action, next_state, params: -(next_state.q**2)},
-        "Leg.reward returns shape (3,), expected (): one number; over joints, take jnp.sum(...)",
-    ),
-    "a reward that is a truth value": (
-        {"reward": lambda self, state, action, next_state, params: next_state.q[0] > 0.0},
-        "Leg.reward returns bool, expected float32.",
+        "Leg.reward returns shape (3,), expected (): one number",
     ),
     "a plan that is rewarded joint by joint": (
         {"planning_reward": lambda self, state, action, next_state, params: next_state.q},
         "Leg.planning_reward returns shape (3,), expected ()",
     ),
-    "an end for each joint": (
-        {"terminated": lambda self, state, params: state.q > 1.0},
-        "Leg.terminated returns shape (3,), expected (): one truth value",
-    ),
     "an end that is a number": (
         {"terminated": lambda self, state, params: state.q[0]},
-        "Leg.terminated returns float32, expected bool. Compare, as in",
+        "Leg.terminated returns float32, expected bool",
     ),
     "a limit that returns velocities alone": (
         {"limit": lambda self, q, v: v},
@@ -150,22 +137,16 @@ WRONG = {
         "Use jax.numpy in place of numpy and math.",
     ),
     "a joint without its comma": ({"joints": Joint("hip")}, "Write joints = (Joint(...),), with"),
-    "two joints of one name": (
-        {"joints": (Joint("hip"), Joint("hip"), Joint("ankle"))},
-        "Leg has joints of the same name: hip.",
-    ),
+    "joints of one name": ({"joints": (Joint("hip"),) * 3}, "Leg has joints of the same name: hip"),
     "limits the wrong way round": (
         {"actuators": (Actuator("motor", "N m", 1.0, -1.0),)},
-        "The limits of 'motor' in Leg must be low < high, got 1.0 and -1.0.",
+        "The limits of 'motor' in Leg must be low < high",
     ),
     "an effect that adds to nothing": (
         {"native_effects": {("viscous_friction", 0): {"b": "damping"}}},
         "maps ('viscous_friction', 0) to damping, which is no parameter.",
     ),
-    "an option that is a list": (
-        {"options": {"masses": [1.0, 2.0]}},
-        "The options of Leg must be hashable",
-    ),
+    "an option that is a list": ({"options": {"masses": [1.0]}}, "options of Leg must be hashable"),
 }
 
 
@@ -209,7 +190,6 @@ DATA = Trajectories.from_arrays([np.zeros((41, 6))] * 2, [np.zeros((40, 1))] * 2
         lambda twin: twins.register(type(twin)),
         lambda twin: calibrate(twin, DATA),
         lambda twin: diagnose(twin, DATA, progress=False),
-        lambda twin: calibrate(twin.extend(CoulombFriction(0)), DATA),
         lambda twin: TwinEnv(twin),
         lambda twin: TwinVecEnv(twin, 2),
         lambda twin: HDS(TwinEnv(Leg()), twin=twin),
@@ -219,6 +199,11 @@ def test_every_door_refuses_it(door, clean_registry):
     with pytest.raises(TwinError, match=r"Broadcasting.actuate returns shape \(1,\)"):
         door(Broadcasting())
     assert "Broadcasting" not in twins.names()
+
+
+def test_effects_and_filters_keep_the_contract(x64):
+    extended = Mass().extend(CoulombFriction(0))
+    check_methods(TransformedTwin(extended, stateful=LowPass(cutoff=0.1, order=1)))
 
 
 def test_a_class_that_is_not_finished_is_not_registered(clean_registry):
@@ -277,13 +262,6 @@ def test_a_twin_is_checked_once(monkeypatch):
     check_methods(Counted(inertia=2.0))
 
     assert n == len(calls) > 0
-
-
-def test_every_twin_of_the_library_keeps_the_contract(x64):
-    for name in twins.names():
-        check_now(twins.make(name))
-    extended = Mass().extend(CoulombFriction(0))
-    check_methods(TransformedTwin(extended, stateful=LowPass(cutoff=0.1, order=1)))
 
 
 def test_a_name_that_is_no_parameter_suggests_the_nearest():

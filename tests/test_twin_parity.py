@@ -84,22 +84,25 @@ def change_constants(model):
         model.site_pos[0, 2] -= 0.05
 
 
-@pytest.mark.parametrize("changed", [False, True], ids=["as shipped", "changed XML"])
-@pytest.mark.parametrize("env_id", MUJOCO)
+@pytest.mark.parametrize(
+    ("env_id", "changed"),
+    [(MUJOCO[0], False), *((env_id, True) for env_id in MUJOCO)],
+    ids=["as shipped", *(f"{env_id} of another XML" for env_id in MUJOCO)],
+)
 def test_mujoco_twins_follow_mujoco(env_id, changed, x64):
     env = gymnasium.make(env_id, **({"frame_skip": 3} if changed else {})).unwrapped
     if changed:
         change_constants(env.model)
     twin = twins.from_env(env)
 
-    for obs, _, terminated, state, twin_obs, _, twin_terminated in random_episodes(env, twin):
+    for obs, reward, ended, state, twin_obs, twin_reward, twin_ended in random_episodes(env, twin):
         # Rounding of 1e-16 per operation, grown along unstable episodes of some ten steps.
         scale = np.maximum(1.0, np.abs([*env.data.qpos, *env.data.qvel]))
         error = np.concatenate([state.q - env.data.qpos, state.v - env.data.qvel]) / scale
         assert np.abs(error).max() < 1e-12
         np.testing.assert_allclose(twin_obs, obs, rtol=1e-12, atol=1e-12)
         if env_id == "InvertedPendulum-v5":
-            assert terminated == twin_terminated
+            assert (ended, reward) == (twin_ended, twin_reward)
 
 
 @pytest.mark.parametrize("env_id", MUJOCO)
@@ -109,13 +112,6 @@ def test_declared_constants_are_those_of_the_shipped_model(env_id):
     assert twin == twins.make(env_id)
     # The compiler derives masses and inertias from shapes; declared to 16 digits.
     assert twin.values == pytest.approx(twins.make(env_id).values, rel=1e-14)
-
-
-def test_the_reward_of_the_inverted_pendulum_is_the_environments(x64):
-    env = gymnasium.make("InvertedPendulum-v5").unwrapped
-
-    for _, reward, _, _, _, twin_reward, _ in random_episodes(env, twins.from_env(env)):
-        assert twin_reward == reward
 
 
 def test_the_reward_of_the_double_pendulum_is_the_environments_at_the_end_of_the_step(x64):
@@ -144,13 +140,12 @@ def test_the_reward_of_the_double_pendulum_is_the_environments_at_the_end_of_the
         (lambda m: m.jnt_axis.__setitem__(1, (1.0, 0.0, 0.0)), "hinges about y"),
     ],
 )
-@pytest.mark.parametrize("env_id", MUJOCO)
-def test_a_model_of_another_structure_is_refused(env_id, change, expected):
-    env = gymnasium.make(env_id).unwrapped
-    change(env.model)
-
-    with pytest.raises(EnvironmentMismatchError, match=f"The twin expects .*{expected}"):
-        twins.from_env(env)
+def test_a_model_of_another_structure_is_refused(change, expected):
+    for env_id in MUJOCO:
+        env = gymnasium.make(env_id).unwrapped
+        change(env.model)
+        with pytest.raises(EnvironmentMismatchError, match=f"The twin expects .*{expected}"):
+            twins.from_env(env)
 
 
 def test_pendulum_follows_gymnasium(x64):
@@ -207,43 +202,27 @@ def acrobot_state(env):
 def test_acrobot_follows_gymnasium(x64):
     env, twin = gymnasium.make("Acrobot-v1").unwrapped, twins.make("Acrobot")
     rng, simulate = np.random.default_rng(0), simulator(twin)
-
-    for seed in range(3):
-        env.reset(seed=seed)
-        state = acrobot_state(env)
-        for _ in range(N_STEPS):
-            choice = rng.integers(3)
-            obs, reward, terminated, *_ = env.step(choice)
-            state, twin_obs, twin_reward, twin_terminated = simulate(
-                state, jnp.array([choice - 1.0])
-            )
-            angles = (state.q - env.state[:2] + math.pi) % (2.0 * math.pi) - math.pi
-            # Rounding of 1e-16, grown by chaotic motion over 40 s.
-            np.testing.assert_allclose(angles, 0.0, rtol=0.0, atol=1e-10)
-            np.testing.assert_allclose(state.v, env.state[2:], rtol=0.0, atol=1e-10)
-            np.testing.assert_allclose(twin_obs, obs, rtol=1e-6, atol=1e-6)  # reported in float32
-            assert (twin_reward, twin_terminated) == (reward, terminated)
-
-
-def test_acrobot_clips_speeds_and_ends_high_as_gymnasium_does(x64):
-    env, twin = gymnasium.make("Acrobot-v1").unwrapped, twins.make("Acrobot")
-    rng, simulate = np.random.default_rng(0), simulator(twin)
     n_clipped = n_terminated = 0
+    env.reset(seed=0)
+    state = acrobot_state(env)
 
-    for _ in range(N_STEPS):
-        env.reset()
-        highest = np.array([math.pi, math.pi, env.MAX_VEL_1, env.MAX_VEL_2])
-        env.state = rng.uniform(-highest, highest)
-        before = acrobot_state(env)
-        _, reward, terminated, *_ = env.step(2)
-        after, _, twin_reward, twin_terminated = simulate(before, jnp.ones(1))
-        # One step at up to 28 rad/s, with derivatives of up to 1e3.
-        np.testing.assert_allclose(after.v, env.state[2:], rtol=0.0, atol=1e-10)
-        assert (twin_reward, twin_terminated) == (reward, terminated)
-        n_clipped += np.abs(after.v[1]) == env.MAX_VEL_2
+    for k in range(2 * N_STEPS):
+        if k >= N_STEPS:  # then single steps from anywhere: at clips, and high up
+            highest = np.array([math.pi, math.pi, env.MAX_VEL_1, env.MAX_VEL_2])
+            env.state = rng.uniform(-highest, highest)
+            state = acrobot_state(env)
+        choice = rng.integers(3)
+        obs, reward, terminated, *_ = env.step(choice)
+        state, twin_obs, twin_reward, twin_ended = simulate(state, jnp.array([choice - 1.0]))
+        angles = (state.q - env.state[:2] + math.pi) % (2.0 * math.pi) - math.pi
+        # Rounding of 1e-16, grown by chaotic motion over 40 s.
+        np.testing.assert_allclose(angles, 0.0, rtol=0.0, atol=1e-10)
+        np.testing.assert_allclose(state.v, env.state[2:], rtol=0.0, atol=1e-10)
+        np.testing.assert_allclose(twin_obs, obs, rtol=1e-6, atol=1e-6)  # reported in float32
+        assert (twin_reward, twin_ended) == (reward, terminated)
+        n_clipped += np.abs(state.v[1]) == env.MAX_VEL_2
         n_terminated += terminated
-    assert n_clipped > 5
-    assert n_terminated > 5
+    assert n_clipped > 5 and n_terminated > 5
 
 
 def test_cart_pole_follows_gymnasium(x64):
@@ -329,31 +308,11 @@ def test_the_drive_of_the_payload_changes_its_momentum(x64):
     np.testing.assert_allclose(acceleration[:2], (command - state.v[:2]) / 0.05, rtol=1e-12)
 
 
-def test_a_payload_under_a_still_handle_keeps_its_energy(x64):
-    twin = twins.make("PayloadPendulum", damping=0.0)
-    simulate = simulator(twin)
-    state = state_of([0.3, -0.2, 1.2], [0.0, 0.0, 0.5])
-
-    def energy(state):
-        return 0.5 * state.v[2] ** 2 - 9.81 * jnp.cos(state.q[2])
-
-    before = energy(state)
-    for _ in range(100):
-        state, *_ = simulate(state, jnp.zeros(2))
-
-    # RK4 loses (3.1 rad/s 25 ms)^6 / 72 = 3e-9 of the energy in each of 200 sub-steps.
-    assert float(energy(state)) == pytest.approx(float(before), rel=1e-5)
-    # The drive holds against the payload up to rounding.
-    np.testing.assert_allclose(state.q[:2], [0.3, -0.2], rtol=0.0, atol=1e-13)
-
-
 def reset_states(env, n):
     for seed in range(n):
         env.reset(seed=seed)
-        if hasattr(env, "data"):
-            yield np.concatenate([env.data.qpos, env.data.qvel])
-        else:
-            yield np.asarray(env.state, float)
+        mujoco_data = getattr(env, "data", None)
+        yield np.concatenate([mujoco_data.qpos, mujoco_data.qvel]) if mujoco_data else env.state
 
 
 @pytest.mark.parametrize("env_id", [*MUJOCO, *CLASSIC, "Acrobot-v1"])
@@ -362,7 +321,7 @@ def test_episodes_start_as_the_environments_do(env_id, x64):
     env = gymnasium.make(env_id, **settings).unwrapped
     twin = twins.make("Acrobot") if env_id == "Acrobot-v1" else twins.from_env(env)
 
-    theirs = np.stack(list(reset_states(env, 500)))
+    theirs = np.stack(list(reset_states(env, 300)))
     keys = jax.random.split(jax.random.key(0), 4000)
     ours = np.concatenate(jax.vmap(twin.initial, (0, None))(keys, twin.params)[:2], axis=1)
 
