@@ -16,7 +16,6 @@ from measuring import measured
 from sb3_hds import Trajectories, cli, effects, twins
 from sb3_hds.cli import measured as measured_room
 from sb3_hds.core import State, rollout
-from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid import Diagnosis
 from sb3_hds.twins import registry
 
@@ -34,64 +33,33 @@ def ask(*words):
     return cli.main(["diagnose", *map(str, words)])
 
 
-def test_a_diagnosis_is_printed_and_written(log, tmp_path, capsys):
-    page, plain = tmp_path / "out.html", tmp_path / "out.json"
-    chosen = ["--effects", "coulomb_friction", "viscous_friction"]
-
-    code = ask("--twin", "PendulumReal", "--data", log, *chosen, "--report", page, "--json", plain)
-
-    assert code == 0
-    assert "coulomb_friction at joint hinge" in capsys.readouterr().out
-    assert json.loads(plain.read_text())["findings"][0]["effect"] == "coulomb_friction"
-    assert page.read_text().startswith("<!DOCTYPE html>")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["out.html", "out.json"]
-
-
-def test_any_verdict_is_success(tmp_path, capsys):
-    rng = np.random.default_rng(0)
-    still = np.array([-1.0, 0.0, 0.0]) + 1e-3 * rng.standard_normal((8, 61, 3))
-    data = Trajectories.from_arrays(list(still), [np.zeros((60, 1))] * 8, dt=0.05)
-
-    code = ask("--twin", "PendulumReal", "--data", data.save(tmp_path / "still"))
-
-    assert code == 0
-    assert "not_identifiable" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"--twin": "Nothing"}, "There is no twin for 'Nothing'"),
+        ({"--twin": "Nothing"}, "no twin for 'Nothing'"),
         ({"--data": "missing.npz"}, "missing.npz"),
-        ({"--effects": "magic"}, "There is no effect 'magic'"),
+        ({"--effects": "CoulombFrction"}, "Did you mean 'coulomb_friction'?"),
         ({"--set": "mass=2"}, "--set takes NAME:VALUE, got 'mass=2'"),
-        ({"--set": "mass:"}, "--set takes NAME:VALUE, got 'mass:'"),
-        ({"--set": "mass:-1"}, "mass"),
-        ({"--set": "mass:heavy"}, "Parameter 'mass' must be a number [kg], got 'heavy'"),
-        ({"--set": "weight:1"}, "has no parameter 'weight'"),
+        ({"--set": "mass:heavy"}, "must be a number [kg]"),
+        ({"--set": "mas:1"}, "Did you mean 'mass'?"),
         ({"--calibrate": "weight"}, "Its parameters are"),
         ({"--columns": "missing.yml"}, "missing.yml"),
-        ({"--report": "nowhere/out.html"}, "nowhere/out.html cannot be written"),
-        ({"--report": "r.pdf"}, "A report is an HTML page: name it r.html in place of r.pdf."),
-        ({"--effects": "CoulombFrction"}, "'CoulombFrction'. Did you mean 'coulomb_friction'?"),
-        ({"--set": "mas:1"}, "no parameter 'mas'. Did you mean 'mass'?"),
-        ({"--json": "."}, ". is a folder"),
+        ({"--report": "nowhere/out.html"}, "cannot be written"),
+        ({"--report": "r.pdf"}, "r.html in place of r.pdf"),
+        ({"--json": "."}, "is a folder"),
         ({"--env": "Nothing-v0"}, "Nothing"),
-        ({"--env": "Pendulum-v1", "--algo": "magic"}, "There is no algorithm 'magic'"),
-        ({"--env": "Pendulum-v1", "--env-kwargs": "g"}, "--env-kwargs takes NAME:VALUE"),
+        ({"--env": "Pendulum-v1", "--algo": "magic"}, "no algorithm 'magic'"),
         ({"--env": "Pendulum-v1", "--env-kwargs": "friction:1"}, "friction"),
         ({"--env": "Pendulum-v1", "--hyperparams": "speed:1"}, "speed"),
         ({"--env": "Pendulum-v1", "--policies": "0"}, "at least 1"),
-        ({"--env": "Pendulum-v1", "--algo": "sac"}, "SAC learns nothing in 0 steps"),
+        ({"--env": "Pendulum-v1", "--algo": "sac"}, "learns nothing"),
         ({"--env": "MountainCarContinuous-v0"}, "observations of shape (2,)"),
     ],
 )
 def test_a_question_that_makes_no_sense_is_one_message(log, capsys, changes, message):
     words = {"--twin": "PendulumReal", "--data": log} | changes
 
-    code = ask(*(word for pair in words.items() for word in pair))
-
-    assert code == 1
+    assert ask(*(word for pair in words.items() for word in pair)) == 1
     told = capsys.readouterr().err
     assert told.startswith("sb3-hds: ") and message in told and "Traceback" not in told
 
@@ -147,21 +115,6 @@ def test_an_audit_with_a_twin_sees_degrees_and_any_verdict_is_success(swings, tm
     assert not list(tmp_path.iterdir())
 
 
-def test_what_an_audit_corrects_is_said_and_audited_again(tmp_path, capsys):
-    time = 0.01 * np.arange(2000)
-    obs = np.stack([np.sin(3.0 * time), 3.0 * np.cos(3.0 * (time - 0.04))], 1)
-    commands = np.random.default_rng(0).standard_normal((1999, 1))
-    log = Trajectories.from_arrays([obs], [commands], dt=0.01).save(tmp_path / "log")
-    told = tmp_path / "audit.json"
-
-    assert cli.main(["audit", "--data", str(log), "--correct", "--json", str(told)]) == 0
-
-    shown, plain = capsys.readouterr().out, json.loads(told.read_text())
-    assert "'obs[1]' was shifted by -40 ms." in shown and shown.count("Audit of 1 trajectory") == 2
-    assert plain["corrections"] and plain["velocity_shift"]
-    assert plain["corrected"]["velocity_shift"] == {}
-
-
 def test_a_calibrated_twin_is_printed_written_and_read_again(swings, tmp_path, capsys):
     twin, told = tmp_path / "twin.json", tmp_path / "fit.json"
     about = ["--twin", "FreePendulum", "--set", "dt:0.00666667", "mass:0.3"]
@@ -182,25 +135,19 @@ def test_a_calibrated_twin_is_printed_written_and_read_again(swings, tmp_path, c
         assert again.values["mass"] == 0.31
 
 
+FREE = ["--twin", "FreePendulum"]
+
+
 @pytest.mark.parametrize(
     ("command", "words", "message"),
     [
-        ("audit", ["--set", "mass:1"], "--set changes the twin: name one with --twin, or --model."),
-        ("audit", ["--json", "nowhere/out.json"], "nowhere/out.json cannot be written"),
-        ("audit", ["--twin", "CartPole"], "CartPole has 5 channels and 1 commands"),
-        ("calibrate", ["--twin", "FreePendulum"], "steps by 0.01 s and the data are sampled every"),
-        ("calibrate", ["--twin", "FreePendulum", "--free", "weight"], "free must name parameters"),
-        ("calibrate", ["--twin", "Nothing"], "There is no twin for 'Nothing'"),
-        (
-            "calibrate",
-            ["--twin", "FreePendulum", "--set", "dt:0.00666667", "--prior", "-1"],
-            "prior must be at least 0",
-        ),
-        (
-            "calibrate",
-            ["--twin", "FreePendulum", "--set", "dt:0.00666667", "--level", "95"],
-            "level must lie between 0 and 1",
-        ),
+        ("audit", ["--set", "mass:1"], "--set changes the twin"),
+        ("audit", ["--json", "nowhere/out.json"], "cannot be written"),
+        ("audit", ["--twin", "CartPole"], "CartPole has 5 channels"),
+        ("calibrate", FREE, "steps by 0.01 s"),
+        ("calibrate", [*FREE, "--free", "weight"], "free must name parameters"),
+        ("calibrate", [*FREE, "--set", "dt:0.00666667", "--prior", "-1"], "prior must be"),
+        ("calibrate", [*FREE, "--set", "dt:0.00666667", "--level", "95"], "level must lie"),
     ],
 )
 def test_other_questions_that_make_no_sense_are_one_message_too(
@@ -231,28 +178,43 @@ def test_what_exists_is_listed_with_units_and_explanations(capsys):
     assert "A carriage with a ball screw" in " ".join(words) and ":class:" not in shown
 
 
-def test_a_twin_is_set_by_numbers_words_and_truth_values(tmp_path, monkeypatch, capsys):
-    asked = []
+@pytest.fixture
+def asked(monkeypatch):
+    """What a diagnosis would be asked: twins, data and further arguments."""
+    seen = []
 
-    def diagnose(twin, data, **_):
-        asked.append(twin)
-        raise CalibrationError("enough")
+    def diagnose(twin, data, **given):
+        seen.append((twin, data, given))
+        warnings.warn("Rows are\nuneven.", UserWarning, stacklevel=2)
+        return Diagnosis("none", twin, twin, data_hash="", seed=0)
 
     monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
-    data = Trajectories.from_arrays([np.zeros((9, 1))], [np.zeros((8, 1))], dt=0.01)
-    log = data.save(tmp_path / "log")
+    return seen
+
+
+def empty_log(folder, n_obs=2, n_act=0):
+    data = Trajectories.from_arrays([np.zeros((9, n_obs))], [np.zeros((8, n_act))], dt=0.01)
+    return data.save(folder / "log")
+
+
+def test_a_twin_is_set_by_words_and_commas_separate_names(asked, tmp_path, capsys):
+    log = empty_log(tmp_path, 1, 1)
     settings = {
         "FreePendulum": ["observe:q", "zero:up", "driven:true", "mass:2e-1", "substeps:4"],
         "ServoPendulum": ["commands:goal, enable"],
     }
+    words = ["--calibrate", "mass,com", "damping", "--effects", "stiffness,", "cogging"]
 
-    for name, words in settings.items():
-        assert ask("--twin", name, "--data", log, "--set", *words) == 1
+    for name, given in settings.items():
+        ask("--twin", name, "--data", log, "--set", *given, *words)
 
-    free, servo = asked
+    (free, _, given), (servo, *_) = asked
     assert (free.observed, free.zero, free.driven, free.substeps) == ("q", "up", True, 4)
-    assert free.values["mass"] == 0.2
-    assert len(servo.actuators) == 2
+    assert free.values["mass"] == 0.2 and len(servo.actuators) == 2
+    assert given["calibrate"] == ["mass", "com", "damping"]
+    assert given["effects"] == ["stiffness", "cogging"]
+    # A warning is one line without code.
+    assert capsys.readouterr().err == 2 * "warning: Rows are uneven.\n"
 
 
 def test_a_log_without_a_map_of_columns_is_told_how_to_write_one(tmp_path, capsys):
@@ -267,62 +229,39 @@ def test_a_log_without_a_map_of_columns_is_told_how_to_write_one(tmp_path, capsy
         assert "{'time'" not in told and "columns={" not in told
 
 
-def test_a_warning_is_one_line_without_code(tmp_path, monkeypatch, capsys):
-    def diagnose(twin, data, **_):
-        warnings.warn("Rows are\nuneven.", UserWarning, stacklevel=2)
-        raise CalibrationError("enough")
-
-    monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
-    data = Trajectories.from_arrays([np.zeros((9, 2))], [np.zeros((8, 0))], dt=0.01)
-
-    ask("--twin", "FreePendulum", "--data", data.save(tmp_path / "log"))
-
-    assert capsys.readouterr().err == "warning: Rows are uneven.\nsb3-hds: enough\n"
-
-
-def test_commas_separate_names_as_blanks_do(tmp_path, monkeypatch):
-    asked = []
-
-    def diagnose(twin, data, *, calibrate, effects, **_):
-        asked.append((calibrate, effects))
-        raise CalibrationError("enough")
-
-    monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
-    data = Trajectories.from_arrays([np.zeros((9, 2))], [np.zeros((8, 0))], dt=0.01)
-    log = data.save(tmp_path / "log")
-    words = ["--calibrate", "mass,com", "damping", "--effects", "stiffness,", "cogging"]
-
-    ask("--twin", "FreePendulum", "--data", log, *words)
-
-    assert asked == [(["mass", "com", "damping"], ["stiffness", "cogging"])]
-
-
-def test_a_twin_of_ones_own_is_taken_from_a_module_in_the_folder(tmp_path, monkeypatch, capsys):
-    asked = []
-
-    def diagnose(twin, data, **_):
-        asked.append(twin)
-        raise CalibrationError("enough")
-
-    monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
+@pytest.fixture
+def own_modules(tmp_path, monkeypatch):
+    """A folder to work in, and registries that forget what its modules register."""
     monkeypatch.setattr("sys.path", [path for path in sys.path if path])
     monkeypatch.setattr(registry, "_TWINS", dict(registry._TWINS))
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rigs_in_a_folder.py").write_text(
         "from sb3_hds import twins\n\n\n@twins.register\n"
-        "class Swing(twins.FreePendulum):\n    name = 'SwingInAFolder'\n"
+        "class Slide(twins.LinearAxis):\n    name = 'SlideInAFolder'\n"
+        "    def bias(self, q, v, params):\n        return -params['damping'] * v\n"
     )
-    data = Trajectories.from_arrays([np.zeros((9, 2))], [np.zeros((8, 0))], dt=0.01)
-    log = data.save(tmp_path / "log")
+    return tmp_path
 
-    assert ask("--twin", "rigs_in_a_folder:SwingInAFolder", "--data", log) == 1
-    assert asked[0].name == "SwingInAFolder"
+
+def test_a_twin_of_ones_own_is_taken_from_a_module_in_the_folder(own_modules, asked, capsys):
+    log = empty_log(own_modules)
+
+    assert ask("--twin", "rigs_in_a_folder:SlideInAFolder", "--data", log) == 0
+    assert asked[0][0].name == "SlideInAFolder"
 
     capsys.readouterr()
     assert ask("--twin", "FreePendulun", "--data", log) == 1
     told = capsys.readouterr().err
     assert "Did you mean 'FreePendulum'? " in told and "--twin module:Name" in told
     assert told.count("\n") == 1 and len(told) < 300
+
+
+def test_a_twin_is_checked_and_a_flaw_is_a_failure(own_modules, capsys):
+    assert cli.main(["twins", "check", "rigs_in_a_folder:SlideInAFolder"]) == 1
+    told = capsys.readouterr().out
+    assert "SlideInAFolder: 1 of 8 checks failed" in told and "FAIL forces of inertia" in told
+    assert cli.main(["twins", "check", "LinearAxis", "--set", "mass:3"]) == 0
+    assert "LinearAxis: all 9 checks passed" in capsys.readouterr().out
 
 
 def test_the_twin_that_was_extended_is_asked_again(log, tmp_path, capsys):
@@ -339,55 +278,54 @@ def test_the_twin_that_was_extended_is_asked_again(log, tmp_path, capsys):
     assert "holds no twin: it has to be what" in capsys.readouterr().err
 
 
-def test_what_the_audit_proposes_is_done_if_wanted_and_said(tmp_path, monkeypatch, capsys):
+def test_what_the_audit_proposes_is_done_if_wanted_and_said(asked, tmp_path, capsys):
     """A filter in the drive: the speed comes four samples late."""
-    asked = []
-
-    def diagnose(twin, data, **_):
-        asked.append(data)
-        return Diagnosis("none", twin, twin, data_hash="", seed=0)
-
-    monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
     time = 0.01 * np.arange(2000)
     obs = np.stack([np.sin(3.0 * time), 3.0 * np.cos(3.0 * (time - 0.04))], 1)
     commands = np.random.default_rng(0).standard_normal((1999, 1))
-    log = Trajectories.from_arrays([obs], [commands], dt=0.01).save(tmp_path / "log")
-    words = ["--twin", "LinearAxis", "--data", log]
-
-    told = tmp_path / "out.json"
+    log = str(Trajectories.from_arrays([obs], [commands], dt=0.01).save(tmp_path / "log"))
+    words, told = ["--twin", "LinearAxis", "--data", log], str(tmp_path / "out.json")
 
     assert ask(*words) == 0
     assert "shifted" not in capsys.readouterr().out
     assert ask(*words, "--correct", "--json", told) == 0
     assert "Caveat: 'axis_velocity' was shifted by -40 ms." in capsys.readouterr().out
-    assert json.loads(told.read_text())["caveats"] == ["'axis_velocity' was shifted by -40 ms."]
-
-    plain, corrected = asked
+    assert json.loads((tmp_path / "out.json").read_text())["caveats"]
+    (_, plain, _), (_, corrected, _) = asked
     np.testing.assert_array_equal(plain.obs[0], obs)
-    np.testing.assert_allclose(
-        corrected.obs[0, :, 1], 3.0 * np.cos(3.0 * time[: len(corrected.obs[0])]), atol=0.02
-    )
+    speed = 3.0 * np.cos(3.0 * time[: len(corrected.obs[0])])
+    np.testing.assert_allclose(corrected.obs[0, :, 1], speed, atol=0.02)
+
+    assert cli.main(["audit", "--data", log, "--correct", "--json", told]) == 0
+    shown, audited = capsys.readouterr().out, json.loads((tmp_path / "out.json").read_text())
+    assert "'obs[1]' was shifted by -40 ms." in shown and shown.count("Audit of 1 trajectory") == 2
+    assert audited["corrections"] and audited["corrected"]["velocity_shift"] == {}
 
 
-def test_the_gain_in_policy_is_in_the_report(log, tmp_path, capsys):
+def test_a_diagnosis_and_the_gain_in_policy_are_printed_and_written(log, tmp_path, capsys):
     page, plain = tmp_path / "out.html", tmp_path / "out.json"
     small = ["pretrain_epochs:1", "n_rollouts:4", "n_random_plans:0", "compare_every:0"]
 
     code = ask(
         *("--twin", "PendulumReal", "--data", log, "--effects", "coulomb_friction"),
-        *("--report", page, "--json", plain),
+        *("viscous_friction", "--budget", "quick", "--report", page, "--json", plain),
         *("--env", "sb3_hds/PendulumReal-v1", "--env-kwargs", "friction:0.1"),
         *("--policies", 1, "--episodes", 2, "--hyperparams", *small),
     )
 
     assert code == 0
-    assert "interquartile mean over 2 start states, one run" in capsys.readouterr().out
-    gain = json.loads(plain.read_text())["policy_gain"]
-    assert set(gain["simulations"]) == {"believed", "extended", "true"}
-    assert f"{gain['gain']['mean']:.1f}" in page.read_text()
+    shown, told = capsys.readouterr().out, json.loads(plain.read_text())
+    assert "coulomb_friction at joint hinge" in shown and "2 start states, one run" in shown
+    assert told["findings"][0]["effect"] == "coulomb_friction"
+    assert set(told["policy_gain"]["simulations"]) == {"believed", "extended", "true"}
+    assert page.read_text().startswith("<!DOCTYPE html>")
+    assert f"{told['policy_gain']['gain']['mean']:.1f}" in page.read_text()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out.html", "out.json"]
 
 
-def test_where_nothing_was_found_no_policies_are_compared(tmp_path, capsys, monkeypatch):
+def test_any_verdict_is_success_and_where_nothing_was_found_no_policies_are_compared(
+    tmp_path, capsys, monkeypatch
+):
     monkeypatch.setattr("sb3_hds.algos.HDS.learn", None)
     still = np.array([-1.0, 0.0, 0.0]) + np.zeros((8, 61, 3))
     data = Trajectories.from_arrays(list(still), [np.zeros((60, 1))] * 8, dt=0.05)
@@ -395,7 +333,8 @@ def test_where_nothing_was_found_no_policies_are_compared(tmp_path, capsys, monk
 
     code = ask(*words, "--env", "sb3_hds/PendulumReal-v1")
 
-    assert code == 0 and "no policies to compare" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert code == 0 and "no policies to compare" in shown and "not_identifiable" in shown
 
 
 # --- what is meant, what exists, and what is sound
@@ -404,15 +343,11 @@ def test_where_nothing_was_found_no_policies_are_compared(tmp_path, capsys, monk
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["diagnos"], "no command 'diagnos'. Did you mean 'diagnose'? There are: diagnose, "),
-        (
-            ["diagnose", "--twin", "a", "--data", "b", "--efects", "x"],
-            "unknown option '--efects'. Did",
-        ),
-        (["diagnose", "--twin", "a", "--data", "b", "--budget", "quik"], "Did you mean 'quick'?"),
-        (["diagnose", "--twin", "a"], "are required: --data. See 'sb3-hds diagnose --help'."),
-        (["robustness", "--modle", "x"], "are required: --algo"),
-        ([], "are required: command. See 'sb3-hds --help'."),
+        (["diagnos"], "Did you mean 'diagnose'?"),
+        (["diagnose", "--twin", "a", "--data", "b", "--efects", "x"], "option '--efects'. Did"),
+        (["diagnose", "--twin", "a", "--data", "b", "--budget", "quik"], "mean 'quick'?"),
+        (["diagnose", "--twin", "a"], "are required: --data"),
+        ([], "are required: command"),
     ],
 )
 def test_words_that_are_not_understood_are_one_line(words, message, capsys):
@@ -467,29 +402,24 @@ def test_an_effect_is_named_as_in_python_or_as_in_the_catalogue():
 @pytest.mark.parametrize(
     ("words", "there", "not_there"),
     [
-        (["effects", "friction"], "stribeck_friction", "backlash"),
         (["effects", "Coulomb-friction"], "directional_coulomb_friction", "viscous_friction"),
-        (["twins", "cart"], "CartPole", "FreePendulum"),
         (["twins", "payload", "handle"], "PayloadPendulum", "PendulumReal"),
     ],
 )
 def test_lists_are_filtered_by_words(words, there, not_there, capsys):
     assert cli.main(words) == 0
-    first_column = [line.split("│")[1].strip() for line in capsys.readouterr().out.splitlines()
-                    if line.startswith("│")]  # fmt: skip
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
+    first_column = [row.split("│")[1].strip() for row in rows]
     assert there in first_column and not_there not in first_column
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["effects", "frictoin"], "No effect mentions 'frictoin'. Did you mean 'friction'?"),
-        (["twins", "chek", "Pendulum"], "No twin mentions 'chek Pendulum'. Did you mean 'check'?"),
-        (["twins", "check"], "Name one twin, as in 'sb3-hds twins check Pendulum'"),
-        (
-            ["twins", "check", "Pendulun"],
-            "There is no twin for 'Pendulun'. Did you mean 'Pendulum'",
-        ),
+        (["effects", "frictoin"], "Did you mean 'friction'?"),
+        (["twins", "chek", "Pendulum"], "Did you mean 'check'?"),
+        (["twins", "check"], "Name one twin"),
+        (["twins", "check", "Pendulun"], "Did you mean 'Pendulum'"),
         (["twins", "cart", "--set", "mass:1"], "--set changes the twin that is checked"),
     ],
 )
@@ -497,20 +427,3 @@ def test_a_list_without_entries_is_one_message(words, message, capsys):
     assert cli.main(words) == 1
     told = capsys.readouterr().err
     assert message in told and told.count("\n") == 1
-
-
-def test_a_twin_is_checked_and_a_flaw_is_a_failure(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(registry, "_TWINS", dict(registry._TWINS))
-    monkeypatch.setattr("sys.path", [path for path in sys.path if path])
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "rigs_to_check.py").write_text(
-        "from sb3_hds import twins\n\n\n@twins.register\n"
-        "class Slide(twins.LinearAxis):\n    name = 'SlideToCheck'\n"
-        "    def bias(self, q, v, params):\n        return -params['damping'] * v\n"
-    )
-
-    assert cli.main(["twins", "check", "rigs_to_check:SlideToCheck"]) == 1
-    told = capsys.readouterr().out
-    assert "SlideToCheck: 1 of 8 checks failed" in told and "FAIL forces of inertia" in told
-    assert cli.main(["twins", "check", "LinearAxis", "--set", "mass:3"]) == 0
-    assert "LinearAxis: all 9 checks passed" in capsys.readouterr().out

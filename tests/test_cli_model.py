@@ -87,11 +87,6 @@ def test_a_calibration_writes_the_corrected_file(arm, tmp_path, capsys):
     assert model.nu == 1 and model.opt.timestep == 0.002
 
 
-def test_an_audit_takes_a_model(arm, capsys):
-    assert ask(arm, "audit") == 0
-    assert "dt = 0.008 s" in " ".join(capsys.readouterr().out.split())
-
-
 def test_a_check_takes_the_file_of_a_model(arm, monkeypatch, capsys):
     monkeypatch.setattr("sb3_hds.twins.check", lambda twin: pytest.exit(twin.name))
     with pytest.raises(pytest.exit.Exception, match="arm1"):

@@ -16,8 +16,8 @@ from sb3_hds.core import (
     Trajectories,
     Twin,
 )
-from sb3_hds.data import SamplingWarning
-from sb3_hds.errors import CalibrationError, EffectError, ParameterError
+from sb3_hds.data import SamplingWarning, audit
+from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.calibrate import check_fits
 
 FRICTION = (effects.ViscousFriction, effects.CoulombFriction)
@@ -47,21 +47,13 @@ def changed(data, change):
     return Trajectories.from_arrays([change(o) for o in obs], actions, dt=data.dt)
 
 
-def test_a_sensor_that_reports_nothing_gets_no_name():
-    twin, data = swinging()
-
-    found = asked(twin, changed(data, lambda obs: obs * [1.0, 0.0]))
-
-    assert found.verdict == "not_identifiable" and not found.findings
-    assert any("'hinge_velocity' stays at exactly 0" in caveat for caveat in found.caveats)
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [
         (lambda obs: obs * [180.0 / np.pi, 1.0], "as if 'hinge_position' were in degrees"),
         (lambda obs: obs[:, ::-1], "They are swapped"),
         (lambda obs: obs + 50.0 * (np.arange(len(obs)) == 50)[:, None], "in a single sample"),
+        (lambda obs: obs * [1.0, 0.0], "'hinge_velocity' stays at exactly 0"),
     ],
 )
 def test_columns_that_are_not_what_the_twin_takes_them_for_get_no_name(change, says):
@@ -70,7 +62,7 @@ def test_columns_that_are_not_what_the_twin_takes_them_for_get_no_name(change, s
     found = asked(twin, changed(data, change))
 
     assert found.verdict == "not_identifiable" and not found.findings
-    assert says in found.caveats[0]
+    assert any(says in caveat for caveat in found.caveats)
 
 
 def test_one_recording_of_rest_is_refused_because_nothing_moves_with_all_other_caveats(tmp_path):
@@ -89,10 +81,18 @@ def test_one_recording_of_rest_is_refused_because_nothing_moves_with_all_other_c
     assert any("Time stamps jitter" in caveat for caveat in found.caveats[1:])
 
 
-def test_an_extended_twin_is_asked_again_by_one_name_for_each_cause():
-    twin, data = swinging(effects.CoulombFriction(0, tau_c=0.02))
+@pytest.fixture(scope="module")
+def rubbing():
+    return swinging(effects.CoulombFriction(0, tau_c=0.02))
 
-    found = asked(twin.extend(effects.CoulombFriction(0, tau_c=0.01)), data)
+
+def test_an_extended_twin_is_asked_again_by_one_name_for_each_cause(rubbing):
+    """Effects may be named, and a single parameter to calibrate may stand alone."""
+    twin, data = rubbing
+    twin = twin.extend(effects.CoulombFriction(0, tau_c=0.01))
+    names = ["coulomb_friction", "viscous_friction"]
+
+    found = diagnose(twin, data, effects=names, calibrate="mass", budget="quick", progress=False)
 
     assert found.verdict == "named"
     [finding] = found.findings
@@ -109,8 +109,6 @@ def test_less_of_what_the_twin_has_is_told_as_what_is_added_to_it():
     estimate = found.findings[0].parameters["b"]
     assert estimate.estimate == pytest.approx(-0.003, rel=0.05)
     assert estimate.added_to == pytest.approx(0.003)
-    assert "added to the twin's own 0.003" in str(found)
-    assert found.to_dict()["findings"][0]["parameters"]["b"]["added_to"] == pytest.approx(0.003)
 
 
 class Deaf(Twin):
@@ -155,14 +153,6 @@ def test_a_twin_that_does_not_listen_to_effects_gets_no_verdict():
         asked(Mute(), data)
 
 
-def test_names_of_effects_are_as_good_as_their_classes():
-    twin, data = swinging(effects.CoulombFriction(0, tau_c=0.02))
-
-    found = asked(twin, data, ["coulomb_friction", "viscous_friction"])
-
-    assert [finding.effect for finding in found.findings] == ["coulomb_friction"]
-
-
 class Nondescript(JointEffect):
     name = "nondescript"
     parameters = {"a": Parameter(null=0.0, scale=0.1, unit="N m", lower=0.0)}
@@ -174,28 +164,23 @@ class Nondescript(JointEffect):
 @pytest.mark.parametrize(
     ("changes", "error", "says"),
     [
-        ({"effects": ["rubbing"]}, EffectError, "no effect 'rubbing'. There are: viscous_friction"),
+        ({"effects": ["rubbing"]}, EffectError, "no effect 'rubbing'"),
         ({"effects": [effects.CoulombFriction(0)]}, EffectError, "effects are classes"),
-        ({"effects": None}, EffectError, "got None. Leave them out to try the whole catalogue"),
-        ({"effects": [Nondescript]}, EffectError, "Nondescript lacks explanation"),
-        ({"calibrate": None}, CalibrationError, r"such as \['mass'\], got None"),
+        ({"effects": None}, EffectError, "got None"),
+        ({"effects": [Nondescript]}, EffectError, "lacks explanation"),
+        ({"calibrate": None}, CalibrationError, "got None"),
         ({"calibrate": "weight"}, CalibrationError, "weight"),
-        ({"seed": -1}, CalibrationError, "seed must be a whole number of at least 0"),
+        ({"seed": -1}, CalibrationError, "seed must be"),
         ({"twin": "FreePendulum"}, CalibrationError, "takes a twin"),
         ({"data": np.zeros(3)}, CalibrationError, "got FreePendulum and ndarray"),
     ],
 )
-def test_mistakes_are_named_at_the_door(changes, error, says):
-    twin, data = swinging()
+def test_mistakes_are_named_at_the_door(rubbing, changes, error, says):
+    twin, data = rubbing
     given = {"twin": twin, "data": data, "progress": False} | changes
 
     with pytest.raises(error, match=says):
         diagnose(given.pop("twin"), given.pop("data"), **given)
-
-
-def test_an_option_that_is_neither_true_nor_false_is_refused():
-    with pytest.raises(ParameterError, match="driven must be True or False, got 'no'"):
-        twins.make("FreePendulum", driven="no")
 
 
 def test_a_rig_is_pushed_as_hard_as_it_was():
@@ -208,8 +193,6 @@ def test_a_rig_is_pushed_as_hard_as_it_was():
 
 
 def test_a_channel_that_is_stuck_in_one_recording_is_found():
-    from sb3_hds.data import audit
-
     twin, data = swinging()
     obs, actions = (list(leaves) for leaves in zip(*map(data.episode, range(len(data)))))  # noqa: B905
     obs[3] = np.stack([obs[3][:, 0], np.full(len(obs[3]), obs[3][0, 1])], 1)
@@ -222,8 +205,6 @@ def test_a_channel_that_is_stuck_in_one_recording_is_found():
 
 
 def test_what_is_corrected_is_said():
-    from sb3_hds.data import audit
-
     twin, data = swinging()
     pairs = [data.episode(i) for i in range(len(data))]
     late = Trajectories.from_arrays(
@@ -240,21 +221,16 @@ def test_what_is_corrected_is_said():
 @pytest.mark.parametrize(
     ("factor", "says"),
     [
-        (2.0, "Use data.resample(dt=0.01) (in the map of columns, dt: 0.01), or make the twin"),
-        (2.0, "with dt=0.02 (on the command line, --set dt:0.02)"),
-        (1e3, "may be in milliseconds: then say so in the map of columns, time: {column: NAME, s"),
-        (1.2e3, "scale: 0.001}"),
-        (1e6, "in microseconds: then say so in the map of columns, time: {column: NAME, scale: 1e"),
+        (2.0, r"data\.resample\(dt=0\.01\).*--set dt:0\.02"),
+        (1.2e3, r"in milliseconds: .*scale: 0\.001}"),
+        (1e6, "in microseconds: .*scale: 1e"),
     ],
 )
 def test_another_interval_says_how_to_change_it_and_which_unit_it_may_be_in(factor, says):
     data = Trajectories.from_arrays([np.zeros((9, 2))], [np.zeros((8, 0))], dt=0.01 * factor)
 
-    with pytest.raises(CalibrationError) as refusal:
+    with pytest.raises(CalibrationError, match=says):
         diagnose(twins.make("FreePendulum"), data, progress=False)
-
-    assert says in str(refusal.value)
-    assert ("seconds:" in str(refusal.value)) == (factor > 100.0)
 
 
 def test_an_interval_that_a_log_cannot_tell_from_the_twins_is_the_same():
@@ -270,16 +246,8 @@ def test_an_interval_that_a_log_cannot_tell_from_the_twins_is_the_same():
                 check_fits(twin, data)
 
 
-def test_a_single_parameter_to_calibrate_may_stand_alone():
-    twin, data = swinging(effects.CoulombFriction(0, tau_c=0.02))
-
-    found = diagnose(twin, data, effects=FRICTION, calibrate="mass", budget="quick", progress=False)
-
-    assert found.findings[0].effect == "coulomb_friction"
-
-
-def test_a_glitch_is_cut_out_and_said_and_hides_nothing():
-    twin, data = swinging(effects.CoulombFriction(0, tau_c=0.02))
+def test_a_glitch_is_cut_out_and_said_and_hides_nothing(rubbing):
+    twin, data = rubbing
     obs = np.array(data.obs)
     obs[2, 40, 0] += 3.0
     glitched = Trajectories.from_arrays(list(obs), list(np.array(data.actions)), dt=data.dt)

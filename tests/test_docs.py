@@ -1,7 +1,6 @@
 """What the pages of the documentation show works, and what they generate is what the code is."""
 
 import ast
-import csv
 import inspect
 import pydoc
 import re
@@ -10,7 +9,6 @@ import subprocess
 import sys
 import tomllib
 from importlib.util import find_spec
-from itertools import pairwise
 from pathlib import Path
 
 import gymnasium
@@ -29,7 +27,6 @@ sys.path.insert(0, str(DOCS / "extensions"))
 
 import benchmark_results  # noqa: E402
 import catalogue  # noqa: E402
-import generated_parts  # noqa: E402
 import import_picture  # noqa: E402
 import summaries  # noqa: E402
 
@@ -62,13 +59,6 @@ def name_of(page: Path) -> str:
     return page.relative_to(ROOT).as_posix()
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_no_page_shows_a_picture_twice(page):
-    pictures = re.findall(r"!\[[^]]*\]\((.*?)\)", generated_parts.fill_in(page.read_text()))
-
-    assert len(pictures) == len(set(pictures))
-
-
 def blocks(page: Path, language: str) -> list[str]:
     """The code of a page, on the lines where it stands, so that tracebacks point there."""
     text = page.read_text()
@@ -78,16 +68,6 @@ def blocks(page: Path, language: str) -> list[str]:
 
 # Their code learns from data, for minutes.
 LONG = ("docs/guide/measured.md", "docs/guide/diagnose.md")
-
-
-def pages_with(language: str) -> list:
-    """Pages with code in a language."""
-    marks = {name: pytest.mark.expensive for name in LONG if language == "python"}
-    return [
-        pytest.param(page, id=name_of(page), marks=marks.get(name_of(page), ()))
-        for page in PAGES
-        if blocks(page, language)
-    ]
 
 
 def commands(page: Path) -> list[list[str]]:
@@ -118,7 +98,22 @@ def small_and_tidy(monkeypatch, tmp_path):
 PRINTED = ("docs/modules/task_design.md",)
 
 
-@pytest.mark.parametrize("page", pages_with("python"))
+def shown_in(script: Path) -> list[list[str]]:
+    """The commands in the docstring of a benchmark, as words."""
+    text = ast.get_docstring(ast.parse(script.read_text())) or ""
+    lines = [line.partition("  #")[0].strip() for line in text.splitlines()]
+    return [shlex.split(line) for line in lines if line.startswith("python benchmarks/")]
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=pytest.mark.expensive if name_of(page) in LONG else ())
+        for page in PAGES
+        if blocks(page, "python")
+    ],
+    ids=lambda page: name_of(page),
+)
 def test_the_code_of_a_page_runs_from_top_to_bottom(page, small_and_tidy, capsys):
     namespace = {"__name__": "a_page"}
 
@@ -130,49 +125,39 @@ def test_the_code_of_a_page_runs_from_top_to_bottom(page, small_and_tidy, capsys
         assert paragraph.strip() in said
 
 
-@pytest.mark.parametrize("page", pages_with("bash"))
-def test_the_commands_of_a_page_exist_and_have_the_options_shown(page):
-    assert [words for words in commands(page) if (wrong := objection(words))] == [], wrong
-
-
-@pytest.mark.parametrize("page", pages_with("yaml"))
-def test_the_hyperparameters_of_a_page_are_arguments_of_the_algorithms(page):
-    for block in blocks(page, "yaml"):
-        for entry in yaml.safe_load(block).values():
-            own = {"n_timesteps", "n_envs", "normalize", "env_wrapper"}  # of the zoo itself
-            for wrapper in entry.get("env_wrapper", ()):
-                [(path, arguments)] = wrapper.items()
-                made = pydoc.locate(path)
-                assert set(arguments) <= set(inspect.signature(made).parameters)
-            assert set(entry) - own <= set(inspect.signature(HDS).parameters)
-
-
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
-def test_the_commands_in_the_docstring_of_a_benchmark_have_the_options_shown(script):
-    text = ast.get_docstring(ast.parse(script.read_text())) or ""
-    lines = [line.partition("  #")[0].strip() for line in text.splitlines()]
-    shown = [shlex.split(line) for line in lines if line.startswith("python benchmarks/")]
-
-    assert [words for words in shown if (wrong := objection(words))] == [], wrong
-
-
-def test_commands_that_do_not_exist_are_found():
-    wrong = (
+def test_commands_that_are_shown_exist_with_their_options_and_others_are_found():
+    of_pages = {name_of(page): commands(page) for page in PAGES}
+    of_scripts = {script.name: shown_in(script) for script in SCRIPTS}
+    wrong = {
+        (place, " ".join(words)): told
+        for place, each in (of_pages | of_scripts).items()
+        for words in each
+        if (told := objection(words))
+    }
+    mistaken = (
         "make instal",
-        "pip install sb3-hsd",
         "pip install sb3-hds[zo]",
         "rl_zoo3 trian --algo hds",
         "rl_zoo3 train --algo hds --evaluate-freq 5",
-        "rl_zoo3 train --algo hsd",
-        "rl_zoo3 train --algo hds -params n_rolouts:5",
         "rl_zoo3 train --algo tqc_jax -params policy_kwargs.n_critic:5",
         "python benchmarks/nothing.py",
         "sb3-hds diagnose --twin PendulumReal",
-        "python examples/demo.py --fodler demo",
         "rm -rf everything",
     )
 
-    assert [line for line in wrong if objection(line.split()) is None] == []
+    assert wrong == {}
+    assert [line for line in mistaken if objection(line.split()) is None] == []
+
+
+def test_hyperparameters_that_are_shown_are_arguments_of_the_algorithms():
+    own = {"n_timesteps", "n_envs", "normalize", "env_wrapper"}  # of the zoo itself
+    read = [yaml.safe_load(block) for page in PAGES for block in blocks(page, "yaml")]
+    for entry in (entry for each in read for entry in each.values()):
+        for wrapper in entry.get("env_wrapper", ()):
+            [(path, arguments)] = wrapper.items()
+            known = inspect.signature(pydoc.locate(path)).parameters
+            assert set(arguments) <= set(known)
+        assert set(entry) - own <= set(inspect.signature(HDS).parameters)
 
 
 def test_an_own_twin_takes_less_than_40_lines():
@@ -220,18 +205,15 @@ def test_every_twin_effect_and_environment_is_listed_with_its_parameters():
 
 
 def test_a_surrogate_is_announced_where_planning_maximises_something_else():
-    lines = {line.split("`")[1]: line for line in surrogate_rows()}
+    rows = [line for line in catalogue.surrogates_as_markdown().splitlines() if "`" in line]
+    lines = {line.split("`")[1]: line for line in rows}
 
     # By their definitions: Pendulum-v1's cost is smooth, InvertedPendulum-v5 pays for being alive.
     assert "the reward itself" in lines["Pendulum"]
     assert "flat" in lines["InvertedPendulum"] and "surrogate" in lines["InvertedPendulum"]
 
 
-def surrogate_rows() -> list[str]:
-    return [line for line in catalogue.surrogates_as_markdown().splitlines() if "`" in line]
-
-
-def test_the_picture_shows_the_imports_that_are_there(tmp_path):
+def test_the_picture_shows_the_imports_that_are_there_and_its_arrows_point_down(tmp_path):
     files = {
         "sb3_hds/__init__.py": '"""The root."""\nfrom sb3_hds.algos import HDS',
         "sb3_hds/errors.py": '"""Errors: of all kinds."""',
@@ -247,51 +229,24 @@ def test_the_picture_shows_the_imports_that_are_there(tmp_path):
     layers = import_picture.read(tmp_path)
 
     imports = {name: set(layer.layers) for name, layer in layers.items()}
-    assert imports == {
-        "errors": set(),
-        "core": {"errors"},
-        "algos": {"core", "errors"},
-        "sb3_hds": {"algos"},
-        "rl_zoo_plugin": {"sb3_hds"},
-    }
+    assert (imports["errors"], imports["core"]) == (set(), {"errors"})
+    assert imports["algos"] == {"core", "errors"} and imports["rl_zoo_plugin"] == {"sb3_hds"}
     assert layers["core"].libraries == {"jax"} and layers["errors"].summary.startswith("Errors")
     # The way from algos to errors leads through core.
-    assert import_picture.without_detours({n: x.layers for n, x in layers.items()})["algos"] == {
-        "core"
-    }
+    assert import_picture.without_detours(imports)["algos"] == {"core"}
     svg = import_picture.as_svg(layers)
     assert svg.count("<rect") == 5 and svg.count("marker-end") == 4
-
-
-def test_arrows_of_the_picture_point_down():
-    layers = import_picture.read()
-    order = import_picture.ranks({name: layer.layers for name, layer in layers.items()})
-
-    pairs = [(name, below) for name, layer in layers.items() for below in layer.layers]
-    assert [pair for pair in pairs if order[pair[0]] <= order[pair[1]]] == []
-
-
-def test_boxes_of_the_picture_lie_side_by_side():
-    drawn = import_picture.as_svg(import_picture.read())
-    wide, high = map(float, re.search(r'viewBox="0 0 (\d+) (\d+)"', drawn).groups())
-    pattern = r'<rect x="(\S+)" y="(\S+)" width="(\S+)" height="(\S+)"'
-    boxes = sorted(tuple(map(float, box)) for box in re.findall(pattern, drawn))
-    lines = [float(y) for y in re.findall(r'<text x="\S+" y="(\S+)"', drawn)]
-
-    assert all(x >= 0 and x + w <= wide and y + h <= high for x, y, w, h in boxes)
-    for y in {box[1] for box in boxes}:
-        row = [box for box in boxes if box[1] == y]
-        assert all(one[0] + one[2] < following[0] for one, following in pairwise(row))
-    tops = sorted({box[1] for box in boxes})
-    assert all(any(top < line < top + boxes[0][3] - 4 for top in tops) for line in lines)
+    ours = {name: layer.layers for name, layer in import_picture.read().items()}
+    order = import_picture.ranks(ours)
+    assert all(order[name] > order[below] for name in ours for below in ours[name])
 
 
 def test_results_are_shown_with_the_command_that_made_them(tmp_path):
+    assert re.search(r"\d", benchmark_results.as_markdown(tmp_path)) is None
     (tmp_path / "results").mkdir()
     script = '"""Regret on a pendulum."""\nif __name__ == "__main__":\n    pass'
     (tmp_path / "pendulum.py").write_text(script)
-    with (tmp_path / "results/regret.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([["algorithm", "regret"], ["hds", "1.5"]])
+    (tmp_path / "results/regret.csv").write_text("algorithm,regret\nhds,1.5\n")
 
     shown = benchmark_results.as_markdown(tmp_path)
 
@@ -314,29 +269,16 @@ def test_the_share_of_a_gap_is_shown_once_both_of_its_ends_were_measured(tmp_pat
     assert "| half | 10 (5 to 15) | 0.333 | 2 |" in shown()
 
 
-def test_episodes_after_the_first_are_shown_together(tmp_path, monkeypatch):
-    monkeypatch.setattr(summaries, "RESULTS", tmp_path)
-    rows = "minutes,steps,return,late\n1,200,-9,3\n2,400,-2,3\n3,600,-4,5\n"
-    (tmp_path / "t.csv").write_text(rows)
-
-    shown = summaries.first_and_rest("t", 1)()
-
-    assert "| 1 | 1 | -9 | 3 |" in shown
-    assert "| 2 to 3 | 3 | -3 (-4 to -2) | 2 |" in shown
-
-
 def test_results_are_turned_into_the_tables_of_the_pages(tmp_path, monkeypatch):
     monkeypatch.setattr(summaries, "RESULTS", tmp_path)
     turned = summaries.crossed("shares", ("kind",), ("env", "policy"), "share")
     assert turned() == summaries.gaits() == "Not measured yet in this checkout.\n\n"
-    rows = [["kind", "env", "policy", "seed", "share"]]
-    rows += [["push", "A", "gait", "0", "0.2"], ["push", "A", "gait", "1", "0.4"]]
-    rows += [["noise", "B", "sac", "0", "1"]]
-    found = [["env", "steps", "return", "target", "searched", "seconds"]]
-    found += [["A", "200000", value, "290", "7", "120"] for value in ("1", "5", "3000")]
-    for name, table in (("shares", rows), ("open_loop", found)):
-        with (tmp_path / f"{name}.csv").open("w", newline="") as file:
-            csv.writer(file).writerows(table)
+    rows = "kind,env,policy,seed,share\npush,A,gait,0,0.2\npush,A,gait,1,0.4\nnoise,B,sac,0,1\n"
+    found = "env,steps,return,target,searched,seconds\n"
+    found += "".join(f"A,200000,{value},290,7,120\n" for value in (1, 5, 3000))
+    minutes = "minutes,steps,return,late\n1,200,-9,3\n2,400,-2,3\n3,600,-4,5\n"
+    for name, table in (("shares", rows), ("open_loop", found), ("minutes", minutes)):
+        (tmp_path / f"{name}.csv").write_text(table)
     (tmp_path / "shares.png").touch()
 
     shown = turned()
@@ -344,10 +286,7 @@ def test_results_are_turned_into_the_tables_of_the_pages(tmp_path, monkeypatch):
     assert "| kind | A, gait | B, sac |" in shown and "shares.png)" in shown
     assert "| push | 0.3 |  |" in shown and "| noise |  | 1 |" in shown
     assert "| A | 200,000 | 7 | 5 (1 to 3,000) | 290 | 3 | 2 |" in summaries.gaits()
-
-
-def test_without_results_no_number_is_shown(tmp_path):
-    assert re.search(r"\d", benchmark_results.as_markdown(tmp_path)) is None
+    assert "| 2 to 3 | 3 | -3 (-4 to -2) | 2 |" in summaries.first_and_rest("minutes", 1)()
 
 
 @pytest.mark.expensive
@@ -399,8 +338,8 @@ def _unknown_packages(words: list[str]) -> str | None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     for word in words:
         name, _, extras = word.partition("[")
-        extra = [e for e in extras.rstrip("]").split(",") if e]
-        if name in ("sb3-hds", ".") and not set(extra) <= set(project["optional-dependencies"]):
+        extra = {e for e in extras.rstrip("]").split(",") if e}
+        if name in ("sb3-hds", ".") and not extra <= set(project["optional-dependencies"]):
             return f"no extra {extra}"
         if name not in (project["name"], ".", "torch") and not word.startswith(("-", "http")):
             return f"unknown package {name}"
@@ -440,10 +379,10 @@ def _options(words: list[str]) -> list[str]:
 
 def _declared_options(script: Path) -> set[str]:
     """The options that a script's calls of ``add_argument`` name, read without running it."""
-    calls = [node for node in ast.walk(ast.parse(script.read_text())) if isinstance(node, ast.Call)]
-    adding = [
-        c for c in calls if isinstance(c.func, ast.Attribute) and c.func.attr == "add_argument"
-    ]
     return {
-        str(word.value) for call in adding for word in call.args if isinstance(word, ast.Constant)
+        str(word.value)
+        for call in ast.walk(ast.parse(script.read_text()))
+        if isinstance(call, ast.Call) and getattr(call.func, "attr", None) == "add_argument"
+        for word in call.args
+        if isinstance(word, ast.Constant)
     }

@@ -17,6 +17,7 @@ from sb3_hds.wrappers import (
     TruncateToTerminate,
 )
 
+ONE = spaces.Discrete(3)
 #: terminated, truncated
 GOES_ON, FALLS, IS_CUT, BOTH = (False, False), (True, False), (False, True), (True, True)
 
@@ -77,19 +78,12 @@ def test_every_end_becomes_one_of_the_other_kind_and_info_says_what_it_was(
     wrapper, flags, expected, said
 ):
     found, infos = played(wrapper(Script(GOES_ON, flags)), 2)
+    _, told = played(wrapper(Script(flags, told={"TimeLimit.truncated": not expected[1]})), 1)
 
     assert found == [GOES_ON, expected]
     assert infos == [{}, {said: True} if said else {}]
-
-
-@pytest.mark.parametrize(
-    ("wrapper", "flags", "cut"),
-    [(TerminateToTruncate, FALLS, True), (TruncateToTerminate, IS_CUT, False)],
-)
-def test_the_old_entry_for_time_outs_is_set_right_where_it_is_told(wrapper, flags, cut):
-    _, infos = played(wrapper(Script(flags, told={"TimeLimit.truncated": not cut})), 1)
-
-    assert infos[0]["TimeLimit.truncated"] is cut
+    # The old entry for time-outs is set right where the end became another.
+    assert told[0]["TimeLimit.truncated"] is (expected[1] == bool(said))
 
 
 def test_a_horizon_without_an_end_cuts_at_the_limit_and_leaves_earlier_ends_alone():
@@ -104,18 +98,13 @@ def test_a_horizon_without_an_end_cuts_at_the_limit_and_leaves_earlier_ends_alon
     assert cut == [GOES_ON, IS_CUT]
 
 
-def test_the_limit_counts_from_every_reset_and_is_the_environment_s_own_by_default():
-    env = InfiniteHorizon(TimeLimit(Script(GOES_ON), 2))
+def test_the_limit_counts_from_every_reset_and_is_the_least_of_several():
+    inner = TimeLimit(Script(GOES_ON), 2)
 
-    assert env.max_episode_steps == 2
-    assert played(env, 2)[0] == played(env, 2)[0] == [GOES_ON, IS_CUT]
-
-
-def test_of_several_limits_the_least_counts():
-    inner = TimeLimit(Script(GOES_ON), 200)
-
-    assert TimeAware(InfiniteHorizon(inner, 50)).max_episode_steps == 50
-    assert TimeAware(TimeLimit(inner, 500)).max_episode_steps == 200
+    assert played(env := InfiniteHorizon(inner), 2)[0] == played(env, 2)[0] == [GOES_ON, IS_CUT]
+    assert InfiniteHorizon(inner).max_episode_steps == 2
+    assert TimeAware(InfiniteHorizon(TimeLimit(inner, 200), 50)).max_episode_steps == 2
+    assert TimeAware(InfiniteHorizon(Script(GOES_ON), 50)).max_episode_steps == 50
 
 
 def test_the_remaining_time_falls_from_one_to_zero():
@@ -132,18 +121,15 @@ def test_the_remaining_time_falls_from_one_to_zero():
 
 
 def test_a_dict_of_observations_gets_the_remaining_time_under_a_name_of_its_own():
-    space = spaces.Dict({"image": spaces.Box(0, 255, (2, 2), np.uint8), "n": spaces.Discrete(3)})
+    space = spaces.Dict(image=spaces.Box(0, 255, (2, 2), np.uint8), n=ONE)
     inner = Script(GOES_ON, space=space)
     env = TimeAware(inner, max_episode_steps=2)
 
     first, _ = env.reset(seed=0)
     second, *_ = env.step(np.zeros(1))
 
-    assert set(first) == {"image", "n", "remaining_time"} and set(inner.observation_space) == {
-        "image",
-        "n",
-    }
-    np.testing.assert_array_equal([first["remaining_time"], second["remaining_time"]], [[1], [0.5]])
+    assert set(first) == {"image", "n", "remaining_time"} == {*space, "remaining_time"}
+    assert [first["remaining_time"], second["remaining_time"]] == [1.0, 0.5]
     assert env.observation_space.contains(first) and env.observation_space.contains(second)
 
 
@@ -151,19 +137,13 @@ def test_a_dict_of_observations_gets_the_remaining_time_under_a_name_of_its_own(
     ("wrapper", "arguments", "space", "says"),
     [
         (InfiniteHorizon, {}, None, "cannot tell after how many steps"),
-        (TimeAware, {}, None, "cannot tell after how many steps"),
         (InfiniteHorizon, {"max_episode_steps": 0}, None, "positive whole number"),
         (TimeAware, {"max_episode_steps": 2.5}, None, "positive whole number"),
         (TimeAware, {"max_episode_steps": True}, None, "positive whole number"),
         (TimeAware, {"max_episode_steps": 5}, spaces.Box(0.0, 1.0, (2, 2)), "FlattenObservation"),
         (TimeAware, {"max_episode_steps": 5}, spaces.Box(0, 9, (2,), int), "Box of floats"),
         (TimeAware, {"max_episode_steps": 5}, spaces.Discrete(3), "or a Dict"),
-        (
-            TimeAware,
-            {"max_episode_steps": 5},
-            spaces.Dict({"remaining_time": spaces.Discrete(3)}),
-            "without 'remaining_time'",
-        ),
+        (TimeAware, {"max_episode_steps": 5}, spaces.Dict(remaining_time=ONE), "remaining_time"),
     ],
 )
 def test_what_makes_no_sense_is_refused_with_the_way_out(wrapper, arguments, space, says):
@@ -171,7 +151,7 @@ def test_what_makes_no_sense_is_refused_with_the_way_out(wrapper, arguments, spa
         wrapper(Script(GOES_ON, space=space), **arguments)
 
 
-def test_an_end_by_hand_is_a_truncation():
+def test_an_end_by_hand_is_a_truncation_and_a_fall_stays_one():
     env = ManualReset(Script(GOES_ON))
     env.reset()
     env.request()
@@ -182,29 +162,11 @@ def test_an_end_by_hand_is_a_truncation():
     env.request()
     env.reset()
     assert env.step(np.zeros(1))[2:] == (*GOES_ON, {})
+    flags, infos = played(ManualReset(Script(FALLS), wanted=lambda: True), 1)
+    assert (flags, infos) == ([BOTH], [{"manual_reset": True}])
 
 
-def test_a_fall_stays_one_where_somebody_asks_for_the_end_as_well():
-    env = ManualReset(Script(FALLS), wanted=lambda: True)
-    env.reset()
-
-    assert env.step(np.zeros(1))[2:] == (*BOTH, {"manual_reset": True})
-
-
-def test_who_wants_the_end_can_be_named_as_a_yml_file_does():
-    ended, going = (
-        played(ManualReset(Script(GOES_ON), f"moving_joints.{who}"), 1)[0]
-        for who in ("somebody", "nobody")
-    )
-
-    assert ended == [IS_CUT] and going == [GOES_ON]
-    with pytest.raises(ParameterError, match=r"no function 'moving_joints\.none'"):
-        ManualReset(Script(GOES_ON), "moving_joints.none")
-    again = pickle.loads(pickle.dumps(ManualReset(Script(GOES_ON), "moving_joints.somebody")))
-    assert played(again, 1)[0] == [IS_CUT]
-
-
-def test_a_spec_remembers_a_name_and_no_function():
+def test_who_wants_the_end_can_be_named_and_a_spec_remembers_the_name_and_no_function():
     made = gymnasium.make("Pendulum-v1")
 
     named, function = (
@@ -216,3 +178,8 @@ def test_a_spec_remembers_a_name_and_no_function():
     env = gymnasium.make(named)
     env.reset()
     assert env.step(np.zeros(1, np.float32))[4]["manual_reset"]
+    for who, flags in (("somebody", IS_CUT), ("nobody", GOES_ON)):
+        again = pickle.loads(pickle.dumps(ManualReset(Script(GOES_ON), f"moving_joints.{who}")))
+        assert played(again, 1)[0] == [flags]
+    with pytest.raises(ParameterError, match=r"no function 'moving_joints\.none'"):
+        ManualReset(Script(GOES_ON), "moving_joints.none")

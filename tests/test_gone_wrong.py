@@ -4,30 +4,19 @@ import gymnasium
 import numpy as np
 import pytest
 from odd_envs import Dead
-from small_models import MODEL_FREE, greedy, reloaded, small
+from small_models import greedy, reloaded, small
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_hds import HDS, TD7, TQC, CrossQ
+from sb3_hds import HDS, TD7, CrossQ
 from sb3_hds.algos.gaussian_policy import GaussianPolicy
 from sb3_hds.algos.networks import finite_leaves
 from sb3_hds.algos.td7 import TD7Policy
 from sb3_hds.errors import DivergedError
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
-
-REPRESENTATIVES = ("droq", "td7")
-
-
-every_algorithm = pytest.mark.parametrize(
-    "name",
-    [
-        name if name in REPRESENTATIVES else pytest.param(name, marks=pytest.mark.expensive)
-        for name in MODEL_FREE
-    ],
-)
 
 
 def finite(model) -> bool:
@@ -72,7 +61,7 @@ def infinite_step(name: str, env, monkeypatch):
     return model
 
 
-@every_algorithm
+@pytest.mark.parametrize("name", ["droq", "td7"])
 def test_weights_of_which_no_loss_tells_are_noticed_before_they_act(name, monkeypatch):
     env = Watched()
     model = infinite_step(name, env, monkeypatch)
@@ -85,22 +74,17 @@ def test_weights_of_which_no_loss_tells_are_noticed_before_they_act(name, monkey
     assert np.isfinite(model.predict(np.zeros(3, np.float32))[0]).all()
 
 
-@every_algorithm
-def test_weights_that_the_last_update_spoils_are_noticed_in_the_end(name, monkeypatch, tmp_path):
+@pytest.mark.parametrize("name", ["droq", "td7"])
+def test_weights_that_the_last_update_spoils_are_noticed_in_the_end_and_not_saved(
+    name, monkeypatch, tmp_path
+):
     model = infinite_step(name, "Pendulum-v1", monkeypatch)
-
     with pytest.raises(DivergedError, match="last good state"):
         model.learn(5, reset_num_timesteps=False)
-
     assert finite(model)
-    model.save(tmp_path / "model")
 
-
-def test_weights_that_are_none_are_not_saved(monkeypatch, tmp_path):
-    model = infinite_step("droq", "Pendulum-v1", monkeypatch)
     model.train(gradient_steps=1, batch_size=16)
     assert not finite(model)
-
     with pytest.raises(DivergedError, match="last good state"):
         model.save(tmp_path / "model")
 
@@ -113,9 +97,8 @@ def test_rates_that_are_infinite_where_networks_compute_are_refused():
         model.learn(20)
 
 
-@pytest.mark.parametrize("name", ["droq", "td7"])
-def test_updates_are_counted_where_they_are_interrupted(name, monkeypatch):
-    model, made = small(name, gradient_steps=200).learn(10), []
+def test_updates_are_counted_where_they_are_interrupted(monkeypatch):
+    model, made = small("td7", gradient_steps=200).learn(10), []
 
     def interrupted(*given):
         made.append(given)
@@ -136,20 +119,14 @@ def test_updates_are_counted_where_they_are_interrupted(name, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "of_reward", "value"),
-    [
-        ("droq", False, np.nan),
-        ("droq", True, np.inf),
-        ("hds", False, np.inf),
-        ("hds", True, np.nan),
-    ],
+    ("name", "of_reward", "value"), [("droq", True, np.inf), ("hds", False, np.nan)]
 )
 def test_statistics_of_vec_normalize_survive_a_dead_sensor(name, of_reward, value):
     env = Dead(value, of_reward)
     normalizer = VecNormalize(DummyVecEnv([lambda: env]))
     model = small(name, normalizer, **({"twin": "Pendulum"} if name == "hds" else {}))
 
-    with pytest.raises(ValueError, match=r"Step 10 of the environment is not finite.*mend"):
+    with pytest.raises(ValueError, match=r"Step 10 of the environment is not finite"):
         model.learn(100)
 
     assert np.isfinite(normalizer.obs_rms.mean).all() and np.isfinite(normalizer.ret_rms.var)
@@ -224,9 +201,7 @@ def test_with_shared_memory_a_cut_counts_as_an_end():
 # --- Arguments that did less than they said
 
 
-@pytest.mark.parametrize(
-    ("given", "n"), [({}, 0), ({"param_resets": [20, 40]}, 1), ({"param_resets": [40]}, 1)]
-)
+@pytest.mark.parametrize(("given", "n"), [({}, 0), ({"param_resets": [40]}, 1)])
 def test_networks_start_afresh_as_what_load_was_passed_says(given, n, monkeypatch):
     model = small("droq", param_resets=[20]).learn(30)
     other, seeds = reloaded(model, **given), []
@@ -248,7 +223,7 @@ def test_without_its_monitor_an_environment_is_left_as_it_is(name):
 
 @pytest.mark.parametrize(
     ("algorithm", "policy"),
-    [(TD7, GaussianPolicy), (TQC, TD7Policy), (CrossQ, GaussianPolicy), (HDS, TD7Policy)],
+    [(TD7, GaussianPolicy), (CrossQ, GaussianPolicy), (HDS, TD7Policy)],
 )
 def test_a_policy_of_another_family_is_refused(algorithm, policy):
     with pytest.raises(ValueError, match=f"cannot use the policy {policy.__name__}"):

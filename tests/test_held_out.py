@@ -64,7 +64,7 @@ def windows_of(lengths, n_steps):
     return np.array(found[-128:])
 
 
-@pytest.mark.parametrize("longest", [15, 60, 200, 700, 5000])
+@pytest.mark.parametrize("longest", [15, 200, 5000])
 def test_windows_keep_their_side_while_recordings_come(longest):
     lengths = np.random.default_rng(longest).integers(11, longest, 50)
     learned, held, settled = set(), set(), False
@@ -85,21 +85,19 @@ def test_windows_keep_their_side_while_recordings_come(longest):
     assert 0.1 < np.mean(kept) < 0.4
 
 
-@pytest.mark.expensive
-@pytest.mark.parametrize("steps", [30, 130, 1000])
-def test_what_was_learned_from_is_not_held_out_when_more_has_come(steps, sides):
-    model_in(real(steps), buffer_size=4000).learn(2000)
-    assert sides.n_corrections > 20
-
-
-def test_nor_when_the_oldest_steps_are_overwritten(sides):
+def test_what_was_learned_from_is_not_held_out_when_the_oldest_steps_are_overwritten(sides):
     model_in(real(60), buffer_size=400).learn(1200)
     assert sides.n_corrections > 15
 
 
 @pytest.mark.expensive
-def test_nor_when_a_file_holds_only_the_latest(sides, tmp_path):
-    model = model_in(real(60), max_saved_steps=410, buffer_size=2000).learn(1000)
+def test_nor_after_data_from_a_file_a_change_and_loading(sides, tmp_path):
+    early = measured(twins.make("PendulumReal", mass=1.4), n=6, noise=0.01)
+    env = real(130, noise=0.001)
+    model = model_in(env, pretrain_data=early, max_saved_steps=900, buffer_size=4000).learn(500)
+    env.unwrapped.set_payload(0.5)
+    model.learn(1000, reset_num_timesteps=False)
+    assert model._changed_at is not None
     model.save(tmp_path / "model")
     n_before = sides.n_corrections
 
@@ -107,23 +105,4 @@ def test_nor_when_a_file_holds_only_the_latest(sides, tmp_path):
     loaded = HDS.load(tmp_path / "model", env=real(60, noise=0.011))
     loaded.learn(500, reset_num_timesteps=False)
 
-    assert sides.n_corrections > n_before + 5
-
-
-@pytest.mark.expensive
-def test_nor_when_the_system_has_become_another_one(sides):
-    env = real(130, noise=0.001)
-    model = model_in(env, buffer_size=4000).learn(500)
-    env.unwrapped.set_payload(0.5)
-
-    model.learn(1000, reset_num_timesteps=False)
-
-    assert model._changed_at is not None
-    assert sides.n_corrections > 20
-
-
-@pytest.mark.expensive
-def test_nor_with_data_from_a_file_before(sides):
-    early = measured(twins.make("PendulumReal", mass=1.4), n=6, noise=0.01)
-    model_in(real(60), pretrain_data=early, buffer_size=2000).learn(800)
-    assert sides.n_corrections > 10
+    assert sides.n_corrections > n_before + 5 > 25

@@ -11,7 +11,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from odd_envs import ACT, AnySpaces
-from small_models import MODEL_FREE, SMALL, STATES, greedy, logged, reloaded, same, saved, small
+from small_models import MODEL_FREE, SMALL, STATES, greedy, logged, reloaded, same, small
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
@@ -23,53 +23,40 @@ from sb3_hds.algos import off_policy, soft_actor_critic, td7_update
 from sb3_hds.algos.bodies import SimbaBody
 from sb3_hds.algos.gaussian_policy import SimbaPolicy
 from sb3_hds.algos.learner import GENERATOR
-from sb3_hds.algos.off_policy import (
-    Trained,
-    judge,
-)
+from sb3_hds.algos.off_policy import Trained, judge
 from sb3_hds.algos.sampling import batches_of
 from sb3_hds.errors import EnvironmentMismatchError
 
 SPACES = {
     "box of two axes": spaces.Box(-1, 1, (2, 3)),
     "choices": spaces.Dict(
-        {
-            "a": spaces.Box(-1, 1, (2,)),
-            "b": spaces.Discrete(3),
-            "c": spaces.MultiDiscrete([2, 3]),
-            "d": spaces.MultiBinary(3),
-        }
+        a=spaces.Box(-1, 1, (2,)),
+        b=spaces.Discrete(3),
+        c=spaces.MultiDiscrete([2, 3]),
+        d=spaces.MultiBinary(3),
     ),
 }
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
-@pytest.mark.parametrize("space", SPACES)
-def test_observations_of_numbers_and_choices_are_learned_from(space):
+@pytest.mark.parametrize(
+    ("name", "space"),
+    [("droq", "box of two axes"), ("droq", "choices"), ("td7", "box of two axes")],
+)
+def test_observations_and_actions_of_any_shape_are_learned_from(name, space):
+    # It refuses actions that its space does not contain.
     env = AnySpaces(SPACES[space], spaces.Box(-2.0, 3.0, (2, 2)))
     policy = "MultiInputPolicy" if space == "choices" else "MlpPolicy"
 
-    model = small("droq", env, policy=policy, learning_starts=5).learn(9)
+    model = small(name, env, policy=policy, learning_starts=5).learn(9)
 
-    action, _ = model.predict(env.reset()[0])
-    assert env.action_space.contains(action)
-
-
-@pytest.mark.parametrize("name", ["gsde_sac", "td7"])
-def test_actions_have_the_shape_of_the_action_space(name):
-    # It refuses what the space does not contain.
-    env = AnySpaces(action_space=spaces.Box(-2.0, 3.0, (2, 2)))
-
-    model = small(name, env, learning_starts=5).learn(9)
-
-    assert model.predict(np.zeros(3, np.float32))[0].shape == (2, 2)
+    assert env.action_space.contains(model.predict(env.reset()[0])[0])
     assert model.replay_buffer.actions.shape[2:] == (4,)
 
 
-@pytest.mark.parametrize("use_sde", [False, True])
-def test_after_the_same_seed_a_model_explores_and_learns_alike(use_sde):
-    models = [small("tqc_jax", use_sde=use_sde, train_freq=5, seed=seed) for seed in (1, 2)]
+def test_after_the_same_seed_a_model_explores_and_learns_alike():
+    models = [small("tqc_jax", use_sde=True, seed=np.uint32(seed)) for seed in (1, 2)]
     actor = models[0].policy.learner.actor
     models[1].policy.learner = models[1].policy.learner._replace(actor=actor)
     obs = np.tile(models[0].observation_space.sample(), (4, 1))
@@ -86,51 +73,29 @@ def test_after_the_same_seed_a_model_explores_and_learns_alike(use_sde):
     assert not np.array_equal(keys[0], of_networks)
 
 
-def test_a_seed_may_be_a_number_of_numpy():
-    one, other = small("droq", seed=np.uint32(7)), small("droq", seed=7)
-
-    assert same(one.get_parameters(), other.get_parameters())
-
-
 @pytest.mark.parametrize(
     ("name", "arguments", "message"),
     [
         ("droq", {"policy_kwargs": {"log_std_init": -2.0}}, "log_std_init .* without use_sde"),
-        (
-            "crossq_jax",
-            {"policy_kwargs": {"batch_norm_momentum": 0.01}},
-            r"SB3-contrib's .*: pass 0\.99 for its 0\.01",
-        ),
-        ("crossq_jax", {"tau": 0.01}, "does not look at tau: there are no target networks"),
-        ("td7", {"tau": 0.01}, "does not look at tau: target networks are copied whole"),
-        ("td7", {"gradient_steps": 2}, "does not look at gradient_steps: with checkpoints"),
+        ("crossq_jax", {"policy_kwargs": {"batch_norm_momentum": 0.01}}, r"pass 0\.99"),
+        ("crossq_jax", {"tau": 0.01}, "does not look at tau"),
+        ("td7", {"gradient_steps": 2, "use_checkpoints": True}, "does not look at gradient_steps"),
     ],
 )
 def test_arguments_that_say_nothing_are_warned_of(name, arguments, message):
     with pytest.warns(UserWarning, match=message):
-        small(name, **{"use_checkpoints": True} if name == "td7" else {}, **arguments)
+        small(name, **arguments)
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
         ({"observation_space": spaces.Box(0, 255, (3, 36, 36), np.uint8)}, "is an image"),
-        ({"observation_space": spaces.Box(0, 255, (36, 36), np.uint8)}, "is an image"),
-        (
-            {"observation_space": spaces.MultiDiscrete([[2, 3], [3, 4]])},
-            "MultiDiscrete with 2 axes",
-        ),
-        ({"observation_space": spaces.Box(-1, 1, (0,))}, "has no numbers"),
+        ({"observation_space": spaces.MultiDiscrete([[2, 3], [3, 4]])}, "with 2 axes"),
         ({"observation_space": spaces.Dict({})}, "has no numbers"),
-        (
-            {"observation_space": spaces.Dict({"angle": spaces.Box(-1, 1, ())})},
-            r"'angle' is a number without an axis",
-        ),
+        ({"observation_space": spaces.Dict({"a": spaces.Box(-1, 1, ())})}, "without an axis"),
         ({"action_space": spaces.Box(0, 5, (2,), np.int32)}, "whole numbers"),
-        (
-            {"action_space": spaces.Box(np.array([0.0, -1.0], "f"), np.array([0.0, 1.0], "f"))},
-            "have no range",
-        ),
+        ({"action_space": spaces.Box(np.float32([0, -1]), np.float32([0, 1]))}, "have no range"),
     ],
     ids=str,
 )
@@ -141,22 +106,14 @@ def test_spaces_that_cannot_be_learned_in_are_refused(given, message):
 
 @pytest.mark.parametrize(
     ("space", "obs"),
-    [
-        (spaces.Discrete(4, start=2), 1),
-        (spaces.MultiDiscrete([2, 3]), [2, 0]),
-        (spaces.MultiDiscrete([2, 3]), [0, -1]),
-    ],
+    [(spaces.Discrete(4, start=2), 1), (spaces.MultiDiscrete([2, 3]), [0, -1])],
 )
 def test_a_choice_that_there_is_not_gets_no_action(space, obs):
-    model = small("droq", AnySpaces(space, ACT))
-
-    with pytest.raises(ValueError, match="none of the choices that its space has"):
-        model.predict(np.array(obs))
+    with pytest.raises(ValueError, match="none of the choices"):
+        small("droq", AnySpaces(space, ACT)).predict(np.array(obs))
 
 
-@pytest.mark.parametrize(
-    ("name", "net_arch"), [("droq", []), ("td7", []), ("td7", {"pi": [8, 4], "qf": [6]})]
-)
+@pytest.mark.parametrize(("name", "net_arch"), [("droq", []), ("td7", {"pi": [8, 4], "qf": []})])
 def test_networks_may_have_no_hidden_layer_or_layers_of_several_widths(name, net_arch):
     kwargs = SMALL[name]["policy_kwargs"] | {"net_arch": net_arch}
 
@@ -198,76 +155,53 @@ def test_returns_of_several_steps_need_a_buffer_that_has_them():
         DroQ("Pendulum-v1", n_steps=3, replay_buffer_class=ReplayBuffer)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"tau": 2.0}, "tau must be from 0 to 1"),
-        ({"target_update_interval": 0}, "target_update_interval must be a whole number of at"),
-        ({"policy_delay": 0}, "policy_delay must be a whole number of at least 1"),
-        ({"ent_coef": "automatic"}, "ent_coef must be a number of at least 0, 'auto'"),
-        ({"n_steps": 3, "optimize_memory_usage": True}, "False where n_steps > 1"),
-        ({"optimize_memory_usage": True}, "'handle_timeout_termination': False"),
-        ({"ent_coef": "auto_0"}, "ent_coef must be a number of at least 0, 'auto'"),
-        ({"target_entropy": "low"}, "target_entropy must be 'auto' or a number"),
-        ({"policy_kwargs": {"net_arch": {"pi": [8]}}}, "net_arch must be a list of widths"),
-        ({"policy_kwargs": {"activation_fn": "swoosh"}}, "activation_fn must be one of"),
-        ({"policy_kwargs": {"optimizer_class": "magic"}}, "optimizer_class must be one of"),
-        ({"policy_kwargs": {"optimizer_kwargs": {"speed": 1}}}, "optimizer_kwargs"),
-        ({"policy_kwargs": {"optimizer_class": th.optim.NAdam}}, "optimizer_class='nadam'"),
-        ({"policy_kwargs": {"dropout_rate": 1.0}}, "dropout_rate must be at least 0"),
-        ({"policy_kwargs": {"n_quantiles": 5}}, "one value each: leave it out, or use"),
-    ],
-)
-def test_what_cannot_work_is_refused_at_the_door(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        DroQ("Pendulum-v1", **arguments)
+def of_policy(**arguments: Any) -> dict[str, Any]:
+    return {"policy_kwargs": {"net_arch": [8]} | arguments}
 
 
 @pytest.mark.parametrize(
-    ("name", "policy", "argument"),
+    ("name", "arguments", "message"),
     [
-        ("droq", "SimbaPolicy", {"renorm_warmup_steps": 100}),
-        ("simba", "MlpPolicy", {"batch_norm_momentum": 0.9}),
-        ("bro", "MlpPolicy", {"dropout_rate": 0.1}),
-    ],
-)
-def test_arguments_that_the_networks_do_not_use_are_refused(name, policy, argument):
-    with pytest.raises(ValueError, match=f"do not use {next(iter(argument))}"):
-        small(name, policy=policy, policy_kwargs={"net_arch": [8], **argument})
-
-
-@pytest.mark.parametrize(
-    ("name", "arguments"),
-    [
-        ("droq", {"param_resets": 50}),
-        ("td7", {"train_freq": 0}),
-        ("droq", {"replay_buffer_class": "HerReplayBuffer"}),
-        ("droq", {"policy_kwargs": {"dropout_rate": None}}),
-        ("gsde_sac", {"policy_kwargs": {"log_std_init": np.nan}}),
-        ("gsde_sac", {"policy_kwargs": {"clip_mean": -1.0}}),
-        ("crossq_jax", {"policy_kwargs": {"batch_norm_momentum": 1.5}}),
-        ("bro", {"gradient_steps": "many"}),
-        ("droq", {"param_resets": [500, 100]}),
-        ("droq", {"sde_sample_freq": 2.5}),
-        ("tqc_jax", {"top_quantiles_to_drop_per_net": 1.5}),
-        ("tqc_jax", {"policy_kwargs": {"n_quantiles": None}}),
-        ("gsde_sac", {"policy_kwargs": {"ortho_init": "last"}}),
-        ("td7", {"policy_kwargs": {"n_critics": 0}}),
-        ("crossq_jax", {"policy_kwargs": {"renorm_warmup_steps": -1}}),
-        ("td7", {"policy_kwargs": {"embedding_size": 0}}),
-        ("bro", {"kl_target": -1}),
-        ("bro", {"std_multiplier": -2}),
-        ("droq", {"linear_ent_coef": "yes"}),
+        ("droq", {"tau": 2.0}, "tau must be from 0 to 1"),
+        ("droq", {"policy_delay": 0}, "policy_delay must be a whole number of at least 1"),
+        ("droq", {"ent_coef": "automatic"}, "ent_coef must be"),
+        ("droq", {"ent_coef": "auto_0"}, "ent_coef must be"),
+        ("droq", {"target_entropy": "low"}, "target_entropy must be"),
+        ("droq", {"linear_ent_coef": "yes"}, "linear_ent_coef must be"),
+        ("droq", {"n_steps": 3, "optimize_memory_usage": True}, "False where n_steps > 1"),
+        ("droq", {"optimize_memory_usage": True}, "handle_timeout_termination"),
+        ("droq", {"param_resets": 50}, "param_resets must be .*50"),
+        ("droq", {"param_resets": [500, 100]}, "param_resets must be"),
+        ("droq", {"replay_buffer_class": "HerReplayBuffer"}, "replay_buffer_class must be"),
+        ("droq", {"learning_rate": "lin_-1e-3"}, "learning rate is a number of at least 0"),
+        ("droq", {"qf_learning_rate": "-1e-3"}, "learning rate is a number of at least 0"),
+        ("droq", of_policy(net_arch={"pi": [8]}), "net_arch must be"),
+        ("droq", of_policy(activation_fn="swoosh"), "activation_fn must be"),
+        ("droq", of_policy(optimizer_class="magic"), "optimizer_class must be"),
+        ("droq", of_policy(optimizer_kwargs={"speed": 1}), "optimizer_kwargs"),
+        ("droq", of_policy(optimizer_class=th.optim.NAdam), "optimizer_class='nadam'"),
+        ("droq", of_policy(dropout_rate=1.0), "dropout_rate must be at least 0"),
+        ("droq", of_policy(n_quantiles=5), "one value each"),
+        ("simba", of_policy(batch_norm_momentum=0.9), "do not use batch_norm_momentum"),
+        ("simba", of_policy(ortho_init=True), "do not use ortho_init"),
+        ("gsde_sac", of_policy(clip_mean=-1.0), "clip_mean must be"),
+        ("gsde_sac", of_policy(log_std_init=np.nan), "log_std_init must be"),
+        ("gsde_sac", of_policy(ortho_init="last"), "ortho_init must be"),
+        ("crossq_jax", of_policy(batch_norm_momentum=1.5), "batch_norm_momentum must be"),
+        ("crossq_jax", of_policy(renorm_warmup_steps=-1), "renorm_warmup_steps must be"),
+        ("tqc_jax", {"top_quantiles_to_drop_per_net": 1.5}, "top_quantiles_to_drop_per_net must"),
+        ("tqc_jax", of_policy(n_quantiles=None), "n_quantiles must be"),
+        ("bro", {"kl_target": -1}, "kl_target must be"),
+        ("bro", {"std_multiplier": -2}, "std_multiplier must be"),
+        ("td7", {"train_freq": 0}, "train_freq must be"),
+        ("td7", of_policy(n_critics=0), "n_critics must be"),
+        ("td7", of_policy(embedding_size=0), "embedding_size must be"),
     ],
     ids=str,
 )
-def test_an_argument_out_of_range_is_refused_by_name(name, arguments):
-    [(argument, value)] = (arguments.get("policy_kwargs") or arguments).items()
-
-    with pytest.raises(ValueError, match=rf"{argument} must be .*") as caught:
+def test_what_cannot_work_is_refused_at_the_door(name, arguments, message):
+    with pytest.raises(ValueError, match=message):
         small(name, **arguments)
-
-    assert repr(value) in str(caught.value)
 
 
 def test_the_default_number_of_steps_goes_beyond_the_random_ones():
@@ -298,12 +232,13 @@ def test_the_replay_buffer_is_that_of_the_arguments_that_a_model_is_loaded_with(
     plain = small(name)
 
     longer = reloaded(plain, n_steps=3, gamma=0.9).learn(20)
-    shorter = reloaded(longer, gamma=0.8).learn(20)
     again = reloaded(longer, n_steps=1).learn(20)
 
-    discounts = [batches_of(model, 1, 16, 1).discount.min() for model in (longer, shorter, again)]
-    assert discounts == pytest.approx([0.9**3, 0.8**3, 0.9])
+    discounts = [batches_of(model, 1, 16, 1).discount.min() for model in (longer, again)]
+    assert discounts == pytest.approx([0.9**3, 0.9])
     assert type(again.replay_buffer) is type(plain.replay_buffer)
+    changed = reloaded(plain, replay_buffer_class=ReplayBuffer)
+    assert type(reloaded(changed).replay_buffer) is ReplayBuffer
 
 
 def test_an_entropy_coefficient_that_a_model_is_loaded_with_is_the_one_that_acts():
@@ -316,26 +251,13 @@ def test_an_entropy_coefficient_that_a_model_is_loaded_with_is_the_one_that_acts
     kept = np.exp(fixed.policy.learner.log_ent_coef.weights["params"])
     assert kept == pytest.approx(0.3) and not fixed.policy.recipe.learns_ent_coef
     assert same(reloaded(learned).get_parameters(), learned.get_parameters())
+    with pytest.raises(ValueError, match="use_sde must be False"):
+        reloaded(learned, use_sde=True)
 
 
-def test_exploration_is_that_of_the_networks_that_are_loaded():
-    with pytest.raises(ValueError, match=r"DroQ\(use_sde=True\): use_sde must be False, as when"):
-        DroQ.load(saved(small("droq")), use_sde=True)
-
-
-def test_a_replay_buffer_that_was_passed_is_used_after_loading():
-    loaded = reloaded(small("td7", replay_buffer_class=ReplayBuffer))
-    changed = reloaded(small("td7"), replay_buffer_class=ReplayBuffer)
-
-    assert type(loaded.replay_buffer) is type(changed.replay_buffer) is ReplayBuffer
-
-
-@pytest.mark.parametrize("name", ["droq", pytest.param("td7", marks=pytest.mark.expensive)])
-def test_hindsight_replay_is_learned_from(name):
+def test_hindsight_replay_is_learned_from():
     env = BitFlippingEnv(n_bits=3, continuous=True, max_steps=3)
-    model = algos.ALL[name](
-        "MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, seed=0, **SMALL[name]
-    )
+    model = small("droq", env, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer)
 
     assert model.learn(40)._n_updates > 0
     batch = batches_of(model, 1, 500, 1)
@@ -376,6 +298,7 @@ def test_networks_start_afresh_when_told_to(name):
 @pytest.mark.parametrize(("name", "afresh"), [("bro", True), ("droq", False)])
 def test_bro_starts_afresh_with_its_temperature_and_others_keep_theirs(name, afresh):
     model = small(name)
+    assert len(model.param_resets or ()) == afresh
     begun = model.policy.learner.log_ent_coef
     later = jax.tree.map(lambda x: x + 1, begun)
     model.policy.learner = model.policy.learner._replace(log_ent_coef=later)
@@ -395,18 +318,6 @@ def test_entropy_may_be_worth_nothing():
     assert lines.column("train/ent_coef")[-1] == 0.0
     assert np.isfinite(lines.column("train/critic_loss")[-1])
     assert reloaded(small("droq").learn(20), ent_coef=0.0).get_parameters()
-
-
-@pytest.mark.parametrize(("gradient_steps", "n"), [(2, 1), (-1, 1)])
-def test_bro_starts_afresh_less_often_where_it_makes_few_updates(gradient_steps, n):
-    assert len(small("bro", gradient_steps=gradient_steps).param_resets) == n
-
-
-def test_whether_the_loss_of_the_entropy_coefficient_is_linear_is_an_argument():
-    other = small("droq", linear_ent_coef=True)
-
-    assert not small("droq").policy.recipe.linear_ent_coef
-    assert other.policy.recipe.linear_ent_coef and reloaded(other).policy.recipe.linear_ent_coef
 
 
 def trained(learner: Any) -> dict[str, np.ndarray]:
@@ -444,25 +355,6 @@ def test_schedules_act_on_all_that_learns(name):
         assert (again[key] != weights).any(), key
 
 
-@pytest.mark.parametrize(
-    ("argument", "rate"),
-    [("learning_rate", "lin_-1e-3"), ("qf_learning_rate", "-1e-3"), ("learning_rate", "lin_nan")],
-)
-def test_a_negative_learning_rate_is_refused_also_as_a_string(argument, rate):
-    with pytest.raises(ValueError, match="A learning rate is a number of at least 0"):
-        small("droq", **{argument: rate})
-
-
-def test_a_schedule_ends_where_training_was_to_end():
-    model = small("droq", learning_rate=lambda left: 1e-3 * left, train_freq=20)
-    lines = logged(model)
-
-    model.learn(30).logger.dump()
-
-    assert model.num_timesteps == 40
-    assert lines.column("train/learning_rate")[-1] == 0.0
-
-
 @pytest.mark.parametrize("argument", ["learning_rate", "qf_learning_rate"])
 def test_a_schedule_that_becomes_negative_is_named_where_it_does(argument):
     model = small("droq", **{argument: lambda left: left - 0.5})
@@ -474,7 +366,6 @@ def test_a_schedule_that_becomes_negative_is_named_where_it_does(argument):
 
 def test_learning_rates_of_every_form_may_be_changed_while_loading():
     model = small("droq", learning_rate=1e-4, qf_learning_rate=2e-4)
-    assert model.qf_learning_rate == 2e-4
 
     changed = reloaded(model, learning_rate="lin_3e-4", qf_learning_rate="lin_5e-4")
 
@@ -485,20 +376,17 @@ def test_learning_rates_of_every_form_may_be_changed_while_loading():
     assert reloaded(changed).qf_learning_rate == "lin_5e-4"
 
 
-@pytest.mark.parametrize("held", [None, 2e-4])
-def test_the_rate_of_the_critics_is_read_from_older_files(held):
+def test_the_rate_of_the_critics_is_read_from_older_files():
     model = small("droq", learning_rate=1e-4)
     # Beside SBX's number, which was the first one of the other rate.
-    model.critic_learning_rate, model.qf_learning_rate = held, 1e-4
+    model.critic_learning_rate, model.qf_learning_rate = 2e-4, 1e-4
 
-    loaded, changed = reloaded(model), reloaded(model, qf_learning_rate=5e-4)
+    assert reloaded(model).qf_learning_rate == 2e-4
+    assert reloaded(model, qf_learning_rate=5e-4).qf_learning_rate == 5e-4
 
-    assert loaded.qf_learning_rate == held and changed.qf_learning_rate == 5e-4
 
-
-@pytest.mark.parametrize("name", ["crossq_jax", pytest.param("td7", marks=pytest.mark.expensive)])
-def test_losses_of_the_actor_are_logged_where_it_was_updated(name):
-    model = small(name, policy_delay=3, gradient_steps=1, train_freq=1)
+def test_losses_of_the_actor_are_logged_where_it_was_updated():
+    model = small("crossq_jax", policy_delay=3, gradient_steps=1, train_freq=1)
     logged(model)
     model.learn(15)
     told, begun = [], model._n_updates
@@ -555,46 +443,34 @@ def test_deviations_of_actions_are_squashed_where_the_authors_of_the_algorithm_d
     assert not squashed("bro", policy_kwargs=told | {"squash_log_std": False})
 
 
-@pytest.mark.parametrize(
-    ("name", "last"), [("gsde_sac", True), ("tqc_jax", True), ("crossq_jax", False)]
-)
+@pytest.mark.parametrize(("name", "last"), [("tqc_jax", True), ("crossq_jax", False)])
 def test_layers_start_orthogonal_where_that_is_asked_for(name, last):
     told = {"net_arch": [16, 16], "ortho_init": True if last else "hidden"}
     learner = small(name, policy_kwargs=told).policy.learner
 
-    for weights in (learner.actor.weights, learner.critic.weights):
-        inner = weights["params"]["body"]["Dense_1"]["kernel"].reshape(-1, 16, 16)
+    actor, critics = (getattr(learner, of).weights["params"] for of in ("actor", "critic"))
+    for weights in (actor, critics):
+        inner = weights["body"]["Dense_1"]["kernel"].reshape(-1, 16, 16)
         gained = np.matmul(inner.swapaxes(-1, -2), inner)
-        np.testing.assert_allclose(
-            gained, np.broadcast_to(2.0 * np.eye(16), gained.shape), atol=1e-5
-        )
-    mean = learner.actor.weights["params"]["Dense_0"]["kernel"]
-    of_values = learner.critic.weights["params"]["Dense_0"]["kernel"][0]
-    for kernel in (mean, of_values):
-        gains = np.linalg.svd(kernel, compute_uv=False)
-        assert np.allclose(gains, np.sqrt(2.0), atol=1e-5) == last
-    if name != "gsde_sac":  # whose noise matrix is no layer
-        gains = np.linalg.svd(learner.actor.weights["params"]["Dense_1"]["kernel"])[1]
-        assert np.allclose(gains, 1.0, atol=1e-5) == last
+        np.testing.assert_allclose(gained, [2.0 * np.eye(16)] * len(gained), atol=1e-5)
+    lasts = ((actor["Dense_0"], 2.0), (critics["Dense_0"], 2.0), (actor["Dense_1"], 1.0))
+    for layer, squared in lasts:
+        gains = np.linalg.svd(layer["kernel"])[1]
+        assert np.allclose(gains, np.sqrt(squared), atol=1e-5) == last
 
 
 @pytest.mark.parametrize(("name", "gain"), [("simba", 1.0), ("bro", np.sqrt(2.0))])
 def test_last_layers_start_as_in_the_code_of_the_authors(name, gain):
-    learner = small(name).policy.learner
+    learner, exploring = (small(name, use_sde=sde).policy.learner for sde in (False, True))
 
-    actor, critics = learner.actor.weights["params"], learner.critic.weights["params"]
-    for layer, expected in {"Dense_0": gain, "Dense_1": 1.0}.items():
-        np.testing.assert_allclose(np.linalg.svd(actor[layer]["kernel"])[1], expected, atol=1e-5)
-    np.testing.assert_allclose(np.linalg.svd(critics["Dense_0"]["kernel"])[1], gain, atol=1e-5)
-    exploring = small(name, use_sde=True).policy.learner.actor
-    mean = exploring.weights["params"]["Dense_0"]["kernel"]
-    np.testing.assert_allclose(np.linalg.svd(mean)[1], gain, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", ["simba", "bro"])
-def test_networks_that_start_as_in_their_papers_refuse_another_start(name):
-    with pytest.raises(ValueError, match=r"'ortho_init': True.*do not use ortho_init"):
-        small(name, policy_kwargs={"ortho_init": True})
+    for trained, layer, expected in (
+        (learner.actor, "Dense_0", gain),
+        (learner.actor, "Dense_1", 1.0),
+        (learner.critic, "Dense_0", gain),
+        (exploring.actor, "Dense_0", gain),
+    ):
+        gains = np.linalg.svd(trained.weights["params"][layer]["kernel"])[1]
+        np.testing.assert_allclose(gains, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(("name", "updates"), [("droq", off_policy), ("td7", td7_update)])

@@ -16,10 +16,7 @@ from small_models import STATES, small
 from sb3_hds.algos import off_policy
 from sb3_hds.algos.bodies import Dropout
 from sb3_hds.algos.observations import flattener
-from sb3_hds.algos.off_policy import (
-    Trained,
-    judge,
-)
+from sb3_hds.algos.off_policy import Trained, judge
 from sb3_hds.algos.optimizers import optimizer_of
 from sb3_hds.algos.quantiles import (
     Truncated,
@@ -33,7 +30,7 @@ from sb3_hds.algos.quantiles import (
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
-@pytest.mark.parametrize("n_targets", [1, 6, 8])
+@pytest.mark.parametrize("n_targets", [1, 8])
 def test_the_slope_of_the_quantile_loss_is_that_of_all_pairs(n_targets):
     rng = np.random.default_rng(0)
     values, targets = (
@@ -59,15 +56,18 @@ def test_the_slope_of_the_quantile_loss_is_that_of_all_pairs(n_targets):
     assert not jax.grad(quantile_huber, 1)(values, targets).any()
 
 
-@pytest.mark.parametrize(("n_quantiles", "n_dropped"), [(1, 0), (3, 1), (33, 5)])
-def test_the_least_quantiles_stay(n_quantiles, n_dropped):
+@pytest.mark.parametrize(("n_quantiles", "n_dropped"), [(1, 0), (33, 5)])
+def test_the_least_quantiles_stay_and_what_is_no_number_spoils_its_row(n_quantiles, n_dropped):
     values = np.random.default_rng(0).normal(size=(2, 7, n_quantiles)).astype(np.float32)
     values[1] = values[1].round(1)  # some are equal
+    values[1, 3, 0] = np.nan
 
     kept = np.asarray(Truncated(n_dropped)(jnp.asarray(values)))
 
-    pool = np.sort(np.concatenate(list(values), -1), -1)
-    np.testing.assert_array_equal(np.sort(kept, -1), pool[:, : 2 * (n_quantiles - n_dropped)])
+    assert np.isnan(kept[3]).all()
+    pool = np.sort(np.concatenate(list(values), -1), -1)[:, : 2 * (n_quantiles - n_dropped)]
+    np.testing.assert_array_equal(np.sort(np.delete(kept, 3, 0), -1), np.delete(pool, 3, 0))
+    assert np.isnan(quantile_huber(values, kept))
 
 
 @pytest.mark.parametrize("processor", [sorted_by_columns, sorted_by_rows])
@@ -79,15 +79,6 @@ def test_every_processor_sorts_alike(processor):
 
     assert np.isnan(rows[3]).all()
     np.testing.assert_array_equal(np.delete(rows, 3, 0), np.sort(np.delete(values, 3, 0), -1))
-
-
-def test_a_quantile_that_is_no_number_makes_no_number_of_all_that_are_kept():
-    values = jnp.zeros((2, 3, 4)).at[1, 1, 2].set(jnp.nan)
-
-    kept = np.isnan(Truncated(1)(values))
-
-    assert kept[1].all() and not kept[[0, 2]].any()
-    assert np.isnan(quantile_huber(values, Truncated(1)(values)))
 
 
 def test_one_critic_is_judged_as_one_of_several():
@@ -119,12 +110,10 @@ def test_dropout_zeroes_its_share():
 
 def test_choices_become_one_hot_and_dictionaries_one_row():
     space = spaces.Dict(
-        {
-            "box": spaces.Box(-1, 1, (2, 2)),
-            "choice": spaces.Discrete(3, start=5),
-            "choices": spaces.MultiDiscrete([2, 3]),
-            "flags": spaces.MultiBinary(2),
-        }
+        box=spaces.Box(-1, 1, (2, 2)),
+        choice=spaces.Discrete(3, start=5),
+        choices=spaces.MultiDiscrete([2, 3]),
+        flags=spaces.MultiBinary(2),
     )
     sample = {name: value[None] for name, value in space.sample().items()}
     sample |= {"choice": np.array([6]), "choices": np.array([[1, 2]])}
@@ -140,9 +129,7 @@ def test_choices_become_one_hot_and_dictionaries_one_row():
     ("make", "arguments"),
     [
         (th.optim.Adam, {"betas": (0.8, 0.99), "eps": 1e-5}),
-        (th.optim.AdamW, {}),
         (th.optim.AdamW, {"weight_decay": 0.1}),
-        (th.optim.RMSprop, {}),
         (th.optim.RMSprop, {"alpha": 0.9, "momentum": 0.5}),
         (th.optim.RAdam, {}),
         (th.optim.SGD, {"momentum": 0.9, "nesterov": True}),
@@ -185,10 +172,9 @@ def test_an_optimiser_of_ones_own_may_have_a_known_name():
 DECOMPOSITION = re.compile(r"@lapack_\w+qr\w*\(.*: \(tensor<(\w+)xf32>")
 
 
-@pytest.mark.parametrize("name", ["tqc_jax", "bro"])
-def test_no_batch_is_decomposed_at_once(name):
+def test_no_batch_is_decomposed_at_once():
     """With two in one program, both threads of two could wait for the other one for ever."""
-    model = small(name, **({"policy_kwargs": {"ortho_init": True}} if name == "tqc_jax" else {}))
+    model = small("bro")
     recipe, n_obs, n_act = (getattr(model.policy, each) for each in ("recipe", "n_obs", "n_act"))
 
     program = off_policy.begin.lower(recipe, n_obs, n_act, 1.0, jax.random.key(0)).as_text()

@@ -51,14 +51,12 @@ def test_columns_are_found_by_the_names_of_joints(form):
 
 
 def test_what_does_not_match_is_named_with_the_nearest():
+    doubled = match(arm(observe="q"), ["left/wrist_1_joint", "right/wrist_1_joint"])
+    assert doubled.obs[1] is None and len(doubled.unused) == 2
     found = match(arm(observe="q"), ["shoulder_pan_joint", "wrist_1_joint", "wrist2joint", "u_1"])
 
     assert found.obs == ("shoulder_pan_joint", "wrist_1_joint", "wrist2joint")
-    message = (
-        r"No column of the log has the name of:\n  shoulder_pan \(command\)"
-        r"[\s\S]*Name columns yourself"
-    )
-    with pytest.raises(TrajectoryError, match=message.replace(r"shoulder_pan \(", r"m0 \(")):
+    with pytest.raises(TrajectoryError, match=r"has the name of:\n  m0 \(command\)"):
         found.check()
 
 
@@ -70,12 +68,6 @@ def test_a_name_within_a_longer_one_is_another_joint():
     assert match(twin, ["left_elbow_pos", "elbow_pos"]).obs == ("elbow_pos", "left_elbow_pos")
     prefixed = ["/robot1/left_elbow_pos", "/robot1/elbow_pos"]
     assert match(twin, prefixed).obs == tuple(reversed(prefixed))
-
-
-def test_two_columns_for_one_joint_are_none():
-    found = match(arm(observe="q"), ["left/wrist_1_joint", "right/wrist_1_joint"])
-
-    assert found.obs[1] is None and len(found.unused) == 2
 
 
 def test_targets_are_the_commands_of_servos():

@@ -12,16 +12,8 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_hds.algos import TwinPolicy
-from sb3_hds.algos.networks import (
-    ACTIVATIONS,
-    Actor,
-    Value,
-    activation,
-    squash,
-    unsquash,
-    value_of,
-    with_input_scales,
-)
+from sb3_hds.algos import networks as nets
+from sb3_hds.algos.networks import ACTIVATIONS, Actor, Value, activation, value_of
 from sb3_hds.algos.persistence import from_state_dict, to_state_dict
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -58,15 +50,11 @@ def widths(weights) -> list[int]:
     "module",
     [
         th.nn.ReLU,
-        th.nn.LeakyReLU,
         th.nn.GELU,
         lambda: th.nn.GELU(approximate="tanh"),
         lambda: th.nn.functional.gelu,
-        th.nn.CELU,
         th.nn.Mish,
         th.nn.Hardsigmoid,
-        th.nn.Hardswish,
-        th.nn.Softsign,
         lambda: th.sigmoid,
     ],
 )
@@ -95,15 +83,14 @@ def test_names_in_any_spelling_and_functions_of_jax_are_activations():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ("sigmoids", r"activation_fn must be one of tanh, relu"),
-        (th.nn.Conv1d, r"activation_fn must be one of tanh, relu"),
-        (None, r"activation_fn must be one of tanh, relu"),
-        (np.tanh, r"activation_fn=.* is no JAX function"),
-        (th.sin, r"activation_fn=.* is no JAX function"),
-        (jnp.sum, "must keep the shape of an array, and makes"),
-        (lambda x: None, "must keep the shape of an array, and makes"),
-        (th.nn.ELU(alpha=0.5), "a JAX function, which may have settings of its own"),
-        (type("ReLU", (th.nn.ReLU,), {}), "a JAX function, which may have settings of its own"),
+        ("sigmoids", "must be one of tanh, relu"),
+        (th.nn.Conv1d, "must be one of tanh, relu"),
+        (np.tanh, "no JAX function"),
+        (th.sin, "no JAX function"),
+        (jnp.sum, "must keep the shape"),
+        (lambda x: None, "must keep the shape"),
+        (th.nn.ELU(alpha=0.5), "settings of its own"),
+        (type("ReLU", (th.nn.ReLU,), {}), "settings of its own"),
     ],
 )
 def test_what_is_no_activation_is_refused(wrong, message):
@@ -137,6 +124,10 @@ def test_a_value_is_a_signed_root_less_squares():
     # u(2) = 2 * (2 + 0.3), u(-2) the same below zero.
     assert value_of(jnp.array([2.0, 0.0, 0.0])) == pytest.approx(4.6)
     assert value_of(jnp.array([-2.0, 1.0, -3.0])) == pytest.approx(-4.6 - 1.0 - 9.0)
+    value = jnp.array([-1e4, -20.0, -1e-3, 0.0, 1.0, 1e4])
+    # Single precision.
+    np.testing.assert_allclose(nets.unsquash(nets.squash(value)), value, rtol=1e-4, atol=1e-7)
+    assert (jnp.diff(nets.squash(value)) > 0.0).all()
 
 
 @pytest.mark.parametrize("hidden", [(), (8,)])
@@ -147,7 +138,7 @@ def test_what_an_actor_computes_does_not_change_with_the_scales_of_its_input(hid
     old = Scales(jnp.array([0.1, 0.0, -2.0]), jnp.array([1.0, 2.0, 0.5]))
     new = Scales(jnp.array([0.4, -1.0, 1.0]), jnp.array([3.0, 0.2, 0.7]))
 
-    moved = with_input_scales(weights, old, new)
+    moved = nets.with_input_scales(weights, old, new)
 
     before = actor.apply(weights, (obs - old.mean) / old.scale)
     # Single precision.
@@ -166,14 +157,6 @@ def test_a_linear_path_leads_past_the_hidden_layers_unless_it_is_switched_off():
     assert "linear" not in without.init(jax.random.key(0), obs)["params"]
     assert policy().actor_network.linear_path
     assert not policy(linear_path=False).actor_network.linear_path
-
-
-def test_squash_and_unsquash_undo_each_other():
-    value = jnp.array([-1e4, -20.0, -1.0, -1e-3, 0.0, 1e-3, 1.0, 20.0, 1e4])
-
-    # Single precision.
-    np.testing.assert_allclose(unsquash(squash(value)), value, rtol=1e-4, atol=1e-7)
-    assert (jnp.diff(squash(value)) > 0.0).all()
 
 
 def test_a_pytree_makes_a_round_trip_through_tensors_of_their_own():
@@ -206,11 +189,9 @@ def test_tensors_that_do_not_fit_are_refused_and_missing_ones_where_that_is_not_
     "net_arch, pi, vf",
     [
         (None, [96, 96, 2], [64, 64, ROOTS]),
-        ([5], [5, 2], [5, ROOTS]),
         ([], [2], [ROOTS]),
         ({"pi": [4, 3], "vf": [6]}, [4, 3, 2], [6, ROOTS]),
         ({"pi": [4]}, [4, 2], [64, 64, ROOTS]),
-        ({"vf": []}, [96, 96, 2], [ROOTS]),
     ],
 )
 def test_net_arch_sets_the_widths_of_both_networks(net_arch, pi, vf):
@@ -227,9 +208,3 @@ def test_rounding_does_not_lead_out_of_the_bounds():
     actions = policy(low, high).unscale_action(np.array([[1.0, -1.0]], np.float32))
 
     assert actions.tolist() == [[float(high), float(low)]]
-
-
-def test_a_policy_that_was_not_trained_acts_already():
-    action, state = policy().predict(np.zeros(3, np.float32))
-
-    assert action.shape == (2,) and state is None

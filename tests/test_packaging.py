@@ -136,10 +136,33 @@ def test_the_stock_zoo_knows_our_algorithms_after_an_editable_install(tmp_path):
 
 
 @needs_build
-def test_uninstalling_leaves_nothing_behind(tmp_path, wheel):
+def test_an_interpreter_starts_with_nothing_but_the_hook_and_in_5_ms_more(installed):
+    started, without = (
+        set(
+            succeeds(
+                installed.python, *option, "-c", "import sys, site; print(*sys.modules)"
+            ).split()
+        )
+        for option in ((), ("-S",))
+    )
+    assert started - without <= {"sitecustomize", "rl_zoo_plugin", "rl_zoo_plugin.hook"}
+
+    # The best of ten: what else the machine does only adds to it.
+    reports = [run(installed.python, "-X", "importtime", "-c", "pass").stderr for _ in range(10)]
+    cumulative = r"\|\s*(\d+) \|\s+rl_zoo_plugin\.hook\n"
+    assert min(int(re.search(cumulative, report)[1]) for report in reports) < 5000  # [us]
+
+
+@needs_build
+def test_an_interpreter_starts_with_a_broken_hook_and_uninstalling_leaves_nothing(tmp_path, wheel):
     environment = Environment(tmp_path)
     environment.install(wheel)
-    assert "sb3_hds.pth" in environment.files()
+    hook = environment.site_packages / "rl_zoo_plugin" / "hook.py"
+    works = hook.read_text()
+    for text in ("raise ImportError('broken')", None):
+        hook.write_text(text) if text else hook.unlink()
+        assert succeeds(environment.python, "-c", "print(1)") == "1\n"
+    hook.write_text(works)
 
     # Only what lies in this environment is uninstalled, not the packages that it borrows.
     (environment.site_packages / "dependencies.pth").write_text("# nothing\n")
@@ -149,47 +172,17 @@ def test_uninstalling_leaves_nothing_behind(tmp_path, wheel):
     assert environment.files() == {"dependencies.pth"}
 
 
-@needs_build
-def test_an_interpreter_starts_with_nothing_but_the_hook_and_in_5_ms_more(installed):
-    at_start = succeeds(installed.python, "-c", "import sys; print(*sys.modules)").split()
-    without = succeeds(
-        installed.python, "-S", "-c", "import sys, site; print(*sys.modules)"
-    ).split()
-    assert set(at_start) - set(without) <= {"sitecustomize", "rl_zoo_plugin", "rl_zoo_plugin.hook"}
+def test_importing_the_package_costs_little_more_than_gymnasium_and_registers_environments():
+    code = "import {}, sys; print(*sys.modules, *gymnasium.registry)".format
+    ours, theirs = (
+        set(succeeds(sys.executable, "-c", code(package)).split())
+        for package in ("gymnasium, sb3_hds", "gymnasium")
+    )
 
-    # The best of ten: what else the machine does only adds to it.
-    reports = [run(installed.python, "-X", "importtime", "-c", "pass").stderr for _ in range(10)]
-    cumulative = r"\|\s*(\d+) \|\s+rl_zoo_plugin\.hook\n"
-    assert min(int(re.search(cumulative, report)[1]) for report in reports) < 5000  # [us]
-
-
-@needs_build
-def test_an_interpreter_starts_when_the_hook_is_broken_or_gone(tmp_path, wheel):
-    environment = Environment(tmp_path)
-    environment.install(wheel)
-    hook = environment.site_packages / "rl_zoo_plugin" / "hook.py"
-
-    hook.write_text("raise ImportError('broken')")
-    assert succeeds(environment.python, "-c", "print(1)") == "1\n"
-    hook.unlink()
-    assert succeeds(environment.python, "-c", "print(1)") == "1\n"
-
-
-def test_importing_the_package_costs_little_more_than_gymnasium():
-    def modules(package: str) -> set[str]:
-        return set(
-            succeeds(sys.executable, "-c", f"import {package}, sys; print(*sys.modules)").split()
-        )
-
-    ours = modules("sb3_hds") - modules("gymnasium")
-
-    assert ours == {"sb3_hds", "sb3_hds.envs", "sb3_hds.envs.registration"}
-
-
-def test_importing_the_package_imports_neither_jax_nor_torch_nor_pandas():
-    code = "import sb3_hds, sys; print(*{'jax', 'torch', 'pandas'} & set(sys.modules))"
-
-    assert succeeds(sys.executable, "-c", code).split() == []
+    assert {name for name in ours - theirs if not name.startswith("sb3_hds/")} == {
+        *("sb3_hds", "sb3_hds.envs", "sb3_hds.envs.registration")
+    }
+    assert "sb3_hds/CartPoleSwingUp-v0" in ours and not {"jax", "torch", "pandas"} & ours
 
 
 def test_who_learns_without_a_twin_does_not_wait_for_what_fits_one_to_data():
@@ -200,12 +193,6 @@ def test_who_learns_without_a_twin_does_not_wait_for_what_fits_one_to_data():
     )
 
     assert succeeds(sys.executable, "-c", code).split() == []
-
-
-def test_importing_the_package_registers_our_environments():
-    code = "import gymnasium, sb3_hds; print(*gymnasium.registry)"
-
-    assert "sb3_hds/CartPoleSwingUp-v0" in succeeds(sys.executable, "-c", code).split()
 
 
 def test_public_names_are_listed_and_exist():

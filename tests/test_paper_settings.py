@@ -92,35 +92,30 @@ def made():
     return of
 
 
+def having(thing: Any, expected: dict[str, Any]) -> dict[str, Any]:
+    return {attribute: getattr(thing, attribute) for attribute in expected}
+
+
 @pytest.mark.parametrize("name", OF_THE_MODEL)
-def test_arguments_are_those_of_the_paper(made, name):
-    expected = OF_THE_MODEL[name]
-    assert {attribute: getattr(made(name), attribute) for attribute in expected} == expected
+def test_arguments_and_networks_are_those_of_the_paper(made, name):
+    model, knobs = made(name), made(name).knobs() if name in RATES else None
+    policy = model.policy
 
-
-@pytest.mark.parametrize("name", RATES)
-def test_learning_rate_and_target_entropy_are_those_of_the_paper(made, name):
-    knobs = made(name).knobs()
+    assert having(model, OF_THE_MODEL[name]) == OF_THE_MODEL[name]
+    if name == "td7":
+        kept = policy.arguments
+        assert kept["net_arch"] == (256, 256) and kept["embedding_size"] == 256
+        assert (kept["activation_fn"], kept["qf_activation_fn"]) == ("relu", "elu")
+        assert model.learning_rates() == pytest.approx((3e-4, 3e-4))
+        return
     assert (knobs.learning_rate, knobs.target_entropy) == pytest.approx(RATES[name])
     assert knobs.qf_learning_rate == knobs.learning_rate
-
-
-@pytest.mark.parametrize("name", NETWORKS)
-def test_networks_and_optimisers_are_those_that_are_published(made, name):
-    policy = made(name).policy
     actor, critics, n_values, optimizer, arguments = NETWORKS[name]
-
-    assert policy.widths == (actor, critics)
+    assert policy.widths == (actor, critics) and policy.n_critics == 2
     assert policy.critic_network.n_values == n_values
-    assert policy.n_critics == 2
     for used in policy.optimizers:
         assert (used.make.__name__, dict(used.arguments)) == (optimizer, arguments)
-
-
-@pytest.mark.parametrize("name", BODIES)
-def test_layers_of_the_critics_are_those_of_the_paper(made, name):
-    body, expected = made(name).policy.critic_network.body, BODIES[name]
-    assert {attribute: getattr(body, attribute) for attribute in expected} == expected
+    assert having(policy.critic_network.body, BODIES.get(name, {})) == BODIES.get(name, {})
 
 
 def test_multipliers_of_bro_start_and_are_updated_as_in_the_paper(made):
@@ -141,11 +136,3 @@ def test_bro_with_the_ratio_of_the_paper_starts_afresh_as_often_as_there():
         *(15_000, 50_000, 250_000, 500_000),
         *(750_000, 1_000_000, 1_500_000, 2_000_000),
     ]
-
-
-def test_networks_of_td7_are_those_of_the_paper(made):
-    arguments = made("td7").policy.arguments
-
-    assert arguments["net_arch"] == (256, 256) and arguments["embedding_size"] == 256
-    assert (arguments["activation_fn"], arguments["qf_activation_fn"]) == ("relu", "elu")
-    assert made("td7").learning_rates() == pytest.approx((3e-4, 3e-4))

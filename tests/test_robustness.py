@@ -51,22 +51,15 @@ def test_they_matter_where_the_loop_sees_what_the_policy_sees(swimmer):
     assert swimmer.policy.read_states is None
 
 
-def test_a_table_has_shares_of_the_return_without_perturbation():
+def test_a_table_has_shares_of_the_return_without_perturbation_where_they_mean_something():
+    """A share of a return that is negative, and the spread of a single episode, do not."""
     found = Robustness({"none": np.array([100.0, 300.0]), "push": np.array([50.0, 100.0])})
-
-    assert found.share("push") == 0.375
-    assert "push" in str(found) and "0.38" in str(found)
-
-
-def test_what_means_nothing_is_left_out_of_the_table():
-    """A share of a return that is negative, and the spread of a single episode."""
     negative = Robustness({"none": np.array([-100.0, -300.0]), "push": np.array([-400.0, -500.0])})
     single = Robustness({"none": np.array([100.0]), "push": np.array([50.0])})
 
-    assert negative.share("push") is None and "share  " not in str(negative)
-    assert "so there are no shares of it" in str(negative) and "-450.0" in str(negative)
+    assert found.share("push") == 0.375 and "0.38" in str(found)
+    assert negative.share("push") is None and "-450.0" in str(negative)
     assert single.to_rows()[1]["std"] is None and "std" not in str(single)
-    assert "Return of one episode each" in str(single) and "0.50" in str(single)
     assert "nan" not in f"{negative}{single}"
 
 
@@ -78,19 +71,6 @@ def test_a_question_that_makes_no_sense_is_refused(swimmer):
     endless = lambda: gymnasium.make("Swimmer-v5", max_episode_steps=-1)  # noqa: E731
     with pytest.raises(EnvironmentMismatchError, match="TimeLimit"):
         measure_robustness(swimmer, endless)
-
-
-def test_the_command_prints_and_writes_the_table(swimmer, tmp_path, capsys):
-    swimmer.save(tmp_path / "model")
-    words = ["--algo", "openloop", "--model", str(tmp_path / "model.zip"), "--env", "Swimmer-v5"]
-
-    done = cli.main(["robustness", *words, "--episodes", "1", "--csv", str(tmp_path / "table.csv")])
-
-    assert done == 0
-    assert "sensor constant" in capsys.readouterr().out
-    rows = rows_of(tmp_path / "table.csv")
-    assert [row["perturbation"] for row in rows] == list(PERTURBATIONS)
-    assert float(rows[1]["share"]) == 1.0
 
 
 def test_a_push_without_mujoco_is_left_out_and_named():
@@ -154,22 +134,22 @@ def test_the_command_takes_what_the_environment_was_made_and_wrapped_with(tmp_pa
     ask = ["robustness", *words, *made, "--episodes", "1", "--csv"]
 
     assert cli.main([*ask, str(tmp_path / "table.csv"), *wrapper]) == 0
+    assert "sensor constant" in capsys.readouterr().out
     without = cli.main([*ask, str(tmp_path / "none.csv")])
 
-    model = algos.DroQ.load(tmp_path / "model.zip")
-    expected = returns_of(model, env, 1)[0]
-    assert float(rows_of(tmp_path / "table.csv")[0]["return"]) == pytest.approx(expected, rel=1e-5)
+    model, rows = algos.DroQ.load(tmp_path / "model.zip"), rows_of(tmp_path / "table.csv")
+    assert float(rows[0]["return"]) == pytest.approx(returns_of(model, env, 1)[0], rel=1e-5)
+    # Pendulum-v1 cannot be pushed.
+    assert [row["perturbation"] for row in rows] == [
+        kind for kind in PERTURBATIONS if kind != "push"
+    ]
     # Without the filter, whose state is observed.
     assert without == 1 and "put the wrappers around it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("name", "package"),
-    [
-        ("sbx.SAC", "sbx"),
-        pytest.param("tqc", "sb3_contrib", marks=pytest.mark.expensive),
-        pytest.param("ppo_lstm", "sb3_contrib", marks=pytest.mark.expensive),
-    ],
+    [("sbx.SAC", "sbx"), pytest.param("ppo_lstm", "sb3_contrib", marks=pytest.mark.expensive)],
 )
 def test_the_command_runs_models_of_the_packages_around(name, package, tmp_path):
     pytest.importorskip("sb3_contrib")
@@ -187,22 +167,17 @@ def test_the_command_runs_models_of_the_packages_around(name, package, tmp_path)
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("--algo opneloop", "no algorithm 'opneloop'. Did you mean 'openloop'?"),
+        ("--algo opneloop", "Did you mean 'openloop'?"),
         ("--algo sbx.Nothing", "no class 'sbx.Nothing'"),
         ("--algo sbx.common", "loads no model"),
-        ("--env-wrapper nowhere.Wrapper", "no class 'nowhere.Wrapper'"),
-        ("--env-wrapper [1,2]", "--env-wrapper takes package.Wrapper"),
+        ("--env-wrapper [1,2]", "--env-wrapper takes"),
         ("--env-wrapper 'sb3_hds.wrappers.LowPassAction: 4'", "--env-wrapper takes"),
         ("--env-kwargs g=5", "--env-kwargs takes NAME:VALUE"),
-        ("--env-kwargs weight:5", "There is no 'Pendulum-v1' with {'weight': 5}"),
-        ("--env Nothing-v0", "There is no 'Nothing-v0'"),
-        (
-            "--model FOLDER/modle.zip",
-            "is no model 'FOLDER/modle.zip'. Did you mean 'FOLDER/model.zip'?",
-        ),
-        ("--model FOLDER/modle", "There is no model 'FOLDER/modle'. Did you mean"),
-        ("--model FOLDER/text.zip", "text.zip holds no model of droq: "),
-        ("--model FOLDER/other.zip", "other.zip holds no model of droq: "),
+        ("--env-kwargs weight:5", "no 'Pendulum-v1' with {'weight': 5}"),
+        ("--env Nothing-v0", "no 'Nothing-v0'"),
+        ("--model FOLDER/modle", "Did you mean 'FOLDER/model.zip'?"),
+        ("--model FOLDER/text.zip", "holds no model of droq"),
+        ("--model FOLDER/other.zip", "holds no model of droq"),
     ],
 )
 def test_the_command_says_in_one_line_what_it_does_not_know(words, message, tmp_path, capsys):
@@ -215,5 +190,4 @@ def test_the_command_says_in_one_line_what_it_does_not_know(words, message, tmp_
 
     assert cli.main(["robustness", *known.split(), *shlex.split(given)]) == 1
     told = capsys.readouterr().err
-    assert message.replace("FOLDER", str(tmp_path)) in told and ".zip.zip" not in told
-    assert told.count("\n") == 1
+    assert message.replace("FOLDER", str(tmp_path)) in told and told.count("\n") == 1
