@@ -37,18 +37,17 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 def nested(env):
     env = LowPassAction(ActionDelay(env, 2), cutoff=4.0)
-    env = ActionScale(ActionRateLimit(env, max_rate=10.0), schedule=[[0, 0.3], [150, 1.0]])
+    env = ActionScale(ActionRateLimit(env, max_rate=10.0), schedule=SCHEDULE)
     return HistoryObservation(ContinuityCost(env, 0.3), n_observations=1, n_actions=2)
 
 
+SCHEDULE = [[0, 0.3], [150, 1.0]]
+
+
 LAYERS = {
-    "rate_limit": lambda env: ActionRateLimit(env, max_rate=10.0),
     "low_pass": lambda env: LowPassAction(env, cutoff=4.0, order=3),
-    "delay": lambda env: ActionDelay(env, steps=3),
-    "scale": lambda env: ActionScale(env, schedule=[[0, 0.3], [150, 1.0]]),
-    "scale_of_some": lambda env: ActionScale(env, schedule=[[0, 0.3], [150, 1.0]], axes=[0]),
+    "scale_of_some": lambda env: ActionScale(env, schedule=SCHEDULE, axes=[0]),
     "history": lambda env: HistoryObservation(env, n_observations=2, n_actions=2),
-    "continuity": lambda env: ContinuityCost(env, weight=0.3),
     # No speed is commanded here: what the twin does beyond its assumptions has to agree, too.
     "barrier": lambda env: JointLimitBarrier(
         env, -2.0, 2.0, position=[[0, 1]], gain=0.5, on_breach="ignore"
@@ -56,7 +55,7 @@ LAYERS = {
     "rhythm_offset": lambda env: CPGPrior(env, omega_swing=3.0, omega_stance=5.0, phase=0.4),
     "rhythm_residual": lambda env: CPGPrior(env, mode="residual", omega_swing=3.0, amplitude=2.5),
     "rhythm_parameters": lambda env: CPGPrior(env, mode="parameters", omega_swing=3.0, offset=0.3),
-    "two_of_a_kind": lambda env: ActionRateLimit(ActionRateLimit(env, 30.0), 10.0),
+    # Rate limit, delay, scale, continuity cost and history among them.
     "nested": nested,
 }
 ALL = pytest.mark.parametrize("layer", LAYERS)
@@ -67,6 +66,7 @@ def test_a_wrapped_pendulum_and_its_twin_agree_step_for_step(layer, x64):
     env = LAYERS[layer](gymnasium.make("Pendulum-v1"))
     twin = twin_of(env)
     step, reward, infer = map(jax.jit, (twin.step, twin.reward, twin.infer))
+    observe = jax.jit(twin.observe)
     obs, _ = env.reset(seed=1)
     env.action_space.seed(1)
     alone = infer(jnp.asarray(obs, jnp.float64), twin.params)
@@ -78,31 +78,22 @@ def test_a_wrapped_pendulum_and_its_twin_agree_step_for_step(layer, x64):
         after, alone = (step(s, command, twin.params) for s in (state, alone))
         # From an observation in single precision: 6e-8 of a speed of 8 rad/s and of each filter;
         # the reward squares an angle of up to pi and a speed of up to 8 rad/s.
-        np.testing.assert_allclose(twin.observe(after, twin.params), obs, atol=5e-6)
+        np.testing.assert_allclose(observe(after, twin.params), obs, atol=5e-6)
         assert float(reward(state, command, after, twin.params)) == pytest.approx(given, abs=5e-5)
         # A twin that never saw the environment again: the pendulum magnifies what was rounded,
         # without bound after some seconds.
         if k < 50:
-            np.testing.assert_allclose(twin.observe(alone, twin.params), obs, atol=5e-3)
-    assert env.unwrapped.state[1] != 0.0
-
-
-@ALL
-def test_what_is_seen_tells_the_state_of_the_twin(layer, x64):
-    twin = twin_of(LAYERS[layer](gymnasium.make("Pendulum-v1")))
-    state = twin.initial(jax.random.key(0), twin.params)
-    for k in range(5):
-        state = twin.step(state, jnp.full(len(twin.actuators), 1.5 - k), twin.params)
-
-    back = twin.infer(twin.observe(state, twin.params), twin.params)
-
-    for ours, theirs in zip(jax.tree.leaves(state), jax.tree.leaves(back), strict=True):
+            np.testing.assert_allclose(observe(alone, twin.params), obs, atol=5e-3)
+    # What is seen tells the state of the twin.
+    back = infer(observe(alone, twin.params), twin.params)
+    for ours, theirs in zip(jax.tree.leaves(alone), jax.tree.leaves(back), strict=True):
         np.testing.assert_allclose(jnp.sin(ours), jnp.sin(theirs), atol=1e-9)  # angles turn
 
 
 @ALL
 def test_the_twin_survives_a_spec_effects_and_another_interval(layer):
-    twin = twin_of(LAYERS[layer](gymnasium.make("Pendulum-v1", g=9.0)))
+    env = LAYERS[layer](gymnasium.make("Pendulum-v1", g=9.0))
+    twin = twin_of(env)
 
     back = twins.from_spec(json.loads(json.dumps(twin.to_spec())))
 
@@ -111,6 +102,8 @@ def test_the_twin_survives_a_spec_effects_and_another_interval(layer):
     assert "viscous_friction.hinge.b" in extended.parameters
     assert extended.without("viscous_friction.hinge") == twin
     assert twin.at_interval(0.1, 2).channels == twin.channels
+    np.testing.assert_allclose([c.low for c in twin.channels], env.observation_space.low)
+    np.testing.assert_allclose([c.high for c in twin.channels], env.observation_space.high)
 
 
 def test_copies_in_other_processes_have_the_same_twin():
@@ -165,13 +158,10 @@ def test_derivatives_of_a_filter_pass_through_the_twin(x64):
     assert float(slope[0]) == pytest.approx(0.4 * 0.15, rel=1e-9)
 
 
-@pytest.mark.parametrize("order", [1, 2, 3, 4, 8])
-@pytest.mark.parametrize("cutoff", [1e-4, 1e-3, 0.01, 0.1, 0.4])
+@pytest.mark.parametrize(("cutoff", "order"), [(1e-4, 1), (1e-3, 8), (0.1, 3), (0.4, 8)])
 def test_a_constant_passes_a_filter_in_single_precision(cutoff, order):
-    low_pass, below = (
-        LowPass(cutoff=cutoff, order=order),
-        Signals(Pendulum().actuators, Pendulum().channels),
-    )
+    low_pass = LowPass(cutoff=cutoff, order=order)
+    below = Signals(Pendulum().actuators, Pendulum().channels)
     command = jnp.full(1, 1.3, jnp.float32)
 
     def step(memory, _):
@@ -182,15 +172,6 @@ def test_a_constant_passes_a_filter_in_single_precision(cutoff, order):
     _, passed = jax.lax.scan(step, start, length=200 + int(20 / cutoff))
 
     assert float(passed[-1, 0]) == pytest.approx(1.3, rel=2e-3)
-
-
-def test_limits_of_the_filters_memory_are_those_of_the_twin_and_the_wrapper():
-    env = LowPassAction(gymnasium.make("Pendulum-v1"), 4.0)
-    twin = twin_of(env)
-
-    np.testing.assert_allclose([c.low for c in twin.channels], env.observation_space.low)
-    np.testing.assert_allclose([c.high for c in twin.channels], env.observation_space.high)
-    assert Signals(twin.actuators, twin.channels).rest() == pytest.approx(0.0)
 
 
 # --- learners ------------------------------------------------------------------------------------
@@ -213,10 +194,11 @@ def test_our_learners_store_what_was_executed(name):
     np.testing.assert_allclose(stored, model.replay_buffer.next_observations[:30, 0, 3], atol=1e-5)
 
 
-def test_a_layer_below_another_that_rescales_is_found_out():
-    env = gymnasium.wrappers.RescaleAction(jumping(), -1.0, 1.0)
+@pytest.mark.parametrize(("limit", "says"), [(1.0, "changes actions"), (0.1, "rescales actions")])
+def test_a_layer_below_another_that_rescales_is_found_out(limit, says):
+    env = gymnasium.wrappers.RescaleAction(jumping(), np.float32(-limit), np.float32(limit))
 
-    with pytest.raises(ValueError, match="outside that layer changes actions"):
+    with pytest.raises(ValueError, match=f"outside that layer {says}"):
         small("droq", env, learning_starts=40).learn(30)
 
 
@@ -250,14 +232,6 @@ def test_planners_plan_through_layers_and_so_keep_what_was_chosen(wrap):
     buffer = model.replay_buffer
     told = buffer.next_observations[:25, 0, 3]
     assert np.max(np.abs(2.0 * buffer.actions[:25, 0, 0] - told)) > 0.1
-
-
-def test_an_action_to_store_in_other_units_is_an_error():
-    env = gymnasium.wrappers.RescaleAction(jumping(), np.float32(-0.1), np.float32(0.1))
-    model = small("droq", env, learning_starts=40)
-
-    with pytest.raises(ValueError, match="outside that layer rescales actions"):
-        model.learn(30)
 
 
 # --- returns where a layer does not bind ---------------------------------------------------------
