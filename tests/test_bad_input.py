@@ -30,53 +30,23 @@ def load(model, **arguments):
 PENDULUM = ("Pendulum-v1",)
 LIMITS = "finite lower and upper bound.*TransformAction"
 # By what is wrong: what a class is called with beside its small arguments, and what it says.
+# By what is wrong: what a class is called with beside its small arguments, and what it says.
 MISTAKES = {
     "an unknown argument": (PENDULUM, {"sed": 3}, r"has no argument 'sed'\. Did you mean 'seed'\?"),
-    "an argument of another": (
-        PENDULUM,
-        {"frobnicate": 1},
-        r"no argument 'frobnicate'\. It has: pol",
-    ),
-    "an unknown argument of the policy": (
-        PENDULUM,
-        {"policy_kwargs": {"net_archs": [8]}},
-        "net_archs",
-    ),
+    "an argument of another": (PENDULUM, {"frobnicate": 1}, "no argument 'frobnicate'.*It has"),
     "no environment": ((), {}, "needs an environment"),
     "a policy alone": (("MlpPolicy",), {}, "needs an environment"),
     "an unknown environment": (("Nowhere-v0",), {}, "Nowhere"),
     "an unknown policy": (("CnnPolicy", *PENDULUM), {}, "no policy 'CnnPolicy': use MlpPolicy"),
-    "an unknown policy alone": (("CnnPolicy",), {}, "no policy 'CnnPolicy': use MlpPolicy"),
-    "the environment first": (
-        (AnySpaces(), "MlpPolicy"),
-        {},
-        r"that is a policy\. The policy comes first",
-    ),
+    "the environment first": ((AnySpaces(), "MlpPolicy"), {}, "The policy comes first"),
     "a class": (("MlpPolicy", AnySpaces), {}, "a class or function: call it first"),
     "a number": (("MlpPolicy", 5), {}, "that is no environment"),
-    "vectors of Gymnasium": (
-        (gymnasium.make_vec("Pendulum-v1", 2),),
-        {},
-        r"GymnasiumVecEnv\(env\)",
-    ),
-    "choices of actions": (
-        (AnySpaces(action_space=spaces.Discrete(3)),),
-        {},
-        r"only supports.*Box.*Discrete\(3\)",
-    ),
+    "vectors": ((gymnasium.make_vec("Pendulum-v1", 2),), {}, r"GymnasiumVecEnv\(env\)"),
+    "choices": ((AnySpaces(action_space=spaces.Discrete(3)),), {}, r"only supports.*Discrete"),
     "wide limits": ((AnySpaces(action_space=spaces.Box(-3e38, 3e38, (1,))),), {}, LIMITS),
-    "half a limit": ((AnySpaces(action_space=spaces.Box(-1.0, np.inf, (1,))),), {}, LIMITS),
     "a seed below 0": (PENDULUM, {"seed": -1}, "seed must be"),
-    "a seed that is a word": (
-        PENDULUM,
-        {"seed": "zero"},
-        "seed must be None or a whole number fro",
-    ),
-    "policy_kwargs as a word": (
-        PENDULUM,
-        {"policy_kwargs": "dict()"},
-        "must be a dictionary, such",
-    ),
+    "a seed that is a word": (PENDULUM, {"seed": "zero"}, "seed must be None or a whole number"),
+    "policy_kwargs as a word": (PENDULUM, {"policy_kwargs": "dict()"}, "must be a dictionary"),
     "a device that is not there": (PENDULUM, {"device": "cuda:7"}, "'cuda:7'.*it has: .*cpu"),
 }
 REFUSED = (ValueError, TypeError, AssertionError, gymnasium.error.NameNotFound)
@@ -94,35 +64,28 @@ def test_a_constructor_says_in_one_line_what_to_do_instead_of(mistake, name):
 
 
 # By what is wrong: what is done with a model, and what the error says.
+# By what is wrong: what is done with a model, and what the error says.
+CAR = "MountainCarContinuous-v0"
 LATER = {
     "steps below 0": (lambda model: model.learn(-5), "whole number of steps of at least 0"),
     "half a step": (lambda model: model.learn(20.5), "whole number of steps of at least 0"),
     "steps as a word": (lambda model: model.learn("20"), "whole number of steps of at least 0"),
-    "no number of steps": (lambda model: model.learn(np.nan), "whole number of steps"),
-    "a callback that is none": (
-        lambda model: model.learn(10, callback=5),
-        "callback must be a BaseCallback of SB3, a function of locals and globals, or a list",
-    ),
+    "a callback that is none": (lambda model: model.learn(10, callback=5), "callback must be a"),
     "no interval": (lambda model: model.learn(10, log_interval=0), "log_interval must be None"),
     "another environment": (
-        lambda model: model.set_env(gymnasium.make("MountainCarContinuous-v0")),
-        "Observation spaces do not match: .*Pass one like it, or make a new model",
+        lambda model: model.set_env(gymnasium.make(CAR)),
+        "Observation spaces do not match: .*Pass one like it",
     ),
     "no environment": (lambda model: model.set_env(None), "that is no environment"),
     "an observation of nothing": (lambda model: model.predict(None), "which is no observation"),
-    "an observation of two numbers": (lambda model: model.predict(np.zeros(2)), "shape"),
     "observations with an axis more": (lambda model: model.predict(np.zeros((2, 3, 1))), "shape"),
     "no number": (lambda model: model.predict(np.array([1.0, 0.0, np.nan])), "not finite"),
-    "an infinite number": (lambda model: model.predict(np.array([1, 0, -np.inf])), "not finite"),
     "what reset returns": (lambda model: model.predict((np.zeros(3), {})), "mixing Gym API"),
     "loading for another environment": (
-        lambda model: load(model, env=gymnasium.make("MountainCarContinuous-v0")),
-        "Observation spaces do not match: .*Pass one like it, or make a new model",
+        lambda model: load(model, env=gymnasium.make(CAR)),
+        "Observation spaces do not match: .*Pass one like it",
     ),
-    "loading with an unknown argument": (
-        lambda model: load(model, sed=3),
-        r"has no argument 'sed'\. Did you mean 'seed'\?",
-    ),
+    "loading with an unknown argument": (lambda model: load(model, sed=3), "Did you mean 'seed'"),
     "loading nothing": (lambda model: type(model).load(None), "Expected the path of a file"),
     "learning without an environment": (
         lambda model: load(model).learn(10),
@@ -208,7 +171,6 @@ def test_a_twin_of_another_system_is_refused():
     [
         ("n_rollouts", 8.5),
         ("horizon", 0),
-        ("horizon", "long"),
         ("lookahead", -1),
         ("order", 3),
         ("planner", "best"),
@@ -217,33 +179,26 @@ def test_a_twin_of_another_system_is_refused():
         ("n_random_plans", -1),
         ("plan_memory", 0),
         ("pretrain_epochs", None),
-        ("batch_size", 0),
         ("gradient_steps", -2),
-        ("gamma", 0.0),
         ("gamma", 1.01),
-        ("gamma", np.nan),
         ("loss", "cubic"),
         ("reset_share", 1.5),
-        ("random_share", -0.5),
         ("gain_weight", -0.1),
         ("sensitivity_weight", np.nan),
         ("averaging", "much"),
-        ("exploration_noise", -1.0),
         ("exploration_noise", np.inf),
         ("learning_rate", -1e-3),
         ("value_learning_rate", "cosine_1e-3"),
         ("temperature", -1.0),
         ("temperature_decay", 1.1),
-        ("exploration_decay", -0.1),
         ("relabel_share", 2.0),
     ],
 )
 def test_a_hyperparameter_out_of_range_is_named_with_its_range(argument, value):
-    with pytest.raises(ValueError) as caught:
+    with pytest.raises(ValueError, match=r"must be|'lin_NUMBER'") as caught:
         small("hds", **{argument: value})
 
-    message = str(caught.value)
-    assert repr(value) in message and ("must be" in message or "'lin_NUMBER'" in message)
+    assert repr(value) in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -273,9 +228,6 @@ def test_settings_of_the_networks_are_checked(settings, reason):
 def test_what_hds_plans_in_is_a_twin_with_effects(arguments, said):
     with pytest.raises(TypeError, match=said):
         small("hds", **arguments)
-
-
-def test_a_single_effect_needs_no_list():
     assert small("hds", effects="viscous_friction").effects == ["viscous_friction"]
 
 
@@ -286,46 +238,33 @@ def test_a_single_effect_needs_no_list():
 def test_hindsight_without_goals_is_refused(name):
     with pytest.raises(EnvironmentMismatchError, match=r"relabels goals: .*Leave replay_buffer"):
         small(name, replay_buffer_class=HerReplayBuffer)
-
-
-def test_hindsight_with_half_of_what_it_needs_is_refused():
     env = AnySpaces(spaces.Dict({"observation": OBS, "desired_goal": OBS}), ACT)
-    with pytest.raises(EnvironmentMismatchError, match="achieved_goal"):
-        small("droq", env, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer)
+    if name == "droq":
+        with pytest.raises(EnvironmentMismatchError, match="achieved_goal"):
+            small(name, env, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer)
 
 
 def test_a_replay_buffer_of_another_environment_is_refused_and_the_own_one_stays(tmp_path):
     model, buffer = small("droq"), tmp_path / "buffer"
-    small("droq", "MountainCarContinuous-v0").save_replay_buffer(buffer)
+    small("droq", CAR).save_replay_buffer(buffer)
     own = model.replay_buffer
 
     with pytest.raises(EnvironmentMismatchError, match="of another environment: its observation"):
         model.load_replay_buffer(buffer)
     assert model.replay_buffer is own
-
-    # As SB3's own tests do.
-    del model.replay_buffer
-    small("droq").save_replay_buffer(buffer)
-    model.load_replay_buffer(buffer)
     small("droq", make_vec_env("Pendulum-v1", 2)).save_replay_buffer(buffer)
     with pytest.raises(EnvironmentMismatchError, match="its n_envs is 2, this model's 1"):
         model.load_replay_buffer(buffer)
-
-
-def test_updates_without_transitions_are_refused(models):
-    with pytest.raises(ValueError, match="nothing to learn from: its replay buffer is empty"):
-        models["droq"].train(1, 16)
-
-
-def test_a_replay_buffer_that_does_not_fit_is_refused_by_its_size():
     with pytest.raises(MemoryError, match=r"buffer_size=1\d+\): .* Pass a smaller buffer_size"):
         small("droq", buffer_size=10**13)
 
 
-@pytest.mark.parametrize("given", ["1", (1, "epsiode"), 0, (-1, "episode"), (1,), 1.5])
-def test_how_often_to_train_is_a_number_of_steps_or_episodes(given):
+@pytest.mark.parametrize("given", ["1", (1, "epsiode"), (-1, "episode"), 1.5])
+def test_how_often_to_train_is_a_number_of_steps_or_episodes(given, models):
     with pytest.raises(ValueError, match="train_freq must be a number of at least 1, or"):
         small("droq", train_freq=given)
+    with pytest.raises(ValueError, match="nothing to learn from: its replay buffer is empty"):
+        models["droq"].train(1, 16)
 
 
 class Own(algos.DroQ):

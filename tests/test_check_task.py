@@ -38,38 +38,27 @@ def words(report: TaskReport) -> str:
 
 
 # Settings of the task and of the check, what is wrong, and the same task mended.
+EFFORT, LATE = {"reward": "jerk", "sees_action": True}, {"reward": "late"}
 DEFECTS = {
     "large observations": ({"units": 100.0}, {}, "Observation scale", {}),
-    "small observations": ({"units": 1e-3}, {}, "Observation scale", {}),
     "observations that are not finite": ({"units": np.nan}, {}, "Observation", {}),
     "large actions": ({"max_force": 3.0}, {}, "Action space", {}),
     "small actions": ({"max_force": 0.1}, {}, "Action space", {}),
     "actions without limits": ({"max_force": np.inf}, {}, "Action space", {}),
     "constant reward": ({"reward": "constant"}, {}, "Constant reward", {}),
-    "no reward": ({"reward": "nothing"}, {}, "Constant reward", {}),
     "nothing but effort": ({"reward": "effort"}, {}, "Sparse reward", {}),
     "rare reward": ({"reward": "rare"}, {}, "Sparse reward", {}),
     "large rewards": ({"scale": 1e3}, {}, "Reward scale", {}),
     "small rewards": ({"scale": 1e-4}, {}, "Reward scale", {}),
     "rewards that are not finite": ({"scale": np.inf}, {}, "Reward", {}),
-    "last action unseen": (
-        {"reward": "jerk"},
-        {},
-        "Last action",
-        {"reward": "jerk", "sees_action": True},
-    ),
+    "last action unseen": ({"reward": "jerk"}, {}, "Last action", EFFORT),
     "velocity unseen": ({"sees_velocity": False}, {}, "Velocity", {}),
     "dying pays": ({"fails": True}, {}, "Termination pays", {"fails": True, "end": -100.0}),
-    "the goal looks like dying": (
-        {"fails": True},
-        {},
-        "Termination pays",
-        {"fails": True, "success": True},
-    ),
+    "a goal like a death": ({"fails": True}, {}, "Termination pays", {"fails": True, "success": 1}),
     "short episodes": ({"limit": 4}, {"gamma": 0.98}, "Episode length", {}),
     "no end": ({"limit": None}, {}, "Episode length", {}),
     "a short-sighted discount": ({"limit": 900}, {"gamma": 0.8}, "Episode length", {}),
-    "late reward": ({"reward": "late"}, {"gamma": 0.9}, "Late reward", {"reward": "late"}),
+    "late reward": (LATE, {"gamma": 0.9}, "Late reward", LATE),
 }
 
 
@@ -99,65 +88,59 @@ def test_a_problem_says_what_was_measured_and_what_to_do(settings, numbers):
     assert all(number in text for number in numbers)
 
 
+class Drawn(gymnasium.Env):
+    """
+    Observes noise; what a step pays and whether it ends an episode is drawn.
+
+    :param step_of: of the environment and the action: reward, end, info
+    """
+
+    observation_space = spaces.Box(-1.0, 1.0, (1,))
+    action_space = spaces.Box(-1.0, 1.0, (1,))
+
+    def __init__(self, step_of):
+        self.step_of = step_of
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.stays = self.np_random.random() < 0.2
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        reward, over, info = self.step_of(self, action)
+        return self.observation_space.sample(), reward, bool(over), False, info
+
+
 def test_ends_are_weighed_against_staying():
-    class Costly(gymnasium.Env):
-        """Each step costs 1; a coin ends it."""
+    def costly(end):
+        def step(env, action):
+            over = env.np_random.random() < 0.1
+            return (end if over else -1.0), over, {}
 
-        observation_space = spaces.Box(-1.0, 1.0, (1,))
-        action_space = spaces.Box(-1.0, 1.0, (1,))
-
-        def __init__(self, end):
-            self.end = end
-
-        def reset(self, *, seed=None, options=None):
-            super().reset(seed=seed)
-            return self.observation_space.sample(), {}
-
-        def step(self, action):
-            over = self.np_random.random() < 0.1
-            return self.observation_space.sample(), self.end if over else -1.0, over, False, {}
+        return Drawn(step)
 
     # Staying costs 1 / (1 - gamma) = 100.
-    assert "Termination pays" in topics(Costly(-99.0))
-    assert "Termination pays" not in topics(Costly(-101.0))
-    assert "staying therefore 100" in " ".join(check_task(Costly(-99.0)).problems)
+    assert "Termination pays" in topics(costly(-99.0))
+    assert "Termination pays" not in topics(costly(-101.0))
+    assert "staying therefore 100" in " ".join(check_task(costly(-99.0)).problems)
 
 
 def test_what_is_said_of_a_limit_is_of_episodes_that_it_cut():
-    class Mixed(gymnasium.Env):
+    def mixed(env, action):
         """Most episodes fall after a few steps; the others would go on for ever."""
-
-        observation_space = spaces.Box(-1.0, 1.0, (1,))
-        action_space = spaces.Box(-1.0, 1.0, (1,))
-
-        def reset(self, *, seed=None, options=None):
-            super().reset(seed=seed)
-            self.stays = self.np_random.random() < 0.2
-            return self.observation_space.sample(), {}
-
-        def step(self, action):
-            fell = not self.stays and self.np_random.random() < 0.3
-            return self.observation_space.sample(), float(action[0]), fell, False, {}
+        return float(action[0]), not env.stays and env.np_random.random() < 0.3, {}
 
     # 1 - 0.99^150 is 78 %, although the mean episode has some 35 steps.
-    assert "Episode length" not in topics(TimeLimit(Mixed(), 150))
-    assert "Episode length" in topics(TimeLimit(Mixed(), 20))
+    assert "Episode length" not in topics(TimeLimit(Drawn(mixed), 150))
+    assert "Episode length" in topics(TimeLimit(Drawn(mixed), 20))
 
 
 def test_a_cost_for_each_step_is_no_constant_reward_where_something_ends_it():
-    class UntilTheGoal(gymnasium.Env):
-        observation_space = spaces.Box(-1.0, 1.0, (1,))
-        action_space = spaces.Box(-1.0, 1.0, (1,))
+    def until_the_goal(env, action):
+        there = env.np_random.random() < 0.02
+        return -1.0, there, {"is_success": there}
 
-        def reset(self, *, seed=None, options=None):
-            super().reset(seed=seed)
-            return self.observation_space.sample(), {}
-
-        def step(self, action):
-            there = self.np_random.random() < 0.02
-            return self.observation_space.sample(), -1.0, there, False, {"is_success": there}
-
-    assert topics(TimeLimit(UntilTheGoal(), 200)) == []
+    assert topics(TimeLimit(Drawn(until_the_goal), 200)) == []
 
 
 def of_stock(env_id: str, **changes) -> list[str]:

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from sb3_hds import Trajectories
-from sb3_hds.data import SamplingWarning
 from sb3_hds.data.columns import columns_from
 from sb3_hds.data.rows import Rows
 from sb3_hds.data.sampling import at_one_interval
@@ -34,13 +33,12 @@ def regular(hz=100.0, n=3000):
 
 
 @pytest.mark.filterwarnings("error::sb3_hds.data.SamplingWarning")
-@pytest.mark.parametrize("logger", ["exact", "first row late", "milliseconds"])
-@pytest.mark.parametrize("hz", [30, 60, 150, 240])
+@pytest.mark.parametrize("logger", ["regular", "late", "rounded"])
+@pytest.mark.parametrize("hz", [30, 150])
 def test_rows_of_a_regular_clock_stay_as_they_are(hz, logger, tmp_path):
     t = regular(hz)
-    stamps = t.copy()
-    stamps[0] += 0.85 / hz * (logger == "first row late")
-    stamps = np.round(t, 3) if logger == "milliseconds" else stamps
+    stamps = np.round(t, 3) if logger == "rounded" else t.copy()
+    stamps[0] += 0.85 / hz * (logger == "late")
     table = np.stack([stamps, motion(t), 0.0 * t], 1)
     np.savetxt(tmp_path / "log.csv", table, "%.9f", ",", header="t,q,u", comments="")
 
@@ -48,41 +46,22 @@ def test_rows_of_a_regular_clock_stay_as_they_are(hz, logger, tmp_path):
 
     assert data.dt == pytest.approx(1.0 / hz, rel=1e-9)
     np.testing.assert_array_equal(data.obs[0, :, 0], np.round(motion(t), 9))
-    clock = {"exact": "regular", "first row late": "late", "milliseconds": "rounded"}[logger]
-    [sampling] = data.report.recordings
-    # A millisecond is within 1 % of the interval at 30 Hz and 60 Hz only where it divides it.
-    assert sampling.clock == clock and not data.report.altered
+    assert data.report.recordings[0].clock == logger and not data.report.altered
 
 
 @pytest.mark.parametrize(
     ("hz", "tick"),
-    [
-        (1000.0, 0.01),
-        (1000.0, 0.015625),
-        (240.0, 0.01),
-        (2441.4, 0.001),
-        (100.0, 0.0078125),
-        (950.0, 0.001),
-    ],
+    # In the last one, rows slip against ticks: 3 ms exactly, but for one in 3,333.
+    [(1000.0, 0.015625), (240.0, 0.01), (2441.4, 0.001), (950.0, 0.001), (333.3, 0.001)],
 )
 def test_ticks_of_the_logger_may_be_longer_than_the_interval(hz, tick):
     t = regular(hz, 6000)
 
     [obs], _, report = read(np.floor(t / tick) * tick, values=[motion(t)])
 
-    assert report.dt == pytest.approx(1.0 / hz, rel=1e-4)
+    assert report.dt == pytest.approx(1.0 / hz, rel=2e-4)
     np.testing.assert_array_equal(obs, motion(t))
     assert "stamps rounded to" in str(report) and report.recordings[0].repeated == ()
-
-
-def test_ticks_that_slip_against_the_rows_now_and_then_are_rounding():
-    """Rows 3.0003 ms apart in whole milliseconds: exactly 3 ms, but for one in 3,333."""
-    t = 3.0003e-3 * np.arange(8000)
-
-    [obs], _, report = read(np.round(t, 3), values=[motion(t)])
-
-    np.testing.assert_array_equal(obs, motion(t))
-    assert report.dt == pytest.approx(3.0003e-3, rel=2e-4) and not report.altered
 
 
 @pytest.mark.parametrize("digits", [9, 3])
@@ -200,16 +179,7 @@ def test_recordings_of_slightly_different_rates_have_one_interval():
     assert [r.resampled for r in apart.recordings] == [False, False, True] and apart.dt == 0.01
 
 
-@pytest.mark.parametrize(
-    ("hz", "dt"),
-    [
-        (29.97, 1 / 29.97),
-        (59.94, 1 / 59.94),
-        (99.999, 0.01),
-        (188.68, 0.0053),
-        (2441.4, 1 / 2441.4),
-    ],
-)
+@pytest.mark.parametrize(("hz", "dt"), [(29.97, 1 / 29.97), (99.999, 0.01), (188.68, 0.0053)])
 def test_an_interval_is_round_only_where_the_stamps_cannot_tell(hz, dt):
     assert read(regular(hz))[2].dt == pytest.approx(dt, rel=1e-9)
 
@@ -261,27 +231,15 @@ def test_short_logs_have_a_clock_too(n):
         assert report.dt == pytest.approx(0.01, rel=1e-3)
 
 
-def test_a_wrapped_angle_is_refused_only_where_rows_are_missing_at_its_seam(tmp_path):
+def test_a_wrapped_angle_is_refused_only_where_rows_are_missing_at_its_seam():
     t = regular(n=600)
     angle = (5.0 * t + np.pi) % (2.0 * np.pi) - np.pi
     seam = int(np.flatnonzero(np.diff(angle) < -3.0)[0])
+    there, elsewhere = (np.delete(np.arange(600), gone) for gone in (seam, seam + 40))
 
-    for gone, refused in ((seam + 40, False), (seam, True)):
-        rows = np.delete(np.arange(600), gone)
-        if refused:
-            with pytest.raises(TrajectoryError, match="jumps by a whole turn"):
-                read(t[rows], values=[angle[rows]])
-        else:
-            assert len(read(t[rows], values=[angle[rows]])[0][0]) == 600
+    with pytest.raises(TrajectoryError, match="jumps by a whole turn"):
+        read(t[there], values=[angle[there]])
+    assert len(read(t[elsewhere], values=[angle[elsewhere]])[0][0]) == 600
+    for rows in (there, elsewhere):
         [obs], _, _ = read(t[rows], values=[angle[rows]], obs=[{"column": "q", "angle": True}])
         assert np.abs(obs - angle).max() < 1e-9
-
-
-def test_what_was_changed_is_warned_of(tmp_path):
-    t = np.delete(regular(n=100), 50)
-    np.savetxt(
-        tmp_path / "log.csv", np.stack([t, t, t], 1), "%.9f", ",", header="t,q,u", comments=""
-    )
-
-    with pytest.warns(SamplingWarning, match="In log.csv, 1 missing row was filled in"):
-        Trajectories.load(tmp_path / "log.csv", columns=COLUMNS)

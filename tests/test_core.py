@@ -109,54 +109,42 @@ def at_rest(speed=0.0):
 # --- parameters
 
 
+def kilograms(**settings):
+    return Parameter(**{"null": 0.0, "scale": 1.0, "unit": "kg"} | settings)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: kilograms(scale=0.0), "scale must be positive, got 0.0 kg"),
+        (lambda: kilograms(null=-1.0, lower=0.0), "null value, -1.0 kg, must lie within"),
+        (lambda: Slider(mass="heavy"), "'mass' must be a number [kg], got 'heavy'"),
+        (lambda: Slider(mass=0.0), "'mass' must be finite and within [0.1, inf] kg, got 0.0"),
+        (lambda: Slider().with_parameters(stiffness=float("nan")), "[-inf, inf] N/m, got nan"),
+        (lambda: Slider(lenght=1.0), "no parameter 'lenght'. Its parameters are: mass, stiffness"),
+        (lambda: Slider(dt=0.0), "needs a finite dt > 0 s and at least one sub-step"),
+        (lambda: Slider(substeps=0), "needs a finite dt > 0 s and at least one sub-step"),
+        (lambda: RescaleAction(1.0, 1.0), "needs finite bounds with low < high"),
         (
-            lambda: Parameter(null=0.0, scale=0.0, unit="kg"),
-            "A parameter's scale must be positive, got 0.0 kg.",
+            lambda: TransformedTwin(Slider(), action=RescaleAction((-1.0, -1.0), 1.0)),
+            "has bounds for 2 actuators, but the twin has 1",
         ),
         (
-            lambda: Parameter(null=-1.0, scale=1.0, unit="kg", lower=0.0),
-            "A parameter's null value, -1.0 kg, must lie within its bounds [0.0, inf].",
+            lambda: TransformedTwin(Slider(), observation=RescaleObservation()),
+            "needs limits to scale by, but these have none: position, speed",
         ),
         (
-            lambda: Slider(mass="heavy"),
-            "Parameter 'mass' must be a number [kg], got 'heavy'.",
-        ),
-        (
-            lambda: Slider(mass=0.0),
-            "Parameter 'mass' must be finite and within [0.1, inf] kg, got 0.0.",
-        ),
-        (
-            lambda: Slider().with_parameters(stiffness=float("nan")),
-            "Parameter 'stiffness' must be finite and within [-inf, inf] N/m, got nan.",
-        ),
-        (
-            lambda: Slider(lenght=1.0),
-            "Slider has no parameter 'lenght'. Its parameters are: mass, stiffness; "
-            "its options are: end.",
-        ),
-        (
-            lambda: Slider(dt=0.0),
-            "Slider needs a finite dt > 0 s and at least one sub-step, got dt=0.0, substeps=1.",
-        ),
-        (
-            lambda: Slider(substeps=0),
-            "Slider needs a finite dt > 0 s and at least one sub-step, got dt=0.1, substeps=0.",
+            lambda: twins.from_spec(Slider().to_spec() | {"transforms": [[{"transform": "flip"}]]}),
+            "flip",
         ),
     ],
 )
-def test_an_impossible_value_is_refused_with_name_unit_and_bounds(make, message):
-    with pytest.raises(ParameterError, match=f"^{re.escape(message)}$"):
+def test_an_impossible_value_is_refused_with_name_unit_and_bounds(make, message, monkeypatch):
+    monkeypatch.setitem(twins.registry._TWINS, "Slider", Slider)
+
+    with pytest.raises(ParameterError, match=re.escape(message)):
         make()
-
-
-def test_a_parameter_of_a_rotary_joint_has_its_own_unit_at_a_sliding_one():
-    hinge = Parameter(null=0.0, scale=0.05, unit="N m s/rad", lower=0.0)
-
-    assert hinge.prismatic() == Parameter(null=0.0, scale=0.05, unit="N s/m", lower=0.0)
-    assert Parameter(null=0.0, scale=1.0, unit="1").prismatic().unit == "1"
+    assert Parameter(0.0, 0.05, "N m s/rad").prismatic() == Parameter(0.0, 0.05, "N s/m")
 
 
 # --- integrators
@@ -188,24 +176,6 @@ def test_the_error_falls_with_the_order_of_the_integrator(x64, integrator, order
     assert slope == pytest.approx(order, abs=0.15)  # terms of the next order bend the line
 
 
-def test_explicit_euler_gains_energy_by_its_textbook_factor(x64):
-    # For dv/dt = -q, one step multiplies q^2 + v^2 by 1 + h^2.
-    q, v = jnp.ones(1), jnp.zeros(1)
-    for _ in range(10):
-        q, v = explicit_euler(lambda q, v: -q, q, v, 0.1, lambda v: v)
-
-    assert float((q**2 + v**2)[0]) == pytest.approx(1.01**10, rel=1e-12)
-
-
-@pytest.mark.parametrize("integrator", [explicit_euler, semi_implicit_euler, rk4])
-def test_a_speed_limit_holds_after_a_step(integrator):
-    _, v = integrator(
-        lambda q, v: jnp.full(1, 50.0), jnp.zeros(1), jnp.zeros(1), 0.1, lambda v: v.clip(-2, 2)
-    )
-
-    assert v == pytest.approx(2.0)
-
-
 # --- linear algebra
 
 
@@ -214,8 +184,7 @@ def spd(rng, n, batch):
     return root @ root.transpose(0, 2, 1) + n * np.eye(n)
 
 
-@pytest.mark.parametrize("n", range(1, 7))
-@pytest.mark.parametrize("columns", [(), (3,)], ids=["vector", "matrix"])
+@pytest.mark.parametrize(("n", "columns"), [(1, ()), (2, (3,)), (3, ()), (4, (3,)), (6, ())])
 def test_a_batch_of_small_systems_is_solved_as_lapack_does(x64, n, columns):
     rng = np.random.default_rng(n)
     matrices, right = spd(rng, n, 20), rng.normal(size=(20, n, *columns))
@@ -227,7 +196,7 @@ def test_a_batch_of_small_systems_is_solved_as_lapack_does(x64, n, columns):
     np.testing.assert_allclose(ours, theirs.reshape(ours.shape), rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 6])
+@pytest.mark.parametrize("n", [2, 6])
 def test_the_derivative_of_a_solution_is_the_implicit_one(x64, n):
     rng = np.random.default_rng(n)
     matrix, change = spd(rng, n, 2)
@@ -366,38 +335,27 @@ def test_a_transformed_twin_reproduces_the_wrapped_environment(x64):
     env, twin = wrapped_pendulum()
     obs, _ = env.reset(seed=0)
     env.action_space.seed(0)
-    step = jax.jit(twin.step)
+
+    @jax.jit
+    def go(obs, action):
+        state = twin.infer(obs, twin.params)
+        after = twin.step(state, action, twin.params)
+        reward = twin.reward(state, action, after, twin.params)
+        return twin.observe(state, twin.params), twin.observe(after, twin.params), reward
 
     for _ in range(200):
-        state = twin.infer(jnp.asarray(obs, jnp.float64), twin.params)
         action = env.action_space.sample()
+        again, seen, ours = go(jnp.asarray(obs, jnp.float64), jnp.asarray(action, jnp.float64))
+        # What is observed through a wrapper is inferred through it, but for arctan2 of float32.
+        np.testing.assert_allclose(again, obs, atol=1e-6)
         obs, reward, *_ = env.step(action)
-        after = step(state, jnp.asarray(action, jnp.float64), twin.params)
         # One step from a float32 observation: rounding 6e-8 of a speed of 8, torque likewise; the
         # reward squares an angle of up to pi and a speed of up to 8.
-        np.testing.assert_allclose(twin.observe(after, twin.params), obs, atol=2e-6)
-        ours = twin.reward(state, jnp.asarray(action, jnp.float64), after, twin.params)
+        np.testing.assert_allclose(seen, obs, atol=2e-6)
         assert float(ours) == pytest.approx(reward, abs=2e-5)
-
-
-def test_a_transformed_twin_declares_the_spaces_of_the_wrapped_environment():
-    env, twin = wrapped_pendulum()
-
     np.testing.assert_allclose([a.low for a in twin.actuators], env.action_space.low)
-    np.testing.assert_allclose([a.high for a in twin.actuators], env.action_space.high)
-    np.testing.assert_allclose([c.low for c in twin.channels], env.observation_space.low)
     np.testing.assert_allclose([c.high for c in twin.channels], env.observation_space.high)
     assert {a.unit for a in twin.actuators} == {c.unit for c in twin.channels} == {"1"}
-
-
-def test_what_is_observed_through_a_wrapper_is_inferred_through_it(x64):
-    _, twin = wrapped_pendulum()
-    state = twin.initial(jax.random.key(0), twin.params)
-
-    back = twin.infer(twin.observe(state, twin.params), twin.params)
-
-    np.testing.assert_allclose(back.q, state.q, rtol=1e-12)
-    np.testing.assert_allclose(back.v, state.v, rtol=1e-12)
 
 
 def test_effects_attach_to_the_plant_below_the_wrapper(x64):
@@ -441,36 +399,6 @@ def test_an_effect_is_taken_away_again_and_the_rest_keeps_its_values():
         base.without("gain.push")
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (
-            lambda: RescaleAction(1.0, 1.0),
-            "RescaleAction needs finite bounds with low < high, got low=1.0, high=1.0.",
-        ),
-        (
-            lambda: TransformedTwin(Slider(), action=RescaleAction((-1.0, -1.0), 1.0)),
-            "RescaleAction has bounds for 2 actuators, but the twin has 1.",
-        ),
-        (
-            lambda: TransformedTwin(Slider(), observation=RescaleObservation()),
-            "RescaleObservation needs limits to scale by, but these have none: position, speed.",
-        ),
-        (
-            lambda: twins.from_spec(
-                twins.Pendulum().to_spec() | {"transforms": [[{"transform": "flip"}]]}
-            ),
-            "A twin was saved with the transform 'flip', which is not known here. "
-            "Known are: rescale_action, rescale_observation, rate_limit, low_pass, delay, scale, "
-            "history, barrier, continuity, rhythm.",
-        ),
-    ],
-)
-def test_a_transform_that_does_not_fit_is_refused(make, message):
-    with pytest.raises(ParameterError, match=f"^{re.escape(message)}$"):
-        make()
-
-
 # --- rollouts
 
 
@@ -479,36 +407,37 @@ def test_a_rollout_is_a_loop_of_steps(x64):
     actions = jnp.asarray(np.random.default_rng(0).uniform(-2, 2, (30, 1)))
     start = state = twin.initial(jax.random.key(0), twin.params)
 
+    @jax.jit
+    def go(state, action):
+        after = twin.step(state, action, twin.params)
+        reward = twin.reward(state, action, after, twin.params)
+        return after, twin.observe(state, twin.params), reward
+
     result = rollout(twin, twin.params, start, actions)
 
     assert result.obs.shape == (31, 3) and result.rewards.shape == (30,) and result.alive.all()
     np.testing.assert_array_equal(result.actions, actions)
     for k, action in enumerate(actions):
-        after = twin.step(state, action, twin.params)
         np.testing.assert_allclose(result.states.q[k], state.q, atol=1e-12)  # other fusion
-        np.testing.assert_allclose(result.obs[k], twin.observe(state, twin.params), atol=1e-12)
-        reward = twin.reward(state, action, after, twin.params)
+        state, obs, reward = go(state, action)
+        np.testing.assert_allclose(result.obs[k], obs, atol=1e-12)
         assert float(result.rewards[k]) == pytest.approx(float(reward), rel=1e-10)
-        state = after
     np.testing.assert_allclose(result.obs[-1], twin.observe(state, twin.params), atol=1e-12)
 
 
 def test_rewards_stop_with_the_step_that_terminates(x64):
     # At 1 m/s and 0.1 s the mass passes 0.95 m in the tenth step.
-    result = rollout(Slider(), Slider().params, at_rest(1.0), jnp.zeros((15, 1)))
+    twin, over = Slider(), State(jnp.ones(1), jnp.zeros(1), {})
+    result = rollout(twin, twin.params, at_rest(1.0), jnp.zeros((15, 1)))
+    planned = rollout(twin, twin.params, at_rest(1.0), jnp.zeros((5, 1)), twin.planning_reward)
+    ended = rollout(twin, twin.params, over, jnp.ones((3, 1)))
 
     assert result.rewards.tolist() == [1.0] * 10 + [0.0] * 5
     assert result.alive.tolist() == [True] * 10 + [False] * 5
     np.testing.assert_allclose(result.states.q[:, 0], [0.1 * min(k, 10) for k in range(16)])
-
-
-def test_a_terminated_start_earns_nothing():
-    over = State(jnp.ones(1), jnp.zeros(1), {})
-
-    result = rollout(Slider(), Slider().params, over, jnp.ones((3, 1)))
-
-    assert not result.alive.any() and not result.rewards.any()
-    np.testing.assert_array_equal(result.states.q, jnp.ones((4, 1)))
+    np.testing.assert_allclose(planned.rewards, 0.1 * np.arange(1, 6))
+    assert not ended.alive.any() and not ended.rewards.any()
+    np.testing.assert_array_equal(ended.states.q, jnp.ones((4, 1)))
 
 
 def test_what_comes_after_the_end_cannot_spoil_a_gradient(x64):
@@ -524,14 +453,6 @@ def test_what_comes_after_the_end_cannot_spoil_a_gradient(x64):
     value, slope = jax.value_and_grad(earned)(1e-6)
 
     assert float(slope) == pytest.approx(float(value) / 1e-6, rel=1e-9)  # linear in the speed
-
-
-def test_another_reward_can_be_planned_for(x64):
-    twin = Slider()
-
-    result = rollout(twin, twin.params, at_rest(1.0), jnp.zeros((5, 1)), twin.planning_reward)
-
-    np.testing.assert_allclose(result.rewards, 0.1 * np.arange(1, 6))
 
 
 def test_a_policy_sees_what_the_sensors_report(x64):
@@ -564,15 +485,9 @@ def test_rollouts_batch_over_states_and_actions(x64):
 
 
 def test_a_rollout_keeps_the_precision_of_its_state(x64):
-    state = State(jnp.zeros(1, jnp.float32), jnp.ones(1, jnp.float32), {})
     twin = Slider().extend(effects.CoulombFriction(tau_c=0.1), Gain())
+    start = twin.infer(jnp.ones(2, jnp.float32), twin.params)
 
-    result = rollout(
-        twin,
-        twin.params,
-        twin.infer(jnp.ones(2, jnp.float32), twin.params),
-        jnp.ones((3, 1), jnp.float32),
-    )
+    result = rollout(twin, twin.params, start, jnp.ones((3, 1), jnp.float32))
 
     assert {leaf.dtype for leaf in jax.tree.leaves(result.states)} == {jnp.dtype(jnp.float32)}
-    assert result.rewards.shape == (3,) and state.q.dtype == jnp.float32

@@ -1,4 +1,4 @@
-"""Saved models, policies and replay buffers that were damaged: seeded, a hundred of each."""
+"""Saved models, policies and replay buffers that were damaged: seeded, thirty of each."""
 
 import io
 import json
@@ -12,7 +12,7 @@ from small_models import NAMES, same, saved, small
 from sb3_hds import algos, load_policy
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
-N = 100
+N = 30
 QUICK = ("hds", "droq", "openloop")
 some_algorithms = pytest.mark.parametrize(
     "name",

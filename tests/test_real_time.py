@@ -1,6 +1,5 @@
 """Control periods, overruns and the watchdog: against a clock of our own, and once a real one."""
 
-import pickle
 import time
 
 import gymnasium
@@ -89,30 +88,23 @@ def test_commands_act_at_the_ticks_however_fast_the_learner_is():
     assert env.timing == Timing(steps=4)
 
 
-def test_a_late_command_is_counted_and_acts_at_once():
-    env, ours = controlled()
+def test_a_late_command_is_counted_and_acts_at_once_and_within_the_grace_keeps_the_ticks():
+    for late, safe, expected in (
+        # Nobody kept the ticks meanwhile: the next period counts from the late command.
+        (0.17, None, [100.17, 100.27]),
+        (0.12, [-1.0], [100.12, 100.2]),
+    ):
+        env, ours = controlled(safe=safe)
 
-    ours.now += 0.17
-    *_, info = env.step(GO)
-    late = env.overrun
-    env.step(GO)
+        ours.now += late
+        assert safe is None or not env.watch()
+        *_, info = env.step(GO)
+        overrun = env.overrun
+        env.step(GO)
 
-    # Nobody kept the ticks meanwhile: the next period counts from the late command.
-    assert times(env) == pytest.approx([100.17, 100.27])
-    assert late and not env.overrun and info["missed_steps"] == 0
-    assert env.timing == Timing(steps=3, overruns=1)
-
-
-def test_a_command_within_the_grace_keeps_the_ticks_where_they_are():
-    env, ours = controlled(safe=[-1.0])
-
-    ours.now += 0.12
-    assert not env.watch()
-    env.step(GO)
-    env.step(GO)
-
-    assert times(env) == pytest.approx([100.12, 100.2])
-    assert env.timing == Timing(steps=3, overruns=1)
+        assert times(env) == pytest.approx(expected)
+        assert overrun and not env.overrun and info["missed_steps"] == 0
+        assert env.timing == Timing(steps=3, overruns=1)
 
 
 def test_the_watchdog_sends_the_safe_action_at_each_tick_without_a_command():
@@ -259,20 +251,6 @@ def test_arguments_out_of_range_are_refused(arguments, says):
         RealTime(Plant(), **arguments)
 
 
-def test_real_time_passes_actions_and_observations_on_and_pickles():
-    env = RealTime(Plant(), 0.001, [0.0])
-    env.reset()
-    env.step(GO)
-
-    copy = pickle.loads(pickle.dumps(env))
-    env.close()
-    copy.reset()
-    obs, *_ = copy.step(GO)
-    copy.close()
-
-    assert obs.shape == (1,) and copy.action_space == env.action_space
-
-
 def test_in_real_time_a_learner_that_hangs_is_replaced_by_the_watchdog():
     env = RealTime(Plant(takes=0.002), 0.02, [-1.0])
     begin = time.monotonic()
@@ -330,11 +308,6 @@ def test_training_beside_the_loop_improves_the_policy_while_the_environment_runs
     assert beside.n_done == done  # nothing runs on
 
 
-def test_a_learner_that_trains_in_the_loop_is_refused_beside_it():
-    with pytest.raises(ValueError, match="gradient_steps=0"):
-        small("droq", Plant()).learn(5, callback=TrainBeside())
-
-
 def test_what_fails_beside_the_loop_fails_in_it():
     model = small("droq", Plant(takes=0.002), gradient_steps=0)
 
@@ -344,3 +317,5 @@ def test_what_fails_beside_the_loop_fails_in_it():
     model.train = broken
     with pytest.raises(RuntimeError, match="caught fire"):
         model.learn(500, callback=TrainBeside())
+    with pytest.raises(ValueError, match="gradient_steps=0"):
+        small("droq", Plant()).learn(5, callback=TrainBeside())

@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import os
 import re
 import signal
 import subprocess
@@ -79,9 +78,8 @@ def test_an_environment_is_recorded_as_it_was_seen(tmp_path):
     assert (data.dt, data.report.obs[2], data.report.altered) == (0.05, "obs[2]", False)
 
 
-@pytest.mark.parametrize("wanted", [1, 500])
-def test_everything_before_a_kill_is_readable(wanted, tmp_path):
-    path = tmp_path / "run.jsonl"
+def test_everything_before_a_kill_is_readable(tmp_path):
+    path, wanted = tmp_path / "run.jsonl", 500
     process = subprocess.Popen([sys.executable, "-c", SCRIPT, path], stdout=subprocess.PIPE)
     assert process.stdout is not None
     for line in process.stdout:
@@ -90,7 +88,7 @@ def test_everything_before_a_kill_is_readable(wanted, tmp_path):
     process.send_signal(signal.SIGKILL)
 
     assert process.wait() == -signal.SIGKILL
-    [data] = [Trajectories.load(path)]
+    data = Trajectories.load(path)
     k = np.arange(data.n_steps + 1)
     assert data.n_steps >= wanted
     np.testing.assert_array_equal(data.obs[0], np.stack([k, k**2], axis=1))
@@ -98,33 +96,24 @@ def test_everything_before_a_kill_is_readable(wanted, tmp_path):
 
 
 def test_a_file_that_is_cut_anywhere_loses_one_step_at_most(tmp_path):
-    with recorder(tmp_path / "run") as whole:
-        whole.start([0.0, 0.0])
-        for k in range(5):
+    with begun(tmp_path / "run") as whole:
+        for k in range(4):
             whole.step([k], [k + 1.0, 0.5])
-    content = whole.path.read_bytes()
+    content, path = whole.path.read_bytes(), whole.path
     ends = [i for i, byte in enumerate(content) if byte == ord("\n")]
 
-    for size in range(len(content) + 1):
-        whole.path.write_bytes(content[:size])
+    for size in range(0, len(content) + 1, 3):
+        path.write_bytes(content[:size])
         n_steps = sum(end < size for end in ends) - 2  # without header and first observation
         if n_steps < 1:
             with pytest.raises(TrajectoryError, match=r"interrupted before|holds no step yet"):
-                Trajectories.load(whole.path)
+                Trajectories.load(path)
         else:
-            assert Trajectories.load(whole.path).obs[0, :, 0].tolist() == list(range(n_steps + 1))
-
-
-def test_a_damaged_line_inside_is_named(tmp_path):
-    with recorder(tmp_path / "run") as whole:
-        whole.start([0.0, 0.0])
-        for k in range(5):
-            whole.step([k], [k + 1.0, 0.5])
-    lines = whole.path.read_text().splitlines(keepends=True)
-    whole.path.write_text("".join([*lines[:3], lines[3][:-10] + "\n", *lines[4:]]))
-
+            assert Trajectories.load(path).obs[0, :, 0].tolist() == list(range(n_steps + 1))
+    lines = content.splitlines(keepends=True)
+    path.write_bytes(b"".join([*lines[:3], lines[3][:-10] + b"\n", *lines[4:]]))
     with pytest.raises(TrajectoryError, match=r"Line 4 of '.*run.jsonl' is damaged"):
-        Trajectories.load(whole.path)
+        Trajectories.load(path)
 
 
 def test_a_loop_without_an_environment_and_its_conditions(tmp_path):
@@ -197,6 +186,12 @@ def test_recordings_with_other_channels_are_not_mixed(tmp_path):
         Trajectories.load(str(tmp_path / "*.jsonl"))
 
 
+def flat_env(path):
+    env = Counter()
+    env.observation_space = spaces.Box(0.0, 1.0, (4, 4))
+    return Record(env, path / "run", dt=0.1)
+
+
 @pytest.mark.parametrize(
     ("use", "message"),
     [
@@ -205,40 +200,21 @@ def test_recordings_with_other_channels_are_not_mixed(tmp_path):
         (lambda path: recorder(path / "b", obs=["u", "q"]), "a name of its own for each channel"),
         (lambda path: recorder(path / "c", obs=["time"]), "other than time and condition"),
         (lambda path: recorder(path / "d", obs="qv"), "obs must be a list of names, got 'qv'"),
-        (
-            lambda path: recorder(path / "e").step([0.0], [0.0, 0.0]),
-            "call start(obs) with the first",
-        ),
-        (
-            lambda path: recorder(path / "f").start([0.0]),
-            "obs must have 2 numbers (q, v), got shape",
-        ),
+        (lambda path: recorder(path / "e").step([0.0], [0.0, 0.0]), "call start(obs) with the"),
+        (lambda path: recorder(path / "f").start([0.0]), "obs must have 2 numbers (q, v)"),
         (lambda path: begun(path / "j").step(["a"], [0.0, 0.0]), "action must hold numbers (u)"),
         (lambda path: begun(path / "k").step([0.0], [0.0, np.nan]), "obs must be finite (q, v)"),
-        (lambda path: begun(path / "l").step(None, [0.0, 0.0]), "action must be finite (u)"),
         (lambda path: begun(path / "m").step([0.0], [0.0, 0.0], time=np.nan), "time must be fin"),
         (lambda path: begun(path / "n").step([0.0], [0.0, 0.0], time=-0.5), "must not decrease"),
         (lambda path: recorder(path / "o").start([0.0, np.inf]), "obs must be finite"),
         (lambda path: Recorder(path / "g", 0.0, obs=["q"], actions=[]), "dt must be the sampling"),
         (lambda path: Record(Counter(), path / "h"), "does not say how long a step is"),
-        (
-            lambda path: Record(gymnasium.make("Pendulum-v1"), path / "i", obs_names=["q"]),
-            "The obs space has 3 channels, got the names ['q']",
-        ),
+        (flat_env, "FlattenObservation"),
     ],
 )
 def test_wrong_use_is_refused_with_the_way_out(use, message, tmp_path):
     with pytest.raises(TrajectoryError, match=re.escape(message)):
         use(tmp_path)
-
-
-def test_spaces_that_are_no_boxes_of_one_axis_are_refused(tmp_path):
-    env = Counter()
-    env.observation_space = spaces.Box(0.0, 1.0, (4, 4))
-
-    with pytest.raises(TrajectoryError, match=r"boxes of one axis, .*FlattenObservation"):
-        Record(env, tmp_path / "run", dt=0.1)
-    assert os.listdir(tmp_path) == []
 
 
 def test_discrete_actions_are_one_channel(tmp_path):
@@ -269,18 +245,6 @@ def test_a_step_is_on_its_way_to_the_disk_when_it_returns_and_costs_little(tmp_p
         "obs": [999.0] * 2,
     }
     assert seconds < 1e-3  # a loop of 1 kHz; some 15 us on an idle machine
-
-
-def test_what_has_no_actuator_is_read_again(tmp_path):
-    path = tmp_path / "free.jsonl"
-    with Recorder(path, 0.01, obs=["q", "v"], actions=[]) as recorder:
-        recorder.start([0.5, 0.0])
-        for k in range(20):
-            recorder.step([], [0.5 - 0.01 * k, -1.0])
-
-    data = Trajectories.load(path)
-
-    assert (data.n_obs, data.n_act, data.n_steps) == (2, 0, 20)
 
 
 def test_what_is_refused_costs_nothing_that_was_recorded(tmp_path):
