@@ -77,7 +77,7 @@ def test_arguments_of_the_environment_reach_the_twin_from_other_processes_too():
     payload = partial(gymnasium.make, payload, goal="stop_at_origin", mass=2.0)
     unnamed = partial(TwinEnv, "Pendulum", mass=1.3)
 
-    for env in copies(gravity, gravity):
+    for env in copies(gravity):
         assert twin_of(env).values == {"gravity": 9.8, "mass": 1.0, "length": 1.0}
     for env in copies(payload):
         assert (twin_of(env).goal, twin_of(env).values["mass"]) == ("stop_at_origin", 2.0)
@@ -94,10 +94,10 @@ def test_environments_made_of_a_twin_give_it_back():
 
 
 def test_copies_that_differ_are_refused():
-    makers = [partial(gymnasium.make, "Pendulum-v1", g=g) for g in (10.0, 10.0, 9.8)]
+    makers = [partial(gymnasium.make, "Pendulum-v1", g=g) for g in (10.0, 9.8)]
 
     for env in copies(*makers):
-        says = r"copies 0 and 2 .* differ: gravity is 10 and 9.8 m/s2"
+        says = r"copies 0 and 1 .* differ: gravity is 10 and 9.8 m/s2"
         with pytest.raises(EnvironmentMismatchError, match=says):
             twin_of(env)
 
