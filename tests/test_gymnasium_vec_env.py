@@ -70,11 +70,9 @@ LEARNERS = {
 @pytest.mark.parametrize(
     ("mode", "learner"),
     [
-        (mode, learner)
-        if learner == "SB3's SAC" or mode is AutoresetMode.NEXT_STEP
-        else pytest.param(mode, learner, marks=pytest.mark.expensive)
-        for mode in MODES
-        for learner in LEARNERS
+        *((mode, "SB3's SAC") for mode in MODES),
+        (AutoresetMode.NEXT_STEP, "DroQ"),
+        pytest.param(AutoresetMode.NEXT_STEP, "SBX's SAC", marks=pytest.mark.expensive),
     ],
 )
 def test_the_replay_buffer_holds_exactly_the_true_transitions(mode, learner):
@@ -86,22 +84,14 @@ def test_the_replay_buffer_holds_exactly_the_true_transitions(mode, learner):
     assert_true(rows)
     # Episodes of several lengths, ended both ways.
     assert {row.cut for copy in rows for row in copy if row.done} == {True, False}
-
-
-@every_mode
-def test_what_is_bootstrapped_is_what_was_only_cut(mode):
-    model = LEARNERS["SB3's SAC"](GymnasiumVecEnv(sync(mode))).learn(40 * N)
-    buffer = model.replay_buffer
-
-    batch = buffer._get_samples(np.arange(buffer.pos))
-
-    for obs, next_obs, over in zip(
-        batch.observations.numpy(), batch.next_observations.numpy(), batch.dones, strict=True
-    ):
-        copy, episode, step, _ = obs
-        last = step + 1 == length_of(copy, episode)
-        assert bool(over) == (last and (copy + episode) % 2 == 1)
-        np.testing.assert_array_equal(next_obs[:3], (copy, episode, step + 1))
+    assert len(model.ep_info_buffer) > 10
+    if learner == "SB3's SAC":
+        # What is bootstrapped is what was only cut.
+        batch = model.replay_buffer._get_samples(np.arange(model.replay_buffer.pos))
+        for obs, over in zip(batch.observations.numpy(), batch.dones, strict=True):
+            copy, episode, step, _ = obs
+            last = step + 1 == length_of(copy, episode)
+            assert bool(over) == (last and (copy + episode) % 2 == 1)
 
 
 @pytest.mark.parametrize(
@@ -129,26 +119,17 @@ def test_environments_in_other_processes_are_stored_as_truly(mode):
         env.close()
 
 
-@pytest.mark.parametrize("name", ["final_obs", "final_observation"])
-def test_somebodys_own_environment_that_resets_in_the_same_step(name):
-    env = CountingVector(N, AutoresetMode.SAME_STEP, name)
+def test_somebodys_own_environment_is_stored_as_truly():
+    own = CountingVector(N, AutoresetMode.NEXT_STEP, knows_masks=True)
+    envs = [
+        GymnasiumVecEnv(CountingVector(N, AutoresetMode.SAME_STEP, "final_obs")),
+        GymnasiumVecEnv(CountingVector(N, AutoresetMode.SAME_STEP, "final_observation")),
+        GymnasiumVecEnv(CountingVector(N, AutoresetMode.DISABLED)),
+        GymnasiumVecEnv(own, partial_reset=lambda which: own.reset(options={"reset_mask": which})),
+    ]
 
-    assert_true(stored(LEARNERS["SB3's SAC"](GymnasiumVecEnv(env)).learn(40 * N)))
-
-
-def test_somebodys_own_environment_that_resets_when_told():
-    env = CountingVector(N, AutoresetMode.DISABLED)
-
-    assert_true(stored(LEARNERS["SB3's SAC"](GymnasiumVecEnv(env)).learn(40 * N)))
-
-
-def test_somebodys_own_environment_with_a_reset_of_its_own():
-    env = CountingVector(N, AutoresetMode.NEXT_STEP, knows_masks=True)
-    adapted = GymnasiumVecEnv(
-        env, partial_reset=lambda which: env.reset(options={"reset_mask": which})
-    )
-
-    assert_true(stored(LEARNERS["SB3's SAC"](adapted).learn(40 * N)))
+    for env in envs:
+        assert_true(stored(LEARNERS["SB3's SAC"](env).learn(40 * N)))
 
 
 def test_steps_that_are_no_transitions_are_refused_at_the_door():
@@ -163,15 +144,6 @@ def test_steps_that_are_no_transitions_are_refused_at_the_door():
     assert GymnasiumVecEnv(silent, autoreset_mode="SameStep").num_envs == N
     with pytest.raises(ParameterError, match=r"takes a gymnasium\.vector\.VectorEnv"):
         GymnasiumVecEnv(Counting())  # type: ignore[arg-type]
-
-
-def test_workers_that_would_reset_twice_are_refused():
-    env = AsyncVectorEnv([counting(0)], shared_memory=False, context="forkserver")
-    try:
-        with pytest.raises(ParameterError, match="shared_memory=True"):
-            GymnasiumVecEnv(env)
-    finally:
-        env.close()
 
 
 @pytest.mark.parametrize(
@@ -206,15 +178,14 @@ def test_episodes_are_told_as_monitor_tells_them(mode):
             assert env.reset_infos[0]["begun"] == monitored.reset()[1]["begun"]
 
 
-def test_returns_are_logged_and_evaluated():
+def test_returns_are_evaluated():
     env = GymnasiumVecEnv(sync(AutoresetMode.SAME_STEP))
-    model = LEARNERS["SB3's SAC"](env).learn(40 * N)
-
-    assert len(model.ep_info_buffer) > 10
     env.seed(0)
-    returns, lengths = evaluate_policy(model, env, 3, return_episode_rewards=True, warn=True)
+
+    model = LEARNERS["SB3's SAC"](env)
+    _, lengths = evaluate_policy(model, env, 3, return_episode_rewards=True, warn=True)
+
     assert sorted(lengths) == sorted(length_of(copy, 0) for copy in range(N))
-    assert len(returns) == 3
 
 
 def test_seeds_and_options_arrive_once():
@@ -231,16 +202,6 @@ def test_seeds_and_options_arrive_once():
     env.set_options([{"wind": 1.0}, {}, {}])
     with pytest.raises(ParameterError, match="same options"):
         env.reset()
-
-
-def test_seeds_decide_what_follows():
-    def run(seed):
-        env = GymnasiumVecEnv(gymnasium.make_vec("Pendulum-v1", 2, "sync"))
-        env.seed(seed)
-        return [env.reset()] + [env.step(np.zeros((2, 1)))[0] for _ in range(3)]
-
-    np.testing.assert_array_equal(run(3), run(3))
-    assert not np.array_equal(run(3), run(4))
 
 
 def test_copies_can_be_reached():
@@ -316,17 +277,6 @@ def test_normalisation_of_sb3_stands_on_top():
     assert obs.shape == (2, 3)
 
 
-def test_gymnasiums_own_statistics_are_kept():
-    wrapped = gymnasium.wrappers.vector.RecordEpisodeStatistics(sync(AutoresetMode.NEXT_STEP))
-    env = GymnasiumVecEnv(wrapped)
-    env.reset()
-
-    _, _, dones, infos = env.step(np.zeros((N, 1), np.float32))
-
-    assert dones.tolist() == [length_of(copy, 0) == 1 for copy in range(N)]
-    assert float(infos[0]["episode"]["l"]) == 1.0 and "episode" not in infos[1]
-
-
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
 def test_statistics_that_begin_anew_in_all_copies_are_not_those_that_are_logged(mode):
     counted = gymnasium.wrappers.vector.RecordEpisodeStatistics(sync(mode))
@@ -339,13 +289,3 @@ def test_statistics_that_begin_anew_in_all_copies_are_not_those_that_are_logged(
         for i in np.flatnonzero(dones):
             assert infos[i]["episode"]["l"] == expected[i]["episode"]["l"]
             assert infos[i]["episode"]["r"] == pytest.approx(expected[i]["episode"]["r"])
-
-
-def test_normalisation_of_gymnasium_that_cannot_reset_single_copies_says_so():
-    copies = gymnasium.make_vec("CartPole-v1", 2, "sync")
-    env = GymnasiumVecEnv(gymnasium.wrappers.vector.NormalizeObservation(copies))
-    env.reset()
-
-    with pytest.raises(RuntimeError, match="VecNormalize above this adapter"):
-        for _ in range(500):
-            env.step(np.zeros(2, int))

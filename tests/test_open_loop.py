@@ -118,21 +118,6 @@ def test_joints_of_the_ant_are_those_that_its_actuators_are_named_after():
     assert joints.position.tolist() == [7 + in_state.index(name) for name in joints.names]
 
 
-@pytest.mark.parametrize("env_id", ["Swimmer-v5", "Walker2d-v5", "Ant-v5"])
-def test_joints_are_found_in_the_observation(env_id):
-    env = make_vec_env(env_id, seed=3)
-    model = OpenLoop("MlpPolicy", env, seed=3)
-    inner = env.envs[0].unwrapped
-
-    env.seed(11)
-    obs = env.reset()
-
-    position, velocity = model.policy.body.in_observations(obs)
-    for i, (joint, _) in enumerate(inner.model.actuator_trnid):
-        assert position[0, i] == inner.data.qpos[inner.model.jnt_qposadr[joint]]
-        assert velocity[0, i] == inner.data.qvel[inner.model.jnt_dofadr[joint]]
-
-
 def hidden():
     return HiddenJoints(gymnasium.make("Swimmer-v5", max_episode_steps=50))
 
@@ -187,7 +172,7 @@ def test_the_state_that_predict_returns_carries_the_phase():
 def test_a_search_finds_the_gait_that_is_rewarded():
     model = OpenLoop("MlpPolicy", Tune(), seed=0, frequency=(0.5, 2.0), n_resets=1)
 
-    model.learn(40 * 600)
+    model.learn(40 * 400)
 
     # Doing nothing costs 40 (0.5^2 / 2 + 0.2^2) = 6.6.
     assert evaluate_policy(model, model.get_env(), 1)[0] > -0.5
@@ -276,15 +261,8 @@ def test_a_restored_search_asks_for_what_cmaes_itself_would_ask_for():
 
 def test_the_ranking_prefers_what_is_good_on_fresh_resets_to_what_was_lucky():
     model = OpenLoop("MlpPolicy", Tune(noise=0.2), seed=0, n_resets=1, population_size=4)
-    space = model.gait_space
-    good = Constants(
-        np.array([0.5]),
-        np.array([0.2]),
-        np.zeros(1),
-        np.array(TAU),
-        np.array(TAU),
-        *[np.zeros(1)] * 2,
-    )
+    space, turn = model.gait_space, np.array(TAU)
+    good = Constants(np.array([0.5]), np.array([0.2]), np.zeros(1), turn, turn, *np.zeros((2, 1)))
     lucky, honest = np.full(space.dim, 2.0), space.encode(good)
     found = model.policy.search._replace(
         mean=lucky,
@@ -333,20 +311,6 @@ def test_legs_that_do_the_same_are_searched_as_one_each_ahead_by_its_lead():
     np.testing.assert_allclose(again.phase, gait.phase, atol=1e-4)
 
 
-def test_a_gait_of_legs_needs_joints_of_legs():
-    with pytest.raises(EnvironmentMismatchError, match="4 legs needs as many joints in each"):
-        OpenLoop("MlpPolicy", "HalfCheetah-v5", gait="trot")
-
-
-def test_a_generation_more_does_not_take_the_steps_of_the_ranking():
-    settings = {"seed": 0, "population_size": 4, "n_resets": 2, "n_elites": 2}
-    # A generation has 320 steps, a round of the ranking 160: the third would end in the ranking.
-    model = OpenLoop("MlpPolicy", Tune(), ranking_share=0.3, **settings).learn(1150)
-
-    assert int(model.policy.search.generation) == 2
-    assert int(model.policy.search.n_rounds) >= 2 and bool(model.policy.search.ranked)
-
-
 def test_points_and_gaits_are_two_names_of_the_same():
     space = GaitSpace(
         amplitude=np.array([1.0, 2.0]),
@@ -379,28 +343,17 @@ def test_an_argument_out_of_range_is_named_with_its_range(settings):
         small("openloop", **settings)
 
 
-def test_constants_of_another_body_are_refused():
+def test_what_does_not_fit_the_body_is_refused():
     model = OpenLoop("MlpPolicy", "Swimmer-v5")
 
     with pytest.raises(ParameterError, match="amplitude must be one number, or one for each of"):
         model.set_constants(amplitude=[1.0, 2.0, 3.0], omega_swing=1.0, omega_stance=1.0)
     with pytest.raises(ParameterError, match="omega_swing must be finite and above 0"):
         model.set_constants(omega_swing=0.0, omega_stance=1.0)
-
-
-def test_observations_that_are_normalised_do_not_show_joints_and_are_refused():
     with pytest.raises(ValueError, match="norm_obs=False"):
         OpenLoop("MlpPolicy", VecNormalize(make_vec_env("Swimmer-v5")))
-
-
-def test_returns_are_judged_in_the_rewards_of_the_environment():
-    env = VecNormalize(make_vec_env(Tune), norm_obs=False)
-    settings = {"seed": 0, "population_size": 4, "n_resets": 1, "ranking_share": 0.0}
-
-    found = [OpenLoop("MlpPolicy", each, **settings).learn(320) for each in (env, Tune())]
-
-    scaled, raw = (model.policy.search.elite_returns for model in found)
-    np.testing.assert_allclose(scaled, raw, rtol=1e-5)
+    with pytest.raises(EnvironmentMismatchError, match="4 legs needs as many joints in each"):
+        OpenLoop("MlpPolicy", "HalfCheetah-v5", gait="trot")
 
 
 @pytest.mark.parametrize("kind", ["frames", "twin"])

@@ -1,5 +1,6 @@
 """Planning against closed forms, finite differences and the known optimum of Pendulum-v1."""
 
+import dataclasses
 import os
 from functools import partial
 from pathlib import Path
@@ -166,13 +167,16 @@ def test_the_gradient_by_the_adjoint_is_that_of_reverse_mode_and_of_finite_diffe
     problem = Problem(twin, twin.params, discount=0.97, terminal_value=lambda obs: obs[0] ** 3)
     start = State(jnp.array([2.0]), jnp.array([0.5]), {})
     controls = 0.5 * jnp.sin(jnp.arange(HORIZON))[:, None]
-    value = lambda u: planning.simulate(problem, start, u).value  # noqa: E731
+    value = jax.jit(lambda u: planning.simulate(problem, start, u).value)
 
-    gradient = planning.control_gradient(
-        planning.expand(problem, planning.simulate(problem, start, controls))
-    )
+    @jax.jit
+    def by_adjoint(controls):
+        plan = planning.simulate(problem, start, controls)
+        return planning.control_gradient(planning.expand(problem, plan))
 
-    np.testing.assert_allclose(gradient, jax.grad(value)(controls), rtol=1e-10)
+    gradient = by_adjoint(controls)
+
+    np.testing.assert_allclose(gradient, jax.jit(jax.grad(value))(controls), rtol=1e-10)
     for k in (0, 5, HORIZON - 1):
         step = 1e-5 * jax.nn.one_hot(k, HORIZON)[:, None]
         difference = (value(controls + step) - value(controls - step)) / 2e-5
@@ -197,17 +201,6 @@ def test_the_expansion_holds_jacobians_and_hessians():
         np.testing.assert_allclose(expansion.curvature[t], 0.9**t * expected, rtol=1e-10)
 
 
-@pytest.mark.parametrize("improve", [planning.gradient_ascent, planning.gauss_newton])
-def test_a_plan_is_improved_like_its_controls(improve):
-    problem = Problem(Spring(), Spring().params)
-    start, controls = _first(starts_of(Spring(), 1)), jnp.full((4, 1), 0.3)
-    plan = planning.simulate(problem, start, controls)
-
-    assert jnp.array_equal(
-        improve(problem, start, plan).controls, improve(problem, start, controls).controls
-    )
-
-
 def _curvatures(roots):
     """Exact curvature of -|roots|^2 at the end of a plan, and the one taken from its slopes."""
     twin = Spring()
@@ -226,24 +219,17 @@ def _curvatures(roots):
 
 
 @pytest.mark.usefixtures("x64")
-def test_one_root_of_a_value_gives_its_curvature():
+def test_roots_of_a_value_give_its_curvature_at_the_goal_and_only_their_length_far_off():
     direction = jnp.array([0.7, -0.2])
-
-    exact, found, _ = _curvatures(lambda obs: (direction @ obs - 3.0)[None])
-
-    np.testing.assert_allclose(exact, 2.0 * jnp.outer(direction, direction), rtol=1e-10)
-    np.testing.assert_allclose(found, exact, rtol=1e-10)
-
-
-@pytest.mark.usefixtures("x64")
-def test_many_roots_of_a_value_give_its_curvature_at_the_goal_and_only_their_length_far_off():
     slopes = jnp.array([[0.7, -0.2], [0.3, 0.5], [-0.1, 0.4]])
-    _, _, goal = _curvatures(lambda obs: slopes @ obs)
-
-    exact, at_goal, _ = _curvatures(lambda obs: slopes @ (obs - goal))
     turn = lambda obs: 1e3 * jnp.stack([jnp.sin(obs[0]), jnp.cos(obs[0])])  # noqa: E731
+
+    one, found, goal = _curvatures(lambda obs: (direction @ obs - 3.0)[None])
+    exact, at_goal, _ = _curvatures(lambda obs: slopes @ (obs - goal))
     _, turning, _ = _curvatures(turn)
 
+    np.testing.assert_allclose(one, 2.0 * jnp.outer(direction, direction), rtol=1e-10)
+    np.testing.assert_allclose(found, one, rtol=1e-10)
     np.testing.assert_allclose(at_goal, exact, rtol=1e-10)
     # Its length is constant. Without fading this would be 2e6.
     assert jnp.abs(turning).max() < 0.2
@@ -267,7 +253,7 @@ def test_a_reward_of_the_next_state_is_expanded_through_the_step():
 
 
 @pytest.mark.parametrize("method", planning.METHODS)
-def test_a_plan_is_never_worse_than_what_it_started_from(method):
+def test_a_plan_is_never_worse_than_what_it_started_from_and_stays_within_limits(method):
     twin = twins.make("Pendulum")
     starts = starts_of(twin, 64)
     keys = jax.random.split(jax.random.key(1), 64)
@@ -275,22 +261,16 @@ def test_a_plan_is_never_worse_than_what_it_started_from(method):
     problem = Problem(twin, twin.params)
     before = jax.vmap(partial(planning.simulate, problem))(starts, controls).value
 
-    plan = planning.solve(twin, starts, controls, method, n_iterations=5)
+    plan, beyond = (
+        planning.solve(twin, starts, given, method, n_iterations=5)
+        for given in (controls, jnp.full((64, 40, 1), 7.0))
+    )
 
     # Another program sums in another order: float32 rounding of a sum of hundreds.
     assert jnp.all(plan.value >= before - 1e-3)
     assert jnp.mean(plan.value > before) > 0.9
-
-
-@pytest.mark.parametrize("method", planning.METHODS)
-def test_controls_stay_within_the_limits(method):
-    twin = twins.make("Pendulum")
-    starts = starts_of(twin, 32)
-
-    plan = planning.solve(twin, starts, jnp.full((32, 30, 1), 7.0), method, n_iterations=5)
-
-    assert jnp.max(jnp.abs(plan.controls)) <= 1.0
-    assert jnp.any(jnp.abs(plan.controls) < 1.0)
+    assert jnp.max(jnp.abs(beyond.controls)) <= 1.0
+    assert jnp.any(jnp.abs(beyond.controls) < 1.0)
 
 
 @pytest.mark.parametrize("method", planning.METHODS)
@@ -309,45 +289,22 @@ def test_a_start_that_is_not_a_number_harms_no_other(method):
 
 
 @pytest.mark.usefixtures("x64")
-def test_shifting_all_rewards_shifts_the_objective_also_of_an_episode_that_ends():
-    twin, discount, offset = Cliff(), 0.9, 0.7
-    start = State(jnp.array([0.5]), jnp.array([3.0]), {})
-    plain = Problem(twin, twin.params, discount)
-    shifted = Problem(twin, twin.params, discount, reward_offset=offset)
-    controls = jnp.zeros((8, 1))
-
-    plan = planning.simulate(plain, start, controls)
-
-    assert not plan.alive[-1]
-    lived = int(jnp.sum(plan.alive)) - 1
-    assert plan.value == pytest.approx(sum(discount**t for t in range(lived + 1)))
-    difference = plan.value - planning.simulate(shifted, start, controls).value
-    assert difference == pytest.approx(offset / (1.0 - discount))
-
-
-@pytest.mark.usefixtures("x64")
-def test_without_shifted_ends_only_the_rewards_of_an_episode_that_ends_are_shifted():
+def test_after_an_end_nothing_counts_and_shifted_rewards_shift_the_objective():
     twin, discount, offset = Cliff(), 0.9, 0.7
     start, controls = State(jnp.array([0.5]), jnp.array([3.0]), {}), jnp.zeros((8, 1))
-    problem = Problem(twin, twin.params, discount, reward_offset=offset, shift_ends=False)
+    plain = Problem(twin, twin.params, discount)
+    shifted = dataclasses.replace(plain, reward_offset=offset)
 
-    plan = planning.simulate(problem, start, controls)
+    plan = planning.simulate(plain, start, controls)
+    expansion = planning.expand(plain, plan)
 
-    lived = int(jnp.sum(plan.alive)) - 1
-    expected = sum(discount**t * (1.0 - offset) for t in range(lived + 1))
-    assert plan.value == pytest.approx(expected)
-
-
-@pytest.mark.usefixtures("x64")
-def test_after_the_end_of_an_episode_nothing_counts_and_nothing_pulls():
-    twin = Cliff()
-    problem = Problem(twin, twin.params)
-    start = State(jnp.array([0.5]), jnp.array([3.0]), {})
-    plan = planning.simulate(problem, start, jnp.zeros((8, 1)))
     end = int(jnp.argmin(plan.alive))
-
-    expansion = planning.expand(problem, plan)
-
+    assert not plan.alive[-1]
+    assert plan.value == pytest.approx(sum(discount**t for t in range(end)))
+    difference = plan.value - planning.simulate(shifted, start, controls).value
+    assert difference == pytest.approx(offset / (1.0 - discount))
+    alone = planning.simulate(dataclasses.replace(shifted, shift_ends=False), start, controls).value
+    assert alone == pytest.approx(sum(discount**t * (1.0 - offset) for t in range(end)))
     np.testing.assert_array_equal(plan.rewards[end:], 0.0)
     np.testing.assert_array_equal(expansion.slope[end:], 0.0)
 
@@ -406,25 +363,14 @@ def test_several_starts_and_growing_horizons_beat_one_plan_from_rest():
     several = jax.jit(
         jax.vmap(lambda s: planning.multi_start(problem, s, [zeros, *noise], improve))
     )(starts)
-    growing = jax.jit(
-        jax.vmap(lambda s: grow(start=s, controls=zeros, horizons=[20, 40, 60, 80, 100]))
-    )(starts)
+    growing = jax.jit(jax.vmap(lambda s: grow(start=s, controls=zeros, horizons=[30, 60, 100])))(
+        starts
+    )
 
     # The first of the several is the one: at least as good everywhere, up to float32 rounding.
     assert jnp.all(several.value >= once.value - 1e-2)
     assert jnp.mean(several.value) > jnp.mean(once.value) + 10.0
     assert jnp.mean(growing.value) > jnp.mean(once.value) + 10.0
-
-
-def test_horizons_that_do_not_grow_to_the_whole_are_refused():
-    twin = Spring()
-    problem = Problem(twin, twin.params)
-    start = _first(starts_of(twin, 1))
-
-    with pytest.raises(ValueError, match=r"to the length of the controls, 10, got \[5, 8\]"):
-        planning.horizon_continuation(
-            problem, start, jnp.zeros((10, 1)), [5, 8], planning.gauss_newton
-        )
 
 
 def test_a_receding_horizon_replays_as_its_own_controls():
@@ -444,14 +390,19 @@ def test_a_receding_horizon_replays_as_its_own_controls():
         planning.receding_horizon(problem, start, 20, jnp.zeros((10, 1)), improve, 3)
 
 
-def test_wrong_arguments_of_solve_are_named():
+def test_wrong_arguments_are_named():
     twin = Spring()
-    starts = starts_of(twin, 2)
+    starts, controls = starts_of(twin, 2), jnp.zeros((10, 1))
+    problem = Problem(twin, twin.params)
 
     with pytest.raises(ValueError, match="first_order, gauss_newton, ilqr, got 'newton'"):
         planning.solve(twin, starts, jnp.zeros((2, 5, 1)), "newton")
     with pytest.raises(ValueError, match=r"\(2, horizon, 1\), got \(3, 5, 1\)"):
         planning.solve(twin, starts, jnp.zeros((3, 5, 1)))
+    with pytest.raises(ValueError, match=r"to the length of the controls, 10, got \[5, 8\]"):
+        planning.horizon_continuation(
+            problem, _first(starts), controls, [5, 8], planning.gauss_newton
+        )
 
 
 @pytest.mark.skipif(
