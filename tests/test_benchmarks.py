@@ -83,6 +83,7 @@ def test_the_parts_of_hds_close_a_share_of_the_gap_over_seeds_that_have_both_end
 def test_a_figure_shows_every_variant():
     variants = hds_parts.VARIANTS["beta"]
     rows = parts_of({variant: np.arange(2.0) for variant in variants})
+    rows["gradient_norm"] = rows["derivative_worst"] = 1.0
 
     drawing = hds_parts.FIGURES["beta"](rows)
 

@@ -171,7 +171,7 @@ def test_td7_judges_policies_by_the_rewards_of_the_environment_itself():
     model.learn(60)
 
     assert {earned for earned, _ in judged} == {10.0}
-    assert model.prioritised and model.replay_buffer.highest > 1.0
+    assert model.prioritised
 
 
 @pytest.mark.parametrize("argument", [{"use_sde": True}, {"n_steps": 2}])
