@@ -178,6 +178,20 @@ def test_episodes_are_told_as_monitor_tells_them(mode):
             assert env.reset_infos[0]["begun"] == monitored.reset()[1]["begun"]
 
 
+def test_a_failure_in_the_last_step_of_a_limit_is_no_time_out():
+    class Failing(Counting):
+        def step(self, action):
+            obs, reward, *_, info = super().step(action)
+            return obs, reward, True, True, info
+
+    env = GymnasiumVecEnv(SyncVectorEnv([lambda: Failing(0)]))
+    env.reset()
+
+    _, _, [done], [info] = env.step(np.zeros((1, 1), np.float32))
+
+    assert done and not info["TimeLimit.truncated"]
+
+
 def test_returns_are_evaluated():
     env = GymnasiumVecEnv(sync(AutoresetMode.SAME_STEP))
     env.seed(0)

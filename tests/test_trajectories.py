@@ -242,6 +242,8 @@ def test_downsampling_by_an_integer_keeps_samples_exactly_and_drops_the_rest():
     assert coarse.lengths.tolist() == [2, 3]
     np.testing.assert_array_equal(coarse.episode(1)[0], data.episode(1)[0][::3])
     np.testing.assert_array_equal(coarse.episode(1)[1], data.episode(1)[1][::3])
+    # 0.07 / 0.01 is a little more than 7.
+    assert data_of(7, dt=0.01).resample(dt=0.07).lengths.tolist() == [1]
 
 
 def test_a_straight_line_survives_any_ratio():
@@ -256,6 +258,16 @@ def test_a_straight_line_survives_any_ratio():
     np.testing.assert_allclose(
         odd.actions[0, :, 0], 0.1 * np.floor(0.7 * np.arange(14)), atol=1e-12
     )
+
+
+def test_there_and_back_is_the_same_data():
+    data = data_of(5, 8)
+
+    back = data.resample(dt=0.02).resample(dt=0.1)
+
+    np.testing.assert_allclose(back.obs, data.obs, atol=1e-12)  # rounding of the grid
+    np.testing.assert_array_equal(back.actions, data.actions)
+    assert data.resample(dt=0.1) is data
 
 
 def test_an_angle_turns_the_shorter_way_across_the_seam():
