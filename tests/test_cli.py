@@ -234,6 +234,7 @@ def own_modules(tmp_path, monkeypatch):
     """A folder to work in, and registries that forget what its modules register."""
     monkeypatch.setattr("sys.path", [path for path in sys.path if path])
     monkeypatch.setattr(registry, "_TWINS", dict(registry._TWINS))
+    monkeypatch.delitem(sys.modules, "rigs_in_a_folder", raising=False)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rigs_in_a_folder.py").write_text(
         "from sb3_hds import twins\n\n\n@twins.register\n"
