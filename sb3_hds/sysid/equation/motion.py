@@ -16,8 +16,9 @@ from sb3_hds.sysid.motion import motion_of
 
 # Samples from which it is told whether a velocity is measured.
 _SOME = 50
-# Samples that a period of the motion needs; what comes faster is thinned.
-_PER_PERIOD = 100
+# Rows of all recordings that are kept in any case, and samples that a period of the motion needs
+# beyond these: dry friction turns round faster than a joint swings.
+_ENOUGH, _PER_PERIOD = 10_000, 100
 # Of a period, over which positions and velocities are compared; errors by which they must be apart,
 # and the share of the speed or scale that matters.
 _PART, _SURE, _SCALE = 0.25, 4.0, 0.005
@@ -137,6 +138,7 @@ def motion(twin: Twin, data: Trajectories) -> Motion:
         1, int(np.min(period[np.isfinite(period)], initial=np.inf) / (_PER_PERIOD * data.dt))
     )
     every = min(every, max(1, int(data.lengths.min()) // _PER_PERIOD))
+    every = min(every, -(-int(data.lengths.sum()) // _ENOUGH))
     recordings = []
     for (q, v, commands), smoothed in zip(raws, values, strict=True):
         raw = v.copy()

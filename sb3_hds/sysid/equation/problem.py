@@ -19,6 +19,9 @@ _MOST_INFLATION = 200.0
 # Least share of changes of the logged command, or of the inertia, that a set may leave.
 _LEAST_LEFT = 0.02
 _RIDGE = 1e-9
+# Of friction that falls as a joint begins to slide, the least share that stays: what falls further
+# stands for a curve of another form.
+_LEAST_SLIDING = 0.3
 # Numbers that what is not linear costs beside its coefficients: a speed, a period.
 _HIDDEN = {"stribeck_friction": 1, "cogging": 1}
 
@@ -245,7 +248,8 @@ class Problem:
             elif item.candidate.ascending:
                 by_name = dict(zip(item.names, (value[c] for c in item.free), strict=True))
                 shorts = (name.rpartition(".")[2] for name in item.candidate.ascending)
-                if np.any(np.diff([by_name.get(short, 0.0) for short in shorts]) < 0.0):
+                sizes = [by_name.get(short, 0.0) for short in shorts]
+                if np.any(np.diff(sizes) < 0.0) or sizes[0] < _LEAST_SLIDING * sizes[-1]:
                     return False
         return True
 

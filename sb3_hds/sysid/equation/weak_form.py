@@ -25,6 +25,10 @@ _NARROWEST = 5
 _REST, _ERRORS = 0.02, 3.0
 # Rows per column of the rich model that must be left, or bumps become narrower, or rest stays in.
 _ENOUGH = 4.0
+# Wider bumps average the noise of the velocities, and cost rows around reversals: so they are wide
+# where this share of what is left is such noise, and narrower by more than the factor only where
+# there is next to none.
+_AVERAGED, _NARROW, _NO_NOISE = 0.5, 3.0, 0.05
 # Huber's threshold, in units of the noise, and how often weights are found anew.
 _HUBER, _PASSES = 2.0, 4
 # Blocks of data that agree or not: recordings, or pieces of them where they are fewer.
@@ -47,6 +51,7 @@ class Rows(NamedTuple):
     :param scale: noise of a row [N m] or [N]
     :param floor: what the noise of the velocities alone would leave, in units of ``scale``
     :param gain: by which a constant force is larger in a row than at an instant
+    :param narrowed: by which bumps are narrower than the widest
     """
 
     y: np.ndarray
@@ -56,6 +61,7 @@ class Rows(NamedTuple):
     scale: float
     floor: float
     gain: float
+    narrowed: float
 
 
 def weak_rows(equation: Equation) -> list[Rows]:
@@ -86,29 +92,34 @@ def _joint(equation: Equation, j: int) -> Rows:
     rich = rich_columns(equation.items, used)
     period = motion.period[j] if np.isfinite(motion.period[j]) else 1.0
     widest = max(_WIDTH * period, _LEAST * motion.dt) / (2.0 * motion.dt)
-    halves = [round(widest / 2**k) for k in range(_NARROWEST)]
-    tried = [(n, True) for n in halves if n >= _LEAST // 2] + [(halves[0], False)]
-    for half, masked in tried:
-        n_half = max(half, 2)
-        projected, pieces = _against_bumps(table, equation.recording, still & masked, n_half)
-        if len(projected) > _ENOUGH * len(rich):
-            break
-    if not len(projected):
-        return Rows(np.zeros(0), np.zeros((0, len(used))), used, np.zeros(0, int), 1.0, 0.0, 1.0)
-    y, x = projected[:, 0], projected[:, 1:]
-    weight, scale = _huber(y, x[:, rich])
-    slope = np.linalg.norm(np.diff(_bump(n_half), prepend=0.0, append=0.0))
+    halves = [max(round(widest / 2**k), 2) for k in range(_NARROWEST)]
+    halves = [n for n in halves if n >= _LEAST // 2] or halves[:1]
     mass = float(np.median(equation.mass[:, j, j]))
-    floor = mass * motion.noise_v[j] * slope / motion.dt / scale
-    return Rows(
-        weight * y / scale,
-        weight[:, None] * x / scale,
-        used,
-        _blocks(pieces, equation.recording),
-        scale,
-        float(floor),
-        float(_bump(n_half).sum()),
-    )
+    made: Rows | None = None
+    for half, masked in [*((n, True) for n in halves), (halves[0], False)]:
+        projected, pieces = _against_bumps(table, equation.recording, still & masked, half)
+        enough = len(projected) > _ENOUGH * len(rich)
+        if not len(projected) or (made is not None and not enough):
+            continue
+        y, x = projected[:, 0], projected[:, 1:]
+        weight, scale = _huber(y, x[:, rich])
+        slope = np.linalg.norm(np.diff(_bump(half), prepend=0.0, append=0.0))
+        made = Rows(
+            weight * y / scale,
+            weight[:, None] * x / scale,
+            used,
+            _blocks(pieces, equation.recording),
+            scale,
+            float(mass * motion.noise_v[j] * slope / motion.dt / scale),
+            float(_bump(half).sum()),
+            halves[0] / half,
+        )
+        if enough and made.floor > (_AVERAGED if made.narrowed < _NARROW else _NO_NOISE):
+            break
+    if made is None:
+        empty = np.zeros(0)
+        return Rows(empty, np.zeros((0, len(used))), used, np.zeros(0, int), 1.0, 0.0, 1.0, 1.0)
+    return made
 
 
 def _at_rest(equation: Equation, j: int) -> np.ndarray:
@@ -232,7 +243,8 @@ def grams(equation: Equation, rows: list[Rows]) -> Grams:
         index = np.ix_([*own.used, n_columns], [*own.used, n_columns])
         z = np.concatenate([own.x, own.y[:, None]], 1)
         local = np.stack([z[own.block == b].T @ z[own.block == b] for b in range(n_blocks)])
-        deflation = _deflation(local, rich_columns(equation.items, own.used))
+        rich = rich_columns(equation.items, own.used)
+        deflation = _deflation(local, rich, _MOST_DEFLATION * own.narrowed)
         local = local / deflation
         effective[j], floor[j] = max(len(own.y) / deflation, 5.0), own.floor
         for b in range(n_blocks):
@@ -242,7 +254,7 @@ def grams(equation: Equation, rows: list[Rows]) -> Grams:
     return Grams(blocks, by_joint, folds, effective, floor, scale, gain, n_blocks)
 
 
-def _deflation(local: np.ndarray, rich: np.ndarray) -> float:
+def _deflation(local: np.ndarray, rich: np.ndarray, most: float) -> float:
     if not len(rich):
         return 1.0
     total = local.sum(0)
@@ -257,7 +269,7 @@ def _deflation(local: np.ndarray, rich: np.ndarray) -> float:
     ratio = np.diag(robust) / np.maximum(np.diag(inverse), 1e-12)
     n = len(local)
     free = n / max(n - int(well.sum()), n / 2)
-    return float(np.clip(np.median(ratio) * free, 1.0, _MOST_DEFLATION))
+    return float(np.clip(np.median(ratio) * free, 1.0, most))
 
 
 def is_parameter(item: Item) -> bool:
