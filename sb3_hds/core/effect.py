@@ -505,7 +505,9 @@ NO_EFFECTS = EffectChain((), {})
 def at_joint(moment: Moment, index: int) -> JointMoment:
     """:return: the view of joint ``index``"""
     unit = jnp.zeros_like(moment.v).at[index].set(1.0)
-    inertia = 1.0 / solve_spd(moment.mass_matrix, unit)[index]
+    # It bounds what a step may do: no number to differentiate by.
+    matrix = jax.lax.stop_gradient(moment.mass_matrix)
+    inertia = 1.0 / solve_spd(matrix, unit)[index]
     return JointMoment(
         moment.q[index],
         moment.v[index],

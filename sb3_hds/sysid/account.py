@@ -15,6 +15,9 @@ from sb3_hds.sysid.search import LEAST_GAIN, Half
 # Directions below this share of the largest curvature do not move.
 _RANK = 1e-10
 
+# Square of an error, in units of the noise, of a simulation that has run away.
+_RUN_AWAY = 1e8
+
 
 def standard_errors(half: Half, point: Point, free: Sequence[int]) -> Float[np.ndarray, " p"]:
     """
@@ -75,13 +78,18 @@ def by_horizon(half: Half, before: Point, after: Point, every: int) -> dict[int,
     found, last = {}, before.raw.shape[1] - 1
     for ahead in sorted({1, max(last // 4, 1), last}):
         old, new = (
-            np.mean((point.raw[:, ahead] / half.evidence.noise) ** 2, 1)
+            _bounded(np.mean((point.raw[:, ahead] / half.evidence.noise) ** 2, 1))
             for point in (before, after)
         )
         gained = compare(new, old, half.unit)
         rms = [float(np.sqrt(np.mean(errors))) for errors in (old, new)]
         found[ahead * every] = HorizonGain(ahead * every, rms[0], rms[1], gained.low, gained.high)
     return found
+
+
+def _bounded(errors: np.ndarray) -> np.ndarray:
+    """What has run away counts as far off."""
+    return np.nan_to_num(np.minimum(errors, _RUN_AWAY), nan=_RUN_AWAY)
 
 
 def pictures_of(
@@ -101,7 +109,8 @@ def pictures_of(
     rows = np.flatnonzero(half.unit == half.unit[0])
     measured = np.asarray(evidence.shots.obs)[rows]
     errors = [
-        np.sqrt(np.mean((point.raw / evidence.noise) ** 2, (0, 2))) for point in (before, after)
+        np.sqrt(np.mean(_bounded((point.raw / evidence.noise) ** 2), (0, 2)))
+        for point in (before, after)
     ]
     rms = np.sqrt(np.mean(after.raw**2, 0))
     return Pictures(

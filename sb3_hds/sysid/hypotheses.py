@@ -287,8 +287,10 @@ class Hypotheses:
 
     def alike(self, key: str, other: str) -> str:
         """:return: when two candidates look alike, as one of them declares, or nothing"""
-        one, two = (next(c for c in self.candidates if c.key == name) for name in (key, other))
-        return one.resembles(two) or two.resembles(one)
+        known = {c.key: c for c in self.candidates}
+        if not {key, other} <= known.keys():
+            return ""
+        return known[key].resembles(known[other]) or known[other].resembles(known[key])
 
     def indices(self, candidate: Candidate) -> tuple[int, ...]:
         return tuple(self.names.index(name) for name in candidate.parameters)

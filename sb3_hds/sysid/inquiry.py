@@ -39,10 +39,10 @@ from sb3_hds.sysid.remainder import (
     short_windows,
     weighed,
 )
-from sb3_hds.sysid.screening import Screened, screen
+from sb3_hds.sysid.screening import SMALL_MACHINE, Screened, screen
 from sb3_hds.sysid.search import Base, Effort, Half, Search, Tried
-from sb3_hds.sysid.several import confirmed_set
-from sb3_hds.sysid.shooting import Shots, shots_of
+from sb3_hds.sysid.several import confirmed_set, proposed_set
+from sb3_hds.sysid.shooting import Shots, evenly, shots_of
 from sb3_hds.sysid.sizes import sized
 from sb3_hds.sysid.telling import (
     NO_CONSTANT,
@@ -76,6 +76,9 @@ _LEAST_SHARE = 0.9
 # The same of a cause and of how its size changes with time: a force whose form is a little wrong
 # seems to change with position or speed, but not with time.
 _LEAST_SHARE_IN_TIME = 0.95
+# Windows of each half that are simulated, where machines have more joints than a few: each joint
+# makes each more expensive.
+_WINDOWS_OF_ALL_JOINTS, _ALL_WINDOWS = 240, 1_000_000
 # Candidates that are fitted to the end to settle the noise.
 _FOR_NOISE = 3
 # How long to search.
@@ -85,6 +88,8 @@ EFFORTS = {"full": Effort(12, 8, 256, 4, True), "quick": Effort(8, 4, 64, 2, Fal
 _IRRELEVANT = 5e-3
 # A force that moves a short window by a smaller share of that is no remainder.
 _OF_IRRELEVANT = 0.18
+# Errors count as noise up to here: what runs away says nothing of it.
+_WORST = 10.0
 # Noise before it is known, in the same units.
 _FIRST_NOISE = 0.05
 # Parameters that a cause has at most, and fewer units of evidence than these cannot say anything.
@@ -163,6 +168,11 @@ class Inquiry:
             self.hypotheses.twin,
             period=self.period,
         )
+        self.most_windows = _ALL_WINDOWS
+        if len(twin.joints) > SMALL_MACHINE:
+            self.most_windows = _WINDOWS_OF_ALL_JOINTS // len(twin.joints)
+            some = evenly(len(self.origin), 2 * self.most_windows)
+            self.shots, self.origin = _rows_of(self.shots, some), self.origin[some]
         self.parts = split(self.data, self.origin, seed)
         self.effort = EFFORTS[budget]
         self.turned_down: dict[str, str] = {}
@@ -215,13 +225,13 @@ class Inquiry:
         if self.convention is not None:
             return self.in_other_words(self.convention)
         self.prepare()
+        if self.screened and len(self.screened.members) > 1:
+            several = self._several(self.screened)
+            if several is not None:
+                return several
         self.settle_noise()
         start = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
         self.bar.stage("comparing causes")
-        if self.screened and len(self.screened.members) > 1:
-            several = self._several(self.screened, start)
-            if several is not None:
-                return several
         naming = Naming(self.search, start, self.seed, family=self._family())
         firsts = self.search.finalists(start, [])
         rejected = self._weighed(firsts, start)
@@ -270,9 +280,16 @@ class Inquiry:
             return 1.0
         return len(self.screened.hypotheses.candidates) / max(len(self.hypotheses.candidates), 1)
 
-    def _several(self, screened: Screened, start: Base) -> Diagnosis | None:
+    def _several(self, screened: Screened) -> Diagnosis | None:
         """:return: a diagnosis of several causes at once, if held-out recordings confirm them"""
-        found, base = confirmed_set(self.search, screened, start)
+        self.bar.stage("settling the noise")
+        start = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
+        self._set_noise(start.point)
+        whole = proposed_set(self.search, screened, start)
+        self._set_noise(min((start.point, whole.point), key=lambda point: point.cost))
+        start, whole = map(self.search.again, (start, whole))
+        self.bar.stage("confirming causes")
+        found, base = confirmed_set(self.search, screened, start, whole)
         if len(found) < 2:
             return None
         self.bar.stage("what is left")
@@ -280,11 +297,15 @@ class Inquiry:
         if self._explained(found, start, base, before, left) < _LEAST_OF_SEVERAL:
             return None
         nearest = ""
+        naming = Naming(self.search, start, self.seed, family=self._family())
+        found, base, force = naming.outdone(found, base)
+        if force is not None:
+            left, nearest = self._left(base), nameless_in_words(*force, self.hypotheses)
         self._set_noise(base.point)
         start, base = map(self.search.again, (start, base))
         if stuck := self._stuck(base):
             found, base, left, nearest = [], start, before, stuck
-        self.turned_down = {key: SMALL for key in screened.hints}
+        self.turned_down = naming.turned_down | {key: SMALL for key in screened.hints}
         return self._told(found, [], start, base, before, left, nearest)
 
     def _weighed(self, firsts: Sequence[Tried], start: Base) -> list[tuple[Candidate, Comparison]]:
@@ -333,7 +354,9 @@ class Inquiry:
         self._set_noise(min((base.point, *(t.point for t in tried)), key=lambda p: p.cost))
 
     def _set_noise(self, point: Point) -> None:
-        noise = np.mean(point.raw**2, (0, 1)) + (_IRRELEVANT * self.spread) ** 2
+        most = _WORST * self.spread
+        error = np.minimum(np.where(np.isfinite(point.raw), np.abs(point.raw), np.inf), most)
+        noise = np.mean(error**2, (0, 1)) + (_IRRELEVANT * self.spread) ** 2
         self.search.set_noise(np.sqrt(noise))
 
     def _constant(
@@ -378,12 +401,16 @@ class Inquiry:
     def _gone(self, one: Accepted, base: Base, left: _Left) -> float:
         """:return: by which a cause lowers the cost of short windows"""
         theta = self.search.without(one.tried.candidate, base).point.theta
-        without = short_windows(self.search.select.evidence, theta, self.data, self.period)
+        without = self._short(theta)
         return without.point.cost - left.short.point.cost
+
+    def _short(self, theta: np.ndarray) -> ShortWindows:
+        half = self.search.select
+        return short_windows(half.evidence, theta, self.data, self.period, 2 * self.most_windows)
 
     def _left(self, base: Base) -> _Left:
         """:return: what the twin leaves as it is believed now"""
-        short = short_windows(self.search.select.evidence, base.point.theta, self.data, self.period)
+        short = self._short(base.point.theta)
         missing = missing_force(short, self.data)
         joints = tuple(joint.name for joint in self.hypotheses.twin.joints)
         power = float(np.mean(np.sum(weighed(missing) ** 2, 1)))

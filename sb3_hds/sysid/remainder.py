@@ -10,7 +10,7 @@ from sb3_hds.core import Trajectories
 from sb3_hds.sysid.comparison import Split, split
 from sb3_hds.sysid.evidence import Evidence, Point, Slopes
 from sb3_hds.sysid.motion import motion_of
-from sb3_hds.sysid.shooting import Shots, shots_of
+from sb3_hds.sysid.shooting import Shots, evenly, shots_of
 
 # Length of a window over which the missing force counts as constant, in periods of the motion, and
 # in steps.
@@ -40,12 +40,14 @@ class ShortWindows(NamedTuple):
     :param point: what is believed, on them
     :param shots: the windows themselves
     :param origin: recording of each, shape ``(n,)``
+    :param time: since the recording began [s], shape ``(n,)``
     """
 
     evidence: Evidence
     point: Point
     shots: Shots
     origin: np.ndarray
+    time: np.ndarray
 
 
 class MissingForce(NamedTuple):
@@ -101,25 +103,37 @@ class _Predicted(NamedTuple):
 
 
 def short_windows(
-    evidence: Evidence, theta: Float[np.ndarray, " p"], data: Trajectories, period: float
+    evidence: Evidence,
+    theta: Float[np.ndarray, " p"],
+    data: Trajectories,
+    period: float,
+    most: int,
 ) -> ShortWindows:
     """
     :param evidence: whose program simulates short windows too
     :param theta: all parameters that may move, shape ``(p,)``; they stay as they are
     :param data: measured
     :param period: of the motion [s]
+    :param most: windows
     """
     longest = evidence.shots.actions.shape[1]
     steps = min(int(np.clip(round(_WINDOW * period / data.dt), _SHORTEST, _LONGEST)), longest)
     shots, origin = shots_of(data, steps, evidence.hypotheses.twin)
+    counter: dict[int, int] = {}
+    time = np.zeros(len(origin))
+    for i, recording in enumerate(origin):
+        counter[recording] = counter.get(recording, -1) + 1
+        time[i] = counter[recording] * (steps + 1) * data.dt
+    some = evenly(len(origin), most)
+    shots, origin = Shots(*(np.asarray(leaf)[some] for leaf in shots)), origin[some]
     counted = (np.arange(longest + 1) <= steps).astype(float)
     short = evidence.on(_lengthened(shots, longest), counted)
-    return ShortWindows(short, short.fit(theta, (), n_steps=_STEPS), shots, origin)
+    return ShortWindows(short, short.fit(theta, (), n_steps=_STEPS), shots, origin, time[some])
 
 
 def missing_force(short: ShortWindows, data: Trajectories) -> MissingForce:
     """:param data: measured"""
-    evidence, point, shots, origin = short
+    evidence, point, shots, origin, time = short
     h, steps = evidence.hypotheses, shots.actions.shape[1]
     scale = h.scale[list(h.pushes)]
     slopes = evidence.slopes(point, h.pushes)
@@ -128,11 +142,6 @@ def missing_force(short: ShortWindows, data: Trajectories) -> MissingForce:
     rest = _left_by_forces(short, slopes)
     calmer = np.sqrt(np.median(rest) / max(numbers - point.offsets.shape[1] - len(scale), 1))
     q, v = motion_of(h.believed, shots.obs, data.dt)
-    counter = {recording: 0 for recording in origin}
-    time = np.zeros(len(origin))
-    for i, recording in enumerate(origin):
-        time[i] = counter[recording] * (steps + 1) * data.dt
-        counter[recording] += 1
     return MissingForce(
         force=-scale * slopes.scores / informed,
         stderr=calmer * scale / np.sqrt(informed),

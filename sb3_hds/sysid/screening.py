@@ -23,9 +23,8 @@ _TOLD, _SURELY = 0.05, 6.0
 # Share of a joint's force that a typical size changes.
 _TYPICAL = 0.05
 # Machines of more joints are not asked about what has no column at every joint, but where much is
-# left that can be predicted; of several causes, only these and what may stand for them are
-# simulated.
-_SMALL_MACHINE, _LEFT = 2, 0.2
+# left that can be predicted; where they have several causes, only these are simulated.
+SMALL_MACHINE, _LEFT = 2, 0.2
 
 
 class Screened(NamedTuple):
@@ -54,14 +53,36 @@ class Screened(NamedTuple):
         """Values of the members' parameters by full name."""
         found = {}
         for member in self.members:
-            candidate = self.problem.items[member.item].candidate
-            if candidate.slot == "parameter":
-                (name,) = member.sizes
-                found[name] = self.hypotheses.believed.values[name] + member.sizes[name]
-                continue
-            shorts = {name.rpartition(".")[2]: name for name in candidate.parameters}
-            found |= {shorts[short]: value for short, value in member.sizes.items()}
+            found |= self._by_full_name(member, member.sizes)
         return found
+
+    def sizes_of(self, rest: Sequence[Member]) -> dict[str, float]:
+        """:return: the same of some members, solved anew without the others"""
+        p, keys = self.problem, [*self.problem.always, *(m.item for m in rest)]
+        value, found = p.solve(keys).value, {}
+        for member in rest:
+            item = p.items[member.item]
+            if set(item.free) <= value.keys():
+                effect = self.hypotheses.effect_of(item.candidate)
+                sizes = item.sizes(effect, [value[c] for c in item.free])
+                found |= self._by_full_name(member, sizes)
+        return found
+
+    def intervals_of(self, member: Member) -> dict[str, tuple[float, float, float]]:
+        """:return: estimate and ends of the interval by full name"""
+        parts = [self._by_full_name(member, x) for x in (member.sizes, member.low, member.high)]
+        return {
+            name: (value, *sorted((parts[1][name], parts[2][name])))
+            for name, value in parts[0].items()
+        }
+
+    def _by_full_name(self, member: Member, sizes: Mapping[str, float]) -> dict[str, float]:
+        candidate = self.problem.items[member.item].candidate
+        if candidate.slot == "parameter":
+            (name,) = sizes
+            return {name: self.hypotheses.believed.values[name] + sizes[name]}
+        shorts = {name.rpartition(".")[2]: name for name in candidate.parameters}
+        return {shorts[short]: float(value) for short, value in sizes.items()}
 
     @property
     def detectable(self) -> dict[str, dict[str, float]]:
@@ -132,11 +153,16 @@ def screen(
     left = what_is_left(p, found.keys)
     hints = tuple(p.items[i].key for i in found.hints)
     joints = [joint.name for joint in coarse.joints]
-    small = len(joints) <= _SMALL_MACHINE
-    where = [name for name, x in zip(joints, left, strict=True) if small or x.predictable > _LEFT]
-    keys = {*(m.key for m in set_of), *(k for m in set_of for k in m.others)}
+    small = len(joints) <= SMALL_MACHINE
+    where = [
+        name
+        for name, x in zip(joints, left, strict=True)
+        if small or (len(set_of) < 2 and x.predictable > _LEFT)
+    ]
+    keys = {m.key for m in set_of}
     if small or len(set_of) < 2:
-        keys |= {*_singles(p), *hints, *_without_column(hypotheses, p, moved, where)}
+        keys |= {*(k for m in set_of for k in m.others), *_singles(p), *hints}
+        keys |= _without_column(hypotheses, p, moved, where)
     return Screened(
         hypotheses=hypotheses,
         problem=p,
@@ -164,7 +190,7 @@ def _without_column(h: Hypotheses, p: Problem, moved: Motion, where: Sequence[st
             continue
         if candidate.slot == "joint" and candidate.place not in where:
             continue
-        if candidate.slot != "joint" and len(moved.speed) > _SMALL_MACHINE:
+        if candidate.slot != "joint" and len(moved.speed) > SMALL_MACHINE:
             continue
         if candidate.slot == "parameter":
             continue

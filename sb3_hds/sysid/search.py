@@ -145,10 +145,16 @@ class Search:
             for half in (self.select, self.confirm)
         )
 
-    def base(self, theta: Float[np.ndarray, " p"], free: Sequence[int]) -> Base:
-        """:return: what is believed, ``free`` refitted from ``theta``"""
-        point = self.select.evidence.fit(theta, free)
-        return Base(point, self.confirm.evidence.fit(point.theta, ()), tuple(free))
+    def base(
+        self, theta: Float[np.ndarray, " p"], free: Sequence[int], near: Base | None = None
+    ) -> Base:
+        """
+        :param near: from whose start states to begin; default: as measured
+        :return: what is believed, ``free`` refitted from ``theta``
+        """
+        begin = (None, None) if near is None else (near.point.offsets, near.kept.offsets)
+        point = self.select.evidence.fit(theta, free, begin[0])
+        return Base(point, self.confirm.evidence.fit(point.theta, (), begin[1]), tuple(free))
 
     def believing(self, tried: Tried, base: Base) -> Base:
         """:return: what is believed, and this candidate besides"""

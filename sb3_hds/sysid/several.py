@@ -1,6 +1,6 @@
 """Several causes at once: a set that equation errors propose, judged by simulation."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from scipy import stats
@@ -15,38 +15,55 @@ from sb3_hds.sysid.telling import Accepted
 
 # Level at which each member has to be missed by held-out recordings when it is left out.
 _LEVEL = 0.05
+# Members beyond which a set counts as large: their sizes are those in the equation of motion, and
+# each of them, confirmed there on held-out data, only must not make predictions worse.
+_MANY = 6
 # Folds of the data on which the equation's t is based.
 _FREEDOM = 7
 
 
-def confirmed_set(search: Search, screened: Screened, start: Base) -> tuple[list[Accepted], Base]:
+def proposed_set(search: Search, screened: Screened, start: Base) -> Base:
     """
-    :param screened: the set, with the sizes that it has in the equation of motion
+    :return: what is believed with the whole set, with its sizes in the equation of motion; of a
+        small set, refitted
+    """
+    h, members = search.hypotheses, _members(search, screened)
+    theta = _with_sizes(search, start.point.theta, screened.sizes)
+    own = [i for candidate, _ in members.values() for i in h.indices(candidate)]
+    refitted = [] if len(members) > _MANY else [i for i in own if i not in start.free]
+    return search.base(theta, (*start.free, *refitted))
+
+
+def confirmed_set(
+    search: Search, screened: Screened, start: Base, base: Base
+) -> tuple[list[Accepted], Base]:
+    """
     :param start: what is believed without any cause
+    :param base: with the whole set
     :return: members without which held-out recordings are predicted worse, and what is believed
         with them; none where the set as a whole does not predict better
     """
-    h = search.hypotheses
-    wanted = {c.key: c for c in h.candidates}
-    members = {m.key: m for m in screened.members if m.key in wanted}
-    theta = start.point.theta.copy()
-    for name, value in screened.sizes.items():
-        if name in h.names:
-            i = h.names.index(name)
-            theta[i] = np.clip(value, h.lower[i], h.upper[i])
-    own = [i for key in members for i in h.indices(wanted[key])]
-    base = search.base(theta, (*start.free, *(i for i in own if i not in start.free)))
+    members = _members(search, screened)
     if not members or not passes(search.better(base.kept, start.kept)):
         return [], start
-    verdicts = {}
+    verdicts, many = {}, len(members) > _MANY
     while members:
-        lost = {key: _without(search, wanted[key], base) for key in members}
+        lost = {
+            key: _in_equation(search, screened, base, members, key)
+            if many
+            else _without(search, candidate, base)
+            for key, (candidate, _) in members.items()
+        }
         verdicts = {
-            key: _at_own_joint(search.confirm, wanted[key], base.kept, without.kept)
-            for key, without in lost.items()
+            key: _at_own_joint(search.confirm, members[key][0], base.kept, rest.kept)
+            for key, rest in lost.items()
         }
         weakest = max(verdicts, key=lambda key: (verdicts[key].p_value, -verdicts[key].gain))
-        weak = [k for k, v in verdicts.items() if v.p_value >= _LEVEL or v.gain < LEAST_GAIN]
+        weak = [
+            k
+            for k, v in verdicts.items()
+            if (v.gain <= 0.0 if many else v.p_value >= _LEVEL or v.gain < LEAST_GAIN)
+        ]
         if not weak:
             break
         worst = weakest if weakest in weak else weak[0]
@@ -55,31 +72,62 @@ def confirmed_set(search: Search, screened: Screened, start: Base) -> tuple[list
     p, every = screened.problem, [m.item for m in screened.members]
     carried = dict(zip(every, map(float, p.carried(every)), strict=True))
     found = [
-        _accepted(search, wanted[key], member, members, verdicts[key], base)._replace(
-            share=carried[member.item]
+        _accepted(search, candidate, member, members, verdicts[key], base)._replace(
+            share=carried[member.item], sizes=screened.intervals_of(member) if many else {}
         )
-        for key, member in members.items()
+        for key, (candidate, member) in members.items()
     ]
     return found, base
 
 
+def _members(search: Search, screened: Screened) -> dict[str, tuple[Candidate, Member]]:
+    known = {c.key: c for c in search.hypotheses.candidates}
+    return {m.key: (known[m.key], m) for m in screened.members if m.key in known}
+
+
 def _without(search: Search, candidate: Candidate, base: Base) -> Base:
-    return search.without(candidate, base)
+    h = search.hypotheses
+    own = list(h.indices(candidate))
+    theta = base.point.theta.copy()
+    theta[own] = h.null[own]
+    return search.base(theta, [i for i in base.free if i not in own], near=base)
+
+
+def _in_equation(
+    search: Search, screened: Screened, base: Base, members: Collection[str], key: str
+) -> Base:
+    """What is believed without a member, the others with their sizes in the equation of motion."""
+    h = search.hypotheses
+    rest = [m for m in screened.members if m.key in members and m.key != key]
+    theta = base.point.theta.copy()
+    own = list(h.indices(next(c for c in h.candidates if c.key == key)))
+    theta[own] = h.null[own]
+    return search.base(_with_sizes(search, theta, screened.sizes_of(rest)), base.free, near=base)
+
+
+def _with_sizes(search: Search, theta: np.ndarray, sizes: Mapping[str, float]) -> np.ndarray:
+    h, theta = search.hypotheses, theta.copy()
+    for name, value in sizes.items():
+        if name in h.names:
+            i = h.names.index(name)
+            theta[i] = np.clip(value, h.lower[i], h.upper[i])
+    return theta
 
 
 def _accepted(
     search: Search,
     candidate: Candidate,
     member: Member,
-    members: dict[str, Member],
+    members: Collection[str],
     verdict: Comparison,
     base: Base,
 ) -> Accepted:
     known = {c.key: c for c in search.hypotheses.candidates}
-    others = [known[k] for k in member.others if k in known and k not in members]
-    rest = _without(search, candidate, base)
-    tried = search.finished(others, rest) if others else []
-    equal = [t.candidate.key for t in tried if as_good(search.better(base.kept, t.kept))]
+    others = [k for k in member.others if k not in members]
+    simulated = [known[k] for k in others if k in known]
+    tried = search.finished(simulated, _without(search, candidate, base)) if simulated else []
+    worse = {t.candidate.key for t in tried if not as_good(search.better(base.kept, t.kept))}
+    equal = [k for k in others if k not in worse]
     chance = float(stats.t.sf(member.t, _FREEDOM)) * len(known)
     same = Tried(candidate, base.point, base.kept, member.gain)
     return Accepted(same, verdict, tuple(equal), min(chance, 1.0))

@@ -64,6 +64,11 @@ class Shots(NamedTuple):
         return len(self.weight)
 
 
+def evenly(n: int, most: int) -> np.ndarray:
+    """:return: so many of ``n`` indices, at equal distances; all where there are no more"""
+    return np.arange(n) if n <= most else np.round(np.linspace(0, n - 1, most)).astype(int)
+
+
 def shots_of(
     data: Trajectories,
     length: int,

@@ -39,6 +39,8 @@ class Accepted(NamedTuple):
     :param alternatives: what the data cannot tell from it
     :param chance: that the best of all candidates would gain as much if nothing were wrong
     :param share: of the force at its joint that it carries; None where that is not known
+    :param sizes: estimate and ends of the interval by parameter, where the equation of motion says
+        them and not the simulation
     """
 
     tried: Tried
@@ -46,6 +48,7 @@ class Accepted(NamedTuple):
     alternatives: tuple[str, ...]
     chance: float
     share: float | None = None
+    sizes: Mapping[str, tuple[float, float, float]] = {}
 
 
 def finding(
@@ -63,14 +66,19 @@ def finding(
     candidate, parameters = one.tried.candidate, {}
     shorts = [name.rpartition(".")[2] for name in candidate.parameters]
     for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
-        low, high = _interval(half, point, free, i, float(reach[i]), profiles)
+        if name in one.sizes:
+            estimate, low, high = one.sizes[name]
+            error = float((high - low) / (2.0 * stats.norm.ppf(0.5 + 0.5 * _CONFIDENCE)))
+        else:
+            low, high = _interval(half, point, free, i, float(reach[i]), profiles)
+            estimate, error = float(theta[i]), float(stderr[i])
         short = name.rpartition(".")[2]
         # Of several places, each has its own.
         own = short if shorts.count(short) == 1 else name.partition(".")[2]
         parameters[own] = Estimate(
             name=name,
-            estimate=float(theta[i]),
-            stderr=float(stderr[i]),
+            estimate=estimate,
+            stderr=error,
             low=low,
             high=high,
             unit=h.parameter(name).unit,
