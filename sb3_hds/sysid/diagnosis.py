@@ -171,6 +171,8 @@ class Diagnosis:
     @property
     def sentence(self) -> str:
         """The verdict in one sentence."""
+        if self.verdict in ("named", "ambiguous") and len(self.findings) > _MANY:
+            return several_in_words(self.findings, [j.name for j in self.believed.joints])
         if self.verdict == "ambiguous":
             first, *others = self.findings
             choice = " or ".join(map(spoken, (first.key, *first.alternatives)))
@@ -180,8 +182,6 @@ class Diagnosis:
             return OTHER_CONVENTION
         if self.verdict != "named":
             return SENTENCES[self.verdict]
-        if len(self.findings) > _MANY:
-            return several_in_words(self.findings, [j.name for j in self.believed.joints])
         new = [f for f in self.findings if self._is_new(f)]
         said = {"lacks": new, "is wrong about": [f for f in self.findings if f not in new]}
         parts = [

@@ -92,6 +92,8 @@ _OF_IRRELEVANT = 0.18
 _WORST = 10.0
 # Noise before it is known, in the same units.
 _FIRST_NOISE = 0.05
+# Causes beyond which one that the data cannot tell from others leaves the others named.
+_FEW_CAUSES = 2
 # Parameters that a cause has at most, and fewer units of evidence than these cannot say anything.
 _WIDEST, _FEWEST_UNITS = 3, 6
 
@@ -492,7 +494,11 @@ class Inquiry:
         unexplained = " ".join(filter(None, (nearest, remains)))
         verdict = "none"
         if findings:
-            verdict = "ambiguous" if findings[0].alternatives else "named"
+            doubtful = [bool(one.alternatives) for one in findings]
+            most = (
+                doubtful[0] if len(doubtful) <= _FEW_CAUSES else 2 * sum(doubtful) > len(doubtful)
+            )
+            verdict = "ambiguous" if most else "named"
         elif unexplained:
             verdict = "unknown"
         gain = by_horizon(confirm, start.kept, base.kept, self.every)

@@ -71,10 +71,8 @@ class Screened(NamedTuple):
     def intervals_of(self, member: Member) -> dict[str, tuple[float, float, float]]:
         """:return: estimate and ends of the interval by full name"""
         parts = [self._by_full_name(member, x) for x in (member.sizes, member.low, member.high)]
-        return {
-            name: (value, *sorted((parts[1][name], parts[2][name])))
-            for name, value in parts[0].items()
-        }
+        value, low, high = parts
+        return {n: (value[n], min(low[n], high[n]), max(low[n], high[n])) for n in value}
 
     def _by_full_name(self, member: Member, sizes: Mapping[str, float]) -> dict[str, float]:
         candidate = self.problem.items[member.item].candidate

@@ -231,6 +231,7 @@ class Search:
 
     def finished(self, candidates: Sequence[Candidate], base: Base) -> list[Tried]:
         """:return: these candidates, fitted to the end, best first"""
+        self._guess([c for c in candidates if c.key not in self._reached], base)
 
         def finish(candidate: Candidate) -> Tried:
             point = self._continued(candidate, base)
@@ -244,11 +245,16 @@ class Search:
 
     def nameless(self, base: Base) -> list[Tried]:
         """:return: what no finding is beside what is believed, fitted to the end, best first"""
-        forces = self.hypotheses.nameless
-        guessed = guesses(self._on_a_sample(base), forces, {})
-        for candidate, guess in zip(forces, guessed, strict=True):
+        self._guess(self.hypotheses.nameless, base)
+        return self.finished(self.hypotheses.nameless, base)
+
+    def _guess(self, candidates: Sequence[Candidate], base: Base) -> None:
+        """Where fits of candidates begin."""
+        if not candidates:
+            return
+        guessed = guesses(self._on_a_sample(base), candidates, {})
+        for candidate, guess in zip(candidates, guessed, strict=True):
             self._reached[candidate.key] = _Reached(guess.theta, guess.offsets, base.free)
-        return self.finished(forces, base)
 
     def relatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> list[Tried]:
         """

@@ -27,6 +27,8 @@ class Found(Protocol):
     def parameters(self) -> Mapping[str, Estimate]: ...
     @property
     def share(self) -> float | None: ...
+    @property
+    def alternatives(self) -> Sequence[str]: ...
 
 
 def spoken(key: str) -> str:
@@ -41,8 +43,19 @@ def several_in_words(findings: Sequence[Found], joints: Sequence[str]) -> str:
     """
     :param findings: more than a few
     :param joints: names of all joints of the machine
-    :return: one sentence: friction of the machine as a whole first, and what there is besides
+    :return: a sentence: friction of the machine as a whole first, and what there is besides; and
+        one on what the data cannot tell from other causes
     """
+    doubt = [
+        f"{_name(f)} or {' or '.join(map(spoken, f.alternatives))}"
+        for f in findings
+        if f.alternatives
+    ]
+    open_ = f" The data cannot tell {'; '.join(doubt)}." if doubt else ""
+    return f"{_of_machine(findings, joints)}{open_}"
+
+
+def _of_machine(findings: Sequence[Found], joints: Sequence[str]) -> str:
     friction = {
         joint: tuple(n for n in _FRICTION if any(_is(f, n, joint) for f in findings))
         for joint in joints
@@ -64,6 +77,10 @@ def several_in_words(findings: Sequence[Found], joints: Sequence[str]) -> str:
         return f"{besides[:1].upper()}{besides[1:]}."
     head = f"{head[:1].upper()}{head[1:]}"
     return f"{head}; {besides} besides." if rest else f"{head}."
+
+
+def _name(finding: Found) -> str:
+    return spoken(finding.key).rsplit(" at ", 1)[0]
 
 
 def _is(finding: Found, effect: str, joint: str) -> bool:
