@@ -782,12 +782,11 @@ def test_no_size_is_certain_where_simulations_blow_up_nearby():
 
 
 def test_several_causes_are_told_as_those_of_a_machine():
-    def finding(effect, joint, size, unit, share=None):
+    def finding(effect, joint, size, unit, share=None, others=()):
         where, key = {"slot": "joint", "name": joint}, f"{effect}.{joint}"
         estimate = SimpleNamespace(estimate=size, unit=unit, before=0.0)
-        return SimpleNamespace(
-            effect=effect, key=key, where=where, parameters={"x": estimate}, share=share
-        )
+        own = {"parameters": {"x": estimate}, "share": share, "alternatives": others}
+        return SimpleNamespace(effect=effect, key=key, where=where, **own)
 
     joints = ["pan", "lift", "wrist"]
     shares = dict(zip(joints, (0.4, 0.5, 0.9), strict=True))
@@ -802,3 +801,7 @@ def test_several_causes_are_told_as_those_of_a_machine():
     told = several_in_words([*dry, viscous], joints)
     assert told.startswith("Lift and wrist have Coulomb friction")
     assert "and pan has viscous and Coulomb friction (it carries 50 % of the torque)" in told
+    doubtful = finding("stiffness", "lift", 3.0, "N m/rad", others=("cogging.lift",))
+    assert several_in_words([*dry, doubtful], joints).endswith(
+        "The data cannot tell stiffness or cogging at lift."
+    )

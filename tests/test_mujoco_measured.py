@@ -66,6 +66,24 @@ def test_friction_of_a_ur10_is_that_of_its_publishers_within_a_quarter(tmp_path)
         assert found[f"{joint}_joint_damping"] == pytest.approx(viscous, rel=0.25)
 
 
+@pytest.mark.expensive
+def test_a_diagnosis_of_a_ur10_names_both_frictions_at_all_six_joints(tmp_path):
+    words = ["diagnose", "--model", UR10 / "ur10.urdf", "--data", BAG, "--budget", "quick"]
+    assert cli.main([*map(str, words), "--json", str(tmp_path / "found.json")]) == 0
+    told = json.loads((tmp_path / "found.json").read_text())
+    sizes = {
+        (f["effect"], f["where"]["name"].removesuffix("_joint")): next(
+            iter(f["parameters"].values())
+        )["estimate"]
+        for f in told["findings"]
+    }
+
+    for joint, coulomb, viscous in zip(JOINTS, COULOMB, VISCOUS, strict=True):
+        assert sizes["coulomb_friction", joint] == pytest.approx(coulomb, rel=0.25)
+        assert sizes["viscous_friction", joint] == pytest.approx(viscous, rel=0.25)
+    assert told["sentence"].startswith("All six joints have viscous and Coulomb friction")
+
+
 def test_its_corrected_file_predicts_held_out_seconds_as_well_as_the_twin(ur10, x64):
     """Windows of 0.2 s from measured states, in units of what each joint moves in them."""
     corrected, file, signals = ur10

@@ -290,7 +290,8 @@ class Diagnosis:
             if field.name not in ("believed", "twin", "pictures")
         }
         twins = {"believed": self.believed.to_spec(), "twin": self.twin.to_spec()}
-        return plain(found | twins | {"params": self.twin.values})
+        said = {"sentence": self.sentence, "params": self.twin.values}
+        return plain(found | twins | said)
 
     def to_html(
         self,

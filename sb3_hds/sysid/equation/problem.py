@@ -22,6 +22,8 @@ _RIDGE = 1e-9
 # Of friction that falls as a joint begins to slide, the least share that stays: what falls further
 # stands for a curve of another form.
 _LEAST_SLIDING = 0.3
+# Ranges of the motion by which a spring may rest outside of it: farther away, it is an offset.
+_BEYOND = 0.5
 # Numbers that what is not linear costs beside its coefficients: a speed, a period.
 _HIDDEN = {"stribeck_friction": 1, "cogging": 1}
 
@@ -64,6 +66,7 @@ class Problem:
     :param mass: some mass matrices, shape ``(n, dof, dof)``
     :param slopes: of these by inertial parameters, by key
     :param drives: share of each joint's actuator force by parameters, by key
+    :param rests: of springs, shares of their second column that are admissible
     :param always: items that belong to every set: what is refitted anyway
     """
 
@@ -78,6 +81,7 @@ class Problem:
     mass: np.ndarray
     slopes: dict[str, np.ndarray]
     drives: dict[str, np.ndarray]
+    rests: dict[int, tuple[float, float]]
     always: tuple[int, ...]
     total: np.ndarray
     cost: float
@@ -241,7 +245,11 @@ class Problem:
                 if not 0.0 <= value[c] <= 1.0:
                     return False
             elif item.rule == "blend":
-                if item.candidate.name != "cogging" and sum(value[c] for c in item.free) < 0.0:
+                one, two = (value[c] for c in item.free)
+                if item.candidate.name != "cogging" and one + two < 0.0:
+                    return False
+                low, high = self.rests.get(i, (-np.inf, np.inf))
+                if not low * (one + two) <= two <= high * (one + two):
                     return False
             elif all(c in found.held for c in item.free):
                 return False
@@ -360,6 +368,21 @@ class Problem:
         return np.sqrt(total)
 
 
+def _rests(equation: Equation, items: Sequence[Item]) -> dict[int, tuple[float, float]]:
+    """Of springs, between which shares of both columns one rests near where the joint moves."""
+    found = {}
+    for number, item in enumerate(items):
+        if item.candidate.name != "stiffness" or item.rule != "blend":
+            continue
+        q = equation.q[:, item.candidate.index]
+        beyond = _BEYOND * float(np.ptp(q))
+        first, second = (at["q0"] for at in item.settings)
+        ends = (float(q.min()) - beyond, float(q.max()) + beyond)
+        low, high = ((end - first) / (second - first) for end in ends)
+        found[number] = (low, high)
+    return found
+
+
 def problem(hypotheses: Hypotheses, equation: Equation, made: Grams) -> Problem:
     """:param made: normal equations of the equation"""
     items, n = tuple(equation.items), len(equation.columns)
@@ -397,6 +420,7 @@ def problem(hypotheses: Hypotheses, equation: Equation, made: Grams) -> Problem:
         mass=equation.mass[some],
         slopes={key: slope[some] for key, slope in equation.slopes.items()},
         drives=equation.drives,
+        rests=_rests(equation, items),
         always=tuple(always),
         total=total,
         cost=float(np.log(made.effective.mean())),
