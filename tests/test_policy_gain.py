@@ -158,7 +158,6 @@ def test_a_truth_that_is_known_is_the_ceiling_and_what_was_made_here_is_closed_h
         (ROBOT, {"budget": -1}, TrajectoryError, "at least"),
         (ROBOT, {"of": "LinearAxis"}, TrajectoryError, "no episode length"),
     ],
-    ids=str,
 )
 def test_what_cannot_be_compared_is_refused(real, changes, error, message):
     changes = {"of": "PendulumReal"} | changes
