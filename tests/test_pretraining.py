@@ -6,7 +6,6 @@ import threading
 import time
 
 import gymnasium
-import jax
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control import PendulumEnv
@@ -116,7 +115,6 @@ def test_a_limit_of_time_acts_while_programs_compile(monkeypatch):
 
 
 def test_an_interrupt_acts_while_programs_compile(monkeypatch):
-    jax.clear_caches()
     slow_programs(monkeypatch)
     model, begin = small("hds"), time.monotonic()
     threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start()
