@@ -377,8 +377,9 @@ def test_what_comes_nearest_is_no_cause_where_a_nameless_force_predicts_better()
     found = asked(data, pushed, effects=[effects.Stiffness, effects.CoulombFriction])
 
     assert found.verdict == "unknown", found
-    beaten = " and ".join(sorted(r.name for r in found.rejected if r.why == NAMELESS))
-    assert f"better than {beaten}: hysteresis.hinge (tau_c = 0.03" in found.unexplained
+    beaten = [r.name for r in found.rejected if r.why == NAMELESS]
+    assert beaten and all(name in found.unexplained for name in beaten)
+    assert "hysteresis.hinge (tau_c = 0.03" in found.unexplained
 
 
 @pytest.mark.expensive

@@ -11,6 +11,7 @@ from sb3_hds.core import AnalyticTwin, Effect, Trajectories, Twin
 from sb3_hds.core.layers import plant_of
 from sb3_hds.data import Audit, audit
 from sb3_hds.data.findings import BackwardDifference, Glitches, Outliers
+from sb3_hds.effects import NAMELESS as NAMELESS_EFFECTS
 from sb3_hds.sysid.account import (
     by_horizon,
     detectable,
@@ -40,7 +41,7 @@ from sb3_hds.sysid.remainder import (
     weighed,
 )
 from sb3_hds.sysid.screening import SMALL_MACHINE, Screened, screen
-from sb3_hds.sysid.search import Base, Effort, Half, Search, Tried
+from sb3_hds.sysid.search import Base, Effort, Half, Search, Tried, as_good
 from sb3_hds.sysid.several import confirmed_set, proposed_set
 from sb3_hds.sysid.shooting import Shots, evenly, shots_of
 from sb3_hds.sysid.sizes import sized
@@ -292,7 +293,7 @@ class Inquiry:
         start, whole = map(self.search.again, (start, whole))
         self.bar.stage("confirming causes")
         found, base = confirmed_set(self.search, screened, start, whole)
-        if len(found) < 2:
+        if len(found) < 2 or self._outdone_by_a_candidate(start, base):
             return None
         self.bar.stage("what is left")
         before, left = self._left(start), self._left(base)
@@ -300,15 +301,26 @@ class Inquiry:
             return None
         nearest = ""
         naming = Naming(self.search, start, self.seed, family=self._family())
+        confirmed = found
         found, base, force = naming.outdone(found, base)
         if force is not None:
             left, nearest = self._left(base), nameless_in_words(*force, self.hypotheses)
+        beaten = [(c.tried.candidate, c.verdict) for c in confirmed if c not in found]
         self._set_noise(base.point)
         start, base = map(self.search.again, (start, base))
         if stuck := self._stuck(base):
             found, base, left, nearest = [], start, before, stuck
         self.turned_down = naming.turned_down | {key: SMALL for key in screened.hints}
-        return self._told(found, [], start, base, before, left, nearest)
+        return self._told(found, beaten, start, base, before, left, nearest)
+
+    def _outdone_by_a_candidate(self, start: Base, base: Base) -> bool:
+        """Whether a force without a name that somebody asked for does better than the set."""
+        names = {kind.name for kind in NAMELESS_EFFECTS}
+        asked = [c for c in self.hypotheses.candidates if c.name in names]
+        return any(
+            t.point.cost < base.point.cost and not as_good(self.search.better(t.kept, base.kept))
+            for t in (self.search.finished(asked, start) if asked else [])
+        )
 
     def _weighed(self, firsts: Sequence[Tried], start: Base) -> list[tuple[Candidate, Comparison]]:
         """:return: every candidate alone, on the half that confirms"""
