@@ -804,5 +804,5 @@ def test_several_causes_are_told_as_those_of_a_machine():
     assert "and pan has viscous and Coulomb friction (it carries 50 % of the torque)" in told
     doubtful = finding("stiffness", "lift", 3.0, "N m/rad", others=("cogging.lift",))
     assert several_in_words([*dry, doubtful], joints).endswith(
-        "The data cannot tell stiffness or cogging at lift."
+        "The data cannot tell stiffness at lift from cogging at lift."
     )

@@ -6,8 +6,11 @@ import pytest
 
 from sb3_hds import Trajectories, effects, twins
 from sb3_hds.sysid.conventions import other_convention
+from sb3_hds.sysid.equation.columns import equation
 from sb3_hds.sysid.equation.motion import kinematics, motion
 from sb3_hds.sysid.equation.smoothing import smooth, white_noise
+from sb3_hds.sysid.equation.weak_form import weak_rows
+from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.leapfrog import in_step_with_the_log
 from sb3_hds.sysid.screening import screen
 
@@ -19,10 +22,10 @@ def proposed(twin, data, calibrate=()):
     return {m.key: m.sizes for m in found.members}
 
 
-def rubbing_axis(length=1.0, time=1.0, force=1.0, cut=None):
+def rubbing_axis(length=1.0, time=1.0, force=1.0, cut=None, noise=1.0, pull=lambda q, v: -3.0 * v):
     """
-    A mass of 2 kg with viscous and dry friction, stepped finely; in other units of length, time and
-    force, or with recordings cut at another place.
+    A mass of 2 kg with dry and viscous friction (or another force), stepped finely; in other units
+    of length, time and force, or with recordings cut at another place.
     """
     rng, fine, n, every = np.random.default_rng(1), 1e-4, 60_000, 100
     obs, actions = [], []
@@ -34,11 +37,12 @@ def rubbing_axis(length=1.0, time=1.0, force=1.0, cut=None):
         for k in range(n):
             if k % every == 0:
                 rows.append((q, v))
-            push = u[k // every] - 3.0 * v
+            push = u[k // every] + pull(q, v)
             slide = v + fine * push / 2.0
             v = np.sign(slide) * max(abs(slide) - fine * 1.5 / 2.0, 0.0)
             q += fine * v
-        rows = np.array([*rows, (q, v)]) + rng.standard_normal((n // every + 1, 2)) * [1e-4, 2e-3]
+        errors = noise * rng.standard_normal((n // every + 1, 2)) * [1e-4, 2e-3]
+        rows = np.array([*rows, (q, v)]) + errors
         obs.append(rows * [length, length / time])
         actions.append(force * u[:, None])
     if cut:
@@ -72,6 +76,49 @@ def test_the_same_data_in_other_units_give_the_same_causes(as_it_is, units):
     per_speed = force * time / length
     assert found["viscous_friction.axis"]["b"] == pytest.approx(3.0 * per_speed, rel=0.03)
     assert found["coulomb_friction.axis"]["tau_c"] == pytest.approx(1.5 * force, rel=0.03)
+
+
+def screened(**changes):
+    twin, data = rubbing_axis(**changes)
+    return screen(twin, motion(twin, data), effects.ALL, ())
+
+
+def test_bumps_are_wide_where_velocities_are_noisy_and_narrow_where_something_else_is_left():
+    def narrowed(unknown, noise):
+        pull = lambda q, v: -3.0 * v + unknown * np.sin(6.0 * q)  # noqa: E731
+        twin, data = rubbing_axis(noise=noise, pull=pull)
+        known = Hypotheses.about(twin, (effects.ViscousFriction, effects.CoulombFriction), ())
+        [rows] = weak_rows(equation(known, motion(twin, data)))
+        return rows.narrowed
+
+    assert narrowed(unknown=0.0, noise=1.0) == 1.0
+    assert narrowed(unknown=2.0, noise=0.01) > 7.0
+
+
+def test_a_spring_that_rests_far_from_where_the_axis_moves_is_an_offset():
+    found = screened(pull=lambda q, v: -3.0 * v - 0.2 * (q - 10.0))
+
+    assert "constant_force.axis" in {m.key for m in found.members}
+    assert "stiffness.axis" not in {m.key for m in found.members}
+
+
+def test_friction_that_grows_ever_slower_does_not_fall_to_nothing():
+    found = screened(pull=lambda q, v: -4.0 * np.sign(v) * np.sqrt(abs(v)))
+
+    assert found.members
+    assert "stribeck_friction.axis" not in {m.key for m in found.members}
+
+
+def test_members_of_a_set_have_other_sizes_where_one_of_them_is_left_out():
+    both = screened()
+    [alone] = both.among({"viscous_friction.axis"}).members
+
+    assert {m.key for m in both.members} == {"viscous_friction.axis", "coulomb_friction.axis"}
+    assert alone.sizes["b"] > 3.5
+    name = "viscous_friction.axis.b"
+    assert both.sizes_of({alone.key}) == {name: pytest.approx(alone.sizes["b"])}
+    value, low, high = both.intervals_of(both.members[0])[name]
+    assert low < value == both.members[0].sizes["b"] < high
 
 
 @pytest.mark.parametrize("believed, calibrate", [(5.0, []), (8.0, ["mass"])])

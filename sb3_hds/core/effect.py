@@ -70,7 +70,8 @@ class JointMoment(NamedTuple):
     :param v: velocity [rad/s] or [m/s]
     :param actuator: force of the actuators on this joint [N m] or [N]
     :param load: force that gravity and inertia take at this joint [N m] or [N]
-    :param inertia: what a force at this joint accelerates, ``1 / (M^-1)_jj`` [kg m2] or [kg]
+    :param inertia: what a force at this joint accelerates, ``1 / (M^-1)_jj`` [kg m2] or [kg]; a
+        constant to derivatives, as it only bounds what a sub-step may do
     :param h: length of the sub-step [s]
     """
 
@@ -505,7 +506,6 @@ NO_EFFECTS = EffectChain((), {})
 def at_joint(moment: Moment, index: int) -> JointMoment:
     """:return: the view of joint ``index``"""
     unit = jnp.zeros_like(moment.v).at[index].set(1.0)
-    # It bounds what a step may do: no number to differentiate by.
     matrix = jax.lax.stop_gradient(moment.mass_matrix)
     inertia = 1.0 / solve_spd(matrix, unit)[index]
     return JointMoment(

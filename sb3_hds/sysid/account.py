@@ -10,13 +10,10 @@ from sb3_hds.sysid.diagnosis import HorizonGain
 from sb3_hds.sysid.evidence import Point
 from sb3_hds.sysid.pictures import Pictures, replay_of
 from sb3_hds.sysid.remainder import MissingForce
-from sb3_hds.sysid.search import LEAST_GAIN, Half
+from sb3_hds.sysid.search import LEAST_GAIN, NOT_FINITE, Half
 
 # Directions below this share of the largest curvature do not move.
 _RANK = 1e-10
-
-# Square of an error, in units of the noise, of a simulation that has run away.
-_RUN_AWAY = 1e8
 
 
 def standard_errors(half: Half, point: Point, free: Sequence[int]) -> Float[np.ndarray, " p"]:
@@ -89,7 +86,7 @@ def by_horizon(half: Half, before: Point, after: Point, every: int) -> dict[int,
 
 def _bounded(errors: np.ndarray) -> np.ndarray:
     """What has run away counts as far off."""
-    return np.nan_to_num(np.minimum(errors, _RUN_AWAY), nan=_RUN_AWAY)
+    return np.nan_to_num(np.minimum(errors, NOT_FINITE), nan=NOT_FINITE)
 
 
 def pictures_of(

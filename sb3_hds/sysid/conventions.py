@@ -72,9 +72,10 @@ def other_convention(twin: Twin, motion: Motion, nuisances: Sequence[str]) -> Co
     if np.all(now < _FINE):
         return None
     changes = list(_changes(twin, motion))
-    few = _fewer(motion, _FEW_ROWS)
-    likely = _by_gain(hypotheses, few, changes, *_left(hypotheses, few))[:_LIKELIEST]
-    ranked = _by_gain(hypotheses, motion, [change for _, change, _ in likely], weight, now)
+    if (few := _fewer(motion, _FEW_ROWS)) is not motion:
+        likely = _by_gain(hypotheses, few, changes, *_left(hypotheses, few))[:_LIKELIEST]
+        changes = [change for _, change, _ in likely]
+    ranked = _by_gain(hypotheses, motion, changes, weight, now)
     if not ranked:
         return None
     gain, change, then = ranked[0]

@@ -19,8 +19,9 @@ from sb3_hds.sysid.units import sizes_in_words, with_unit
 Verdict = Literal["named", "ambiguous", "none", "unknown", "not_identifiable"]
 
 _WIDTH = 80
-# Causes beyond which they are told as those of a machine, and in a table.
-_MANY, _TABLE = 2, 3
+# Causes beyond which they are told as those of a machine, and one that the data cannot tell from
+# others leaves the others named; and beyond which they are in a table.
+MANY, _TABLE = 2, 3
 # Candidates whose smallest sizes are printed; all are in the report.
 _MOST_SHOWN = 12
 # Rejected candidates that get a line of their own.
@@ -171,7 +172,7 @@ class Diagnosis:
     @property
     def sentence(self) -> str:
         """The verdict in one sentence."""
-        if self.verdict in ("named", "ambiguous") and len(self.findings) > _MANY:
+        if self.verdict in ("named", "ambiguous") and len(self.findings) > MANY:
             return several_in_words(self.findings, [j.name for j in self.believed.joints])
         if self.verdict == "ambiguous":
             first, *others = self.findings

@@ -4,7 +4,7 @@ import numpy as np
 
 from sb3_hds.core import Twin
 from sb3_hds.sysid.equation.motion import Motion
-from sb3_hds.sysid.equation.terms import side_by_side
+from sb3_hds.sysid.equation.terms import terms
 
 # Rows at which the twin is linearised, and finite differences in shares of the motion.
 _SOME, _STEP = 64, 1e-5
@@ -15,7 +15,8 @@ def divergence_rate(twin: Twin, motion: Motion) -> float:
     :param twin: at the interval of the data
     :param motion: of the joints
     :return: greatest rate [1/s] at which a small change of the state grows along the recordings,
-        from eigenvalues of the linearised step; zero where none grows
+        from eigenvalues of the linearised step, in which positions follow the new velocities;
+        zero where none grows
     """
     twin, dt, dof = motion.twin(twin), motion.dt, len(motion.period)
     parts = [(r.q[:-1], r.v[:-1], r.actions) for r in motion.recordings]
@@ -26,7 +27,8 @@ def divergence_rate(twin: Twin, motion: Motion) -> float:
     moved = [np.zeros(2 * dof), *steps]
     states = np.concatenate([np.concatenate([q, v], 1) + step for step in moved])
     commands = np.tile(u, (len(moved), 1))
-    pushed = side_by_side(twin, twin.params, states[:, :dof], states[:, dof:], commands).change
+    q, v = states[:, :dof], states[:, dof:]
+    pushed = terms(twin, twin.params, q, v, commands, recorded=False).change
     pushed = pushed.reshape(len(moved), len(u), dof)
     by_state = (pushed[1:] - pushed[0]) / np.diag(steps)[:, None, None]
     faster = np.concatenate([np.zeros((dof, dof)), np.eye(dof)], 1) + by_state.transpose(1, 2, 0)

@@ -22,7 +22,7 @@ from sb3_hds.sysid.calibrate import spread_of
 from sb3_hds.sysid.comparison import Comparison, split
 from sb3_hds.sysid.constancy import Change, change
 from sb3_hds.sysid.conventions import Convention, other_convention
-from sb3_hds.sysid.diagnosis import Diagnosis, Rejected
+from sb3_hds.sysid.diagnosis import MANY, Diagnosis, Rejected
 from sb3_hds.sysid.divergence import divergence_rate
 from sb3_hds.sysid.equation.motion import Motion, motion
 from sb3_hds.sysid.evidence import Evidence, Point, portion_for
@@ -93,8 +93,6 @@ _OF_IRRELEVANT = 0.18
 _WORST = 10.0
 # Noise before it is known, in the same units.
 _FIRST_NOISE = 0.05
-# Causes beyond which one that the data cannot tell from others leaves the others named.
-_FEW_CAUSES = 2
 # Parameters that a cause has at most, and fewer units of evidence than these cannot say anything.
 _WIDEST, _FEWEST_UNITS = 3, 6
 
@@ -319,7 +317,7 @@ class Inquiry:
         asked = [c for c in self.hypotheses.candidates if c.name in names]
         return any(
             t.point.cost < base.point.cost and not as_good(self.search.better(t.kept, base.kept))
-            for t in (self.search.finished(asked, start) if asked else [])
+            for t in self.search.finished(asked, start)
         )
 
     def _weighed(self, firsts: Sequence[Tried], start: Base) -> list[tuple[Candidate, Comparison]]:
@@ -506,10 +504,8 @@ class Inquiry:
         unexplained = " ".join(filter(None, (nearest, remains)))
         verdict = "none"
         if findings:
-            doubtful = [bool(one.alternatives) for one in findings]
-            most = (
-                doubtful[0] if len(doubtful) <= _FEW_CAUSES else 2 * sum(doubtful) > len(doubtful)
-            )
+            open_ = sum(bool(one.alternatives) for one in findings)
+            most = 2 * open_ > len(findings) if len(findings) > MANY else findings[0].alternatives
             verdict = "ambiguous" if most else "named"
         elif unexplained:
             verdict = "unknown"

@@ -1,6 +1,6 @@
 """Which causes are worth a simulation: sets of them, and single ones, by equation errors."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -48,18 +48,15 @@ class Screened(NamedTuple):
     keys: frozenset[str]
     nameless_at: tuple[str, ...]
 
-    @property
-    def sizes(self) -> dict[str, float]:
-        """Values of the members' parameters by full name."""
-        found = {}
-        for member in self.members:
-            found |= self._by_full_name(member, member.sizes)
-        return found
+    def among(self, keys: Collection[str]) -> "Screened":
+        """:return: the same with some members, solved and judged anew without the others"""
+        rest = [m.item for m in self.members if m.key in keys]
+        return self._replace(members=_members_of(self.hypotheses, self.problem, rest))
 
-    def sizes_of(self, rest: Sequence[Member]) -> dict[str, float]:
-        """:return: the same of some members, solved anew without the others"""
-        p, keys = self.problem, [*self.problem.always, *(m.item for m in rest)]
-        value, found = p.solve(keys).value, {}
+    def sizes_of(self, keys: Collection[str]) -> dict[str, float]:
+        """:return: values of the parameters of some members, by full name, solved without others"""
+        p, rest = self.problem, [m for m in self.members if m.key in keys]
+        value, found = p.solve([*p.always, *(m.item for m in rest)]).value, {}
         for member in rest:
             item = p.items[member.item]
             if set(item.free) <= value.keys():
@@ -146,8 +143,7 @@ def screen(
         return None
     p = problem(hypotheses, made, grams(made, weak_rows(made)))
     found = propose(p)
-    by_key = {c.key: hypotheses.effect_of(c) for c in hypotheses.candidates}
-    set_of = [m for m in members(p, found.keys, by_key) if m.item not in p.always]
+    set_of = _members_of(hypotheses, p, [i for i in found.keys if i not in p.always])
     left = what_is_left(p, found.keys)
     hints = tuple(p.items[i].key for i in found.hints)
     joints = [joint.name for joint in coarse.joints]
@@ -165,12 +161,18 @@ def screen(
         hypotheses=hypotheses,
         problem=p,
         motion=moved,
-        members=tuple(set_of),
+        members=set_of,
         hints=hints,
         left=tuple(left),
         keys=frozenset(keys),
         nameless_at=tuple(where),
     )
+
+
+def _members_of(h: Hypotheses, p: Problem, items: Sequence[int]) -> tuple[Member, ...]:
+    effects = {c.key: h.effect_of(c) for c in h.candidates}
+    found = members(p, [*p.always, *items], effects)
+    return tuple(m for m in found if m.item not in p.always)
 
 
 def _singles(p: Problem) -> list[str]:

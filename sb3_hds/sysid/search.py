@@ -24,7 +24,7 @@ _MOST_LOOKS, _MOST_FIRSTS = 3, 4
 # Errors that differ by a smaller share are the same, however surely they differ.
 _SAME = 0.01
 # Mean square error of a window that cannot be simulated, in units of the noise.
-_NOT_FINITE = 1e8
+NOT_FINITE = 1e8
 # Steps of fits to the end, and of start states alone: to the end, and for a rough comparison.
 _ALL_STEPS, _KEPT_STEPS, _ROUGH_STEPS = 25, 6, 1
 
@@ -47,7 +47,7 @@ class Half(NamedTuple):
         """:return: mean square of each window, with what is irrelevant added"""
         noise = self.evidence.noise
         errors = np.mean((point.raw / noise) ** 2, (1, 2))
-        errors = np.nan_to_num(errors, nan=_NOT_FINITE, posinf=_NOT_FINITE)
+        errors = np.nan_to_num(errors, nan=NOT_FINITE, posinf=NOT_FINITE)
         return errors + float(np.mean((self.irrelevant / noise) ** 2))
 
     def total(self, point: Point) -> float:
@@ -161,12 +161,15 @@ class Search:
         own = self.hypotheses.indices(tried.candidate)
         return Base(tried.point, tried.kept, (*base.free, *own))
 
-    def without(self, candidate: Candidate, base: Base) -> Base:
-        """:return: what is believed, but for this candidate; the rest refitted"""
+    def without(self, candidate: Candidate, base: Base, near: Base | None = None) -> Base:
+        """
+        :param near: from whose start states to begin; default: as measured
+        :return: what is believed, but for this candidate; the rest refitted
+        """
         own = self.hypotheses.indices(candidate)
         theta = base.point.theta.copy()
         theta[list(own)] = self.hypotheses.null[list(own)]
-        return self.base(theta, [i for i in base.free if i not in own])
+        return self.base(theta, [i for i in base.free if i not in own], near)
 
     def again(self, base: Base) -> Base:
         """:return: the same belief, fitted under the noise that is known now"""

@@ -47,7 +47,7 @@ def several_in_words(findings: Sequence[Found], joints: Sequence[str]) -> str:
         one on what the data cannot tell from other causes
     """
     doubt = [
-        f"{_name(f)} or {' or '.join(map(spoken, f.alternatives))}"
+        f"{spoken(f.key)} from {' or '.join(map(spoken, f.alternatives))}"
         for f in findings
         if f.alternatives
     ]
@@ -77,10 +77,6 @@ def _of_machine(findings: Sequence[Found], joints: Sequence[str]) -> str:
         return f"{besides[:1].upper()}{besides[1:]}."
     head = f"{head[:1].upper()}{head[1:]}"
     return f"{head}; {besides} besides." if rest else f"{head}."
-
-
-def _name(finding: Found) -> str:
-    return spoken(finding.key).rsplit(" at ", 1)[0]
 
 
 def _is(finding: Found, effect: str, joint: str) -> bool:

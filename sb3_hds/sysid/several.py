@@ -10,7 +10,7 @@ from sb3_hds.sysid.equation.selection import Member
 from sb3_hds.sysid.evidence import Point
 from sb3_hds.sysid.hypotheses import Candidate, encoders
 from sb3_hds.sysid.screening import Screened
-from sb3_hds.sysid.search import LEAST_GAIN, Base, Half, Search, Tried, as_good, passes
+from sb3_hds.sysid.search import LEAST_GAIN, NOT_FINITE, Base, Half, Search, Tried, as_good, passes
 from sb3_hds.sysid.telling import Accepted
 
 # Level at which each member has to be missed by held-out recordings when it is left out.
@@ -28,7 +28,7 @@ def proposed_set(search: Search, screened: Screened, start: Base) -> Base:
         small set, refitted
     """
     h, members = search.hypotheses, _members(search, screened)
-    theta = _with_sizes(search, start.point.theta, screened.sizes)
+    theta = _with_sizes(search, start.point.theta, screened.sizes_of(members))
     own = [i for candidate, _ in members.values() for i in h.indices(candidate)]
     refitted = [] if len(members) > _MANY else [i for i in own if i not in start.free]
     return search.base(theta, (*start.free, *refitted))
@@ -49,9 +49,9 @@ def confirmed_set(
     verdicts, many = {}, len(members) > _MANY
     while members:
         lost = {
-            key: _in_equation(search, screened, base, members, key)
+            key: _in_equation(search, screened, start, base, members.keys() - {key})
             if many
-            else _without(search, candidate, base)
+            else search.without(candidate, base, near=base)
             for key, (candidate, _) in members.items()
         }
         verdicts = {
@@ -69,6 +69,9 @@ def confirmed_set(
         worst = weakest if weakest in weak else weak[0]
         members.pop(worst)
         base = lost[worst]
+    if len(members) < len(screened.members):
+        screened = screened.among(members)
+        members = _members(search, screened)
     p, every = screened.problem, [m.item for m in screened.members]
     carried = dict(zip(every, map(float, p.carried(every)), strict=True))
     found = [
@@ -85,24 +88,12 @@ def _members(search: Search, screened: Screened) -> dict[str, tuple[Candidate, M
     return {m.key: (known[m.key], m) for m in screened.members if m.key in known}
 
 
-def _without(search: Search, candidate: Candidate, base: Base) -> Base:
-    h = search.hypotheses
-    own = list(h.indices(candidate))
-    theta = base.point.theta.copy()
-    theta[own] = h.null[own]
-    return search.base(theta, [i for i in base.free if i not in own], near=base)
-
-
 def _in_equation(
-    search: Search, screened: Screened, base: Base, members: Collection[str], key: str
+    search: Search, screened: Screened, start: Base, base: Base, keys: Collection[str]
 ) -> Base:
-    """What is believed without a member, the others with their sizes in the equation of motion."""
-    h = search.hypotheses
-    rest = [m for m in screened.members if m.key in members and m.key != key]
-    theta = base.point.theta.copy()
-    own = list(h.indices(next(c for c in h.candidates if c.key == key)))
-    theta[own] = h.null[own]
-    return search.base(_with_sizes(search, theta, screened.sizes_of(rest)), base.free, near=base)
+    """What is believed with these members only, with their sizes in the equation of motion."""
+    theta = _with_sizes(search, start.point.theta, screened.sizes_of(keys))
+    return search.base(theta, base.free, near=base)
 
 
 def _with_sizes(search: Search, theta: np.ndarray, sizes: Mapping[str, float]) -> np.ndarray:
@@ -125,7 +116,9 @@ def _accepted(
     known = {c.key: c for c in search.hypotheses.candidates}
     others = [k for k in member.others if k not in members]
     simulated = [known[k] for k in others if k in known]
-    tried = search.finished(simulated, _without(search, candidate, base)) if simulated else []
+    tried = (
+        search.finished(simulated, search.without(candidate, base, near=base)) if simulated else []
+    )
     worse = {t.candidate.key for t in tried if not as_good(search.better(base.kept, t.kept))}
     equal = [k for k in others if k not in worse]
     chance = float(stats.t.sf(member.t, _FREEDOM)) * len(known)
@@ -155,4 +148,4 @@ def _errors(half: Half, point: Point, channels: Sequence[int]) -> np.ndarray:
     noise = half.evidence.noise[list(channels)]
     errors = np.mean((point.raw[..., list(channels)] / noise) ** 2, (1, 2))
     floor = float(np.mean((half.irrelevant[list(channels)] / noise) ** 2))
-    return np.nan_to_num(errors, nan=1e8, posinf=1e8) + floor
+    return np.nan_to_num(errors, nan=NOT_FINITE, posinf=NOT_FINITE) + floor

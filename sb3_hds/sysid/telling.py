@@ -62,13 +62,14 @@ def finding(
     """
     h, theta = half.evidence.hypotheses, point.theta
     stderr = standard_errors(half, point, free)
-    reach = margin(len(np.unique(half.unit)), stderr)
+    unit = margin(len(np.unique(half.unit)), np.ones(()))
+    reach = unit * stderr
     candidate, parameters = one.tried.candidate, {}
     shorts = [name.rpartition(".")[2] for name in candidate.parameters]
     for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
         if name in one.sizes:
             estimate, low, high = one.sizes[name]
-            error = float((high - low) / (2.0 * stats.norm.ppf(0.5 + 0.5 * _CONFIDENCE)))
+            error = float((high - low) / (2.0 * unit))
         else:
             low, high = _interval(half, point, free, i, float(reach[i]), profiles)
             estimate, error = float(theta[i]), float(stderr[i])

@@ -94,18 +94,18 @@ class Problem:
         candidate = self.items[i].candidate
         return candidate.slot, candidate.index
 
-    @cached_property
-    def families(self) -> tuple[tuple, ...]:
+    def family(self, i: int) -> tuple:
         """Of items with an equal family, a set has one at most."""
+        return self._families[i]
+
+    @cached_property
+    def _families(self) -> tuple[tuple, ...]:
         return tuple(
             (item.key,)
             if item.candidate.slot == PARAMETER
             else (plausibility(item.candidate.name).family, *self.place(i))
             for i, item in enumerate(self.items)
         )
-
-    def family(self, i: int) -> tuple:
-        return self.families[i]
 
     def clashes(self, keys: Sequence[int]) -> bool:
         families = [self.family(i) for i in keys]

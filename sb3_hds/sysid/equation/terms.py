@@ -14,7 +14,7 @@ from sb3_hds.core.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.layers import plant_of
 
 # Rows that are evaluated at a time: programs are compiled for one shape.
-ROWS = 1024
+_ROWS = 1024
 
 
 class Terms(NamedTuple):
@@ -39,6 +39,7 @@ def terms(
     q: Float[np.ndarray, "n dof"],
     v: Float[np.ndarray, "n dof"],
     actions: Float[np.ndarray, "n act"],
+    recorded: bool = True,
 ) -> Terms:
     """
     :param twin: whose interval is that of the rows; what it remembers is filled from the first row
@@ -46,26 +47,14 @@ def terms(
     :param q: positions where intervals begin
     :param v: velocities there
     :param actions: held over each interval
+    :param recorded: whether rows follow one another, so that a twin may remember the ones before
     """
-    if not _remembers(twin):
-        return side_by_side(twin, params, q, v, actions)
-    with jax.enable_x64(True):
-        params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), dict(params))
-        given = (jnp.asarray(x, jnp.float64) for x in (q, v, actions))
-        return Terms(*map(np.asarray, _one_after_the_other(twin, params, *given)))
-
-
-def side_by_side(
-    twin: Twin,
-    params: Params,
-    q: Float[np.ndarray, "n dof"],
-    v: Float[np.ndarray, "n dof"],
-    actions: Float[np.ndarray, "n act"],
-) -> Terms:
-    """The same where nothing is remembered from row to row."""
     parts = []
     with jax.enable_x64(True):
         params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), dict(params))
+        if recorded and _remembers(twin):
+            given = (jnp.asarray(x, jnp.float64) for x in (q, v, actions))
+            return Terms(*map(np.asarray, _one_after_the_other(twin, params, *given)))
         for index, n in portions(len(q)):
             given = (jnp.asarray(x[index], jnp.float64) for x in (q, v, actions))
             found = _side_by_side(twin, params, *given)
@@ -75,8 +64,8 @@ def side_by_side(
 
 def portions(n: int) -> Iterator[tuple[np.ndarray, int]]:
     """:return: rows, always as many at a time, the last one repeated; and how many of them count"""
-    for first in range(0, n, ROWS):
-        yield np.minimum(np.arange(first, first + ROWS), n - 1), min(ROWS, n - first)
+    for first in range(0, n, _ROWS):
+        yield np.minimum(np.arange(first, first + _ROWS), n - 1), min(_ROWS, n - first)
 
 
 def forces(

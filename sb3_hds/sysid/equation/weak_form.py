@@ -95,31 +95,32 @@ def _joint(equation: Equation, j: int) -> Rows:
     halves = [max(round(widest / 2**k), 2) for k in range(_NARROWEST)]
     halves = [n for n in halves if n >= _LEAST // 2] or halves[:1]
     mass = float(np.median(equation.mass[:, j, j]))
-    made: Rows | None = None
-    for half, masked in [*((n, True) for n in halves), (halves[0], False)]:
-        projected, pieces = _against_bumps(table, equation.recording, still & masked, half)
-        enough = len(projected) > _ENOUGH * len(rich)
-        if not len(projected) or (made is not None and not enough):
-            continue
+
+    def against(half: int, left_out: np.ndarray) -> Rows:
+        projected, pieces = _against_bumps(table, equation.recording, left_out, half)
         y, x = projected[:, 0], projected[:, 1:]
-        weight, scale = _huber(y, x[:, rich])
+        weight, scale = _huber(y, x[:, rich]) if len(y) else (y, 1.0)
         slope = np.linalg.norm(np.diff(_bump(half), prepend=0.0, append=0.0))
-        made = Rows(
+        return Rows(
             weight * y / scale,
             weight[:, None] * x / scale,
             used,
             _blocks(pieces, equation.recording),
             scale,
-            float(mass * motion.noise_v[j] * slope / motion.dt / scale),
+            float(mass * motion.noise_v[j] * slope / motion.dt / scale) if len(y) else 0.0,
             float(_bump(half).sum()),
             halves[0] / half,
         )
-        if enough and made.floor > (_AVERAGED if made.narrowed < _NARROW else _NO_NOISE):
+
+    made: Rows | None = None
+    for half in halves:
+        rows = against(half, still)
+        if len(rows.y) <= _ENOUGH * len(rich):
+            continue
+        made = rows
+        if rows.floor > (_AVERAGED if rows.narrowed < _NARROW else _NO_NOISE):
             break
-    if made is None:
-        empty = np.zeros(0)
-        return Rows(empty, np.zeros((0, len(used))), used, np.zeros(0, int), 1.0, 0.0, 1.0, 1.0)
-    return made
+    return against(halves[0], np.zeros_like(still)) if made is None else made
 
 
 def _at_rest(equation: Equation, j: int) -> np.ndarray:
