@@ -23,13 +23,8 @@ from sb3_hds.algos.windows import (
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.errors import CalibrationError, TrajectoryError
 from sb3_hds.sysid import Fit
-from sb3_hds.sysid.calibrate import (
-    check_fits,
-    every_name,
-    fit_windows,
-    free_names,
-    spread_of,
-)
+from sb3_hds.sysid.calibrate import check_fits, fit_windows, spread_of
+from sb3_hds.sysid.free import each, every_name, free_names
 from sb3_hds.sysid.prediction import (
     gain,
     is_better,
@@ -261,7 +256,7 @@ def _calibrated(
     try:
         return fit_windows(
             start,
-            wishes.names,
+            each(wishes.names),
             windows.learned,
             windows.origin,
             windows.spread,

@@ -23,6 +23,22 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="parameters to estimate, or patterns in quotes, '*_damping'; default: all of the twin",
     )
     command.add_argument(
+        "--effects",
+        nargs="*",
+        default=[],
+        metavar="NAME[.PLACE]",
+        help="of 'sb3-hds effects' that the twin is extended by first, at every place or at one: "
+        "action_delay, coulomb_friction.hinge",
+    )
+    command.add_argument(
+        "--tied",
+        nargs="*",
+        default=[],
+        metavar="PATTERN",
+        help="parameters that take one value, as of joints of a kind: '*_hip_joint_damping' "
+        "'action_delay.*.delay'",
+    )
+    command.add_argument(
         "--errors",
         choices=("simulation", "force"),
         default="simulation",
@@ -50,12 +66,15 @@ def run(given: argparse.Namespace) -> None:
     from sb3_hds.data import audit
     from sb3_hds.errors import TrajectoryError
     from sb3_hds.sysid import calibrate
-    from sb3_hds.sysid.calibrate import check_fits, free_names
+    from sb3_hds.sysid.calibrate import check_fits
+    from sb3_hds.sysid.free import free_names
 
     for target in filter(None, (given.json, given.write)):
         check_target(target)
     measured.check_write(given)
     twin, data = measured.question(given)
+    twin = _extended(twin, names(given.effects))
+    tied = {pattern: _spelt_out([pattern], twin) for pattern in names(given.tied)}
     free = free_names(twin, _spelt_out(names(given.free), twin) or None)
     check_fits(twin, data)
     found, caveats = audit(data, twin=twin), []
@@ -70,6 +89,7 @@ def run(given: argparse.Namespace) -> None:
         twin,
         data,
         free=free,
+        tied=tied,
         prior=given.prior,
         level=given.level,
         errors=given.errors,
@@ -82,6 +102,20 @@ def run(given: argparse.Namespace) -> None:
     if given.json:
         measured.write_json(given.json, fit.to_dict() | spec | {"data_caveats": caveats})
     measured.write_twin(given, fit.twin)
+
+
+def _extended(twin: "Twin", wanted: Sequence[str]) -> "Twin":
+    """With effects at the places that are named, or at all."""
+    from sb3_hds.effects import ALL, effect_named
+
+    places = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}
+    found = []
+    for word in wanted:
+        name, _, place = word.partition(".")
+        kind = effect_named(name, ALL)
+        at = [place] if place else [each.name for each in places[kind.slot]]
+        found += [kind(where) for where in at]
+    return twin.extend(*found) if found else twin
 
 
 def _spelt_out(patterns: Sequence[str], twin: "Twin") -> list[str]:

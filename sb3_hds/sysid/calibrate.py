@@ -1,7 +1,7 @@
 """Estimate the parameters of a twin from measured data."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import NamedTuple
 
@@ -14,13 +14,13 @@ from sb3_hds.core import Params, Trajectories, Twin
 from sb3_hds.core.contract import check_methods
 from sb3_hds.core.episodes import same_interval
 from sb3_hds.data.report import Reading
-from sb3_hds.effects import force_of
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.bounds import Bounds, bounds_of
 from sb3_hds.sysid.covariance import Spread, covariance_of
+from sb3_hds.sysid.free import Free, free_names, tie
 from sb3_hds.sysid.inverse_dynamics import Forces, by_inverse_dynamics
 from sb3_hds.sysid.motion import first_offsets
-from sb3_hds.sysid.projection import Errors, Solution, evaluate, solve
+from sb3_hds.sysid.projection import Errors, Groups, Solution, evaluate, one_each, solve
 from sb3_hds.sysid.results import Estimate, Fit
 from sb3_hds.sysid.shooting import Shots, n_free, shots_of
 
@@ -41,6 +41,7 @@ def calibrate(
     data: Trajectories,
     *,
     free: Iterable[str] | None = None,
+    tied: Mapping[str, Iterable[str]] | None = None,
     window: int | None = None,
     errors: str = "simulation",
     loss: str = "huber",
@@ -65,6 +66,8 @@ def calibrate(
     :param twin: whose values are where the search begins, and stay where they are not ``free``
     :param data: measured trajectories, sampled at the twin's ``dt``
     :param free: names of the parameters to estimate; default: all but ``twin.known_parameters``
+    :param tied: free parameters that take one value, such as those of joints of a kind, by a name
+        for it: ``{"hip_damping": ["left_hip_damping", "right_hip_damping"]}``
     :param window: steps per window; default: half a second, between 5 and 50 steps, and not longer
         than the longest recording
     :param errors: that are made small: ``"simulation"``, of the channels over a window; or
@@ -87,7 +90,7 @@ def calibrate(
     :raises TwinError: for a twin whose methods do not return what they have to
     """
     check_methods(twin)
-    names = free_names(twin, free)
+    wanted = tie(twin, free_names(twin, free), tied or {})
     check_fits(twin, data)
     if loss not in ("huber", "linear"):
         raise CalibrationError(f"loss must be 'huber' or 'linear', got {loss!r}.")
@@ -100,10 +103,10 @@ def calibrate(
     shots, origin = shots_of(data, window or default_window(data), twin, n_windows, seed)
     threshold = _HUBER if loss == "huber" else None
     if errors == "force":
-        return _fit_forces(twin, names, data, shots, origin, threshold, level)
+        return _fit_forces(twin, wanted, data, shots, origin, threshold, level)
     return fit_windows(
         twin,
-        names,
+        wanted,
         shots,
         origin,
         spread_of(data),
@@ -111,13 +114,13 @@ def calibrate(
         prior=prior,
         level=level,
         max_steps=max_steps,
-        elsewhere=lambda: by_inverse_dynamics(twin, names, data, threshold),
+        elsewhere=lambda: by_inverse_dynamics(twin, tuple(wanted.values()), data, threshold),
     )
 
 
 def fit_windows(
     twin: Twin,
-    names: tuple[str, ...],
+    free: Free,
     shots: Shots,
     origin: np.ndarray,
     spread: Float[np.ndarray, " obs"],
@@ -132,7 +135,7 @@ def fit_windows(
     """
     :func:`calibrate` on windows that were cut already.
 
-    :param names: of the free parameters
+    :param free: parameters, by the name of the value that they take
     :param shots: windows; those of weight zero do not count
     :param origin: recording of each window, shape ``(n,)``
     :param spread: of each channel over the data
@@ -142,13 +145,14 @@ def fit_windows(
         values miss a channel by more than it varies
     :raises CalibrationError: for fewer measurements than unknowns
     """
-    _check_enough(twin, names, shots)
+    groups = tuple(free.values())
+    _check_enough(twin, groups, shots)
     origin = np.where(shots.weight > 0.0, origin, -1)
     with jax.enable_x64(True):
-        values = np.array([twin.values[name] for name in names])
+        values = np.array([twin.values[group[0]] for group in groups])
         believed, noise = values if believed is None else believed, _FIRST_NOISE * spread
         fixed, shots = _doubles(twin.params), Shots(*map(jnp.asarray, shots))
-        look = partial(evaluate, twin, names, threshold, fixed, shots)
+        look = partial(evaluate, twin, groups, threshold, fixed, shots)
         begin = first_offsets(twin, np.asarray(shots.obs), twin.dt)
         at = look(values, jnp.asarray(begin), noise)
         before = np.asarray(at.raw)
@@ -158,36 +162,37 @@ def fit_windows(
             there = look(other.values, jnp.asarray(begin), noise)
             if np.sum(np.asarray(there.bent) ** 2) < np.sum(np.asarray(at.bent) ** 2):
                 values, at = other.values, there
-        search = partial(solve, twin, names, threshold, max_steps, fixed)
+        search = partial(solve, twin, groups, threshold, max_steps, fixed)
         for _ in range(_PASSES):
-            begin = bounds_of([twin.parameters[name] for name in names]).inside(values)
+            begin = bounds_of([twin.parameters[group[0]] for group in groups]).inside(values)
             found = search(begin, shots, noise, at.offsets, believed, prior)
             values = np.asarray(found.values)
             at = look(values, at.offsets, noise)
-            noise = _noise(at.raw, shots, len(names), n_free(twin), spread)
+            noise = _noise(at.raw, shots, len(free), n_free(twin), spread)
         errors = jax.tree.map(np.asarray, look(values, at.offsets, noise))
-    return _fit(twin, names, errors, before, origin, values, noise, found, level, prior)
+    return _fit(twin, free, errors, before, origin, values, noise, found, level, prior)
 
 
 def _fit_forces(
     twin: Twin,
-    names: tuple[str, ...],
+    free: Free,
     data: Trajectories,
     shots: Shots,
     origin: np.ndarray,
     threshold: float | None,
     level: float,
 ) -> Fit:
-    found = by_inverse_dynamics(twin, names, data, threshold)
+    groups = tuple(free.values())
+    found = by_inverse_dynamics(twin, groups, data, threshold)
     if found is None:
         raise CalibrationError(
             f"errors='force' asks for the equation of motion of an AnalyticTwin, and {twin.name} "
             "has more than that, or none. Calibrate the twin without effects, or leave errors out."
         )
     errors, slopes, recording = found.windows(shots.actions.shape[1])
-    bounds = bounds_of([twin.parameters[name] for name in names])
+    bounds = bounds_of([twin.parameters[group[0]] for group in groups])
     spread = covariance_of(errors, slopes, recording, bounds.scale, 0.0, 0)
-    values = dict(zip(names, found.values.tolist(), strict=True))
+    values = one_each(groups, found.values.tolist())
     with jax.enable_x64(True):
         scale = _FIRST_NOISE * spread_of(data)
         own = Shots(*map(jnp.asarray, shots))
@@ -199,7 +204,7 @@ def _fit_forces(
     real = origin >= 0
     noise = _noise(raws[1], shots, 0, n_free(twin), spread_of(data))
     told = _Told(raws[0][real], raws[1][real], noise, True, 1, "force")
-    return _result(twin, names, found.values, spread, bounds, told, level)
+    return _result(twin, free, found.values, spread, bounds, told, level)
 
 
 def _rms(raw: np.ndarray) -> np.ndarray:
@@ -254,38 +259,14 @@ def _other_unit(ratio: float) -> str:
     )
 
 
-def every_name(twin: Twin) -> tuple[str, ...]:
-    """:return: names of all parameters but known ones and the share of a learned force"""
-    force = force_of(twin)
-    learned = () if force is None else (f"{force[0]}.share",)
-    kept = {*learned, *twin.known_parameters}
-    return tuple(name for name in twin.parameters if name not in kept)
-
-
-def free_names(twin: Twin, free: Iterable[str] | None) -> tuple[str, ...]:
-    """
-    :param free: names of parameters; None for all but the share of a learned force
-    :raises CalibrationError: for a name that the twin does not have, or none at all
-    """
-    names = every_name(twin) if free is None else (free,) if isinstance(free, str) else tuple(free)
-    unknown = [name for name in names if name not in twin.parameters]
-    if unknown or not names or len(set(names)) < len(names):
-        known = ", ".join(twin.parameters) or "none"
-        raise CalibrationError(
-            f"free must name parameters of {twin.name}, each once, got {', '.join(names) or 'none'}"
-            f". Its parameters are: {known}."
-        )
-    return names
-
-
-def _check_enough(twin: Twin, names: tuple[str, ...], shots: Shots) -> None:
+def _check_enough(twin: Twin, groups: Groups, shots: Shots) -> None:
     real = int(np.sum(shots.weight))
     measured = real * int(np.prod(shots.obs.shape[1:]))
-    unknown = len(names) + real * n_free(twin)
+    unknown = len(groups) + real * n_free(twin)
     if measured <= unknown:
         raise CalibrationError(
             f"{real} windows of {shots.actions.shape[1]} steps hold {measured} measurements, and "
-            f"{len(names)} parameters with the start states are {unknown} unknowns. "
+            f"{len(groups)} parameters with the start states are {unknown} unknowns. "
             "Record more, free fewer parameters, or ask for longer windows."
         )
 
@@ -307,7 +288,7 @@ def _noise(
 
 def _fit(
     twin: Twin,
-    names: tuple[str, ...],
+    free: Free,
     errors: Errors,
     before: np.ndarray,
     origin: np.ndarray,
@@ -317,13 +298,14 @@ def _fit(
     level: float,
     prior: float,
 ) -> Fit:
-    bounds, real = bounds_of([twin.parameters[name] for name in names]), origin >= 0
+    groups, real = tuple(free.values()), origin >= 0
+    bounds = bounds_of([twin.parameters[group[0]] for group in groups])
     spread = covariance_of(
         errors.bent[real], errors.slopes[real], origin[real], bounds.scale, prior, n_free(twin)
     )
     solved = bool(found.converged), int(found.n_steps)
     told = _Told(before[real], errors.raw[real], noise, *solved, "simulation")
-    return _result(twin, names, values, spread, bounds, told, level)
+    return _result(twin, free, values, spread, bounds, told, level)
 
 
 class _Told(NamedTuple):
@@ -339,14 +321,15 @@ class _Told(NamedTuple):
 
 def _result(
     twin: Twin,
-    names: tuple[str, ...],
+    free: Free,
     values: np.ndarray,
     spread: Spread,
     bounds: Bounds,
     told: _Told,
     level: float,
 ) -> Fit:
-    parameters = [twin.parameters[name] for name in names]
+    groups = tuple(free.values())
+    parameters = [twin.parameters[group[0]] for group in groups]
     margin = spread.quantile(level) * spread.stderr
     estimates = tuple(
         Estimate(
@@ -356,15 +339,21 @@ def _result(
             low=float(max(value - half, parameter.lower)),
             high=float(min(value + half, parameter.upper)),
             unit=parameter.unit,
-            before=twin.values[name],
+            before=twin.values[group[0]],
             at_bound=bool(at_bound),
         )
-        for name, parameter, value, stderr, half, at_bound in zip(
-            names, parameters, values, spread.stderr, margin, bounds.reached(values), strict=True
+        for (name, group), parameter, value, stderr, half, at_bound in zip(
+            free.items(),
+            parameters,
+            values,
+            spread.stderr,
+            margin,
+            bounds.reached(values),
+            strict=True,
         )
     )
     return Fit(
-        twin=twin.with_parameters(**dict(zip(names, values.tolist(), strict=True))),
+        twin=twin.with_parameters(**one_each(groups, values.tolist())),
         estimates=estimates,
         covariance=spread.covariance,
         channels=tuple((channel.name, channel.unit) for channel in twin.channels),
@@ -377,7 +366,7 @@ def _result(
         level=level,
         converged=told.converged,
         n_steps=told.n_steps,
-        undetermined=tuple(_in_words(names, row) for row in spread.undetermined),
+        undetermined=tuple(_in_words(tuple(free), row) for row in spread.undetermined),
         errors=told.errors,
     )
 

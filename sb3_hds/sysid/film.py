@@ -44,7 +44,10 @@ SCRIPT = """
   function show(frame) {
     now = frame;
     groups.forEach(function (group, player) {
-      const ends = data.lines[player][frame];
+      const ends = data.lines[player][frame], shapes = data.outlines[player][frame];
+      group.querySelectorAll("polygon").forEach(function (outline, i) {
+        outline.setAttribute("points", shapes[i].join(" "));
+      });
       group.querySelectorAll("line").forEach(function (line, i) {
         ["x1", "y1", "x2", "y2"].forEach(function (name, k) {
           line.setAttribute(name, ends[4 * i + k]);
@@ -110,10 +113,15 @@ def _stage(moving: Moving) -> str:
             '<line x1="{:.1f}" y1="{:.1f}" x2="{:.1f}" y2="{:.1f}"/>'.format(*ends.ravel())
             for ends in np.nan_to_num(moving.lines[player, moving.still])
         )
+        shapes = "".join(
+            f'<polygon points="{" ".join(f"{x:.1f}" for x in corners.ravel())}" fill="{colour}" '
+            'fill-opacity=".25" stroke-width=".4"/>'
+            for corners in np.nan_to_num(moving.outlines[player, moving.still])
+        )
         opacity = (1.0, 0.8, 0.9)[player]
         groups.append(
             f'<g stroke="{colour}" stroke-width="{width:.2f}" stroke-opacity="{opacity}">'
-            f"{lines}</g>"
+            f"{shapes}{lines}</g>"
         )
     return "".join(groups)
 

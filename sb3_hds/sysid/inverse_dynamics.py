@@ -12,6 +12,7 @@ from scipy.optimize import lsq_linear
 from sb3_hds.core import AnalyticTwin, State, Trajectories, Twin
 from sb3_hds.core.compilation import QUICKEST_COMPILATION
 from sb3_hds.sysid.equation.motion import motion
+from sb3_hds.sysid.projection import Groups, one_each
 
 # Gauss-Newton steps: most parameters are linear, and need one; Huber's weights need a few.
 _STEPS = 6
@@ -53,7 +54,7 @@ class Forces(NamedTuple):
 
 
 def by_inverse_dynamics(
-    twin: Twin, names: tuple[str, ...], data: Trajectories, threshold: float | None = _HUBER
+    twin: Twin, groups: Groups, data: Trajectories, threshold: float | None = _HUBER
 ) -> Forces | None:
     r"""
     Least squares on the force that measured motion needs and the twin does not have,
@@ -66,7 +67,7 @@ def by_inverse_dynamics(
 
     Source: Khalil and Dombre, *Modeling, Identification and Control of Robots*, 2002, section 12.
 
-    :param names: of the free parameters
+    :param groups: free parameters
     :param threshold: of the Huber loss, in units of the noise; None for plain squares
     :return: None for a twin that has more than an equation of motion
     """
@@ -76,15 +77,15 @@ def by_inverse_dynamics(
     middle = lambda x: 0.5 * (x[1:] + x[:-1])  # noqa: E731
     parts = [(middle(r.q), middle(r.v), middle(r.a), r.actions) for r in moved.recordings]
     recording = np.repeat(moved.origin, [len(r.actions) for r in moved.recordings])
-    parameters = [twin.parameters[name] for name in names]
+    parameters = [twin.parameters[group[0]] for group in groups]
     scale = np.array([p.scale if p.scale > 0.0 else 1.0 for p in parameters])
-    own = np.array([twin.values[name] for name in names])
+    own = np.array([twin.values[group[0]] for group in groups])
     lower, upper = (np.array([getattr(p, end) for p in parameters]) for end in ("lower", "upper"))
     values = own.copy()
     with jax.enable_x64(True):
         rows = tuple(jnp.asarray(np.concatenate(x), jnp.float64) for x in zip(*parts, strict=True))
         fixed = {k: jnp.asarray(leaf, jnp.float64) for k, leaf in twin.params.items()}
-        look = partial(_missing, twin, names, fixed)
+        look = partial(_missing, twin, groups, fixed)
         for step in range(_STEPS + 1):
             missing, slopes = map(np.asarray, look(jnp.asarray(values), *rows))
             if not (np.isfinite(missing).all() and np.isfinite(slopes).all()):
@@ -93,8 +94,8 @@ def by_inverse_dynamics(
             errors, table = weight * missing, weight[..., None] * slopes
             if step == _STEPS:
                 break
-            belief = np.diag(np.full(len(names), 1.0 / _BELIEF))
-            whole = np.concatenate([table.reshape(-1, len(names)) * scale, belief])
+            belief = np.diag(np.full(len(groups), 1.0 / _BELIEF))
+            whole = np.concatenate([table.reshape(-1, len(groups)) * scale, belief])
             right = np.concatenate([-errors.ravel(), (own - values) / scale / _BELIEF])
             room = (lower - values) / scale, (upper - values) / scale
             values = np.clip(values + scale * _within(whole, right, room), lower, upper)
@@ -123,7 +124,7 @@ def _within(table: np.ndarray, right: np.ndarray, room: tuple[np.ndarray, np.nda
 @partial(jax.jit, static_argnums=(0, 1), compiler_options=QUICKEST_COMPILATION)
 def _missing(
     twin: AnalyticTwin,
-    names: tuple[str, ...],
+    groups: Groups,
     fixed: dict[str, Array],
     values: Array,
     q: Array,
@@ -132,7 +133,7 @@ def _missing(
     actions: Array,
 ) -> tuple[Float[Array, "n dof"], Float[Array, "n dof p"]]:
     def missing(values: Array, q: Array, v: Array, a: Array, action: Array) -> Array:
-        p = fixed | dict(zip(names, values, strict=True))
+        p = fixed | one_each(groups, values)
         needed = twin.mass_matrix(q, p) @ a + twin.bias(q, v, p)
         return needed - twin.actuate(State(q, v, {}), action, p)
 

@@ -251,6 +251,7 @@ def film_frames(
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.patches import Polygon
 
     n = len(moving.names)
     figure = Figure(figsize=(12.8, 7.2), dpi=100)
@@ -259,8 +260,13 @@ def film_frames(
     stage = figure.add_subplot(grid[:, 0])
     stage.set(xlim=(0, 100), ylim=(100, 0), aspect="equal")
     stage.axis("off")
-    drawn = []
+    drawn, shapes = [], []
     for p, (label, colour) in enumerate(players):
+        patches = [Polygon(corners, closed=True) for corners in moving.outlines[p, 0]]
+        for patch in patches:
+            patch.set(facecolor=(colour, 0.25), edgecolor=colour, lw=0.8)
+            stage.add_patch(patch)
+        shapes.append(patches)
         width = 3.5 * moving.width * (1.6, 1.0, 0.6)[p]
         style = {"color": colour, "lw": width, "solid_capstyle": "round", "alpha": 0.9}
         lines = [stage.plot([], [], **style)[0] for _ in moving.lines[p, 0]]
@@ -281,6 +287,9 @@ def film_frames(
         for lines, places in zip(drawn, moving.lines[:, frame], strict=True):
             for line, ends in zip(lines, places, strict=True):
                 line.set_data(ends[:, 0], ends[:, 1])
+        for patches, places in zip(shapes, moving.outlines[:, frame], strict=True):
+            for patch, corners in zip(patches, places, strict=True):
+                patch.set_xy(corners)
         for cursor in cursors:
             cursor.set_xdata([moving.time[frame]] * 2)
         canvas.draw()

@@ -30,6 +30,10 @@ _TOLERANCE = 1e-8
 _N_FIRST, _N_AGAIN = 8, 3
 
 
+#: parameters, each with those that take the same value
+Groups = tuple[tuple[str, ...], ...]
+
+
 class Solution(NamedTuple):
     """
     :param values: of the free parameters, shape ``(p,)``
@@ -58,10 +62,15 @@ class Errors(NamedTuple):
     slopes: Any
 
 
+def one_each(groups: Groups, values: Any) -> dict[str, Any]:
+    """:return: the value of each parameter, given one for each group"""
+    return {name: x for group, x in zip(groups, values, strict=True) for name in group}
+
+
 @partial(jax.jit, static_argnums=(0, 1, 2, 3), compiler_options=QUICKEST_COMPILATION)
 def solve(
     twin: Twin,
-    names: tuple[str, ...],
+    groups: Groups,
     threshold: float | None,
     max_steps: int,
     fixed: Params,
@@ -73,15 +82,15 @@ def solve(
     prior: float,
 ) -> Solution:
     """The estimate for given noise: one program for all data of a shape."""
-    bounds = bounds_of([twin.parameters[name] for name in names])
+    bounds = bounds_of([twin.parameters[group[0]] for group in groups])
 
     def both(values: Array) -> tuple[Array, Array]:
-        found = errors_at(twin, names, threshold, fixed, shots, values, offsets, noise, _N_AGAIN)
+        found = errors_at(twin, groups, threshold, fixed, shots, values, offsets, noise, _N_AGAIN)
         from_belief = prior * (values - believed) / bounds.scale
         pull = prior * jnp.diag(1.0 / bounds.scale)
         return (
             jnp.concatenate([found.bent.ravel(), from_belief]),
-            jnp.concatenate([found.slopes.reshape(-1, len(names)), pull]),
+            jnp.concatenate([found.slopes.reshape(-1, len(groups)), pull]),
         )
 
     @jax.custom_jvp
@@ -106,7 +115,7 @@ def solve(
 
 def errors_at(
     twin: Twin,
-    names: tuple[str, ...],
+    groups: Groups,
     threshold: float | None,
     fixed: Params,
     shots: Shots,
@@ -120,11 +129,11 @@ def errors_at(
 
     :param n_iterations: Gauss-Newton steps of each start state
     """
-    params = fixed | dict(zip(names, values, strict=True))
+    params = fixed | one_each(groups, values)
 
     def one(shot: Shots, first: Offset) -> Errors:
         at = fit_start(twin, params, shot, noise, first, n_iterations, threshold)
-        return _projected(twin, names, threshold, fixed, noise, values, shot, at)
+        return _projected(twin, groups, threshold, fixed, noise, values, shot, at)
 
     return jax.vmap(one)(shots, offsets)
 
@@ -134,7 +143,7 @@ evaluate = jax.jit(errors_at, static_argnums=(0, 1, 2), compiler_options=QUICKES
 
 def _projected(
     twin: Twin,
-    names: tuple[str, ...],
+    groups: Groups,
     threshold: float | None,
     fixed: Params,
     noise: Float[Array, " obs"],
@@ -146,10 +155,10 @@ def _projected(
     Errors of one window, and their slopes by the parameters alone: its start state, optimal for
     them, follows. Only first derivatives are needed (Kaufman).
     """
-    n = len(names)
+    n = len(groups)
 
     def of(both: Array) -> tuple[Array, Array]:
-        params = fixed | dict(zip(names, both[:n], strict=True))
+        params = fixed | one_each(groups, both[:n])
         simulated = simulate(twin, params, shot, both[n:])
         raw = weighed(simulated, shot, jnp.ones_like(noise)).reshape(simulated.shape)
         return weighed(simulated, shot, noise, threshold), raw

@@ -12,6 +12,7 @@ from sb3_hds.twins.mujoco.load import load
 from sb3_hds.twins.mujoco.mechanism import BALL, FREE, Drive, Link, Mechanism
 from sb3_hds.twins.mujoco.reading import integrator_of, n_actuators, read
 from sb3_hds.twins.mujoco.refusals import refuse
+from sb3_hds.twins.mujoco.shapes import shapes_of
 from sb3_hds.twins.mujoco.twin import MechanismTwin, Reward, Terminated
 
 _KINDS = ("torque", "position", "velocity")
@@ -74,6 +75,9 @@ def from_mujoco(
             "they would move apart. To leave that out, pass ignore=['equality']."
         )
     mechanism = read(loaded.model, integrator=integrator)
+    if loaded.drawn is not None:
+        shapes = shapes_of(loaded.drawn, mechanism.places)
+        mechanism = dataclasses.replace(mechanism, shapes=shapes)
     if "limits" in ignore:
         links = (dataclasses.replace(link, limit=None) for link in mechanism.links)
         mechanism = dataclasses.replace(mechanism, links=tuple(links))

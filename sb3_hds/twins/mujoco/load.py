@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from sb3_hds.errors import ModelFileError
 from sb3_hds.twins.mujoco.library import mujoco
+from sb3_hds.twins.mujoco.shapes import visuals_of
 
 
 class Loaded(NamedTuple):
@@ -15,12 +16,14 @@ class Loaded(NamedTuple):
     :param dt: control interval, where an environment has one [s]
     :param urdf: whether it comes from a URDF, which names neither drives nor an integrator
     :param mimics: joints of a URDF that follow another, which older versions of MuJoCo leave free
+    :param drawn: what is seen of its bodies; None for nothing
     """
 
     model: Any
     dt: float | None = None
     urdf: bool = False
     mimics: tuple[str, ...] = ()
+    drawn: Any = None
 
 
 def load(source: Any) -> Loaded:
@@ -31,14 +34,15 @@ def load(source: Any) -> Loaded:
     """
     mj = mujoco()
     if isinstance(source, mj.MjModel):
-        return Loaded(source)
+        return Loaded(source, drawn=source)
     if isinstance(source, mj.MjSpec):
-        return Loaded(_compiled(source.copy, "this MjSpec")[0])
+        model = _compiled(source.copy, "this MjSpec")[0]
+        return Loaded(model, drawn=model)
     if isinstance(source, str | os.PathLike):
         return _from_text_or_file(source)
     model = getattr(getattr(source, "unwrapped", None), "model", None)
     if isinstance(model, mj.MjModel):
-        return Loaded(model, float(source.unwrapped.dt))
+        return Loaded(model, float(source.unwrapped.dt), drawn=model)
     raise ModelFileError(
         "A model is the path of an MJCF or URDF file, an MjSpec, an MjModel, or an environment of "
         f"Gymnasium with MuJoCo inside, got {type(source).__name__}."
@@ -48,7 +52,11 @@ def load(source: Any) -> Loaded:
 def _from_text_or_file(source: str | os.PathLike[str]) -> Loaded:
     text, urdf, parsed, where = _parser_of(source)
     mimics = tuple(_mimics(text)) if urdf else ()
-    return Loaded(_compiled(parsed, where)[0], urdf=urdf, mimics=mimics)
+    model = _compiled(parsed, where)[0]
+    if not urdf:
+        return Loaded(model, drawn=model)
+    folder = Path.cwd() if text == str(source).lstrip() else Path(source).parent
+    return Loaded(model, urdf=True, mimics=mimics, drawn=visuals_of(text, folder))
 
 
 def spec_of(source: Any) -> tuple[Any, Any, bool]:

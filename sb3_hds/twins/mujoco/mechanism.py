@@ -160,6 +160,19 @@ class Place:
 
 
 @dataclasses.dataclass(frozen=True)
+class Shape:
+    """
+    A mesh as it is drawn: a convex body.
+
+    :param link: index of the link that carries it; -1 for the world
+    :param points: its corners, in the link's frame [m]
+    """
+
+    link: int
+    points: tuple[tuple[float, ...], ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class Mechanism:
     """
     All that the equation of motion of a model needs.
@@ -170,6 +183,7 @@ class Mechanism:
     :param integrator: ``"euler"``, ``"implicitfast"`` or ``"rk4"``
     :param implicit_damping: whether ``euler`` takes damping at the end of its step
     :param start: position in which an episode begins
+    :param shapes: that are drawn
     """
 
     name: str
@@ -181,6 +195,7 @@ class Mechanism:
     integrator: str
     implicit_damping: bool
     start: tuple[float, ...]
+    shapes: tuple[Shape, ...] = ()
 
     @property
     def n_q(self) -> int:
@@ -204,7 +219,8 @@ class Mechanism:
         )
         drives = tuple(Drive(**drive) for drive in spec.pop("drives"))
         places = tuple(Place(**place) for place in spec.pop("places"))
-        return cls(links=links, drives=drives, places=places, **spec)
+        shapes = tuple(Shape(**shape) for shape in spec.pop("shapes", ()))
+        return cls(links=links, drives=drives, places=places, shapes=shapes, **spec)
 
 
 def _frozen(value: Any) -> Any:

@@ -287,6 +287,23 @@ class MechanismTwin(AnalyticTwin):
             found.append(jnp.stack([place(origin), place(outwards)]))
         return jnp.stack(found)
 
+    def meshes(self, state: State) -> Float[Array, "shapes corners 3"]:
+        """
+        :return: corners of the convex bodies that its model's meshes are drawn as [m]; those of a
+            body that has fewer than others come more than once
+        """
+        shapes, frames = self.mechanism.shapes, frames_of(self.mechanism.links, list(state.q))
+        most = max((len(shape.points) for shape in shapes), default=0)
+        zero, found = jnp.zeros_like(state.q[0]), [jnp.zeros((0, most, 3), state.q.dtype)]
+        for shape in shapes:
+            points = jnp.asarray(np.resize(np.array(shape.points), (most, 3)), state.q.dtype)
+            if shape.link >= 0:
+                rows, origin = frames[shape.link]
+                rotation = jnp.stack([jnp.stack([zero + x for x in row]) for row in rows])
+                points = points @ rotation.T + jnp.stack([zero + x for x in origin])
+            found.append(points[None])
+        return jnp.concatenate(found)
+
     def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
         """The mechanism seen along y: from the world through all joints to each last body."""
         links, zero = self.mechanism.links, jnp.zeros_like(state.v[0])

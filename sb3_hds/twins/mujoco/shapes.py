@@ -1,0 +1,103 @@
+"""What a robot looks like: the meshes of its model, as far as their files are there."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from sb3_hds.twins.mujoco.library import mujoco
+from sb3_hds.twins.mujoco.mechanism import Place, Shape
+
+# What MuJoCo reads.
+_FORMATS = (".obj", ".stl")
+# Directions in which the outermost vertex of a mesh is kept.
+_N_DIRECTIONS = 64
+
+
+def shapes_of(model: Any, places: Sequence[Place]) -> tuple[Shape, ...]:
+    """
+    :param model: compiled with its meshes
+    :param places: frames of its bodies in those of the links
+    :return: one for each geom that is a mesh, of a body that has a name
+    """
+    frames = {"world": Place("world", -1, (0.0, 0.0, 0.0), tuple(map(tuple, np.eye(3))))}
+    frames |= {place.name: place for place in places}
+    found = []
+    for g in range(model.ngeom):
+        place = frames.get(model.body(int(model.geom_bodyid[g])).name)
+        if place is None or model.geom_type[g] != mujoco().mjtGeom.mjGEOM_MESH:
+            continue
+        mesh = int(model.geom_dataid[g])
+        begin = int(model.mesh_vertadr[mesh])
+        own = np.asarray(model.mesh_vert[begin : begin + int(model.mesh_vertnum[mesh])], float)
+        turn = np.zeros(9)
+        mujoco().mju_quat2Mat(turn, model.geom_quat[g])
+        points = _outermost(own) @ turn.reshape(3, 3).T + model.geom_pos[g]
+        points = points @ np.array(place.rotation).T + np.array(place.position)
+        found.append(Shape(place.link, tuple(tuple(map(float, row)) for row in points.round(4))))
+    return tuple(found)
+
+
+def visuals_of(text: str, folder: Path) -> Any:
+    """
+    MuJoCo drops what only shows of a URDF, and fails where a file is missing.
+
+    :param text: of a URDF
+    :param folder: in which it lies
+    :return: a compiled model of loose bodies, named as the links, with the meshes that are there;
+        None where there are none
+    """
+    mj = mujoco()
+    spec, n = mj.MjSpec(), 0
+    try:
+        links = [*ElementTree.fromstring(text).iter("link")]
+    except ElementTree.ParseError:
+        return None
+    for link in links:
+        body = spec.worldbody.add_body(name=link.get("name", ""))
+        for visual in link.findall("visual"):
+            mesh, origin = visual.find("geometry/mesh"), visual.find("origin")
+            path = None if mesh is None else _found(mesh.get("filename", ""), folder)
+            if mesh is None or path is None:
+                continue
+            at = {} if origin is None else origin.attrib
+            scale, place, turn = (
+                [float(x) for x in given.split()]
+                for given in (
+                    mesh.get("scale", "1 1 1"),
+                    at.get("xyz", "0 0 0"),
+                    at.get("rpy", "0 0 0"),
+                )
+            )
+            quaternion = np.zeros(4)
+            mj.mju_euler2Quat(quaternion, turn, "XYZ")
+            spec.add_mesh(name=f"mesh{n}", file=str(path), scale=scale)
+            body.add_geom(
+                type=mj.mjtGeom.mjGEOM_MESH, meshname=f"mesh{n}", pos=place, quat=quaternion
+            )
+            n += 1
+    try:
+        return spec.compile() if n else None
+    except ValueError:
+        return None
+
+
+def _found(name: str, folder: Path) -> Path | None:
+    """A mesh by the end of its path: packages lie where nobody says."""
+    parts = Path(name.partition("://")[2] or name).parts
+    for first in range(len(parts)):
+        path = folder.joinpath(*parts[first:])
+        if path.suffix.lower() in _FORMATS and path.is_file():
+            return path.resolve()
+    return None
+
+
+def _outermost(points: np.ndarray) -> np.ndarray:
+    """Vertices of the convex hull, the outermost in each of many directions."""
+    k = np.arange(_N_DIRECTIONS) + 0.5
+    z, angle = 1.0 - 2.0 * k / _N_DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * k
+    across = np.sqrt(1.0 - z**2)
+    directions = np.stack([across * np.cos(angle), across * np.sin(angle), z], 1)
+    return points[np.unique(np.argmax(directions @ points.T, axis=1))]
