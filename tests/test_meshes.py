@@ -63,5 +63,5 @@ def test_a_page_draws_them_and_a_saved_twin_keeps_them(twin):
     moving = moving_of(again, again, replay)
 
     assert again == twin and moving.outlines.shape == (3, 60, 1, 20, 2)
-    assert 0.0 <= moving.outlines[0].min() and moving.outlines[0].max() <= 100.0
+    assert moving.outlines[0].min() >= 0.0 and moving.outlines[0].max() <= 100.0
     assert section_of(moving).count("<polygon") == 3
