@@ -3,7 +3,6 @@
 import io
 import zipfile
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -55,9 +54,6 @@ SMALL: dict[str, dict[str, Any]] = {
     "openloop": {"population_size": 3, "horizon": 4, "n_elites": 2, "ranking_share": 0.0},
 }
 
-#: what it takes to run whole episodes
-WHOLE_EPISODES = {"openloop": {"horizon": None}}
-
 NAMES = list(algos.ALL)
 #: the algorithms that plan in a twin
 PLANNERS = [name for name in NAMES if issubclass(algos.ALL[name], TwinAlgorithm)]
@@ -69,14 +65,13 @@ MODEL_FREE = [name for name in OFF_POLICY if name not in PLANNERS]
 STATES = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, -2.0]], np.float32)
 
 
-def _or_expensive(name: str) -> Any:
-    quick = name in ("hds", "droq", "td7", "openloop")
-    return name if quick else pytest.param(name, marks=pytest.mark.expensive)
-
-
 #: all; those that share every line with one of these four are among the expensive tests
-EVERY_NAME = [_or_expensive(name) for name in NAMES]
-EVERY_OFF_POLICY = [_or_expensive(name) for name in OFF_POLICY]
+EVERY_NAME = [
+    name
+    if name in ("hds", "droq", "td7", "openloop")
+    else pytest.param(name, marks=pytest.mark.expensive)
+    for name in NAMES
+]
 
 
 def small(name: str, env: Any = "Pendulum-v1", **changes: Any) -> BaseAlgorithm:
@@ -146,8 +141,3 @@ def reloaded(model: BaseAlgorithm, **changes: Any) -> BaseAlgorithm:
 def greedy(actor: Any, obs: Any = STATES) -> np.ndarray:
     """:return: what a model, or a policy, does where it explores nothing"""
     return actor.predict(obs, deterministic=True)[0]
-
-
-def steps_of(checkpoint: Path) -> int:
-    """:return: 50 for ``rl_model_50_steps.zip``, as SB3 names them"""
-    return int(checkpoint.stem.split("_")[-2])

@@ -50,11 +50,8 @@ def test_what_is_remembered_are_steps_of_the_environment():
     assert any((a != b).any() for a, b in zip(before, weights_of(model), strict=True))
 
 
-@pytest.mark.parametrize(
-    "name", ["tqc_jax", *(pytest.param(n, marks=pytest.mark.expensive) for n in ("droq", "bro"))]
-)
-def test_a_seed_does_not_know_which_others_run_beside_it(name):
-    model = small(name)
+def test_a_seed_does_not_know_which_others_run_beside_it():
+    model = small("tqc_jax")
     together, _ = learn_compiled(model, 40, seeds=[3, 5])
     (alone,), _ = learn_compiled(model, 40, seeds=[5])
 
@@ -66,16 +63,13 @@ def test_a_seed_does_not_know_which_others_run_beside_it(name):
 
 @pytest.mark.expensive
 def test_the_point_mass_is_solved():
-    """As ``test_an_algorithm_learns`` asks of learning step by step."""
     settings = SMALL["tqc_jax"] | {"policy_kwargs": {"net_arch": [32, 32]}, "gradient_steps": 5}
     model = algos.TQC(env=point_mass_env(), gamma=0.9, learning_rate=3e-3, **settings)
-    models, episodes = learn_compiled(model, 1_500, seeds=range(2))
+    (learned,), (episodes,) = learn_compiled(model, 1_500, seeds=[0])
 
     best, idle = returns_of(linear_controller()).mean(), returns_of(lambda _: np.zeros(1)).mean()
-    for learned, own in zip(models, episodes, strict=True):
-        act = partial(learned.predict, deterministic=True)
-        assert (returns_of(lambda obs, act=act: act(obs)[0]).mean() - idle) / (best - idle) > 0.8
-        assert np.diff(own.timesteps).tolist() == [N_STEPS] * (1_500 // N_STEPS - 1)
+    assert (returns_of(partial(greedy, learned)).mean() - idle) / (best - idle) > 0.8
+    assert np.diff(episodes.timesteps).tolist() == [N_STEPS] * (1_500 // N_STEPS - 1)
 
 
 def test_runs_of_any_length_are_one_program():
@@ -125,8 +119,6 @@ def test_a_twin_may_be_passed_for_what_a_wrapper_changes_and_the_time_limit_is_t
     env = gymnasium.wrappers.TransformReward(made, lambda reward: reward)
     with pytest.raises(EnvironmentMismatchError, match=r"pass a twin="):
         learn_compiled(small("tqc_jax", env), 40)
-    with pytest.raises(EnvironmentMismatchError, match="takes actions from"):
-        learn_compiled(small("tqc_jax", env), 40, twin=twins.make("InvertedPendulum-v5"))
 
     _, (episodes,) = learn_compiled(small("tqc_jax", env), 95, twin=twins.make("Pendulum"))
 
@@ -137,27 +129,17 @@ def pendulums(n: int) -> DummyVecEnv:
     return DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")] * n)
 
 
-NOISE = NormalActionNoise(np.zeros(1), np.ones(1))
-NO_TIMEOUTS = {"handle_timeout_termination": False}
-
-
 @pytest.mark.parametrize(
     ("words", "arguments"),
     [
         ("n_envs", {"env": pendulums(2)}),
         ("VecNormalize", {"env": VecNormalize(pendulums(1))}),
         ("n_steps", {"n_steps": 3}),
-        ("action_noise", {"action_noise": NOISE}),
+        ("action_noise", {"action_noise": NormalActionNoise(np.zeros(1), np.ones(1))}),
         ("param_resets", {"param_resets": [50]}),
         ("episodes", {"train_freq": (1, "episode")}),
-        (
-            "time limits that count as ends",
-            {"optimize_memory_usage": True, "replay_buffer_kwargs": NO_TIMEOUTS},
-        ),
-        (
-            r"store='executed': use store='raw'",
-            {"env": ActionRateLimit(gymnasium.make("Pendulum-v1"), 4.0, store="executed")},
-        ),
+        ("count as ends", {"replay_buffer_kwargs": {"handle_timeout_termination": False}}),
+        ("store='raw'", {"env": ActionRateLimit(pendulums(1).envs[0], 4.0, store="executed")}),
     ],
 )
 def test_what_needs_python_is_refused(words, arguments):
@@ -165,13 +147,8 @@ def test_what_needs_python_is_refused(words, arguments):
 
     with pytest.raises(ValueError, match=words):
         learn_compiled(model, 100)
-
-
-def test_other_families_and_no_seeds_are_refused():
     with pytest.raises(ValueError, match=r"SAC family, not TD7"):
         learn_compiled(small("td7"), 100)
-    with pytest.raises(ValueError, match="one seed"):
-        learn_compiled(small("tqc_jax"), 100, seeds=[])
 
 
 def test_actions_are_random_until_learning_starts():

@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 from odd_envs import Dead
-from small_models import greedy, reloaded, small
+from small_models import greedy, small
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -23,28 +23,12 @@ def finite(model) -> bool:
     return finite_leaves(model.policy.weights)
 
 
-class Watched(gymnasium.Wrapper):
-    """Keeps the commands that it is given."""
-
-    def __init__(self) -> None:
-        super().__init__(gymnasium.make("Pendulum-v1"))
-        self.commands = []
-
-    def step(self, action):
-        self.commands.append(np.array(action))
-        return super().step(action)
-
-
-# --- Divergence
-
-
 def test_an_update_that_diverges_is_an_error_and_leaves_the_last_good_weights():
     model = small("droq").learn(20)
     before = model.get_parameters()["policy"]
     model.replay_buffer.rewards[:] = 1e38
 
-    # RL Zoo prunes trials for the latter.
-    assert issubclass(DivergedError, FloatingPointError) and issubclass(DivergedError, ValueError)
+    assert issubclass(DivergedError, ValueError)  # for which RL Zoo prunes a trial
     with pytest.raises(DivergedError, match="diverged"):
         for _ in range(20):
             model.train(gradient_steps=4, batch_size=16)
@@ -54,51 +38,28 @@ def test_an_update_that_diverges_is_an_error_and_leaves_the_last_good_weights():
     assert model._n_updates == int(model.policy.learner.n_updates)
 
 
-def infinite_step(name: str, env, monkeypatch):
-    """:return: a model that has learned, whose next update leaves no weight of the actor finite"""
-    model = small(name, env, gradient_steps=1, train_freq=5, policy_delay=1).learn(20)
-    monkeypatch.setattr(model, "learning_rates", lambda: (np.inf, 1e-3))
-    return model
-
-
 @pytest.mark.parametrize("name", ["droq", "td7"])
-def test_weights_of_which_no_loss_tells_are_noticed_before_they_act(name, monkeypatch):
-    env = Watched()
-    model = infinite_step(name, env, monkeypatch)
-
-    with pytest.raises(DivergedError, match="keeps its last good state"):
-        model.learn(50, reset_num_timesteps=False)
-
-    assert finite(model) and np.isfinite(env.commands).all()
-    assert np.isfinite(model.replay_buffer.actions).all()
-    assert np.isfinite(model.predict(np.zeros(3, np.float32))[0]).all()
-
-
-@pytest.mark.parametrize("name", ["droq", "td7"])
-def test_weights_that_the_last_update_spoils_are_noticed_in_the_end_and_not_saved(
+def test_weights_of_which_no_loss_tells_are_noticed_before_they_act_or_are_saved(
     name, monkeypatch, tmp_path
 ):
-    model = infinite_step(name, "Pendulum-v1", monkeypatch)
-    with pytest.raises(DivergedError, match="last good state"):
-        model.learn(5, reset_num_timesteps=False)
-    assert finite(model)
+    model = small(name, gradient_steps=1, train_freq=5, policy_delay=1).learn(20)
+    # The next update leaves no weight of the actor finite.
+    monkeypatch.setattr(model, "learning_rates", lambda: (np.inf, 1e-3))
+
+    for n_steps in (50, 5):
+        with pytest.raises(DivergedError, match="keeps its last good state"):
+            model.learn(n_steps, reset_num_timesteps=False)
+        assert finite(model) and np.isfinite(model.replay_buffer.actions).all()
 
     model.train(gradient_steps=1, batch_size=16)
     assert not finite(model)
     with pytest.raises(DivergedError, match="last good state"):
         model.save(tmp_path / "model")
-
     assert not list(tmp_path.iterdir()) and finite(model)
 
 
-def test_rates_that_are_infinite_where_networks_compute_are_refused():
-    model = small("droq", learning_rate=1e39)
-    with pytest.raises(ValueError, match="learning_rate must be a finite number"):
-        model.learn(20)
-
-
 def test_updates_are_counted_where_they_are_interrupted(monkeypatch):
-    model, made = small("td7", gradient_steps=200).learn(10), []
+    model, made = small("td7").learn(10), []
 
     def interrupted(*given):
         made.append(given)
@@ -115,48 +76,34 @@ def test_updates_are_counted_where_they_are_interrupted(monkeypatch):
     assert model._n_updates == int(model.policy.learner.n_updates) > before
 
 
-# --- Sensors that die
-
-
-@pytest.mark.parametrize(
-    ("name", "of_reward", "value"), [("droq", True, np.inf), ("hds", False, np.nan)]
-)
-def test_statistics_of_vec_normalize_survive_a_dead_sensor(name, of_reward, value):
+@pytest.mark.parametrize(("of_reward", "value"), [(True, np.inf), (False, np.nan)])
+def test_statistics_of_vec_normalize_survive_a_dead_sensor(of_reward, value):
     env = Dead(value, of_reward)
     normalizer = VecNormalize(DummyVecEnv([lambda: env]))
-    model = small(name, normalizer, **({"twin": "Pendulum"} if name == "hds" else {}))
+    model = small("droq", normalizer)
 
     with pytest.raises(ValueError, match=r"Step 10 of the environment is not finite"):
         model.learn(100)
 
     assert np.isfinite(normalizer.obs_rms.mean).all() and np.isfinite(normalizer.ret_rms.var)
     assert model.replay_buffer.pos == 9 and np.isfinite(greedy(model)).all()
-    # Nine steps and what the environment began with; HDS has counted steps of its twin before.
-    assert name == "hds" or normalizer.obs_rms.count == pytest.approx(10.0, abs=0.01)
+    # Nine steps and what the environment began with.
+    assert normalizer.obs_rms.count == pytest.approx(10.0, abs=0.01)
     env.value = 0.5
     model.learn(20, reset_num_timesteps=False)
     assert np.isfinite(model.replay_buffer.observations).all()
 
 
-def test_an_environment_that_begins_with_no_number_is_an_error():
-    class Blind(gymnasium.Wrapper):
-        value = np.nan
-
-        def reset(self, **given):
-            obs, info = super().reset(**given)
-            return obs * self.value, info
-
-    env = Blind(gymnasium.make("Pendulum-v1"))
+def test_an_environment_that_begins_with_no_number_is_an_error(monkeypatch):
+    env = gymnasium.make("Pendulum-v1")
     model = small("droq", env)
 
-    with pytest.raises(ValueError, match="What the environment begins with is not finite"):
-        model.learn(20)
+    with monkeypatch.context() as blind:
+        blind.setattr(env.unwrapped, "_get_obs", lambda: np.full(3, np.nan, np.float32))
+        with pytest.raises(ValueError, match="What the environment begins with is not finite"):
+            model.learn(20)
 
-    env.value = 1.0
     assert model.learn(20).num_timesteps == 20
-
-
-# --- Episodes that are cut off from outside
 
 
 def test_returns_of_n_steps_end_where_learning_began_anew():
@@ -198,32 +145,15 @@ def test_with_shared_memory_a_cut_counts_as_an_end():
     assert model.replay_buffer.dones[29].all()
 
 
-# --- Arguments that did less than they said
-
-
-@pytest.mark.parametrize(("given", "n"), [({}, 0), ({"param_resets": [40]}, 1)])
-def test_networks_start_afresh_as_what_load_was_passed_says(given, n, monkeypatch):
-    model = small("droq", param_resets=[20]).learn(30)
-    other, seeds = reloaded(model, **given), []
-    monkeypatch.setattr(other, "_restart", seeds.append)
-
-    other.learn(30, reset_num_timesteps=False)
-
-    assert len(seeds) == n
-
-
 @pytest.mark.parametrize("name", ["droq", "hds"])
 def test_without_its_monitor_an_environment_is_left_as_it_is(name):
-    watched, bare = (
-        small(name, monitor_wrapper=wrapped).get_env().envs[0] for wrapped in (True, False)
-    )
+    bare = small(name, monitor_wrapper=False).get_env().envs[0]
 
-    assert isinstance(watched, Monitor) and not isinstance(bare, Monitor)
+    assert not isinstance(bare, Monitor)
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "policy"),
-    [(TD7, GaussianPolicy), (CrossQ, GaussianPolicy), (HDS, TD7Policy)],
+    ("algorithm", "policy"), [(CrossQ, GaussianPolicy), (TD7, GaussianPolicy), (HDS, TD7Policy)]
 )
 def test_a_policy_of_another_family_is_refused(algorithm, policy):
     with pytest.raises(ValueError, match=f"cannot use the policy {policy.__name__}"):

@@ -12,7 +12,6 @@ from stable_baselines3.common.distributions import StateDependentNoiseDistributi
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_hds.algos import learn_compiled
-from sb3_hds.algos.heads import ExploringActor
 from sb3_hds.algos.off_policy import act
 from sb3_hds.algos.squashed import Gaussian, exploration_std, log_probability, marginal_std
 
@@ -26,25 +25,19 @@ def both_noises(full_std: bool, use_expln: bool) -> tuple[Gaussian, np.ndarray, 
     means, before = means[:, :2], 2.0 * before[:, :2]
     before[0, 0] = 5.0  # where the action is 1 but for 1e-4
     log_std = rng.normal(size=(5, 2 if full_std else 1)) - 1.0
-    theirs = StateDependentNoiseDistribution(
-        2, full_std, use_expln=use_expln, squash_output=True, learn_features=True
-    )
-    theirs.latent_sde_dim = 5
-    theirs.sample_weights(th.as_tensor(log_std), 7)
     # SB3 expands a single column by ones of single precision; these are of double.
-    wide = th.as_tensor(np.broadcast_to(log_std, (5, 2)).copy())
-    theirs.full_std = True
-    theirs.proba_distribution(th.as_tensor(means), wide, th.as_tensor(latent))
-    std = exploration_std(jnp.broadcast_to(jnp.asarray(log_std), (5, 2)), use_expln)
-    return (
-        Gaussian(jnp.asarray(means), marginal_std(jnp.asarray(latent), std), latent),
-        before,
-        theirs,
-    )
+    wide = np.broadcast_to(log_std, (5, 2)).copy()
+    theirs = StateDependentNoiseDistribution(2, True, use_expln=use_expln, squash_output=True)
+    theirs.learn_features, theirs.latent_sde_dim = True, 5
+    theirs.sample_weights(th.as_tensor(wide), 7)
+    theirs.proba_distribution(*map(th.as_tensor, (means, wide, latent)))
+    std = marginal_std(jnp.asarray(latent), exploration_std(jnp.asarray(wide), use_expln))
+    return Gaussian(jnp.asarray(means), std, latent), before, theirs
 
 
-@pytest.mark.parametrize(("full_std", "use_expln"), [(False, True), (True, False)])
-@pytest.mark.parametrize("double", [True, False])
+@pytest.mark.parametrize(
+    ("full_std", "use_expln", "double"), [(False, True, True), (True, False, False)]
+)
 def test_state_dependent_noise_is_that_of_stable_baselines(full_std, use_expln, double):
     # SB3 has to find these from rounded actions again, which costs digits where they are near 1.
     rounding, of_actions = (1e-12, 1e-9) if double else (1e-5, 1e-5)
@@ -56,30 +49,6 @@ def test_state_dependent_noise_is_that_of_stable_baselines(full_std, use_expln, 
         np.testing.assert_allclose(jnp.tanh(gaussian.mean), theirs.mode(), rtol=rounding)
         expected = theirs.log_prob(th.tanh(th.as_tensor(before)))
         np.testing.assert_allclose(found, expected, rtol=of_actions, atol=of_actions)
-
-
-def test_noise_depends_on_the_state_and_stays_until_it_is_drawn_again():
-    model = small("gsde_sac", policy_kwargs={"net_arch": [8], "log_std_init": 0.0})
-
-    def deviations() -> np.ndarray:
-        explored, without = (
-            np.arctanh(np.clip(model.predict(STATES, deterministic=way)[0] / 2.0, -0.999, 0.999))
-            for way in (False, True)
-        )
-        return explored - without
-
-    model.policy.reset_noise()
-    first, again = deviations(), deviations()
-    model.policy.reset_noise()
-
-    np.testing.assert_array_equal(first, again)
-    assert abs(first[0] - first[1]) > 1e-3
-    assert np.abs(deviations() - first).min() > 1e-3
-    assert model.policy.get_std().shape == (8, 1)
-    assert model.policy.get_std().mean() == pytest.approx(1.0)
-    told = {"net_arch": [8], "log_std_init": 1.0, "use_expln": True}
-    slower = small("gsde_sac", policy_kwargs=told).policy.get_std()
-    assert slower.mean() == pytest.approx(1.0 + np.log(2.0), rel=1e-5)
 
 
 def test_each_environment_has_its_noise_matrix_and_the_deviation_is_logged():
@@ -121,32 +90,14 @@ def test_a_noise_matrix_lasts_over_as_many_collections_as_it_takes(compiled):
     assert misfit(slice(10, 30)) > 1e-3
 
 
-def test_noise_that_is_drawn_at_each_step_is_warned_of():
-    with pytest.warns(UserWarning, match="draws a new noise matrix at each step"):
-        small("droq", use_sde=True, train_freq=1)
-
-
-@pytest.mark.parametrize("at_warmup", [True, False])
-def test_noise_acts_before_learning_starts_only_where_it_is_told_to(at_warmup):
-    how = {"learning_starts": 100, "train_freq": 10, "use_sde_at_warmup": at_warmup}
-    model = small("gsde_sac", **how).learn(10)
+def test_noise_does_not_act_before_learning_starts_unless_it_is_told_to():
+    model = small("gsde_sac", learning_starts=100, train_freq=10).learn(10)
     seen, taken = model.replay_buffer.observations[:10, 0], model.replay_buffer.actions[:10, 0]
 
-    # One matrix in the whole collection: the policy's actions can be had again.
     explored = model.policy.scale_action(model.predict(seen)[0])
 
-    assert np.allclose(explored, taken, atol=1e-5) == at_warmup
+    assert not np.allclose(explored, taken, atol=1e-5)
     assert model._n_updates == 0
-
-
-def test_state_dependent_noise_of_simba_is_not_squashed():
-    model = small("simba", use_sde=True)
-
-    assert isinstance(model.policy.actor_network, ExploringActor)
-    # The noise matrix is drawn with e^-3; a squashed logarithm would not be.
-    assert model.policy.get_std() == pytest.approx(np.exp(-3.0), rel=0.1)
-    with pytest.raises(ValueError, match=r"'squash_log_std': True.*with use_sde=True"):
-        small("simba", use_sde=True, policy_kwargs={"squash_log_std": True})
 
 
 def test_the_optimistic_actor_of_bro_explores_by_gsde_too():

