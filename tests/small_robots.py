@@ -127,16 +127,36 @@ BALL = robot(
       <joint name="shoulder" type="ball" damping="0.05" stiffness="0.6" armature="0.01"/>
       <geom type="capsule" fromto="0 0 0 0.02 0 -0.3" size="0.03"/>
       <body name="lower" pos="0 0 -0.3">
-        <joint name="elbow" axis="0 1 0" damping="0.03" gravcomp="0"/>
+        <joint name="elbow" axis="0 1 0" damping="0.03"/>
         <geom type="capsule" fromto="0 0 0 0 0.01 -0.25" size="0.02"/>
       </body>
-    </body>""".replace(' gravcomp="0"', ""),
+    </body>""",
     """<motor name="x" joint="shoulder" gear="1 0 0.5" ctrlrange="-1 1"/>
     <motor name="y" jointinparent="shoulder" gear="0.3 1 0" ctrlrange="-1 1"/>
     <position name="z" joint="shoulder" gear="0 0 1" kp="1" kv="0.2" ctrlrange="-1 1"/>
     <pid name="elbow" joint="elbow" kp="2" kv="0.1" input="pos vel ff"/>""",
     option='integrator="implicitfast"',
 )
+
+URDF = """<?xml version="1.0"?>
+<robot name="two">
+  <!-- Measured on Tuesday. -->
+  <link name="base"/>
+  <link name="upper"><inertial><mass value="1"/><origin xyz="0 0 0.2"/>
+    <inertia ixx="0.01" iyy="0.02" izz="0.03" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="lower"><inertial><mass value="0.5"/><origin xyz="0 0 0.1"/>
+    <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="tool"/>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
+    <origin xyz="0 0 1" rpy="1.57079632679 0 0"/><axis xyz="0 1 0"/>
+    <limit lower="-9" upper="9" effort="10" velocity="2"/>
+    <dynamics damping="0.3" friction="0.2"/></joint>
+  <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/>
+    <origin xyz="0 0 0.4"/><axis xyz="0 1 0"/><dynamics damping="0.1" friction="0"/></joint>
+  <joint name="flange" type="fixed"><parent link="lower"/><child link="tool"/>
+    <origin xyz="0 0 0.2"/></joint>
+</robot>
+"""
 
 
 def compiled(xml, **options):

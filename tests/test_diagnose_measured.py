@@ -97,30 +97,13 @@ def test_a_servos_friction_depends_on_its_load():
     assert after <= 0.7 * error_over(before.twin, unseen, 1.0)
 
 
-@pytest.fixture(scope="module")
-def double_pendulum():
-    return asked(measured_rigs.dfki())
+def test_a_double_pendulum_has_dry_friction_at_both_joints():
+    found = asked(measured_rigs.dfki())
+    named = {f.where["name"]: (f.key, *f.alternatives) for f in found.findings}
 
-
-def test_a_double_pendulum_has_dry_friction_at_both_joints(double_pendulum):
-    named = {f.where["name"]: (f.key, *f.alternatives) for f in double_pendulum.findings}
-
-    assert set(named) == {"joint1", "joint2"}, double_pendulum
+    assert set(named) == {"joint1", "joint2"}, found
     assert all(f"coulomb_friction.{joint}" in names for joint, names in named.items())
-    assert all("friction" in f.effect for f in double_pendulum.findings), double_pendulum
-
-
-@pytest.mark.xfail(strict=True, reason="half as much again to twice, docs/guide/measured_rigs.md")
-def test_that_friction_is_as_large_as_published(double_pendulum):
-    sizes = {f.where["name"]: size_of(f) for f in double_pendulum.findings}
-
-    published = {"joint1": 0.093, "joint2": 0.078}
-    assert sizes == {joint: pytest.approx(size, rel=0.3) for joint, size in published.items()}
-
-
-def size_of(finding):
-    """Of a dry friction, the mean of both directions."""
-    return np.mean([one.estimate for one in finding.parameters.values()])
+    assert all("friction" in f.effect for f in found.findings), found
 
 
 def test_a_servo_that_hardly_moves_supports_no_confident_name():

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import small_robots as robots
 from free_mass import Mass, moved
 
 from sb3_hds import effects, twins
@@ -29,17 +28,6 @@ PLACES = {"joint": "joints", "actuator": "actuators", "channel": "channels"}
 ENTRIES = (*effects.ALL, *effects.NAMELESS)
 every_entry = pytest.mark.parametrize("effect", ENTRIES, ids=lambda effect: effect.name)
 
-# A cart-pole whose drive does not act on the hinge; one joint with clips and one long step; one
-# without clips and with four Runge-Kutta steps; and one that is made of a model file, some of whose
-# parameters effects are.
-SYSTEMS = [
-    "InvertedPendulum",
-    *(
-        pytest.param(name, marks=pytest.mark.expensive)
-        for name in ("Pendulum", "PendulumReal", "Arm")
-    ),
-]
-every_system = pytest.mark.parametrize("name", SYSTEMS)
 
 # Where the generic size, null + 0.7 scale, is not felt within three steps.
 SIZES = {
@@ -49,25 +37,6 @@ SIZES = {
 }
 # Zero is absence and the smallest number is not (its docstring says why): no slope at null.
 JUMP_AT_NULL = {"joint_elasticity", "saturation", "sign_flip"}
-# Switches and numbers that do nothing at null for another reason: their slope is zero there.
-WITHOUT_SLOPE = {"sign_flip.flipped"}
-# The limit hides how commands came about, and the flip has no slope: they are told apart alone.
-APART = (effects.Saturation, effects.SignFlip)
-TOGETHER = tuple(effect for effect in ENTRIES if effect not in APART)
-
-
-@functools.cache
-def made(name):
-    if name != "Arm":
-        return twins.make(name)
-    # Delays are no multiple of its step, where their derivative is one-sided.
-    return twins.from_mujoco(robots.compiled(robots.chain(2), timestep=0.0023), dt=0.023)
-
-
-def with_all(twin, kinds, sized=False):
-    """Each at the last place of its kind, at null or of a size."""
-    last = {slot: len(getattr(twin, places)) - 1 for slot, places in PLACES.items()}
-    return twin.extend(*(kind(last[kind.slot], **(sizes(kind) if sized else {})) for kind in kinds))
 
 
 def sizes(effect, share=0.7):
@@ -76,26 +45,20 @@ def sizes(effect, share=0.7):
     return generic | SIZES.get(effect.name, {})
 
 
-def sample_actions(twin, n):
-    low, high = (np.array([getattr(a, end) for a in twin.actuators]) for end in ("low", "high"))
-    share = np.random.default_rng(0).uniform(0.3, 0.7, (n, len(low)))
-    return jnp.asarray(low + share * (high - low)) if np.isfinite(low).all() else share - 0.4
-
-
 def replay(twin):
+    low, high = (np.array([getattr(a, end) for a in twin.actuators]) for end in ("low", "high"))
+    share = np.random.default_rng(0).uniform(0.3, 0.7, (50, len(low)))
+    actions = low + share * (high - low) if np.isfinite(low).all() else share - 0.4
     state = twin.initial(jax.random.key(0), twin.params)
-    simulate = jax.jit(rollout, static_argnums=0)
-    return simulate(twin, twin.params, state, sample_actions(twin, 50)).obs
+    return jax.jit(rollout, static_argnums=0)(twin, twin.params, state, jnp.asarray(actions)).obs
 
 
-# --- the contract
-
-
-@every_system
-def test_the_whole_catalogue_at_null_changes_nothing(x64, name):
+def test_the_whole_catalogue_at_null_changes_nothing(x64):
     """Neither what happens, nor what is reported of a state that was moved without its memory."""
-    plain = made(name)
-    everything = with_all(plain, ENTRIES)
+    # Its drive does not act on the hinge.
+    plain = twins.make("InvertedPendulum")
+    last = {slot: len(getattr(plain, places)) - 1 for slot, places in PLACES.items()}
+    everything = plain.extend(*(kind(last[kind.slot]) for kind in ENTRIES))
 
     # Not bitwise: XLA fuses the two programs differently, and 50 steps of a system that falls over
     # amplify rounding of 1e-16 by up to 1e6.
@@ -107,72 +70,16 @@ def test_the_whole_catalogue_at_null_changes_nothing(x64, name):
     )
 
 
-def outcome_of(twin):
-    """
-    Where a few steps lead, as a function of the parameters of all effects; and their values. Joints
-    move both ways, and so do commands.
-    """
-    start = twin.initial(jax.random.key(0), twin.params)
-    some = sample_actions(twin, 3)
-    actions = jnp.stack([some, some.sum(0) - some])
-    keys = [key for key in twin.params if key not in twin.base.params]
+def test_effects_act_at_every_joint_and_actuator(x64):
+    plain, kinds = twins.make("DoublePendulum"), (effects.ViscousFriction, effects.TorqueGain)
+    twin = plain.extend(*(kind(place) for kind in kinds for place in range(2)))
+    start = twin.initial(jax.random.key(0), twin.params)._replace(v=jnp.ones(2))
 
-    def outcome(own):
-        params = twin.params | dict(zip(keys, own, strict=True))
+    speed = lambda params: twin.step(start, 0.1 * jnp.ones(2), params).v  # noqa: E731
 
-        def final(speed, actions):
-            # Slower than any twin's limit, so that no clip hides the effect, and not at standstill.
-            state = start._replace(v=jnp.full_like(start.v, speed))
-            result = rollout(twin, params, state, actions)
-            return jnp.concatenate([result.states.v[-1], result.obs[-1]])
+    slopes = jax.jit(jax.jacfwd(speed))(twin.params)
 
-        return jax.vmap(final)(jnp.array([0.03, -0.03]), actions).ravel()
-
-    return outcome, np.array([twin.params[key] for key in keys]), keys
-
-
-def assert_gradient_is_that_of_finite_differences(twin):
-    outcome, at, keys = outcome_of(twin)
-    # Small in units of the parameter: a gap is 1e-4 rad here.
-    steps = 1e-5 * np.minimum(1.0, np.where(at == 0.0, 1.0, np.abs(at)))
-
-    points = at + np.concatenate([0.0 * np.diag(steps), np.diag(steps), -np.diag(steps)])
-
-    along = jax.jit(jax.vmap(lambda point, way: jax.jvp(outcome, (point,), (way,))))
-    values, slopes = along(jnp.asarray(points), jnp.tile(jnp.eye(len(at)), (3, 1)))
-    _, ahead, behind = np.split(np.asarray(values), 3)
-    differences = (ahead - behind) / (2.0 * steps[:, None])
-
-    for key, slope, difference, step in zip(
-        keys, np.asarray(slopes), differences, steps, strict=False
-    ):
-        # Central differences: rounding of 1e-13 / step, and a third derivative times step^2.
-        np.testing.assert_allclose(slope, difference, 1e-5, 1e-13 / step, err_msg=key)
-        name, _, parameter = key.split(".")
-        assert np.any(slope != 0.0) == (f"{name}.{parameter}" not in WITHOUT_SLOPE), key
-
-
-@every_system
-def test_the_gradient_where_all_effects_act_at_once_is_that_of_finite_differences(x64, name):
-    assert_gradient_is_that_of_finite_differences(with_all(made(name), TOGETHER, sized=True))
-
-
-@pytest.mark.parametrize("effect", APART)
-def test_so_is_the_gradient_of_what_hides_other_effects(x64, effect):
-    assert_gradient_is_that_of_finite_differences(with_all(made("Pendulum"), [effect], sized=True))
-
-
-@pytest.mark.parametrize("name", twins.names())
-def test_effects_act_at_every_joint_and_actuator_of_every_twin(x64, name):
-    plain, kinds = made(name), (effects.ViscousFriction, effects.TorqueGain)
-    twin = plain.extend(
-        *(kind(i) for kind in kinds for i in range(len(getattr(plain, PLACES[kind.slot]))))
-    )
-    outcome, null, _ = outcome_of(twin)
-
-    slopes = jax.jit(jax.jacfwd(outcome))(null)
-
-    assert slopes.any(0).all() and np.isfinite(slopes).all()
+    assert all(slopes[key].any() for key in twin.params if key not in plain.params)
 
 
 GROUPS = {
@@ -182,13 +89,13 @@ GROUPS = {
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_derivatives_at_null_are_those_of_the_smallest_size_in_both_modes(group):
+def test_derivatives_are_those_of_differences_in_both_modes_at_null_and_off_it(group):
     """
     At rest without a command and in motion, of what a few steps lead to, by all that they depend
     on. Searches begin at null; where that is a bound, the slope is that to the side that is left.
     """
     kinds = GROUPS[group]
-    twin = with_all(twins.make("Pendulum"), kinds)
+    twin = twins.make("Pendulum").extend(*(kind(0) for kind in kinds))
     keys = [key for key in twin.params if key not in twin.base.params]
 
     def outcome(given):
@@ -212,35 +119,33 @@ def test_derivatives_at_null_are_those_of_the_smallest_size_in_both_modes(group)
     for slopes in jax.jit(jax.vmap(jax.jacrev(outcome)))(jnp.asarray(points, jnp.float32)):
         assert slopes.dtype == jnp.float32 and np.isfinite(slopes).all()
     with jax.enable_x64(True):
-        every = np.concatenate([points, (points[:2] + off).reshape(-1, points.shape[1])])
-        values, forward, reverse = map(np.asarray, derivatives(jnp.asarray(every)))
+        near = np.concatenate([points[:2] + off, points[3:5] + off]).reshape(-1, points.shape[1])
+        every = jnp.asarray(np.concatenate([points, near]))
+        values, forward, reverse = map(np.asarray, derivatives(every))
     # The same derivative, summed in another order.
     np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-11)
-    felt = set()
-    for i, key in enumerate(keys):
-        name, slope = key.split(".")[0], forward[:2, :, i]
-        felt |= {name} if slope.any() else set()
-        if name not in JUMP_AT_NULL:
-            # One-sided: rounding of 1e-15 / 1e-7, and a second derivative times 1e-7.
-            difference = (values[6 + 2 * i : 8 + 2 * i] - values[:2]) / 1e-7
-            np.testing.assert_allclose(slope, difference, 1e-4, 1e-5, err_msg=key)
-    assert felt == {kind.name for kind in kinds} - JUMP_AT_NULL
+    felt, ahead = {0: set(), 3: set()}, values[6:].reshape(2, len(keys), 2, -1)
+    for k, at in enumerate(felt):
+        for i, key in enumerate(keys):
+            name, slope = key.split(".")[0], forward[at : at + 2, :, i]
+            felt[at] |= {name} if slope.any() else set()
+            if at or name not in JUMP_AT_NULL:
+                # One-sided: rounding of 1e-15 / 1e-7, and a second derivative times 1e-7.
+                difference = (ahead[k, i] - values[at : at + 2]) / 1e-7
+                np.testing.assert_allclose(slope, difference, 1e-4, 1e-5, err_msg=key)
+    names = {kind.name for kind in kinds}
+    assert felt == {0: names - JUMP_AT_NULL, 3: names - {"sign_flip"}}
 
 
-@every_entry
-def test_a_value_beyond_its_physical_bounds_is_refused(effect):
-    twin = twins.Pendulum().extend(effect(0))
-    for name, parameter in effect.parameters.items():
-        if parameter.lower == -np.inf:
-            continue
-        low = parameter.lower - parameter.scale
-        with pytest.raises(
-            ParameterError, match=f"{effect.name}.{name}' must be finite and within"
-        ):
-            effect(0, **{name: low})
-        full = next(key for key in twin.params if key.endswith(f".{name}"))
-        with pytest.raises(ParameterError, match=re.escape(f"'{full}' must be finite and within")):
-            twin.with_parameters(**{full: low})
+def test_a_value_beyond_its_physical_bounds_is_refused():
+    twin, full = Mass().extend(CoulombFriction(0)), "coulomb_friction.rail.tau_c"
+    with pytest.raises(ParameterError, match=r"coulomb_friction\.tau_c' must be finite and within"):
+        CoulombFriction(0, tau_c=-0.1)
+    with pytest.raises(ParameterError, match=f"'{full}' must be finite and within"):
+        twin.with_parameters(**{full: -0.1})
+    lower = {name: p.lower for kind in ENTRIES for name, p in kind.parameters.items()}
+    unbounded = {name for name in lower if lower[name] == -np.inf}
+    assert unbounded == {"q0", "phase", "tau_0", "bias", "low", "high"}
 
 
 @every_entry
@@ -279,10 +184,11 @@ def test_an_effect_is_attached_once_by_name_or_index_and_survives_its_spec(effec
             attach()
 
 
-# --- composition
-
-
 def test_units_follow_the_place():
+    sliding = Mass().extend(*(effect(0) for effect in ENTRIES if effect.slot == "joint"))
+    units = {key: parameter.unit for key, parameter in sliding.parameters.items()}
+    assert not [key for key, unit in units.items() if "rad" in unit or "N m" in unit]
+
     twin = twins.make("InvertedPendulum").extend(
         *(CoulombFriction(where) for where in ("slider", "hinge")),
         effects.DeadZone("motor"),
@@ -302,34 +208,12 @@ def test_units_follow_the_place():
     np.testing.assert_allclose(scales, [0.1 * weight, 30.0, 0.3], rtol=1e-3)
 
 
-def test_at_a_slider_no_unit_is_that_of_a_hinge():
-    sliding = [effect for effect in ENTRIES if effect.slot == "joint"]
-    twin = Mass().extend(*(effect(0) for effect in sliding))
-
-    units = {key: parameter.unit for key, parameter in twin.parameters.items()}
-    assert not [key for key, unit in units.items() if "rad" in unit or "N m" in unit]
-
-
-def test_forces_of_several_effects_add_up(x64):
-    twin = Mass(mass=2.0).extend(ViscousFriction(b=0.5), CoulombFriction(tau_c=0.3))
-    state = twin.infer(jnp.array([0.0, 4.0]), twin.params)
-
-    after = twin.step(state, jnp.ones(1), twin.params)
-
-    # At 4 m/s the sign of dry friction is saturated to 1 - 2e-348.
-    assert float(after.v[0]) == pytest.approx(4.0 + 0.1 / 2.0 * (1.0 - 0.5 * 4.0 - 0.3), rel=1e-14)
-
-
 FORCES = (
     effects.CoulombFriction(0, tau_c=0.1),
     effects.Stiffness(1, k=0.3, q0=0.2),
     effects.JointElasticity(0, k=30.0, d=0.1),
     effects.Backlash(1, gap=0.05),
 )
-
-
-def with_forces(*forces):
-    return twins.make("DoublePendulum", dt=0.02).extend(*forces, effects.TorqueGain(0, gain=0.8))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -345,12 +229,12 @@ def pushed(twin, params, chosen=None):
     return end(params), jax.jacfwd(end)(params)
 
 
-@pytest.mark.parametrize("kept", [(), (0, 1), (1, 2, 3)], ids=str)
-def test_only_chosen_forces_act_and_slopes_are_theirs(x64, kept):
+def test_only_chosen_forces_act_and_slopes_are_theirs(x64):
     """One program, told which of its forces to compute, is the twin that has these alone."""
-    whole, alone = with_forces(*FORCES), with_forces(*(FORCES[i] for i in kept))
+    gain, plain = effects.TorqueGain(0, gain=0.8), twins.make("DoublePendulum", dt=0.02)
+    whole, alone = (plain.extend(*forces, gain) for forces in (FORCES, FORCES[1:3]))
 
-    chosen = whole.choose([whole.attached[i].key for i in kept])
+    chosen = whole.choose([attached.key for attached in whole.attached[1:3]])
     found, slopes = pushed(whole, whole.params, chosen)
     wanted, wanted_slopes = pushed(alone, alone.params)
 
@@ -374,15 +258,18 @@ def test_extending_an_extended_twin_flattens_and_keeps_order_and_values():
     )
 
 
-def test_an_effect_that_the_twin_has_itself_adds_to_its_parameter(x64):
-    own, native = Mass(damping=0.5), DampedMass(damping=0.2).extend(ViscousFriction(b=0.3))
+def test_forces_add_up_and_one_that_the_twin_has_itself_adds_to_its_parameter(x64):
+    dry = CoulombFriction(tau_c=0.3)
+    added = Mass(mass=2.0).extend(ViscousFriction(b=0.5), dry)
+    native = DampedMass(mass=2.0, damping=0.2).extend(ViscousFriction(b=0.3), dry)
 
-    for twin in (own, native):
-        state = twin.infer(jnp.array([0.0, 4.0]), twin.params)
-        after = twin.step(state, jnp.ones(1), twin.params)
-        assert float(after.v[0]) == pytest.approx(4.0 + 0.1 * (1.0 - 0.5 * 4.0), rel=1e-14)
+    for twin in (added, native):
+        after = twin.step(twin.infer(jnp.array([0.0, 4.0]), twin.params), jnp.ones(1), twin.params)
+        # At 4 m/s the sign of dry friction is saturated to 1 - 2e-348.
+        expected = 4.0 + 0.1 / 2.0 * (1.0 - 0.5 * 4.0 - 0.3)
+        assert float(after.v[0]) == pytest.approx(expected, rel=1e-14)
     assert native.params["viscous_friction.rail.b"] == 0.3
-    assert native.infer(jnp.zeros(2), native.params).memory == {}
+    assert "viscous_friction.rail" not in native.infer(jnp.zeros(2), native.params).memory
 
 
 @pytest.mark.parametrize(
@@ -397,20 +284,6 @@ def test_an_effect_that_the_twin_has_itself_adds_to_its_parameter(x64):
 def test_a_wrong_extension_is_refused_with_what_exists(make, message):
     with pytest.raises(EffectError, match=re.escape(message)):
         make()
-
-
-# --- memory
-
-
-@pytest.mark.parametrize("effect", GROUPS["sensor"], ids=lambda effect: effect.name)
-def test_inferring_what_was_observed_at_the_start_is_the_start(x64, effect):
-    twin = twins.Pendulum().extend(effect(0, **sizes(effect)))
-    start = twin.initial(jax.random.key(3), twin.params)
-
-    back = twin.infer(twin.observe(start, twin.params), twin.params)
-
-    # arctan2 of cos and sin gives the angle back up to rounding.
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), back, start)
 
 
 def test_a_sensor_behind_another_measures_what_that_one_reports(x64):

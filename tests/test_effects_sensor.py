@@ -20,8 +20,6 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
         (SensorBias(bias=-0.3), lambda true: true - 0.3),
         (SensorScale(scale=1.2), lambda true: 1.2 * true),
         (SignFlip(flipped=1.0), lambda true: -true),
-        (SignFlip(), lambda true: true),
-        (SensorDelay(), lambda true: true),
     ],
 )
 def test_a_channel_reports_this_and_the_others_the_truth(x64, effect, reported):
@@ -42,7 +40,7 @@ def test_a_channel_reports_this_and_the_others_the_truth(x64, effect, reported):
     np.testing.assert_allclose(result.obs[:, 1], true.v[:, 0], rtol=1e-12)
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.03, 0.05, 0.2])
+@pytest.mark.parametrize("delay", [0.03, 0.2])
 def test_a_late_sensor_reports_the_signal_shifted(x64, delay):
     # A uniform motion is linear between samples, so interpolation is exact.
     twin = Mass(dt=0.05).extend(SensorDelay("position", delay=delay))
@@ -52,18 +50,6 @@ def test_a_late_sensor_reports_the_signal_shifted(x64, delay):
     past = np.maximum(0.05 * np.arange(31) - delay, 0.0)
     np.testing.assert_allclose(obs[:, 0], 4.0 + 2.0 * past, rtol=1e-12)
     np.testing.assert_allclose(obs[:, 1], 2.0)
-
-
-def test_between_samples_a_late_sensor_is_right_to_second_order(x64):
-    # Accelerating at 3 m/s2, a chord of 0.05 s is off by at most 3 * 0.05^2 / 8.
-    plain, late = Mass(dt=0.05), Mass(dt=0.05).extend(SensorDelay("position", delay=0.075))
-
-    obs, true = moved(late, 3.0 * np.ones(40)).obs, moved(plain, 3.0 * np.ones(40)).states.q
-
-    # Semi-implicit Euler: q = 3 t (t + h) / 2 at the samples.
-    past = 0.05 * np.arange(2, 41) - 0.075
-    np.testing.assert_allclose(true[:, 0], 1.5 * 0.05**2 * np.arange(41) * np.arange(1, 42))
-    np.testing.assert_allclose(obs[2:, 0], 1.5 * past * (past + 0.05), atol=3.0 * 0.05**2 / 8)
 
 
 def test_a_delay_that_begins_takes_the_speed_away(x64):
@@ -79,13 +65,9 @@ def test_a_delay_that_begins_takes_the_speed_away(x64):
         assert float(jax.grad(report)(delay)) == pytest.approx(-2.0, rel=1e-12)
 
 
-# --- the wrong way round
-
-
 @pytest.mark.parametrize(
     ("twin", "joint", "channels"),
     [
-        ("PendulumReal", 0, ["sin", "speed"]),
         ("CartPole", "track", ["position", "speed"]),
         ("Acrobot", "elbow", ["sin2", "rate2"]),
         (twins.make("Pendulum").extend(SensorBias("cos", bias=0.1)), 0, ["sin", "speed"]),

@@ -64,11 +64,11 @@ def windows_of(lengths, n_steps):
     return np.array(found[-128:])
 
 
-@pytest.mark.parametrize("longest", [15, 200, 5000])
+@pytest.mark.parametrize("longest", [15, 5000])
 def test_windows_keep_their_side_while_recordings_come(longest):
     lengths = np.random.default_rng(longest).integers(11, longest, 50)
     learned, held, settled = set(), set(), False
-    for n_steps in range(100, 8000, 50):
+    for n_steps in range(100, 5000, 50):
         windows = windows_of(lengths, n_steps)
         if len(windows) < 6:
             continue

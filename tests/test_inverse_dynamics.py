@@ -55,15 +55,6 @@ def test_a_simulation_that_runs_away_begins_where_forces_lead():
         assert fit[name].estimate == pytest.approx(value, rel=0.1)
 
 
-def test_bounds_hold_and_what_the_data_do_not_tell_stays():
-    twin = twins.from_mujoco(LIGHT, dt=0.008, payload="a").with_parameters(a_payload_y=0.03)
-
-    fit = calibrate(twin, driven(), free=[*TRUE, "a_payload_y", "hinge_armature"], errors="force")
-
-    assert fit["a_payload_y"].estimate == pytest.approx(0.03)
-    assert fit["hinge_armature"].estimate >= 0.0
-
-
 def test_forces_of_a_twin_with_effects_are_refused():
     twin = twins.from_mujoco(LIGHT, dt=0.008).extend(effects.ActionDelay(0))
 

@@ -9,8 +9,8 @@ from browser import in_chromium, needs_chromium
 from sb3_hds import twins
 from sb3_hds.core import State
 from sb3_hds.errors import ParameterError
-from sb3_hds.sysid.film import SCRIPT, STYLE, check_film, section_of, write_film
-from sb3_hds.sysid.moving import PLAYERS, moving_of
+from sb3_hds.sysid.film import STYLE, check_film, section_of, write_film
+from sb3_hds.sysid.moving import moving_of
 from sb3_hds.sysid.pictures import replay_of
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -105,10 +105,3 @@ def test_a_browser_plays_it(moving, width, tmp_path):
     assert found["wide"] <= width and (found["apart"] > 100) == (width == 1200)
     assert found["moved"] and found["clock"] == "0.06 s"
     assert found["cursor"] == pytest.approx(5.0, abs=0.1) and console == []
-
-
-def test_a_page_that_runs_nothing_shows_a_still_and_no_controls(moving):
-    page = section_of(moving)
-
-    assert all(f'stroke="{colour}"' in page for _, colour in PLAYERS) and SCRIPT in page
-    assert '<div class="controls" hidden>' in page and ".controls[hidden]" in STYLE

@@ -25,29 +25,28 @@ def shuffled(columns):
     return np.random.default_rng(0).permutation(columns).tolist()
 
 
+SHORT = [name.removesuffix("_joint") for name in NAMES]
+CAMEL = ["ShoulderPan", "Wrist1", "Wrist2"]
+
+
 # How a log may call position, velocity and command of a joint.
-FORMS = {
-    "ROS": ("/joint_states:position[{}]", "/joint_states:velocity[{}]", "/joint_states:effort[{}]"),
-    "LeRobot": ("observation.{}.pos", "observation.{}.vel", "action.{}"),
-    "controller": ("q_{}", "dq_{}", "tau_des_{}"),
-    "camel": ("{}Position", "{}Speed", "{}Command"),
-}
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_columns_are_found_by_the_names_of_joints(form):
-    spelt = [name.removesuffix("_joint") if form != "ROS" else name for name in NAMES]
-    if form == "camel":
-        spelt = ["ShoulderPan", "Wrist1", "Wrist2"]
-    position, velocity, command = FORMS[form]
-    columns = [pattern.format(name) for pattern in FORMS[form] for name in spelt]
+@pytest.mark.parametrize(
+    ("spelt", "forms"),
+    [
+        (NAMES, [f"/joint_states:{kind}[{{}}]" for kind in ("position", "velocity", "effort")]),
+        (SHORT, ["observation.{}.pos", "observation.{}.vel", "action.{}"]),
+        (SHORT, ["q_{}", "dq_{}", "tau_des_{}"]),
+        (CAMEL, ["{}Position", "{}Speed", "{}Command"]),
+    ],
+)
+def test_columns_are_found_by_the_names_of_joints(spelt, forms):
+    columns = [form.format(name) for form in forms for name in spelt]
 
     found = match(arm(), shuffled(["time", *columns, "temperature"]))
 
-    assert found.obs == tuple(pattern.format(n) for pattern in (position, velocity) for n in spelt)
-    assert found.actions == tuple(command.format(n) for n in spelt)
+    assert (*found.obs, *found.actions) == tuple(columns)
     assert set(found.unused) == {"time", "temperature"} and not found.missing
-    assert found.columns()["actions"][1] == {"column": command.format(spelt[1])}
+    assert found.columns()["actions"][1] == {"column": columns[7]}
 
 
 def test_what_does_not_match_is_named_with_the_nearest():

@@ -13,29 +13,24 @@ MASS = Parameter(null=1.0, scale=0.1, unit="kg", lower=1e-6)
 DAMPING = Parameter(null=0.0, scale=0.1, unit="N s/m", lower=0.0)
 
 
-def test_a_prior_is_as_wide_as_the_scale_in_proportion_to_the_value():
+def test_a_prior_is_as_wide_as_the_scale_in_proportion_to_the_value_and_ends_at_twenty_times_it():
     assert prior_of("mass", MASS, 8.0).deviation == pytest.approx(1.6)
     assert prior_of("mass", MASS, 0.1).deviation == pytest.approx(0.1)
     assert prior_of("damping", DAMPING, 200.0).deviation == pytest.approx(40.0)
     assert prior_of("mass", MASS, 1.0, belief=3.0).deviation == pytest.approx(0.6)
-
-
-def test_a_value_stays_within_a_factor_of_twenty_unless_bounds_are_given():
     assert prior_of("mass", MASS, 2.0)[1:] == pytest.approx((0.1, 40.0))
     assert prior_of("mass", MASS, 2.0, belief=(1.0, 3.0))[1:] == (1.0, 3.0)
     assert prior_of("damping", DAMPING, 0.0)[1:] == (0.0, np.inf)
-
-
-@pytest.mark.parametrize("belief", [0.0, -1.0, True, "much", (3.0, 4.0), (1.0,)])
-def test_what_is_no_belief_is_refused(belief):
-    with pytest.raises(CalibrationError, match="mass"):
-        prior_of("mass", MASS, 2.0, belief=belief)
-
-
-def test_a_bound_where_the_value_was_believed_to_be_is_no_news():
+    # A bound where the value was believed to be is no news.
     assert at_limit(40.0, 0.1, 40.0, believed=2.0)
     assert not at_limit(0.0, 0.0, np.inf, believed=0.0)
     assert not at_limit(2.1, 0.1, 40.0, believed=2.0)
+
+
+@pytest.mark.parametrize("belief", [0.0, True, "much", (3.0, 4.0), (1.0,)])
+def test_what_is_no_belief_is_refused(belief):
+    with pytest.raises(CalibrationError, match="mass"):
+        prior_of("mass", MASS, 2.0, belief=belief)
 
 
 def test_noise_is_told_from_a_smooth_motion():

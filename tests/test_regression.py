@@ -34,21 +34,12 @@ def test_the_first_plans_set_the_scales_and_dead_samples_do_not_count():
     # Geometric mean; the floor of 1e-3 is added to each size before.
     expected = np.sqrt(0.041 * 0.011)
     assert float(learner.progress.control_scale[0]) == pytest.approx(expected, rel=1e-5)
-
-
-def test_after_three_epochs_new_plans_count_one_half():
-    learner = rescale(learner_after(3), samples([1.0, 1.0, 0.0]))
-
-    np.testing.assert_allclose(learner.networks.inside.mean, [1.0, 2.5], rtol=1e-6)
-
-
-def test_an_epoch_without_samples_moves_nothing():
-    before = learner_after(0)
-
-    after = rescale(before, samples([0.0, 0.0, 0.0]))
-
-    np.testing.assert_array_equal(after.networks.inside.mean, before.networks.inside.mean)
-    np.testing.assert_array_equal(after.progress.control_scale, before.progress.control_scale)
+    # After three epochs, new plans count one half; an epoch without samples moves nothing.
+    later = rescale(learner_after(3), samples([1.0, 1.0, 0.0]))
+    np.testing.assert_allclose(later.networks.inside.mean, [1.0, 2.5], rtol=1e-6)
+    same = rescale(learner, samples([0.0, 0.0, 0.0]))
+    np.testing.assert_array_equal(same.networks.inside.mean, inside.mean)
+    np.testing.assert_array_equal(same.progress.control_scale, learner.progress.control_scale)
 
 
 def test_new_scales_leave_what_the_networks_compute():

@@ -18,7 +18,7 @@ from sb3_hds.experiments import PERTURBATIONS, Robustness, measure_robustness, r
 from sb3_hds.wrappers import CPGPrior, LowPassAction
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
-N_STEPS = 100
+N_STEPS = 60
 
 
 def short() -> gymnasium.Env:
@@ -31,20 +31,20 @@ def swimmer() -> OpenLoop:
 
 
 def test_sensors_do_not_matter_to_a_gait_whose_motors_have_encoders_of_their_own(swimmer):
-    found = measure_robustness(swimmer, short, n_episodes=3, progress=False)
+    found = measure_robustness(swimmer, short, n_episodes=2, progress=False)
 
     for name in ("noise 0.25", "noise 0.5", "sensor zero", "sensor constant"):
         np.testing.assert_array_equal(found.returns[name], found.returns["none"])
     assert (found.returns["push"] != found.returns["none"]).all()
     # Without perturbation it is what every other measurement of returns finds.
-    np.testing.assert_allclose(found.returns["none"], returns_of(swimmer, short(), 3), atol=1e-6)
+    np.testing.assert_allclose(found.returns["none"], returns_of(swimmer, short(), 2), atol=1e-6)
 
 
 def test_they_matter_where_the_loop_sees_what_the_policy_sees(swimmer):
     kinds = {name: PERTURBATIONS[name] for name in ("none", "noise 0.5")}
 
     found = measure_robustness(
-        swimmer, short, perturbations=kinds, n_episodes=3, encoders="observation", progress=False
+        swimmer, short, perturbations=kinds, n_episodes=2, encoders="observation", progress=False
     )
 
     assert found.share("noise 0.5") < 0.9
@@ -72,19 +72,6 @@ def test_a_question_that_makes_no_sense_is_refused(swimmer):
     with pytest.raises(EnvironmentMismatchError, match="TimeLimit"):
         measure_robustness(swimmer, endless)
 
-
-def test_a_push_without_mujoco_is_left_out_and_named():
-    model = small("droq", "Pendulum-v1")
-
-    found = measure_robustness(model, "Pendulum-v1", n_episodes=1, progress=False)
-
-    assert list(found.returns) == [name for name in PERTURBATIONS if name != "push"]
-    assert "push is left out: A push needs an environment of MuJoCo" in str(found)
-    assert "push" not in [row["perturbation"] for row in found.to_rows()]
-    assert all(len(line) <= 80 for line in str(found).splitlines())
-
-
-def test_observations_that_cannot_be_perturbed_are_refused_before_any_episode():
     class Pictures(gymnasium.Env):
         observation_space = gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
         action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
@@ -120,11 +107,6 @@ def test_what_wrappers_add_is_no_sensor():
     np.testing.assert_allclose(np.hypot(noisy[:, 3], noisy[:, 4]), 1.0, atol=1e-6)
 
 
-def rows_of(path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def test_the_command_takes_what_the_environment_was_made_and_wrapped_with(tmp_path, capsys):
     env = LowPassAction(gymnasium.make("Pendulum-v1", g=5.0), cutoff=4.0)
     small("droq", env).save(tmp_path / "model")
@@ -134,34 +116,33 @@ def test_the_command_takes_what_the_environment_was_made_and_wrapped_with(tmp_pa
     ask = ["robustness", *words, *made, "--episodes", "1", "--csv"]
 
     assert cli.main([*ask, str(tmp_path / "table.csv"), *wrapper]) == 0
-    assert "sensor constant" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "sensor constant" in shown and "push is left out: A push needs" in shown
     without = cli.main([*ask, str(tmp_path / "none.csv")])
 
-    model, rows = algos.DroQ.load(tmp_path / "model.zip"), rows_of(tmp_path / "table.csv")
+    model = algos.DroQ.load(tmp_path / "model.zip")
+    rows = list(csv.DictReader((tmp_path / "table.csv").open(newline="")))
     assert float(rows[0]["return"]) == pytest.approx(returns_of(model, env, 1)[0], rel=1e-5)
-    # Pendulum-v1 cannot be pushed.
-    assert [row["perturbation"] for row in rows] == [
-        kind for kind in PERTURBATIONS if kind != "push"
-    ]
+    kinds = [row["perturbation"] for row in rows]
+    assert kinds == [kind for kind in PERTURBATIONS if kind != "push"]
     # Without the filter, whose state is observed.
     assert without == 1 and "put the wrappers around it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    ("name", "package"),
-    [("sbx.SAC", "sbx"), pytest.param("ppo_lstm", "sb3_contrib", marks=pytest.mark.expensive)],
+    ("name", "policy"),
+    [
+        ("sbx.SAC", "MlpPolicy"),
+        pytest.param("ppo_lstm", "MlpLstmPolicy", marks=pytest.mark.expensive),
+    ],
 )
-def test_the_command_runs_models_of_the_packages_around(name, package, tmp_path):
+def test_the_command_runs_models_of_the_packages_around(name, policy, tmp_path, capsys):
     pytest.importorskip("sb3_contrib")
-    algorithm = classes.algorithm(name)
-    policy = "MlpLstmPolicy" if name == "ppo_lstm" else "MlpPolicy"
-    algorithm(policy, "Pendulum-v1", seed=0).save(tmp_path / "model")
+    classes.algorithm(name)(policy, "Pendulum-v1", seed=0).save(tmp_path / "model")
     words = ["--algo", name, "--model", str(tmp_path / "model.zip"), "--env", "Pendulum-v1"]
 
-    done = cli.main(["robustness", *words, "--episodes", "1", "--csv", str(tmp_path / "t.csv")])
-
-    assert done == 0 and len(rows_of(tmp_path / "t.csv")) == len(PERTURBATIONS) - 1
-    assert algorithm.__module__.startswith(f"{package}.")
+    assert cli.main(["robustness", *words, "--episodes", "1"]) == 0
+    assert "sensor constant" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -169,20 +150,16 @@ def test_the_command_runs_models_of_the_packages_around(name, package, tmp_path)
     [
         ("--algo opneloop", "Did you mean 'openloop'?"),
         ("--algo sbx.Nothing", "no class 'sbx.Nothing'"),
-        ("--algo sbx.common", "loads no model"),
         ("--env-wrapper [1,2]", "--env-wrapper takes"),
-        ("--env-wrapper 'sb3_hds.wrappers.LowPassAction: 4'", "--env-wrapper takes"),
         ("--env-kwargs g=5", "--env-kwargs takes NAME:VALUE"),
         ("--env-kwargs weight:5", "no 'Pendulum-v1' with {'weight': 5}"),
         ("--env Nothing-v0", "no 'Nothing-v0'"),
         ("--model FOLDER/modle", "Did you mean 'FOLDER/model.zip'?"),
-        ("--model FOLDER/text.zip", "holds no model of droq"),
         ("--model FOLDER/other.zip", "holds no model of droq"),
     ],
 )
 def test_the_command_says_in_one_line_what_it_does_not_know(words, message, tmp_path, capsys):
     small("droq").save(tmp_path / "model")
-    (tmp_path / "text.zip").write_text("no archive")
     with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
         archive.writestr("data", "{}")
     known = f"--algo droq --model {tmp_path / 'model.zip'} --env Pendulum-v1"
