@@ -21,7 +21,7 @@ from sb3_hds.sysid.remainder import MissingForce, remainder
 from sb3_hds.sysid.search import Half, Search, _Reached
 from sb3_hds.sysid.sentence import several_in_words
 from sb3_hds.sysid.shooting import shots_of
-from sb3_hds.sysid.telling import ANOTHER, NAMELESS, contradiction, errs_more, out_of_reach
+from sb3_hds.sysid.telling import NAMELESS, contradiction, errs_more, out_of_reach
 
 KINDS = ["ViscousFriction", "CoulombFriction", "QuadraticDrag", "TorqueGain", "MotorLag"]
 KINDS += ["ActionDelay"]
@@ -192,16 +192,6 @@ def test_what_a_search_from_where_nothing_is_wrong_misses_is_found(effect, stren
     for name, one in found.findings[0].parameters.items():
         if name not in ("d", "phase"):
             assert one.estimate == pytest.approx(effect.values[name], rel=0.1), name
-
-
-@pytest.mark.expensive
-def test_friction_that_rises_is_not_named_after_friction_that_falls():
-    rising = effects.StribeckFriction("hinge", tau_c=0.03, tau_s=0.01, v_s=0.6)
-    pushed, data = swinging(rising)
-    found = asked(data, pushed, effects=[effects.StribeckFriction], budget="quick")
-
-    assert "stribeck_friction" not in [finding.effect for finding in found.findings]
-    assert [one.why for one in found.rejected if "stribeck" in one.name] == [ANOTHER]
 
 
 def test_nothing_is_not_the_verdict_where_held_out_recordings_surely_prefer_something():

@@ -26,26 +26,6 @@ def lead_of(states, key):
 
 
 @pytest.mark.parametrize(
-    ("effect", "integrator", "h"),
-    [
-        (JointElasticity(k=5.0, d=0.1, motor_share=0.1), semi_implicit_euler, 10.0),
-        (Backlash(gap=0.2, motor_share=0.1), explicit_euler, 0.1),
-        (Backlash(gap=0.2, motor_share=0.1), rk4, 1e-3),
-    ],
-)
-def test_motor_and_load_together_have_the_momentum_of_the_rigid_joint(x64, effect, integrator, h):
-    pushes = np.random.default_rng(0).uniform(-1.0, 1.0, 100)
-    twin = mass_with(integrator, dt=h, mass=0.5)
-
-    rigid, both = (moved(x, pushes, speed=1.0).states for x in (twin, twin.extend(effect)))
-
-    _, speed = lead_of(both, f"{effect.name}.rail")
-    momentum = 0.5 * (both.v[:, 0] + 0.1 * speed)
-    np.testing.assert_allclose(momentum, 0.5 * rigid.v[:, 0], rtol=1e-9, atol=1e-12 + 1e-13 * h)
-    assert np.abs(speed).max() > 1e-6
-
-
-@pytest.mark.parametrize(
     ("kind", "name", "sizes", "lead", "speed", "integrator", "h"),
     [
         (JointElasticity, "k", [1e-3, 1.0, 1e3, 1e9], 0.1, -2.0, semi_implicit_euler, 10.0),

@@ -37,9 +37,8 @@ FURUTA = robots.robot(
     </body>""",
     '<motor joint="arm"/>',
 )
-TIP = (
-    """<body pos="0 0 -{}"><inertial pos="0 0 0" mass="{}" diaginertia="1e-9 1e-9 1e-9"/></body>"""
-)
+TIP = """<body pos="0 0 -{}">
+  <inertial pos="0 0 0" mass="{}" diaginertia="1e-9 1e-9 1e-9"/></body>"""
 S, C = 9.81 * np.sin(0.2), 9.81 * np.cos(0.2)
 
 
