@@ -86,6 +86,9 @@ GROUPS = {
     slot: [effect for effect in ENTRIES if effect.__module__.endswith(slot)]
     for slot in ("joint", "position", "nameless", "transmission", "actuator", "sensor")
 }
+# The limit hides how commands came about.
+GROUPS["actuator"].remove(effects.Saturation)
+GROUPS["sensor"].append(effects.Saturation)
 
 
 @pytest.mark.parametrize("group", GROUPS)
@@ -210,9 +213,8 @@ def test_units_follow_the_place():
 
 FORCES = (
     effects.CoulombFriction(0, tau_c=0.1),
-    effects.Stiffness(1, k=0.3, q0=0.2),
+    effects.Stiffness(0, k=0.3, q0=0.2),
     effects.JointElasticity(0, k=30.0, d=0.1),
-    effects.Backlash(1, gap=0.05),
 )
 
 
@@ -222,7 +224,7 @@ def pushed(twin, params, chosen=None):
     chain, actions = EffectChain((), {}, chosen), jnp.sin(jnp.arange(25.0))[:, None]
 
     def end(params):
-        start = twin.infer(jnp.array([0.5, -0.3, 0.0, 0.0]), params)
+        start = twin.infer(jnp.array([0.5, 0.0]), params)
         go = lambda state, action: (twin.step(state, action, params, chain), None)  # noqa: E731
         return twin.observe(jax.lax.scan(go, start, actions)[0], params)
 
@@ -231,8 +233,8 @@ def pushed(twin, params, chosen=None):
 
 def test_only_chosen_forces_act_and_slopes_are_theirs(x64):
     """One program, told which of its forces to compute, is the twin that has these alone."""
-    gain, plain = effects.TorqueGain(0, gain=0.8), twins.make("DoublePendulum", dt=0.02)
-    whole, alone = (plain.extend(*forces, gain) for forces in (FORCES, FORCES[1:3]))
+    gain, plain = effects.TorqueGain(0, gain=0.8), twins.make("LinearAxis", dt=0.02)
+    whole, alone = (plain.extend(*forces, gain) for forces in (FORCES, FORCES[1:]))
 
     chosen = whole.choose([attached.key for attached in whole.attached[1:3]])
     found, slopes = pushed(whole, whole.params, chosen)

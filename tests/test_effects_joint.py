@@ -174,7 +174,7 @@ def test_load_dependent_friction_counts_both_sides_of_the_gear(x64):
         )
     ]
     # The bias is -4.9: actuator + bias = -5.9. Inertia 1/3.
-    assert float(speeds[1] - speeds[0]) / 1e-6 == pytest.approx(-0.1 * 5.9 * 3.0, rel=1e-5)
+    assert float(speeds[1][0] - speeds[0][0]) / 1e-6 == pytest.approx(-0.1 * 5.9 * 3.0, rel=1e-5)
 
 
 def test_a_spring_makes_a_mass_oscillate_about_its_rest(x64):
