@@ -14,6 +14,8 @@ from measuring import measured
 
 from sb3_hds import Trajectories, cli, effects, twins
 from sb3_hds.cli import measured as measured_room
+from sb3_hds.experiments import PolicyGain
+from sb3_hds.experiments.policy_gain import _summarised
 from sb3_hds.sysid import Diagnosis
 from sb3_hds.twins import registry
 
@@ -29,9 +31,9 @@ def swings(tmp_path_factory):
     """A free pendulum of 0.3 kg: its log in radians, with stamps in milliseconds, and a map."""
     folder = tmp_path_factory.mktemp("swings")
     twin = twins.make("FreePendulum", mass=0.3, damping=0.002, dt=1.0 / 150.0)
-    obs = measured(twin, n=6, n_steps=450, commands=np.zeros((6, 450, 0))).obs
-    time = np.tile(np.round(np.arange(451) / 150.0, 3), 6)
-    run = np.repeat(np.arange(6), 451)
+    obs = measured(twin, n=4, n_steps=300, commands=np.zeros((4, 300, 0))).obs
+    time = np.tile(np.round(np.arange(301) / 150.0, 3), 4)
+    run = np.repeat(np.arange(4), 301)
     for name, scale in (("rad", 1.0), ("deg", 180.0 / np.pi)):
         table = np.column_stack([time, run, scale * obs.reshape(-1, 2)])
         header = {"header": "t,run,angle,speed", "comments": ""}
@@ -264,25 +266,36 @@ def test_what_the_audit_proposes_is_done_if_wanted_and_said(asked, tmp_path, cap
     assert audited["corrections"] and audited["corrected"]["velocity_shift"] == {}
 
 
-def test_a_diagnosis_and_the_gain_in_policy_are_printed_and_written(tmp_path, capsys):
+def test_a_diagnosis_and_the_gain_in_policy_are_printed_and_written(tmp_path, capsys, monkeypatch):
+    compared, returns = (
+        [],
+        {"believed": np.array([[-9.0, -7.0]]), "extended": np.array([[-4.0, -2.0]])},
+    )
+
+    def measure(found, env, learner, **given):
+        compared.append((env.unwrapped.spec.id, learner.__name__, given))
+        return PolicyGain(returns, _summarised(returns["extended"] - returns["believed"]))
+
+    monkeypatch.setattr("sb3_hds.experiments.measure_policy_gain", measure)
     twin, page, plain = twins.make("PendulumReal"), tmp_path / "out.html", tmp_path / "out.json"
     rubbing = twin.extend(effects.CoulombFriction(0, tau_c=0.1))
-    log = measured(rubbing, n=12, n_steps=100, noise=0.01).save(tmp_path / "log")
-    small = ["pretrain_epochs:1", "n_rollouts:4", "n_random_plans:0", "compare_every:0"]
+    log = measured(rubbing, n=8, n_steps=80, noise=0.01).save(tmp_path / "log")
 
     code = ask(
         *("--twin", "PendulumReal", "--data", log, "--effects", "coulomb_friction"),
         *("--budget", "quick", "--report", page, "--json", plain),
         *("--env", "sb3_hds/PendulumReal-v1", "--env-kwargs", "friction:0.1"),
-        *("--policies", 1, "--episodes", 2, "--hyperparams", *small),
+        *("--policies", 1, "--episodes", 2, "--hyperparams", "n_rollouts:4"),
     )
 
     assert code == 0
+    ((env, learner, given),) = compared
+    assert (env, learner) == ("sb3_hds/PendulumReal-v1", "HDS")
+    assert (given["seeds"], given["n_episodes"], given["n_rollouts"]) == (1, 2, 4)
     shown, told = capsys.readouterr().out, json.loads(plain.read_text())
     assert "coulomb_friction at joint hinge" in shown and "2 start states, one run" in shown
     assert told["findings"][0]["effect"] == "coulomb_friction"
-    assert set(told["policy_gain"]["simulations"]) == {"believed", "extended", "true"}
-    assert f"{told['policy_gain']['gain']['mean']:.1f}" in page.read_text()
+    assert told["policy_gain"]["gain"]["mean"] == 5.0 and "5.0" in page.read_text()
 
 
 def test_where_nothing_was_found_no_policies_are_compared(asked, tmp_path, capsys):

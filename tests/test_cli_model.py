@@ -34,7 +34,7 @@ def write(path, head, rows):
     np.savetxt(path, rows, "%.9f", ",", header=head, comments="")
 
 
-def motion(model, n=400):
+def motion(model, n=200):
     data, rows = mujoco.MjData(model), []
     rate = np.array([2.0, 3.1])[: model.nu]
     for k in range(n):

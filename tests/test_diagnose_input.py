@@ -61,17 +61,25 @@ def test_one_recording_of_rest_is_refused_because_nothing_moves_with_all_other_c
     assert any("Time stamps jitter" in caveat for caveat in found.caveats[1:])
 
 
-def test_an_extended_twin_is_asked_again_by_one_name_for_each_cause(rubbing):
-    """Effects may be named, and a single parameter to calibrate may stand alone."""
+def test_an_extended_twin_is_asked_again_by_names_and_a_glitch_is_cut_out_and_said(
+    rubbing,
+):
     twin = TWIN.extend(effects.CoulombFriction(0, tau_c=0.01))
+    obs = np.array(rubbing.obs)
+    obs[2, 40, 0] += 3.0
+    glitched = Trajectories.from_arrays(list(obs), list(rubbing.actions), dt=0.02)
     names = ["CoulombFriction", "viscous_friction"]
 
-    found = diagnose(twin, rubbing, effects=names, calibrate="mass", budget="quick", progress=False)
+    found = diagnose(
+        twin, glitched, effects=names, calibrate="mass", budget="quick", progress=False
+    )
 
     [finding] = found.findings
     assert (finding.effect, finding.alternatives) == ("coulomb_friction", ())
-    assert finding.parameters["tau_c"].estimate == pytest.approx(0.02, rel=0.05)
-    assert found.twin.values["coulomb_friction.hinge.tau_c"] == pytest.approx(0.02, rel=0.05)
+    assert finding.parameters["tau_c"].estimate == pytest.approx(0.02, rel=0.1)
+    assert found.twin.values["coulomb_friction.hinge.tau_c"] == pytest.approx(0.02, rel=0.1)
+    [said] = [caveat for caveat in found.caveats if caveat.endswith("Cut out.")]
+    assert "'hinge_position' jumps" in said
 
 
 def test_less_of_what_the_twin_has_is_told_as_what_is_added_to_it():
@@ -156,16 +164,3 @@ def test_an_interval_that_a_log_cannot_tell_from_the_twins_is_the_same():
         else:
             with pytest.raises(CalibrationError, match=r"steps by 0\.0333333 s and the data are"):
                 check_fits(twin, data)
-
-
-def test_a_glitch_is_cut_out_and_said_and_hides_nothing(rubbing):
-    obs = np.array(rubbing.obs)
-    obs[2, 40, 0] += 3.0
-    glitched = Trajectories.from_arrays(list(obs), list(rubbing.actions), dt=0.02)
-
-    found = asked(TWIN, glitched)
-
-    assert [finding.effect for finding in found.findings] == ["coulomb_friction"]
-    assert found.findings[0].parameters["tau_c"].estimate == pytest.approx(0.02, rel=0.2)
-    [said] = [caveat for caveat in found.caveats if caveat.endswith("Cut out.")]
-    assert "'hinge_position' jumps" in said

@@ -49,7 +49,7 @@ def test_a_simulation_that_runs_away_begins_where_forces_lead():
     """From zero friction, simulated velocities are hundreds of times the measured ones."""
     twin = twins.from_mujoco(LIGHT, dt=0.008)
 
-    fit = calibrate(twin, driven(noise=0.0), free=list(TRUE), window=10)
+    fit = calibrate(twin, driven(n=120, noise=0.0), free=list(TRUE), window=10)
 
     for name, value in TRUE.items():
         assert fit[name].estimate == pytest.approx(value, rel=0.1)

@@ -11,8 +11,10 @@ from sb3_hds.effects import NeuralForce
 from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid import fit_residual
 
+SMALL = {"n_members": 2, "net_arch": (8,)}
 
-def simulated(twin, n=6, n_steps=100, noise=0.0):
+
+def simulated(twin, n=6, n_steps=80, noise=0.0):
     """Episodes of random commands in a twin, as if they had been measured."""
     rng = np.random.default_rng(0)
     (actuator,) = twin.actuators
@@ -135,7 +137,7 @@ def test_it_learns_a_friction_that_the_twin_lacks():
     twin = twins.make("Pendulum")
     data = simulated(twin.extend(effects.CoulombFriction(0, tau_c=0.4)))
 
-    found = fit_residual(twin, data)
+    found = fit_residual(twin, data, **SMALL)
 
     assert found.accepted
     assert found.twin.values[f"{found.key}.share"] == 1.0
@@ -157,7 +159,7 @@ def test_a_force_learned_from_garbage_is_refused():
         rng.standard_normal(data.obs.shape), list(data.actions), dt=data.dt
     )
 
-    found = fit_residual(twin, noise, seed=1)
+    found = fit_residual(twin, noise, seed=1, **SMALL)
 
     assert not found.accepted
     assert found.twin.values[f"{found.key}.share"] == 0.0
@@ -165,4 +167,4 @@ def test_a_force_learned_from_garbage_is_refused():
 
 def test_nothing_is_learned_where_nothing_is_wrong():
     twin = twins.make("Pendulum")
-    assert not fit_residual(twin, simulated(twin, noise=0.02)).accepted
+    assert not fit_residual(twin, simulated(twin, noise=0.02), **SMALL).accepted

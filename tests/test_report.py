@@ -17,12 +17,12 @@ from sb3_hds.sysid import telling
 from sb3_hds.sysid.diagnosis import SENTENCES, Rejected
 
 TWIN = twins.make("PendulumReal")
-KINDS = (effects.CoulombFriction, effects.ViscousFriction, effects.Backlash)
+KINDS = (effects.CoulombFriction, effects.ViscousFriction)
 
 
 @pytest.fixture(scope="module")
 def rubbing():
-    data = measured(TWIN.extend(effects.CoulombFriction(0, tau_c=0.1)), 12, 120, noise=0.01)
+    data = measured(TWIN.extend(effects.CoulombFriction(0, tau_c=0.1)), 8, 80, noise=0.01)
     return diagnose(TWIN, data, effects=KINDS, budget="quick", progress=False)
 
 
