@@ -19,7 +19,7 @@ from sb3_hds.sysid.guesses import newton
 from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
 from sb3_hds.sysid.progress import Bar
 from sb3_hds.sysid.remainder import MissingForce, remainder
-from sb3_hds.sysid.search import Half, Search, _Reached
+from sb3_hds.sysid.search import Half, Search
 from sb3_hds.sysid.sentence import several_in_words
 from sb3_hds.sysid.shooting import shots_of
 from sb3_hds.sysid.telling import NAMELESS, contradiction, errs_more, out_of_reach
@@ -128,27 +128,6 @@ def test_two_causes_are_found_together():
     assert {f.effect for f in found.findings} == {"coulomb_friction", "action_delay"}
     assert found.twin.values["coulomb_friction.hinge.tau_c"] == pytest.approx(0.1, rel=0.15)
     assert found.twin.values["action_delay.torque.delay"] == pytest.approx(0.05, rel=0.15)
-
-
-def test_a_fit_goes_on_where_the_candidate_explains_most_with_its_start_states():
-    asked_about = []
-
-    def nearest(theta, offsets, measured):
-        asked_about.append((list(theta), len(offsets)))
-        return offsets[-1], abs(theta[1] - 3.0)
-
-    search = SimpleNamespace(hypotheses=SimpleNamespace(indices=lambda _: (1,)), _far=set())
-    evidence = SimpleNamespace(shots=SimpleNamespace(n=2), nearest=nearest)
-    believed = Point(np.array([1.0, 0.0]), np.zeros((2, 1)), None, 0.0)
-    here = _Reached(np.array([1.2, 2.5]), np.ones((2, 1)), (0,))
-    elsewhere = _Reached(np.array([7.0, 9.0]), np.full((2, 1), 5.0), ())
-
-    candidate = SimpleNamespace(key="lag.motor")
-    theta, offsets = Search._begin(search, candidate, believed, (0,), evidence, [elsewhere, here])
-
-    assert asked_about == [([1.0, 9.0], 1), ([1.2, 2.5], 2)]
-    np.testing.assert_array_equal(theta, here.theta)
-    np.testing.assert_array_equal(offsets, here.offsets)
 
 
 def swinging(*hidden, strength=0.05):
@@ -475,26 +454,6 @@ def test_every_window_begins_with_what_happened_before_it(effect):
     theta[list(hypotheses.indices(candidate))] = list(effect.values.values())
 
     np.testing.assert_allclose(evidence.fit(theta, ()).raw, 0.0, atol=1e-5)
-
-
-def test_what_is_null_and_does_not_move_is_not_computed():
-    twin = twins.make("LinearAxis", dt=0.02).extend(effects.Stiffness(0, k=2.0))
-    kinds = (effects.Stiffness, effects.CoulombFriction, effects.Backlash, effects.TorqueGain)
-    hypotheses = Hypotheses.about(twin, kinds, ())
-    place = hypotheses.names.index
-
-    def computed(theta, *index):
-        on = hypotheses.chosen(theta, np.array(index)).on
-        return {key.partition(".")[0] for key in on if on[key]}
-
-    there = place("coulomb_friction.axis.tau_c")
-    nothing = len(hypotheses.names)
-    assert computed(hypotheses.null, nothing) == {"stiffness"}, "which the twin had already"
-    assert computed(hypotheses.null, there, nothing) == {"stiffness", "coulomb_friction"}
-    theta = hypotheses.null.copy()
-    theta[place("backlash.axis.gap")] = 0.01
-    theta[place("stiffness.axis.k")] = 0.0
-    assert computed(theta, nothing) == {"backlash"}
 
 
 def test_a_guess_stays_within_its_room():

@@ -5,11 +5,7 @@ import pytest
 from measuring import measured
 
 from sb3_hds import diagnose, effects, twins
-from sb3_hds.core import (
-    NO_EFFECTS,
-    JointEffect,
-    Trajectories,
-)
+from sb3_hds.core import NO_EFFECTS, JointEffect, Trajectories
 from sb3_hds.data import SamplingWarning
 from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.calibrate import check_fits
@@ -61,9 +57,7 @@ def test_one_recording_of_rest_is_refused_because_nothing_moves_with_all_other_c
     assert any("Time stamps jitter" in caveat for caveat in found.caveats[1:])
 
 
-def test_an_extended_twin_is_asked_again_by_names_and_a_glitch_is_cut_out_and_said(
-    rubbing,
-):
+def test_an_extended_twin_is_asked_again_by_names_and_a_glitch_is_cut_out_and_said(rubbing):
     twin = TWIN.extend(effects.CoulombFriction(0, tau_c=0.01))
     obs = np.array(rubbing.obs)
     obs[2, 40, 0] += 3.0

@@ -11,7 +11,7 @@ import pytest
 from free_mass import Mass, moved
 
 from sb3_hds import effects, twins
-from sb3_hds.core import EffectChain, ForceEffect, Parameter, State, rollout
+from sb3_hds.core import EffectChain, rollout
 from sb3_hds.effects import CoulombFriction, ViscousFriction
 from sb3_hds.errors import EffectError, ParameterError
 
@@ -302,46 +302,3 @@ def test_a_sensor_behind_another_measures_what_that_one_reports(x64):
     ):
         obs = moved(Mass().extend(*order), np.zeros(10), position=expected[0], speed=1.0).obs
         np.testing.assert_allclose(obs[:, 0], expected, rtol=1e-12, atol=1e-12)
-
-
-def test_memory_batches_and_keeps_the_precision_of_the_state(x64):
-    twin = Mass().extend(
-        effects.MotorLag(time_constant=0.2),
-        effects.Hysteresis(**sizes(effects.Hysteresis)),
-        effects.SensorDelay(0, delay=0.1),
-    )
-    obs = jnp.asarray(np.random.default_rng(0).normal(size=(4, 2)), jnp.float32)
-    actions = jnp.ones((10, 1), jnp.float32)
-
-    def simulate(obs):
-        return rollout(twin, twin.params, twin.infer(obs, twin.params), actions)
-
-    batch = jax.jit(jax.vmap(simulate))(obs)
-
-    assert {leaf.dtype for leaf in jax.tree.leaves(batch.states)} == {jnp.dtype(jnp.float32)}
-    np.testing.assert_allclose(batch.obs[2], jax.jit(simulate)(obs[2]).obs, rtol=1e-5)  # float32
-
-
-def test_a_force_effect_may_act_on_other_joints_than_its_own(x64):
-    class Coupling(ForceEffect):
-        """Pulls two joints together."""
-
-        name = "coupling"
-        parameters = {"k": Parameter(null=0.0, scale=1.0, unit="N m/rad", lower=0.0)}
-        explanation, source = "A belt connects two joints.", "test"
-
-        def force(self, moment, index, memory, params):
-            pull = params["k"] * (moment.q[1] - moment.q[0])
-            return jnp.stack([pull, -pull])
-
-    plain = twins.make("Acrobot", dt=1e-6)
-    coupled = plain.extend(Coupling(k=2.0))
-    q = jnp.array([0.3, -0.2])
-
-    def speed(twin, memory):
-        return twin.step(State(q, jnp.zeros(2), memory), jnp.zeros(1), twin.params).v
-
-    gained = (speed(coupled, {"coupling.shoulder": ()}) - speed(plain, {})) / 1e-6
-    pull = 2.0 * (q[1] - q[0])
-    expected = np.linalg.solve(plain.mass_matrix(q, plain.params), [pull, -pull])
-    np.testing.assert_allclose(gained, expected, rtol=1e-5)  # first order in a step of 1e-6 s

@@ -8,14 +8,7 @@ from free_mass import Mass, mass_with, moved
 from scipy.special import ellipk
 
 from sb3_hds import twins
-from sb3_hds.core import (
-    JointMoment,
-    State,
-    explicit_euler,
-    rk4,
-    rollout,
-    semi_implicit_euler,
-)
+from sb3_hds.core import JointMoment, State, explicit_euler, rk4, rollout, semi_implicit_euler
 from sb3_hds.effects import (
     Cogging,
     ConstantForce,
@@ -63,14 +56,7 @@ def test_friction_never_adds_energy(x64, effect):
 
 
 def coast(effect, integrator, h, v, steps=1, mass=0.5, values=None):
-    """
-    Speed of a free mass after each step under friction alone.
-
-    :param effect: with its values
-    :param v: initial speeds
-    :param values: of its parameters, for each initial speed, where they differ
-    :return: shape ``(len(v), steps + 1)``
-    """
+    """Speeds of free masses under friction alone, for each of them; so may values differ."""
     twin = mass_with(integrator, dt=h, mass=mass).extend(effect)
 
     def speeds(v, own):

@@ -86,7 +86,7 @@ def test_windows_keep_their_side_while_recordings_come(longest):
 
 
 def test_what_was_learned_from_is_not_held_out_when_the_oldest_steps_are_overwritten(sides):
-    model_in(real(60), buffer_size=300).learn(800)
+    model_in(real(60), buffer_size=400).learn(900)
     assert sides.n_corrections > 9
 
 

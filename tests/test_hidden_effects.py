@@ -75,20 +75,6 @@ def test_a_late_sensor_keeps_its_bias_and_a_reversed_joint_turns_position_and_ve
     np.testing.assert_allclose(turned, end_of("furuta") * [1.0, -1.0, 1.0, -1.0])
 
 
-def test_dry_friction_of_the_engine_is_dry():
-    # Thrown with a speed of 1 m/s on a level axis without damping, the mass stops after m v / tau.
-    model = modelled(SYSTEMS["linear_axis"], [Planted("coulomb_friction", 0, {"tau_c": 4.0})])
-    model.dof_damping[:] = 0.0
-    data = mujoco.MjData(model)
-    data.qvel[0] = 1.0
-    while data.time < 0.45:
-        mujoco.mj_step(model, data)
-    assert data.qvel[0] == pytest.approx(1.0 - 0.45 * 4.0 / 2.0, abs=2e-3)
-    while data.time < 0.52:
-        mujoco.mj_step(model, data)
-    assert abs(data.qvel[0]) < 1e-3
-
-
 def judged(effect, named, v, *, index=0, values=(), u=1.0, system="double_pendulum"):
     """Whether names are right where one effect was planted and joints move at given velocities."""
     planted = Planted(effect, index, dict(values))

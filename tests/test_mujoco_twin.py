@@ -274,9 +274,17 @@ def test_derivatives_are_those_of_finite_differences_both_ways(xml, options):
     differences = (np.stack(ends[0], 1) - np.stack(ends[1], 1)) / 2e-6
     # Rounding of 1e-16 over 1e-6, and curvature of dry friction.
     np.testing.assert_allclose(slopes, differences, rtol=1e-6, atol=1e-7)
+
+
+def test_derivatives_are_finite_in_single_precision():
     with jax.enable_x64(False):
-        single = jax.jit(jax.grad(lambda x: after(x).sum()))(jnp.zeros(len(here)))
-    assert single.dtype == jnp.float32 and np.isfinite(single).all()
+        twin = twins.from_mujoco(robots.compiled(robots.BALL))
+        start = twin.initial(jax.random.key(0), twin.params)
+        loss = lambda v: jnp.sum(twin.step(start._replace(v=v), jnp.zeros(6), twin.params).q)  # noqa: E731
+
+        slope = jax.jit(jax.grad(loss))(start.v)
+
+    assert slope.dtype == jnp.float32 and np.isfinite(slope).all()
 
 
 def test_a_difference_of_orientations_leads_from_one_to_the_other():

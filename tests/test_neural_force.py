@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from measuring import measured
 
 from sb3_hds import effects, twins
 from sb3_hds.core import Trajectories, rollout
@@ -11,22 +12,14 @@ from sb3_hds.effects import NeuralForce
 from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid import fit_residual
 
+
+def recorded(twin, n=6, n_steps=80, noise=0.0):
+    (high,) = (actuator.high for actuator in twin.actuators)
+    commands = np.random.default_rng(0).uniform(-high, high, (n, n_steps, 1))
+    return measured(twin, n, n_steps, noise, commands=commands)
+
+
 SMALL = {"n_members": 2, "net_arch": (8,)}
-
-
-def simulated(twin, n=6, n_steps=80, noise=0.0):
-    """Episodes of random commands in a twin, as if they had been measured."""
-    rng = np.random.default_rng(0)
-    (actuator,) = twin.actuators
-    actions = rng.uniform(actuator.low, actuator.high, (n, n_steps, 1))
-    starts = jax.vmap(lambda k: twin.initial(k, twin.params))(
-        jax.random.split(jax.random.key(1), n)
-    )
-    run = jax.jit(jax.vmap(lambda s, u: rollout(twin, twin.params, s, u).obs))
-    obs = np.asarray(run(starts, jnp.asarray(actions, jnp.float32)), np.float64)
-    return Trajectories.from_arrays(
-        obs + noise * rng.standard_normal(obs.shape), actions, dt=twin.dt
-    )
 
 
 def end_of(twin, params=None, n_steps=20):
@@ -130,12 +123,12 @@ def test_what_is_no_ensemble_no_file_of_one_or_too_few_data_is_refused(tmp_path)
         NeuralForce(n_members=0)
     twin = twins.make("Pendulum")
     with pytest.raises(CalibrationError, match="too few"):
-        fit_residual(twin, simulated(twin, n=1, n_steps=12), window=10)
+        fit_residual(twin, recorded(twin, n=1, n_steps=12), window=10)
 
 
 def test_it_learns_a_friction_that_the_twin_lacks():
     twin = twins.make("Pendulum")
-    data = simulated(twin.extend(effects.CoulombFriction(0, tau_c=0.4)))
+    data = recorded(twin.extend(effects.CoulombFriction(0, tau_c=0.4)))
 
     found = fit_residual(twin, data, **SMALL)
 
@@ -153,7 +146,7 @@ def test_it_learns_a_friction_that_the_twin_lacks():
 
 def test_a_force_learned_from_garbage_is_refused():
     twin = twins.make("Pendulum")
-    data = simulated(twin)
+    data = recorded(twin)
     rng = np.random.default_rng(0)
     noise = Trajectories.from_arrays(
         rng.standard_normal(data.obs.shape), list(data.actions), dt=data.dt
@@ -167,4 +160,4 @@ def test_a_force_learned_from_garbage_is_refused():
 
 def test_nothing_is_learned_where_nothing_is_wrong():
     twin = twins.make("Pendulum")
-    assert not fit_residual(twin, simulated(twin, noise=0.02), **SMALL).accepted
+    assert not fit_residual(twin, recorded(twin, noise=0.02), **SMALL).accepted
