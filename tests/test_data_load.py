@@ -10,13 +10,13 @@ import jax
 import numpy as np
 import pytest
 import scipy.io
+import yaml
 
 from sb3_hds import Trajectories
 from sb3_hds.core import Trajectories as CoreTrajectories
 from sb3_hds.core import trajectories
 from sb3_hds.data import SamplingWarning
 from sb3_hds.data.columns import columns_from
-from sb3_hds.data.load import _paths
 from sb3_hds.data.rows import rows_of
 from sb3_hds.errors import TrajectoryError
 
@@ -32,65 +32,15 @@ def swing(n=50, dt=DT, start=0.0):
     return {"t": t, "q": np.sin(3.0 * t), "v": 3.0 * np.cos(3.0 * t), "u": np.arange(n) / 10.0}
 
 
-def write_csv(path, table, separator=","):
+def write_csv(path, table):
     rows = zip(*table.values(), strict=True)
-    lines = [separator.join(table), *(separator.join(str(x) for x in row) for row in rows)]
+    lines = [",".join(table), *(",".join(map(str, row)) for row in rows)]
     path.write_text("\n".join(lines) + "\n")
     return path
 
 
-def write_npz(path, table):
-    np.savez(path, **table)
-    return path
-
-
-def write_parquet(path, table):
-    pandas, _ = pytest.importorskip("pandas"), pytest.importorskip("pyarrow")
-    pandas.DataFrame(table).to_parquet(path)
-    return path
-
-
-def write_mat(path, table):
-    scipy.io.savemat(path, table)
-    return path
-
-
-def write_json(path, table):
-    path.write_text(json.dumps({name: list(map(float, c)) for name, c in table.items()}))
-    return path
-
-
-def write_records(path, table):
-    rows = [
-        dict(zip(table, map(float, row), strict=True)) for row in zip(*table.values(), strict=True)
-    ]
-    path.write_text(json.dumps({"mass": 0.5, "entries": rows}))
-    return path
-
-
-WRITERS = {
-    "log.csv": write_csv,
-    "log.npz": write_npz,
-    "log.parquet": write_parquet,
-    "log.mat": write_mat,
-    "log.json": write_json,
-    "records.json": write_records,
-}
-
-
-@pytest.mark.parametrize("name", WRITERS)
-def test_a_log_of_any_format_holds_observation_k_and_the_action_that_follows_it(name, tmp_path):
-    table = swing()
-
-    data = Trajectories.load(WRITERS[name](tmp_path / name, table), columns=COLUMNS)
-
-    obs, actions = data.episode(0)
-    np.testing.assert_array_equal(obs, np.stack([table["q"], table["v"]], axis=1))
-    np.testing.assert_array_equal(actions, table["u"][:-1, None])
-    assert (data.dt, data.conditions, not data.report.altered) == (DT, ("default",), True)
-
-
-def test_columns_are_scaled_shifted_held_constant_and_renamed(tmp_path):
+@pytest.mark.parametrize("kind", ["dict", "yml"])
+def test_columns_are_scaled_shifted_held_constant_and_renamed(kind, tmp_path):
     write_csv(tmp_path / "log.csv", swing())
     columns = {
         "time": {"column": "t", "scale": 2.0},
@@ -99,27 +49,19 @@ def test_columns_are_scaled_shifted_held_constant_and_renamed(tmp_path):
             {"constant": 7.0, "name": "load"},
         ],
         "actions": [],
+        "condition": {"from": "filename"},
     }
+    if kind == "yml":
+        # What YAML takes for a word is a number, too.
+        (tmp_path / "map.yml").write_text(yaml.safe_dump(columns).replace("2.0", "2e0"))
+        columns = str(tmp_path / "map.yml")
 
-    data = Trajectories.load(tmp_path / "log.csv", columns=columns)
+    data = Trajectories.load(str(tmp_path / "*.csv"), columns=columns)
 
     np.testing.assert_allclose(data.obs[0, :, 0], 1.0 - 2.0 * swing()["q"], rtol=1e-15)
     assert (data.obs[0, :, 1] == 7.0).all() and data.n_act == 0
     assert data.dt == 2.0 * DT and data.report.obs == ("angle", "load")
-
-
-def test_a_yml_file_says_the_same_as_a_dict(tmp_path):
-    write_csv(tmp_path / "log.csv", swing())
-    (tmp_path / "map.yml").write_text(
-        "dt: 0.02\nobs: [{column: q, scale: 1e-1}, {column: v}]\n"
-        "actions: [{column: u, scale: 2.0}]\ncondition: {from: filename}\n"
-    )
-
-    data = Trajectories.load(str(tmp_path / "*.csv"), columns=str(tmp_path / "map.yml"))
-
-    np.testing.assert_allclose(data.obs[0, :, 0], 0.1 * swing()["q"])
-    assert data.conditions == ("log",) and data.actions[0, 3, 0] == 2.0 * swing()["u"][3]
-    assert data.dt == 0.02
+    assert data.conditions == ("log",)
 
 
 def test_patterns_give_files_in_alphabetical_order_and_lists_keep_theirs(tmp_path, monkeypatch):
@@ -176,8 +118,9 @@ def test_cells_of_a_mat_file_are_episodes_and_the_longer_axis_of_a_matrix_is_tim
 
 
 def test_our_own_files_need_no_columns_and_come_back_together(tmp_path):
-    write_csv(tmp_path / "log.csv", swing())
-    data = Trajectories.load(tmp_path / "log.csv", columns=COLUMNS)
+    table = swing()
+    table["u"][-1] = np.nan  # it acts on nothing
+    data = Trajectories.load(write_csv(tmp_path / "log.csv", table), columns=COLUMNS)
     for name in ("a", "b"):
         data.save(tmp_path / name)
 
@@ -186,9 +129,6 @@ def test_our_own_files_need_no_columns_and_come_back_together(tmp_path):
 
     np.testing.assert_array_equal(again.obs, data.obs)
     assert again.report is None and len(both) == 2 and both.origin.tolist() == [0, 1]
-
-
-# --- time
 
 
 def jittered(n=400, share=0.2, seed=0):
@@ -213,11 +153,10 @@ def test_jittered_stamps_are_resampled_and_the_change_is_reported(tmp_path):
     np.testing.assert_allclose(data.obs[0, :, 0], np.sin(3.0 * grid), atol=9.0 * bound)
     np.testing.assert_allclose(data.obs[0, :, 1], 3.0 * np.cos(3.0 * grid), atol=27.0 * bound)
     [sampling] = data.report.recordings
-    steps = np.diff(table["t"])
-    np.testing.assert_allclose(sampling.intervals, (steps.min(), np.median(steps), steps.max()))
     # The grid is a mean of 400 stamps that are off by up to a tenth of an interval.
-    assert sampling.resampled and 0.0 < sampling.moved <= 0.11 * DT
-    assert sampling.clock == "jittered" and 0.0 < sampling.error[0] < 18.0 * bound
+    assert sampling.clock == "jittered" and 0.0 < sampling.moved <= 0.11 * DT
+    assert "measured when the stamps say" in data.report.clocks() and data.report.altered
+    assert 0.0 < sampling.error[0] < 18.0 * bound
     assert max(map(len, str(data.report).splitlines())) <= 80
     assert json.loads(json.dumps(data.report.to_dict()))["recordings"][0]["rows"] == 400
     # It goes with selections, but not through JAX.
@@ -237,19 +176,6 @@ def test_a_resampled_command_gives_the_impulse_of_the_one_that_was_held(tmp_path
     assert data.actions.sum() * data.dt == pytest.approx(held @ table["u"][:-1], rel=1e-9)
 
 
-def test_an_angle_turns_the_shorter_way_when_resampled(tmp_path):
-    table = swing(40, dt=0.1)
-    table["q"] = (0.4 * np.arange(40) + np.pi) % (2.0 * np.pi) - np.pi
-    columns = {"time": "t", "obs": [{"column": "q", "angle": True}], "actions": ["u"], "dt": 0.05}
-
-    with pytest.warns(SamplingWarning):
-        data = Trajectories.load(write_csv(tmp_path / "log.csv", table), columns=columns)
-
-    angle = data.obs[0, :, 0]
-    assert (angle >= -np.pi).all() and (angle < np.pi).all()
-    np.testing.assert_allclose(np.unwrap(angle), 0.2 * np.arange(79), atol=1e-12)
-
-
 def test_a_gap_ends_the_episode_and_both_parts_are_one_recording(tmp_path):
     table = swing(50)
     table["t"][20:] += 6.0 * DT
@@ -266,22 +192,15 @@ def test_a_gap_ends_the_episode_and_both_parts_are_one_recording(tmp_path):
     np.testing.assert_array_equal(whole.actions[0, 18:27, 0], [1.8, *[1.9] * 7, 2.0])
 
 
-# --- refused at the door
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"observations": ["q"]}, "the key 'observations', which is not known"),
-        ({"action": ["u"]}, "Did you mean 'actions'?"),
+        ({"tiem": "t"}, "Did you mean 'time'"),
         ({"obs": "q"}, "obs must be a list of columns, got 'q'."),
-        ({"obs": []}, "obs must name at least one column."),
         ({"obs": [{"colum": "q"}]}, "obs[0] has the key 'colum'"),
         ({"obs": [{"column": "q", "constant": 1.0}]}, "obs[0] needs either 'column'"),
         ({"obs": [{"column": "q", "scale": "big"}]}, "scale must be a finite number, got 'big'"),
-        ({"obs": [True]}, "must be the name of a column, got True"),
         ({"obs": ["q", "q"]}, "two channels of obs are called 'q'"),
-        ({"time": {"constant": 0.0}}, "time needs either 'column'"),
         ({"time": None}, "time: NAME"),
         ({"condition": "load"}, "condition must be {column: NAME} or {from: filename}"),
         ({"dt": -1.0}, "dt must be the sampling interval"),
@@ -298,79 +217,54 @@ def test_columns_that_make_no_sense_are_refused_with_the_way_out(change, message
         Trajectories.load(tmp_path / "log.csv", columns=COLUMNS | change)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("obs: [q", "is not valid yml"),
-        ("- q\n- v", "holds a list. columns names what a log holds"),
-        ("tiem: t", "has the key 'tiem', which is not known.*Did you mean 'time'"),
-        ("obs: !!python/object/apply:os.getcwd []", "is not valid yml"),
-        (None, "could not be read"),
-    ],
-)
-def test_a_yml_file_that_cannot_be_read_says_why(text, message, tmp_path):
-    write_csv(tmp_path / "log.csv", swing())
-    if text is not None:
+def test_a_yml_file_runs_no_code(tmp_path):
+    for text in ("obs: [q", "obs: !!python/object/apply:os.getcwd []"):
         (tmp_path / "map.yml").write_text(text)
+        with pytest.raises(TrajectoryError, match="is not valid yml"):
+            Trajectories.load(tmp_path / "log.csv", columns=tmp_path / "map.yml")
 
-    with pytest.raises(TrajectoryError, match=message):
-        Trajectories.load(tmp_path / "log.csv", columns=tmp_path / "map.yml")
+
+LINES = "0.0,1,2,3\n0.1,1,2,3\n"
 
 
 @pytest.mark.parametrize(
-    ("column", "rows", "value", "message"),
+    ("name", "content", "says"),
     [
-        ("q", slice(3, 4), np.nan, "Column 'q' of 'log.csv' must be finite, got nan in"),
-        ("t", slice(3, 4), np.inf, "Column 't' of 'log.csv' must be finite, got inf in"),
-        ("u", slice(7, 8), np.nan, "got nan in row 7, counted from 0 (1 such values"),
-        ("t", slice(20, 50), 0.05, "decreases in 'log.csv', from 0.19 to 0.05 s at row 20"),
-        ("u", slice(49, 50), np.nan, None),  # the last action acts on nothing
+        ("text.json", '"hello"', "has no column 'q', 't', 'u', 'v'. It has: 0."),
+        ("log.mat", "nothing that MATLAB wrote" * 20, "is damaged or not a .mat file"),
+        ("log.csv", "", "is empty: nothing was logged"),
+        ("log.csv", "t,q,v,u\n", "no row"),
+        ("log.csv", LINES, "its 4 columns have no names: write their numb"),
+        ("log.csv", "rig,3,hot\nMonday\nt,q,v,u\n" + LINES, "before the names: skip: 2."),
+        ("log.csv", "t,q,v,u\nlow,high,low,low\n" + LINES, "what follows must be numbers, got"),
+        ("log.csv", "t,q,v,u\n0,1,2,3\n3,4,5,6,7\n", "has 5 fields in line 3 and 4 before"),
+        ("log.csv", "t,q,v,u\n0,00,1,5,0,0,0,0\n", "4 names in its first line and 8 fields"),
+        ("log.csv", f"t,q,v,u\n{LINES}0.2,off?,6,0\n", "must hold numbers, got 'off?' in row 2"),
+        ("log.csv", "t,q,v,u\n2024-05-01 12:00:00.1,1,0,0\n", "to seconds before"),
+        ("log.csv", f"t,q,v,u\n{LINES}0.2,nan,6,0\n", "must be finite, got nan in row 2"),
+        ("log.csv", f"t,q,v,u\n{LINES}0.05,0,6,0\n", "from 0.1 to 0.05 s at row 2"),
+        ("log.csv", b"\x89HDF\r\n\x1a\n" + bytes(99), "is an HDF5 file, in spite of its name"),
+        ("log.mat", b"PAR1" + bytes(99), "rename it to 'log.parquet'"),
+        ("log.db3", b"nothing", "'ros2 bag reindex' or 'rosbag reindex'"),
+        ("log.xls", "", "there are readers for .csv, .tsv"),
+        ("log.csv", bytes(range(256)), "is damaged or not a .csv file"),
+        ("nowhere.csv", None, "does not exist"),
+        ("log.npz", None, "must have the same length, got q 50, t 50, u 50, v 49"),
+        ("", None, "is a folder; name the files in it"),
+        ("[ab].csv", None, "b.csv' has not; it has: t, q, u"),
+        ("*.hdf", None, "No file matches"),
     ],
 )
-def test_a_defect_is_named_with_column_and_row(column, rows, value, message, tmp_path):
-    table = swing()
-    table[column][rows] = value
-    path = write_csv(tmp_path / "log.csv", table)
-
-    if message is None:
-        assert Trajectories.load(path, columns=COLUMNS).n_steps == 49
-        return
-    with pytest.raises(TrajectoryError, match=re.escape(message)):
-        Trajectories.load(path, columns=COLUMNS)
-
-
-def test_files_that_cannot_be_read_say_why(tmp_path):
+def test_a_file_that_cannot_be_read_says_why(name, content, says, tmp_path):
     write_csv(tmp_path / "a.csv", swing())
     write_csv(tmp_path / "b.csv", {k: v for k, v in swing().items() if k != "v"})
     np.savez(tmp_path / "log.npz", **(swing() | {"v": np.zeros(49)}))
-    contents = {
-        "log.json": (b'{"t": [0.0,', "is damaged or not a .json file"),
-        "text.json": (b'"hello"', "has no column 'q', 't', 'u', 'v'. It has: 0."),
-        "log.mat": (b"nothing that MATLAB wrote" * 20, "is damaged or not a .mat file"),
-        "bad.npz": (b"PK nothing", "is damaged"),
-        "empty.csv": (b"", "is empty: nothing was logged"),
-        "names.csv": (b"t,q,v,u\n", "no row"),
-        "numbers.csv": (b"0.0,1,2,3\n0.1,1,2,3\n", "its 4 columns have no names: write their numb"),
-        "log.xls": (b"", "there are readers for .csv, .tsv"),
-        "picture.csv": (bytes(range(256)), "is damaged or not a .csv file"),
-        "nowhere.csv": (None, "does not exist"),
-        "log.npz": (None, "must have the same length, got q 50, t 50, u 50, v 49"),
-        "": (None, "is a folder; name the files in it"),
-        "[ab].csv": (None, "b.csv' has not; it has: t, q, u"),
-        "*.hdf": (None, "No file matches"),
-    }
+    if content is not None:
+        content = content.encode() if isinstance(content, str) else content
+        (tmp_path / name).write_bytes(content)
 
-    for name, (content, message) in contents.items():
-        if content is not None:
-            (tmp_path / name).write_bytes(content)
-        with pytest.raises(TrajectoryError, match=re.escape(message)):
-            Trajectories.load(str(tmp_path / name), columns=COLUMNS)
-    with pytest.raises(TrajectoryError, match="cannot be read without columns"):
-        Trajectories.load([tmp_path / "log.json"])
-    with pytest.raises(TrajectoryError, match="names no file"):
-        Trajectories.load([], columns=COLUMNS)
-    with pytest.raises(TrajectoryError, match="files must be paths or patterns, got 3"):
-        _paths(3)  # types are checked before, where tests run
+    with pytest.raises(TrajectoryError, match=re.escape(says)):
+        Trajectories.load(str(tmp_path / name), columns=COLUMNS)
 
 
 def test_nothing_is_unpickled(tmp_path):
@@ -427,37 +321,3 @@ def test_dates_and_durations_count_seconds(kind):
     [rows] = rows_of(table, columns_from(COLUMNS), "log", "log")
 
     np.testing.assert_allclose(rows.times, 0.01 * np.arange(5), atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("logged by rig 3\nt,q,u\n0.0,1.0,0.0\n0.1,1.1,0.0\n", "before the names: skip: 1."),
-        ("rig,3,hot\nMonday\nt,q,u\n0.0,1.0,0.0\n0.1,1.1,0.0\n", "before the names: skip: 2."),
-        ("t,q,u\nlow,high,low\n0.0,1.0,0.0\n0.1,1.1,0.0\n", "what follows must be numbers, got"),
-        ("t,q,u\n0,1,2\n3,4,5,6\n", "has 4 fields in line 3 and 3 before"),
-        ("t,q,u\n0,00,1,5,0,0\n0,01,1,5,0,0\n", "3 names in its first line and 6 fields"),
-        ("t,q,u\n0.0,1,3\n0.1,off?,6\n", "must hold numbers, got 'off?' in row 1"),
-        ("t,q,u\n2024-05-01 12:00:00.1,1,0\n2024-05-01 12:00:00.2,1,0\n", "to seconds before"),
-        ("t,q,u\n12:00:00.1,1.0,0.0\n12:00:00.2,1.1,0.0\n", "Convert dates and times of day"),
-    ],
-)
-def test_lines_that_do_not_belong_into_a_log_are_told_apart(text, says, tmp_path):
-    (tmp_path / "log.csv").write_text(text)
-
-    with pytest.raises(TrajectoryError, match=re.escape(says)):
-        Trajectories.load(tmp_path / "log.csv", COLUMNS | {"obs": ["q"]})
-
-
-def test_angles_that_wrap_are_not_interpolated_unless_they_are_named(tmp_path):
-    rng = np.random.default_rng(0)
-    times = 0.01 * np.arange(600) + 0.003 * rng.random(600)
-    turning = 5.0 * times + 0.01 * rng.standard_normal(600)
-    table = {"t": times, "q": turning % (2.0 * np.pi), "u": 0.0 * times}
-    path = write_csv(tmp_path / "log.csv", table)
-
-    with pytest.raises(TrajectoryError, match=r"jumps by a whole turn after row .*angle: true"):
-        Trajectories.load(path, columns=COLUMNS | {"obs": ["q"]})
-    with pytest.warns(SamplingWarning):
-        data = Trajectories.load(path, columns=COLUMNS | {"obs": [{"column": "q", "angle": True}]})
-    assert data.n_steps > 500
