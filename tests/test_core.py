@@ -9,16 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from free_mass import Mass
 
 from sb3_hds import effects, twins
 from sb3_hds.core import (
-    ActionEffect,
     Actuator,
-    AnalyticTwin,
-    Channel,
     EffectChain,
     ExtendedTwin,
-    Joint,
     Moment,
     Parameter,
     RescaleAction,
@@ -33,37 +30,17 @@ from sb3_hds.core import (
     solve_spd,
 )
 from sb3_hds.core.effect import Attached, at_joint
+from sb3_hds.effects import DeadZone, TorqueGain
 from sb3_hds.errors import EffectError, ParameterError
 
 
-class Slider(AnalyticTwin):
+class Slider(Mass):
     """A mass on a rail with a spring; an episode ends at ``end``, each of its steps earns 1."""
 
     name = "Slider"
-    dt = 0.1
-    joints = (Joint("rail", "m"),)
     actuators = (Actuator("push", "N", -1.0, 1.0),)
-    channels = (Channel("position", "m"), Channel("speed", "m/s"))
-    parameters = {
-        "mass": Parameter(null=1.0, scale=0.1, unit="kg", lower=0.1),
-        "stiffness": Parameter(null=0.0, scale=1.0, unit="N/m"),
-    }
+    parameters = Mass.parameters | {"stiffness": Parameter(null=0.0, scale=1.0, unit="N/m")}
     options = {"end": 0.95}
-
-    def initial(self, key, params):
-        return State(jnp.zeros(1), jax.random.uniform(key, (1,)), {})
-
-    def infer(self, obs, params):
-        return State(obs[:1], obs[1:], {})
-
-    def observe(self, state, params):
-        return jnp.concatenate([state.q, state.v])
-
-    def actuate(self, state, action, params):
-        return jnp.clip(action, -1.0, 1.0)
-
-    def mass_matrix(self, q, params):
-        return params["mass"] * jnp.ones((1, 1), q.dtype)
 
     def bias(self, q, v, params):
         return params["stiffness"] * q
@@ -78,39 +55,19 @@ class Slider(AnalyticTwin):
         return state.q[0] > self.end
 
 
-class Gain(ActionEffect):
-    """Multiplies a command."""
-
-    name = "gain"
-    parameters = {"k": Parameter(null=1.0, scale=0.1, unit="1")}
-    explanation = "The drive is stronger or weaker than rated."
-    source = "test"
-
-    def act(self, command, memory, h, params):
-        return params["k"] * command, memory
-
-
-class Offset(ActionEffect):
-    """Adds to a command."""
-
-    name = "offset"
-    parameters = {"c": Parameter(null=0.0, scale=0.1, unit="N")}
-    explanation = "The drive pushes when told not to."
-    source = "test"
-
-    def act(self, command, memory, h, params):
-        return command + params["c"], memory
-
-
 def at_rest(speed=0.0):
     return State(jnp.zeros(1), jnp.full(1, speed), {})
 
 
-# --- parameters
-
-
 def kilograms(**settings):
     return Parameter(**{"null": 0.0, "scale": 1.0, "unit": "kg"} | settings)
+
+
+def behind(**wrappers):
+    return TransformedTwin(Slider(), **wrappers)
+
+
+FLIPPED = {"transforms": [[{"transform": "flip"}]]}
 
 
 @pytest.mark.parametrize(
@@ -121,22 +78,13 @@ def kilograms(**settings):
         (lambda: Slider(mass="heavy"), "'mass' must be a number [kg], got 'heavy'"),
         (lambda: Slider(mass=0.0), "'mass' must be finite and within [0.1, inf] kg, got 0.0"),
         (lambda: Slider().with_parameters(stiffness=float("nan")), "[-inf, inf] N/m, got nan"),
-        (lambda: Slider(lenght=1.0), "no parameter 'lenght'. Its parameters are: mass, stiffness"),
-        (lambda: Slider(dt=0.0), "needs a finite dt > 0 s and at least one sub-step"),
+        (lambda: Slider(lenght=1.0), "no parameter 'lenght'. Its parameters are: mass, damp"),
+        (lambda: Slider(mas=1.0), "no parameter 'mas'. Did you mean 'mass'"),
         (lambda: Slider(substeps=0), "needs a finite dt > 0 s and at least one sub-step"),
         (lambda: RescaleAction(1.0, 1.0), "needs finite bounds with low < high"),
-        (
-            lambda: TransformedTwin(Slider(), action=RescaleAction((-1.0, -1.0), 1.0)),
-            "has bounds for 2 actuators, but the twin has 1",
-        ),
-        (
-            lambda: TransformedTwin(Slider(), observation=RescaleObservation()),
-            "needs limits to scale by, but these have none: position, speed",
-        ),
-        (
-            lambda: twins.from_spec(Slider().to_spec() | {"transforms": [[{"transform": "flip"}]]}),
-            "flip",
-        ),
+        (lambda: behind(action=RescaleAction((-1.0, -1.0), 1.0)), "has bounds for 2 actuators"),
+        (lambda: behind(observation=RescaleObservation()), "these have none: position, speed"),
+        (lambda: twins.from_spec(Slider().to_spec() | FLIPPED), "flip"),
     ],
 )
 def test_an_impossible_value_is_refused_with_name_unit_and_bounds(make, message, monkeypatch):
@@ -146,8 +94,6 @@ def test_an_impossible_value_is_refused_with_name_unit_and_bounds(make, message,
         make()
     assert Parameter(0.0, 0.05, "N m s/rad").prismatic() == Parameter(0.0, 0.05, "N s/m")
 
-
-# --- integrators
 
 _SYSTEM = np.array([[0.0, 1.0], [-4.0, -0.3]])  # dq/dt = v, dv/dt = -4 q - 0.3 v
 
@@ -176,15 +122,12 @@ def test_the_error_falls_with_the_order_of_the_integrator(x64, integrator, order
     assert slope == pytest.approx(order, abs=0.15)  # terms of the next order bend the line
 
 
-# --- linear algebra
-
-
 def spd(rng, n, batch):
     root = rng.normal(size=(batch, n, n))
     return root @ root.transpose(0, 2, 1) + n * np.eye(n)
 
 
-@pytest.mark.parametrize(("n", "columns"), [(1, ()), (2, (3,)), (3, ()), (4, (3,)), (6, ())])
+@pytest.mark.parametrize(("n", "columns"), [(1, ()), (2, (3,)), (6, ())])
 def test_a_batch_of_small_systems_is_solved_as_lapack_does(x64, n, columns):
     rng = np.random.default_rng(n)
     matrices, right = spd(rng, n, 20), rng.normal(size=(20, n, *columns))
@@ -196,9 +139,8 @@ def test_a_batch_of_small_systems_is_solved_as_lapack_does(x64, n, columns):
     np.testing.assert_allclose(ours, theirs.reshape(ours.shape), rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("n", [2, 6])
-def test_the_derivative_of_a_solution_is_the_implicit_one(x64, n):
-    rng = np.random.default_rng(n)
+def test_the_derivative_of_a_solution_is_the_implicit_one(x64):
+    n, rng = 6, np.random.default_rng(6)
     matrix, change = spd(rng, n, 2)
     right, shift = rng.normal(size=(2, n))
 
@@ -219,30 +161,11 @@ def test_a_least_pivot_replaces_a_negative_one_and_leaves_good_ones(x64):
 
 def test_the_inertia_of_a_joint_is_what_a_force_there_accelerates(x64):
     matrix = spd(np.random.default_rng(0), 3, 1)[0]
-    zero = jnp.zeros(3)
+    moment = Moment(*[jnp.zeros(3)] * 4, jnp.asarray(matrix), 0.1)
 
-    inertia = [
-        at_joint(Moment(zero, zero, zero, zero, jnp.asarray(matrix), 0.1), j).inertia
-        for j in range(3)
-    ]
+    inertia = [at_joint(moment, joint).inertia for joint in range(3)]
 
     np.testing.assert_allclose(inertia, 1.0 / np.diag(np.linalg.inv(matrix)), rtol=1e-12)
-
-
-# --- twins
-
-
-def test_twins_that_differ_in_values_alone_are_one_program():
-    step = jax.jit(
-        lambda twin, state, params: twin.step(state, jnp.ones(1), params), static_argnums=0
-    )
-    light, heavy = Slider(mass=0.5), Slider(mass=2.0)
-
-    speeds = [step(twin, at_rest(), twin.params).v[0] for twin in (light, heavy)]
-
-    assert light == heavy and hash(light) == hash(heavy)
-    np.testing.assert_allclose(speeds, [0.2, 0.05], rtol=1e-6)  # v = h / m, float32
-    assert step._cache_size() == 1
 
 
 def test_twins_that_differ_in_structure_are_unequal():
@@ -251,22 +174,12 @@ def test_twins_that_differ_in_structure_are_unequal():
 
     different = [Slider(dt=0.2), Slider(substeps=2), Slider(end=2.0), Other(), twins.Pendulum()]
     different.append(Slider().extend(effects.ViscousFriction()))
-    different.append(TransformedTwin(Slider(), action=RescaleAction(-2.0, 2.0)))
+    different.append(behind(action=RescaleAction(-2.0, 2.0)))
 
     for one in different:
         assert one != Slider()
         assert one == one.with_parameters()
     assert Slider() != "Slider"
-
-
-def test_new_values_leave_the_old_twin_alone():
-    old = Slider(mass=2.0)
-
-    new = old.with_parameters(mass=3.0)
-
-    assert (old.params["mass"], new.params["mass"]) == (2.0, 3.0)
-    new.params["mass"] = 9.0
-    assert new.params["mass"] == 3.0
 
 
 def test_sub_steps_are_shorter_steps(x64):
@@ -281,58 +194,37 @@ def test_sub_steps_are_shorter_steps(x64):
     np.testing.assert_allclose(once.v, after.v, rtol=1e-14)
 
 
-def test_retracting_by_a_difference_arrives_memory_included(x64):
-    twin = Slider()
-    state = State(jnp.array([1.0]), jnp.array([2.0]), {"lag.push": jnp.array([3.0, 4.0])})
-    reference = State(jnp.array([0.5]), jnp.array([0.0]), {"lag.push": jnp.array([1.0, 1.0])})
-
-    tangent = twin.difference(state, reference)
-    arrived = twin.retract(reference, tangent)
-
-    assert tangent.shape == (4,)
-    jax.tree.map(np.testing.assert_array_equal, arrived, state)
-
-
 def test_a_command_meets_effects_in_order_and_a_joined_chain_last(x64):
-    params = {"gain.push.k": 3.0, "offset.push.c": 1.0}
-    gain, offset = Attached("gain.push", Gain(), 0), Attached("offset.push", Offset(), 0)
-    memory = {"gain.push": (), "offset.push": ()}
+    params = {"torque_gain.push.gain": 3.0, "dead_zone.push.width": 2.0}
+    gain, dead = (Attached(f"{e.name}.push", e, 0) for e in (TorqueGain(), DeadZone()))
+    memory = {gain.key: (), dead.key: ()}
 
     def command(chain):
         return float(chain.act(jnp.full(1, 2.0), memory, 0.1)[0][0])
 
-    assert command(EffectChain((gain, offset), params)) == 7.0
-    assert command(EffectChain((offset, gain), params)) == 9.0
-    assert command(EffectChain((offset,), params) + EffectChain((gain,), params)) == 9.0
+    assert command(EffectChain((gain, dead), params)) == 5.0
+    assert command(EffectChain((dead, gain), params)) == 3.0
+    assert command(EffectChain((dead,), params) + EffectChain((gain,), params)) == 3.0
 
 
 def test_an_extended_twin_obeys_a_chain_from_outside_before_its_own_effects(x64):
-    twin = Slider().extend(Offset(c=0.25))
-    outer = EffectChain((Attached("gain.push", Gain(), 0),), {"gain.push.k": 0.5})
+    twin = Slider().extend(DeadZone(width=0.1))
+    gain = Attached("torque_gain.push", TorqueGain(), 0)
+    outer = EffectChain((gain,), {"torque_gain.push.gain": 0.5})
     state = twin.infer(jnp.zeros(2), twin.params)
-    state = state._replace(memory=state.memory | {"gain.push": ()})
+    state = state._replace(memory=state.memory | {"torque_gain.push": ()})
 
     after = twin.step(state, jnp.full(1, 0.6), twin.params, outer)
 
-    assert float(after.v[0]) == pytest.approx(0.1 * (0.5 * 0.6 + 0.25), rel=1e-12)
-
-
-# --- twins behind wrappers
-
-
-def wrapped_pendulum():
-    """Pendulum-v1 behind Gymnasium's two wrappers, and the twin that stands for it."""
-    env = gym.make("Pendulum-v1")
-    env = gym.wrappers.RescaleAction(env, np.float32(-1.0), np.float32(3.0))
-    low, high = np.array([-2.0, -1.0, 0.0], np.float32), np.array([2.0, 0.0, 1.0], np.float32)
-    env = gym.wrappers.RescaleObservation(env, low, high)
-    observation = RescaleObservation(low=low.tolist(), high=high.tolist())
-    twin = twins.make("Pendulum")
-    return env, TransformedTwin(twin, observation=observation, action=RescaleAction(-1.0, 3.0))
+    assert float(after.v[0]) == pytest.approx(0.1 * (0.5 * 0.6 - 0.05), rel=1e-12)
 
 
 def test_a_transformed_twin_reproduces_the_wrapped_environment(x64):
-    env, twin = wrapped_pendulum()
+    env = gym.wrappers.RescaleAction(gym.make("Pendulum-v1"), np.float32(-1.0), np.float32(3.0))
+    low, high = np.array([-2.0, -1.0, 0.0], np.float32), np.array([2.0, 0.0, 1.0], np.float32)
+    env = gym.wrappers.RescaleObservation(env, low, high)
+    observation, action = RescaleObservation(low.tolist(), high.tolist()), RescaleAction(-1.0, 3.0)
+    twin = TransformedTwin(twins.make("Pendulum"), observation=observation, action=action)
     obs, _ = env.reset(seed=0)
     env.action_space.seed(0)
 
@@ -360,17 +252,17 @@ def test_a_transformed_twin_reproduces_the_wrapped_environment(x64):
 
 def test_effects_attach_to_the_plant_below_the_wrapper(x64):
     wrapper = RescaleAction(-0.5, 0.5)  # Slider takes -1 to 1 N
-    inside = TransformedTwin(Slider().extend(Offset(c=0.25)), action=wrapper)
+    inside = TransformedTwin(Slider().extend(DeadZone(width=0.1)), action=wrapper)
 
-    outside = TransformedTwin(Slider(), action=wrapper).extend(Offset(c=0.25))
+    outside = behind(action=wrapper).extend(DeadZone(width=0.1))
 
     assert outside == inside and outside.params == inside.params
     after = outside.step(
         outside.infer(jnp.zeros(2), outside.params), jnp.full(1, 0.1), outside.params
     )
-    assert float(after.v[0]) == pytest.approx(0.1 * (0.2 + 0.25), rel=1e-12)
+    assert float(after.v[0]) == pytest.approx(0.1 * (0.2 - 0.05), rel=1e-12)
     with pytest.raises(EffectError, match=re.escape("Use twin.extend(*effects), which attaches")):
-        ExtendedTwin(TransformedTwin(Slider(), action=wrapper), Offset())
+        ExtendedTwin(behind(action=wrapper), DeadZone())
 
 
 def test_values_and_effects_survive_a_spec_through_wrappers():
@@ -387,19 +279,16 @@ def test_values_and_effects_survive_a_spec_through_wrappers():
 def test_an_effect_is_taken_away_again_and_the_rest_keeps_its_values():
     base = Slider().with_parameters(mass=2.0)
     one = base.extend(effects.ViscousFriction(b=0.3))
-    both = one.extend(Gain(k=0.5))
+    gain, friction = "torque_gain.push", "viscous_friction.rail"
+    both = one.extend(TorqueGain(gain=0.5))
 
-    assert both.without("gain.push").to_spec() == one.to_spec()
-    assert both.without("gain.push", "viscous_friction.rail").to_spec() == base.to_spec()
+    assert both.without(gain).to_spec() == one.to_spec()
+    assert both.without(gain, friction).to_spec() == base.to_spec()
     seen = TransformedTwin(both, action=RescaleAction(-1.0, 1.0))
-    assert seen.without("gain.push").base.to_spec() == one.to_spec()
-    with pytest.raises(EffectError, match=r"no effect gain\.push attached"):
-        one.without("gain.push")
-    with pytest.raises(EffectError, match=r"no effect gain\.push attached"):
-        base.without("gain.push")
-
-
-# --- rollouts
+    assert seen.without(gain).base.to_spec() == one.to_spec()
+    for twin in (one, base):
+        with pytest.raises(EffectError, match=r"no effect torque_gain\.push attached"):
+            twin.without(gain)
 
 
 def test_a_rollout_is_a_loop_of_steps(x64):
@@ -465,29 +354,3 @@ def test_a_policy_sees_what_the_sensors_report(x64):
     np.testing.assert_allclose(closed.actions, -0.5 * closed.obs[:-1, 2:3], atol=1e-12)
     # The same 40 steps in another program: rounding, amplified by a swinging pendulum.
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-10), closed, opened)
-
-
-def test_rollouts_batch_over_states_and_actions(x64):
-    twin = Slider()
-    speeds = jnp.array([0.1, 1.0])
-    states = State(jnp.zeros((2, 1)), speeds[:, None], {})
-    actions = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (2, 15, 1)))
-
-    batch = jax.jit(jax.vmap(lambda s, a: rollout(twin, twin.params, s, a)))(states, actions)
-
-    for i, speed in enumerate(speeds):
-        alone = rollout(twin, twin.params, at_rest(float(speed)), actions[i])
-        jax.tree.map(
-            lambda b, a, i=i: np.testing.assert_allclose(b[i], a, atol=1e-12),  # other fusion
-            batch,
-            alone,
-        )
-
-
-def test_a_rollout_keeps_the_precision_of_its_state(x64):
-    twin = Slider().extend(effects.CoulombFriction(tau_c=0.1), Gain())
-    start = twin.infer(jnp.ones(2, jnp.float32), twin.params)
-
-    result = rollout(twin, twin.params, start, jnp.ones((3, 1), jnp.float32))
-
-    assert {leaf.dtype for leaf in jax.tree.leaves(result.states)} == {jnp.dtype(jnp.float32)}

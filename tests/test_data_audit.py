@@ -3,26 +3,22 @@
 import dataclasses
 import json
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from measuring import measured
 
 from sb3_hds import Trajectories, audit, twins
-from sb3_hds.core import Channel
-from sb3_hds.data import Finding, SamplingWarning
+from sb3_hds.core import Channel, State
+from sb3_hds.data import Finding
+from sb3_hds.effects import CoulombFriction
 from sb3_hds.errors import TrajectoryError
+from sb3_hds.sysid.timing import in_step
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
-# Twins whose data neither end nor reach a limit, with a position, angles, and both.
-# Twins whose data neither end nor reach a limit, with a position, angles, and both; seed and noise.
-CLEAN = [
-    ("PendulumReal", 0, 0.0),
-    ("PendulumReal", 1, 0.01),
-    ("CartPole", 2, 0.01),
-    ("Acrobot", 1, 0.0),
-    ("PayloadPendulum", 2, 0.01),
-    ("MountainCar", 0, 0.01),
+pytestmark = [
+    pytest.mark.usefixtures("quick_compilation"),
+    pytest.mark.filterwarnings("ignore::sb3_hds.data.SamplingWarning"),
 ]
 
 
@@ -52,7 +48,13 @@ def changed(data, change):
     return Trajectories.from_arrays(obs, actions, dt=data.dt)
 
 
-def logged(data, path, warns=True, times=None):
+def alone(obs, seed=1):
+    """One recording, whose command is noise."""
+    command = np.random.default_rng(seed).standard_normal((len(obs) - 1, 1))
+    return Trajectories.from_arrays([obs], [command], dt=0.01)
+
+
+def logged(data, path, times=None):
     """The same data, read back from a CSV file, by default with exact stamps."""
     tables = []
     for i in range(len(data)):
@@ -60,38 +62,37 @@ def logged(data, path, warns=True, times=None):
         t = data.dt * np.arange(len(obs)) if times is None else times(i, len(obs))
         rows = [np.full(len(obs), i), t, *obs.T, *np.vstack([actions, actions[-1:]]).T]
         tables.append(np.stack(rows, axis=1))
-    obs, actions = (
-        [f"{k}{j}" for j in range(n)] for k, n in (("x", data.n_obs), ("u", data.n_act))
-    )
+    obs, actions = [f"x{j}" for j in range(data.n_obs)], [f"u{j}" for j in range(data.n_act)]
     header = ",".join(["run", "t", *obs, *actions])
     np.savetxt(path, np.concatenate(tables), "%.17g", ",", header=header, comments="")
     columns = {"time": "t", "obs": obs, "actions": actions, "episode": "run"}
-    if warns:
-        with pytest.warns(SamplingWarning):
-            return Trajectories.load(path, columns=columns | {"dt": data.dt})
-    return Trajectories.load(path, columns=columns)
+    return Trajectories.load(path, columns=columns | ({"dt": data.dt} if times else {}))
 
 
-@pytest.mark.parametrize(("name", "seed", "noise"), CLEAN)
+# Twins whose data neither end nor reach a limit, with a position, angles, and both; seed and noise.
+@pytest.mark.parametrize(
+    ("name", "seed", "noise"),
+    [
+        ("PendulumReal", 1, 0.01),
+        ("CartPole", 2, 0.01),
+        ("Acrobot", 1, 0.0),
+        ("MountainCar", 0, 0.01),
+    ],
+)
 def test_clean_data_raise_no_alarm(name, seed, noise, tmp_path):
     exact = measured(twins.make(name), n_steps=200, seed=seed, share=0.5)
-    clean = changed(
-        exact,
-        lambda i, obs, actions: (
-            obs + noise * obs.std(0) * np.random.default_rng(i).standard_normal(obs.shape),
-            actions,
-        ),
-    )
 
+    def disturb(i, obs, actions):
+        error = np.random.default_rng(i).standard_normal(obs.shape)
+        return obs + noise * obs.std(0) * error, actions
+
+    clean = changed(exact, disturb)
     found = audit(clean, twin=twins.make(name))
-    from_file = audit(logged(clean, tmp_path / "log.csv", warns=False))
+    from_file = audit(logged(clean, tmp_path / "log.csv"))
 
     assert found.findings == from_file.findings == ()
     assert found.usable and found.reason == "" and found.velocity_shift == {}
     assert found.corrected(clean) is clean
-
-
-# --- time
 
 
 def test_jitter_is_found_and_says_how_much(data, tmp_path):
@@ -129,29 +130,23 @@ def test_defects_of_the_clock_are_found_where_they_are(data, tmp_path):
     np.testing.assert_array_equal(read.episode(1)[0], data.episode(1)[0])
 
 
-@pytest.mark.parametrize(
-    ("how", "channel", "share"),
-    [
-        ("hold", "cos, sin, speed", 0.1),
-        ("insert", "cos, sin, speed", 0.1),
-        ("half the rate", "cos, sin, speed", 0.5),
-        ("one channel", "speed", 0.75),
-    ],
-)
-def test_repeated_samples_are_found(data, how, channel, share):
-    rng = np.random.default_rng(0)
+def some_held(k):
+    return k - np.r_[False, np.random.default_rng(0).random(len(k) - 1) < 0.1]
 
+
+@pytest.mark.parametrize(
+    ("held", "of", "channel", "share"),
+    [
+        (some_held, slice(3), "cos, sin, speed", 0.1),
+        (lambda k: k // 2 * 2, slice(3), "cos, sin, speed", 0.5),
+        (lambda k: k // 4 * 4, [2], "speed", 0.75),
+    ],
+    ids=["some", "half the rate", "one channel"],
+)
+def test_repeated_samples_are_found(data, held, of, channel, share):
     def repeat(_, obs, actions):
-        k = np.arange(len(obs))
-        if how == "hold":
-            k[1:] -= rng.random(len(k) - 1) < 0.1
-        elif how == "insert":
-            k = np.repeat(k, 1 + (rng.random(len(k)) < 0.1))[: len(k)]
-        elif how == "half the rate":
-            k = k // 2 * 2
-        else:
-            obs[:, 2] = obs[k // 4 * 4, 2]
-        return obs[k], actions
+        obs[:, of] = obs[held(np.arange(len(obs)))][:, of]
+        return obs, actions
 
     finding = only(audit(changed(data, repeat), channels_of("PendulumReal")), "RepeatedSamples")
 
@@ -162,15 +157,12 @@ def test_an_encoder_that_moves_slowly_repeats_no_samples_even_after_interpolatio
     twin = twins.make("CartPole")
     smooth = measured(twin, n_steps=400, share=0.3)
     counts = changed(smooth, lambda i, obs, actions: (np.round(obs / 0.02) * 0.02, actions))
-    read = logged(counts, tmp_path / "log.csv", warns=False)
+    read = logged(counts, tmp_path / "log.csv")
 
     for data in (counts, counts.resample(0.7 * twin.dt), read.resample(0.7 * twin.dt)):
         found = audit(data, channels_of("CartPole"))
         assert not kinds(found) & {"RepeatedSamples", "StuckChannel"}
         assert [c.resolution for c in found.channels] == pytest.approx([0.02] * 5)
-
-
-# --- channels
 
 
 def test_a_stuck_channel_is_named_with_its_samples(data):
@@ -210,9 +202,6 @@ def test_a_system_that_comes_to_rest_is_neither_stuck_nor_cut_off(data):
         assert not kinds(found) & {"StuckChannel", "SaturatedChannel", "ReinitialisedState"}
 
 
-# --- episodes that were not told apart
-
-
 def joined(data, n=60):
     """Two episodes in each recording, as a logger writes that does not know of resets."""
 
@@ -244,9 +233,7 @@ def test_a_state_that_was_put_back_is_found_and_cut_out(name):
 def test_a_jump_in_resampled_rows_is_cut_without_the_sample_between(tmp_path):
     twin = twins.make("CartPole")
     recorded = joined(measured(twin, n_steps=200))
-    read = logged(
-        recorded, tmp_path / "log.csv", times=lambda _, n: twin.dt * (np.arange(n) * 1.07)
-    )
+    read = logged(recorded, tmp_path / "log.csv", lambda _, n: twin.dt * (np.arange(n) * 1.07))
 
     found = audit(read)
     corrected = found.corrected(read)
@@ -257,12 +244,9 @@ def test_a_jump_in_resampled_rows_is_cut_without_the_sample_between(tmp_path):
     assert max(jumps) < 0.5 * finding.size
 
 
-# --- velocities
-
-
 @pytest.mark.parametrize(
     ("first", "last", "lost", "also"),
-    [(0, 0, 1, None), (80, 90, 12, None), (200, 200, 1, None), (80, 90, 12, slice(84, 86))],
+    [(0, 0, 1, None), (200, 200, 1, None), (80, 90, 12, slice(84, 86))],
 )
 def test_values_beyond_all_measure_are_refused_by_name_and_cut_out(data, first, last, lost, also):
     def spoil(i, obs, actions):
@@ -276,27 +260,19 @@ def test_values_beyond_all_measure_are_refused_by_name_and_cut_out(data, first, 
     found = audit(spoiled, channels_of("PendulumReal"))
     better = found.corrected(spoiled)
 
-    assert not found.usable and "'speed' jumps to 1e+06" in str(found)
-    places = [
-        (p.trajectory, p.first, p.last)
-        for finding in found.findings
-        for p in finding.places
-        if finding.channel == "speed"
-    ]
-    assert kinds(found) == {"Outliers"} and (3, first, last) in places
+    assert not found.usable and kinds(found) == {"Outliers"}
+    [of_speed] = [f for f in found.findings if f.channel == "speed"]
+    assert [(p.trajectory, p.first, p.last) for p in of_speed.places] == [(3, first, last)]
+    assert "'speed' jumps to 1e+06" in str(of_speed)
     assert np.abs(better.obs).max() < 100.0 and better.n_steps == data.n_steps - lost
     assert audit(better).findings == ()
 
 
-@pytest.mark.parametrize(
-    "what", ["a blow", "a short blow", "it runs away", "an impact", "a tick at rest"]
-)
+@pytest.mark.parametrize("what", ["a short blow", "it runs away", "an impact", "a tick at rest"])
 def test_what_motion_makes_is_no_outlier_and_no_glitch(what):
     t = np.arange(60)
 
     def shape(i, obs, actions):
-        if what == "a blow" and i == 3:
-            obs[80:140, 1] += 1e3 * np.exp(-t / 5.0)
         if what == "a short blow" and i == 3:
             obs[200:260, 1] += 100.0 * np.exp(-t / 2.0)
         if what == "it runs away" and i == 3:
@@ -323,7 +299,7 @@ def late(data, channel, lag):
     return changed(data, shift)
 
 
-@pytest.mark.parametrize("lag", [-3, 1, 6])
+@pytest.mark.parametrize("lag", [-3, 1])
 def test_a_velocity_that_comes_late_or_early_is_found_and_shifted(data, lag):
     recorded, names = late(data, 2, lag), channels_of("PendulumReal")
 
@@ -336,36 +312,18 @@ def test_a_velocity_that_comes_late_or_early_is_found_and_shifted(data, lag):
     assert found.velocity_shift == {"speed": pytest.approx(lag * data.dt, abs=0.15 * data.dt)}
     assert ("lags" if lag > 0 else "leads") in str(finding)
     assert "VelocityShift" not in kinds(audit(corrected, names))
-    truth = np.stack([data.episode(i)[0][10:-10] for i in range(len(data))])
-    first = max(0, int(np.ceil(-finding.samples)))  # sample of the truth that is now the first one
-    after = corrected.obs - truth[:, first : first + corrected.obs.shape[1]]
-    # Interpolation and the twin's own tenth of a sample are left.
-    assert after[..., 2].std() < 0.35 * (recorded.obs - truth)[..., 2].std()
+    with pytest.raises(TrajectoryError, match="not the data of this audit"):
+        found.corrected(data)
 
 
 @pytest.mark.parametrize(("lag", "seen"), [(0.65, False), (1.0, True), (-1.5, True)])
 def test_a_lag_of_a_fraction_of_a_sample_is_left_alone(lag, seen):
     t = np.arange(3000.0)
     obs = np.stack([np.sin(0.1 * t), 10.0 * np.cos(0.1 * (t - lag))], axis=1)
-    recorded = Trajectories.from_arrays([obs], [np.sin(t[:-1])[:, None] ** 3], dt=0.01)
 
-    shift = audit(recorded, ["q", "v"]).velocity_shift
+    shift = audit(alone(obs), ["q", "v"]).velocity_shift
 
     assert shift == ({"v": pytest.approx(0.01 * lag, abs=2e-4)} if seen else {})
-
-
-def test_a_shift_longer_than_an_episode_is_refused(data):
-    recorded = late(data, 2, 3)
-    found = audit(recorded, channels_of("PendulumReal"))
-    short = dataclasses.replace(found, lengths=tuple(recorded.windows(2).lengths.tolist()))
-
-    with pytest.raises(TrajectoryError, match="2 steps, too few for shifts"):
-        short.corrected(recorded.windows(2))
-    with pytest.raises(TrajectoryError, match="not the data of this audit"):
-        found.corrected(data)
-
-
-# --- motion
 
 
 def test_the_noise_of_a_system_that_sometimes_rests_is_measured():
@@ -375,9 +333,8 @@ def test_the_noise_of_a_system_that_sometimes_rests_is_measured():
     q = np.where(t < 15.0, 0.0, 1.0 - np.cos(t - 15.0))
     v = np.where(t < 15.0, 0.0, np.sin(t - 15.0))
     obs = np.stack([q, v], axis=1) + sigma * rng.standard_normal((3000, 2))
-    recorded = Trajectories.from_arrays([obs], [rng.standard_normal((2999, 1))], dt=0.01)
 
-    found = audit(recorded, ["q", "v"])
+    found = audit(alone(obs), ["q", "v"])
 
     assert found.stands_still == pytest.approx(0.5, abs=0.05) and found.usable
     # 125 windows of 12 rows: 1375 degrees of freedom, a standard error of 2 %.
@@ -399,47 +356,33 @@ def test_standing_still_is_not_usable_and_tells_the_noise(resolution):
     assert "stands still 100 % of the time" in nothing.reason
 
 
-def test_too_few_steps_are_not_usable(data):
-    found = audit(data.windows(20)[:3], channels_of("PendulumReal"))
-
-    assert not found.usable and "60 steps in all; a verdict needs 100" in found.reason
-
-
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("n_steps", [1, 2, 5, 20, 41])
+@pytest.mark.parametrize("n_steps", [1, 2, 41])
 def test_the_shortest_data_are_not_usable_and_break_nothing(n_steps):
     obs = np.random.default_rng(0).standard_normal((2, n_steps + 1, 1))
 
     found = audit(Trajectories.from_arrays(obs, np.zeros((2, n_steps, 0)), dt=0.01))
 
-    assert not found.usable and found.to_dict()["n_steps"] == 2 * n_steps
+    assert not found.usable and f"{2 * n_steps} steps in all; a verdict needs" in found.reason
     assert found.velocity_shift == {}
 
 
-def test_motion_within_noise_is_not_usable():
-    rng, t = np.random.default_rng(0), 0.01 * np.arange(3000)
-    rest = np.where((t % 10.0) < 5.0, 0.0, 0.08 * np.sin(20.0 * t))
-    obs = np.stack([rest, 3.0 * rest], axis=1) + [0.01, 0.03] * rng.standard_normal((3000, 2))
-
-    found = audit(Trajectories.from_arrays([obs], [rng.standard_normal((2999, 1))], dt=0.01))
-
-    assert not found.usable and "times its noise" in found.reason
-
-
-def test_mostly_resting_data_are_usable_with_a_warning():
+def test_motion_within_noise_is_not_usable_and_rest_most_of_the_time_is():
     rng, t = np.random.default_rng(0), 0.01 * np.arange(5000)
-    obs = np.where(t[:, None] > 43.0, np.stack([np.sin(t - 43.0), np.cos(t)], 1), 0.0)
-    obs += 0.001 * rng.standard_normal(obs.shape)
+    small = np.where((t % 10.0) < 5.0, 0.0, 0.08 * np.sin(20.0 * t))
+    within = np.stack([small, 3.0 * small], axis=1) + [0.01, 0.03] * rng.standard_normal((5000, 2))
+    resting = np.where(t[:, None] > 43.0, np.stack([np.sin(t - 43.0), np.cos(t)], 1), 0.0)
+    resting += 0.001 * rng.standard_normal(resting.shape)
 
-    found = audit(Trajectories.from_arrays([obs], [rng.standard_normal((4999, 1))], dt=0.01))
+    noisy, still = audit(alone(within)), audit(alone(resting))
 
-    assert found.usable and "MostlyStill" in kinds(found)
+    assert not noisy.usable and "times its noise" in noisy.reason
+    assert still.usable and "MostlyStill" in kinds(still)
 
 
 @pytest.mark.parametrize(
     ("command", "kind", "says"),
     [
-        (lambda obs, noise: 0.0 * noise + 0.4, "ConstantCommand", "is 0.4 throughout"),
         # Interpolation makes it of a gain that nobody changed, and drift of a set point.
         (lambda obs, noise: 100.0 + 1e-13 * noise, "ConstantCommand", "is 100 throughout"),
         (lambda obs, noise: 100.0 + 0.4 * noise, "ConstantCommand", "between 99.6 and 100.4"),
@@ -474,9 +417,6 @@ def test_motion_that_goes_to_and_fro_too_seldom_is_found(period, n_strokes):
         assert "2 recordings under 2 conditions" in str(finding)
 
 
-# --- the result
-
-
 def test_it_prints_in_80_columns_and_is_plain_json(data):
     def spoil(i, obs, actions):
         obs[60:130, 1] = obs[60, 1]
@@ -504,9 +444,6 @@ def test_names_and_twins_must_fit_the_channels(data):
         audit(data, twin=twins.make("CartPole"))
 
 
-# --- channels that are not what they are taken for
-
-
 def pendulum_data(dt=0.01, noise=0.0, n=400):
     """Angle and speed of eight swings that differ in amplitude and frequency."""
     rng = np.random.default_rng(0)
@@ -529,31 +466,21 @@ KNOWN = (Channel("angle", "rad"), Channel("speed", "rad/s"))
     [
         (KNOWN, 0.05, (180.0 / np.pi, 1.0), "as if 'angle' were in degrees"),
         (("angle", "speed"), 0.0, (1.0, 180.0 / np.pi), "as if 'speed' were in degrees"),
-        (KNOWN, 0.0, (1000.0, 1.0), "as if 'angle' were in millimetres"),
         (KNOWN, 0.05, (1.0, 30.0), "one of them is in other units."),
         (KNOWN, 0.0, (1.0, 30.0 / np.pi), "as if 'speed' were in revolutions per minute"),
+        ("wrapped", 0.0, (180.0 / np.pi, 1.0), "as if 'angle' were in degrees"),
     ],
 )
 def test_a_position_in_other_units_than_its_velocity_is_refused(channels, noise, scales, says):
     data = changed(pendulum_data(noise=noise), lambda _, obs, actions: (obs * scales, actions))
+    if channels == "wrapped":
+        channels = KNOWN
+        data = changed(data, lambda _, obs, u: (np.c_[obs[:, 0] % 360.0, obs[:, 1]], u))
 
     found = audit(data, channels)
 
     assert kinds(found) == {"OtherUnits"} and not found.usable and says in found.reason
     assert found.findings[0].factor == pytest.approx(scales[0] / scales[1], rel=0.1)
-
-
-def test_a_wrapped_angle_in_degrees_is_in_other_units_than_its_velocity():
-    t = 0.01 * np.arange(401)
-    obs = [
-        np.stack([np.degrees(w * t + np.sin(w * t)) % 360.0, w + w * np.cos(w * t)], axis=1)
-        for w in np.linspace(3.0, 6.0, 8)
-    ]
-    actions = [np.random.default_rng(0).standard_normal((400, 1))] * 8
-
-    found = audit(Trajectories.from_arrays(obs, actions, dt=0.01), KNOWN)
-
-    assert "as if 'angle' were in degrees" in found.reason
 
 
 @pytest.mark.parametrize(("factor", "dt"), [(0.2, 0.01), (0.8, 0.2), (1.25, 0.05), (8.0, 0.2)])
@@ -563,63 +490,58 @@ def test_a_factor_that_a_scale_of_the_sensor_explains_is_left_to_it(factor, dt):
     assert "OtherUnits" not in kinds(audit(data, KNOWN)) | kinds(audit(data))
 
 
-def swings(seed=0, n=8, steps=300, dt=0.02, noise=0.003):
-    """Angles of a free pendulum with dry friction: w^2 = 42 1/s^2, up to 1.4 rad."""
-    rng, recordings = np.random.default_rng(seed), []
-    for q in rng.uniform(0.6, 1.4, n) * rng.choice([-1.0, 1.0], n):
-        v, seen = 0.0, []
-        for step in range(10 * steps + 1):
-            if step % 10 == 0:
-                seen.append(q)
-            v += 0.1 * dt * (-42.0 * np.sin(q) - 0.86 * np.tanh(v / 0.01))
-            q += 0.1 * dt * v
-        recordings.append(np.array(seen)[:, None] + noise * rng.standard_normal((steps + 1, 1)))
-    return recordings
+class Swinging(twins.FreePendulum):
+    """A free pendulum that is let go far out."""
+
+    def initial(self, key, params):
+        q = jax.random.uniform(key, (1,), minval=0.6, maxval=1.4)
+        return State(q, jnp.zeros_like(q), {})
 
 
-def pendulum_twin(**changes):
-    own = {"mass": 0.3, "com": 0.2, "inertia": 0.002, "observe": "q", "dt": 0.02}
-    return twins.make("FreePendulum", **own | changes)
+PENDULUM = {"mass": 0.3, "com": 0.2, "inertia": 0.002, "observe": "q", "dt": 0.02}
 
 
-def angles(recordings):
-    return Trajectories.from_arrays(recordings, [np.zeros((300, 0))] * 8, dt=0.02)
+@pytest.fixture(scope="module")
+def swings():
+    rubbing = Swinging(**PENDULUM).extend(CoulombFriction(0, tau_c=0.012))
+    return measured(rubbing, n_steps=300, noise=0.003)
 
 
-@pytest.mark.parametrize("changes", [{}, {"com": 0.28}, {"mass": 0.6, "damping": 0.02}])
-def test_an_angle_in_degrees_is_refused_if_the_twin_says_so_whatever_else_is_wrong(changes):
-    twin, degrees = pendulum_twin(**changes), angles(np.rad2deg(swings()))
+@pytest.fixture(scope="module")
+def degrees(swings):
+    return changed(swings, lambda _, obs, actions: (np.rad2deg(obs), actions))
+
+
+@pytest.mark.parametrize("changes", [{}, {"mass": 0.6, "damping": 0.02}])
+def test_an_angle_in_degrees_is_refused_if_the_twin_says_so_whatever_else_is_wrong(
+    changes, swings, degrees, tmp_path
+):
+    twin = twins.make("FreePendulum", **PENDULUM | changes)
 
     found = audit(degrees, twin=twin)
 
     assert not found.usable and kinds(found) == {"MistakenUnits"}
     assert "{column: hinge_position, unit: deg}" in found.reason
-    assert audit(angles(swings()), twin=twin).usable and audit(degrees).usable
+    assert audit(swings, twin=twin).usable and audit(degrees).usable
+    # Of a log, the column.
+    read = logged(degrees, tmp_path / "log.csv")
+    assert "{column: x0, unit: deg}" in audit(read, twin=twin).reason
 
 
-def test_an_angle_in_degrees_under_a_twin_that_is_all_wrong_is_a_caveat():
-    found = audit(angles(np.rad2deg(swings())), ["angle"], pendulum_twin(zero="up"))
+def test_an_angle_in_degrees_under_a_twin_that_is_all_wrong_is_a_caveat(degrees):
+    found = audit(degrees, ["angle"], twins.make("FreePendulum", **PENDULUM, zero="up"))
 
     assert found.usable and kinds(found) == {"LikelyUnits"}
     assert "'angle' spans" in str(found) and "degrees" in str(found.findings[0])
 
 
-def test_the_line_to_write_names_the_column_of_the_log(tmp_path):
-    degrees, path = angles(np.rad2deg(swings())), tmp_path / "log.csv"
-
-    found = audit(logged(degrees, path, warns=False), twin=pendulum_twin())
-
-    assert "'hinge_position' spans" in found.reason and "{column: x0, unit: deg}" in found.reason
-
-
-@pytest.mark.parametrize(("unit", "factor"), [("millimetres", 1e3), ("centimetres", 1e2)])
-def test_an_axis_in_millimetres_is_refused(unit, factor):
+def test_an_axis_in_millimetres_is_refused():
     force = 5.0 * np.sin(0.2 * np.random.default_rng(0).standard_normal((8, 200, 1)).cumsum(1))
     twin = twins.make("LinearAxis", mass=2.6)  # the real one has 2 kg
     clean = measured(twins.make("LinearAxis", mass=2.0), n_steps=200, commands=force)
-    data = changed(clean, lambda _, obs, actions: (factor * obs, actions))
+    data = changed(clean, lambda _, obs, actions: (1e3 * obs, actions))
 
-    assert f"if it is in {unit}" in audit(data, twin=twin).reason
+    assert "if it is in millimetres" in audit(data, twin=twin).reason
     assert audit(clean, twin=twin).usable
 
 
@@ -635,22 +557,20 @@ def test_a_joint_that_turns_many_times_is_in_the_right_unit():
         assert not kinds(found) & {"MistakenUnits", "LikelyUnits", "OtherUnits"}
 
 
-# --- backward differences
+def differentiated(data, noise=0.0, digits=15):
+    """Positions as an encoder reports them, and their backward differences."""
+    rng = np.random.default_rng(0)
 
+    def change(_, obs, actions):
+        q = obs[:, 0] + noise * rng.standard_normal(len(obs))
+        return np.stack([q[1:], np.diff(q) / data.dt], 1).round(digits), actions[1:]
 
-def differentiated(noise=1e-4, dt=0.01):
-    """An angle of an encoder, and its backward difference."""
-    rng, t = np.random.default_rng(0), dt * np.arange(1, 1001)
-    obs = []
-    for w in np.linspace(2.0, 5.0, 6):
-        angle = np.sin(w * t) + noise * rng.standard_normal(1000)
-        obs.append(np.stack([angle, np.diff(angle, prepend=0.0) / dt], 1)[1:])
-    return Trajectories.from_arrays(obs, [rng.standard_normal((998, 1))] * 6, dt=dt)
+    return changed(data, change)
 
 
 @pytest.mark.parametrize("digits", [15, 4])
 def test_a_backward_difference_is_recognised_and_offered_as_a_correction(digits):
-    data = changed(differentiated(), lambda _, obs, u: (obs.round(digits), u))
+    data = differentiated(pendulum_data(n=1000), noise=1e-4, digits=digits)
 
     found = audit(data, KNOWN)
     better = found.corrected(data)
@@ -664,26 +584,29 @@ def test_a_backward_difference_is_recognised_and_offered_as_a_correction(digits)
 def test_a_speed_that_a_sensor_measures_half_a_sample_late_is_no_backward_difference():
     rng, t = np.random.default_rng(0), 0.01 * np.arange(1000)
     obs = np.stack([np.sin(3.0 * t), 3.0 * np.cos(3.0 * (t - 0.005))], 1)
-    torque = [rng.standard_normal((999, 1))]
 
     for noise in ([0.0, 0.0], [1e-4, 3e-2]):
         seen = obs + noise * rng.standard_normal(obs.shape)
-        assert kinds(audit(Trajectories.from_arrays([seen], torque, dt=0.01), KNOWN)) <= {
-            "PoorExcitation"
-        }
+        assert kinds(audit(alone(seen), KNOWN)) <= {"PoorExcitation"}
 
 
-def test_a_backward_difference_is_told_from_the_steps_of_a_twin():
+def test_a_backward_difference_is_told_from_the_steps_of_a_twin_and_moved_back_for_a_diagnosis():
     force = np.sin(0.2 * np.random.default_rng(0).standard_normal((8, 200, 1)).cumsum(1))
     twin = twins.make("LinearAxis")
-    differences = changed(
-        measured(twin, n_steps=200, commands=force),
-        lambda _, obs, u: (np.stack([obs[1:, 0], np.diff(obs[:, 0]) / twin.dt], 1), u[1:]),
-    )
+    differences = differentiated(measured(twin, n_steps=200, commands=force))
+
+    moved, words = in_step(twin, differences)
 
     assert "BackwardDifference" in kinds(audit(differences, twin=twin))
     # Without noise and without a twin, nobody knows.
     assert "BackwardDifference" not in kinds(audit(differences))
+    assert len(words) == 1 and "it was moved back. No sensor delays it." in words[0]
+    central = np.gradient(moved.obs[..., 0], twin.dt, axis=1)[:, 1:-1]
+    np.testing.assert_allclose(moved.obs[:, 1:-1, 1], central, atol=5e-3)
+    # A velocity that the twin computes in the same way stays.
+    cart_pole = twins.make("CartPole")
+    data = measured(cart_pole, n_steps=200)
+    assert in_step(cart_pole, data) == (data, ())
 
 
 def test_a_position_and_a_velocity_that_are_swapped_are_refused_if_units_tell():
@@ -694,9 +617,6 @@ def test_a_position_and_a_velocity_that_are_swapped_are_refused_if_units_tell():
     assert kinds(found) == {"Swapped"} and not found.usable
     assert "'angle' should be a position" in found.reason
     assert audit(data, ["a", "b"]).findings == ()
-
-
-# --- single samples
 
 
 @pytest.mark.parametrize(("channel", "noise"), [(0, 0.01), (1, 0.0)])

@@ -8,26 +8,11 @@ import numpy as np
 import pytest
 
 from sb3_hds import twins
-from sb3_hds.core import State, rollout
+from sb3_hds.core import State
 
 
 def state_of(q, v):
     return State(jnp.asarray(q, jnp.float64), jnp.asarray(v, jnp.float64), {})
-
-
-def test_the_double_pendulums_reward_is_positive_while_alive(x64):
-    """So that planning, which counts nothing after the fall, does not prefer an early one."""
-    twin = twins.make("InvertedDoublePendulum")
-    starts = jax.vmap(twin.initial, (0, None))(
-        jax.random.split(jax.random.key(0), 200), twin.params
-    )
-    pushes = jax.random.choice(jax.random.key(1), jnp.array([-1.0, 1.0]), (200, 20, 1))
-
-    episodes = jax.jit(jax.vmap(lambda s, a: rollout(twin, twin.params, s, a)))(starts, pushes)
-
-    survived = episodes.alive[:, 1:]
-    assert not survived[:, -1].any()
-    assert episodes.rewards[:, :-1][survived].min() > 0.0
 
 
 def test_cart_pole_is_best_at_rest_upright_in_the_middle(x64):
@@ -77,18 +62,18 @@ def greedy_episode(twin, start, n_steps):
     actions = jnp.linspace(-1.0, 1.0, 41)[:, None] ** 3  # finer around zero
 
     def advance(carry, _):
-        state, alive, earned, n_alive = carry
+        state, alive, earned = carry
         after = jax.vmap(twin.step, (None, 0, None))(state, actions, twin.params)
         planned = jax.vmap(twin.planning_reward, (None, 0, 0, None))
         best = jnp.argmax(planned(state, actions, after, twin.params))
         after = jax.tree.map(lambda leaf: leaf[best], after)
         reward = twin.reward(state, actions[best], after, twin.params)
-        earned, n_alive = earned + alive * reward, n_alive + alive
-        return (after, alive & ~twin.terminated(after, twin.params), earned, n_alive), None
+        over = twin.terminated(after, twin.params)
+        return (after, alive & ~over, earned + alive * reward), None
 
-    carry = (start, jnp.array(True), jnp.zeros(()), jnp.zeros((), int))
-    (_, alive, earned, n_alive), _ = jax.lax.scan(advance, carry, None, n_steps)
-    return alive, earned, n_alive
+    carry = (start, jnp.array(True), jnp.zeros(()))
+    (_, alive, earned), _ = jax.lax.scan(advance, carry, None, n_steps)
+    return alive, earned
 
 
 def test_climbing_the_mountain_cars_surrogate_reaches_the_goal_cheaply(x64):
@@ -98,20 +83,17 @@ def test_climbing_the_mountain_cars_surrogate_reaches_the_goal_cheaply(x64):
     x = jnp.asarray(x[np.abs(x + math.pi / 6.0) > 0.005])[:, None]
     starts = State(x, jnp.zeros_like(x), {})
 
-    alive, earned, _ = jax.jit(jax.vmap(lambda s: greedy_episode(twin, s, 999)))(starts)
+    alive, earned = jax.jit(jax.vmap(lambda s: greedy_episode(twin, s, 999)))(starts)
 
     assert not alive.any()
     assert earned.min() >= 93.0
 
 
 def test_climbing_the_acrobots_surrogate_swings_it_up(x64):
-    """One step of foresight mostly does it in 150 steps, where random torque needs far longer."""
+    """One step of foresight mostly does it in 150 steps, where random torque seldom does."""
     twin = twins.make("Acrobot")
     starts = jax.vmap(twin.initial, (0, None))(jax.random.split(jax.random.key(0), 32), twin.params)
-    torques = jax.random.uniform(jax.random.key(1), (32, 150, 1), minval=-1.0, maxval=1.0)
 
-    alive, _, _ = jax.jit(jax.vmap(lambda s: greedy_episode(twin, s, 150)))(starts)
-    random = jax.jit(jax.vmap(lambda s, a: rollout(twin, twin.params, s, a)))(starts, torques)
+    alive, _ = jax.jit(jax.vmap(lambda s: greedy_episode(twin, s, 150)))(starts)
 
     assert alive.mean() <= 0.25
-    assert random.alive[:, -1].mean() >= 0.75
