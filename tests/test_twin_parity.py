@@ -84,15 +84,12 @@ def change_constants(model):
         model.site_pos[0, 2] -= 0.05
 
 
-@pytest.mark.parametrize(
-    ("env_id", "changed"),
-    [(MUJOCO[0], False), *((env_id, True) for env_id in MUJOCO)],
-    ids=["as shipped", *(f"{env_id} of another XML" for env_id in MUJOCO)],
-)
-def test_mujoco_twins_follow_mujoco(env_id, changed, x64):
-    env = gymnasium.make(env_id, **({"frame_skip": 3} if changed else {})).unwrapped
-    if changed:
-        change_constants(env.model)
+@pytest.mark.parametrize("env_id", MUJOCO)
+def test_mujoco_twins_follow_mujoco(env_id, x64):
+    single = env_id == "InvertedPendulum-v5"
+    env = gymnasium.make(env_id, frame_skip=3, **({} if single else {"healthy_reward": 7.0}))
+    env = env.unwrapped
+    change_constants(env.model)
     twin = twins.from_env(env)
 
     for obs, reward, ended, state, twin_obs, twin_reward, twin_ended in random_episodes(env, twin):
@@ -101,8 +98,15 @@ def test_mujoco_twins_follow_mujoco(env_id, changed, x64):
         error = np.concatenate([state.q - env.data.qpos, state.v - env.data.qvel]) / scale
         assert np.abs(error).max() < 1e-12
         np.testing.assert_allclose(twin_obs, obs, rtol=1e-12, atol=1e-12)
-        if env_id == "InvertedPendulum-v5":
+        if single:
             assert (ended, reward) == (twin_ended, twin_reward)
+            continue
+        # As the environment has it, the tip is where the last Runge-Kutta stage put it: O(h^3) off.
+        assert ended != twin_ended or twin_reward == pytest.approx(reward, abs=5e-3)
+        mujoco.mj_kinematics(env.model, env.data)
+        x, _, z = env.data.site_xpos[0]
+        expected, _ = env._get_rew(x, z, bool(z <= 1.0))
+        assert twin_reward == pytest.approx(expected, rel=1e-12) and twin_ended == (z <= 1.0)
 
 
 @pytest.mark.parametrize("env_id", MUJOCO)
@@ -114,38 +118,21 @@ def test_declared_constants_are_those_of_the_shipped_model(env_id):
     assert twin.values == pytest.approx(twins.make(env_id).values, rel=1e-14)
 
 
-def test_the_reward_of_the_double_pendulum_is_the_environments_at_the_end_of_the_step(x64):
-    env = gymnasium.make("InvertedDoublePendulum-v5", healthy_reward=7.0).unwrapped
-
-    for _, reward, ended, _, _, twin_reward, twin_ended in random_episodes(
-        env, twins.from_env(env)
-    ):
-        # As the environment has it, the tip is where the last Runge-Kutta stage put it: O(h^3) off.
-        assert ended != twin_ended or twin_reward == pytest.approx(reward, abs=5e-3)
-        mujoco.mj_kinematics(env.model, env.data)
-        x, _, z = env.data.site_xpos[0]
-        expected, _ = env._get_rew(x, z, bool(z <= 1.0))
-        assert twin_reward == pytest.approx(expected, rel=1e-12)
-        assert twin_ended == (z <= 1.0)
-
-
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
         (lambda m: m.dof_frictionloss.__setitem__(0, 0.1), "joints without dry friction"),
-        (lambda m: m.jnt_stiffness.__setitem__(1, 0.1), "joints without springs"),
         (lambda m: setattr(m.opt, "integrator", 0), "the integrator RK4"),
-        (lambda m: setattr(m.opt, "density", 1.2), "no medium around the bodies"),
         (lambda m: m.actuator_ctrlrange.__setitem__(0, (-2.0, 2.0)), "commands within"),
         (lambda m: m.jnt_axis.__setitem__(1, (1.0, 0.0, 0.0)), "hinges about y"),
     ],
 )
 def test_a_model_of_another_structure_is_refused(change, expected):
-    for env_id in MUJOCO:
-        env = gymnasium.make(env_id).unwrapped
-        change(env.model)
-        with pytest.raises(EnvironmentMismatchError, match=f"The twin expects .*{expected}"):
-            twins.from_env(env)
+    env = gymnasium.make(MUJOCO[1]).unwrapped
+    change(env.model)
+
+    with pytest.raises(EnvironmentMismatchError, match=f"The twin expects .*{expected}"):
+        twins.from_env(env)
 
 
 def test_pendulum_follows_gymnasium(x64):
@@ -195,22 +182,18 @@ def test_mountain_car_follows_gymnasium(x64):
     assert n_walls >= 1
 
 
-def acrobot_state(env):
-    return state_of(env.state[:2], env.state[2:])
-
-
 def test_acrobot_follows_gymnasium(x64):
     env, twin = gymnasium.make("Acrobot-v1").unwrapped, twins.make("Acrobot")
     rng, simulate = np.random.default_rng(0), simulator(twin)
     n_clipped = n_terminated = 0
     env.reset(seed=0)
-    state = acrobot_state(env)
+    state = state_of(env.state[:2], env.state[2:])
 
     for k in range(2 * N_STEPS):
         if k >= N_STEPS:  # then single steps from anywhere: at clips, and high up
             highest = np.array([math.pi, math.pi, env.MAX_VEL_1, env.MAX_VEL_2])
             env.state = rng.uniform(-highest, highest)
-            state = acrobot_state(env)
+            state = state_of(env.state[:2], env.state[2:])
         choice = rng.integers(3)
         obs, reward, terminated, *_ = env.step(choice)
         state, twin_obs, twin_reward, twin_ended = simulate(state, jnp.array([choice - 1.0]))
@@ -230,17 +213,17 @@ def test_cart_pole_follows_gymnasium(x64):
     env.kinematics_integrator = "semi-implicit"
     rng, simulate = np.random.default_rng(0), simulator(twin)
 
-    for seed, forces in enumerate([(-10.0, 10.0), (10.0, -10.0), None]):
+    for seed in range(3):
         env.reset(seed=seed)
         env.state, env.steps_beyond_terminated = rng.normal(size=4), 1
         state = state_of(env.state[[0, 2]], env.state[[1, 3]])
         for _ in range(N_STEPS):
-            env.force_mag = rng.choice(forces) if forces else rng.uniform(-10.0, 10.0)
+            env.force_mag = rng.uniform(-10.0, 10.0)
             env.step(1)
             state, *_ = simulate(state, jnp.array([env.force_mag]))
             # Rounding of 1e-16, grown by the upper equilibrium over 4 s.
-            np.testing.assert_allclose(state.q, env.state[[0, 2]], rtol=0.0, atol=1e-11)
-            np.testing.assert_allclose(state.v, env.state[[1, 3]], rtol=0.0, atol=1e-11)
+            ours = np.r_[state.q, state.v]
+            np.testing.assert_allclose(ours, env.state[[0, 2, 1, 3]], rtol=0.0, atol=1e-11)
 
 
 def payload_in_cartesian_coordinates(twin):
@@ -260,14 +243,9 @@ def payload_in_cartesian_coordinates(twin):
     return derivative
 
 
-@pytest.mark.parametrize(
-    ("substeps", "tolerance"),
-    # RK4: the servo's error per sub-step is (h / 0.05 s)^5 / 120, 2.6e-4 at the default and 1e-12
-    # at 100 sub-steps, of a change of up to 4 m/s in speed, whence 0.05 s of that in position.
-    [(2, 2e-3), (100, 1e-9)],
-)
-def test_payload_pendulum_follows_an_independent_integration(substeps, tolerance, x64):
-    twin = twins.make("PayloadPendulum", mass=0.7, length=0.8, damping=0.1, substeps=substeps)
+def test_payload_pendulum_follows_an_independent_integration(x64):
+    # RK4: the servo's error per sub-step is (h / 0.05 s)^5 / 120, 1e-12 of a change of up to 4 m/s.
+    twin = twins.make("PayloadPendulum", mass=0.7, length=0.8, damping=0.1, substeps=100)
     rng, simulate = np.random.default_rng(0), simulator(twin)
     state = twin.initial(jax.random.key(1), twin.params)
 
@@ -285,27 +263,7 @@ def test_payload_pendulum_follows_an_independent_integration(substeps, tolerance
             derivative, (0.0, 0.05), reference, "DOP853", args=(command,), rtol=1e-12, atol=1e-13
         ).y[:, -1]
         where = [0, 1, 4, 5]
-        np.testing.assert_allclose(points(state)[where], reference[where], 0.0, tolerance)
-
-
-def test_the_drive_of_the_payload_changes_its_momentum(x64):
-    """Less the weight, it is the rate of momentum of handle (10 kg) and payload."""
-    twin = twins.make("PayloadPendulum", mass=0.7, length=0.8, damping=0.1)
-    state, command = state_of([0.1, 0.2, 0.6], [0.5, -0.3, 2.0]), jnp.array([1.0, -0.5])
-
-    def momentum(q, v):
-        payload_v = v[:2] + 0.8 * v[2] * jnp.stack([jnp.cos(q[2]), jnp.sin(q[2])])
-        return 10.0 * v[:2] + 0.7 * payload_v
-
-    drive = twin.actuate(state, command, twin.params)
-    acceleration = jnp.linalg.solve(
-        twin.mass_matrix(state.q, twin.params), drive - twin.bias(state.q, state.v, twin.params)
-    )
-    _, rate = jax.jvp(momentum, (state.q, state.v), (state.v, acceleration))
-
-    weight = np.array([0.0, 10.7 * 9.81])
-    np.testing.assert_allclose(drive[:2] - weight, rate, rtol=1e-12)  # rounding
-    np.testing.assert_allclose(acceleration[:2], (command - state.v[:2]) / 0.05, rtol=1e-12)
+        np.testing.assert_allclose(points(state)[where], reference[where], 0.0, 1e-9)
 
 
 def reset_states(env, n):
