@@ -16,13 +16,13 @@ class AnySpaces(gymnasium.Env):
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self._left = 10
+        self.n = 0
         return self.observation_space.sample(), {}
 
     def step(self, action):
         assert self.action_space.contains(action)
-        self._left -= 1
-        return self.observation_space.sample(), 1.0, False, self._left == 0, {}
+        self.n += 1
+        return self.observation_space.sample(), 1.0, False, self.n == 10, {}
 
 
 class Dead(gymnasium.Wrapper):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from small_models import small
-from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_hds.algos import TrainBeside
 from sb3_hds.errors import ParameterError, SafetyError
@@ -50,18 +49,11 @@ class Plant(gymnasium.Env):
         return np.full(1, self.n, np.float32), 1.0, False, self.n >= self.length, {}
 
 
-def controlled(takes=0.0, length=1000, safe=None, **settings):
+def controlled(takes=0.0, length=1000, safe=None):
     """A period of 0.1 s, begun with a first command at 100 s."""
     ours = Time()
-    env = RealTime(
-        Plant(ours, 0.0, length),
-        0.1,
-        safe,
-        threaded=False,
-        clock=ours.clock,
-        sleep=ours.sleep,
-        **settings,
-    )
+    how = {"threaded": False, "clock": ours.clock, "sleep": ours.sleep}
+    env = RealTime(Plant(ours, 0.0, length), 0.1, safe, **how)
     env.reset(seed=0)
     env.step(GO)
     env.unwrapped.takes = takes
@@ -78,14 +70,24 @@ def times(env):
 
 def test_commands_act_at_the_ticks_however_fast_the_learner_is():
     env, ours = controlled(takes=0.02)
+    slow, _ = controlled(takes=0.25)
 
-    for thinking in (0.0, 0.05, 0.03):
+    for thinking in (0.0, 0.0525, 0.0325):
         ours.now += thinking
         env.step(GO)
+    slow.step(GO)
+    slow.step(GO)
 
     assert times(env) == pytest.approx([100.1, 100.2, 100.3])
-    assert env.latency == pytest.approx(0.03) and not env.overrun
+    assert env.latency == pytest.approx(0.0325) and not env.overrun
     assert env.timing == Timing(steps=4)
+    # Bins of 5 ms up to 0.2 s.
+    counts, edges = env.latencies()
+    assert np.flatnonzero(counts).tolist() == [0, 6, 10] and counts[-1] == 0
+    assert edges[10] == pytest.approx(0.05) and edges[-1] == np.inf
+    # A step from 0.1 to 0.35 s, so the next tick is at 0.4 s.
+    assert times(slow) == pytest.approx([100.1, 100.4])
+    assert slow.timing == Timing(steps=3, slow_steps=2)
 
 
 def test_a_late_command_is_counted_and_acts_at_once_and_within_the_grace_keeps_the_ticks():
@@ -147,16 +149,16 @@ def test_an_episode_that_ends_under_the_watchdog_is_reported_and_the_command_dro
     assert env.timing == Timing(steps=1, safe_actions=2, dropped=1)
 
 
-@pytest.mark.parametrize("when", ["before reset", "after reset"])
-def test_no_tick_passes_between_episodes(when):
+@pytest.mark.parametrize("reset_first", [True, False])
+def test_no_tick_passes_while_a_learner_trains_between_episodes(reset_first):
     env, ours = controlled(safe=[-1.0], length=2)
     env.step(GO)
 
-    if when == "after reset":
+    if reset_first:
         env.reset()
-    ours.now += 60.0  # training
+    ours.now += 60.0
     assert not env.watch()
-    if when == "before reset":
+    if not reset_first:
         env.reset()
     env.step(GO)
     ours.now += 0.05
@@ -167,75 +169,30 @@ def test_no_tick_passes_between_episodes(when):
     assert env.latencies()[0].sum() == 2
 
 
-def test_learners_that_train_between_episodes_keep_every_tick():
-    ours = Time()
-    plant = gymnasium.wrappers.TimeLimit(Plant(ours), 10)
-    env = RealTime(plant, 0.1, [-1.0], threaded=False, clock=ours.clock, sleep=ours.sleep)
-
-    class Slow(BaseCallback):
-        """Each training takes a second, in which a watchdog would look."""
-
-        def _on_step(self):
-            return True
-
-        def _on_rollout_end(self):
-            ours.now += 1.0
-            assert not env.watch()
-
-    settings = {"train_freq": (1, "episode"), "gradient_steps": 1, "learning_starts": 10}
-    small("gsde_sac", env, **settings).learn(40, callback=Slow())
-
-    assert env.timing == Timing(steps=40)
+def interrupt(seconds):
+    raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("how", ["interrupted", "refused"])
-def test_the_watchdog_goes_on_where_a_step_was_not_finished(how):
+@pytest.mark.parametrize(
+    ("sleep", "action", "error"),
+    [(interrupt, GO, KeyboardInterrupt), (None, np.array([np.nan]), ValueError)],
+    ids=["interrupted", "refused"],
+)
+def test_the_watchdog_goes_on_where_a_step_was_not_finished(sleep, action, error):
     env, ours = controlled(safe=[-1.0])
     ours.now += 0.16
     assert env.watch()
-    if how == "interrupted":
-
-        def sleep(seconds):
-            raise KeyboardInterrupt
-
-        env._sleep, action, error = sleep, GO, KeyboardInterrupt
-    else:
-        action, error = np.array([np.nan]), ValueError
+    env._sleep = sleep or ours.sleep
     with pytest.raises(error):
         env.step(action)
+    env._sleep = ours.sleep
 
     for _ in range(20):
         ours.now += 0.025
         env.watch()
 
     assert [command for _, command in env.unwrapped.told[1:]] == [-1.0] * 6
-    env._sleep = ours.sleep
-    *_, info = env.step(GO)
-    assert info["missed_steps"] == 6
-
-
-def test_a_step_longer_than_the_period_is_counted_and_skips_to_the_next_tick():
-    env, _ = controlled(takes=0.25)
-
-    env.step(GO)
-    env.step(GO)
-
-    # From 0.1 to 0.35 s, so the next tick is at 0.4 s.
-    assert times(env) == pytest.approx([100.1, 100.4])
-    assert env.timing == Timing(steps=3, slow_steps=2)
-
-
-def test_latencies_fill_a_histogram_with_an_open_end():
-    env, ours = controlled()
-
-    for thinking in (0.0025, 0.0525, 0.0525, 5.0):
-        ours.now += thinking
-        env.step(GO)
-
-    counts, edges = env.latencies()
-    # Bins of 5 ms up to 0.2 s.
-    assert counts.sum() == 4 and counts[-1] == 1 and edges[-1] == np.inf
-    assert counts[0] == 1 and counts[10] == 2 and edges[10] == pytest.approx(0.05)
+    assert env.step(GO)[-1]["missed_steps"] == 6
 
 
 @pytest.mark.parametrize(
@@ -262,15 +219,12 @@ def test_in_real_time_a_learner_that_hangs_is_replaced_by_the_watchdog():
         *_, info = env.step(GO)
     finally:
         env.close()
-    elapsed = time.monotonic() - begin
 
-    commands = [command for _, command in env.unwrapped.told]
     # Never faster than the clock, and how much slower depends on the machine.
-    assert elapsed >= 4 * 0.02 + 0.3
+    assert time.monotonic() - begin >= 4 * 0.02 + 0.3
     assert 1 <= info["missed_steps"] <= 16
-    assert commands[-1] == 1.0 and commands[-2] == -1.0
+    assert [command for _, command in env.unwrapped.told[-2:]] == [-1.0, 1.0]
     assert env.timing.steps == 6 and env.timing.safe_actions >= info["missed_steps"]
-    assert env.overrun and env.latencies()[0].sum() == 5
 
 
 def test_a_watchdog_whose_safe_action_fails_says_so_and_stays_still():
@@ -280,15 +234,15 @@ def test_a_watchdog_whose_safe_action_fails_says_so_and_stays_still():
                 raise OSError("no answer from the drive")
             return super().step(action)
 
-    env = RealTime(Broken(), 0.2, [0.5])
+    env = RealTime(Broken(), 0.1, [0.5])
     env.reset()
-    env.step(np.zeros(1, np.float32))
-    time.sleep(0.7)
+    env.step(GO)
+    time.sleep(0.35)
     with pytest.raises(SafetyError, match="watchdog"):
-        env.step(np.zeros(1, np.float32))
+        env.step(GO)
     assert len(env.unwrapped.told) == 1
     env.reset()
-    env.step(np.zeros(1, np.float32))
+    env.step(GO)
     env.close()
 
 

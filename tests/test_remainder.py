@@ -17,8 +17,7 @@ def agreements(rng, n_units=N_UNITS, n_windows=1):
     return found.reshape(N_SETS, -1), np.repeat(np.arange(n_units), n_windows)
 
 
-@pytest.mark.parametrize("n_windows", [1, 16])
-@pytest.mark.parametrize("n_units", [N_UNITS, 20])
+@pytest.mark.parametrize(("n_units", "n_windows"), [(N_UNITS, 1), (N_UNITS, 16), (20, 1)])
 def test_chance_is_that_of_the_best_among_all_sets(n_units, n_windows):
     rng = np.random.default_rng(0)
     best = [_by_chance(*agreements(rng, n_units, n_windows)).min() for _ in range(200)]
