@@ -4,26 +4,11 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
+from free_mass import Mass
 from gymnasium import spaces
-from jaxtyping import PRNGKeyArray
 from scipy.linalg import solve_discrete_are
 
-from sb3_hds.core import (
-    Action,
-    Actuator,
-    AnalyticTwin,
-    Channel,
-    Force,
-    Joint,
-    MassMatrix,
-    Obs,
-    Parameter,
-    Params,
-    Position,
-    Scalar,
-    State,
-    Velocity,
-)
+from sb3_hds.core import Actuator, Channel, Parameter, State
 from sb3_hds.envs import TwinEnv
 
 N_STEPS = 20
@@ -31,7 +16,7 @@ _LOW, _HIGH = -1.0, 3.0  # [N]
 _DRAG = 0.5  # [N s/m]
 
 
-class PointMass(AnalyticTwin):
+class PointMass(Mass):
     r"""
     :math:`m\dot v = u - 0.5\,v` with a force :math:`u` from -1 to 3 N, stronger one way.
 
@@ -41,33 +26,22 @@ class PointMass(AnalyticTwin):
     name = "PointMass"
     dt = 0.2
     max_episode_steps = N_STEPS
-    joints = (Joint("slide", "m"),)
     actuators = (Actuator("force", "N", _LOW, _HIGH),)
     channels = (Channel("x", "m", -10.0, 10.0), Channel("v", "m/s", -10.0, 10.0))
     parameters = {"mass": Parameter(null=1.0, scale=0.2, unit="kg", lower=1e-3)}
 
-    def initial(self, key: PRNGKeyArray, params: Params) -> State:
+    def initial(self, key, params):
         start = jax.random.uniform(key, (1,), minval=-1.0, maxval=1.0)
         return State(start, jnp.zeros(1), {})
 
-    def infer(self, obs: Obs, params: Params) -> State:
-        return State(obs[:1], obs[1:], {})
-
-    def observe(self, state: State, params: Params) -> Obs:
-        return jnp.concatenate([state.q, state.v])
-
-    def actuate(self, state: State, action: Action, params: Params) -> Force:
+    def actuate(self, state, action, params):
         return jnp.clip(action, _LOW, _HIGH)
 
-    def mass_matrix(self, q: Position, params: Params) -> MassMatrix:
-        return jnp.full((1, 1), params["mass"])
-
-    def bias(self, q: Position, v: Velocity, params: Params) -> Force:
+    def bias(self, q, v, params):
         return _DRAG * v
 
-    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        cost = state.q**2 + 0.1 * state.v**2 + 0.01 * action**2
-        return -jnp.sum(cost)
+    def reward(self, state, action, next_state, params):
+        return -jnp.sum(state.q**2 + 0.1 * state.v**2 + 0.01 * action**2)
 
 
 def point_mass_env(dtype: type = np.float32) -> gymnasium.Env:

@@ -108,7 +108,7 @@ def test_the_vectorised_twin_answers_sb3s_questions():
     assert [spec.id for spec in env.get_attr("spec", indices=[1])] == ["Pendulum-v1"]
     assert env.get_attr("twin", indices=1)[0].values["mass"] == 1.1
     assert env.env_is_wrapped(TimeLimit) == [False] * 2 and not env.has_attr("nonsense")
-    assert len(np.unique(env.get_images(), axis=0)) == 2 and env.render().shape == (400, 800, 3)
+    assert len(np.unique(env.get_images(), axis=0)) == 2 and env.render().shape == (800, 400, 3)
     env.set_attr("note", "kept")
     with pytest.raises(ValueError, match="share 'note'"):
         env.set_attr("note", "lost", indices=[0])
