@@ -47,15 +47,12 @@ class Noting(BaseCallback):
 def test_what_is_logged_and_evaluated_has_a_series_of_its_own_whose_axis_moves(tmp_path):
     model = small("hds", pretrain_epochs=21)
     lines = logged(model)
-    env = Monitor(gymnasium.make("Pendulum-v1"))
-
-    model.learn(
-        50,
-        callback=EvalCallback(
-            env, eval_freq=10, n_eval_episodes=1, verbose=0, log_path=str(tmp_path)
-        ),
-        log_interval=1,
+    env = Monitor(gymnasium.make("Pendulum-v1", max_episode_steps=20))
+    evaluation = EvalCallback(
+        env, eval_freq=10, n_eval_episodes=1, verbose=0, log_path=str(tmp_path)
     )
+
+    model.learn(50, callback=evaluation, log_interval=1)
 
     # Ten lines before the first of the two epochs that come after 25 steps each.
     epochs = "pretrain/time/epochs"
