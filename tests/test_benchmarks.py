@@ -1,12 +1,21 @@
-"""What the benchmarks compute from their tables, and what they keep between runs."""
+"""What the benchmarks run, compute from their tables, and keep between runs."""
 
-import hardware
-import hds_parts
+from importlib.util import find_spec
+from inspect import signature
+
+import intervals
+import model_free
 import numpy as np
 import pandas as pd
 import pytest
 import runs
 import sim_to_real
+import speed
+from model_free import LENGTHS, ONLY_ON, OURS, PEERS
+
+from rl_zoo_plugin.lazy import parameters_of
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def runs_of(cell, seeds, methods=("wrong_twin", "ceiling", "randomised", "hds")):
@@ -32,15 +41,6 @@ def test_a_median_leaves_out_cells_and_seeds_that_have_not_run_yet():
     assert sim_to_real.over_cells(heavy, ["heavy"], n_draws=10).empty
 
 
-def test_leads_are_those_of_equal_seeds_after_as_many_steps():
-    table = runs_of("light", 2)
-    sac = table[table["method"] == "hds"].assign(method="sac")
-    sac["return"] += [-5.0, -5.0, -5.0, -5.0, 1.0, -5.0]
-    found = sim_to_real.seed_by_seed(pd.concat([table, sac]))
-    assert found.to_numpy().tolist() == [["sac", 6, 1, -1.0]]
-    assert sim_to_real.seed_by_seed(table).empty
-
-
 def test_a_code_version_is_that_of_what_is_written_in_the_files(tmp_path):
     inner = tmp_path / "inner"
     inner.mkdir()
@@ -52,43 +52,6 @@ def test_a_code_version_is_that_of_what_is_written_in_the_files(tmp_path):
     seen.append(runs.code_version(tmp_path))
 
     assert seen[0] == seen[1] and len(set(seen)) == 3
-
-
-def test_a_pretrained_model_of_other_code_is_not_used(monkeypatch):
-    before = hardware.kept_at("Pendulum", 0, {"randomisation": 1.0})
-    monkeypatch.setattr(hardware, "code_version", lambda root: "another")
-    assert hardware.kept_at("Pendulum", 0, {"randomisation": 1.0}) != before
-
-
-def test_the_twin_of_euler_steps_is_wrong_in_nothing_but_its_integrator():
-    system, twin = hardware.make("euler steps").unwrapped, hardware.data_sheet("euler steps")
-    assert twin.name == "Pendulum"
-    assert twin.values == {name: getattr(system, name) for name in twin.values}
-    assert (system.friction, system.drag, system.delay, system.noise) == (0.0, 0.0, 0.0, 0.0)
-
-
-def parts_of(returns):
-    rows = [(variant, seed, x) for variant, own in returns.items() for seed, x in enumerate(own)]
-    return pd.DataFrame(rows, columns=["variant", "seed", "return"])
-
-
-def test_the_parts_of_hds_close_a_share_of_the_gap_over_seeds_that_have_both_ends():
-    rows = parts_of({"as it is": [5.0, 15.0, 99.0], "wrong twin": [0.0, 10.0], "ceiling": [10, 30]})
-    found = hds_parts.closed(rows, rows)
-    assert found["as it is"] == pytest.approx(10.0 / 30.0)
-    assert (found["wrong twin"], found["ceiling"]) == (0.0, 1.0)
-    assert hds_parts.closed(rows, rows[rows["variant"] != "ceiling"]) == {}
-
-
-def test_a_figure_shows_every_variant():
-    variants = hds_parts.VARIANTS["beta"]
-    rows = parts_of({variant: np.arange(2.0) for variant in variants})
-    rows["gradient_norm"] = rows["derivative_worst"] = 1.0
-
-    drawing = hds_parts.FIGURES["beta"](rows)
-
-    drawing.canvas.draw()
-    assert {tick.get_text() for tick in drawing.axes[0].get_xticklabels()} == set(variants)
 
 
 def test_a_run_that_was_stopped_before_its_end_is_made_again_in_place(monkeypatch, tmp_path):
@@ -107,3 +70,82 @@ def test_a_run_that_was_stopped_before_its_end_is_made_again_in_place(monkeypatc
     assert asked == [0]
     found = pd.read_csv(tmp_path / "table.csv")
     assert found.to_dict("list") == {"seed": [1, 0, 0], "mark": [2, 1, 2]}
+
+
+@pytest.mark.skipif(find_spec("rl_zoo3") is None, reason="needs the extra 'zoo'")
+def test_every_setting_of_a_method_is_an_argument_of_its_class():
+    for method in (*OURS, *PEERS):
+        for env in ONLY_ON.get(method, LENGTHS):
+            algorithm, settings = model_free.made_of(env, method)
+            known = parameters_of(algorithm) if method in OURS else signature(algorithm).parameters
+            assert set(settings) <= set(known), (env, method)
+            assert len(model_free.marks(env, method)) > 1
+
+
+def test_a_long_run_goes_on_from_its_last_mark(tmp_path, monkeypatch):
+    env, method = "InvertedPendulum-v5", "td7"
+    monkeypatch.setattr(model_free, "LENGTHS", {env: (150, 50)})
+    monkeypatch.setattr(model_free, "CACHE", tmp_path)
+    made_of = model_free.made_of
+    small = {"learning_starts": 20, "buffer_size": 1000, "batch_size": 16}
+    small["policy_kwargs"] = {"net_arch": [8], "embedding_size": 8}
+    monkeypatch.setattr(model_free, "made_of", lambda *run: (made_of(*run)[0], small))
+
+    def interrupted_after(mark):
+        def evaluate(model):
+            if model.num_timesteps > mark:
+                raise KeyboardInterrupt
+            return np.array([float(model.num_timesteps)])
+
+        return evaluate
+
+    monkeypatch.setattr(model_free, "evaluation", lambda env: interrupted_after(140))
+    with pytest.raises(KeyboardInterrupt):
+        model_free.worker(env, method, 0)
+    kept = runs.InterruptedRun(tmp_path / "model_free" / f"{env}_{method}_0")
+    before = kept.rows()
+    model = kept.model(model_free.class_of(env, method), env)
+
+    monkeypatch.setattr(model_free, "evaluation", lambda env: interrupted_after(1e9))
+    rows = model_free.worker(env, method, 0)
+
+    assert len(before) == 2
+    assert model.num_timesteps == model.replay_buffer.size() == before[-1]["steps"] < 140
+    assert model._n_updates > 0
+    assert rows[:2] == before
+    assert [row["mark"] for row in rows] == [50, 100, 150]
+    assert 150 <= rows[-1]["steps"] <= 180
+    assert not kept.folder.exists()
+
+
+def test_intervals_are_those_of_rliable():
+    library = pytest.importorskip("rliable.library")
+    metrics = pytest.importorskip("rliable.metrics")
+    rng = np.random.default_rng(0)
+    ours, theirs = rng.normal(size=5), rng.normal(0.3, 2.0, size=8)
+    of_mean = lambda scores: np.array([metrics.aggregate_mean(scores)])  # noqa: E731
+
+    points, limits = library.get_interval_estimates({"ours": ours[:, None]}, of_mean, reps=10_000)
+
+    mean, low, high = intervals.of_mean(ours)
+    assert mean == pytest.approx(points["ours"][0])
+    # Three standard errors of a 2.5 % quantile of 10,000 draws, in deviations of the mean.
+    apart = 3.0 * 2.0 * ours.std() / np.sqrt(5) * np.sqrt(0.025 * 0.975 / 10_000) / 0.0584
+    np.testing.assert_allclose([low, high], limits["ours"][:, 0], atol=apart)
+    chance = metrics.probability_of_improvement(ours[:, None], theirs[:, None])
+    assert intervals.chance_of_more(ours, theirs) == pytest.approx(chance)
+
+
+def test_the_speed_up_is_that_of_neighbouring_blocks(monkeypatch):
+    # The machine slows down; ours takes half the time of the peer but in one block.
+    blocks = [[0.5 * i, 1.0 * i] for i in range(1, speed.N_BLOCKS)] + [[9.0, 3.0]]
+    monkeypatch.setattr(speed, "ours", lambda name, ratio: speed.Products(ratio))
+    monkeypatch.setattr(speed, "other", lambda name, ratio, library: speed.Products(ratio))
+    monkeypatch.setattr(speed, "block_length", lambda models: 10)
+    left = iter(blocks)
+    monkeypatch.setattr(speed, "turn", lambda models, steps, backwards: next(left))
+
+    [row] = speed.worker("sac", 2, "sbx")["rows"]
+
+    assert (row["low"], row["speed_up"], row["high"]) == (2.0, 2.0, 2.0)
+    assert row["steps_per_s"] == pytest.approx(10 / np.median(blocks, 0)[0])

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from odd_envs import AnySpaces
 from small_models import STATES, greedy, repacked, saved, small
 from stable_baselines3 import SAC
 
@@ -51,21 +50,6 @@ def test_checkpoints_of_td7_act_in_the_policy_alone(no_pickle, tmp_path):
         np.testing.assert_array_equal(greedy(policy), greedy(model))
     model.policy.drop_checkpoint()
     assert (greedy(model) != greedy(policy)).any()
-
-
-def test_observations_of_several_parts_keep_their_order(no_pickle):
-    # In an order that is not the alphabet's.
-    space = spaces.Dict(
-        [("speed", spaces.Box(-np.inf, np.inf, (2,))), ("gear", spaces.Discrete(3, start=1))]
-    )
-    env = AnySpaces(space, spaces.Box(-1.0, 1.0, (2, 2)))
-    model = small("droq", env, policy="MultiInputPolicy", seed=3)
-    obs = {"speed": np.array([0.3, -2.0], np.float32), "gear": 2}
-
-    policy = sb3_hds.load_policy(saved(model))
-
-    np.testing.assert_array_equal(greedy(policy, obs), greedy(model, obs))
-    assert greedy(model, obs).shape == (2, 2)
 
 
 @pytest.mark.parametrize(
