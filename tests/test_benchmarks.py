@@ -10,7 +10,6 @@ import pandas as pd
 import pytest
 import runs
 import sim_to_real
-import speed
 from model_free import LENGTHS, ONLY_ON, OURS, PEERS
 
 from rl_zoo_plugin.lazy import parameters_of
@@ -134,18 +133,3 @@ def test_intervals_are_those_of_rliable():
     np.testing.assert_allclose([low, high], limits["ours"][:, 0], atol=apart)
     chance = metrics.probability_of_improvement(ours[:, None], theirs[:, None])
     assert intervals.chance_of_more(ours, theirs) == pytest.approx(chance)
-
-
-def test_the_speed_up_is_that_of_neighbouring_blocks(monkeypatch):
-    # The machine slows down; ours takes half the time of the peer but in one block.
-    blocks = [[0.5 * i, 1.0 * i] for i in range(1, speed.N_BLOCKS)] + [[9.0, 3.0]]
-    monkeypatch.setattr(speed, "ours", lambda name, ratio: speed.Products(ratio))
-    monkeypatch.setattr(speed, "other", lambda name, ratio, library: speed.Products(ratio))
-    monkeypatch.setattr(speed, "block_length", lambda models: 10)
-    left = iter(blocks)
-    monkeypatch.setattr(speed, "turn", lambda models, steps, backwards: next(left))
-
-    [row] = speed.worker("sac", 2, "sbx")["rows"]
-
-    assert (row["low"], row["speed_up"], row["high"]) == (2.0, 2.0, 2.0)
-    assert row["steps_per_s"] == pytest.approx(10 / np.median(blocks, 0)[0])

@@ -96,18 +96,6 @@ def test_the_wheel_holds_both_packages_the_yml_files_and_the_start_up_files(whee
 
 @needs_build
 @needs_zoo
-def test_the_stock_zoo_knows_our_algorithms_after_an_editable_install(tmp_path):
-    environment = Environment(tmp_path)
-    environment.install("-e", ROOT)
-
-    package, _, known, hyperparams = succeeds(environment.python, "-c", REPORT).split()
-
-    assert Path(package) == ROOT / "sb3_hds" / "__init__.py" and known == "True"
-    assert Path(hyperparams) == ROOT / "hyperparams" / "hds.yml"
-
-
-@needs_build
-@needs_zoo
 def test_with_the_wheel_the_zoo_knows_our_algorithms_and_interpreters_start_as_before(
     tmp_path, wheel
 ):
