@@ -68,7 +68,7 @@ test-newest: RESOLUTION := highest
 test-lowest test-newest: test-%:
 	test -x $(VENV)-$*/bin/python || $(PYTHON) -m venv $(VENV)-$*
 	$(VENV)-$*/bin/python -m pip --disable-pip-version-check install --quiet --no-compile \
-		--constraint constraints.txt --extra-index-url $(TORCH_INDEX) torch
+		--retries 1 --constraint constraints.txt --extra-index-url $(TORCH_INDEX) torch
 	$(VENV)-$*/bin/python -m pip --disable-pip-version-check install --quiet uv
 	$(VENV)-$*/bin/uv pip install --python $(VENV)-$*/bin/python --resolution $(RESOLUTION) \
 		--editable ".[zoo,report,dev]"

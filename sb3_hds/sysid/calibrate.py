@@ -1,26 +1,22 @@
 """Estimate the parameters of a twin from measured data."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from sb3_hds.core import Params, Trajectories, Twin
+from sb3_hds.core import Parameter, Trajectories, Twin
 from sb3_hds.core.contract import check_methods
 from sb3_hds.core.episodes import same_interval
 from sb3_hds.data.report import Reading
 from sb3_hds.errors import CalibrationError
-from sb3_hds.sysid.bounds import Bounds, bounds_of
 from sb3_hds.sysid.covariance import Spread, covariance_of
-from sb3_hds.sysid.free import Free, free_names, tie
-from sb3_hds.sysid.inverse_dynamics import Forces, by_inverse_dynamics
-from sb3_hds.sysid.motion import first_offsets
-from sb3_hds.sysid.projection import Errors, Groups, Solution, evaluate, one_each, solve
+from sb3_hds.sysid.evidence import Evidence, portion_for
+from sb3_hds.sysid.free import Free, free_names, one_each, own_values, tie
+from sb3_hds.sysid.hypotheses import Hypotheses
+from sb3_hds.sysid.inverse_dynamics import NO_THRESHOLD, Forces, by_inverse_dynamics
 from sb3_hds.sysid.results import Estimate, Fit
 from sb3_hds.sysid.shooting import Shots, n_free, shots_of
 
@@ -32,6 +28,10 @@ _FIRST_NOISE, _LEAST_NOISE = 0.05, 1e-7
 # Huber's threshold, in units of the noise: 95 % as efficient as least squares on Gaussian noise.
 _HUBER = 1.345
 _PASSES = 3
+# Steps of start states alone, and the share of the cost below which a step is the last.
+_FIRST_STEPS, _TOLERANCE = 8, 1e-9
+# An estimate this close to a bound lies on it, in units of its scale.
+_ON_BOUND = 1e-3
 # Beyond this ratio of two intervals, one is taken to be in another unit.
 _OTHER_UNIT = 100.0
 
@@ -54,8 +54,8 @@ def calibrate(
     """
     Find the parameter values under which a twin reproduces measured data best.
 
-    Levenberg-Marquardt (optimistix) in double precision over short windows with free start states,
-    which are eliminated by variable projection. Each channel is weighted by its noise, which is
+    Levenberg-Marquardt in double precision over short windows with free start states, which are
+    eliminated from the normal equations. Each channel is weighted by its noise, which is
     estimated too. Standard errors are those of the sandwich estimator, clustered by recording (by
     window where there are few recordings): they hold for noise that is neither white nor Gaussian.
 
@@ -101,7 +101,7 @@ def calibrate(
     if not 0.0 < level < 1.0:
         raise CalibrationError(f"level must lie between 0 and 1, got {level}.")
     shots, origin = shots_of(data, window or default_window(data), twin, n_windows, seed)
-    threshold = _HUBER if loss == "huber" else None
+    threshold = _HUBER if loss == "huber" else NO_THRESHOLD
     if errors == "force":
         return _fit_forces(twin, wanted, data, shots, origin, threshold, level)
     return fit_windows(
@@ -125,7 +125,7 @@ def fit_windows(
     origin: np.ndarray,
     spread: Float[np.ndarray, " obs"],
     *,
-    threshold: float | None = _HUBER,
+    threshold: float = _HUBER,
     prior: float = 0.0,
     believed: Float[np.ndarray, " p"] | None = None,
     level: float = 0.95,
@@ -139,38 +139,44 @@ def fit_windows(
     :param shots: windows; those of weight zero do not count
     :param origin: recording of each window, shape ``(n,)``
     :param spread: of each channel over the data
-    :param threshold: of the Huber loss, in units of the noise; None for plain squares
+    :param threshold: of the Huber loss, in units of the noise
     :param believed: centre of the prior; default: the twin's own values
     :param elsewhere: where else the search may begin, asked where simulations with the twin's own
         values miss a channel by more than it varies
     :raises CalibrationError: for fewer measurements than unknowns
     """
-    groups = tuple(free.values())
-    _check_enough(twin, groups, shots)
-    origin = np.where(shots.weight > 0.0, origin, -1)
-    with jax.enable_x64(True):
-        values = np.array([twin.values[group[0]] for group in groups])
-        believed, noise = values if believed is None else believed, _FIRST_NOISE * spread
-        fixed, shots = _doubles(twin.params), Shots(*map(jnp.asarray, shots))
-        look = partial(evaluate, twin, groups, threshold, fixed, shots)
-        begin = first_offsets(twin, np.asarray(shots.obs), twin.dt)
-        at = look(values, jnp.asarray(begin), noise)
-        before = np.asarray(at.raw)
-        astray = np.any(_rms(before[origin >= 0]) > spread)
-        other = elsewhere() if elsewhere is not None and astray else None
-        if other is not None:
-            there = look(other.values, jnp.asarray(begin), noise)
-            if np.sum(np.asarray(there.bent) ** 2) < np.sum(np.asarray(at.bent) ** 2):
-                values, at = other.values, there
-        search = partial(solve, twin, groups, threshold, max_steps, fixed)
-        for _ in range(_PASSES):
-            begin = bounds_of([twin.parameters[group[0]] for group in groups]).inside(values)
-            found = search(begin, shots, noise, at.offsets, believed, prior)
-            values = np.asarray(found.values)
-            at = look(values, at.offsets, noise)
-            noise = _noise(at.raw, shots, len(free), n_free(twin), spread)
-        errors = jax.tree.map(np.asarray, look(values, at.offsets, noise))
-    return _fit(twin, free, errors, before, origin, values, noise, found, level, prior)
+    _check_enough(twin, free, shots)
+    real = origin >= 0
+    kept, origin = Shots(*(np.asarray(leaf)[real] for leaf in shots)), origin[real]
+    evidence = Evidence(
+        Hypotheses.of_values(twin, free, believed, prior),
+        kept,
+        _FIRST_NOISE * spread,
+        width=len(free),
+        portion=portion_for(shots.n),
+        threshold=threshold,
+    )
+    at = evidence.fit(own_values(twin, free), (), n_steps=_FIRST_STEPS)
+    before, found = at.raw, None
+    if elsewhere is not None and np.any(_rms(before) > spread):
+        other = elsewhere()
+        there = other and evidence.fit(other.values, (), n_steps=_FIRST_STEPS)
+        if there and there.cost < at.cost:
+            at = there
+    for _ in range(_PASSES):
+        found = evidence.solve(at.theta, range(len(free)), at.offsets, max_steps, _TOLERANCE)
+        at = found.point
+        noise = _noise(at.raw, len(free), n_free(twin), spread)
+        evidence = evidence.with_noise(noise)
+    assert found is not None
+    at = evidence.fit(at.theta, (), at.offsets, n_steps=_FIRST_STEPS)
+    slopes, scale = evidence.slopes(at), evidence.hypotheses.scale
+    n_measured = at.raw.size - n_free(twin) * len(at.raw)
+    uncertainty = covariance_of(
+        slopes.curvature.sum(0), slopes.scores, origin, scale, prior, n_measured
+    )
+    told = _Told(before, at.raw, noise, found.converged, found.n_steps, "simulation")
+    return _result(twin, free, at.theta, uncertainty, told, level)
 
 
 def _fit_forces(
@@ -179,32 +185,42 @@ def _fit_forces(
     data: Trajectories,
     shots: Shots,
     origin: np.ndarray,
-    threshold: float | None,
+    threshold: float,
     level: float,
 ) -> Fit:
-    groups = tuple(free.values())
-    found = by_inverse_dynamics(twin, groups, data, threshold)
+    found = by_inverse_dynamics(twin, tuple(free.values()), data, threshold)
     if found is None:
         raise CalibrationError(
             f"errors='force' asks for the equation of motion of an AnalyticTwin, and {twin.name} "
             "has more than that, or none. Calibrate the twin without effects, or leave errors out."
         )
+    real, spread = origin >= 0, spread_of(data)
+    evidence = Evidence(
+        Hypotheses.of_values(twin, free),
+        Shots(*(np.asarray(leaf)[real] for leaf in shots)),
+        _FIRST_NOISE * spread,
+        width=0,
+        portion=portion_for(shots.n),
+        threshold=threshold,
+    )
+    scale = evidence.hypotheses.scale
     errors, slopes, recording = found.windows(shots.actions.shape[1])
-    bounds = bounds_of([twin.parameters[group[0]] for group in groups])
-    spread = covariance_of(errors, slopes, recording, bounds.scale, 0.0, 0)
-    values = one_each(groups, found.values.tolist())
-    with jax.enable_x64(True):
-        scale = _FIRST_NOISE * spread_of(data)
-        own = Shots(*map(jnp.asarray, shots))
-        begin = jnp.asarray(first_offsets(twin, np.asarray(shots.obs), twin.dt))
-        raws = [
-            np.asarray(evaluate(twin, (), threshold, p, own, jnp.zeros(0), begin, scale).raw)
-            for p in (_doubles(twin.params), _doubles(twin.with_parameters(**values).params))
-        ]
-    real = origin >= 0
-    noise = _noise(raws[1], shots, 0, n_free(twin), spread_of(data))
-    told = _Told(raws[0][real], raws[1][real], noise, True, 1, "force")
-    return _result(twin, free, found.values, spread, bounds, told, level)
+    slopes = slopes * scale
+    uncertainty = covariance_of(
+        np.einsum("nmp,nmq->pq", slopes, slopes),
+        np.einsum("nmp,nm->np", slopes, errors),
+        recording,
+        scale,
+        0.0,
+        errors.size,
+    )
+    before, after = (
+        evidence.fit(values, (), n_steps=_FIRST_STEPS).raw
+        for values in (own_values(twin, free), found.values)
+    )
+    noise = _noise(after, 0, n_free(twin), spread)
+    told = _Told(before, after, noise, True, 1, "force")
+    return _result(twin, free, found.values, uncertainty, told, level)
 
 
 def _rms(raw: np.ndarray) -> np.ndarray:
@@ -259,53 +275,26 @@ def _other_unit(ratio: float) -> str:
     )
 
 
-def _check_enough(twin: Twin, groups: Groups, shots: Shots) -> None:
+def _check_enough(twin: Twin, free: Free, shots: Shots) -> None:
     real = int(np.sum(shots.weight))
     measured = real * int(np.prod(shots.obs.shape[1:]))
-    unknown = len(groups) + real * n_free(twin)
+    unknown = len(free) + real * n_free(twin)
     if measured <= unknown:
         raise CalibrationError(
             f"{real} windows of {shots.actions.shape[1]} steps hold {measured} measurements, and "
-            f"{len(groups)} parameters with the start states are {unknown} unknowns. "
+            f"{len(free)} parameters with the start states are {unknown} unknowns. "
             "Record more, free fewer parameters, or ask for longer windows."
         )
 
 
-def _doubles(params: Params) -> Params:
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
-
-
 def _noise(
-    raw: Array | np.ndarray, shots: Shots, n_params: int, n_start: int, spread: np.ndarray
-) -> np.ndarray:
+    raw: np.ndarray, n_params: int, n_start: int, spread: np.ndarray
+) -> Float[np.ndarray, " obs"]:
     """Standard deviation of each channel's error, by the median, so that outliers do not matter."""
-    real = np.asarray(shots.weight) > 0.0
-    error = np.asarray(raw)[real].reshape(-1, raw.shape[-1])
-    freedom = error.size / max(error.size - n_params - n_start * int(real.sum()), 1)
+    error = raw.reshape(-1, raw.shape[-1])
+    freedom = error.size / max(error.size - n_params - n_start * len(raw), 1)
     noise = 1.4826 * np.median(np.abs(error), 0) * np.sqrt(freedom)
     return np.maximum(noise, _LEAST_NOISE * spread)
-
-
-def _fit(
-    twin: Twin,
-    free: Free,
-    errors: Errors,
-    before: np.ndarray,
-    origin: np.ndarray,
-    values: np.ndarray,
-    noise: np.ndarray,
-    found: Solution,
-    level: float,
-    prior: float,
-) -> Fit:
-    groups, real = tuple(free.values()), origin >= 0
-    bounds = bounds_of([twin.parameters[group[0]] for group in groups])
-    spread = covariance_of(
-        errors.bent[real], errors.slopes[real], origin[real], bounds.scale, prior, n_free(twin)
-    )
-    solved = bool(found.converged), int(found.n_steps)
-    told = _Told(before[real], errors.raw[real], noise, *solved, "simulation")
-    return _result(twin, free, values, spread, bounds, told, level)
 
 
 class _Told(NamedTuple):
@@ -324,7 +313,6 @@ def _result(
     free: Free,
     values: np.ndarray,
     spread: Spread,
-    bounds: Bounds,
     told: _Told,
     level: float,
 ) -> Fit:
@@ -348,7 +336,7 @@ def _result(
             values,
             spread.stderr,
             margin,
-            bounds.reached(values),
+            _at_bound(parameters, values),
             strict=True,
         )
     )
@@ -369,6 +357,14 @@ def _result(
         undetermined=tuple(_in_words(tuple(free), row) for row in spread.undetermined),
         errors=told.errors,
     )
+
+
+def _at_bound(parameters: Sequence[Parameter], values: np.ndarray) -> list[bool]:
+    """Whether values lie on a physical bound."""
+    return [
+        bool(min(value - p.lower, p.upper - value) < _ON_BOUND * p.scale)
+        for p, value in zip(parameters, values, strict=True)
+    ]
 
 
 def _in_words(names: tuple[str, ...], direction: np.ndarray) -> str:

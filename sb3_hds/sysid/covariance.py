@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy import stats
 
 # With fewer recordings than this more than there are parameters, windows count as independent.
@@ -33,12 +34,12 @@ class Spread(NamedTuple):
 
 
 def covariance_of(
-    errors: np.ndarray,
-    slopes: np.ndarray,
-    origin: np.ndarray,
-    scale: np.ndarray,
+    curvature: Float[np.ndarray, "p p"],
+    scores: Float[np.ndarray, "n p"],
+    origin: Int[np.ndarray, " n"],
+    scale: Float[np.ndarray, " p"],
     prior: float,
-    n_start: int,
+    n_measured: int,
 ) -> Spread:
     """
     The sandwich estimator, clustered by recording, or by window where recordings are few.
@@ -46,26 +47,23 @@ def covariance_of(
     Source: Cameron and Miller, *A practitioner's guide to cluster-robust inference*, Journal of
     Human Resources 50(2), 2015, sections II and VI (CR1 correction, t with G - 1).
 
-    :param errors: in units of the noise, start states eliminated, shape ``(n, m)``
-    :param slopes: of the errors by the parameters, shape ``(n, m, p)``
-    :param origin: recording of each window, shape ``(n,)``
-    :param scale: typical deviation of each parameter, shape ``(p,)``
+    :param curvature: of the cost, start states eliminated, parameters in units of their scale
+    :param scores: slopes of the cost of each window, likewise
+    :param origin: recording of each window
+    :param scale: typical deviation of each parameter
     :param prior: reciprocal of what is believed of each parameter's deviation, in units of scale
-    :param n_start: numbers that the start state of a window has
+    :param n_measured: numbers that were measured, less those of the start states
     """
-    n, m, p = slopes.shape
-    slopes = slopes * scale
+    n, p = scores.shape
     recordings = np.unique(origin)
     groups = origin if len(recordings) >= _FEWEST_RECORDINGS + p else np.arange(n)
     labels = np.unique(groups)
-    information = np.einsum("nmp,nmq->pq", slopes, slopes) + prior**2 * np.eye(p)
-    power, directions = np.linalg.eigh(information)
+    power, directions = np.linalg.eigh(curvature + prior**2 * np.eye(p))
     # In units of the scale, under noise of one, the standard error along a direction.
     weak = power <= _UNDETERMINED**-2
     bread = (directions[:, ~weak] / power[~weak]) @ directions[:, ~weak].T
-    scores = np.einsum("nmp,nm->np", slopes, errors)
     summed = np.stack([scores[groups == label].sum(0) for label in labels])
-    n_groups, n_measured = len(labels), n * (m - n_start)
+    n_groups = len(labels)
     correction = n_groups / max(n_groups - 1, 1) * (n_measured - 1) / max(n_measured - p, 1)
     covariance = bread @ (correction * summed.T @ summed + prior**2 * np.eye(p)) @ bread
     stderr = np.sqrt(np.maximum(np.diag(covariance), 0.0))

@@ -60,6 +60,18 @@ class Point(NamedTuple):
     cost: float
 
 
+class Solution(NamedTuple):
+    """
+    :param point: the end of the search
+    :param converged: whether another step would hardly lower the cost
+    :param n_steps: that were taken
+    """
+
+    point: Point
+    converged: bool
+    n_steps: int
+
+
 class Slopes(NamedTuple):
     """
     At a point, start states eliminated, parameters in units of their scale.
@@ -104,6 +116,8 @@ class Evidence:
     :param width: most parameters that move at a time
     :param rows: whether a row of a window counts, shape ``(steps + 1,)``; default: all do
     :param portion: windows that are simulated at a time: one program serves data of every size
+    :param threshold: beyond which an error counts in proportion, not by its square, in units of the
+        noise
     """
 
     hypotheses: Hypotheses
@@ -112,6 +126,7 @@ class Evidence:
     width: int
     rows: Float[np.ndarray, " rows"] | None = None
     portion: int = _PORTION
+    threshold: float = _HUBER
 
     def with_noise(self, noise: Float[np.ndarray, " obs"]) -> "Evidence":
         return dataclasses.replace(self, noise=noise)
@@ -127,6 +142,17 @@ class Evidence:
         offsets: Float[np.ndarray, "n free"] | None = None,
         n_steps: int = 15,
     ) -> Point:
+        """:return: where :meth:`solve` ends"""
+        return self.solve(theta, free, offsets, n_steps).point
+
+    def solve(
+        self,
+        theta: Float[np.ndarray, " p"],
+        free: Sequence[int],
+        offsets: Float[np.ndarray, "n free"] | None = None,
+        n_steps: int = 15,
+        enough: float = _ENOUGH,
+    ) -> "Solution":
         """
         Levenberg-Marquardt over the start states and some parameters, within their bounds.
 
@@ -134,6 +160,7 @@ class Evidence:
         :param free: indices of the parameters that move; none: only start states do
         :param offsets: of the start states, where to begin; default: as measured
         :param n_steps: at most
+        :param enough: a step that lowers the cost by a smaller share than this is the last
         """
         h, moving = self.hypotheses, np.array(free, int)
         low, high, size = h.lower[moving], h.upper[moving], h.scale[moving]
@@ -142,7 +169,9 @@ class Evidence:
         now, damping = self._blocks(theta, moving, offsets), _DAMPING
         null, firm = h.null[moving], (size / h.prior[moving]) ** 2
         doubt = lambda x: float(0.5 * firm @ ((x[moving] - null) / size) ** 2)  # noqa: E731
+        converged, taken = False, 0
         for _ in range(n_steps):
+            taken += 1
             step = _eliminated(now, damping)
             new = theta.copy()
             pull = firm, firm * (theta[moving] - null) / size
@@ -164,9 +193,11 @@ class Evidence:
             elif gained := max(now.cost.sum() + doubt(theta) - then.cost.sum() - doubt(new), 0.0):
                 theta, offsets, now = new, ahead, then
             damping *= _LESS if gained else _MORE
-            if (gained and gained < _ENOUGH * now.cost.sum()) or damping > _MOST_DAMPING:
+            if (gained and gained < enough * now.cost.sum()) or damping > _MOST_DAMPING:
+                converged = True
                 break
-        return Point(theta, offsets, now.raw, float(now.cost.sum()) + doubt(theta))
+        point = Point(theta, offsets, now.raw, float(now.cost.sum()) + doubt(theta))
+        return Solution(point, converged, taken)
 
     def slopes(self, point: Point, index: Sequence[int] | None = None) -> Slopes:
         """
@@ -268,7 +299,7 @@ class Evidence:
             raw, by_start, by_theta = (np.asarray(leaf)[:n] for leaf in found)
             slopes.append(by_theta)
         by_theta = np.concatenate(slopes, -1)[..., : len(index)]
-        return _normal(raw, by_start, by_theta, self.noise, self._counted)
+        return _normal(raw, by_start, by_theta, self.noise, self._counted, self.threshold)
 
 
 def in_threads(work: Callable[[_Given], _Told], given: Sequence[_Given]) -> Iterator[_Told]:
@@ -301,12 +332,12 @@ def _look(
     offsets: Float[Array, "n free"],
     scale: Float[Array, " p"],
     n_lead: Array,
-    chosen: Chosen,
+    chosen: Chosen | None,
 ) -> tuple[Array, Array, Array]:
     """
     :param ties: parameters that share one number, by the name of that number
     :param n_lead: steps before each window that matter to what is remembered
-    :param chosen: the effects that may do something under these parameters
+    :param chosen: the effects that may do something under these parameters; None: all
     :return: simulated minus measured, and its slopes by start state and by the parameters that
         ``index`` names (in units of their scale)
     """
@@ -337,14 +368,15 @@ def _normal(
     by_theta: np.ndarray,
     noise: np.ndarray,
     counted: np.ndarray,
+    threshold: float,
 ) -> _Blocks:
     n = len(raw)
     finite = np.isfinite(raw)
     error = np.where(finite, raw / noise, _NOT_FINITE) * counted[:, None]
     size = np.abs(error)
-    small = np.minimum(size, _HUBER)
-    cost = np.sum(0.5 * small**2 + _HUBER * (size - small), (1, 2))
-    weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(size, 1e-12)))
+    small = np.minimum(size, threshold)
+    cost = np.sum(0.5 * small**2 + threshold * (size - small), (1, 2))
+    weight = np.sqrt(np.minimum(1.0, threshold / np.maximum(size, 1e-12)))
     factor = (weight * counted[:, None] / noise)[..., None]
     start, theta = (
         np.where(np.isfinite(slopes), slopes, 0.0) * factor for slopes in (by_start, by_theta)

@@ -2,6 +2,10 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
 
 from sb3_hds.core import Twin
 from sb3_hds.effects import force_of
@@ -71,3 +75,13 @@ def tie(twin: Twin, names: Iterable[str], tied: Mapping[str, Iterable[str]]) -> 
 def _alike(twin: Twin, name: str) -> tuple[str, float, float, float]:
     parameter = twin.parameters[name]
     return parameter.unit, parameter.lower, parameter.upper, twin.values[name]
+
+
+def own_values(twin: Twin, free: Free) -> Float[np.ndarray, " p"]:
+    """:return: what the twin has for them"""
+    return np.array([twin.values[members[0]] for members in free.values()], float)
+
+
+def one_each(groups: Iterable[tuple[str, ...]], values: Any) -> dict[str, Any]:
+    """:return: the value of each parameter, given one for each group"""
+    return {name: x for group, x in zip(groups, values, strict=True) for name in group}

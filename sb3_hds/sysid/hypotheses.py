@@ -34,6 +34,7 @@ from sb3_hds.effects import (
     reversed_joint,
 )
 from sb3_hds.errors import CalibrationError, EffectError
+from sb3_hds.sysid.free import Free
 from sb3_hds.sysid.priors import Belief, prior_of
 from sb3_hds.sysid.shooting import remembered_for, remembers_for
 
@@ -219,6 +220,42 @@ class Hypotheses:
             period=period,
         )
 
+    @classmethod
+    def of_values(
+        cls,
+        twin: Twin,
+        free: Free,
+        believed: Float[np.ndarray, " p"] | None = None,
+        prior: float = 0.0,
+    ) -> "Hypotheses":
+        """
+        No cause, but values of parameters that are not known.
+
+        :param twin: as it is
+        :param free: parameters, by the name of the value that they take
+        :param believed: centre of the prior; default: the twin's own values
+        :param prior: how firm it is, as the reciprocal of its standard deviation in units of each
+            parameter's scale; 0: there is none
+        """
+        first = [members[0] for members in free.values()]
+        own = [twin.parameters[name] for name in first]
+        scale = np.array([p.scale for p in own], float)
+        values = np.array([twin.values[name] for name in first], float)
+        return cls(
+            believed=twin,
+            twin=twin,
+            candidates=(),
+            names=tuple(free),
+            null=values if believed is None else np.asarray(believed, float),
+            scale=scale,
+            lower=np.array([p.lower for p in own], float),
+            upper=np.array([p.upper for p in own], float),
+            nuisances=tuple(range(len(own))),
+            prior=scale / prior if prior else np.full(len(own), np.inf),
+            pushes=(),
+            ties={name: members for name, members in free.items() if members != (name,)},
+        )
+
     @cached_property
     def fixed(self) -> Params:
         """All parameters of the extended twin, in double precision."""
@@ -243,12 +280,15 @@ class Hypotheses:
     def _single(self, name: str) -> str:
         return self.ties[name][0] if name in self.ties else name
 
-    def chosen(self, theta: Float[np.ndarray, " p"], index: Int[np.ndarray, " k"]) -> Chosen:
+    def chosen(self, theta: Float[np.ndarray, " p"], index: Int[np.ndarray, " k"]) -> Chosen | None:
         """
         :param theta: all parameters, shape ``(p,)``
         :param index: of those by which slopes are taken; others than parameters name nothing
-        :return: the effects that are not null, or whose slopes are asked for
+        :return: the effects that are not null, or whose slopes are asked for; None for all, where
+            there is no candidate
         """
+        if not self.candidates:
+            return None
         layer, moving = _extended_of(self.twin), {self.names[i] for i in index if i < len(theta)}
         if layer is None:
             return Chosen.of((), ())

@@ -12,11 +12,13 @@ from scipy.optimize import lsq_linear
 from sb3_hds.core import AnalyticTwin, State, Trajectories, Twin
 from sb3_hds.core.compilation import QUICKEST_COMPILATION
 from sb3_hds.sysid.equation.motion import motion
-from sb3_hds.sysid.projection import Groups, one_each
+from sb3_hds.sysid.free import one_each
 
 # Gauss-Newton steps: most parameters are linear, and need one; Huber's weights need a few.
 _STEPS = 6
 _HUBER = 1.345
+#: for plain squares: beyond any error, in units of the noise
+NO_THRESHOLD = 1e12
 _NORMAL = 1.4826
 # How firmly the twin's own values are believed, as a standard deviation in each parameter's scale:
 # enough to keep what the data do not tell.
@@ -54,7 +56,7 @@ class Forces(NamedTuple):
 
 
 def by_inverse_dynamics(
-    twin: Twin, groups: Groups, data: Trajectories, threshold: float | None = _HUBER
+    twin: Twin, groups: tuple[tuple[str, ...], ...], data: Trajectories, threshold: float = _HUBER
 ) -> Forces | None:
     r"""
     Least squares on the force that measured motion needs and the twin does not have,
@@ -68,7 +70,7 @@ def by_inverse_dynamics(
     Source: Khalil and Dombre, *Modeling, Identification and Control of Robots*, 2002, section 12.
 
     :param groups: free parameters
-    :param threshold: of the Huber loss, in units of the noise; None for plain squares
+    :param threshold: of the Huber loss, in units of the noise
     :return: None for a twin that has more than an equation of motion
     """
     if not isinstance(twin, AnalyticTwin):
@@ -102,11 +104,9 @@ def by_inverse_dynamics(
     return Forces(values, errors, table, recording, moved.every)
 
 
-def _weights(missing: np.ndarray, threshold: float | None) -> np.ndarray:
+def _weights(missing: np.ndarray, threshold: float) -> np.ndarray:
     noise = _NORMAL * np.median(np.abs(missing), 0)
     noise = np.maximum(noise, 1e-12 * np.abs(missing).max() + 1e-300)
-    if threshold is None:
-        return np.broadcast_to(1.0 / noise, missing.shape)
     return np.sqrt(np.minimum(1.0, threshold * noise / np.maximum(np.abs(missing), 1e-300))) / noise
 
 
@@ -124,7 +124,7 @@ def _within(table: np.ndarray, right: np.ndarray, room: tuple[np.ndarray, np.nda
 @partial(jax.jit, static_argnums=(0, 1), compiler_options=QUICKEST_COMPILATION)
 def _missing(
     twin: AnalyticTwin,
-    groups: Groups,
+    groups: tuple[tuple[str, ...], ...],
     fixed: dict[str, Array],
     values: Array,
     q: Array,

@@ -1,5 +1,6 @@
 """What each candidate would add to the equation of motion: columns, linear in their sizes."""
 
+import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -23,6 +24,7 @@ from sb3_hds.core import (
 )
 from sb3_hds.core.compilation import QUICKEST_COMPILATION
 from sb3_hds.effects import SensorDelay
+from sb3_hds.effects.joint import DryFriction
 from sb3_hds.sysid.equation.motion import Motion
 from sb3_hds.sysid.equation.terms import Terms, forces, portions, terms
 from sb3_hds.sysid.hypotheses import PARAMETER, Candidate, Hypotheses, encoders
@@ -183,6 +185,8 @@ def equation(hypotheses: Hypotheses, motion: Motion) -> Equation:
     )
     typical = np.sqrt(np.mean(np.concatenate([load, found.actuator]) ** 2)) + 1e-300
     refuted = refuted_by_kinematics(twin, motion)
+    inertia = 1.0 / np.diagonal(np.linalg.inv(found.mass), axis1=1, axis2=2)
+    nodes = [_nodes(made, rows, found.bias, inertia, j) for j in range(inertia.shape[1])]
     for candidate in hypotheses.candidates:
         effect = hypotheses.effect_of(candidate)
         if candidate.key in refuted:
@@ -190,7 +194,7 @@ def equation(hypotheses: Hypotheses, motion: Motion) -> Equation:
         if candidate.slot == PARAMETER:
             _add_parameter(made, hypotheses, candidate, rows, smooth, typical)
         elif isinstance(effect, JointEffect) and not jax.tree.leaves(effect.memory(twin)):
-            _add_force(made, candidate, effect, found, rows)
+            _add_force(made, candidate, effect, nodes[candidate.index], rows)
         elif isinstance(effect, ActionEffect) and candidate.index >= 0:
             _add_command(made, hypotheses, candidate, effect, rows)
         elif isinstance(effect, SensorEffect):
@@ -279,12 +283,15 @@ def _add_parameter(
 
 # ------------------------------------------------------------------------------ forces at joints
 def _add_force(
-    made: Equation, candidate: Candidate, effect: JointEffect, found: Terms, rows: _Rows
+    made: Equation,
+    candidate: Candidate,
+    effect: JointEffect,
+    nodes: Mapping[str, np.ndarray],
+    rows: _Rows,
 ) -> None:
     j, motion = candidate.index, made.motion
     ranges = _ranges(made, rows, j, None)
     settings = effect.grid(ranges)
-    nodes = _nodes(made, rows, found, j)
     names = tuple(effect.parameters)
     nulls = {name: p.null for name, p in effect.parameters.items()}
     given = settings or ({},)
@@ -318,7 +325,9 @@ def _add_force(
             )
 
 
-def _nodes(made: Equation, rows: _Rows, found: Terms, joint: int) -> dict[str, np.ndarray]:
+def _nodes(
+    made: Equation, rows: _Rows, bias: np.ndarray, inertia: np.ndarray, joint: int
+) -> dict[str, np.ndarray]:
     """
     Where forces are evaluated: at three places of each interval (Simpson's rule, within what the
     twin's integrator sees of it), each at three velocities (the sign of one is not known exactly).
@@ -337,8 +346,8 @@ def _nodes(made: Equation, rows: _Rows, found: Terms, joint: int) -> dict[str, n
         "q": np.broadcast_to(position[..., None], speed.shape),
         "v": speed,
         "actuator": made.load[:, joint],
-        "load": found.bias[:, joint],
-        "inertia": 1.0 / np.linalg.inv(found.mass)[:, joint, joint],
+        "load": bias[:, joint],
+        "inertia": inertia[:, joint],
         "weights": shares[:, None] * _WEIGHTS,
     }
 
@@ -348,20 +357,41 @@ def _force_slopes(
 ) -> np.ndarray:
     """:return: derivative of the mean force by each parameter, ``(settings, parameters, n)``"""
     weights, found = nodes["weights"], []
+    effect, standstill = _for_any_joint(effect)
     rows = {name: x for name, x in nodes.items() if name != "weights"}
     with jax.enable_x64(True):
         for index, n in portions(len(rows["load"])):
             given = {name: jnp.asarray(x[index], jnp.float64) for name, x in rows.items()}
-            slopes = [_slopes_of(effect, each, given, weights, h) for each in settings]
+            slopes = [_slopes_of(effect, standstill, each, given, weights, h) for each in settings]
             found.append(np.stack(slopes)[..., :n])
     return np.concatenate(found, -1)
 
 
+def _for_any_joint(effect: JointEffect) -> tuple[JointEffect, float]:
+    """One program serves all joints: what differs between them is told apart from the effect."""
+    if not isinstance(effect, DryFriction):
+        return effect, 0.0
+    return _standing_still_at(effect, 1.0), effect.standstill
+
+
+def _standing_still_at(effect: DryFriction, speed: Any) -> DryFriction:
+    changed = copy.copy(effect)
+    changed.standstill = speed
+    return changed
+
+
 @partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
 def _slopes_of(
-    effect: JointEffect, values: Array, nodes: dict[str, Array], weights: Array, h: float
+    effect: JointEffect,
+    standstill: Array,
+    values: Array,
+    nodes: dict[str, Array],
+    weights: Array,
+    h: float,
 ) -> Array:
     names = tuple(effect.parameters)
+    if isinstance(effect, DryFriction):
+        effect = _standing_still_at(effect, standstill)
 
     def mean(values: Array, q: Array, v: Array, actuator: Array, load: Array, inertia: Array):
         params = dict(zip(names, values, strict=True))
