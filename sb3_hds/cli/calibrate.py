@@ -45,6 +45,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="that are made small: of simulated windows (the default), or of the equation of "
         "motion, for logs of torques that the twin explains worse than its sensors measure",
     )
+    command.add_argument(
+        "--windows", type=int, help="how many windows to use, drawn at random; default: all"
+    )
     command.add_argument("--window", type=int, help="steps of a window; default: half a second")
     command.add_argument(
         "--prior",
@@ -94,6 +97,7 @@ def run(given: argparse.Namespace) -> None:
         level=given.level,
         errors=given.errors,
         window=given.window,
+        n_windows=given.windows,
     )
     print(fit)
     for caveat in caveats:

@@ -1,12 +1,35 @@
 """Linear algebra on matrices of a handful of rows that XLA vectorises over a batch."""
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-# Rows up to which loops are unrolled where LAPACK could do it: beyond, they take a multiple of the
-# time to compile and run no faster.
-_UNROLLED = 4
+# Rows up to which loops are written out: beyond, they take a multiple of the time to compile. And
+# rows up to which there are loops at all: LAPACK's batched solvers spread over threads, for which
+# two programs that run at once can wait for ever, and cost several times as much for a batch of 64.
+_UNROLLED, _LOOPED = 4, 16
+
+
+class Factor(NamedTuple):
+    """
+    Of a symmetric positive definite matrix :math:`L D L^T`.
+
+    :param lower: :math:`L`, shape ``(n, n)``; what is not below its diagonal is not read
+    :param pivot: the diagonal of :math:`D`, shape ``(n,)``
+    """
+
+    lower: Array
+    pivot: Array
+
+
+def uses_lapack(n: int) -> bool:
+    """
+    :param n: rows of matrices
+    :return: whether they are solved by LAPACK: no two programs that do may run at once
+    """
+    return n > _LOOPED
 
 
 def solve_spd(
@@ -14,9 +37,6 @@ def solve_spd(
 ) -> Float[Array, "n *k"]:
     """
     Solve ``matrix @ x = right`` for a symmetric positive definite matrix.
-
-    LAPACK's batched solvers dominate the run time of a batch of tiny systems on a CPU: up to four
-    rows, and where pivots are raised, ``L D L^T`` is unrolled into element-wise operations.
 
     :param matrix: symmetric positive definite, shape ``(n, n)``; not checked
     :param right: shape ``(n,)`` or ``(n, k)``
@@ -26,8 +46,7 @@ def solve_spd(
     """
     n = matrix.shape[0]
     if n > _UNROLLED and least_pivot is None:
-        factor = lax.linalg.cholesky(matrix, symmetrize_input=False)
-        return solve_factored(factor, right)
+        return solve_factored(factorised(matrix), right)
     lower: dict[tuple[int, int], Array] = {}
     pivot: list[Array] = []
     for j in range(n):
@@ -45,15 +64,52 @@ def solve_spd(
     return jnp.stack(x)
 
 
-def solve_factored(
-    factor: Float[Array, "n n"], right: Float[Array, "n *k"]
-) -> Float[Array, "n *k"]:
+def factorised(matrix: Float[Array, "n n"]) -> Factor:
     """
-    :param factor: lower triangular ``L``
+    :param matrix: symmetric positive definite; not checked
+    """
+    n = matrix.shape[0]
+    if uses_lapack(n):
+        root = lax.linalg.cholesky(matrix, symmetrize_input=False)
+        return Factor(root / jnp.diagonal(root), jnp.diagonal(root) ** 2)
+    below = jnp.arange(n)
+
+    def column(j: Array, now: tuple[Array, Factor]) -> tuple[Array, Factor]:
+        rest, found = now
+        whole = lax.dynamic_index_in_dim(rest, j, 1, keepdims=False)
+        pivot = lax.dynamic_index_in_dim(whole, j, 0, keepdims=False)
+        share = jnp.where(below > j, whole / pivot, 0.0)
+        lower = lax.dynamic_update_index_in_dim(found.lower, share, j, 1)
+        pivots = lax.dynamic_update_index_in_dim(found.pivot, pivot, j, 0)
+        return rest - share[:, None] * whole[None, :], Factor(lower, pivots)
+
+    nothing = Factor(jnp.zeros_like(matrix), jnp.zeros_like(matrix[0]))
+    return lax.fori_loop(0, n, column, (matrix, nothing))[1]
+
+
+def solve_factored(factor: Factor, right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+    """
+    :param factor: of a matrix
     :param right: shape ``(n,)`` or ``(n, k)``
-    :return: ``x`` of ``L @ L.T @ x = right``
+    :return: ``x`` of ``matrix @ x = right``
     """
-    columns = right.reshape(len(factor), -1)
-    half = lax.linalg.triangular_solve(factor, columns, left_side=True, lower=True)
-    whole = lax.linalg.triangular_solve(factor, half, left_side=True, lower=True, transpose_a=True)
-    return whole.reshape(right.shape)
+    n = len(factor.pivot)
+    columns, pivot = right.reshape(n, -1), factor.pivot[:, None]
+    if uses_lapack(n):
+        known = {"left_side": True, "lower": True, "unit_diagonal": True}
+        half = lax.linalg.triangular_solve(factor.lower, columns, **known)
+        known["transpose_a"] = True
+        return lax.linalg.triangular_solve(factor.lower, half / pivot, **known).reshape(right.shape)
+
+    def forwards(j: Array, x: Array) -> Array:
+        own = lax.dynamic_index_in_dim(x, j, 0)
+        return x - lax.dynamic_index_in_dim(factor.lower, j, 1) * own
+
+    def backwards(k: Array, x: Array) -> Array:
+        j = n - 1 - k
+        share = lax.dynamic_index_in_dim(factor.lower, j, 1)
+        own = lax.dynamic_index_in_dim(x, j, 0) - jnp.sum(share * x, 0, keepdims=True)
+        return lax.dynamic_update_index_in_dim(x, own, j, 0)
+
+    half = lax.fori_loop(0, n, forwards, columns)
+    return lax.fori_loop(0, n, backwards, half / pivot).reshape(right.shape)

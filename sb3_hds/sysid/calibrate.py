@@ -28,8 +28,9 @@ _FIRST_NOISE, _LEAST_NOISE = 0.05, 1e-7
 # Huber's threshold, in units of the noise: 95 % as efficient as least squares on Gaussian noise.
 _HUBER = 1.345
 _PASSES = 3
-# Steps of start states alone, and the share of the cost below which a step is the last.
-_FIRST_STEPS, _TOLERANCE = 8, 1e-9
+# Steps of start states alone. A step that lowers the log likelihood by less is the last: it moves
+# estimates by a fraction of their standard errors.
+_FIRST_STEPS, _LEAST_STEP = 8, 1e-3
 # An estimate this close to a bound lies on it, in units of its scale.
 _ON_BOUND = 1e-3
 # Beyond this ratio of two intervals, one is taken to be in another unit.
@@ -164,7 +165,7 @@ def fit_windows(
         if there and there.cost < at.cost:
             at = there
     for _ in range(_PASSES):
-        found = evidence.solve(at.theta, range(len(free)), at.offsets, max_steps, _TOLERANCE)
+        found = evidence.solve(at.theta, range(len(free)), at.offsets, max_steps, 0.0, _LEAST_STEP)
         at = found.point
         noise = _noise(at.raw, len(free), n_free(twin), spread)
         evidence = evidence.with_noise(noise)

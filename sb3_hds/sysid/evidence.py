@@ -2,8 +2,10 @@
 
 import dataclasses
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property, partial
 from typing import NamedTuple, TypeVar
 
@@ -15,6 +17,7 @@ from jaxtyping import Array, Float
 from sb3_hds.core import Effect, EffectChain, Params, Twin
 from sb3_hds.core.compilation import QUICK_COMPILATION
 from sb3_hds.core.effect import Chosen
+from sb3_hds.core.linear import uses_lapack
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.motion import first_offsets
 from sb3_hds.sysid.shooting import Shots, n_steps_of, simulate, with_slopes
@@ -33,6 +36,9 @@ _RIDGE = 1e-9
 _PORTION, _ROUND = 64, 8
 # Steps of all windows beyond which a second program, for start states alone, is worth compiling.
 _MANY_STEPS = 10_000
+
+# Held by programs that must not run beside another one.
+_LAPACK = threading.Lock()
 
 _Given = TypeVar("_Given")
 _Told = TypeVar("_Told")
@@ -152,6 +158,7 @@ class Evidence:
         offsets: Float[np.ndarray, "n free"] | None = None,
         n_steps: int = 15,
         enough: float = _ENOUGH,
+        least: float = 0.0,
     ) -> "Solution":
         """
         Levenberg-Marquardt over the start states and some parameters, within their bounds.
@@ -161,6 +168,7 @@ class Evidence:
         :param offsets: of the start states, where to begin; default: as measured
         :param n_steps: at most
         :param enough: a step that lowers the cost by a smaller share than this is the last
+        :param least: so is one that lowers it by less than this
         """
         h, moving = self.hypotheses, np.array(free, int)
         low, high, size = h.lower[moving], h.upper[moving], h.scale[moving]
@@ -193,7 +201,7 @@ class Evidence:
             elif gained := max(now.cost.sum() + doubt(theta) - then.cost.sum() - doubt(new), 0.0):
                 theta, offsets, now = new, ahead, then
             damping *= _LESS if gained else _MORE
-            if (gained and gained < enough * now.cost.sum()) or damping > _MOST_DAMPING:
+            if (gained and gained < enough * now.cost.sum() + least) or damping > _MOST_DAMPING:
                 converged = True
                 break
         point = Point(theta, offsets, now.raw, float(now.cost.sum()) + doubt(theta))
@@ -282,7 +290,7 @@ class Evidence:
         filled[:n] = offsets
         slopes = []
         for own in _in_groups(index, self._width_for(index), len(theta)):
-            with jax.enable_x64(True):
+            with jax.enable_x64(True), _alone(len(h.twin.joints)):
                 found = _look(
                     h.twin,
                     h.names,
@@ -296,10 +304,16 @@ class Evidence:
                     n_lead,
                     h.chosen(theta, own),
                 )
-            raw, by_start, by_theta = (np.asarray(leaf)[:n] for leaf in found)
+                found = [np.asarray(leaf)[:n] for leaf in found]
+            raw, by_start, by_theta = found
             slopes.append(by_theta)
         by_theta = np.concatenate(slopes, -1)[..., : len(index)]
         return _normal(raw, by_start, by_theta, self.noise, self._counted, self.threshold)
+
+
+def _alone(n: int) -> AbstractContextManager:
+    """For programs that solve matrices of so many rows."""
+    return _LAPACK if uses_lapack(n) else nullcontext()
 
 
 def in_threads(work: Callable[[_Given], _Told], given: Sequence[_Given]) -> Iterator[_Told]:

@@ -24,6 +24,7 @@ from sb3_hds.core import (
     State,
     Trajectories,
     Twin,
+    solve_spd,
 )
 from sb3_hds.core.layers import layers_of
 from sb3_hds.errors import TrajectoryError
@@ -276,7 +277,7 @@ def solve_normal(slopes: Array, right: Array) -> Array:
     """
     normal = slopes.T @ slopes
     normal = normal + (_DAMPING * jnp.trace(normal) + 1e-300) * jnp.eye(normal.shape[0])
-    return jnp.linalg.solve(normal, slopes.T @ right)
+    return solve_spd(normal, slopes.T @ right)
 
 
 def _moved(twin: Twin, state: State, offset: Offset) -> State:
@@ -290,16 +291,22 @@ def remembered_for(twin: Twin, period: float = 1.0) -> float:
     :return: how long before a window what the twin remembers may have begun to differ [s]
     """
     obs = jnp.zeros(len(twin.channels))
-    if not jax.tree.leaves(jax.eval_shape(lambda: twin.infer(obs, twin.params).memory)):
-        return 0.0
+    memory = jax.eval_shape(lambda: twin.infer(obs, twin.params).memory)
     extended = (layer for layer in layers_of(twin) if isinstance(layer, ExtendedTwin))
-    attached = (a.effect for layer in extended for a in layer.attached)
-    return max([_LEAD * period, *(remembers_for(effect, period) for effect in attached)])
+    attached = {a.key: a.effect for layer in extended for a in layer.attached}
+    return max(
+        (
+            remembers_for(attached[key], period) if key in attached else _LEAD * period
+            for key, leaf in memory.items()
+            if jax.tree.leaves(leaf)
+        ),
+        default=0.0,
+    )
 
 
 def remembers_for(effect: Effect, period: float) -> float:
     """:return: how long an effect's memory tells how it began [s]"""
-    return max(effect.forgets * period, getattr(effect, "longest", 0.0))
+    return getattr(effect, "longest", effect.forgets * period)
 
 
 def n_steps_of(seconds: float, dt: float) -> int:

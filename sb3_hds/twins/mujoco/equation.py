@@ -12,7 +12,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
 from sb3_hds.core import Force, MassMatrix, Params, Position, Velocity
-from sb3_hds.core.linear import solve_factored
+from sb3_hds.core.linear import Factor, factorised, solve_factored
 from sb3_hds.twins.mujoco.dynamics import (
     Configuration,
     Tree,
@@ -118,9 +118,9 @@ class Equation:
 
     def _solve(
         self, q: Array, v: Array, force: Array, coupling: Array, p: Any
-    ) -> tuple[Array, Array]:
-        """The acceleration, and the Cholesky factor of the matrix that was solved."""
-        factor = lax.linalg.cholesky(self._mass_matrix(q, p) + coupling, symmetrize_input=False)
+    ) -> tuple[Array, Factor]:
+        """The acceleration, and the factor of the matrix that was solved."""
+        factor = factorised(self._mass_matrix(q, p) + coupling)
         return solve_factored(factor, force - self._inverse(q, v, p)), factor
 
     def _with_derivative(self) -> Any:
