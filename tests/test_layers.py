@@ -20,7 +20,7 @@ ORDER = (
 ALL = set().union(*ORDER)
 
 ARRAYS = {"jax", "numpy", "jaxtyping"}
-SOLVERS = ARRAYS | {"flax", "optax", "optimistix"}
+SOLVERS = ARRAYS | {"flax", "optax"}
 STEPPING = ARRAYS | {"gymnasium", "stable_baselines3.common.vec_env"}
 LEARNING = SOLVERS | {"gymnasium", "stable_baselines3", "sbx", "cmaes", "torch", "rich", "tqdm"}
 TABLES = {"pandas", "rich", "yaml"}

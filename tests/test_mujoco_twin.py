@@ -1,6 +1,7 @@
 """Twins of model files: against MuJoCo's own steps, and in what they read, refuse and derive."""
 
 import functools
+import itertools
 import json
 import os
 import re
@@ -54,6 +55,14 @@ def shipped(name):
 
 
 EULER, RK4, IMPLICIT = 0, 1, 3
+LARGE = {
+    "cheetah": lambda: shipped("half_cheetah.xml"),
+    "reacher": lambda: shipped("reacher.xml"),
+    "servos": lambda: robots.chain(6, actuator="position"),
+    "motors": lambda: robots.chain(7),
+    "held quadruped": robots.quadruped,
+    "free quadruped": lambda: robots.quadruped(robots.FREE_BASE),
+}
 
 
 @pytest.mark.parametrize(
@@ -63,12 +72,9 @@ EULER, RK4, IMPLICIT = 0, 1, 3
         pytest.param(lambda: robots.GRIPPER, IMPLICIT, id="gripper"),
         pytest.param(lambda: robots.BALL, EULER, id="ball joint"),
         pytest.param(lambda: robots.chain(3, actuator="velocity"), IMPLICIT, id="speeds"),
-        pytest.param(lambda: shipped("half_cheetah.xml"), EULER, id="cheetah", marks=EXPENSIVE),
-        pytest.param(
-            lambda: robots.chain(6, actuator="position"), IMPLICIT, id="servos", marks=EXPENSIVE
-        ),
-        pytest.param(
-            lambda: robots.quadruped(robots.FREE_BASE), RK4, id="quadruped", marks=EXPENSIVE
+        *(
+            pytest.param(make, integrator, id=f"{name}, {integrator}", marks=EXPENSIVE)
+            for (name, make), integrator in itertools.product(LARGE.items(), (EULER, RK4, IMPLICIT))
         ),
     ],
 )
