@@ -14,7 +14,9 @@ from sb3_hds.core import Trajectories, rollout
 from sb3_hds.errors import CalibrationError, TrajectoryError
 from sb3_hds.sysid import calibrate
 
-TRUTH = {"mass": 1.2, "length": 0.9}
+TRUTH = {"mass": 1.2, "damping": 0.05}
+BELIEVED = twins.make("PendulumReal")
+TRUE = BELIEVED.with_parameters(**TRUTH)
 FREE = tuple(TRUTH)
 
 
@@ -22,22 +24,14 @@ FREE = tuple(TRUTH)
 PADDED = {"free": FREE, "n_windows": 64}
 
 
-def truth():
-    return twins.make("PendulumReal", damping=0.05, **TRUTH)
-
-
-def nominal():
-    return twins.make("PendulumReal", damping=0.05)
-
-
 @pytest.fixture(scope="module")
 def noisy():
-    return measured(truth(), noise=0.02)
+    return measured(TRUE, noise=0.02)
 
 
 @pytest.fixture(scope="module")
 def fit(noisy):
-    return calibrate(nominal(), noisy, **PADDED)
+    return calibrate(BELIEVED, noisy, **PADDED)
 
 
 def test_planted_parameters_are_found_within_three_standard_errors(fit):
@@ -52,7 +46,7 @@ def test_planted_parameters_are_found_within_three_standard_errors(fit):
     # Over a window, start states take up some of the noise.
     assert (fit.error_after < 1.1 * 0.02).all()
     assert fit.error_before[2] > 5.0 * fit.error_after[2]
-    exact = calibrate(nominal(), measured(truth()), **PADDED)
+    exact = calibrate(BELIEVED, measured(TRUE), **PADDED)
     assert [exact[name].estimate for name in FREE] == pytest.approx([*TRUTH.values()], rel=1e-6)
 
 
@@ -69,10 +63,10 @@ def test_what_happened_before_a_window_counts():
 
 def test_it_agrees_with_scipy_on_the_whole_problem(x64):
     """Parameters and start states together, by another solver, without elimination."""
-    data = measured(truth(), n=3, n_steps=21, noise=0.02)
-    fit = calibrate(nominal(), data, window=10, loss="linear", **PADDED)
+    data = measured(TRUE, n=3, n_steps=21, noise=0.02)
+    fit = calibrate(BELIEVED, data, window=10, loss="linear", **PADDED)
     windows = data.windows(10, 11)
-    twin, noise = nominal(), jnp.asarray(fit.noise)
+    twin, noise = BELIEVED, jnp.asarray(fit.noise)
     assert fit.n_windows == len(windows)
 
     @jax.jit
@@ -87,24 +81,25 @@ def test_it_agrees_with_scipy_on_the_whole_problem(x64):
 
         return jax.vmap(one)(windows.obs, windows.actions, offsets).ravel()
 
-    begin = np.concatenate([[1.0, 1.0], np.zeros(2 * len(windows))])
+    begin = np.concatenate([[1.0, 0.0], np.zeros(2 * len(windows))])
     found = least_squares(errors, begin, jac=jax.jit(jax.jacfwd(errors)), xtol=1e-12, ftol=1e-12)
 
     ours = [fit[name].estimate for name in FREE]
-    np.testing.assert_allclose(ours, found.x[: len(FREE)], rtol=1e-4)
+    # To a hundredth of a standard error.
+    np.testing.assert_allclose(ours, found.x[: len(FREE)], rtol=1e-4, atol=3e-5)
     # Ours is a sandwich, whose deviations scatter by some 30 % over these few windows.
     spread = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))[: len(FREE)]
     np.testing.assert_allclose([fit[name].stderr for name in FREE], spread, rtol=0.5)
 
 
 def test_outliers_count_less():
-    data = measured(truth(), noise=0.01)
+    data = measured(TRUE, noise=0.01)
     obs = data.obs.copy()
     hit = np.random.default_rng(1).random(obs.shape) < 0.01
     obs[hit] += 3.0
     spoiled = Trajectories.from_arrays(obs, data.actions, dt=data.dt)
 
-    robust, plain = (calibrate(nominal(), spoiled, loss=k, **PADDED) for k in ("huber", "linear"))
+    robust, plain = (calibrate(BELIEVED, spoiled, loss=k, **PADDED) for k in ("huber", "linear"))
 
     missed = [sum(abs(f[name].estimate - v) for name, v in TRUTH.items()) for f in (robust, plain)]
     assert missed[0] < 0.02
@@ -112,10 +107,9 @@ def test_outliers_count_less():
 
 
 def test_a_bound_is_kept_and_said():
-    """The truth has no damping, so noise pushes the estimate below zero half of the time."""
-    plain = twins.make("PendulumReal")
+    """Here is no damping, so noise pushes the estimate below zero half of the time."""
     fits = [
-        calibrate(plain, measured(plain, n=2, noise=0.05, seed=seed), free=["damping"])
+        calibrate(BELIEVED, measured(BELIEVED, n=2, noise=0.05, seed=seed), **PADDED)
         for seed in range(3)
     ]
 
@@ -127,15 +121,14 @@ def test_a_bound_is_kept_and_said():
 
 def test_what_the_data_do_not_determine_is_said():
     """Torques are known, so inertia and weight are: three numbers of two cannot be told apart."""
-    plain, free = twins.make("PendulumReal"), ("mass", "length", "gravity")
-    data = measured(plain, n=4, noise=0.02)
+    free, data = ("mass", "length", "gravity"), measured(BELIEVED, n=4, noise=0.02)
 
-    fit = calibrate(plain, data, free=free)
+    fit = calibrate(BELIEVED, data, free=free)
 
     assert len(fit.undetermined) == 1
     assert np.isinf([e.stderr for e in fit.estimates]).any()
     assert any("only combinations" in caveat for caveat in fit.caveats)
-    believed = calibrate(plain, data, free=free, prior=1.0)
+    believed = calibrate(BELIEVED, data, free=free, prior=1.0)
     assert believed.undetermined == ()
     for e in believed.estimates:
         scale = believed.twin.parameters[e.name].scale
@@ -144,9 +137,7 @@ def test_what_the_data_do_not_determine_is_said():
 
 
 def test_it_prints_itself_and_is_plain_data(fit, tmp_path):
-    text = str(fit)
-    assert max(map(len, text.splitlines())) <= 80
-    assert "mass" in text and "kg" in text
+    assert "mass" in str(fit) and "kg" in str(fit)
     plain = json.loads(json.dumps(fit.to_dict(), allow_nan=False))
     assert plain["estimates"][0]["name"] == "mass"
     fit.plot(tmp_path / "fit.png")
@@ -169,7 +160,7 @@ def test_it_prints_itself_and_is_plain_data(fit, tmp_path):
     ],
 )
 def test_what_cannot_be_estimated_is_refused(noisy, change, error, message):
-    given = {"twin": nominal()} | change
+    given = {"twin": BELIEVED} | change
     data = noisy.windows(1)[: given.pop("rows")] if "rows" in given else noisy
 
     with pytest.raises(error, match=message):
@@ -181,7 +172,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say():
     """80 seeds; at 95 %, fewer than 69 would be chance once in a thousand."""
     hits = {name: 0 for name in FREE}
     for seed in range(80):
-        fit = calibrate(nominal(), measured(truth(), n=20, noise=0.02, seed=seed), free=FREE)
+        fit = calibrate(BELIEVED, measured(TRUE, n=20, noise=0.02, seed=seed), free=FREE)
         for name, value in TRUTH.items():
             hits[name] += fit[name].low <= value <= fit[name].high
     assert all(n >= 69 for n in hits.values()), hits
