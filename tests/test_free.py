@@ -1,5 +1,6 @@
 """Parameters that are estimated: by name, and several that take one value."""
 
+import numpy as np
 import pytest
 import small_robots as robots
 from measuring import measured
@@ -23,7 +24,10 @@ def leg():
 
 def test_what_is_tied_takes_one_value_and_counts_once(leg):
     truth = dict.fromkeys(DAMPING, 0.4) | dict.fromkeys(LATE, 0.025)
-    data = measured(leg.with_parameters(**truth), n=3, n_steps=100, noise=1e-4)
+    time = 0.01 * np.arange(100)[:, None]
+    swing = [0.5 * np.sin((4.0 + k) * time + np.array([0.0, 1.0])) for k in range(3)]
+    real = leg.with_parameters(**truth)
+    data = measured(real, n=3, n_steps=100, noise=1e-4, commands=np.stack(swing))
 
     fit = calibrate(leg, data, free=[*DAMPING], tied={"damping": DAMPING, "delay": LATE})
 

@@ -127,11 +127,9 @@ def test_what_is_loaded_stays_on_its_device(tmp_path):
         with pytest.warns(UserWarning, match="loaded on the CPU"):
             greedy(reloaded(model, device="cuda"))
 
-    subprocess.run(
-        [sys.executable, "-c", TWO_DEVICES, str(tmp_path)],
-        check=True,
-        env=os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"},
-    )
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"
+    command = [sys.executable, "-c", TWO_DEVICES, str(tmp_path)]
+    subprocess.run(command, check=True, env=os.environ | {"XLA_FLAGS": flags})
 
 
 def test_a_file_of_one_twin_algorithm_is_not_loaded_as_another():

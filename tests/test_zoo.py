@@ -24,6 +24,7 @@ CONSOLE = (str(Path(sys.executable).with_name("rl_zoo3")),)
 MODULE = (sys.executable, "-m")
 # Small plans: these tests ask whether a command works, not how well the algorithm learns.
 QUICK = ("n_rollouts:8", "pretrain_epochs:1", "horizon:8", "gradient_steps:4", "n_random_plans:1")
+QUICK += ("n_iterations:1", "refit_freq:0")
 FEW = ("learning_starts:50", "train_freq:50", "gradient_steps:2", "batch_size:16")
 
 
@@ -74,7 +75,7 @@ def trained(zoo) -> Path:
     """The folder of a run by the console command."""
     schedule = ("-n", "300", "--eval-freq", "100", "--save-freq", "150")
     shown = ("--n-eval-envs", "2", "--eval-episodes", "2", "-P", "--tensorboard-log", "curves")
-    changes = ("--env-kwargs", "g:9.8", "-params", "train_freq:2", *QUICK)
+    changes = ("--env-kwargs", "g:9.8", "-params", "train_freq:150", *QUICK)
     zoo.succeeds(*CONSOLE, "train", *of("hds", "-f", "logs"), *schedule, *shown, *changes)
     return zoo.folder / "logs" / "hds" / "Pendulum-v1_1"
 
@@ -83,7 +84,7 @@ def test_a_run_folder_holds_what_the_zoo_always_writes_of_steps_of_the_environme
     checkpoints = {f"rl_model_{step}_steps.zip" for step in (150, 300)}
     # Those of the command line replace those of the file.
     used = hyperparameters_in(trained)
-    assert (used["policy"], used["train_freq"], used["n_rollouts"]) == ("MlpPolicy", 2, 8)
+    assert (used["policy"], used["train_freq"], used["n_rollouts"]) == ("MlpPolicy", 150, 8)
     assert {"best_model.zip", "Pendulum-v1.zip"} | checkpoints <= files_in(trained)
     assert {"args.yml", "config.yml"} <= files_in(trained / "Pendulum-v1")
     with open(trained / "0.monitor.csv") as file:

@@ -165,7 +165,7 @@ def fit_windows(
         if there and there.cost < at.cost:
             at = there
     for _ in range(_PASSES):
-        found = evidence.solve(at.theta, range(len(free)), at.offsets, max_steps, 0.0, _LEAST_STEP)
+        found = evidence.solve(at.theta, range(len(free)), at.offsets, max_steps, least=_LEAST_STEP)
         at = found.point
         noise = _noise(at.raw, len(free), n_free(twin), spread)
         evidence = evidence.with_noise(noise)
