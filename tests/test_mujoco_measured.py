@@ -123,3 +123,52 @@ def test_its_corrected_file_predicts_held_out_seconds_as_well_as_the_twin(ur10, 
 
     assert ours < 0.5 < before
     assert theirs < 1.1 * ours
+
+
+GO2 = UR10.parent / "go2"
+LEGS = [
+    f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")
+]
+MAP = {
+    "time": "time",
+    "obs": [{"column": f"position[{i}]", "name": f"{j}_position"} for i, j in enumerate(LEGS)],
+    "actions": [{"column": f"target[{i}]", "name": j} for i, j in enumerate(LEGS)],
+}
+
+
+@pytest.mark.expensive
+def test_a_quadruped_s_loop_is_calibrated_and_its_file_steps_held_out_seconds_better(tmp_path):
+    """Of positions alone; half seconds from measured states, in the C engine."""
+    log = np.load(GO2 / "traj_0.npz")
+    time, q, target = (log[name] for name in ("time", "position", "target"))
+    np.savez(tmp_path / "a.npz", time=time[:3200], position=q[:3200], target=target[:3200])
+    (tmp_path / "map.yml").write_text(json.dumps(MAP))
+    kinds = [
+        f"*_{part}_joint_{word}"
+        for part in ("hip", "thigh", "calf")
+        for word in ("damping", "frictionloss")
+    ]
+    words = ["calibrate", "--model", GO2 / "go2.urdf", "--data", tmp_path / "a.npz"]
+    words += ["--columns", tmp_path / "map.yml", "--actuators", "position", "kp:20", "kv:1.5"]
+    words += ["--free", "*_damping", "*_frictionloss", "--tied", *kinds, "--windows", 16]
+
+    assert cli.main([*map(str, words), "--write", str(tmp_path / "corrected.xml")]) == 0
+
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "corrected.xml"))
+    v = np.gradient(q, 0.005, axis=0)
+    found = {"corrected": [], "nominal": []}
+    for name, seen in found.items():
+        if name == "nominal":
+            model.dof_frictionloss[:], model.dof_damping[:] = 0.0, 0.0
+        data = mujoco.MjData(model)
+        for k in range(3200, len(q) - 101, 100):
+            mujoco.mj_resetData(model, data)
+            data.qpos[:], data.qvel[:] = q[k], v[k]
+            for step in range(100):
+                data.ctrl[:] = target[k + step]
+                for _ in range(round(0.005 / model.opt.timestep)):
+                    mujoco.mj_step(model, data)
+                seen.append(data.qpos - q[k + step + 1])
+    before, after = (np.sqrt(np.mean(np.square(found[name]))) for name in ("nominal", "corrected"))
+
+    assert after < 0.5 * before

@@ -14,7 +14,9 @@ STANDSTILL = 0.01
 
 
 def dry_friction(
-    joint: JointMoment, level: Scalar | float, standstill: float = STANDSTILL
+    joint: JointMoment,
+    level: Scalar | float,
+    standstill: Scalar | float = STANDSTILL,
 ) -> Scalar:
     r"""
     A force against the motion, :math:`-l \tanh(v / w)` with :math:`w = \max(w_0, l h / I)`.

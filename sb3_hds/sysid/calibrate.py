@@ -56,13 +56,12 @@ def calibrate(
     Find the parameter values under which a twin reproduces measured data best.
 
     Levenberg-Marquardt in double precision over short windows with free start states, which are
-    eliminated from the normal equations. Each channel is weighted by its noise, which is
-    estimated too. Standard errors are those of the sandwich estimator, clustered by recording (by
+    eliminated from the normal equations. Each channel is weighted by its noise, which is estimated
+    too. Standard errors are those of the sandwich estimator, clustered by recording (by
     window where there are few recordings): they hold for noise that is neither white nor Gaussian.
 
     Source: Bock, *Recent advances in parameter identification techniques for ODE*, 1983 (multiple
-    shooting); Kaufman, BIT 15, 1975 (variable projection); Huber and Ronchetti, *Robust
-    Statistics*, 2009.
+    shooting, and how start states are eliminated); Huber and Ronchetti, *Robust Statistics*, 2009.
 
     :param twin: whose values are where the search begins, and stay where they are not ``free``
     :param data: measured trajectories, sampled at the twin's ``dt``
