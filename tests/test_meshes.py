@@ -14,7 +14,8 @@ from sb3_hds.sysid.moving import moving_of
 from sb3_hds.sysid.pictures import replay_of
 
 BOX = np.array([[x, y, z] for x in (-0.1, 0.2) for y in (-0.05, 0.05) for z in (0.0, 0.5)])
-ARM = """<robot name="arm"><link name="base"/>
+ARM = """<robot name="arm"><link name="world"/><link name="base"/>
+  <joint name="foot" type="fixed"><parent link="world"/><child link="base"/></joint>
   <link name="upper"><inertial><mass value="1"/><origin xyz="0 0 0.2"/>
     <inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial>
     <visual><origin xyz="0 0 0.1" rpy="0.4 0 0"/>

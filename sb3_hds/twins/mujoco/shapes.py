@@ -56,7 +56,7 @@ def visuals_of(text: str, folder: Path) -> Any:
     except ElementTree.ParseError:
         return None
     for link in links:
-        body = spec.worldbody.add_body(name=link.get("name", ""))
+        body = None
         for visual in link.findall("visual"):
             mesh, origin = visual.find("geometry/mesh"), visual.find("origin")
             path = None if mesh is None else _found(mesh.get("filename", ""), folder)
@@ -74,6 +74,7 @@ def visuals_of(text: str, folder: Path) -> Any:
             quaternion = np.zeros(4)
             mj.mju_euler2Quat(quaternion, turn, "XYZ")
             spec.add_mesh(name=f"mesh{n}", file=str(path), scale=scale)
+            body = body or _body_of(spec, link.get("name", ""))
             body.add_geom(
                 type=mj.mjtGeom.mjGEOM_MESH, meshname=f"mesh{n}", pos=place, quat=quaternion
             )
@@ -82,6 +83,10 @@ def visuals_of(text: str, folder: Path) -> Any:
         return spec.compile() if n else None
     except ValueError:
         return None
+
+
+def _body_of(spec: Any, name: str) -> Any:
+    return spec.worldbody if name == "world" else spec.worldbody.add_body(name=name)
 
 
 def _found(name: str, folder: Path) -> Path | None:
