@@ -1,6 +1,6 @@
 """Linear algebra on matrices of a handful of rows that XLA vectorises over a batch."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
@@ -74,7 +74,7 @@ def factorised(matrix: Float[Array, "n n"]) -> Factor:
         return Factor(root / jnp.diagonal(root), jnp.diagonal(root) ** 2)
     below = jnp.arange(n)
 
-    def column(j: Array, now: tuple[Array, Factor]) -> tuple[Array, Factor]:
+    def column(j: Any, now: tuple[Array, Factor]) -> tuple[Array, Factor]:
         rest, found = now
         whole = lax.dynamic_index_in_dim(rest, j, 1, keepdims=False)
         pivot = lax.dynamic_index_in_dim(whole, j, 0, keepdims=False)
@@ -101,11 +101,11 @@ def solve_factored(factor: Factor, right: Float[Array, "n *k"]) -> Float[Array, 
         known["transpose_a"] = True
         return lax.linalg.triangular_solve(factor.lower, half / pivot, **known).reshape(right.shape)
 
-    def forwards(j: Array, x: Array) -> Array:
+    def forwards(j: Any, x: Array) -> Array:
         own = lax.dynamic_index_in_dim(x, j, 0)
         return x - lax.dynamic_index_in_dim(factor.lower, j, 1) * own
 
-    def backwards(k: Array, x: Array) -> Array:
+    def backwards(k: Any, x: Array) -> Array:
         j = n - 1 - k
         share = lax.dynamic_index_in_dim(factor.lower, j, 1)
         own = lax.dynamic_index_in_dim(x, j, 0) - jnp.sum(share * x, 0, keepdims=True)
