@@ -152,6 +152,7 @@ def test_it_prints_itself_and_is_plain_data(fit, tmp_path):
         ({"free": ["weight"]}, CalibrationError, r"free must name parameters .*gravity, mass"),
         ({"free": ["mass", "mass"]}, CalibrationError, "each once"),
         ({"loss": "cauchy"}, CalibrationError, "'huber' or 'linear'"),
+        ({"n_windows": 0}, CalibrationError, "n_windows must be at least 1"),
         ({"level": 1.5}, CalibrationError, "level must lie"),
         ({"twin": twins.make("CartPole")}, CalibrationError, "observes 5 channels"),
         ({"twin": twins.make("PendulumReal", dt=0.02)}, CalibrationError, r"resample\(dt=0\.02\)"),

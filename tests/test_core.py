@@ -127,7 +127,7 @@ def spd(rng, n, batch):
     return root @ root.transpose(0, 2, 1) + n * np.eye(n)
 
 
-@pytest.mark.parametrize(("n", "columns"), [(1, ()), (2, (3,)), (6, ())])
+@pytest.mark.parametrize(("n", "columns"), [(1, ()), (2, (3,)), (6, ()), (12, (3,)), (20, (2,))])
 def test_a_batch_of_small_systems_is_solved_as_lapack_does(x64, n, columns):
     rng = np.random.default_rng(n)
     matrices, right = spd(rng, n, 20), rng.normal(size=(20, n, *columns))
@@ -137,6 +137,16 @@ def test_a_batch_of_small_systems_is_solved_as_lapack_does(x64, n, columns):
     theirs = np.linalg.solve(matrices, right if columns else right[..., None])
     # The matrices are conditioned better than 1e2, so 1e-12 leaves rounding a factor of 100.
     np.testing.assert_allclose(ours, theirs.reshape(ours.shape), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [2, 12, 16])
+def test_programs_that_solve_up_to_sixteen_rows_may_run_at_once(n):
+    """LAPACK waits for threads that another program may hold."""
+    given = jnp.zeros((8, n, n)), jnp.zeros((8, n))
+
+    program = jax.jit(jax.vmap(solve_spd)).lower(*given).compile().as_text()
+
+    assert "custom-call" not in program
 
 
 def test_the_derivative_of_a_solution_is_the_implicit_one(x64):

@@ -186,3 +186,54 @@ def test_impossible_hardware_is_refused(attempt, says):
 def test_the_truth_of_another_environment_is_not_known():
     with pytest.raises(TypeError, match=r"twins\.make"):
         envs.true_twin(gymnasium.make("Pendulum-v1"))
+
+
+def euler(start, torques, shifted=False):
+    """
+    Where the steps of Pendulum-v1 lead, without its limit of the speed.
+
+    Angles at whole steps and speeds at half ones are a leapfrog, which is of second order: Euler's
+    steps are that, started with a speed half a step too late and read half a step too early, and
+    with each torque half a step too late.
+
+    :param shifted: moves both back
+    """
+    dt, (angle, speed) = 0.05, start
+    accelerated = lambda angle, torque: 15.0 * np.sin(angle) + 3.0 * torque  # noqa: E731
+    before = torques[0]
+    if shifted:
+        speed -= 0.5 * dt * accelerated(angle, torques[0])
+    for torque in torques:
+        acting = 0.5 * (before + torque) if shifted else torque
+        speed += dt * accelerated(angle, acting)
+        angle += dt * speed
+        before = torque
+    if shifted:
+        speed += 0.5 * dt * accelerated(angle, torques[-1])
+    return np.array([angle, speed])
+
+
+def test_the_steps_of_pendulum_v1_are_off_by_half_a_step_and_little_else(x64):
+    env, slow = gymnasium.make(PENDULUM), ([1.0], [0.5])
+    torques = commands(env, 5)
+    np.testing.assert_allclose(
+        euler(np.ravel(slow), torques[:, 0]),
+        simulated(twins.make("Pendulum"), torques, slow)[-1],
+        rtol=1e-9,
+    )
+
+    missed, missed_shifted, truth = [], [], []
+    for seed in range(200):
+        start = np.random.default_rng(seed).uniform([-3.0, -8.0], [3.0, 8.0])
+        torques = 2.5 * commands(env, 20, seed)
+        truth.append(driven(env, torques, (start[:1], start[1:])))
+        missed.append(euler(start, torques[:, 0]) - truth[-1][-1])
+        missed_shifted.append(euler(start, torques[:, 0], shifted=True) - truth[-1][-1])
+
+    scale = np.std(truth, (0, 1))
+    share, share_shifted = (
+        np.sqrt(np.mean((np.array(m) / scale) ** 2)) for m in (missed, missed_shifted)
+    )
+    # After a second, from all angles and speeds up to 8 rad/s, in shares of the scale of both.
+    assert share == pytest.approx(0.17, abs=0.01)
+    assert share_shifted < 0.01

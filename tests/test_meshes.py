@@ -56,6 +56,13 @@ def test_meshes_are_where_mujoco_has_them_and_weigh_nothing(twin):
     assert bare.mechanism.links == twin.mechanism.links
 
 
+def test_visuals_that_make_no_sense_are_not_drawn(tmp_path):
+    (tmp_path / "box.obj").write_text("no mesh")
+    for text in (ARM, ARM.replace('rpy="0.4 0 0"', 'rpy="all round"')):
+        (tmp_path / "arm.urdf").write_text(text)
+        assert twins.from_mujoco(tmp_path / "arm.urdf", dt=0.01).mechanism.shapes == ()
+
+
 def test_a_page_draws_them_and_a_saved_twin_keeps_them(twin):
     again = twins.from_spec(json.loads(json.dumps(twin.to_spec())), ())
     measured = 0.5 * np.sin(0.05 * np.arange(60)).reshape(2, 30, 1) * np.ones(2)

@@ -1,5 +1,6 @@
 """Linear algebra on matrices of a handful of rows that XLA vectorises over a batch."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -96,10 +97,14 @@ def solve_factored(factor: Factor, right: Float[Array, "n *k"]) -> Float[Array, 
     n = len(factor.pivot)
     columns, pivot = right.reshape(n, -1), factor.pivot[:, None]
     if uses_lapack(n):
-        known = {"left_side": True, "lower": True, "unit_diagonal": True}
-        half = lax.linalg.triangular_solve(factor.lower, columns, **known)
-        known["transpose_a"] = True
-        return lax.linalg.triangular_solve(factor.lower, half / pivot, **known).reshape(right.shape)
+        below = partial(
+            lax.linalg.triangular_solve,
+            factor.lower,
+            left_side=True,
+            lower=True,
+            unit_diagonal=True,
+        )
+        return below(below(columns) / pivot, transpose_a=True).reshape(right.shape)
 
     def forwards(j: Any, x: Array) -> Array:
         own = lax.dynamic_index_in_dim(x, j, 0)

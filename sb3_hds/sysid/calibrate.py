@@ -98,6 +98,8 @@ def calibrate(
         raise CalibrationError(f"errors must be 'simulation' or 'force', got {errors!r}.")
     if not 0.0 <= prior < math.inf:
         raise CalibrationError(f"prior must be at least 0 (no belief), got {prior}.")
+    if n_windows is not None and n_windows < 1:
+        raise CalibrationError(f"n_windows must be at least 1, got {n_windows}.")
     if not 0.0 < level < 1.0:
         raise CalibrationError(f"level must lie between 0 and 1, got {level}.")
     shots, origin = shots_of(data, window or default_window(data), twin, n_windows, seed)

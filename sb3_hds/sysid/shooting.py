@@ -205,27 +205,13 @@ def residuals(
     shot: Shots,
     offset: Offset,
     noise: Obs,
-    threshold: float | None = None,
 ) -> Float[Array, " residuals"]:
     """
-    :param threshold: of the Huber loss: half the sum of squares of what is returned is that loss;
-        None for plain squares
     :return: simulated minus measured, in units of the noise, flattened; zero for padding, and large
         where the simulation is not finite
     """
-    return weighed(simulate(twin, params, shot, offset), shot, noise, threshold)
-
-
-def weighed(
-    simulated: Float[Array, "rows obs"], shot: Shots, noise: Obs, threshold: float | None = None
-) -> Float[Array, " residuals"]:
-    """As :func:`residuals`, of what was simulated already."""
-    error = (simulated - shot.obs) / noise
+    error = (simulate(twin, params, shot, offset) - shot.obs) / noise
     error = jnp.where(jnp.isfinite(error), error, _NOT_FINITE).ravel()
-    if threshold is not None:
-        far = jnp.maximum(jnp.abs(error), threshold)
-        bent = jnp.sign(error) * jnp.sqrt(2.0 * threshold * far - threshold**2)
-        error = jnp.where(jnp.abs(error) > threshold, bent, error)
     return jnp.sqrt(shot.weight) * error
 
 
@@ -245,7 +231,6 @@ def fit_start(
     noise: Obs,
     first: Offset,
     n_iterations: int,
-    threshold: float | None = None,
 ) -> Offset:
     """
     The start state under which the twin comes closest to one window: Gauss-Newton steps, each of
@@ -256,7 +241,7 @@ def fit_start(
     """
 
     def error(offset: Offset) -> Array:
-        return residuals(twin, params, shot, offset, noise, threshold)
+        return residuals(twin, params, shot, offset, noise)
 
     def improve(_: Array, offset: Offset) -> Offset:
         now, slopes = with_slopes(error, offset)

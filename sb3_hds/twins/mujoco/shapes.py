@@ -20,10 +20,11 @@ def shapes_of(model: Any, places: Sequence[Place]) -> tuple[Shape, ...]:
     """
     :param model: compiled with its meshes
     :param places: frames of its bodies in those of the links
-    :return: one for each geom that is a mesh, of a body that has a name
+    :return: one for each geom that is a mesh, of a body that has a name which no site has
     """
     frames = {"world": Place("world", -1, (0.0, 0.0, 0.0), tuple(map(tuple, np.eye(3))))}
-    frames |= {place.name: place for place in places}
+    sites = {model.site(i).name for i in range(model.nsite)}
+    frames |= {place.name: place for place in places if place.name not in sites}
     found = []
     for g in range(model.ngeom):
         place = frames.get(model.body(int(model.geom_bodyid[g])).name)
@@ -47,15 +48,18 @@ def visuals_of(text: str, folder: Path) -> Any:
     :param text: of a URDF
     :param folder: in which it lies
     :return: a compiled model of loose bodies, named as the links, with the meshes that are there;
-        None where there are none
+        None where there are none, or they make no sense: a twin can do without
     """
+    try:
+        return _loose_bodies(ElementTree.fromstring(text), folder)
+    except (ElementTree.ParseError, ValueError):
+        return None
+
+
+def _loose_bodies(robot: ElementTree.Element, folder: Path) -> Any:
     mj = mujoco()
     spec, n = mj.MjSpec(), 0
-    try:
-        links = [*ElementTree.fromstring(text).iter("link")]
-    except ElementTree.ParseError:
-        return None
-    for link in links:
+    for link in robot.iter("link"):
         body = None
         for visual in link.findall("visual"):
             mesh, origin = visual.find("geometry/mesh"), visual.find("origin")
@@ -79,10 +83,7 @@ def visuals_of(text: str, folder: Path) -> Any:
                 type=mj.mjtGeom.mjGEOM_MESH, meshname=f"mesh{n}", pos=place, quat=quaternion
             )
             n += 1
-    try:
-        return spec.compile() if n else None
-    except ValueError:
-        return None
+    return spec.compile() if n else None
 
 
 def _body_of(spec: Any, name: str) -> Any:
