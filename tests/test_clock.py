@@ -5,8 +5,8 @@ import pytest
 
 from sb3_hds import Trajectories
 from sb3_hds.data.columns import columns_from
-from sb3_hds.data.rows import Rows
-from sb3_hds.data.sampling import at_one_interval
+from sb3_hds.data.resampling.resample import at_one_interval
+from sb3_hds.data.resampling.rows import Rows
 from sb3_hds.errors import TrajectoryError
 
 COLUMNS = {"time": "t", "obs": ["q"], "actions": ["u"]}

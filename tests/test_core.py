@@ -29,7 +29,8 @@ from sb3_hds.core import (
     semi_implicit_euler,
     solve_spd,
 )
-from sb3_hds.core.effect import Attached, at_joint
+from sb3_hds.core.effect import at_joint
+from sb3_hds.core.effect_chain import Attached
 from sb3_hds.effects import DeadZone, TorqueGain
 from sb3_hds.errors import EffectError, ParameterError
 

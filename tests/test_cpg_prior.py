@@ -10,7 +10,7 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check
 from moving_joints import MovingJoints
 
 from sb3_hds.core import Actuator, Channel, Signals
-from sb3_hds.core.oscillators import advance_phase
+from sb3_hds.core.transforms.oscillators import advance_phase
 from sb3_hds.envs import TwinEnv, twin_of
 from sb3_hds.errors import EnvironmentMismatchError, ParameterError
 from sb3_hds.wrappers import ActionRateLimit, CPGPrior, Perturb, ShowJoints

@@ -14,10 +14,10 @@ import yaml
 
 from sb3_hds import Trajectories
 from sb3_hds.core import Trajectories as CoreTrajectories
-from sb3_hds.core import trajectories
+from sb3_hds.core.trajectories import trajectories
 from sb3_hds.data import SamplingWarning
 from sb3_hds.data.columns import columns_from
-from sb3_hds.data.rows import rows_of
+from sb3_hds.data.resampling.rows import rows_of
 from sb3_hds.errors import TrajectoryError
 
 DT = 0.01

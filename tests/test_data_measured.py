@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sb3_hds import audit
-from sb3_hds.data.velocity import lags_of
+from sb3_hds.data.audit.velocity import lags_of
 
 pytestmark = [
     pytest.mark.measured,

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 from sb3_hds import OpenLoop
 from sb3_hds.algos import gait_search
 from sb3_hds.algos.gait_space import Constants, GaitSpace
-from sb3_hds.core.oscillators import Gait, target_at
+from sb3_hds.core.transforms.oscillators import Gait, target_at
 from sb3_hds.envs import TwinVecEnv
 from sb3_hds.errors import EnvironmentMismatchError
 from sb3_hds.wrappers import ShowJoints

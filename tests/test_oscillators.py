@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sb3_hds.core import oscillators
-from sb3_hds.core.oscillators import AmplitudeState, Gait, Hopf, HopfState
+from sb3_hds.core.transforms import oscillators
+from sb3_hds.core.transforms.oscillators import AmplitudeState, Gait, Hopf, HopfState
 
 pytestmark = pytest.mark.usefixtures("x64", "quick_compilation")
 TAU = 2.0 * math.pi

@@ -22,7 +22,7 @@ from sb3_hds.wrappers import (
     Phase,
     SharedControlTemplate,
 )
-from sb3_hds.wrappers.projection import nearest
+from sb3_hds.wrappers.safety.projection import nearest
 
 PHASES = [
     {

@@ -17,7 +17,7 @@ from sb3_hds.core import (
     rk4,
     semi_implicit_euler,
 )
-from sb3_hds.core.filters import Delay
+from sb3_hds.core.transforms.filters import Delay
 from sb3_hds.effects import CoulombFriction, SensorBias
 from sb3_hds.twins.mechanics import Points, check_mechanics
 

@@ -9,7 +9,7 @@ from free_mass import Mass
 from sb3_hds import HDS, Trajectories, calibrate, diagnose, twins
 from sb3_hds.core import Actuator, AnalyticTwin, Channel, Joint, Parameter, State, TransformedTwin
 from sb3_hds.core.contract import check_methods
-from sb3_hds.core.filters import LowPass
+from sb3_hds.core.transforms.filters import LowPass
 from sb3_hds.effects import CoulombFriction
 from sb3_hds.envs import TwinEnv, TwinVecEnv
 from sb3_hds.errors import TwinError

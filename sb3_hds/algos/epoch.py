@@ -26,7 +26,7 @@ from sb3_hds.algos.learner import (
 from sb3_hds.algos.networks import output
 from sb3_hds.algos.regression import regress, remember, rescale, samples_of
 from sb3_hds.core import Obs, Params, State
-from sb3_hds.core.compilation import QUICK_COMPILATION
+from sb3_hds.core.numerics.compilation import QUICK_COMPILATION
 from sb3_hds.planning import (
     Plan,
     Problem,

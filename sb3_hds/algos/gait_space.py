@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.core.oscillators import advance_phase
+from sb3_hds.core.transforms.oscillators import advance_phase
 
 Point = Float[np.ndarray, " dim"]
 PerJoint = Float[np.ndarray, " act"]
@@ -19,8 +19,8 @@ _EDGE = 1e-3
 
 class Constants(NamedTuple):
     """
-    What a policy consists of: the oscillators of :class:`~sb3_hds.core.oscillators.Gait`, and the
-    gains of the loop that tracks them.
+    What a policy consists of: the oscillators of
+    :class:`~sb3_hds.core.transforms.oscillators.Gait`, and the gains of the loop that tracks them.
 
     :param amplitude: per joint [rad]
     :param offset: per joint [rad]

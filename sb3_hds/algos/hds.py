@@ -20,7 +20,7 @@ from sb3_hds.algos.model import check_known, missing_effects, nulls_of, required
 from sb3_hds.algos.pretraining import meanwhile, nothing
 from sb3_hds.algos.twin_algorithm import TwinAlgorithm
 from sb3_hds.core import Effect, Params, Trajectories, Twin
-from sb3_hds.core.layers import plant_of
+from sb3_hds.core.twin import plant_of
 from sb3_hds.effects import ALL, SignFlip, force_of, reversed_joint
 from sb3_hds.errors import TrajectoryError
 from sb3_hds.sysid import Diagnosis, Finding, diagnose

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sb3_hds.algos.networks import Actor, Value, output, value_of
 from sb3_hds.core import Obs, Params, State, Twin
-from sb3_hds.core.compilation import QUICK_COMPILATION
+from sb3_hds.core.numerics.compilation import QUICK_COMPILATION
 from sb3_hds.planning import Plan, Problem, best_of_random
 
 # The typical shortfall of the first rollouts becomes this many units of the objective.

@@ -13,7 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_hds.algos.recordings import Recordings
 from sb3_hds.core import Trajectories
-from sb3_hds.core.replay_buffer import episodes_in
+from sb3_hds.core.trajectories.replay_buffer import episodes_in
 from sb3_hds.errors import TrajectoryError
 
 if TYPE_CHECKING:

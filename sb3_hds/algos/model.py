@@ -7,7 +7,7 @@ from typing import Any
 from sb3_hds import effects, twins
 from sb3_hds.algos.mistakes import in_one_line
 from sb3_hds.core import Effect, Twin
-from sb3_hds.core.layers import plant_of
+from sb3_hds.core.twin import plant_of
 from sb3_hds.errors import NoTwinError, RewardError
 
 

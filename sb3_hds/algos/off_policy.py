@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from sb3_hds.algos.observations import Seen, seen
 from sb3_hds.algos.optimizers import Optimizer, Trained, Weights
 from sb3_hds.algos.squashed import Gaussian, log_probability
-from sb3_hds.core.compilation import QUICK_COMPILATION
+from sb3_hds.core.numerics.compilation import QUICK_COMPILATION
 
 Values = Float[Array, "critics batch values"]
 Targets = Float[Array, "batch targets"]

@@ -31,7 +31,7 @@ from sb3_hds.algos.mistakes import check_log_interval, whole_steps
 from sb3_hds.algos.oscillator_policy import OscillatorPolicy
 from sb3_hds.algos.persistence import TensorPolicy
 from sb3_hds.algos.saving import SavesTensors
-from sb3_hds.core.oscillators import LEADS
+from sb3_hds.core.transforms.oscillators import LEADS
 from sb3_hds.errors import EnvironmentMismatchError, ParameterError
 
 

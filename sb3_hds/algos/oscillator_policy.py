@@ -16,7 +16,7 @@ from sb3_hds.algos.body import Body
 from sb3_hds.algos.gait_search import SearchState
 from sb3_hds.algos.gait_space import Constants
 from sb3_hds.algos.persistence import TensorPolicy, TrainingTensors, refuse_odd
-from sb3_hds.core.oscillators import Gait, target_at
+from sb3_hds.core.transforms.oscillators import Gait, target_at
 from sb3_hds.errors import EnvironmentMismatchError
 from sb3_hds.wrappers.actuated_joints import track
 

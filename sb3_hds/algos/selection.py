@@ -22,7 +22,7 @@ from sb3_hds.algos.learner import (
 )
 from sb3_hds.algos.networks import output
 from sb3_hds.core import Twin
-from sb3_hds.core.compilation import QUICK_COMPILATION
+from sb3_hds.core.numerics.compilation import QUICK_COMPILATION
 from sb3_hds.planning import Problem, follow
 
 # Simulated steps of a policy in a comparison, and the numbers of episodes between which they make.

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from sb3_hds.algos.networks import Activation
 from sb3_hds.algos.off_policy import Batch, Turn, in_turn
 from sb3_hds.algos.optimizers import Optimizer, Trained, Weights
-from sb3_hds.core.compilation import QUICK_COMPILATION
+from sb3_hds.core.numerics.compilation import QUICK_COMPILATION
 
 _EPSILON = 1e-8
 # Uniform, of variance 1 / (3 n) with n inputs.

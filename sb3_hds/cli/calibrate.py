@@ -65,7 +65,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> None:
     """Audit, estimate, and tell: on the screen, as JSON, as a twin."""
-    from sb3_hds.core.storage import check_target
+    from sb3_hds.core.trajectories.storage import check_target
     from sb3_hds.data import audit
     from sb3_hds.errors import TrajectoryError
     from sb3_hds.sysid import calibrate

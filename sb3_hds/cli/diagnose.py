@@ -60,7 +60,7 @@ def run(given: argparse.Namespace) -> None:
 
 def _check_targets(given: argparse.Namespace) -> None:
     """What would fail after minutes fails now."""
-    from sb3_hds.core.storage import check_target
+    from sb3_hds.core.trajectories.storage import check_target
 
     for target in filter(None, (given.json, given.write)):
         check_target(target)

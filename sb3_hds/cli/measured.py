@@ -173,6 +173,6 @@ def write_twin(given: argparse.Namespace, twin: "Twin") -> None:
 
 def write_json(path: str, plain: Mapping[str, Any]) -> None:
     """:param plain: without numbers that are not finite"""
-    from sb3_hds.core.storage import write_bytes
+    from sb3_hds.core.trajectories.storage import write_bytes
 
     write_bytes(path, (json.dumps(plain, indent=1, allow_nan=False) + "\n").encode())

@@ -58,7 +58,7 @@ def question(given: argparse.Namespace) -> "tuple[MechanismTwin, Trajectories]":
     :raises TrajectoryError: for signals of the twin that the log does not have by name
     """
     from sb3_hds.cli.measured import loaded
-    from sb3_hds.data.naming import names_in
+    from sb3_hds.data.overview import names_in
 
     own = settings("--set", given.set)
     make = partial(twin_of_model, given.model, words=_words(given))

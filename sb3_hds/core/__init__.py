@@ -1,14 +1,9 @@
 """The pure JAX core: parameters, effects, twins and data."""
 
 from sb3_hds.core.analytic import AnalyticTwin
-from sb3_hds.core.barrier import Barrier
-from sb3_hds.core.continuity import Continuity
-from sb3_hds.core.cpg import Rhythm
 from sb3_hds.core.effect import (
-    NO_EFFECTS,
     ActionEffect,
     Effect,
-    EffectChain,
     ForceEffect,
     JointEffect,
     JointMoment,
@@ -16,26 +11,28 @@ from sb3_hds.core.effect import (
     Ranges,
     SensorEffect,
 )
+from sb3_hds.core.effect_chain import NO_EFFECTS, EffectChain
 from sb3_hds.core.extended import ExtendedTwin
-from sb3_hds.core.filters import Delay, LowPass, RateLimit, Scale
-from sb3_hds.core.history import History
-from sb3_hds.core.integrators import explicit_euler, rk4, semi_implicit_euler
-from sb3_hds.core.linear import solve_spd
+from sb3_hds.core.numerics.integrators import explicit_euler, rk4, semi_implicit_euler
+from sb3_hds.core.numerics.linear import solve_spd
 from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.rollout import Rollout, rollout, rollout_policy
 from sb3_hds.core.signals import Actuator, Channel, Joint
-from sb3_hds.core.stateful import Signals, StatefulTransform
 from sb3_hds.core.trajectories import Trajectories
-from sb3_hds.core.transform import (
-    TRANSFORMS,
+from sb3_hds.core.transformed import TransformedTwin, seen_through
+from sb3_hds.core.transforms.barrier import Barrier
+from sb3_hds.core.transforms.base import (
     ActionTransform,
     ObservationTransform,
-    RescaleAction,
-    RescaleObservation,
-    transform_from_spec,
-    transform_to_spec,
+    Signals,
+    StatefulTransform,
 )
-from sb3_hds.core.transformed import TransformedTwin, seen_through
+from sb3_hds.core.transforms.continuity import Continuity
+from sb3_hds.core.transforms.cpg import Rhythm
+from sb3_hds.core.transforms.filters import Delay, LowPass, RateLimit, Scale
+from sb3_hds.core.transforms.history import History
+from sb3_hds.core.transforms.registry import TRANSFORMS, transform_from_spec, transform_to_spec
+from sb3_hds.core.transforms.rescale import RescaleAction, RescaleObservation
 from sb3_hds.core.twin import State, Twin
 from sb3_hds.core.types import (
     Action,

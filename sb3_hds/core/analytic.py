@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sb3_hds.core.compilation import QUICKEST_COMPILATION
-from sb3_hds.core.effect import NO_EFFECTS, EffectChain, Moment
-from sb3_hds.core.integrators import Integrator, semi_implicit_euler
-from sb3_hds.core.linear import solve_spd
+from sb3_hds.core.effect import Moment
+from sb3_hds.core.effect_chain import NO_EFFECTS, EffectChain
+from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
+from sb3_hds.core.numerics.integrators import Integrator, semi_implicit_euler
+from sb3_hds.core.numerics.linear import solve_spd
 from sb3_hds.core.twin import State, Twin
 from sb3_hds.core.types import (
     Action,

@@ -12,9 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from sb3_hds.core.analytic import AnalyticTwin
-from sb3_hds.core.layers import layers_of
 from sb3_hds.core.signals import Actuator, Channel, Joint
-from sb3_hds.core.twin import State, Twin
+from sb3_hds.core.twin import State, Twin, layers_of
 from sb3_hds.errors import TwinError
 
 _SIGNALS = {"joints": Joint, "actuators": Actuator, "channels": Channel}

@@ -9,17 +9,14 @@ memory from one to the next.
 
 import abc
 import copy
-import dataclasses
-from collections.abc import Callable, Collection, Mapping
-from functools import partial
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from sb3_hds.core.linear import solve_spd
+from sb3_hds.core.numerics.linear import solve_spd
 from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.types import (
     Action,
@@ -28,7 +25,6 @@ from sb3_hds.core.types import (
     MassMatrix,
     Memory,
     Params,
-    Position,
     Scalar,
     Velocity,
 )
@@ -332,175 +328,6 @@ class SensorEffect(Effect):
     def advance(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Memory:
         """:return: the memory after a control interval that ends with the value ``measured``"""
         return memory
-
-
-@dataclasses.dataclass(frozen=True)
-class Attached:
-    """
-    An effect at its place in a twin.
-
-    :param key: full name, ``"viscous_friction.hinge"``: prefix of its parameters, key of its memory
-    :param effect: the effect
-    :param index: index of the joint, actuator or channel
-    """
-
-    key: str
-    effect: Effect
-    index: int
-
-    def own(self, params: Params) -> Params:
-        """:return: the effect's own parameters and tensors, without prefix"""
-        names = (*self.effect.parameters, *self.effect.tensors)
-        return {name: params[f"{self.key}.{name}"] for name in names}
-
-
-class Chosen(NamedTuple):
-    """
-    Which of an extended twin's force effects are computed; the others are taken to be null. It may
-    change from call to call of a compiled program, which then costs what these cost, not what all
-    do. Derivatives can be taken forwards only.
-
-    :param free: positions of those evaluated at every stage, among all that are, first those that
-        are chosen; and their number
-    :param held: likewise, of those that are held
-    :param on: by key, whether an effect is chosen
-    """
-
-    free: tuple[Any, Any]
-    held: tuple[Any, Any]
-    on: Mapping[str, Any]
-
-    @classmethod
-    def of(cls, attached: tuple[Attached, ...], keys: Collection[str]) -> "Chosen":
-        """
-        :param attached: all effects of the twin that are simulated
-        :param keys: of those to compute
-        """
-        forces = {a.key: a.effect for a in attached if isinstance(a.effect, ForceEffect)}
-        on = {key: np.array(key in keys) for key in forces}
-
-        def first(held: bool) -> tuple[np.ndarray, np.ndarray]:
-            chosen = np.array([on[key] for key in forces if forces[key].held == held], bool)
-            return np.argsort(~chosen, kind="stable"), np.asarray(chosen.sum())
-
-        return cls(first(False), first(True), on)
-
-
-class EffectChain:
-    """
-    The attached effects with their values, as a twin's ``step`` meets them at each sub-step.
-
-    :param attached: the effects, in the order in which the signal meets them; sensors are left out
-    :param params: full parameters of the extended twin
-    :param chosen: which forces are computed; None: all
-    """
-
-    def __init__(
-        self, attached: tuple[Attached, ...], params: Params, chosen: Chosen | None = None
-    ) -> None:
-        self._actions = [
-            (a, a.effect, a.own(params)) for a in attached if isinstance(a.effect, ActionEffect)
-        ]
-        self._forces = [
-            (a, a.effect, a.own(params)) for a in attached if isinstance(a.effect, ForceEffect)
-        ]
-        self._chosen = chosen
-
-    def __add__(self, other: "EffectChain") -> "EffectChain":
-        """:return: the effects of both; commands meet ``other`` last"""
-        both = EffectChain((), {}, self._chosen or other._chosen)
-        both._actions = self._actions + other._actions
-        both._forces = self._forces + other._forces
-        return both
-
-    @property
-    def has_forces(self) -> bool:
-        """:return: whether any effect acts in the equation of motion"""
-        return bool(self._forces)
-
-    def act(
-        self, action: Action, memory: dict[str, Memory], h: float
-    ) -> tuple[Action, dict[str, Memory]]:
-        """:return: the command that reaches the plant for ``h`` seconds, and the memory after it"""
-        for attached, effect, params in self._actions:
-            command, after = effect.act(action[attached.index], memory[attached.key], h, params)
-            action, memory = action.at[attached.index].set(command), memory | {attached.key: after}
-        return action, memory
-
-    def force(self, moment: Moment, memory: dict[str, Memory], held: bool = False) -> Force:
-        """:return: the sum of all force effects that are held, or of all others, ``(dof,)``"""
-        total = jnp.zeros_like(moment.v)
-        forces = [
-            partial(effect.force, moment, attached.index, memory[attached.key], params)
-            for attached, effect, params in self._forces
-            if effect.held == held
-        ]
-        if self._chosen is None:
-            return sum((force() for force in forces), total)
-        if not forces:
-            return total
-        order, n = map(jnp.asarray, self._chosen.held if held else self._chosen.free)
-        add = lambda i, total: total + jax.lax.switch(order[i], forces)  # noqa: E731
-        return jax.lax.fori_loop(0, n, add, total)
-
-    def held(
-        self,
-        moment: Callable[[Position, Velocity], Moment],
-        q: Position,
-        v: Velocity,
-        memory: dict[str, Memory],
-        h: float,
-        displace: Callable[[Position, Velocity], Position],
-    ) -> tuple[Force, Moment]:
-        """
-        :param moment: the system at a position and a velocity
-        :param q: at the start of the sub-step
-        :param v: at the start of the sub-step
-        :param displace: moves a position along a velocity times a time
-        :return: the sum of all force effects that are held, ``(dof,)``, and the middle of the
-            sub-step, where they are evaluated: reached with what they are at its start
-        """
-        if not any(effect.held for _, effect, _ in self._forces):
-            return jnp.zeros_like(v), moment(q, v)
-
-        def towards(now: tuple[Force, Velocity], ahead: Scalar) -> tuple[Any, Any]:
-            place = displace(q, ahead * v), v + ahead * now[1]
-            there = moment(*place)
-            force = self.force(there, memory, held=True)
-            total = there.actuator + force - there.load
-            return (force, solve_spd(there.mass_matrix, total)), place
-
-        def middle() -> tuple[Force, Position, Velocity]:
-            ahead = jnp.array([0.0, 0.5], v.dtype) * h
-            # One loop: written out, it takes twice as long to compile.
-            still = jnp.zeros_like(v)
-            (force, _), (places, speeds) = jax.lax.scan(towards, (still, still), ahead)
-            return force, places[-1], speeds[-1]
-
-        if self._chosen is None:
-            force, *place = middle()
-        else:
-            nothing = lambda: (jnp.zeros_like(v), q, v)  # noqa: E731
-            force, *place = jax.lax.cond(self._chosen.held[1] > 0, middle, nothing)
-        return force, moment(*place)
-
-    def advance(self, middle: Moment, end: Moment, memory: dict[str, Memory]) -> dict[str, Memory]:
-        """:return: the memory of the force effects after the sub-step with this middle and end"""
-        for attached, effect, params in self._forces:
-            moment, before = middle if effect.held else end, memory[attached.key]
-            advanced = partial(effect.advance, moment, attached.index, before, params)
-            if self._chosen is None:
-                after = advanced()
-            elif jax.tree.leaves(before):
-                on, stay = self._chosen.on[attached.key], lambda before=before: before
-                after = jax.lax.cond(on, advanced, stay)
-            else:
-                after = before
-            memory = memory | {attached.key: after}
-        return memory
-
-
-NO_EFFECTS = EffectChain((), {})
 
 
 def at_joint(moment: Moment, index: int) -> JointMoment:

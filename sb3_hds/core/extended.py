@@ -11,16 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core.effect import (
-    NO_EFFECTS,
-    ActionEffect,
-    Attached,
-    Chosen,
-    Effect,
-    EffectChain,
-    ForceEffect,
-    SensorEffect,
-)
+from sb3_hds.core.effect import ActionEffect, Effect, ForceEffect, SensorEffect
+from sb3_hds.core.effect_chain import NO_EFFECTS, Attached, Chosen, EffectChain
 from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.transformed import TransformedTwin
 from sb3_hds.core.twin import State, Twin

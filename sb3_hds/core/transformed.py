@@ -6,12 +6,16 @@ from typing import Any
 import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core.effect import NO_EFFECTS, Effect, EffectChain
-from sb3_hds.core.stateful import Signals, StatefulTransform
-from sb3_hds.core.transform import (
-    TRANSFORMS,
+from sb3_hds.core.effect import Effect
+from sb3_hds.core.effect_chain import NO_EFFECTS, EffectChain
+from sb3_hds.core.transforms.base import (
     ActionTransform,
     ObservationTransform,
+    Signals,
+    StatefulTransform,
+)
+from sb3_hds.core.transforms.registry import (
+    TRANSFORMS,
     Transform,
     transform_from_spec,
     transform_to_spec,

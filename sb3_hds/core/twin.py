@@ -3,7 +3,7 @@
 import abc
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from numbers import Integral, Real
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core.effect import NO_EFFECTS, EffectChain
+from sb3_hds.core.effect_chain import NO_EFFECTS, EffectChain
 from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.signals import Actuator, Channel, Joint
 from sb3_hds.core.types import (
@@ -322,3 +322,17 @@ class Twin(abc.ABC):
                     f"{known}{choices}."
                 )
             self.values[name] = self.parameters[name].check(name, value)
+
+
+def layers_of(twin: Twin) -> Iterator[Twin]:
+    """:return: the twin, what it wraps, what that wraps, ..., last the plant"""
+    layer: Any = twin
+    while layer is not None:
+        yield layer
+        layer = getattr(layer, "base", None)
+
+
+def plant_of(twin: Twin) -> Twin:
+    """:return: the twin without any effect or wrapper"""
+    *_, plant = layers_of(twin)
+    return plant

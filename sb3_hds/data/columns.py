@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from sb3_hds.core.episodes import check_dt
+from sb3_hds.core.trajectories.episodes import check_dt
 from sb3_hds.data.conversion import KNOWN, TIMES, Unit, unit_of
 from sb3_hds.errors import TrajectoryError, did_you_mean
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_hds.core.episodes import check_dt
+from sb3_hds.core.trajectories.episodes import check_dt
 from sb3_hds.data.columns import Columns, Entry, Label
 from sb3_hds.errors import TrajectoryError
 

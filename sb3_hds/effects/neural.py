@@ -23,8 +23,8 @@ from sb3_hds.core import (
     Scalar,
     Velocity,
 )
-from sb3_hds.core.layers import layers_of
-from sb3_hds.core.storage import read_npz, write_npz
+from sb3_hds.core.trajectories.storage import read_npz, write_npz
+from sb3_hds.core.twin import layers_of
 from sb3_hds.errors import EffectError, TrajectoryError
 
 if TYPE_CHECKING:

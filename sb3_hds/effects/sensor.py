@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sb3_hds.core import Memory, Parameter, Params, Scalar, SensorEffect
-from sb3_hds.core.layers import plant_of
+from sb3_hds.core.twin import plant_of
 from sb3_hds.effects.shapes import limited
 from sb3_hds.errors import EffectError
 

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sb3_hds.envs.constant_reward import ConstantReward
     from sb3_hds.envs.elastic_quadruped import ElasticQuadruped
+    from sb3_hds.envs.ground_truth import true_twin
     from sb3_hds.envs.inverted_pendulum_friction import InvertedPendulumFriction
     from sb3_hds.envs.mirror import check_mirrors, twin_of
     from sb3_hds.envs.pendulum_real import PendulumReal
     from sb3_hds.envs.registration import register_environments
-    from sb3_hds.envs.side_by_side import verify_mirror
-    from sb3_hds.envs.truth import true_twin
     from sb3_hds.envs.twin_env import TwinEnv
     from sb3_hds.envs.twin_vec_env import TwinVecEnv
+    from sb3_hds.envs.verify import verify_mirror
 
 __all__ = [
     "ConstantReward",
@@ -42,9 +42,9 @@ _MODULES = {
     "TwinVecEnv": "twin_vec_env",
     "check_mirrors": "mirror",
     "register_environments": "registration",
-    "true_twin": "truth",
+    "true_twin": "ground_truth",
     "twin_of": "mirror",
-    "verify_mirror": "side_by_side",
+    "verify_mirror": "verify",
 }
 
 

@@ -79,7 +79,7 @@ def check_mirrors(env: gymnasium.Env | VecEnv, twin: Twin) -> None:
     """
     Check that a twin has the actions and the observations of an environment as wrapped.
 
-    Says nothing about what a step does: see :func:`~sb3_hds.envs.side_by_side.verify_mirror`.
+    Says nothing about what a step does: see :func:`~sb3_hds.envs.verify.verify_mirror`.
 
     :param env: as the learner gets it
     :param twin: what is planned with

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from sb3_hds.core import Actuator, Channel, State, Twin
 from sb3_hds.core.contract import check_methods
 from sb3_hds.envs import programs
-from sb3_hds.envs.doors import check_action, check_start, start_of
+from sb3_hds.envs.validation import check_action, check_start, start_of
 from sb3_hds.twins import registry
 
 _RENDER_MODES = ["rgb_array"]

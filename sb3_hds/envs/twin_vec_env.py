@@ -14,7 +14,6 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 
 from sb3_hds.core import State, Twin
 from sb3_hds.envs import programs
-from sb3_hds.envs.doors import check_action, check_start, start_of
 from sb3_hds.envs.twin_env import (
     action_space,
     check_render_mode,
@@ -23,6 +22,7 @@ from sb3_hds.envs.twin_env import (
     observation_space,
     twin_from,
 )
+from sb3_hds.envs.validation import check_action, check_start, start_of
 
 _NO_LIMIT = np.iinfo(np.int32).max
 

@@ -20,14 +20,14 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_hds.algos import HDS
 from sb3_hds.algos.twin_algorithm import TwinAlgorithm
 from sb3_hds.core import Twin
-from sb3_hds.core.storage import write_bytes
+from sb3_hds.core.trajectories.storage import write_bytes
 from sb3_hds.envs import TwinEnv, true_twin
 from sb3_hds.errors import EnvironmentMismatchError, ParameterError, TrajectoryError
 from sb3_hds.experiments.returns import returns_of
 from sb3_hds.sysid import Diagnosis
 from sb3_hds.sysid.plots import as_png, plot_policy_gain
 from sb3_hds.sysid.wording import policy_in_words
-from sb3_hds.wrappers.step_limit import step_limit_of
+from sb3_hds.wrappers.episodes.step_limit import step_limit_of
 
 _N_RESAMPLES = 2000
 _LEVEL = 0.9

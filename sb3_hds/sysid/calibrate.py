@@ -9,8 +9,8 @@ from jaxtyping import Float
 
 from sb3_hds.core import Parameter, Trajectories, Twin
 from sb3_hds.core.contract import check_methods
-from sb3_hds.core.episodes import same_interval
-from sb3_hds.data.report import Reading
+from sb3_hds.core.trajectories.episodes import same_interval
+from sb3_hds.data.resampling.report import Reading
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.covariance import Spread, covariance_of
 from sb3_hds.sysid.evidence import Evidence, portion_for

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_hds.core import AnalyticTwin, Twin
-from sb3_hds.core.layers import plant_of
+from sb3_hds.core.twin import plant_of
 from sb3_hds.effects import ConstantForce, CoulombFriction, ViscousFriction
 from sb3_hds.sysid.equation.columns import equation
 from sb3_hds.sysid.equation.motion import Motion, Moved

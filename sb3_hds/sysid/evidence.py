@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sb3_hds.core import Effect, EffectChain, Params, Twin
-from sb3_hds.core.compilation import QUICK_COMPILATION
-from sb3_hds.core.effect import Chosen
-from sb3_hds.core.linear import uses_lapack
+from sb3_hds.core.effect_chain import Chosen
+from sb3_hds.core.numerics.compilation import QUICK_COMPILATION
+from sb3_hds.core.numerics.linear import uses_lapack
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.motion import first_offsets
 from sb3_hds.sysid.shooting import Shots, n_steps_of, simulate, with_slopes

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_hds.core.storage import check_target
+from sb3_hds.core.trajectories.storage import check_target
 from sb3_hds.errors import ParameterError
 from sb3_hds.sysid import plots
 from sb3_hds.sysid.moving import PLAYERS, Moving

@@ -20,9 +20,9 @@ from sb3_hds.core import (
     SensorEffect,
     Twin,
 )
-from sb3_hds.core.effect import Attached, Chosen
+from sb3_hds.core.effect_chain import Attached, Chosen
 from sb3_hds.core.extended import with_native
-from sb3_hds.core.layers import layers_of, plant_of
+from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.effects import (
     NAMELESS,
     ActionDelay,

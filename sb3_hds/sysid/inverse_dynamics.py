@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from scipy.optimize import lsq_linear
 
 from sb3_hds.core import AnalyticTwin, State, Trajectories, Twin
-from sb3_hds.core.compilation import QUICKEST_COMPILATION
+from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.sysid.equation.motion import motion
 from sb3_hds.sysid.free import one_each
 

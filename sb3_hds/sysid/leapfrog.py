@@ -6,8 +6,8 @@ import dataclasses
 import numpy as np
 
 from sb3_hds.core import AnalyticTwin, ExtendedTwin, Trajectories, Twin, semi_implicit_euler
-from sb3_hds.core.integrators import Integrator
-from sb3_hds.core.layers import layers_of, plant_of
+from sb3_hds.core.numerics.integrators import Integrator
+from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.sysid.conventions import what_friction_leaves
 from sb3_hds.sysid.equation.motion import joint_motion, kinematics, lag_of, motion
 from sb3_hds.sysid.hypotheses import encoders

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sb3_hds.core import Params, Twin
-from sb3_hds.core.compilation import QUICKEST_COMPILATION
+from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 
 # Samples from which the first velocity is told.
 _FEW = 5

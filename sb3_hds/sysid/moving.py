@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sb3_hds.core import Params, Twin
-from sb3_hds.core.compilation import QUICKEST_COMPILATION
-from sb3_hds.core.layers import plant_of
+from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
+from sb3_hds.core.twin import plant_of
 from sb3_hds.sysid.pictures import Replay
 from sb3_hds.twins import MechanismTwin
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from scipy import stats
 
 from sb3_hds.core import Params, Trajectories, Twin
-from sb3_hds.core.compilation import QUICKEST_COMPILATION
+from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.sysid.results import Fit
 from sb3_hds.sysid.shooting import Shots, fit_start, n_free, simulate, with_slopes
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_hds.core.storage import check_target, write_bytes
+from sb3_hds.core.trajectories.storage import check_target, write_bytes
 from sb3_hds.errors import ParameterError
 from sb3_hds.sysid import plots, wording
 from sb3_hds.sysid.diagnosis import Diagnosis

@@ -12,7 +12,7 @@ import optax
 from jaxtyping import Array, Float
 
 from sb3_hds.core import AnalyticTwin, Params, State, Trajectories, TransformedTwin, Twin
-from sb3_hds.core.layers import layers_of, plant_of
+from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.effects import NeuralForce, force_of
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.calibrate import check_fits, default_window, spread_of

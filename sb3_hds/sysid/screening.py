@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_hds.core import AnalyticTwin, Effect, Twin
-from sb3_hds.core.layers import plant_of
+from sb3_hds.core.twin import plant_of
 from sb3_hds.sysid.equation.columns import equation, refuted_by_kinematics
 from sb3_hds.sysid.equation.motion import Motion
 from sb3_hds.sysid.equation.problem import Problem, problem

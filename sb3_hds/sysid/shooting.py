@@ -26,7 +26,7 @@ from sb3_hds.core import (
     Twin,
     solve_spd,
 )
-from sb3_hds.core.layers import layers_of
+from sb3_hds.core.twin import layers_of
 from sb3_hds.errors import TrajectoryError
 
 # Error that stands for a simulation that is not finite, in units of the noise.

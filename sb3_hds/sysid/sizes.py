@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sb3_hds.core import AnalyticTwin, Trajectories, Twin
-from sb3_hds.core.layers import plant_of
+from sb3_hds.core.twin import plant_of
 from sb3_hds.errors import EffectError
 from sb3_hds.sysid.evidence import Evidence
 from sb3_hds.sysid.hypotheses import Hypotheses

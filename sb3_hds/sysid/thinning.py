@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_hds.core import Trajectories, Twin, rk4
-from sb3_hds.core.layers import plant_of
+from sb3_hds.core.twin import plant_of
 
 # Samples and sub-steps of Runge-Kutta that a period of the motion needs.
 _SAMPLES, _SUBSTEPS = 100, 200

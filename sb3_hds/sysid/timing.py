@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from sb3_hds.core import Trajectories, Twin, rollout
-from sb3_hds.data.corrections import shifted
-from sb3_hds.data.velocity import Lag, lags_of
+from sb3_hds.data.audit.results import shifted
+from sb3_hds.data.audit.velocity import Lag, lags_of
 
 # Longest shift that is taken for a matter of computation [samples], [s], and the least that counts.
 _SAMPLES, _SECONDS, _VISIBLE = 1.0, 2e-3, 0.1

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array
 
 from sb3_hds.core import AnalyticTwin, Params, State, Twin
-from sb3_hds.core.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.contract import check_methods, check_now
-from sb3_hds.core.layers import layers_of, plant_of
+from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
+from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.errors import TwinError
 from sb3_hds.twins import registry
 from sb3_hds.twins.check_result import CheckItem, TwinCheck

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sb3_hds.core import AnalyticTwin, Params, Position, Scalar, State, Velocity
-from sb3_hds.core.compilation import QUICKEST_COMPILATION
+from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.twins.check_result import CheckItem
 
 # Rounding in double precision, through a few hundred operations.

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_hds.core import Actuator, Channel, Signals
-from sb3_hds.core.stateful import StatefulTransform
+from sb3_hds.core.transforms.base import StatefulTransform
 from sb3_hds.errors import ParameterError
 
 _STORES = ("raw", "executed")

@@ -22,7 +22,7 @@ from sb3_hds.core import (
     State,
     Twin,
 )
-from sb3_hds.core.compilation import QUICKEST_COMPILATION
+from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.effects import SensorDelay
 from sb3_hds.effects.joint import DryFriction
 from sb3_hds.sysid.equation.motion import Motion

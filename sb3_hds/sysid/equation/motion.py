@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.signal import savgol_filter
 
 from sb3_hds.core import Trajectories, Twin, explicit_euler, semi_implicit_euler
-from sb3_hds.core.layers import plant_of
+from sb3_hds.core.twin import plant_of
 from sb3_hds.sysid.equation.smoothing import smooth
 from sb3_hds.sysid.motion import motion_of
 

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sb3_hds.core import AnalyticTwin, Params, State, Twin
-from sb3_hds.core.compilation import QUICKEST_COMPILATION
-from sb3_hds.core.layers import plant_of
+from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
+from sb3_hds.core.twin import plant_of
 
 # Rows that are evaluated at a time: programs are compiled for one shape.
 _ROWS = 1024

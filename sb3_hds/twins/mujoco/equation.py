@@ -12,7 +12,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
 from sb3_hds.core import Force, MassMatrix, Params, Position, Velocity
-from sb3_hds.core.linear import Factor, factorised, solve_factored
+from sb3_hds.core.numerics.linear import Factor, factorised, solve_factored
 from sb3_hds.twins.mujoco.dynamics import (
     Configuration,
     Tree,

@@ -12,8 +12,8 @@ import numpy as np
 
 from sb3_hds.core import ExtendedTwin, Twin
 from sb3_hds.core.extended import with_native
-from sb3_hds.core.layers import layers_of, plant_of
-from sb3_hds.core.storage import check_target, write_bytes
+from sb3_hds.core.trajectories.storage import check_target, write_bytes
+from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.errors import ModelFileError
 from sb3_hds.twins.mujoco import algebra as alg
 from sb3_hds.twins.mujoco import dynamics

@@ -1,0 +1,1 @@
+"""Integrators, small linear systems, and how programs are compiled."""

@@ -1,0 +1,213 @@
+"""Wrappers that remember, or that look before they let an action through."""
+
+import abc
+import dataclasses
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from sb3_hds.core.signals import Actuator, Channel
+from sb3_hds.errors import ParameterError
+
+
+class Signals(NamedTuple):
+    """
+    What enters an environment or a twin, and what leaves it.
+
+    :param actuators: the commands that it takes
+    :param channels: the entries of its observation
+    """
+
+    actuators: tuple[Actuator, ...]
+    channels: tuple[Channel, ...]
+
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """:return: smallest and largest commands, each of shape ``(n_act,)``"""
+        return np.array([a.low for a in self.actuators]), np.array([a.high for a in self.actuators])
+
+    def rest(self) -> np.ndarray:
+        """:return: the command nearest to zero, shape ``(n_act,)``: what acts before an episode"""
+        return np.clip(0.0, *self.limits())
+
+
+@dataclasses.dataclass(frozen=True)
+class ObservationTransform(abc.ABC):
+    """
+    What the policy sees, as a function of what the twin below reports.
+
+    A subclass is a frozen dataclass whose fields are plain data: it can be saved and compared.
+    ``below`` are the channels of the twin below.
+    """
+
+    #: under which it is saved
+    name: ClassVar[str]
+
+    @abc.abstractmethod
+    def channels(self, below: tuple[Channel, ...]) -> tuple[Channel, ...]:
+        """
+        :return: the channels that the policy sees
+        :raises ParameterError: if the transform does not fit the twin below
+        """
+
+    @abc.abstractmethod
+    def observe(
+        self, obs: Float[Array, " inner"], below: tuple[Channel, ...]
+    ) -> Float[Array, " outer"]:
+        """:return: what the policy sees"""
+
+    @abc.abstractmethod
+    def invert(
+        self, obs: Float[Array, " outer"], below: tuple[Channel, ...]
+    ) -> Float[Array, " inner"]:
+        """:return: what the twin below reports; the inverse of :meth:`observe`"""
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionTransform(abc.ABC):
+    """
+    What the twin below is told, as a function of what the policy says.
+
+    A subclass is a frozen dataclass whose fields are plain data: it can be saved and compared.
+    ``below`` are the actuators of the twin below.
+    """
+
+    #: under which it is saved
+    name: ClassVar[str]
+
+    @abc.abstractmethod
+    def actuators(self, below: tuple[Actuator, ...]) -> tuple[Actuator, ...]:
+        """
+        :return: the actuators that the policy commands
+        :raises ParameterError: if the transform does not fit the twin below
+        """
+
+    @abc.abstractmethod
+    def apply(
+        self, action: Float[Array, " outer"], below: tuple[Actuator, ...]
+    ) -> Float[Array, " inner"]:
+        """:return: the command for the twin below"""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StatefulTransform(abc.ABC):
+    r"""
+    What a wrapper does to actions and observations, with what it remembers:
+
+    .. math:: u_k, m_{k+1} = f(a_k, o_k, m_k), \qquad \text{seen: } (o_k, m_k)
+
+    A subclass is a frozen dataclass whose fields are plain data: it can be saved and compared. Its
+    methods take NumPy and JAX arrays alike, so that the wrapper of an environment and the twin
+    behind that wrapper run the same lines. ``below`` is what lies below the wrapper.
+
+    :param observed: whether the policy sees :math:`m_k`; without it the task is no longer Markov,
+        and a twin infers the memory of the start of an episode
+    """
+
+    #: under which it is saved
+    name: ClassVar[str]
+    #: whether the memory outlives the episode
+    persists: ClassVar[bool] = False
+
+    observed: bool = True
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            object.__setattr__(self, field.name, _hashable(getattr(self, field.name)))
+
+    @abc.abstractmethod
+    def remembers(self, below: Signals) -> tuple[Channel, ...]:
+        """
+        :return: a channel for each number that it remembers
+        :raises ParameterError: if the transform does not fit what lies below
+        """
+
+    @abc.abstractmethod
+    def act(
+        self,
+        action: Float[Any, " outer"],
+        obs: Float[Any, " obs"],
+        memory: Float[Any, " memory"],
+        below: Signals,
+    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        """
+        :param obs: what is observed below when the action is chosen
+        :return: the command, and the memory after it
+        """
+
+    @abc.abstractmethod
+    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+        """:return: the memory at the start of an episode that begins with ``obs``"""
+
+    def cost(
+        self,
+        action: Float[Any, " outer"],
+        obs: Float[Any, " obs"],
+        memory: Float[Any, " memory"],
+        below: Signals,
+    ) -> Any:
+        """:return: what is taken off the reward of this step"""
+        return 0.0
+
+    def actuators(self, below: Signals) -> tuple[Actuator, ...]:
+        """:return: the actuators that the policy commands"""
+        return below.actuators
+
+    def channels(self, below: Signals) -> tuple[Channel, ...]:
+        """:return: the channels that the policy sees"""
+        remembered = self.remembers(below)
+        return below.channels + remembered if self.observed else below.channels
+
+    def draw(
+        self, key: PRNGKeyArray, obs: Float[Array, " obs"], below: Signals
+    ) -> Float[Array, " memory"]:
+        """:return: a memory that an episode of a twin may begin with"""
+        return self.start(obs, below)
+
+    def observe(
+        self, obs: Float[Any, " obs"], memory: Float[Any, " memory"]
+    ) -> Float[Any, " seen"]:
+        """:return: what the policy sees"""
+        return namespace(obs).concatenate([obs, memory]) if self.observed else obs
+
+    def infer(
+        self, seen: Float[Any, " seen"], below: Signals
+    ) -> tuple[Float[Any, " obs"], Float[Any, " memory"]]:
+        """:return: what is observed below and what is remembered; see ``observed``"""
+        obs = seen[: len(below.channels)]
+        return obs, seen[len(below.channels) :] if self.observed else self.start(obs, below)
+
+
+def namespace(array: Any) -> Any:
+    """:return: ``numpy`` or ``jax.numpy``, wherever the array is from"""
+    return array.__array_namespace__()
+
+
+def per_place(transform: StatefulTransform, field: str, n: int, places: str) -> np.ndarray:
+    """
+    :param field: holds one number, or one for each place
+    :return: one number for each of ``n`` places
+    :raises ParameterError: if it has another number of them
+    """
+    values = np.atleast_1d(np.asarray(getattr(transform, field), float))
+    if values.shape not in ((1,), (n,)):
+        raise ParameterError(
+            f"{type(transform).__name__} has {values.size} values of {field}, but there are {n} "
+            f"{places}. Pass one number, or one for each."
+        )
+    return np.broadcast_to(values, (n,))
+
+
+def refuse_unless(transform: StatefulTransform, field: str, allowed: bool, wanted: str) -> None:
+    """:raises ParameterError: naming the field, what it may be and what it is"""
+    if not allowed:
+        raise ParameterError(
+            f"{type(transform).__name__}({field}={getattr(transform, field)!r}): {field} must be "
+            f"{wanted}."
+        )
+
+
+def _hashable(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    return tuple(map(_hashable, value)) if isinstance(value, list | tuple) else value

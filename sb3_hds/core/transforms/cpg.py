@@ -1,0 +1,249 @@
+"""A rhythm under a policy: what it adds to actions, what it remembers and shows."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from jaxtyping import Float
+
+from sb3_hds.core.signals import Actuator, Channel
+from sb3_hds.core.transforms.base import Signals, StatefulTransform, namespace, refuse_unless
+from sb3_hds.core.transforms.filters import clipped
+from sb3_hds.core.transforms.oscillators import (
+    AmplitudeState,
+    advance_amplitude,
+    advance_phase,
+    period,
+)
+from sb3_hds.errors import ParameterError
+
+_PER_JOINT = ("amplitude", "offset", "phase", "kp", "kd", "action_range")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Rhythm(StatefulTransform):
+    r"""
+    Oscillators :math:`q_i^* = a_i \sin(\theta_i + \varphi_i) + b_i` that a policy adjusts, with
+    actions :math:`\alpha` from -1 to 1.
+
+    All joints share one clock :math:`c`, the share of the cycle that has passed, from 0 to 1.
+    Remembers its sine and cosine, and with ``"parameters"`` the amplitudes and their rates.
+
+    The commands are :math:`u = k_p (q^* - q) - k_d\,\dot q`, with joints that the observation
+    shows, or :math:`u = q^*` where ``position`` is empty; they are clipped to the limits of the
+    actuators.
+
+    :param mode: ``"offset"``: :math:`q^* + \rho\,\alpha`; ``"residual"``: the command
+        :math:`u + \rho\,\alpha`; ``"parameters"``: factors on each amplitude, and one on both
+        frequencies, from ``amplitude_factor`` (linear) and ``frequency_factor`` (geometric): with
+        the defaults, an action of 0 is the gait as it was passed
+    :param omega_swing: [rad/s]
+    :param omega_stance: [rad/s]
+    :param amplitude: per joint, or one for all [rad]
+    :param offset: likewise
+    :param phase: likewise
+    :param kp: command per rad
+    :param kd: command per rad/s
+    :param action_range: :math:`\rho`, in rad for ``"offset"``, in commands for ``"residual"``
+    :param amplitude_factor: smallest and largest
+    :param frequency_factor: smallest and largest, above 0
+    :param amplitude_gain: how fast amplitudes follow their commands [1/s]
+    :param position: where the observation has the position of the joint of each actuator
+    :param velocity: likewise its velocity
+    :param dt: control interval [s]
+    :raises ParameterError: for numbers out of range
+    """
+
+    name: ClassVar[str] = "rhythm"
+    modes: ClassVar[tuple[str, ...]] = ("offset", "residual", "parameters")
+
+    mode: str = "offset"
+    omega_swing: float
+    omega_stance: float
+    amplitude: Any = 1.0
+    offset: Any = 0.0
+    phase: Any = 0.0
+    kp: Any = 1.0
+    kd: Any = 0.05
+    action_range: Any = 0.1
+    amplitude_factor: Sequence[float] = (0.0, 2.0)
+    frequency_factor: Sequence[float] = (0.5, 2.0)
+    amplitude_gain: float = 50.0
+    position: Sequence[int] = ()
+    velocity: Sequence[int] = ()
+    dt: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.mode not in self.modes:
+            wanted = ", ".join(map(repr, self.modes))
+            raise ParameterError(f"Rhythm(mode={self.mode!r}): mode must be one of {wanted}.")
+        for name in ("omega_swing", "omega_stance", "amplitude_gain", "dt"):
+            if not (math.isfinite(value := getattr(self, name)) and value > 0.0):
+                raise ParameterError(f"Rhythm({name}={value}): {name} must be above 0 and finite.")
+        for name in ("amplitude_factor", "frequency_factor"):
+            refuse_unless(self, name, len(getattr(self, name)) == 2, "smallest and largest")
+            low, high = getattr(self, name)
+            if not (0.0 <= low < high < math.inf and (low > 0.0 or name[0] == "a")):
+                raise ParameterError(f"Rhythm({name}={[low, high]}): needs 0 <= lowest < highest.")
+        for name in _PER_JOINT:
+            if not np.isfinite(np.asarray(getattr(self, name), float)).all():
+                raise ParameterError(
+                    f"Rhythm({name}={getattr(self, name)}): {name} must be finite."
+                )
+        both = len(self.position) == len(self.velocity)
+        refuse_unless(self, "velocity", both, f"as many as positions ({len(self.position)})")
+
+    def sized(self, n: int) -> "Rhythm":
+        """
+        :return: the same with one number for each of ``n`` joints
+        :raises ParameterError: if it has another number of them
+        """
+        per_joint = [getattr(self, name) for name in _PER_JOINT]
+        if all(isinstance(values, tuple) and len(values) == n for values in per_joint):
+            return self
+        found = {}
+        for name in _PER_JOINT:
+            values = np.asarray(getattr(self, name), float)
+            if values.shape not in ((), (n,)):
+                raise ParameterError(
+                    f"Rhythm has {values.size} values of {name}, and there are {n} actuators. Pass "
+                    "one number, or one for each."
+                )
+            found[name] = tuple(np.broadcast_to(values, (n,)).tolist())
+        return dataclasses.replace(self, **found)
+
+    @property
+    def n_joints(self) -> int:
+        """How many there are, once it is sized."""
+        return len(self.amplitude)
+
+    @property
+    def n_actions(self) -> int:
+        """How many numbers the policy chooses."""
+        return self.n_joints + (self.mode == "parameters")
+
+    def remembers(self, below: Signals) -> tuple[Channel, ...]:
+        """
+        :return: sine and cosine of the clock, then amplitudes and their rates
+        :raises ParameterError: for another number of joints, or entries that are not observed
+        """
+        n, n_seen = len(below.actuators), len(below.channels)
+        self.sized(n)
+        if len(self.position) not in (0, n):
+            raise ParameterError(
+                f"Rhythm has {len(self.position)} entries in position, and there are {n} "
+                "actuators. Pass one for each, or none: then targets are the commands."
+            )
+        if not all(0 <= i < n_seen for i in (*self.position, *self.velocity)):
+            raise ParameterError(
+                f"Rhythm reads joints from the entries {list(self.position)} and "
+                f"{list(self.velocity)}, but an observation has {n_seen}."
+            )
+        clock = Channel("sin(clock)", "1", -1.0, 1.0), Channel("cos(clock)", "1", -1.0, 1.0)
+        if self.mode != "parameters":
+            return clock
+        # From rest within their range, critically damped amplitudes do not leave it, nor do their
+        # rates exceed the gain times its width.
+        least, most = self.amplitude_factor
+        width, names = most - least, [a.name for a in below.actuators]
+        radii = [
+            Channel(f"amplitude of {name}", "1", least - width, most + width) for name in names
+        ]
+        rates = [Channel(f"rate of it / gain, {name}", "1", -width, width) for name in names]
+        return (*clock, *radii, *rates)
+
+    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+        radii, n = [], len(below.actuators)
+        if self.mode == "parameters":
+            radii = [0.5 * sum(self.amplitude_factor)] * n + [0.0] * n
+        return namespace(obs).asarray(np.array([0.0, 1.0, *radii]), dtype=obs.dtype)
+
+    def actuators(self, below: Signals) -> tuple[Actuator, ...]:
+        names = [f"{self.mode} of {a.name}" for a in below.actuators]
+        if self.mode == "parameters":
+            names.append("frequency")
+        return tuple(Actuator(name, "1", -1.0, 1.0) for name in names)
+
+    def act(
+        self,
+        action: Float[Any, " outer"],
+        obs: Float[Any, " obs"],
+        memory: Float[Any, " memory"],
+        below: Signals,
+    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        rhythm, chosen = self.sized(len(below.actuators)), action.clip(-1.0, 1.0)
+        target, after = rhythm.target(chosen, memory)
+        position, velocity = rhythm.joints_in(obs)
+        return clipped(rhythm.command(chosen, target, position, velocity), below), after
+
+    def joints_in(
+        self, obs: Float[Any, " obs"]
+    ) -> tuple[Float[Any, " act"] | None, Float[Any, " act"] | None]:
+        """:return: positions and velocities that an observation shows; None where none are read"""
+        if not self.position:
+            return None, None
+        return obs[np.array(self.position)], obs[np.array(self.velocity)]
+
+    def target(
+        self, action: Float[Any, " outer"], memory: Float[Any, " memory"]
+    ) -> tuple[Float[Any, " act"], Float[Any, " memory"]]:
+        """
+        Of a rhythm that is :meth:`sized`.
+
+        :param action: of the policy, from -1 to 1
+        :return: what the joints aim at in the middle of the interval, and the memory after it
+        """
+        xp, dt = namespace(memory), self.dt
+        cycle, n = period(self.omega_swing, self.omega_stance), self.n_joints
+        clock = xp.arctan2(memory[0], memory[1]) / (2.0 * math.pi)
+        rate, radius, after = 1.0, 1.0, memory[2:]
+        if self.mode == "parameters":
+            wanted = _within(action[:n], self.amplitude_factor)
+            slowest, fastest = self.frequency_factor
+            rate = slowest * (fastest / slowest) ** (0.5 * (action[n] + 1.0))
+            gain, still = self.amplitude_gain, xp.zeros_like(wanted)
+            state = AmplitudeState(memory[2 : 2 + n], gain * memory[2 + n :], still)
+            radius = advance_amplitude(state, wanted, 0.0, 0.5 * dt, gain).radius
+            settled = advance_amplitude(state, wanted, 0.0, dt, gain)
+            after = xp.concatenate([settled.radius, settled.speed / gain])
+        gone = (clock * cycle + 0.5 * rate * dt) % cycle
+        phase = advance_phase(_like(memory, self.phase), gone, self.omega_swing, self.omega_stance)
+        aim = radius * _like(memory, self.amplitude) * xp.sin(phase) + _like(memory, self.offset)
+        if self.mode == "offset":
+            aim = aim + _like(memory, self.action_range) * action
+        turned = 2.0 * math.pi * (clock + rate * dt / cycle)
+        shown = xp.stack([xp.sin(turned), xp.cos(turned)])
+        return aim, xp.concatenate([shown, after]).astype(memory.dtype)
+
+    def command(
+        self,
+        action: Float[Any, " outer"],
+        target: Float[Any, " act"],
+        position: Float[Any, " act"] | None,
+        velocity: Float[Any, " act"] | None,
+    ) -> Float[Any, " act"]:
+        """
+        :param position: of the joints; None: the targets are the commands
+        :param velocity: likewise
+        :return: what the actuators are told, not clipped
+        """
+        command = target
+        if position is not None:
+            kp, kd = _like(target, self.kp), _like(target, self.kd)
+            command = kp * (target - position) - kd * velocity
+        if self.mode == "residual":
+            command = command + _like(target, self.action_range) * action
+        return command
+
+
+def _within(share: Any, ends: Sequence[float]) -> Any:
+    """From -1 to 1 onto an interval."""
+    return ends[0] + 0.5 * (share + 1.0) * (ends[1] - ends[0])
+
+
+def _like(array: Any, values: Any) -> Any:
+    """The values where the array lives, in its precision."""
+    return namespace(array).asarray(values, dtype=array.dtype)

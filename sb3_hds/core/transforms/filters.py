@@ -1,0 +1,284 @@
+"""What makes commands smooth, late or small, between a policy and what it commands."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from sb3_hds.core.signals import Channel
+from sb3_hds.core.transforms.base import (
+    Signals,
+    StatefulTransform,
+    namespace,
+    per_place,
+    refuse_unless,
+)
+
+#: of a low-pass [cycles per step]: 0.1 Hz at 10 kHz
+LOWEST_CUTOFF = 1e-5
+# A bound of an observation must hold in single precision, too.
+_ROUNDING = 1e-5
+# The impulse response of a filter is summed until this share of what was remembered is left.
+_NEGLIGIBLE = 1e-12
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RateLimit(StatefulTransform):
+    r"""
+    Commands change by at most :math:`\Delta` from one step to the next:
+
+    .. math:: u_k = \min(\max(a_k, u_{k-1} - \Delta), u_{k-1} + \Delta)
+
+    Remembers :math:`u_{k-1}`; before an episode, the command nearest to zero. Where the limit is
+    active, the derivative with respect to the action is zero.
+
+    :param max_change: :math:`\Delta` [command unit], one number or one per actuator
+    :raises ParameterError: unless it is positive
+    """
+
+    name: ClassVar[str] = "rate_limit"
+
+    max_change: float | Sequence[float]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        refuse_unless(self, "max_change", bool(np.all(np.array(self.max_change) > 0.0)), "positive")
+
+    def remembers(self, below: Signals) -> tuple[Channel, ...]:
+        per_place(self, "max_change", len(below.actuators), "actuators")
+        return tuple(Channel(f"last {a.name}", *a[1:]) for a in below.actuators)
+
+    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+        return namespace(obs).asarray(below.rest(), dtype=obs.dtype)
+
+    def act(
+        self,
+        action: Float[Any, " outer"],
+        obs: Float[Any, " obs"],
+        memory: Float[Any, " memory"],
+        below: Signals,
+    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        most = _like(action, per_place(self, "max_change", len(below.actuators), "actuators"))
+        wanted = clipped(action, below)
+        command = wanted.clip(memory - most, memory + most)
+        return command, command
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LowPass(StatefulTransform):
+    r"""
+    A Butterworth low-pass of each command, by the bilinear transform: sections of second order one
+    after the other, each two trapezoidal integrators of :math:`g = \tan(\pi f)`, and one of first
+    order where the order is odd:
+
+    .. math:: v = \frac{z_1 + g\,(a - z_2)}{1 + g\,(g + k)}, \quad y = z_2 + g v, \quad
+        z_1 \leftarrow 2 v - z_1, \quad z_2 \leftarrow 2 y - z_2
+
+    In this form a constant passes unchanged however low the cut-off and the precision; polynomials
+    of the same filter lose it in single precision. The command is :math:`y` of the last section,
+    clipped to the limits of the actuator: from second order on, a low-pass overshoots. Remembers
+    the :math:`z`; before an episode, those at rest at the command nearest to zero.
+
+    Source: Zavalishin, *The Art of VA Filter Design*, 2018, chapters 3 to 5.
+
+    :param cutoff: :math:`f`, where half of the power passes [cycles per step], below a half
+    :param order: a whole number from 1
+    :raises ParameterError: for a cut-off or an order out of range
+    """
+
+    name: ClassVar[str] = "low_pass"
+
+    cutoff: float
+    order: int
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        fine = LOWEST_CUTOFF <= self.cutoff < 0.5
+        refuse_unless(self, "cutoff", fine, f"from {LOWEST_CUTOFF:g} to below 0.5")
+        whole = isinstance(self.order, int) and self.order >= 1
+        refuse_unless(self, "order", whole, "a whole number of at least 1")
+
+    def remembers(self, below: Signals) -> tuple[Channel, ...]:
+        low, high = below.limits()
+        still, swing = self._at_rest(), self._largest()
+        half = 0.5 * (high - low) + _ROUNDING * np.maximum(np.abs(low), np.abs(high))
+        return tuple(
+            Channel(f"filter {i + 1} of {a.name}", a.unit, still[i] * m - w, still[i] * m + w)
+            for i in range(self.order)
+            for a, m, w in zip(below.actuators, 0.5 * (low + high), swing[i] * half, strict=True)
+        )
+
+    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+        return _like(obs, np.outer(self._at_rest(), below.rest()).ravel())
+
+    def act(
+        self,
+        action: Float[Any, " outer"],
+        obs: Float[Any, " obs"],
+        memory: Float[Any, " memory"],
+        below: Signals,
+    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        n, wanted = len(below.actuators), clipped(action, below)
+        y, after = self._passed(wanted, [memory[i * n : (i + 1) * n] for i in range(self.order)])
+        return clipped(y, below), namespace(action).concatenate(after)
+
+    def _passed(self, y: Any, z: Sequence[Any]) -> tuple[Any, list[Any]]:
+        """
+        :param y: what comes in
+        :param z: what each integrator remembers
+        :return: what comes out, and what they remember then
+        """
+        g, after = math.tan(math.pi * self.cutoff), []
+        for i in range(self.order // 2):
+            damping = 2.0 * math.sin((2 * i + 1) * math.pi / (2 * self.order))
+            first, second = z[2 * i : 2 * i + 2]
+            v = (first + g * (y - second)) / (1.0 + g * (g + damping))
+            y = second + g * v
+            after += [2.0 * v - first, 2.0 * y - second]
+        if self.order % 2:
+            v = (y - z[-1]) * (g / (1.0 + g))
+            y = v + z[-1]
+            after.append(y + v)
+        return y, after
+
+    def _at_rest(self) -> np.ndarray:
+        """What it remembers of a command of one that never changed, shape ``(order,)``."""
+        return np.array([0.0, 1.0] * (self.order // 2) + [1.0] * (self.order % 2))
+
+    def _largest(self) -> np.ndarray:
+        """The most that it remembers of commands within [-1, 1], shape ``(order,)``."""
+        step = np.array(self._passed(0.0, list(np.eye(self.order)))[1])
+        answers = np.array(self._passed(1.0, [0.0] * self.order)[1])[:, None]
+        while np.abs(step).max() > _NEGLIGIBLE:
+            answers, step = np.concatenate([answers, step @ answers], 1), step @ step
+        return np.abs(answers).sum(1)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Delay(StatefulTransform):
+    """
+    Commands arrive a whole number of steps late; until the first arrives, the one nearest to zero.
+
+    Remembers the commands on their way, the oldest first. A delay that is no multiple of the step,
+    or is to be estimated, is :class:`sb3_hds.effects.ActionDelay`.
+
+    :param steps: how late [control intervals]
+    :raises ParameterError: unless it is a positive whole number
+    """
+
+    name: ClassVar[str] = "delay"
+
+    steps: int
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        whole = isinstance(self.steps, int) and self.steps >= 1
+        refuse_unless(self, "steps", whole, "a whole number of at least 1")
+
+    def remembers(self, below: Signals) -> tuple[Channel, ...]:
+        return tuple(
+            Channel(f"{a.name} in {i}", *a[1:]) for i in range(self.steps) for a in below.actuators
+        )
+
+    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+        return _like(obs, np.tile(below.rest(), self.steps))
+
+    def act(
+        self,
+        action: Float[Any, " outer"],
+        obs: Float[Any, " obs"],
+        memory: Float[Any, " memory"],
+        below: Signals,
+    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        n, queue = len(below.actuators), [memory, clipped(action, below)]
+        return memory[:n], namespace(action).concatenate(queue)[n:]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Scale(StatefulTransform):
+    r"""
+    Commands reach only a share :math:`s` of the range around its middle :math:`m`:
+
+    .. math:: u = m + s\,(a - m)
+
+    Those of other actuators than ``axes`` reach all of theirs. The share follows a schedule, linear
+    between its points and constant outside. Where it changes, it remembers how much of the schedule
+    has passed, from 0 to 1, over all episodes; an episode of a twin begins anywhere in it. Without
+    ``observed``, a twin infers the beginning of the schedule.
+
+    :param schedule: ``((steps, share), ...)``, steps growing from 0, shares above 0 and at most 1
+    :param axes: numbers of the actuators concerned, from 0; None: all
+    :raises ParameterError: for any other schedule, or actuators that there are not
+    """
+
+    name: ClassVar[str] = "scale"
+    persists: ClassVar[bool] = True
+
+    schedule: Sequence[Sequence[float]]
+    axes: Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        points = np.asarray(self.schedule, float)
+        fine = points.ndim == 2 and points.shape[1] == 2 and points[0, 0] == 0.0
+        fine = fine and bool(np.all(np.diff(points[:, 0]) > 0.0))
+        fine = fine and bool(np.all((points[:, 1] > 0.0) & (points[:, 1] <= 1.0)))
+        wanted = "pairs of steps, growing from 0, and a share above 0 and at most 1"
+        refuse_unless(self, "schedule", bool(fine), wanted)
+
+    @property
+    def length(self) -> float:
+        """Steps until the last point; 0 where nothing changes."""
+        return float(self.schedule[-1][0])
+
+    def remembers(self, below: Signals) -> tuple[Channel, ...]:
+        n = len(below.actuators)
+        fine = self.axes is None or (len(self.axes) > 0 and set(self.axes) <= set(range(n)))
+        refuse_unless(self, "axes", fine, f"numbers of the {n} actuators, from 0 to {n - 1}")
+        return (Channel("progress of the scale", "1", 0.0, 1.0),) if self.length else ()
+
+    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+        return _like(obs, np.zeros(1 if self.length else 0))
+
+    def draw(
+        self, key: PRNGKeyArray, obs: Float[Array, " obs"], below: Signals
+    ) -> Float[Array, " memory"]:
+        return jax.random.uniform(key, (1 if self.length else 0,), obs.dtype)
+
+    def act(
+        self,
+        action: Float[Any, " outer"],
+        obs: Float[Any, " obs"],
+        memory: Float[Any, " memory"],
+        below: Signals,
+    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        middle = _like(action, 0.5 * np.sum(below.limits(), 0))
+        share = self.share(memory, len(below.actuators))
+        command = middle + share * (clipped(action, below) - middle)
+        return command, (memory + 1.0 / self.length).clip(0.0, 1.0) if self.length else memory
+
+    def share(self, memory: Float[Any, " memory"], n: int) -> Any:
+        """:return: of the range that each of ``n`` commands reaches now, or one for all"""
+        share = self.schedule[0][1]
+        if self.length:
+            steps, shares = np.array(self.schedule).T
+            at = _like(memory, steps), _like(memory, shares)
+            share = namespace(memory).interp(memory * self.length, *at)
+        if self.axes is None:
+            return share
+        return 1.0 + _like(memory, np.isin(np.arange(n), self.axes)) * (share - 1.0)
+
+
+def clipped(command: Float[Any, " act"], below: Signals) -> Float[Any, " act"]:
+    """:return: the command within the limits of the actuators below"""
+    low, high = below.limits()
+    return command.clip(_like(command, low), _like(command, high))
+
+
+def _like(array: Any, values: np.ndarray) -> Any:
+    """The values where the array lives, in its precision."""
+    return namespace(array).asarray(values, dtype=array.dtype)

@@ -1,0 +1,82 @@
+"""Uninterrupted rows, as measured: what the checks of the audit look at."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int
+
+from sb3_hds.core.trajectories import Trajectories
+from sb3_hds.data.audit.finding import Place
+from sb3_hds.data.resampling.report import Part
+
+
+class Stretch(NamedTuple):
+    """
+    Rows without a gap.
+
+    :param source: recording, for people
+    :param trajectory: number of the trajectory that was made of them
+    :param numbers: of the rows in the recording, from 0
+    :param times: since the first sample of the trajectory [s]
+    :param obs: shape ``(rows, n_obs)``
+    """
+
+    source: str
+    trajectory: int
+    numbers: Int[np.ndarray, " rows"]
+    times: Float64[np.ndarray, " rows"]
+    obs: Float64[np.ndarray, "rows n_obs"]
+
+    @property
+    def dt(self) -> float:
+        """Median interval [s]."""
+        return float(np.median(np.diff(self.times)))
+
+    def place(self, first: int, last: int) -> Place:
+        """:return: its rows ``first`` to ``last``, by their numbers in the recording"""
+        return Place(
+            self.source,
+            int(self.numbers[first]),
+            int(self.numbers[last]),
+            self.trajectory,
+            float(self.times[first]),
+            float(self.times[max(first - 1, 0)]),
+            float(self.times[min(last + 1, len(self.times) - 1)]),
+        )
+
+
+def stretches_of(data: Trajectories) -> list[Stretch]:
+    """:return: the rows of the log that each trajectory was read from, or else its samples"""
+    parts = _parts_of(data)
+    if parts:
+        return [
+            Stretch(p.rows.source, i, p.rows.numbers, p.rows.times - p.begin, p.rows.obs)
+            for i, p in enumerate(parts)
+        ]
+    numbers = [np.arange(n + 1) for n in data.lengths]
+    return [
+        Stretch(f"trajectory {i}", i, k, data.dt * k, data.obs[i, : len(k)])
+        for i, k in enumerate(numbers)
+    ]
+
+
+def runs(flags: Bool[np.ndarray, " steps"]) -> Iterator[tuple[int, int]]:
+    """
+    :param flags: of rows, or of the steps between rows
+    :return: where each run of set flags begins, and where the next flag is not set
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+
+
+def _parts_of(data: Trajectories) -> list[Part]:
+    """What each trajectory was made of; nothing if they are not, one for one, what was read."""
+    if data.report is None:
+        return []
+    chosen = set(data.origin.tolist())
+    parts = [part for part in data.report.parts if part.recording in chosen]
+    same = [part.recording for part in parts] == data.origin.tolist() and [
+        part.n_steps for part in parts
+    ] == data.lengths.tolist()
+    return parts if same else []

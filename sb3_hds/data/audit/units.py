@@ -1,0 +1,204 @@
+"""Positions and velocities that cannot be what they are taken for: other units, or swapped."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from sb3_hds.core.signals import Channel
+from sb3_hds.core.trajectories import Trajectories
+from sb3_hds.core.twin import Twin
+from sb3_hds.data.audit.finding import Place
+from sb3_hds.data.audit.findings import RPM, LikelyUnits, MistakenUnits, OtherUnits, Swapped
+from sb3_hds.data.audit.replay import position_channels, replayed, stretches_in
+from sb3_hds.data.audit.velocity import Match
+
+# Factor: up to here `effects.SensorScale`, which is bounded to 0.1 to 10, gives it a name.
+_BEYOND = 10.0
+_RPM_NEAR = 0.05  # relative: a factor within those bounds that has a name of its own
+_LATEST = 4.0  # samples: a pair whose lag is longer may be a sine and its second derivative
+_ALIKE = 0.3  # largest difference of a block's slope from that of all data, for half of the blocks
+_FEWEST = 3  # blocks
+_SMOOTH = 0.2  # correlation of successive velocities: below, differences of positions are too small
+
+
+def other_units(
+    data: Trajectories, channels: Sequence[Channel], matches: Sequence[Match]
+) -> list[OtherUnits]:
+    """
+    Velocities that are the derivative of a position but for a large factor, or that of revolutions
+    per minute.
+
+    Only of channels that belong to no other one as position or velocity: in an oscillation,
+    everything is the derivative of something, but for a factor. Where units are known, they say
+    what may be a velocity of what.
+
+    :param data: at one interval
+    :param channels: of the observation
+    :param matches: of the data
+    """
+    own = [match for match in matches if match.agrees and _known(match, channels) is not False]
+    taken = {j for match in own for j in (match.velocity, *match.parts)}
+    far = [
+        match
+        for match in matches
+        if not taken & {match.velocity, *match.parts}
+        and _known(match, channels) is not False
+        and _far(match, data.dt)
+    ]
+    # Of each velocity, the position that it follows best comes last.
+    far.sort(key=lambda match: match.scores.highest)
+    found = {match.velocity: match for match in far}
+    return [
+        OtherUnits(channels[v].name, _whole(data), match.position, 1.0 / match.scores.slope_there)
+        for v, match in found.items()
+    ]
+
+
+def swapped(
+    data: Trajectories, channels: Sequence[Channel], matches: Sequence[Match]
+) -> list[Swapped]:
+    """
+    Channels that are a velocity by their unit, and of which a position is the derivative.
+
+    :param data: at one interval
+    :param channels: of the observation; nothing is found where they have no units
+    :param matches: of the data
+    """
+    right = {j for m in matches if m.agrees and _known(m, channels) for j in (m.velocity, *m.parts)}
+    return [
+        Swapped(channels[m.velocity].name, _whole(data), channels[m.parts[0]].name)
+        for m in matches
+        if m.agrees
+        and abs(m.scores.lag) <= _LATEST
+        and len(m.parts) == 1
+        and _is_rate(channels[m.parts[0]].unit, channels[m.velocity].unit)
+        and not right & {m.velocity, *m.parts}
+    ]
+
+
+def _far(match: Match, dt: float) -> bool:
+    """Whether the factor is large, beyond doubt, and about the same everywhere."""
+    scores = match.scores
+    known = abs(scores.slope_there / RPM - 1.0) < _RPM_NEAR
+    usual = 1.0 / _BEYOND <= scores.slope_there <= _BEYOND and not known
+    if usual or abs(scores.lag) > _LATEST:
+        return False
+    v = np.concatenate([v - v.mean() for _, v in match.pairs])
+    slopes = match.slopes(dt)
+    alike = np.median(np.abs(slopes / scores.slope_there - 1.0)) < _ALIKE
+    return bool(len(slopes) >= _FEWEST and alike and v[1:] @ v[:-1] > _SMOOTH * (v @ v))
+
+
+def _known(match: Match, channels: Sequence[Channel]) -> bool | None:
+    """Whether the units are those of a position and its velocity; None: not all are known."""
+    units = [channels[j].unit for j in (match.velocity, *match.parts)]
+    if not all(units):
+        return None
+    return _is_rate(units[0], "rad" if len(match.parts) > 1 else units[1])
+
+
+def _is_rate(velocity: str, position: str) -> bool:
+    return bool(position) and velocity == f"{position}/s"
+
+
+def _whole(data: Trajectories) -> tuple[Place, ...]:
+    return tuple(Place(f"trajectory {i}", 0, int(n), i) for i, n in enumerate(data.lengths))
+
+
+_FEWEST_STRETCHES = 6  # stretches
+# Share of its acceleration that the twin leaves unexplained, as it is at least, and in the other
+# unit at most, to be sure.
+_NOTHING, _MOST = 0.6, 0.3
+# The twin's acceleration by the measured one, for a suspicion: as it is at most, in the other unit
+# within these bounds.
+_TOO_SMALL, _ABOUT_RIGHT = 0.1, (0.4, 2.5)
+
+
+class _Unit(NamedTuple):
+    name: str
+    symbol: str
+    of: str  # unit of the twin
+    factor: float
+    span: float  # of the measurements from which the other unit comes to mind
+
+
+_UNITS = (
+    _Unit("degrees", "deg", "rad", np.pi / 180.0, 2.0 * np.pi),
+    _Unit("millimetres", "mm", "m", 1e-3, 5.0),
+    _Unit("centimetres", "cm", "m", 1e-2, 5.0),
+)
+
+
+def mistaken_units(
+    data: Trajectories, twin: Twin, channels: Sequence[Channel], columns: Sequence[str]
+) -> list[MistakenUnits]:
+    """
+    Positions that span more than a turn, or 5 m, and that accelerate as the twin says only if they
+    are in degrees, millimetres or centimetres.
+
+    The twin is simulated for 0.3 s from measured states. In another unit than its own, it explains
+    nothing of the acceleration; in the right one, most of it, even if its parameters are off by a
+    third. Motion without forces, or under forces that are proportional to it, fits any unit: there
+    is no finding then.
+
+    :param data: at the twin's interval
+    :param channels: of the observation, named as in reports
+    :param columns: their names in the log
+    """
+    units = [u for u in _UNITS if _spans(data, twin, u)]
+    stretches = stretches_in(data) if units and not _has_quaternions(twin) else None
+    if stretches is None or len(stretches.obs) < _FEWEST_STRETCHES:
+        return []
+    channel_of = position_channels(twin, stretches)
+    as_is = replayed(twin, stretches, np.ones(data.n_obs))
+    found: dict[int, tuple[float, MistakenUnits]] = {}
+    for unit in units:
+        scale = np.where([_is_of(c, unit.of) for c in twin.channels], unit.factor, 1.0)
+        then = replayed(twin, stretches, scale)
+        for joint, channel in channel_of.items():
+            if twin.channels[channel].unit != unit.of:
+                continue
+            left, times = then.unexplained()[joint], as_is.predicted()[joint]
+            sure = as_is.unexplained()[joint] >= _NOTHING and left <= _MOST
+            low, high = _ABOUT_RIGHT
+            likely = times < _TOO_SMALL and low < then.predicted()[joint] < high
+            if (sure or likely) and left < found.get(joint, (np.inf,))[0]:
+                kind = MistakenUnits if sure else LikelyUnits
+                found[joint] = (
+                    float(left),
+                    kind(
+                        channels[channel].name,
+                        tuple(
+                            Place(f"trajectory {i}", 0, int(n), i)
+                            for i, n in enumerate(data.lengths)
+                        ),
+                        column=columns[channel],
+                        span=float(np.ptp(data.obs[..., channel])),
+                        unit=unit.of,
+                        other=unit.name,
+                        symbol=unit.symbol,
+                        factor=unit.factor,
+                        explained=float(1.0 - left),
+                        times=float(1.0 / max(times, 1e-6)),
+                    ),
+                )
+    return [finding for _, finding in found.values()]
+
+
+def _spans(data: Trajectories, twin: Twin, unit: _Unit) -> bool:
+    """Whether some position of that unit spans so much that another one comes to mind."""
+    own = [i for i, channel in enumerate(twin.channels) if channel.unit == unit.of]
+    return any(np.ptp(data.obs[..., i], axis=1).max() > unit.span for i in own)
+
+
+def _is_of(channel: Channel, unit: str) -> bool:
+    return channel.unit in (unit, f"{unit}/s")
+
+
+def _has_quaternions(twin: Twin) -> bool:
+    """Whether positions are longer than velocities, so that they have no unit of their own."""
+    obs = jax.ShapeDtypeStruct((len(twin.channels),), float)
+    state = jax.eval_shape(lambda obs: twin.infer(obs, twin.params), obs)
+    return state.q.shape != state.v.shape

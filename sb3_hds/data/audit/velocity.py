@@ -1,0 +1,340 @@
+"""Velocity channels that come late or early, as the derivative of a position tells."""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from sb3_hds.core.trajectories import Trajectories
+from sb3_hds.core.twin import Twin
+from sb3_hds.data.audit.finding import Place
+from sb3_hds.data.audit.findings import BackwardDifference, VelocityShift
+from sb3_hds.data.audit.replay import replayed, stretches_in
+from sb3_hds.data.resampling.angles import unwrapped
+
+_REACH = 0.05  # [s] longest shift that is looked for, but at least _FEWEST samples
+_FEWEST, _MOST = 8, 100  # samples
+_SHORTEST = 24  # steps of an episode that is looked at
+_PER_REACH = 4  # steps of an episode for each sample of the longest shift
+_WIDTHS = (1, 3, 7, 15, 31)  # samples of the moving average; the first that makes a pair clear
+_CLEAR = 0.95  # correlation of a position's derivative with its velocity
+_SAME = 0.25  # largest difference of their ratio from 1
+_CIRCLE = 0.1  # largest root mean square of cos^2 + sin^2 - 1
+_BLOCKS = 12
+_VISIBLE = 0.75  # samples: half of one is what a backward difference or semi-implicit Euler has
+_SIGMAS = 3.0
+_BETTER = 2.0  # by how much the shift must reduce the unexplained variance,
+# Mean square of a velocity less its backward difference, by that less a smoother one: where both
+# are noise, and where they are not. A smooth velocity half a sample late has 1/50.
+_SAME_NOISE, _SAME_NUMBER = 0.5, 2.5e-3
+# Correlation of successive fourth differences: -0.8 for noise of a position, -0.67 under random
+# forces, and more for smooth motion.
+_ALTERNATES = -0.735
+_LONG = 2.0  # unless it is longer than this [samples]
+
+Pairs = Sequence[tuple[np.ndarray, np.ndarray]]
+"""Position and velocity of each episode, each of shape ``(rows,)``."""
+
+
+class Lag(NamedTuple):
+    """
+    :param velocity: channel
+    :param position: name of the position whose derivative it is
+    :param samples: by how many the velocity comes late; negative: early
+    :param stderr: standard error of that, from blocks of the data
+    :param better: unexplained variance of the velocity without the shift by that with it
+    :param backward: whether it is the backward difference of the position
+    """
+
+    velocity: int
+    position: str
+    samples: float
+    stderr: float
+    better: float
+    backward: bool = False
+
+
+class Match(NamedTuple):
+    """
+    A channel that follows the derivative of another one, whatever the factor.
+
+    :param velocity: channel
+    :param position: name of what it follows the derivative of
+    :param parts: channels of that: one, or those of a cosine and a sine
+    :param pairs: both, per episode
+    :param scores: of these
+    :param width: of the moving average [samples]
+    """
+
+    velocity: int
+    position: str
+    parts: tuple[int, ...]
+    pairs: Pairs
+    scores: "_Scores"
+    width: int
+
+    @property
+    def agrees(self) -> bool:
+        """Whether both are in the same unit."""
+        return abs(self.scores.slope_there - 1.0) < _SAME
+
+    def slopes(self, dt: float) -> Float64[np.ndarray, " blocks"]:
+        """:return: of the velocity on the derivative, in blocks of the data, at the same lag"""
+        reach, there = len(self.scores.slope) // 2, int(self.scores.correlation.argmax())
+        blocks = _blocks(self.pairs, reach, self.width)
+        return np.array([_Scores.of([b], dt, reach, self.width).slope[there] for b in blocks])
+
+
+def velocity_shifts(
+    data: Trajectories, names: Sequence[str], matches: Sequence[Match]
+) -> list[VelocityShift]:
+    """
+    :param data: at one interval
+    :param names: of the observation channels
+    :param matches: of the data
+    :return: the lags that are longer than a backward difference has, beyond doubt, and either long
+        or the cause of half of what the derivative leaves unexplained
+    """
+    whole = tuple(Place(f"trajectory {i}", 0, int(n), i) for i, n in enumerate(data.lengths))
+    return [
+        VelocityShift(
+            names[lag.velocity],
+            whole,
+            position=lag.position,
+            samples=lag.samples,
+            seconds=lag.samples * data.dt,
+            stderr=lag.stderr,
+        )
+        for lag in _lags(matches, data.dt)
+        if abs(lag.samples) >= max(_VISIBLE, _SIGMAS * lag.stderr)
+        and (lag.better >= _BETTER or abs(lag.samples) >= _LONG)
+    ]
+
+
+class Difference(NamedTuple):
+    """
+    :param backward: whether a velocity is the backward difference of its position: it has that
+        one's noise, or it is the same number
+    :param rough: whether the noise of the position shows in it
+    """
+
+    backward: bool
+    rough: bool
+
+
+def difference_of(pairs: Pairs, dt: float) -> Difference:
+    """
+    Compare a velocity with the backward difference, and with a mean of four that is as late.
+
+    :param pairs: position and velocity of each episode
+    """
+    exact, smooth, bends = [], [], []
+    for q, v in pairs:
+        steps = np.diff(q) / dt
+        exact.append(v[2:-1] - steps[1:-1])
+        smooth.append(v[2:-1] - (steps[2:] + 2.0 * steps[1:-1] + steps[:-2]) / 4.0)
+        bends.append(np.diff(q, 4))
+    ours, others = (float(np.mean(np.concatenate(part) ** 2)) for part in (exact, smooth))
+    products = sum(float(x[1:] @ x[:-1]) for x in bends)
+    rough = bool(products < _ALTERNATES * sum(float(x @ x) for x in bends))
+    share = _SAME_NOISE if rough else _SAME_NUMBER
+    return Difference(ours < share * others, rough)
+
+
+def lags_of(data: Trajectories, names: Sequence[str]) -> list[Lag]:
+    """
+    Pairs of a position and its velocity in the same unit, and the lag between them.
+
+    :param data: at one interval
+    :param names: of the observation channels
+    """
+    return _lags(matches_of(data, names), data.dt)
+
+
+def matches_of(data: Trajectories, names: Sequence[str]) -> list[Match]:
+    """
+    Pairs of a position and its velocity, found by their correlation.
+
+    The velocity is compared with the central difference of the position, which has no delay, both
+    smoothed by the same symmetric window. A parabola through the correlations around the best shift
+    gives the fraction of a sample. The angle of a cosine and a sine is a position too.
+
+    :param data: at one interval
+    :param names: of the observation channels
+    """
+    episodes = [data.episode(i)[0] for i, n in enumerate(data.lengths) if n >= _SHORTEST]
+    if not episodes:
+        return []
+    wanted = int(np.clip(round(_REACH / data.dt), _FEWEST, _MOST))
+    reach = min(wanted, *(len(x) // _PER_REACH for x in episodes))
+    found = []
+    for v in range(data.n_obs):
+        for parts, positions in _positions(episodes, v):
+            pairs = [(q, x[:, v]) for q, x in zip(positions, episodes, strict=True)]
+            for width in _WIDTHS:
+                if any(len(x) <= 4 * reach + width for x in episodes):
+                    continue
+                scores = _Scores.of(pairs, data.dt, reach, width)
+                if scores.highest > _CLEAR:
+                    name = ", ".join(names[j] for j in parts)
+                    found.append(Match(v, name, parts, pairs, scores, width))
+                    break
+    return found
+
+
+def _lags(matches: Sequence[Match], dt: float) -> list[Lag]:
+    """Of each velocity, that to the position that it fits best."""
+    found = []
+    for v in dict.fromkeys(match.velocity for match in matches if match.agrees):
+        own = [match for match in matches if match.velocity == v and match.agrees]
+        best = max(own, key=lambda match: match.scores.highest)
+        scores = best.scores
+        stderr = _stderr(best.pairs, dt, len(scores.slope) // 2, best.width)
+        backward = difference_of(best.pairs, dt).backward
+        found.append(Lag(v, best.position, scores.lag, stderr, scores.better, backward))
+    return found
+
+
+def _positions(
+    episodes: Sequence[np.ndarray], v: int
+) -> list[tuple[tuple[int, ...], list[np.ndarray]]]:
+    """Everything that channel v may be the derivative of, per episode; turns are counted."""
+    others = [j for j in range(episodes[0].shape[1]) if j != v]
+    found: list[tuple[tuple[int, ...], list[np.ndarray]]]
+    found = [((j,), [unwrapped(x[:, j]) for x in episodes]) for j in others]
+    joined = np.concatenate(episodes)
+    for c, s in itertools.permutations(others, 2):
+        if np.sqrt(np.mean((joined[:, c] ** 2 + joined[:, s] ** 2 - 1.0) ** 2)) < _CIRCLE:
+            angles = [np.unwrap(np.arctan2(x[:, s], x[:, c])) for x in episodes]
+            found.append(((c, s), angles))
+    return found
+
+
+def _stderr(pairs: Pairs, dt: float, reach: int, width: int) -> float:
+    blocks = _blocks(pairs, reach, width)
+    scores = [_Scores.of([block], dt, reach, width) for block in blocks]
+    lags = np.array([s.lag for s in scores if s.highest > 0.5 * _CLEAR])
+    if len(lags) < 3:
+        return 0.0 if len(lags) else np.inf
+    # Robust, because a block in which hardly anything moves says little.
+    spread = 1.4826 * float(np.median(np.abs(lags - np.median(lags))))
+    return float(spread / np.sqrt(len(lags)))
+
+
+def _blocks(pairs: Pairs, reach: int, width: int) -> Pairs:
+    """Parts of the episodes, or these if parts are too short."""
+    n_blocks = max(1, _BLOCKS // len(pairs))
+    blocks = [
+        block
+        for q, v in pairs
+        for block in zip(np.array_split(q, n_blocks), np.array_split(v, n_blocks), strict=True)
+        if len(block[0]) > 4 * reach + width
+    ]
+    return blocks or pairs
+
+
+class _Scores(NamedTuple):
+    """
+    How a velocity follows from the derivative, at shifts from -reach to reach samples.
+
+    :param correlation: at each shift
+    :param slope: of the velocity on the derivative
+    """
+
+    correlation: Float64[np.ndarray, " shifts"]
+    slope: Float64[np.ndarray, " shifts"]
+
+    @classmethod
+    def of(cls, pairs: Pairs, dt: float, reach: int, width: int) -> "_Scores":
+        window = np.ones(width) / width
+        moments = np.zeros((3, 2 * reach + 1))
+        for q, v in pairs:
+            rate = np.convolve((q[2:] - q[:-2]) / (2.0 * dt), window, "valid")
+            speed = np.convolve(v[1:-1], window, "valid")[reach : len(rate) - reach]
+            # At shift s, the velocity of sample k is compared with the derivative of k - s.
+            shifted = np.lib.stride_tricks.sliding_window_view(rate, len(speed))[::-1]
+            moments[0] += speed @ speed
+            moments[1] += shifted @ speed
+            moments[2] += np.einsum("ij,ij->i", shifted, shifted)
+        vv, vr, rr = moments
+        tiny = np.finfo(float).tiny
+        return cls(vr / np.sqrt(np.maximum(vv * rr, tiny)), vr / np.maximum(rr, tiny))
+
+    @property
+    def highest(self) -> float:
+        """The largest correlation."""
+        return float(self.correlation.max())
+
+    @property
+    def slope_there(self) -> float:
+        """The slope where the correlation is largest."""
+        return float(self.slope[self.correlation.argmax()])
+
+    @property
+    def better(self) -> float:
+        """Unexplained variance without a shift by that with the best one."""
+        unexplained = 1.0 - self.correlation**2
+        return float(unexplained[len(unexplained) // 2] / max(unexplained.min(), 1e-12))
+
+    @property
+    def lag(self) -> float:
+        """The shift of the largest correlation, to a fraction of a sample."""
+        reach, i = len(self.correlation) // 2, int(self.correlation.argmax())
+        if i in (0, 2 * reach):
+            return float(i - reach)
+        left, middle, right = self.correlation[i - 1 : i + 2]
+        bend = left - 2.0 * middle + right
+        return float(i - reach + (0.5 * (left - right) / bend if bend < 0.0 else 0.0))
+
+
+def backward_differences(
+    data: Trajectories, names: Sequence[str], matches: Sequence[Match], twin: Twin | None
+) -> list[BackwardDifference]:
+    """
+    :param data: at one interval
+    :param names: of the observation channels
+    :param matches: of the data
+    :param twin: whose own velocities may be the same, as semi-implicit Euler steps make them; where
+        there is none, only differences in which the noise of the position shows are told, which no
+        simulation has
+    """
+    found: dict[int, tuple[Match, bool]] = {}
+    for match in matches:
+        difference = difference_of(match.pairs, data.dt)
+        if match.agrees and difference.backward:
+            found[match.velocity] = match, difference.rough
+    own = _own(data, twin, [match for match, _ in found.values()]) if twin and found else None
+    whole = tuple(Place(f"trajectory {i}", 0, int(n), i) for i, n in enumerate(data.lengths))
+    return [
+        BackwardDifference(
+            names[v],
+            whole,
+            position=match.position,
+            samples=0.5,
+            seconds=0.5 * data.dt,
+            stderr=0.0,
+        )
+        for v, (match, rough) in found.items()
+        if (rough if own is None else v not in own)
+    ]
+
+
+def _own(data: Trajectories, twin: Twin, matches: Sequence[Match]) -> set[int] | None:
+    """Velocity channels that are backward differences in a simulation; None: it says nothing."""
+    stretches = stretches_in(data)
+    if stretches is None:
+        return None
+    obs = replayed(twin, stretches, np.ones(data.n_obs)).obs
+    obs = obs[np.isfinite(obs).all((1, 2))]
+    if not len(obs):
+        return None
+    own = set()
+    for match in matches:
+        first, *second = (obs[..., part] for part in match.parts)
+        position = np.unwrap(np.arctan2(second[0], first), axis=1) if second else first
+        pairs = list(zip(position, obs[..., match.velocity], strict=True))
+        if difference_of(pairs, data.dt).backward:
+            own.add(match.velocity)
+    return own

@@ -1,0 +1,109 @@
+"""What rows say of their time stamps: written twice, too coarse, or right where a clock is not."""
+
+import numpy as np
+from jaxtyping import Bool
+
+from sb3_hds.data.resampling.angles import unwrapped
+from sb3_hds.data.resampling.clock import Clock, shares_stamps
+from sb3_hds.data.resampling.rows import Rows
+from sb3_hds.errors import TrajectoryError
+
+_NEIGHBOURS = 5  # rows before and after a repeated stamp that say whether there is a row too many
+_EQUAL = 1e-6  # of an interval: stamps that are closer than this are the same
+_TWICE, _ONCE = 0.9, 0.5  # share of equal rows under equal stamps, and under different ones
+_FEWEST_STAMPS = 30  # that tell an interval to 0.1 %, where several rows share each
+_FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # differences in which smooth motion vanishes
+_SMOOTH = np.ones(5) / 5.0
+_SIGMAS = 4.0
+
+
+def check_resolved(rows: Rows) -> None:
+    """
+    :param rows: of one episode, none written twice
+    :raises TrajectoryError: if stamps are so coarse that no interval follows from them
+    """
+    different = np.unique(rows.times)
+    coarse = len(different) == 1 or (shares_stamps(rows.times) and len(different) < _FEWEST_STAMPS)
+    if len(rows.times) < 2 or not coarse:
+        return
+    largest = float(np.abs(rows.times).max())
+    single = float(np.spacing(np.float32(largest)))
+    apart = float(np.median(np.diff(different))) if len(different) > 1 else 0.0
+    stored_short = len(different) == 1 or np.isclose(apart % single, 0.0, atol=1e-6 * single)
+    why = ""
+    if single > 1e-3 and stored_short and np.array_equal(rows.times, np.float32(rows.times)):
+        why = (
+            f"In single precision (float32), numbers around {largest:.4g} are {single:g} apart: "
+            "store stamps as float64, or subtract the first one before. "
+        )
+    raise TrajectoryError(
+        f"The time stamps of '{rows.source}' are too coarse: {len(rows.times)} rows share "
+        f"{len(different)} of them, so how far rows are apart does not follow. {why}Or leave "
+        "'time' out of columns and say the interval: dt: SECONDS."
+    )
+
+
+def written_twice(rows: Rows, interval: float) -> Bool[np.ndarray, " rows"]:
+    """
+    Rows that have the stamp of the row before because they are that row once more.
+
+    Where only a few stamps are repeated, those after which the clock is a row behind. Where many
+    are, either all of them, if measurements are repeated as well, or none: the logger's ticks are
+    coarser than its rows are apart.
+
+    :param rows: of one episode
+    :param interval: typical one [s]
+    """
+    waits = np.diff(rows.times)
+    again = np.concatenate([[False], (waits == 0.0) | (waits <= _EQUAL * interval)])
+    if not again.any():
+        return again
+    if shares_stamps(rows.times):
+        same = np.concatenate([[False], (rows.obs[1:] == rows.obs[:-1]).all(1)])
+        elsewhere = same[1:][~again[1:]]
+        copied = same[again].mean() > _TWICE and elsewhere.sum() < _ONCE * len(elsewhere)
+        return again if copied else np.zeros_like(again)
+    ahead = rows.times / interval - np.arange(len(again))
+    found = np.zeros_like(again)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], again, [0]])))
+    for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        before, after = ahead[max(first - _NEIGHBOURS, 0) : first], ahead[end : end + _NEIGHBOURS]
+        behind = np.median(before) - np.median(after) if len(after) else end - first
+        found[end - int(np.clip(np.round(behind), 0, end - first)) : end] = True
+    return found
+
+
+def values_follow_stamps(rows: Rows, clock: Clock) -> bool:
+    """
+    Whether rows were measured when their stamps say, rather than at the ticks of their clock.
+
+    If row k was measured late by a time d, its value differs by v d from what it would be at its
+    tick, which spoils the smoothness of the motion. So fourth differences of the values are
+    regressed on those of v d: the slope is 1 if stamps are right, and 0 if ticks are. What noise
+    hides makes no difference; then the answer is no.
+
+    :param rows: of which some stamps are off their ticks
+    :param clock: of these
+    """
+    off = (rows.times - clock.times) / clock.dt
+    usable = np.zeros(max(len(off) - 4, 0), bool)
+    if len(off) > 4:
+        usable = clock.slots[4:] - clock.slots[:-4] == 4
+    products, squares, errors = 0.0, 0.0, []
+    for column in rows.obs.T if usable.any() else []:
+        x = unwrapped(column)
+        rate = np.convolve(
+            np.gradient(np.pad(x, 2, "reflect", reflect_type="odd")), _SMOOTH, "valid"
+        )
+        rough, late = (np.convolve(y, _FOURTH, "valid")[usable] for y in (x, rate * off))
+        size = float(np.mean(rough**2))
+        if size > 0.0:
+            products += float(late @ rough) / size
+            squares += float(late @ late) / size
+            errors.append((rough / np.sqrt(size), late / np.sqrt(size)))
+    if squares == 0.0:
+        return False
+    slope = products / squares
+    left = np.concatenate([rough - slope * late for rough, late in errors])
+    stderr = float(np.sqrt(np.mean(left**2) / squares))
+    return bool(slope > max(0.5, _SIGMAS * stderr))

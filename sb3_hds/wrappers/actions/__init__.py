@@ -1,0 +1,1 @@
+"""Wrappers that shape commands on their way to the actuators."""

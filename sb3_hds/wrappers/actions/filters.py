@@ -1,0 +1,134 @@
+"""Commands without high frequencies."""
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import gymnasium
+import numpy as np
+
+from sb3_hds.core import Delay, LowPass, RateLimit
+from sb3_hds.core.transforms.filters import LOWEST_CUTOFF
+from sb3_hds.errors import ParameterError
+from sb3_hds.wrappers.action_layer import TransformLayer
+from sb3_hds.wrappers.interval import interval_of
+
+# As many numbers per action are appended to observations.
+_HIGHEST_ORDER = 8
+
+
+class LowPassAction(TransformLayer):
+    """
+    A Butterworth low-pass in front of each command. The filter's state is appended to observations.
+
+    From second order on, the filter overshoots a step (4 % at second order); commands are clipped
+    to their limits. Put limits of joints below it: a filter delays what they ask for.
+
+    Source: Butterworth, *On the theory of filter amplifiers*, Experimental Wireless 7, 1930;
+    bilinear transform as in ``scipy.signal.butter``, see :class:`sb3_hds.core.LowPass`.
+
+    :param env: its actions are a bounded Box with one axis
+    :param cutoff: frequency at which half of the power passes [Hz], below half the control rate
+    :param order: 1 to 8
+    :param dt: control interval [s]; default: the environment's own ``dt`` or ``tau``
+    :param observe_state: whether the state is appended, ``order`` numbers per action; without it,
+        the task is not Markov
+    :param store: ``"executed"``: learners store the filtered command
+    :raises ParameterError: for a cut-off or an order out of range, or an unknown interval
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        cutoff: float,
+        order: int = 2,
+        *,
+        dt: float | None = None,
+        observe_state: bool = True,
+        store: str = "raw",
+    ) -> None:
+        interval = interval_of(env, ParameterError) if dt is None else dt
+        if not 0.0 < interval < math.inf:
+            raise ParameterError(f"LowPassAction(dt={dt!r}): dt must be above 0 s.")
+        if not LOWEST_CUTOFF <= cutoff * interval < 0.5:
+            raise ParameterError(
+                f"LowPassAction(cutoff={cutoff!r}): with a step of {interval:g} s, cutoff must be "
+                f"at least {LOWEST_CUTOFF / interval:g} Hz and below {0.5 / interval:g} Hz, half "
+                "the control rate."
+            )
+        if order not in range(1, _HIGHEST_ORDER + 1):
+            raise ParameterError(
+                f"LowPassAction(order={order!r}): order must be a whole number from 1 to "
+                f"{_HIGHEST_ORDER}."
+            )
+        arguments = {
+            "cutoff": cutoff,
+            "order": order,
+            "dt": dt,
+            "observe_state": observe_state,
+            "store": store,
+        }
+        transform = LowPass(cutoff=cutoff * interval, order=order, observed=observe_state)
+        super().__init__(env, transform, store, arguments)
+
+
+class ActionDelay(TransformLayer):
+    """
+    Commands arrive whole steps late. Those on their way are appended to observations.
+
+    Learners always store what they chose: what is executed in a step was chosen in an earlier one.
+
+    :param env: its actions are a bounded Box with one axis
+    :param steps: how late [control intervals]
+    :param observe_state: whether the commands on their way are appended, the oldest first; without
+        them, the task is not Markov
+    :param store: ``"raw"``
+    :raises ParameterError: unless ``steps`` is a whole number of at least 1
+    """
+
+    stores: ClassVar[tuple[str, ...]] = ("raw",)
+
+    def __init__(
+        self, env: gymnasium.Env, steps: int, *, observe_state: bool = True, store: str = "raw"
+    ) -> None:
+        arguments = {"steps": steps, "observe_state": observe_state, "store": store}
+        super().__init__(env, Delay(steps=steps, observed=observe_state), store, arguments)
+
+
+class ActionRateLimit(TransformLayer):
+    """
+    Commands change by at most so much per second. The last command is appended to observations.
+
+    :param env: its actions are a bounded Box with one axis
+    :param max_rate: [command unit / s], one number or one per action
+    :param dt: control interval [s]; default: the environment's own ``dt`` or ``tau``
+    :param observe_state: whether the last command is appended; without it, the task is not Markov
+    :param store: ``"executed"``: learners store the limited command
+    :raises ParameterError: for a rate that is not positive, or an unknown interval
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        max_rate: float | Sequence[float],
+        *,
+        dt: float | None = None,
+        observe_state: bool = True,
+        store: str = "raw",
+    ) -> None:
+        interval = interval_of(env, ParameterError) if dt is None else dt
+        rates = np.asarray(max_rate, float)
+        if not (rates > 0.0).all():
+            raise ParameterError(
+                f"ActionRateLimit(max_rate={max_rate}): max_rate must be above 0, in units of the "
+                "action per second, one number or one for each."
+            )
+        most = (rates * interval).tolist()
+        arguments = {
+            "max_rate": max_rate,
+            "dt": dt,
+            "observe_state": observe_state,
+            "store": store,
+        }
+        transform = RateLimit(max_change=most, observed=observe_state)
+        super().__init__(env, transform, store, arguments)

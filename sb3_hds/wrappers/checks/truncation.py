@@ -1,0 +1,323 @@
+"""Does a time-out reach the learner as what it is?"""
+
+import math
+from collections import Counter
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import (
+    AsyncVectorEnv,
+    AutoresetMode,
+    SyncVectorEnv,
+    VectorEnv,
+    VectorWrapper,
+)
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
+
+from sb3_hds.errors import ParameterError
+from sb3_hds.wrappers.checks.ends_seen import End, Seen, ends_of_env, ends_of_vec_env, is_same
+from sb3_hds.wrappers.checks.report import Report, counted, name_of
+from sb3_hds.wrappers.episodes.step_limit import Limit, limits_of, own_limit, step_limit_of
+from sb3_hds.wrappers.vec_env import GymnasiumVecEnv
+
+# Steps that are made where no limit is known.
+_USUAL = 2_000
+# Ends after equally many steps that are no coincidence, if they are half of all; or so many times
+# those after any number of steps in the last fifth before, and those after any other number.
+_FEWEST = 3
+_THAN_BEFORE, _THAN_ANY = 3.0, 1.5
+# Where layers of vectorised environments keep their limit; copies keep it under the first name.
+_NAMES = ("_max_episode_steps", "max_episode_steps")
+# What Python says where an environment keeps to Gym before 0.26.
+_OLD_SIGNS = ("values to unpack", "unexpected keyword argument 'seed'")
+
+
+class TruncationReport(Report):
+    """What :func:`check_truncation` found."""
+
+
+def check_truncation(
+    env: gymnasium.Env | VecEnv | VectorEnv, *, n_steps: int | None = None, seed: int = 0
+) -> TruncationReport:
+    r"""
+    Find out whether a time-out reaches the learner as a truncation.
+
+    A learner bootstraps the value of the last observation at a truncation, and takes 0 at a
+    termination. A time limit that arrives as a termination makes values wrong, silently: those of a
+    constant reward of 1 by a factor of :math:`1 / (1 - \gamma^n)` for a limit of ``n`` steps.
+
+    Episodes are made with random actions. What an end *means* cannot be seen from outside; but
+    ends that come after the same number of steps time and again are a limit, unless observations
+    tell the time. A limit around a shorter one, which never acts, is found in the whole stack of
+    wrappers; in copies in processes of their own, by where episodes end. The environment is reset
+    and stepped, and not closed.
+
+    :param env: an environment, an SB3 ``VecEnv`` of anybody's, or a Gymnasium ``VectorEnv`` in any
+        autoreset mode, wrapped as the learner gets it
+    :param n_steps: at most so many; None: four episodes of the time limit in each copy, or 2,000
+    :param seed: of starts and actions
+    :raises ParameterError: for anything else, or no steps
+    """
+    if n_steps is not None and n_steps < 1:
+        raise ParameterError(f"check_truncation(n_steps={n_steps}): at least one step is needed.")
+    if isinstance(env, VectorEnv):
+        return _of_vector_env(env, n_steps, seed)
+    if isinstance(env, VecEnv):
+        problems, notes, seen = _of_vec_env(env, n_steps, seed)
+    elif isinstance(env, gymnasium.Env):
+        problems, notes, seen = _of_env(env, n_steps, seed)
+    else:
+        raise ParameterError(
+            "check_truncation takes a gymnasium.Env, an SB3 VecEnv or a gymnasium.vector.VectorEnv,"
+            f" got {type(env).__name__}."
+        )
+    return TruncationReport(_subject(env, seen), problems, notes)
+
+
+def _of_env(env: gymnasium.Env, n_steps: int | None, seed: int) -> tuple[list, list, Seen]:
+    limit = step_limit_of(env)
+    try:
+        seen = ends_of_env(env, n_steps or 4 * (limit or _USUAL // 4), seed)
+    except (ValueError, TypeError) as error:
+        if not any(sign in str(error) for sign in _OLD_SIGNS):
+            raise
+        old = (
+            f"{env}.step() or reset() does not return what Gymnasium's do ({error}). With a single "
+            "'done', a time-out cannot be told from a failure. Return (obs, reward, terminated, "
+            "truncated, info), and (obs, info) from reset(seed=..., options=...)."
+        )
+        return [old], [], Seen([], 0, False)
+    problems = _only_in_info(seen) + _looks_like_a_limit(seen, limit)
+    problems += _never_acts([limits_of(env)], env, seen) + _nothing_ended(seen)
+    return problems, [] if problems else _unseen(seen, limit), seen
+
+
+def _of_vec_env(env: VecEnv, n_steps: int | None, seed: int) -> tuple[list, list, Seen]:
+    stacks, copies = _stacks(env)
+    known = [min(map(_steps_of, stack)) for stack in stacks if stack]
+    limit = max(filter(None, known or map(step_limit_of, copies)), default=None)
+    seen = ends_of_vec_env(env, n_steps or env.num_envs * 4 * (limit or _USUAL // 4), seed)
+    problems = _missing_keys(seen) + _lost_observations(env, seen)
+    if _tells_time_outs(seen):
+        problems += _looks_like_a_limit(seen, limit) + _never_acts(stacks, env, seen)
+    problems += _nothing_ended(seen)
+    return problems, [] if problems else _unseen(seen, limit), seen
+
+
+def _of_vector_env(env: VectorEnv, n_steps: int | None, seed: int) -> TruncationReport:
+    seen = Seen([], 0, False)
+    try:
+        adapted = GymnasiumVecEnv(env)
+        problems, notes, seen = _of_vec_env(adapted, n_steps, seed)
+    except (ParameterError, RuntimeError) as error:
+        return TruncationReport(_subject(env, seen), [str(error)], [])
+    if adapted.autoreset_mode is AutoresetMode.NEXT_STEP:
+        notes.append(
+            "In NEXT_STEP mode the step after an end ignores the action and is no transition. "
+            "GymnasiumVecEnv(env) leaves it out; a learner of your own must, too."
+        )
+    return TruncationReport(_subject(env, seen), problems, notes)
+
+
+def _only_in_info(seen: Seen) -> list[str]:
+    n = sum(end.terminated and bool(end.told.get("TimeLimit.truncated")) for end in seen.ends)
+    if not n:
+        return []
+    return [
+        f"{counted(n, 'time-out')} of {counted(len(seen.ends), 'end')} stood only in "
+        "info['TimeLimit.truncated'], and step() returned terminated=True. SB3 writes this entry "
+        "itself, from what step() returns, so the time-out is taken for a failure. Return "
+        "truncated=True and terminated=False."
+    ]
+
+
+def _looks_like_a_limit(seen: Seen, limit: int | None) -> list[str]:
+    """Ends that are terminations and come after the same number of steps."""
+    longest = max((end.length for end in seen.ends), default=0)
+    lengths = Counter(end.length for end in seen.ends if end.terminated)
+    n, at_end = lengths[longest], [end for end in seen.ends if end.length == longest]
+    often = n >= _FEWEST and (2 * n >= lengths.total() or _stands_out(lengths, longest))
+    # An episode of one step has no time to run out.
+    if longest < 2 or not (often or (longest == limit and n > 1)) or seen.clock:
+        return []
+    if not all(end.terminated for end in at_end):
+        return []
+    return [
+        f"{n} of {counted(len(seen.ends), 'episode')} ended as terminations after exactly "
+        f"{longest} steps. That looks like a time limit: the learner will take states that are "
+        "worth something for worth nothing. Return truncated=True, terminated=False there, or use "
+        f"sb3_hds.wrappers.InfiniteHorizon(env, max_episode_steps={longest}). If the task really "
+        "is over then, let observations tell the time: sb3_hds.wrappers.TimeAware."
+    ]
+
+
+def _never_acts(stacks: list[list[Limit]], env: Any, seen: Seen) -> list[str]:
+    """A limit around a shorter one, which ends every episode before."""
+    found = [pair for stack in stacks if (pair := _outrun(stack)) is not None]
+    if found:
+        outer, inner = found[0]
+        where = f" (in {len(found)} of {len(stacks)} copies)" if len(stacks) > 1 else ""
+        what = f"The limit of {outer} never acts{where}: that of {inner} inside it comes first."
+    else:
+        outer = min((stack[0] for stack in stacks if stack), key=_steps_of, default=None)
+        cut = Counter(end.length for end in seen.ends if not end.terminated)
+        longest = max((end.length for end in seen.ends), default=0)
+        n = cut[longest]
+        if outer is None or longest >= outer.steps or n < _FEWEST or 2 * n < cut.total():
+            return []
+        what = (
+            f"{n} of {counted(len(seen.ends), 'episode')} were cut after exactly {longest} steps, "
+            f"by something inside: the limit of {outer} never acts."
+        )
+    spec = getattr(env, "spec", None)
+    made = f"gymnasium.make('{spec.id}'" if spec is not None else "gymnasium.make(id"
+    return [
+        f"{what} Episodes are shorter than was asked for. Set the limit where the environment is "
+        f"made, as {made}, max_episode_steps={outer.steps}), or leave one of them out."
+    ]
+
+
+def _outrun(stack: list[Limit]) -> tuple[Limit, Limit] | None:
+    """:return: the first limit around a shorter one, and the shortest one inside it"""
+    for i, outer in enumerate(stack):
+        inner = min(stack[i:], key=_steps_of)
+        if inner.steps < outer.steps:
+            return outer, inner
+    return None
+
+
+def _steps_of(limit: Limit) -> int:
+    return limit.steps
+
+
+def _stands_out(lengths: Counter, longest: int) -> bool:
+    """Whether far more episodes ended at the longest length than failures alone would have it."""
+    n, earlier = lengths[longest], {k: m for k, m in lengths.items() if k < longest}
+    before = max((m for k, m in earlier.items() if k >= 0.8 * longest), default=0)
+    return n >= max(_THAN_BEFORE * before, _THAN_ANY * max(earlier.values(), default=0))
+
+
+def _tells_time_outs(seen: Seen) -> bool:
+    """Whether each end, or at least each time-out, is told; SB3 reads nothing as False."""
+    told = [end.told.get("TimeLimit.truncated") for end in seen.ends]
+    return any(told) or None not in told
+
+
+def _missing_keys(seen: Seen) -> list[str]:
+    problems = []
+    n = sum("TimeLimit.truncated" not in end.told for end in seen.ends)
+    if n and not _tells_time_outs(seen):
+        problems.append(
+            f"In {n} of {counted(len(seen.ends), 'end')}, infos[i] had no 'TimeLimit.truncated'. "
+            "SB3 takes such an end for a termination, time-outs included. The VecEnv must set it "
+            "in every step to `truncated and not terminated`."
+        )
+    n = sum(end.last_obs is None for end in seen.ends)
+    if n:
+        problems.append(
+            f"In {n} of {counted(len(seen.ends), 'end')}, infos[i] had no 'terminal_observation'. "
+            "SB3 then stores the first observation of the next episode as where the step led. The "
+            "VecEnv must put the last observation there when it resets a copy by itself."
+        )
+    return problems
+
+
+def _lost_observations(env: VecEnv, seen: Seen) -> list[str]:
+    """Last observations that cannot be what they should be."""
+    told = [end for end in seen.ends if end.last_obs is not None]
+    strange = [end for end in told if not _fits(env, end.last_obs)]
+    if strange:
+        return [
+            f"In {len(strange)} of {counted(len(told), 'end')}, infos[i]['terminal_observation'] "
+            f"was {_shape(strange[0].last_obs)} instead of one observation of "
+            f"{env.observation_space}. Put the row of that copy there."
+        ]
+    # Where all episodes begin alike, an episode may as well end where it began.
+    starts_differ = any(not is_same(end.first_obs, told[0].first_obs) for end in told)
+    n = sum(is_same(end.last_obs, end.first_obs) for end in told)
+    if not starts_differ or n < len(told):
+        return []
+    return [
+        f"In {n} of {counted(len(told), 'end')}, infos[i]['terminal_observation'] was what step() "
+        "returned as well: it is either the first observation of the next episode, whose value "
+        "has nothing to do with the step before, or the copy was not reset. Keep the last "
+        "observation before resetting, and return the first one of the next episode."
+    ]
+
+
+def _nothing_ended(seen: Seen) -> list[str]:
+    if seen.ends:
+        return []
+    return [
+        f"No episode ended in {seen.n_steps} steps, so it is not known how a time-out arrives. "
+        "Pass more n_steps=; or, if nothing ever ends it, cut episodes: "
+        "gymnasium.wrappers.TimeLimit(env, max_episode_steps=...)."
+    ]
+
+
+def _unseen(seen: Seen, limit: int | None) -> list[str]:
+    if not all(end.terminated for end in seen.ends):
+        return []
+    late = sum(end.length >= (limit or math.inf) for end in seen.ends)
+    when = f", {late} of them at the limit of {limit} steps"
+    if not late:
+        when = f" before the limit of {limit} steps" if limit else ""
+    return [
+        f"No time-out was seen: all {counted(len(seen.ends), 'episode')} terminated{when}. How one "
+        "arrives has not been checked."
+    ]
+
+
+def _stacks(env: VecEnv) -> tuple[list[list[Limit]], list[gymnasium.Env]]:
+    """:return: of each copy, the limits around it, outermost first; and copies in this process"""
+    bare, around = _unwrapped(env, VecEnvWrapper, "venv")
+    if isinstance(bare, GymnasiumVecEnv):
+        bare, more = _unwrapped(bare.env, VectorWrapper, "env")
+        around += more
+    if isinstance(bare, DummyVecEnv | SyncVectorEnv):
+        return [around + limits_of(copy) for copy in bare.envs], list(bare.envs)
+    return [around + (own_limit(bare, *_NAMES) or _asked(bare))], []
+
+
+def _unwrapped(env: Any, wrapper: type, inner: str) -> tuple[Any, list[Limit]]:
+    """:return: what the wrappers of a kind are around, and their limits"""
+    limits = []
+    while isinstance(env, wrapper):
+        limits += own_limit(env, *_NAMES)
+        env = getattr(env, inner)
+    return env, limits
+
+
+def _asked(env: Any) -> list[Limit]:
+    """What copies in processes of their own say, of which the outermost wrapper answers first."""
+    try:
+        if isinstance(env, AsyncVectorEnv):
+            # Asked for what they do not have, they end.
+            has_some = all(env.call("has_wrapper_attr", _NAMES[0]))
+        else:
+            has_some = env.has_attr(_NAMES[0])
+        steps = max(env.get_attr(_NAMES[0])) if has_some else None
+    except (AttributeError, NotImplementedError, TypeError, ValueError):
+        return []
+    return [Limit("the outermost wrapper", steps)] if isinstance(steps, int) and steps > 0 else []
+
+
+def _fits(env: VecEnv, obs: Any) -> bool:
+    space = env.observation_space
+    if isinstance(space, gymnasium.spaces.Dict):
+        return isinstance(obs, dict) and obs.keys() == space.spaces.keys()
+    return np.shape(obs) == (space.shape or ())
+
+
+def _shape(obs: Any) -> str:
+    return type(obs).__name__ if isinstance(obs, dict) else f"of shape {np.shape(obs)}"
+
+
+def _subject(env: Any, seen: Seen) -> str:
+    ends: list[End] = seen.ends
+    n_cut = sum(not end.terminated for end in ends)
+    return (
+        f"Truncation of {name_of(env)}: in {counted(seen.n_steps, 'step')}, {n_cut} truncated and "
+        f"{counted(len(ends) - n_cut, 'terminated episode')}"
+    )

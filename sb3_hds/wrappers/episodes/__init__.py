@@ -1,0 +1,1 @@
+"""Wrappers that set when an episode ends, and how the next one begins."""

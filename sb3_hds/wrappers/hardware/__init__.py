@@ -1,0 +1,1 @@
+"""Wrappers for a real machine: its clock, its log, and pushes."""

@@ -1,0 +1,1 @@
+"""Wrappers that keep commands and states within limits."""

@@ -1,0 +1,232 @@
+"""A task in phases, each with few inputs and its own constraints."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from sb3_hds.core import Channel
+from sb3_hds.errors import ParameterError, SafetyError
+from sb3_hds.wrappers.action_layer import ActionLayer, is_vector, with_channels
+from sb3_hds.wrappers.by_name import function_of
+from sb3_hds.wrappers.safety.barrier import refuse_layers_below
+from sb3_hds.wrappers.safety.projection import Constraints, ConstraintSet, condition_of, nearest
+
+
+@dataclasses.dataclass(frozen=True)
+class Phase:
+    """
+    One phase of a task.
+
+    :param name: unique within the template
+    :param mapping: from inputs to commands, a matrix of shape ``(n_commands, n_inputs)``; or a
+        function of the observation that returns one, or its name ``"package.module.function"``
+    :param offset: command for inputs of zero, shape ``(n_commands,)``; default: zero
+    :param constraints: active in this phase, as :class:`ActionShield` takes them; None: none
+    :param transitions: ``{"to": NAME, "when": CONDITION}``, the first that holds after a step
+        counts. A condition is a function of the observation, its name, or ``{"channel": INDEX,
+        "above": VALUE}`` (or ``"below"``)
+    """
+
+    name: str
+    mapping: Any
+    offset: Sequence[float] | None = None
+    constraints: Constraints | None = None
+    transitions: Sequence[Mapping[str, Any]] = ()
+
+
+class SharedControlTemplate(ActionLayer):
+    r"""
+    A finite-state description of a task. In each phase, a few inputs in [-1, 1] are mapped to
+    commands, :math:`u = M(o)\,a + c`, and projected onto the constraints of the phase; conditions
+    on observations lead from phase to phase. So a policy learns only what is left to learn, and
+    constraints are kept instead of rewarded.
+
+    The phase is appended to observations, one entry for each, 1 for the present one.
+    ``info["phase"]`` is its name. Learners store what they chose: a command has no unique input.
+
+    Assumes that some command is allowed at every observation of a phase. It has to be next to the
+    environment: any layer below would change what it decided.
+
+    Source: the idea of shared control templates as in Quere et al., *Shared control templates for
+    assistive robotics*, ICRA 2020, and Padalkar et al., *Guiding reinforcement learning with shared
+    control templates*, ICRA 2023; this is a description of its own, for linear constraints.
+
+    :param env: observes a Box with one axis, takes a bounded one
+    :param phases: the first is where an episode begins; a :class:`Phase` each, or its arguments
+    :param observe_state: whether the phase is appended; without it, the task is not Markov
+    :param store: ``"raw"``
+    :raises ParameterError: for phases that do not fit each other or the environment
+    """
+
+    stores: ClassVar[tuple[str, ...]] = ("raw",)
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        phases: Sequence[Phase | Mapping[str, Any]],
+        *,
+        observe_state: bool = True,
+        store: str = "raw",
+    ) -> None:
+        arguments = {"phases": phases, "observe_state": observe_state, "store": store}
+        refuse_layers_below(type(self), env)
+        super().__init__(env, store, arguments)
+        self.phases = [_phase_of(phase) for phase in phases]
+        self._observes, self._index, self._seen = observe_state, 0, None
+        self._violated = 0.0
+        self._phase_of = {phase.name: i for i, phase in enumerate(self.phases)}
+        if len(self._phase_of) != len(self.phases) or not self.phases:
+            raise ParameterError(
+                f"Phases need names of their own: {[p.name for p in self.phases]}."
+            )
+        self._parts = [_Compiled(phase, env, self._phase_of) for phase in self.phases]
+        n_inputs = {part.n_inputs for part in self._parts if part.n_inputs is not None}
+        if len(n_inputs) != 1:
+            raise ParameterError(
+                f"All phases must map the same number of inputs, got {sorted(n_inputs)}: fill "
+                "mappings up with columns of zeros, and give one phase at least a constant one."
+            )
+        self.action_space = spaces.Box(-1.0, 1.0, (n_inputs.pop(),), np.float32)
+        if observe_state:
+            flags = tuple(Channel(f"phase {phase.name}", "1", 0.0, 1.0) for phase in self.phases)
+            self.observation_space = with_channels(self, env.observation_space, flags)
+
+    @property
+    def phase(self) -> str:
+        """Name of the present phase."""
+        return self.phases[self._index].name
+
+    def nominal(self, action: np.ndarray) -> np.ndarray:
+        part = self._parts[self._index]
+        command = part.matrix(self._seen) @ np.clip(action, -1.0, 1.0) + part.offset
+        return np.clip(command, self.commands.low, self.commands.high)
+
+    def decide(self, action: np.ndarray) -> np.ndarray:
+        wanted, part = self.nominal(action), self._parts[self._index]
+        if part.constraints is None:
+            return wanted
+        ends = self.commands.low.astype(float), self.commands.high.astype(float)
+        command = nearest(wanted, *part.constraints.at(self._seen), *ends)
+        if command is None:
+            raise SafetyError(
+                f"No command satisfies the constraints of phase '{self.phase}' at the observation "
+                f"{self._seen}. Loosen them, or leave the phase before."
+            )
+        return command
+
+    def begin(self, obs: Any) -> None:
+        super().begin(obs)
+        self._index, self._violated = 0, 0.0
+        self._move_on(obs)
+
+    def arrive(self, obs: Any, command: np.ndarray) -> None:
+        super().arrive(obs, command)
+        constraints, self._violated = self._parts[self._index].constraints, 0.0
+        if constraints is not None:
+            G, h = constraints.at(self._seen)
+            self._violated = float(np.clip(G @ command - h, 0.0, None).sum())
+        self._move_on(obs)
+
+    def seen(self, obs: Any) -> Any:
+        if not self._observes:
+            return obs
+        flags = np.arange(len(self.phases)) == self._index
+        return np.concatenate([obs, flags]).astype(self.observation_space.dtype)
+
+    def cost(self) -> float:
+        return self._violated
+
+    def told(self) -> dict[str, Any]:
+        return {"phase": self.phase}
+
+    def _move_on(self, obs: Any) -> None:
+        self._seen = obs
+        for condition, following in self._parts[self._index].transitions:
+            if condition(obs):
+                self._index = following
+                return
+
+
+def _phase_of(given: Any) -> Phase:
+    """:raises ParameterError: for arguments that a phase does not have"""
+    if isinstance(given, Phase):
+        return given
+    names = [field.name for field in dataclasses.fields(Phase)]
+    found = set(given) if isinstance(given, Mapping) else set()
+    if not {"name", "mapping"} <= found <= set(names):
+        raise ParameterError(
+            f"A phase is a dictionary with 'name' and 'mapping' and, if needed, "
+            f"{', '.join(map(repr, names[2:]))}, got {given!r}."
+        )
+    return Phase(**given)
+
+
+class _Compiled:
+    """A phase whose names have become functions and indices."""
+
+    def __init__(self, phase: Phase, env: gymnasium.Env, phases: Mapping[str, int]) -> None:
+        assert env.action_space.shape is not None
+        self._n = env.action_space.shape[0]
+        self._phase = phase.name
+        self._mapping = (
+            function_of(phase.mapping) if isinstance(phase.mapping, str) else phase.mapping
+        )
+        fixed = None if callable(self._mapping) else self._checked(self._mapping, ParameterError)
+        self._fixed, self.n_inputs = fixed, None if fixed is None else fixed.shape[1]
+        self.offset = np.zeros(self._n) if phase.offset is None else np.array(phase.offset, float)
+        if self.offset.shape != (self._n,):
+            raise ParameterError(
+                f"Phase '{phase.name}' has the offset {phase.offset!r} for {self._n} commands."
+            )
+        self.constraints: ConstraintSet | None = None
+        if phase.constraints is not None:
+            label = f"Phase '{phase.name}'"
+            self.constraints = ConstraintSet(label, phase.constraints, self._n)
+            self._refuse_what_nothing_satisfies(env.action_space)
+        seen = env.observation_space
+        n_obs = seen.shape[0] if isinstance(seen, spaces.Box) and is_vector(seen) else 0
+        for transition in phase.transitions:
+            if not isinstance(transition, Mapping) or set(transition) != {"to", "when"}:
+                raise ParameterError(
+                    f"Phase '{phase.name}' has the transition {transition!r}: it needs 'to', the "
+                    "name of a phase, and 'when', a condition, and nothing else."
+                )
+        unknown = [t["to"] for t in phase.transitions if t["to"] not in phases]
+        if unknown:
+            raise ParameterError(
+                f"Phase '{phase.name}' leads to {unknown}, but there are: {list(phases)}."
+            )
+        self.transitions = [
+            (condition_of(t["when"], n_obs), phases[t["to"]]) for t in phase.transitions
+        ]
+
+    def _refuse_what_nothing_satisfies(self, commands: spaces.Space) -> None:
+        assert isinstance(commands, spaces.Box) and self.constraints is not None
+        if not self.constraints.is_constant:
+            return
+        ends = commands.low.astype(float), commands.high.astype(float)
+        if nearest(np.zeros(self._n), *self.constraints.at(None), *ends) is None:
+            raise ParameterError(
+                f"No command between {ends[0].tolist()} and {ends[1].tolist()} satisfies the "
+                f"constraints of phase '{self._phase}'."
+            )
+
+    def matrix(self, obs: Any) -> np.ndarray:
+        """:return: from inputs to commands, shape ``(n_commands, n_inputs)``"""
+        return self._checked(self._mapping(obs), ValueError) if self._fixed is None else self._fixed
+
+    def _checked(self, matrix: Any, error: type[Exception]) -> np.ndarray:
+        try:
+            found = np.asarray(matrix, float)
+        except (TypeError, ValueError):
+            found = np.empty(())
+        if found.ndim != 2 or len(found) != self._n or not np.isfinite(found).all():
+            raise error(
+                f"Phase '{self._phase}' needs a finite mapping of shape ({self._n}, n_inputs), got "
+                f"{matrix!r}."
+            )
+        return found

@@ -1,0 +1,133 @@
+"""Commands that coupled constraints allow."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from sb3_hds.errors import ParameterError, SafetyError
+from sb3_hds.wrappers.action_layer import ActionLayer
+from sb3_hds.wrappers.by_name import function_of
+from sb3_hds.wrappers.safety.barrier import check_on_breach, refuse_layers_below, report_breach
+from sb3_hds.wrappers.safety.projection import Constraints, ConstraintSet, nearest
+
+# How far a guard may be below zero because of single precision, without being a breach.
+_ROUNDING = 1e-5
+
+
+class ActionShield(ActionLayer):
+    r"""
+    The command is the one nearest to the action among those that linear constraints allow:
+
+    .. math:: \min_u |u - a|^2 \quad \text{s.t.}\quad G(o)\,u \le h(o),\ u \in \text{Box}
+
+    With :math:`G = -\partial b / \partial q\,\Delta t` and :math:`h = \gamma\, b(o)`, that keeps
+    :math:`b \ge 0` for joints commanded by their speed, exactly where :math:`b` is linear: several
+    limits, walls and joint combinations at once. For limits of single joints,
+    :class:`JointLimitBarrier` is the closed form.
+
+    Assumes that some command is allowed at every observation, and that what is allowed is safe. The
+    first is checked at construction where constraints are constant, and at every step; the second
+    at every reset and step, where a ``guard`` says what safe means. It has to be next to the
+    environment: any layer below would change what it decided.
+
+    ``info["constraint_cost"]`` is how far guards are below zero, summed, or without one, by how
+    much the executed command violates the constraints; ``info["infeasible"]`` is whether no command
+    was allowed.
+
+    Source: Ames et al., *Control barrier functions: theory and applications*, ECC 2019, section II.
+
+    :param env: its actions are a bounded Box with one axis
+    :param constraints: ``(G, h)``; or a function of the observation that returns them, or its name
+        ``"package.module.function"``
+    :param guard: function of the observation that returns what must stay at least 0, shape
+        ``(k,)``; or its name
+    :param fallback: the command where none is allowed, for example the one that stops; None raises
+    :param on_breach: what to do where a guard is negative: ``"raise"``, ``"warn"`` or ``"ignore"``
+    :param store: ``"executed"``: learners store the command
+    :raises ParameterError: for constraints of the wrong shape, constant ones that contradict each
+        other, or another layer below
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        constraints: Constraints,
+        *,
+        guard: Callable[[Any], Any] | str | None = None,
+        fallback: Sequence[float] | None = None,
+        on_breach: str = "raise",
+        store: str = "raw",
+    ) -> None:
+        arguments = {
+            "constraints": constraints,
+            "guard": guard,
+            "fallback": fallback,
+            "on_breach": on_breach,
+            "store": store,
+        }
+        refuse_layers_below(type(self), env)
+        super().__init__(env, store, arguments)
+        self._low, self._high = (x.astype(float) for x in (self.commands.low, self.commands.high))
+        self._constraints = ConstraintSet(type(self).__name__, constraints, self._low.size)
+        self._guard = function_of(guard) if isinstance(guard, str) else guard
+        self._on_breach = check_on_breach(type(self), on_breach)
+        self._fallback = None if fallback is None else self._checked(fallback)
+        self._margins, self._violated, self._infeasible = np.zeros(0), 0.0, False
+        self._seen: Any = None
+        if self._constraints.is_constant and self._project(self._low, None) is None:
+            raise ParameterError(
+                "ActionShield has constraints that no command within the limits satisfies: "
+                f"{constraints!r}."
+            )
+
+    def decide(self, action: np.ndarray) -> np.ndarray:
+        command = self._project(action, self._seen)
+        self._infeasible = command is None
+        if command is not None:
+            return command
+        if self._fallback is None:
+            raise SafetyError(
+                f"No command satisfies the constraints at the observation {self._seen}. Loosen "
+                "them, or pass a fallback: the command that is executed then."
+            )
+        return self._fallback
+
+    def begin(self, obs: Any) -> None:
+        super().begin(obs)
+        self._violated, self._infeasible = 0.0, False
+        self._look(obs)
+
+    def arrive(self, obs: Any, command: np.ndarray) -> None:
+        super().arrive(obs, command)
+        G, h = self._constraints.at(self._seen)
+        self._violated = float(np.clip(G @ command - h, 0.0, None).sum())
+        self._look(obs)
+
+    def cost(self) -> float:
+        return float(-self._margins.clip(None, 0.0).sum()) if self._guard else self._violated
+
+    def told(self) -> dict[str, Any]:
+        return {"infeasible": self._infeasible}
+
+    def _look(self, obs: Any) -> None:
+        self._seen = obs
+        if self._guard is None:
+            return
+        self._margins = np.atleast_1d(np.asarray(self._guard(obs), float))
+        if not np.all(self._margins >= -_ROUNDING):
+            report_breach(
+                self._on_breach,
+                f"What ActionShield guards is {self._margins.min():.3g}, below zero, at the "
+                f"observation {obs}: its constraints do not keep it, or the episode began there.",
+            )
+
+    def _project(self, action: np.ndarray, obs: Any) -> np.ndarray | None:
+        return nearest(action, *self._constraints.at(obs), self._low, self._high)
+
+    def _checked(self, fallback: Sequence[float]) -> np.ndarray:
+        command = np.asarray(fallback, float)
+        if not self.commands.contains(command.astype(self.commands.dtype)):
+            raise ParameterError(f"fallback must be a command within {self.commands}: {fallback}.")
+        return command
