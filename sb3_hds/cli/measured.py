@@ -3,22 +3,15 @@
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from sb3_hds.cli import model_files
+from sb3_hds.cli.columns import loaded
 from sb3_hds.cli.settings import settings
 
 if TYPE_CHECKING:
     from sb3_hds.core import Trajectories, Twin
-
-_COLUMNS = """Say what the columns mean in a yml file, --columns map.yml:
-
-    time: NAME                               # or {column: NAME, unit: ms}, or dt: SECONDS
-    obs: [NAME, {column: NAME, unit: deg}]   # in the order of 'sb3-hds twins'
-    actions: [NAME]
-
-'sb3-hds columns FILE' prints what is in a log, and such a map to start from."""
 
 
 def add_arguments(command: argparse.ArgumentParser, *, twin_required: bool = True) -> None:
@@ -73,24 +66,6 @@ def question(given: argparse.Namespace) -> "tuple[Twin, Trajectories]":
 def data_of(given: argparse.Namespace) -> "Trajectories":
     """What ``--data`` names, under the map of ``--columns``."""
     return loaded(given, given.columns)
-
-
-def loaded(given: argparse.Namespace, columns: Any) -> "Trajectories":
-    """What ``--data`` names; what is wrong with the map of columns is said in yml."""
-    from sb3_hds.data import Trajectories
-    from sb3_hds.data.columns import FORM
-    from sb3_hds.data.load import WITHOUT_COLUMNS
-    from sb3_hds.errors import TrajectoryError
-
-    files: str | Sequence[str] = given.data[0] if len(given.data) == 1 else given.data
-    try:
-        return Trajectories.load(files, columns=columns)
-    except TrajectoryError as error:
-        told = str(error)
-        for python in (FORM, WITHOUT_COLUMNS):
-            if python in told:
-                told = told.replace(python, _COLUMNS)
-        raise TrajectoryError(told) from error
 
 
 def twin_of(given: argparse.Namespace) -> "Twin":

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from sb3_hds.cli.columns import loaded
 from sb3_hds.cli.settings import names, settings
 
 if TYPE_CHECKING:
@@ -57,7 +58,6 @@ def question(given: argparse.Namespace) -> "tuple[MechanismTwin, Trajectories]":
 
     :raises TrajectoryError: for signals of the twin that the log does not have by name
     """
-    from sb3_hds.cli.measured import loaded
     from sb3_hds.data.overview import names_in
 
     own = settings("--set", given.set)

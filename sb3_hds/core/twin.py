@@ -6,12 +6,13 @@ import math
 from collections.abc import Iterator, Mapping
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from sb3_hds.core.effect import Effect
 from sb3_hds.core.effect_chain import NO_EFFECTS, EffectChain
 from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.signals import Actuator, Channel, Joint
@@ -28,10 +29,6 @@ from sb3_hds.core.types import (
     Velocity,
 )
 from sb3_hds.errors import EffectError, ParameterError, TwinError, did_you_mean
-
-if TYPE_CHECKING:
-    from sb3_hds.core.effect import Effect
-
 
 # Not `typing.Self`: the checks that the tests install on annotations cannot read it.
 _Twin = TypeVar("_Twin", bound="Twin")
@@ -157,7 +154,7 @@ class Twin(abc.ABC):
         changed.dt, changed.substeps = float(dt), int(substeps)
         return changed
 
-    def extend(self, *effects: "Effect") -> "Twin":
+    def extend(self, *effects: Effect) -> "Twin":
         """:return: this twin plus ``effects``, in the order in which a signal meets them"""
         from sb3_hds.core.extended import ExtendedTwin
 
