@@ -7,16 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 from point_mass import linear_controller, point_mass_env, returns_of
-from small_models import (
-    EVERY_NAME,
-    OFF_POLICY,
-    PLANNERS,
-    SMALL,
-    greedy,
-    logged,
-    same,
-    small,
-)
+from small_models import EVERY_NAME, OFF_POLICY, PLANNERS, SMALL, greedy, logged, same, small
 from stable_baselines3.common import callbacks as of_sb3
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env

@@ -16,12 +16,7 @@ from sb3_hds.algos.bodies import Dropout
 from sb3_hds.algos.observations import flattener
 from sb3_hds.algos.off_policy import Trained
 from sb3_hds.algos.optimizers import optimizer_of
-from sb3_hds.algos.quantiles import (
-    all_targets,
-    sorted_by_columns,
-    sorted_by_rows,
-    target_by_target,
-)
+from sb3_hds.algos.quantiles import all_targets, sorted_by_columns, sorted_by_rows, target_by_target
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 

@@ -9,14 +9,7 @@ from free_mass import Mass
 from test_twin_contract import broken
 
 from sb3_hds import twins
-from sb3_hds.core import (
-    Parameter,
-    State,
-    TransformedTwin,
-    Twin,
-    rk4,
-    semi_implicit_euler,
-)
+from sb3_hds.core import Parameter, State, TransformedTwin, Twin, rk4, semi_implicit_euler
 from sb3_hds.core.transforms.filters import Delay
 from sb3_hds.effects import CoulombFriction, SensorBias
 from sb3_hds.twins.mechanics import Points, check_mechanics

@@ -15,15 +15,7 @@ from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.numerics.integrators import Integrator, semi_implicit_euler
 from sb3_hds.core.numerics.linear import solve_spd
 from sb3_hds.core.twin import State, Twin
-from sb3_hds.core.types import (
-    Action,
-    Coordinates,
-    Force,
-    MassMatrix,
-    Params,
-    Position,
-    Velocity,
-)
+from sb3_hds.core.types import Action, Coordinates, Force, MassMatrix, Params, Position, Velocity
 
 # Turns of a rotary joint at which its load is asked for: at one of them gravity pulls hard.
 _TURNS = (0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi)

@@ -16,16 +16,7 @@ from sb3_hds.core.effect_chain import NO_EFFECTS, Attached, Chosen, EffectChain
 from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.transformed import TransformedTwin
 from sb3_hds.core.twin import State, Twin
-from sb3_hds.core.types import (
-    Action,
-    Coordinates,
-    Flag,
-    Obs,
-    Params,
-    Position,
-    Scalar,
-    Tangent,
-)
+from sb3_hds.core.types import Action, Coordinates, Flag, Obs, Params, Position, Scalar, Tangent
 from sb3_hds.errors import EffectError
 
 

@@ -23,13 +23,7 @@ from sb3_hds.effects.nameless import ClearanceSpring, Hysteresis
 from sb3_hds.effects.names import effect_named
 from sb3_hds.effects.neural import NeuralForce, force_of
 from sb3_hds.effects.position import Cogging, ConstantForce, CubicStiffness, Stiffness
-from sb3_hds.effects.sensor import (
-    SensorBias,
-    SensorDelay,
-    SensorScale,
-    SignFlip,
-    reversed_joint,
-)
+from sb3_hds.effects.sensor import SensorBias, SensorDelay, SensorScale, SignFlip, reversed_joint
 from sb3_hds.effects.transmission import Backlash, JointElasticity
 
 # In the order in which a signal meets them: a bus, then the drive, then its motor; a sensor, then

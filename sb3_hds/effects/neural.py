@@ -11,20 +11,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from sb3_hds.core import (
-    Action,
-    Coordinates,
-    Force,
-    ForceEffect,
-    Memory,
-    Moment,
-    Parameter,
-    Params,
-    Scalar,
-    Velocity,
-)
+from sb3_hds.core import ForceEffect, Moment, Parameter
 from sb3_hds.core.trajectories.storage import read_npz, write_npz
 from sb3_hds.core.twin import layers_of
+from sb3_hds.core.types import Action, Coordinates, Force, Memory, Params, Scalar, Velocity
 from sb3_hds.errors import EffectError, TrajectoryError
 
 if TYPE_CHECKING:

@@ -5,16 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 
-from sb3_hds.core import (
-    Force,
-    ForceEffect,
-    Memory,
-    Moment,
-    Parameter,
-    Params,
-    Scalar,
-    solve_spd,
-)
+from sb3_hds.core import ForceEffect, Moment, Parameter, solve_spd
+from sb3_hds.core.types import Force, Memory, Params, Scalar
 from sb3_hds.effects.shapes import beyond
 from sb3_hds.errors import EffectError
 

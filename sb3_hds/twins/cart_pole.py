@@ -6,23 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core import (
-    Action,
-    Actuator,
-    Channel,
-    Force,
-    Joint,
-    MassMatrix,
-    Obs,
-    Parameter,
-    Params,
-    Position,
-    Scalar,
-    State,
-    Velocity,
-    rk4,
-    semi_implicit_euler,
-)
+from sb3_hds.core import Actuator, Channel, Joint, Parameter, State, rk4, semi_implicit_euler
+from sb3_hds.core.types import Action, Force, MassMatrix, Obs, Params, Position, Scalar, Velocity
 from sb3_hds.twins.rig import Rig
 
 _MAX_FORCE = 10.0  # [N]

@@ -5,18 +5,8 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from sb3_hds.core import (
-    Action,
-    Actuator,
-    Force,
-    Joint,
-    MassMatrix,
-    Parameter,
-    Params,
-    Position,
-    State,
-    Velocity,
-)
+from sb3_hds.core import Actuator, Joint, Parameter, State
+from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Velocity
 from sb3_hds.errors import ParameterError
 from sb3_hds.twins.rig import TILT, Rig, check_length
 

@@ -5,19 +5,8 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from sb3_hds.core import (
-    Action,
-    Actuator,
-    Force,
-    Joint,
-    MassMatrix,
-    Parameter,
-    Params,
-    Position,
-    Scalar,
-    State,
-    Velocity,
-)
+from sb3_hds.core import Actuator, Joint, Parameter, State
+from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Scalar, Velocity
 from sb3_hds.twins.rig import TILT, Rig, check_length
 
 

@@ -6,23 +6,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core import (
+from sb3_hds.core import Actuator, AnalyticTwin, Channel, Joint, Parameter, State, rk4
+from sb3_hds.core.types import (
     Action,
-    Actuator,
-    AnalyticTwin,
-    Channel,
     Flag,
     Force,
-    Joint,
     MassMatrix,
     Obs,
-    Parameter,
     Params,
     Position,
     Scalar,
-    State,
     Velocity,
-    rk4,
 )
 from sb3_hds.twins import cart_and_poles
 

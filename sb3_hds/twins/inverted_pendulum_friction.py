@@ -5,18 +5,8 @@ from typing import Any, Self
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from sb3_hds.core import (
-    Action,
-    Channel,
-    Flag,
-    Force,
-    Obs,
-    Params,
-    Position,
-    Scalar,
-    State,
-    Velocity,
-)
+from sb3_hds.core import Channel, State
+from sb3_hds.core.types import Action, Flag, Force, Obs, Params, Position, Scalar, Velocity
 from sb3_hds.twins.inverted_pendulum import InvertedPendulum
 
 _MAX_COMMAND = 3.0

@@ -6,23 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core import (
-    Action,
-    Actuator,
-    AnalyticTwin,
-    Channel,
-    Force,
-    Joint,
-    MassMatrix,
-    Obs,
-    Parameter,
-    Params,
-    Position,
-    Scalar,
-    State,
-    Velocity,
-    rk4,
-)
+from sb3_hds.core import Actuator, AnalyticTwin, Channel, Joint, Parameter, State, rk4
+from sb3_hds.core.types import Action, Force, MassMatrix, Obs, Params, Position, Scalar, Velocity
 from sb3_hds.errors import ParameterError
 
 _MAX_SPEED = 2.0  # [m/s]

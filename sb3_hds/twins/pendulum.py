@@ -6,22 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core import (
-    Action,
-    Actuator,
-    AnalyticTwin,
-    Channel,
-    Force,
-    Joint,
-    MassMatrix,
-    Obs,
-    Parameter,
-    Params,
-    Position,
-    Scalar,
-    State,
-    Velocity,
-)
+from sb3_hds.core import Actuator, AnalyticTwin, Channel, Joint, Parameter, State
+from sb3_hds.core.types import Action, Force, MassMatrix, Obs, Params, Position, Scalar, Velocity
 
 _MAX_SPEED = 8.0  # [rad/s]
 _MAX_TORQUE = 2.0  # [N m]

@@ -9,7 +9,17 @@ import numpy as np
 from jaxtyping import Float
 
 from sb3_hds.core.signals import Channel
-from sb3_hds.core.transforms.base import Signals, StatefulTransform, namespace, refuse_unless
+from sb3_hds.core.transforms.base import (
+    InnerAction,
+    InnerObs,
+    OuterAction,
+    Recalled,
+    Signals,
+    StatefulTransform,
+    like,
+    namespace,
+    refuse_unless,
+)
 from sb3_hds.core.transforms.filters import clipped
 from sb3_hds.errors import ParameterError
 
@@ -92,27 +102,23 @@ class Barrier(StatefulTransform):
             )
         return ()
 
-    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+    def start(self, obs: InnerObs, below: Signals) -> Recalled:
         return obs[:0]
 
     def act(
-        self,
-        action: Float[Any, " outer"],
-        obs: Float[Any, " obs"],
-        memory: Float[Any, " memory"],
-        below: Signals,
-    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
+    ) -> tuple[InnerAction, Recalled]:
         q, step = self.positions(obs), self.gain * self.dt
-        slowest = (self.share * (_like(q, self.low) - q) + self.tolerance) / step
-        fastest = (self.share * (_like(q, self.high) - q) - self.tolerance) / step
+        slowest = (self.share * (like(q, self.low) - q) + self.tolerance) / step
+        fastest = (self.share * (like(q, self.high) - q) - self.tolerance) / step
         # Which joint is behind each command; the last entry stands for none.
         joints = [self.action.index(i) if i in self.action else -1 for i in range(len(action))]
-        free = _like(q, [math.inf])
+        free = like(q, [math.inf])
         concatenate, order = namespace(q).concatenate, np.array(joints)
         lower, upper = concatenate([slowest, -free])[order], concatenate([fastest, free])[order]
         return clipped(clipped(action, below).clip(lower, upper), below), memory
 
-    def positions(self, obs: Float[Any, " obs"]) -> Float[Any, " joints"]:
+    def positions(self, obs: InnerObs) -> Float[Any, " joints"]:
         """:return: the positions of the guarded joints [rad] or [m]"""
         first, last = np.array([(_indices(p)[0], _indices(p)[-1]) for p in self.position]).T
         if np.all(first == last):
@@ -120,16 +126,12 @@ class Barrier(StatefulTransform):
         xp = namespace(obs)
         return xp.where(first == last, obs[first], xp.arctan2(obs[last], obs[first]))
 
-    def violation(self, obs: Float[Any, " obs"]) -> Any:
+    def violation(self, obs: InnerObs) -> Any:
         """:return: by how much the guarded joints are beyond their limits, summed"""
         q = self.positions(obs)
-        beyond = (_like(q, self.low) - q).clip(0.0) + (q - _like(q, self.high)).clip(0.0)
+        beyond = (like(q, self.low) - q).clip(0.0) + (q - like(q, self.high)).clip(0.0)
         return beyond.sum()
 
 
 def _indices(place: int | Sequence[int]) -> Sequence[int]:
     return (place,) if isinstance(place, int) else place
-
-
-def _like(array: Any, values: Sequence[float]) -> Any:
-    return namespace(array).asarray(np.array(values), dtype=array.dtype)

@@ -2,13 +2,20 @@
 
 import abc
 import dataclasses
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.core.signals import Actuator, Channel
 from sb3_hds.errors import ParameterError
+
+# Arrays of NumPy or JAX; "outer" is the policy's side of a wrapper, "inner" the side of the plant.
+OuterAction: TypeAlias = Float[Any, " outer"]
+InnerAction: TypeAlias = Float[Any, " inner"]
+InnerObs: TypeAlias = Float[Any, " obs"]
+Seen: TypeAlias = Float[Any, " seen"]
+Recalled: TypeAlias = Float[Any, " memory"]
 
 
 class Signals(NamedTuple):
@@ -124,28 +131,18 @@ class StatefulTransform(abc.ABC):
 
     @abc.abstractmethod
     def act(
-        self,
-        action: Float[Any, " outer"],
-        obs: Float[Any, " obs"],
-        memory: Float[Any, " memory"],
-        below: Signals,
-    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
+    ) -> tuple[InnerAction, Recalled]:
         """
         :param obs: what is observed below when the action is chosen
         :return: the command, and the memory after it
         """
 
     @abc.abstractmethod
-    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+    def start(self, obs: InnerObs, below: Signals) -> Recalled:
         """:return: the memory at the start of an episode that begins with ``obs``"""
 
-    def cost(
-        self,
-        action: Float[Any, " outer"],
-        obs: Float[Any, " obs"],
-        memory: Float[Any, " memory"],
-        below: Signals,
-    ) -> Any:
+    def cost(self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals) -> Any:
         """:return: what is taken off the reward of this step"""
         return 0.0
 
@@ -164,18 +161,19 @@ class StatefulTransform(abc.ABC):
         """:return: a memory that an episode of a twin may begin with"""
         return self.start(obs, below)
 
-    def observe(
-        self, obs: Float[Any, " obs"], memory: Float[Any, " memory"]
-    ) -> Float[Any, " seen"]:
+    def observe(self, obs: InnerObs, memory: Recalled) -> Seen:
         """:return: what the policy sees"""
         return namespace(obs).concatenate([obs, memory]) if self.observed else obs
 
-    def infer(
-        self, seen: Float[Any, " seen"], below: Signals
-    ) -> tuple[Float[Any, " obs"], Float[Any, " memory"]]:
+    def infer(self, seen: Seen, below: Signals) -> tuple[InnerObs, Recalled]:
         """:return: what is observed below and what is remembered; see ``observed``"""
         obs = seen[: len(below.channels)]
         return obs, seen[len(below.channels) :] if self.observed else self.start(obs, below)
+
+
+def like(array: Any, values: Any) -> Any:
+    """:return: the values as an array of the same library, in the same precision"""
+    return namespace(array).asarray(np.asarray(values), dtype=array.dtype)
 
 
 def namespace(array: Any) -> Any:

@@ -4,10 +4,17 @@ import dataclasses
 import math
 from typing import Any, ClassVar
 
-from jaxtyping import Float
-
 from sb3_hds.core.signals import Channel
-from sb3_hds.core.transforms.base import Signals, StatefulTransform, namespace, refuse_unless
+from sb3_hds.core.transforms.base import (
+    InnerAction,
+    InnerObs,
+    OuterAction,
+    Recalled,
+    Signals,
+    StatefulTransform,
+    namespace,
+    refuse_unless,
+)
 from sb3_hds.core.transforms.filters import clipped
 
 
@@ -36,23 +43,13 @@ class Continuity(StatefulTransform):
     def remembers(self, below: Signals) -> tuple[Channel, ...]:
         return tuple(Channel(f"last {a.name}", *a[1:]) for a in below.actuators)
 
-    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+    def start(self, obs: InnerObs, below: Signals) -> Recalled:
         return namespace(obs).asarray(below.rest(), dtype=obs.dtype)
 
     def act(
-        self,
-        action: Float[Any, " outer"],
-        obs: Float[Any, " obs"],
-        memory: Float[Any, " memory"],
-        below: Signals,
-    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
+    ) -> tuple[InnerAction, Recalled]:
         return action, clipped(action, below)
 
-    def cost(
-        self,
-        action: Float[Any, " outer"],
-        obs: Float[Any, " obs"],
-        memory: Float[Any, " memory"],
-        below: Signals,
-    ) -> Any:
+    def cost(self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals) -> Any:
         return self.weight * ((clipped(action, below) - memory) ** 2).sum()

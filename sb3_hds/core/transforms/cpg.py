@@ -9,7 +9,17 @@ import numpy as np
 from jaxtyping import Float
 
 from sb3_hds.core.signals import Actuator, Channel
-from sb3_hds.core.transforms.base import Signals, StatefulTransform, namespace, refuse_unless
+from sb3_hds.core.transforms.base import (
+    InnerAction,
+    InnerObs,
+    OuterAction,
+    Recalled,
+    Signals,
+    StatefulTransform,
+    like,
+    namespace,
+    refuse_unless,
+)
 from sb3_hds.core.transforms.filters import clipped
 from sb3_hds.core.transforms.oscillators import (
     AmplitudeState,
@@ -155,7 +165,7 @@ class Rhythm(StatefulTransform):
         rates = [Channel(f"rate of it / gain, {name}", "1", -width, width) for name in names]
         return (*clock, *radii, *rates)
 
-    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+    def start(self, obs: InnerObs, below: Signals) -> Recalled:
         radii, n = [], len(below.actuators)
         if self.mode == "parameters":
             radii = [0.5 * sum(self.amplitude_factor)] * n + [0.0] * n
@@ -168,28 +178,22 @@ class Rhythm(StatefulTransform):
         return tuple(Actuator(name, "1", -1.0, 1.0) for name in names)
 
     def act(
-        self,
-        action: Float[Any, " outer"],
-        obs: Float[Any, " obs"],
-        memory: Float[Any, " memory"],
-        below: Signals,
-    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
+    ) -> tuple[InnerAction, Recalled]:
         rhythm, chosen = self.sized(len(below.actuators)), action.clip(-1.0, 1.0)
         target, after = rhythm.target(chosen, memory)
         position, velocity = rhythm.joints_in(obs)
         return clipped(rhythm.command(chosen, target, position, velocity), below), after
 
     def joints_in(
-        self, obs: Float[Any, " obs"]
+        self, obs: InnerObs
     ) -> tuple[Float[Any, " act"] | None, Float[Any, " act"] | None]:
         """:return: positions and velocities that an observation shows; None where none are read"""
         if not self.position:
             return None, None
         return obs[np.array(self.position)], obs[np.array(self.velocity)]
 
-    def target(
-        self, action: Float[Any, " outer"], memory: Float[Any, " memory"]
-    ) -> tuple[Float[Any, " act"], Float[Any, " memory"]]:
+    def target(self, action: OuterAction, memory: Recalled) -> tuple[Float[Any, " act"], Recalled]:
         """
         Of a rhythm that is :meth:`sized`.
 
@@ -210,17 +214,17 @@ class Rhythm(StatefulTransform):
             settled = advance_amplitude(state, wanted, 0.0, dt, gain)
             after = xp.concatenate([settled.radius, settled.speed / gain])
         gone = (clock * cycle + 0.5 * rate * dt) % cycle
-        phase = advance_phase(_like(memory, self.phase), gone, self.omega_swing, self.omega_stance)
-        aim = radius * _like(memory, self.amplitude) * xp.sin(phase) + _like(memory, self.offset)
+        phase = advance_phase(like(memory, self.phase), gone, self.omega_swing, self.omega_stance)
+        aim = radius * like(memory, self.amplitude) * xp.sin(phase) + like(memory, self.offset)
         if self.mode == "offset":
-            aim = aim + _like(memory, self.action_range) * action
+            aim = aim + like(memory, self.action_range) * action
         turned = 2.0 * math.pi * (clock + rate * dt / cycle)
         shown = xp.stack([xp.sin(turned), xp.cos(turned)])
         return aim, xp.concatenate([shown, after]).astype(memory.dtype)
 
     def command(
         self,
-        action: Float[Any, " outer"],
+        action: OuterAction,
         target: Float[Any, " act"],
         position: Float[Any, " act"] | None,
         velocity: Float[Any, " act"] | None,
@@ -232,18 +236,13 @@ class Rhythm(StatefulTransform):
         """
         command = target
         if position is not None:
-            kp, kd = _like(target, self.kp), _like(target, self.kd)
+            kp, kd = like(target, self.kp), like(target, self.kd)
             command = kp * (target - position) - kd * velocity
         if self.mode == "residual":
-            command = command + _like(target, self.action_range) * action
+            command = command + like(target, self.action_range) * action
         return command
 
 
 def _within(share: Any, ends: Sequence[float]) -> Any:
     """From -1 to 1 onto an interval."""
     return ends[0] + 0.5 * (share + 1.0) * (ends[1] - ends[0])
-
-
-def _like(array: Any, values: Any) -> Any:
-    """The values where the array lives, in its precision."""
-    return namespace(array).asarray(values, dtype=array.dtype)

@@ -11,8 +11,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.core.signals import Channel
 from sb3_hds.core.transforms.base import (
+    InnerAction,
+    InnerObs,
+    OuterAction,
+    Recalled,
     Signals,
     StatefulTransform,
+    like,
     namespace,
     per_place,
     refuse_unless,
@@ -52,17 +57,13 @@ class RateLimit(StatefulTransform):
         per_place(self, "max_change", len(below.actuators), "actuators")
         return tuple(Channel(f"last {a.name}", *a[1:]) for a in below.actuators)
 
-    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+    def start(self, obs: InnerObs, below: Signals) -> Recalled:
         return namespace(obs).asarray(below.rest(), dtype=obs.dtype)
 
     def act(
-        self,
-        action: Float[Any, " outer"],
-        obs: Float[Any, " obs"],
-        memory: Float[Any, " memory"],
-        below: Signals,
-    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
-        most = _like(action, per_place(self, "max_change", len(below.actuators), "actuators"))
+        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
+    ) -> tuple[InnerAction, Recalled]:
+        most = like(action, per_place(self, "max_change", len(below.actuators), "actuators"))
         wanted = clipped(action, below)
         command = wanted.clip(memory - most, memory + most)
         return command, command
@@ -112,16 +113,12 @@ class LowPass(StatefulTransform):
             for a, m, w in zip(below.actuators, 0.5 * (low + high), swing[i] * half, strict=True)
         )
 
-    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
-        return _like(obs, np.outer(self._at_rest(), below.rest()).ravel())
+    def start(self, obs: InnerObs, below: Signals) -> Recalled:
+        return like(obs, np.outer(self._at_rest(), below.rest()).ravel())
 
     def act(
-        self,
-        action: Float[Any, " outer"],
-        obs: Float[Any, " obs"],
-        memory: Float[Any, " memory"],
-        below: Signals,
-    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
+    ) -> tuple[InnerAction, Recalled]:
         n, wanted = len(below.actuators), clipped(action, below)
         y, after = self._passed(wanted, [memory[i * n : (i + 1) * n] for i in range(self.order)])
         return clipped(y, below), namespace(action).concatenate(after)
@@ -184,16 +181,12 @@ class Delay(StatefulTransform):
             Channel(f"{a.name} in {i}", *a[1:]) for i in range(self.steps) for a in below.actuators
         )
 
-    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
-        return _like(obs, np.tile(below.rest(), self.steps))
+    def start(self, obs: InnerObs, below: Signals) -> Recalled:
+        return like(obs, np.tile(below.rest(), self.steps))
 
     def act(
-        self,
-        action: Float[Any, " outer"],
-        obs: Float[Any, " obs"],
-        memory: Float[Any, " memory"],
-        below: Signals,
-    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
+    ) -> tuple[InnerAction, Recalled]:
         n, queue = len(below.actuators), [memory, clipped(action, below)]
         return memory[:n], namespace(action).concatenate(queue)[n:]
 
@@ -241,8 +234,8 @@ class Scale(StatefulTransform):
         refuse_unless(self, "axes", fine, f"numbers of the {n} actuators, from 0 to {n - 1}")
         return (Channel("progress of the scale", "1", 0.0, 1.0),) if self.length else ()
 
-    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
-        return _like(obs, np.zeros(1 if self.length else 0))
+    def start(self, obs: InnerObs, below: Signals) -> Recalled:
+        return like(obs, np.zeros(1 if self.length else 0))
 
     def draw(
         self, key: PRNGKeyArray, obs: Float[Array, " obs"], below: Signals
@@ -250,35 +243,26 @@ class Scale(StatefulTransform):
         return jax.random.uniform(key, (1 if self.length else 0,), obs.dtype)
 
     def act(
-        self,
-        action: Float[Any, " outer"],
-        obs: Float[Any, " obs"],
-        memory: Float[Any, " memory"],
-        below: Signals,
-    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
-        middle = _like(action, 0.5 * np.sum(below.limits(), 0))
+        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
+    ) -> tuple[InnerAction, Recalled]:
+        middle = like(action, 0.5 * np.sum(below.limits(), 0))
         share = self.share(memory, len(below.actuators))
         command = middle + share * (clipped(action, below) - middle)
         return command, (memory + 1.0 / self.length).clip(0.0, 1.0) if self.length else memory
 
-    def share(self, memory: Float[Any, " memory"], n: int) -> Any:
+    def share(self, memory: Recalled, n: int) -> Any:
         """:return: of the range that each of ``n`` commands reaches now, or one for all"""
         share = self.schedule[0][1]
         if self.length:
             steps, shares = np.array(self.schedule).T
-            at = _like(memory, steps), _like(memory, shares)
+            at = like(memory, steps), like(memory, shares)
             share = namespace(memory).interp(memory * self.length, *at)
         if self.axes is None:
             return share
-        return 1.0 + _like(memory, np.isin(np.arange(n), self.axes)) * (share - 1.0)
+        return 1.0 + like(memory, np.isin(np.arange(n), self.axes)) * (share - 1.0)
 
 
 def clipped(command: Float[Any, " act"], below: Signals) -> Float[Any, " act"]:
     """:return: the command within the limits of the actuators below"""
     low, high = below.limits()
-    return command.clip(_like(command, low), _like(command, high))
-
-
-def _like(array: Any, values: np.ndarray) -> Any:
-    """The values where the array lives, in its precision."""
-    return namespace(array).asarray(values, dtype=array.dtype)
+    return command.clip(like(command, low), like(command, high))

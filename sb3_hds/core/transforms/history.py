@@ -1,13 +1,21 @@
 """What was seen and done before."""
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float
 
 from sb3_hds.core.signals import Actuator, Channel
-from sb3_hds.core.transforms.base import Signals, StatefulTransform, namespace, refuse_unless
+from sb3_hds.core.transforms.base import (
+    InnerAction,
+    InnerObs,
+    OuterAction,
+    Recalled,
+    Signals,
+    StatefulTransform,
+    namespace,
+    refuse_unless,
+)
 from sb3_hds.core.transforms.filters import clipped
 
 
@@ -40,16 +48,12 @@ class History(StatefulTransform):
             below.actuators, self.n_actions
         )
 
-    def start(self, obs: Float[Any, " obs"], below: Signals) -> Float[Any, " memory"]:
+    def start(self, obs: InnerObs, below: Signals) -> Recalled:
         return namespace(obs).zeros(len(self.remembers(below)), dtype=obs.dtype)
 
     def act(
-        self,
-        action: Float[Any, " outer"],
-        obs: Float[Any, " obs"],
-        memory: Float[Any, " memory"],
-        below: Signals,
-    ) -> tuple[Float[Any, " inner"], Float[Any, " memory"]]:
+        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
+    ) -> tuple[InnerAction, Recalled]:
         n_seen, n_done = self.n_observations * obs.shape[0], self.n_actions * action.shape[0]
         concatenate = namespace(action).concatenate
         seen = concatenate([obs, memory[:n_seen]])[:n_seen]

@@ -1,5 +1,5 @@
 r"""
-Oscillators that make gaits: functions of time, or of a state that is integrated.
+Oscillators that make gaits, in closed form.
 
 A phase moves fast in one half of its cycle and slowly in the other:
 
@@ -12,16 +12,12 @@ swing and stance, and are right on both sides.
 import math
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sb3_hds.core.types import Scalar
-from sb3_hds.errors import ParameterError
 
 PerJoint = Float[Array, " act"]
-PerLeg = Float[Array, " leg"]
-Offsets = Float[Array, "leg leg"]
 
 
 class Gait(NamedTuple):
@@ -89,55 +85,6 @@ def target_at(gait: Gait, time: Scalar | float) -> PerJoint:
     return gait.amplitude * jnp.sin(phase_at(gait, time)) + gait.offset
 
 
-class Hopf(NamedTuple):
-    r"""
-    Coupled Hopf oscillators, one for each leg:
-
-    .. math::
-
-        \dot r_i = \alpha (\mu - r_i^2) r_i, \qquad \dot\varphi_i = \omega(\varphi_i)
-        + \sum_j w_{ij}\, r_j \sin(\varphi_j - \varphi_i - \Phi_{ij})
-
-    with the frequency of swing or stance. Source: Righetti and Ijspeert, *Pattern generators with
-    sensory feedback for the control of quadruped locomotion*, ICRA 2008; in this form Raffin et
-    al., *Learning to exploit elastic actuators for quadruped locomotion*, 2022, equation 1.
-
-    :param omega_swing: [rad/s]
-    :param omega_stance: [rad/s]
-    :param offsets: :math:`\Phi_{ij}`, by how much leg j is ahead of leg i [rad], see :data:`LEADS`
-    :param coupling: :math:`w_{ij}`, how hard leg j pulls at leg i [1/s]: a matrix, or one number
-        for all pairs
-    :param alpha: how fast amplitudes settle [1/s]
-    :param mu: square of the amplitude they settle at
-    """
-
-    omega_swing: Scalar | float
-    omega_stance: Scalar | float
-    offsets: Offsets
-    coupling: Offsets | Scalar | float = 1.0
-    alpha: Scalar | float = 50.0
-    mu: Scalar | float = 1.0
-
-
-class HopfState(NamedTuple):
-    """
-    :param radius: amplitude of each oscillator
-    :param phase: of each [rad], not wrapped
-    """
-
-    radius: PerLeg
-    phase: PerLeg
-
-
-def coupling_offsets(lead: PerLeg) -> Offsets:
-    """
-    :param lead: phase of each leg in the wanted gait, up to one that all share [rad]
-    :return: :math:`\\Phi_{ij}` = lead of j minus lead of i: at rest exactly in that gait
-    """
-    lead = jnp.asarray(lead)
-    return lead[None, :] - lead[:, None]
-
-
 _HALF, _QUARTER = math.pi, 0.5 * math.pi
 
 #: phases of the legs front left, front right, hind left, hind right in each gait [rad]
@@ -147,48 +94,6 @@ LEADS: dict[str, tuple[float, float, float, float]] = {
     "bound": (0.0, 0.0, _HALF, _HALF),
     "walk": (0.0, _HALF, 3.0 * _QUARTER, _QUARTER),
 }
-
-
-def hopf_rate(state: HopfState, hopf: Hopf) -> HopfState:
-    """
-    :return: the time derivative of the state
-    :raises ParameterError: for weights that are neither one number nor one for each pair of legs
-    """
-    radius, phase = state
-    if jnp.shape(hopf.coupling) not in ((), hopf.offsets.shape):
-        raise ParameterError(
-            f"Hopf(coupling=...) has the shape {jnp.shape(hopf.coupling)}. Pass one number, or one "
-            f"for each pair of legs, of shape {hopf.offsets.shape}."
-        )
-    ahead = phase[None, :] - phase[:, None] - hopf.offsets
-    pull = jnp.sum(hopf.coupling * radius[None, :] * jnp.sin(ahead), axis=1)
-    omega = jnp.where(jnp.sin(phase) > 0.0, hopf.omega_swing, hopf.omega_stance)
-    return HopfState(hopf.alpha * (hopf.mu - radius**2) * radius, omega + pull)
-
-
-def advance_hopf(state: HopfState, hopf: Hopf, dt: float, substeps: int) -> HopfState:
-    """
-    Integrate by the classical Runge-Kutta method.
-
-    Where a phase changes over between swing and stance inside a sub-step of length h, it is off by
-    at most ``h |omega_swing - omega_stance|``, twice in each cycle; otherwise the error is of
-    fourth order.
-
-    :param dt: [s]
-    :param substeps: in ``dt``
-    :return: the state ``dt`` later
-    """
-    h = dt / substeps
-
-    def step(now: HopfState, _: None) -> tuple[HopfState, None]:
-        k1 = hopf_rate(now, hopf)
-        k2 = hopf_rate(_moved(now, k1, 0.5 * h), hopf)
-        k3 = hopf_rate(_moved(now, k2, 0.5 * h), hopf)
-        k4 = hopf_rate(_moved(now, k3, h), hopf)
-        rate = jax.tree.map(lambda a, b, c, d: (a + 2.0 * b + 2.0 * c + d) / 6.0, k1, k2, k3, k4)
-        return _moved(now, rate, h), None
-
-    return jax.lax.scan(step, state, None, substeps)[0]
 
 
 class AmplitudeState(NamedTuple):
@@ -237,7 +142,3 @@ def advance_amplitude(
     radius = mu + (error + slope * dt) * decay
     speed = (slope - k * (error + slope * dt)) * decay
     return AmplitudeState(radius, speed, (state.phase + omega * dt) % (2.0 * math.pi))
-
-
-def _moved(state: HopfState, rate: HopfState, h: float) -> HopfState:
-    return jax.tree.map(lambda x, dx: x + h * dx, state, rate)

@@ -12,38 +12,27 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core import (
+from sb3_hds.core import Actuator, AnalyticTwin, Channel, Joint, State, rk4, semi_implicit_euler
+from sb3_hds.core.types import (
     Action,
-    Actuator,
-    AnalyticTwin,
-    Channel,
+    Coordinates,
     Flag,
     Force,
-    Joint,
     MassMatrix,
     Obs,
     Params,
     Position,
     Scalar,
-    State,
     Tangent,
     Velocity,
-    rk4,
-    semi_implicit_euler,
 )
-from sb3_hds.core.types import Coordinates
 from sb3_hds.errors import ParameterError
 from sb3_hds.twins.mujoco import algebra as alg
 from sb3_hds.twins.mujoco.actuators import Actuation, Moving
 from sb3_hds.twins.mujoco.dynamics import frames_of
 from sb3_hds.twins.mujoco.equation import Equation
 from sb3_hds.twins.mujoco.mechanism import BALL, FREE, SLIDE, Link, Mechanism
-from sb3_hds.twins.mujoco.parameters import (
-    dof_names,
-    native_effects,
-    of_drives,
-    place_of,
-)
+from sb3_hds.twins.mujoco.parameters import dof_names, native_effects, of_drives, place_of
 from sb3_hds.twins.mujoco.quaternions import normalized, turn_between, turned
 
 # How far an episode begins from where the model stands [rad] or [m].
