@@ -10,7 +10,8 @@ import numpy as np
 from sb3_hds.core import AnalyticTwin, Effect, Trajectories, Twin
 from sb3_hds.core.twin import plant_of
 from sb3_hds.data import Audit, audit
-from sb3_hds.data.audit.findings import BackwardDifference, Glitches, Outliers
+from sb3_hds.data.audit.differences import BackwardDifference
+from sb3_hds.data.audit.outliers import Glitches, Outliers
 from sb3_hds.effects import NAMELESS as NAMELESS_EFFECTS
 from sb3_hds.sysid.account import (
     by_horizon,

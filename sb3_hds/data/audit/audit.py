@@ -10,24 +10,18 @@ from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.core.trajectories.episodes import same_interval
 from sb3_hds.core.twin import Twin
 from sb3_hds.data.audit import continuity
-from sb3_hds.data.audit.excitation import excitation, stillness_of
-from sb3_hds.data.audit.finding import Finding, Place
-from sb3_hds.data.audit.findings import (
-    Gaps,
-    JitteredStamps,
-    MissingRows,
-    Outliers,
-    RepeatedStamps,
-    StandingStill,
-    UnevenSampling,
-    WithinNoise,
-)
+from sb3_hds.data.audit.differences import backward_differences
+from sb3_hds.data.audit.excitation import StandingStill, WithinNoise, excitation, stillness_of
+from sb3_hds.data.audit.finding import Finding
 from sb3_hds.data.audit.limits import reached_limits
-from sb3_hds.data.audit.outliers import glitches, outliers
+from sb3_hds.data.audit.outliers import Outliers, glitches, outliers
 from sb3_hds.data.audit.results import Audit, ChannelSummary
-from sb3_hds.data.audit.stretches import Stretch, stretches_of
+from sb3_hds.data.audit.stretches import Stretch, joined, stretches_of
+from sb3_hds.data.audit.timing import (
+    timing,
+)
 from sb3_hds.data.audit.units import mistaken_units, other_units, swapped
-from sb3_hds.data.audit.velocity import backward_differences, matches_of, velocity_shifts
+from sb3_hds.data.audit.velocity import matches_of, velocity_shifts
 from sb3_hds.data.resampling.report import Reading
 from sb3_hds.data.resampling.resolution import resolutions
 from sb3_hds.errors import TrajectoryError
@@ -77,7 +71,7 @@ def audit(
     if not found:
         found += excitation(data, still, names, actions)
     unfit = any(isinstance(finding, Outliers | StandingStill | WithinNoise) for finding in found)
-    found += _sampling(data, report)
+    found += timing(data, report)
     if not unfit:
         matches = matches_of(data, names)
         found += [
@@ -92,7 +86,7 @@ def audit(
             *continuity.saturated(rows, names, resolution),
             *continuity.repeated_samples(rows, names, resolution),
         ]
-    values = np.concatenate([stretch.obs for stretch in rows])
+    values = joined(rows)
     summaries = tuple(
         ChannelSummary(
             channel.name,
@@ -152,57 +146,3 @@ def _beyond(rows: Sequence[Stretch], names: Sequence[str], resolution: np.ndarra
     found: list[Finding] = [*outliers(rows, names)]
     far = {finding.channel for finding in found}
     return [*found, *(f for f in glitches(rows, names, resolution) if f.channel not in far)]
-
-
-def _sampling(data: Trajectories, report: Reading | None) -> list[Finding]:
-    """What the time stamps of the recordings say that the data are from."""
-    if report is None:
-        return []
-    chosen = {o: i for i, o in reversed(list(enumerate(data.origin.tolist())))}
-    recordings = [(chosen[o], r) for o, r in enumerate(report.recordings) if o in chosen]
-    found: list[Finding] = []
-    uneven = [(i, r) for i, r in recordings if r.resampled and r.uneven]
-    if uneven:
-        n = sum(r.rows - 1 for _, r in uneven)
-        found.append(
-            UnevenSampling(
-                "time",
-                tuple(Place(r.source, 0, r.rows - 1, i) for i, r in uneven),
-                min(r.intervals[0] for _, r in uneven),
-                float(np.median([r.intervals[1] for _, r in uneven])),
-                max(r.intervals[2] for _, r in uneven),
-                sum(r.uneven for _, r in uneven) / n,
-            )
-        )
-    late = [(i, r) for i, r in recordings if r.clock == "late" and not r.resampled]
-    if late:
-        found.append(
-            JitteredStamps(
-                "time",
-                tuple(Place(r.source, k, k, i) for i, r in late for k in r.late),
-                sum(len(r.late) for _, r in late),
-                max(r.off for _, r in late),
-                max(r.jitter for _, r in late),
-            )
-        )
-    jittered = [(i, r) for i, r in recordings if r.clock == "jittered" and not r.resampled]
-    if jittered:
-        found.append(
-            JitteredStamps(
-                "time",
-                tuple(Place(r.source, 0, r.rows - 1, i) for i, r in jittered),
-                0,
-                max(r.off for _, r in jittered),
-                max(r.jitter for _, r in jittered),
-            )
-        )
-    holes = [(Place(r.source, k, k, i), n) for i, r in recordings for k, n in r.missing]
-    if holes:
-        found.append(MissingRows("time", tuple(p for p, _ in holes), sum(n for _, n in holes)))
-    stamps = tuple(Place(r.source, k, k, i) for i, r in recordings for k in r.repeated)
-    if stamps:
-        found.append(RepeatedStamps("time", stamps, len(stamps)))
-    gaps = [(Place(r.source, k, k, i), seconds) for i, r in recordings for k, seconds in r.gaps]
-    if gaps:
-        found.append(Gaps("time", tuple(place for place, _ in gaps), max(s for _, s in gaps)))
-    return found

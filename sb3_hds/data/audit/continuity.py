@@ -1,19 +1,13 @@
 """Values that no motion gives: repeated, stuck, cut off, put back."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from sb3_hds.data.audit.finding import Place
-from sb3_hds.data.audit.findings import (
-    DeadChannel,
-    ReinitialisedState,
-    RepeatedSamples,
-    SaturatedChannel,
-    StuckChannel,
-)
-from sb3_hds.data.audit.stretches import Stretch, runs
+from sb3_hds.data.audit.finding import Finding, Place, listed, percent
+from sb3_hds.data.audit.stretches import Stretch, joined, runs
 from sb3_hds.data.resampling.angles import whole_turns
 
 _STEPS = 8.0  # smallest steps per sample: slower motion repeats values because of quantisation
@@ -29,6 +23,93 @@ _LARGE = 0.2  # of the spread of a channel: what a jump exceeds
 _ISOLATED = 6.0  # times the steps around it
 _NEAR_START = 0.05  # of the spread of a channel
 _AT_START = 1e-6  # of the spread of a channel
+
+
+@dataclasses.dataclass(frozen=True)
+class RepeatedSamples(Finding):
+    """:param share: of the samples of a moving channel that repeat the one before"""
+
+    share: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' repeats its last value while it moves, in {percent(self.share)} of "
+            f"its moving samples ({listed(self.places)})."
+        )
+
+    remedy = "The sensor is read more often than it measures: log at its rate, or resample to it."
+
+
+@dataclasses.dataclass(frozen=True)
+class StuckChannel(Finding):
+    """:param value: at which the channel stays, in its unit"""
+
+    value: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' stays at exactly {self.value:.4g} while other channels move "
+            f"({listed(self.places)})."
+        )
+
+    remedy = "Check cable and driver of this sensor; leave the channel or these samples out."
+
+
+@dataclasses.dataclass(frozen=True)
+class DeadChannel(StuckChannel):
+    """In all recordings: whatever the twin has to predict of it, a wrong cause would do."""
+
+    blocks = True
+    remedy = "Check cable and driver of this sensor, or leave the channel out."
+
+
+@dataclasses.dataclass(frozen=True)
+class SaturatedChannel(Finding):
+    """
+    :param value: that the channel does not exceed, in its unit
+    :param share: of the samples that are there
+    """
+
+    value: float
+    share: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' is cut off at {self.value:.4g}: {percent(self.share)} of its "
+            f"samples are exactly there ({listed(self.places)})."
+        )
+
+    remedy = (
+        "Choose a larger range of the sensor, or leave these samples out. A mechanical stop looks "
+        "the same: then the twin needs one."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class ReinitialisedState(Finding):
+    """
+    :param to_start: whether the state jumps to where a recording begins
+    :param size: of the largest jump, in the unit of its channel
+    """
+
+    to_start: bool
+    size: float
+
+    @property
+    def sentence(self) -> str:
+        target = "to where a recording begins" if self.to_start else "as no motion does"
+        return (
+            f"'{self.channel}' jumps by up to {self.size:.3g} from one sample to the next, "
+            f"{target} ({listed(self.places)})."
+        )
+
+    remedy = (
+        "The system was put back inside the recording: audit.corrected(data) cuts there. Or name "
+        "the column that counts episodes when loading."
+    )
 
 
 def repeated_samples(
@@ -83,7 +164,7 @@ def saturated(
     """
     found = []
     usual = _usual_steps(stretches)
-    everything = np.concatenate([stretch.obs for stretch in stretches])
+    everything = joined(stretches)
     for j, name in enumerate(names):
         quantised = resolution[j] > 0.0
         shortest = _PLATEAU if quantised else 2
@@ -111,7 +192,7 @@ def stuck(
     """
     found = []
     usual = _usual_steps(stretches)
-    everything = np.concatenate([stretch.obs for stretch in stretches])
+    everything = joined(stretches)
     for j, name in enumerate(names):
         extremes = everything[:, j].min(), everything[:, j].max()
         if extremes[0] == extremes[1]:
@@ -194,7 +275,7 @@ class _Usual(NamedTuple):
     def of(cls, stretches: Sequence[Stretch]) -> "_Usual | None":
         steps = np.abs(np.concatenate([np.diff(stretch.obs, axis=0) for stretch in stretches]))
         moving = steps[steps.any(axis=1)]
-        spread = np.concatenate([stretch.obs for stretch in stretches]).std(axis=0)
+        spread = joined(stretches).std(axis=0)
         bends = np.concatenate([_bends(stretch.obs, spread) for stretch in stretches])
         if not len(moving) or not len(bends):
             return None

@@ -1,5 +1,6 @@
 """Whether there is enough motion, and enough of it caused by the commands."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -7,23 +8,165 @@ import numpy as np
 from jaxtyping import Float64
 
 from sb3_hds.core.trajectories import Trajectories
-from sb3_hds.data.audit.finding import Finding, Place
-from sb3_hds.data.audit.findings import (
-    ConstantCommand,
-    DependentCommand,
-    MostlyStill,
-    PoorExcitation,
-    StandingStill,
-    TooShort,
-    WeakMotion,
-    WithinNoise,
-)
-from sb3_hds.data.audit.stretches import Stretch
+from sb3_hds.data.audit.finding import Finding, counted, percent, recordings
+from sb3_hds.data.audit.stretches import Stretch, all_samples, joined
 
 _SECONDS, _FEWEST, _MOST = 0.1, 12, 100  # length of a window, and its limits in rows
 _WHITE = 0.5  # mean squared step by variance: 2 for white noise, 0 for smooth motion
 _SMALL = 0.3  # of the spread of a channel: what is larger is motion
 _ALL_NOISE = 3.0  # a channel that spreads no further than this times its noise does not move
+
+
+@dataclasses.dataclass(frozen=True)
+class StandingStill(Finding):
+    """:param share: of the time during which nothing moves beyond noise"""
+
+    blocks = True
+    share: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"The system stands still {percent(self.share)} of the time "
+            f"({recordings(self.places)}): this tells the noise of its sensors and nothing about "
+            "its motion."
+        )
+
+    remedy = "Record motion, with commands that use the range that matters to you."
+
+
+@dataclasses.dataclass(frozen=True)
+class TooShort(Finding):
+    """
+    :param n_steps: that there are
+    :param needed: at least so many
+    """
+
+    blocks = True
+    n_steps: int
+    needed: int
+
+    @property
+    def sentence(self) -> str:
+        return f"There are {self.n_steps} steps in all; a verdict needs {self.needed} at least."
+
+    remedy = "Record longer, or more often."
+
+
+@dataclasses.dataclass(frozen=True)
+class WeakMotion(Finding):
+    """:param ratio: spread of the channel by its noise"""
+
+    ratio: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' moves by only {self.ratio:.1f} times its noise "
+            f"({recordings(self.places)})."
+        )
+
+    remedy = "Move it further: what acts on it cannot be estimated from this."
+
+
+@dataclasses.dataclass(frozen=True)
+class WithinNoise(Finding):
+    """:param ratio: largest spread of a channel by its noise"""
+
+    blocks = True
+    ratio: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"No channel moves by more than {self.ratio:.1f} times its noise "
+            f"({recordings(self.places)})."
+        )
+
+    remedy = "Record larger motion: nothing can be estimated from this."
+
+
+@dataclasses.dataclass(frozen=True)
+class MostlyStill(Finding):
+    """:param share: of the time during which nothing moves beyond noise"""
+
+    share: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"The system stands still {percent(self.share)} of the time "
+            f"({recordings(self.places)})."
+        )
+
+    remedy = "Only the rest tells anything about its motion: record more of it."
+
+
+@dataclasses.dataclass(frozen=True)
+class PoorExcitation(Finding):
+    """
+    :param n_strokes: how often the channel moves one way or the other in all recordings, by a tenth
+        of its range at least; no other channel does so more often
+    :param n_conditions: under which was recorded
+    """
+
+    n_strokes: int
+    n_conditions: int
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"Excitation is poor: no channel goes to and fro more often than '{self.channel}', "
+            f"{counted(self.n_strokes, 'stroke')} in {counted(len(self.places), 'recording')} "
+            f"under {counted(self.n_conditions, 'condition')} ({recordings(self.places)})."
+        )
+
+    remedy = (
+        "What takes away less than a fifth of the error hardly stands out from chance in so few. "
+        "Record more strokes, at other speeds, and vary what stayed the same: the load, the gain, "
+        "the course of the commands."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class ConstantCommand(Finding):
+    """
+    :param low: smallest value of the command, in its unit
+    :param high: largest one
+    """
+
+    low: float
+    high: float
+
+    @property
+    def sentence(self) -> str:
+        span = f"between {self.low:.5g} and {self.high:.5g}"
+        value = span if f"{self.low:.4g}" != f"{self.high:.4g}" else f"{self.high:.4g}"
+        return f"The command '{self.channel}' is {value} throughout ({recordings(self.places)})."
+
+    remedy = (
+        "Gain, delay and lag of this actuator cannot be estimated from this. If it is meant to do "
+        "so (free swing), go on."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class DependentCommand(Finding):
+    """:param r2: share of its variance that follows from the observations"""
+
+    r2: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"The command '{self.channel}' follows from the observations of the same moment "
+            f"(R2 = {self.r2:.5f}), as under linear feedback ({recordings(self.places)})."
+        )
+
+    remedy = (
+        "Feedback and dynamics cannot be told apart from this: add a signal to the command, or "
+        "change the set point."
+    )
 
 
 class Stillness(NamedTuple):
@@ -56,7 +199,7 @@ def stillness_of(stretches: list[Stretch], resolution: Float64[np.ndarray, " n_o
     spread = np.concatenate([part.std(axis=1, ddof=1) for part in parts])
     step = np.concatenate([np.sqrt(np.mean(np.diff(p, axis=1) ** 2, axis=1)) for p in parts])
     width = np.concatenate([np.ptp(part, axis=1) for part in parts])
-    overall = np.concatenate([stretch.obs for stretch in stretches]).std(axis=0)
+    overall = joined(stretches).std(axis=0)
     jitters = step**2 >= _WHITE * spread**2
     floor = np.array([_median(s[j]) for s, j in zip(spread.T, jitters.T, strict=True)])
     small = (spread <= _SMALL * overall) | (overall <= _ALL_NOISE * floor)
@@ -100,7 +243,7 @@ def excitation(
     :param obs: names of the observation channels
     :param actions: names of the action channels
     """
-    places = tuple(Place(f"trajectory {i}", 0, int(n), i) for i, n in enumerate(data.lengths))
+    places = all_samples(data)
     found: list[Finding] = []
     if data.n_steps < NEEDED:
         found.append(TooShort("all channels", places, data.n_steps, NEEDED))

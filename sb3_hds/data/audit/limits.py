@@ -1,5 +1,6 @@
 """Positions at the stops of a machine, which its twin does not have."""
 
+import dataclasses
 from collections.abc import Sequence
 from functools import partial
 
@@ -11,11 +12,36 @@ from jaxtyping import Array, Float
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.twin import Twin
 from sb3_hds.core.types import Params
-from sb3_hds.data.audit.findings import ReachedLimit
+from sb3_hds.data.audit.finding import Finding, listed, percent
 from sb3_hds.data.audit.stretches import Stretch, runs
 
 # Of the range: stops are soft, and sensors noisy.
 _MARGIN = 0.002
+
+
+@dataclasses.dataclass(frozen=True)
+class ReachedLimit(Finding):
+    """
+    :param value: end of the joint's range
+    :param unit: of that
+    :param share: of the samples that are there
+    """
+
+    value: float
+    unit: str
+    share: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"Joint '{self.channel}' is at its limit of {self.value:.4g} {self.unit} in "
+            f"{percent(self.share)} of the samples ({listed(self.places)})."
+        )
+
+    remedy = (
+        "The twin has no stops, so what happens there is none of its forces: leave these samples "
+        "out, or correct the range in the model file."
+    )
 
 
 def reached_limits(stretches: Sequence[Stretch], twin: Twin) -> list[ReachedLimit]:

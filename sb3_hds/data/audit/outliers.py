@@ -1,16 +1,61 @@
 """Values far beyond all others, which the physics of a system does not reach in one sample."""
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Int
 
-from sb3_hds.data.audit.findings import Glitches, Outliers
-from sb3_hds.data.audit.stretches import Stretch, runs
+from sb3_hds.data.audit.finding import Finding, listed
+from sb3_hds.data.audit.stretches import Stretch, joined, runs
 
 _USUAL = 0.98  # of the samples: the range that they fill is the usual one
 _FAR = 20.0  # usual ranges from the median
 _AT_ONCE = 0.5  # of the way there, and of the way back, in one sample
+
+
+@dataclasses.dataclass(frozen=True)
+class Outliers(Finding):
+    """
+    They outweigh all else in a mean square.
+
+    :param value: farthest one, in the unit of the channel
+    :param low: lower end of the range that 98 % of the channel's samples fill
+    :param high: upper end
+    """
+
+    blocks = True
+    value: float
+    low: float
+    high: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' jumps to {self.value:.4g} and back, where 98 % of its samples are "
+            f"between {self.low:.4g} and {self.high:.4g} ({listed(self.places)})."
+        )
+
+    remedy = "Look at sensor and cable. audit.corrected(data) cuts these samples out."
+
+
+@dataclasses.dataclass(frozen=True)
+class Glitches(Outliers):
+    """
+    Single samples, far from those around them.
+
+    :param step: largest from one sample to the next elsewhere in these recordings
+    """
+
+    step: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' jumps to {self.value:.4g} and back in a single sample, where it "
+            f"moves by {self.step:.3g} at most from one sample to the next "
+            f"({listed(self.places)})."
+        )
 
 
 def outliers(stretches: Sequence[Stretch], names: Sequence[str]) -> list[Outliers]:
@@ -21,7 +66,7 @@ def outliers(stretches: Sequence[Stretch], names: Sequence[str]) -> list[Outlier
     """
     found = []
     tail = 0.5 * (1.0 - _USUAL)
-    everything = np.concatenate([stretch.obs for stretch in stretches])
+    everything = joined(stretches)
     low, middle, high = np.quantile(everything, (tail, 0.5, 1.0 - tail), axis=0)
     for j, name in enumerate(names):
         farthest = _FAR * (high[j] - low[j])
@@ -70,7 +115,7 @@ def glitches(
     wraps to and fro is no glitch, nor is a tick of an encoder at rest.
     """
     found = []
-    everything = np.concatenate([stretch.obs for stretch in stretches])
+    everything = joined(stretches)
     low, high = np.quantile(everything, (0.01, 0.99), axis=0)
     steps = np.abs(np.concatenate([np.diff(stretch.obs, axis=0) for stretch in stretches]))
     usual = np.quantile(steps, _USUAL_STEPS, axis=0) if len(steps) else np.zeros(len(names))

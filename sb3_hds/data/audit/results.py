@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from sb3_hds.core.trajectories import Trajectories
+from sb3_hds.data.audit.continuity import ReinitialisedState
 from sb3_hds.data.audit.finding import Finding, counted, percent
-from sb3_hds.data.audit.findings import Outliers, ReinitialisedState, VelocityShift
+from sb3_hds.data.audit.outliers import Outliers
+from sb3_hds.data.audit.velocity import VelocityShift
 from sb3_hds.errors import TrajectoryError
 
 _WIDTH = 80

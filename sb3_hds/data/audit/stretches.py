@@ -1,6 +1,6 @@
 """Uninterrupted rows, as measured: what the checks of the audit look at."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -59,6 +59,16 @@ def stretches_of(data: Trajectories) -> list[Stretch]:
         Stretch(f"trajectory {i}", i, k, data.dt * k, data.obs[i, : len(k)])
         for i, k in enumerate(numbers)
     ]
+
+
+def all_samples(data: Trajectories) -> tuple[Place, ...]:
+    """:return: one place for each trajectory, from its first sample to its last"""
+    return tuple(Place(f"trajectory {i}", 0, int(n), i) for i, n in enumerate(data.lengths))
+
+
+def joined(stretches: Sequence[Stretch]) -> Float64[np.ndarray, "rows n_obs"]:
+    """:return: the rows of all of them"""
+    return np.concatenate([stretch.obs for stretch in stretches])
 
 
 def runs(flags: Bool[np.ndarray, " steps"]) -> Iterator[tuple[int, int]]:

@@ -1,5 +1,6 @@
 """Positions and velocities that cannot be what they are taken for: other units, or swapped."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -9,9 +10,9 @@ import numpy as np
 from sb3_hds.core.signals import Channel
 from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.core.twin import Twin
-from sb3_hds.data.audit.finding import Place
-from sb3_hds.data.audit.findings import RPM, LikelyUnits, MistakenUnits, OtherUnits, Swapped
+from sb3_hds.data.audit.finding import Finding, percent, recordings
 from sb3_hds.data.audit.replay import position_channels, replayed, stretches_in
+from sb3_hds.data.audit.stretches import all_samples
 from sb3_hds.data.audit.velocity import Match
 
 # Factor: up to here `effects.SensorScale`, which is bounded to 0.1 to 10, gives it a name.
@@ -21,6 +22,124 @@ _LATEST = 4.0  # samples: a pair whose lag is longer may be a sine and its secon
 _ALIKE = 0.3  # largest difference of a block's slope from that of all data, for half of the blocks
 _FEWEST = 3  # blocks
 _SMOOTH = 0.2  # correlation of successive velocities: below, differences of positions are too small
+
+
+_FACTORS = {"degrees": 57.29578, "millimetres": 1000.0, "centimetres": 100.0}
+RPM = 30.0 / 3.1415926536
+"""Revolutions per minute of one radian per second."""
+_NEAR = 0.15  # what a central difference and noise may change of the factor
+
+
+@dataclasses.dataclass(frozen=True)
+class OtherUnits(Finding):
+    """
+    A velocity follows the derivative of a position, but for a factor that no sensor is off by.
+
+    :param position: name of the channel whose derivative it is
+    :param factor: by which that changes faster than the velocity says
+    """
+
+    blocks = True
+    position: str
+    factor: float
+
+    @property
+    def sentence(self) -> str:
+        fast = f"changes {self.factor:.3g} times as fast as '{self.channel}' says"
+        return (
+            f"'{self.position}' {fast} ({recordings(self.places)}): one of them is in other units"
+            f"{self._likely}."
+        )
+
+    @property
+    def _likely(self) -> str:
+        for unit, factor in _FACTORS.items():
+            for name, ratio in ((self.position, factor), (self.channel, 1.0 / factor)):
+                if abs(self.factor / ratio - 1.0) < _NEAR:
+                    return f", as if '{name}' were in {unit}"
+        if abs(self.factor * RPM - 1.0) < _NEAR:
+            return f", as if '{self.channel}' were in revolutions per minute"
+        return ""
+
+    remedy = (
+        "Give that one its unit in columns, as {column: NAME, unit: deg}, or rpm or mm, or its "
+        "scale: 0.0174533 if it is in degrees, 0.104720 if it is in revolutions per minute, 0.001 "
+        "if it is in millimetres."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class MistakenUnits(Finding):
+    """
+    A position that moves as the twin says only if it is in another unit.
+
+    :param column: its name in the log
+    :param span: of its measurements
+    :param unit: that the twin takes it for
+    :param other: the one that fits, in words
+    :param symbol: of that
+    :param factor: from that to the twin's
+    :param explained: share of its acceleration that the twin explains then
+    :param times: how often it accelerates as much as the twin says, if it is in the twin's unit
+    """
+
+    blocks = True
+    column: str
+    span: float
+    unit: str
+    other: str
+    symbol: str
+    factor: float
+    explained: float
+    times: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' spans {self.span:.3g} {self.unit}, and {self._why} "
+            f"({recordings(self.places)}). Write {{column: {self.column}, unit: {self.symbol}}}, "
+            f"or scale it by {self.factor:.6g}."
+        )
+
+    @property
+    def _why(self) -> str:
+        return (
+            f"the twin explains hardly any of its acceleration, but {percent(self.explained)} if "
+            f"it is in {self.other}"
+        )
+
+    remedy = "Whatever is named from such data makes up for the factor."
+
+
+@dataclasses.dataclass(frozen=True)
+class LikelyUnits(MistakenUnits):
+    """In the other unit, it moves about as much as the twin says, but not when it says so."""
+
+    blocks = False
+
+    @property
+    def _why(self) -> str:
+        return (
+            f"it accelerates {self.times:.2g} times as much as the twin says, as if it were in "
+            f"{self.other}"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Swapped(Finding):
+    """:param derivative_of: name of the channel whose derivative this one is, and not vice versa"""
+
+    blocks = True
+    derivative_of: str
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' should be a position and is the derivative of "
+            f"'{self.derivative_of}', which should be its velocity ({recordings(self.places)})."
+        )
+
+    remedy = "They are swapped: name the columns of obs in the order of the twin's channels."
 
 
 def other_units(
@@ -51,7 +170,9 @@ def other_units(
     far.sort(key=lambda match: match.scores.highest)
     found = {match.velocity: match for match in far}
     return [
-        OtherUnits(channels[v].name, _whole(data), match.position, 1.0 / match.scores.slope_there)
+        OtherUnits(
+            channels[v].name, all_samples(data), match.position, 1.0 / match.scores.slope_there
+        )
         for v, match in found.items()
     ]
 
@@ -68,7 +189,7 @@ def swapped(
     """
     right = {j for m in matches if m.agrees and _known(m, channels) for j in (m.velocity, *m.parts)}
     return [
-        Swapped(channels[m.velocity].name, _whole(data), channels[m.parts[0]].name)
+        Swapped(channels[m.velocity].name, all_samples(data), channels[m.parts[0]].name)
         for m in matches
         if m.agrees
         and abs(m.scores.lag) <= _LATEST
@@ -101,10 +222,6 @@ def _known(match: Match, channels: Sequence[Channel]) -> bool | None:
 
 def _is_rate(velocity: str, position: str) -> bool:
     return bool(position) and velocity == f"{position}/s"
-
-
-def _whole(data: Trajectories) -> tuple[Place, ...]:
-    return tuple(Place(f"trajectory {i}", 0, int(n), i) for i, n in enumerate(data.lengths))
 
 
 _FEWEST_STRETCHES = 6  # stretches
@@ -170,10 +287,7 @@ def mistaken_units(
                     float(left),
                     kind(
                         channels[channel].name,
-                        tuple(
-                            Place(f"trajectory {i}", 0, int(n), i)
-                            for i, n in enumerate(data.lengths)
-                        ),
+                        all_samples(data),
                         column=columns[channel],
                         span=float(np.ptp(data.obs[..., channel])),
                         unit=unit.of,

@@ -1,5 +1,6 @@
 """Velocity channels that come late or early, as the derivative of a position tells."""
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,10 +9,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from sb3_hds.core.trajectories import Trajectories
-from sb3_hds.core.twin import Twin
-from sb3_hds.data.audit.finding import Place
-from sb3_hds.data.audit.findings import BackwardDifference, VelocityShift
-from sb3_hds.data.audit.replay import replayed, stretches_in
+from sb3_hds.data.audit.finding import Finding, recordings
+from sb3_hds.data.audit.stretches import all_samples
 from sb3_hds.data.resampling.angles import unwrapped
 
 _REACH = 0.05  # [s] longest shift that is looked for, but at least _FEWEST samples
@@ -36,6 +35,35 @@ _LONG = 2.0  # unless it is longer than this [samples]
 
 Pairs = Sequence[tuple[np.ndarray, np.ndarray]]
 """Position and velocity of each episode, each of shape ``(rows,)``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class VelocityShift(Finding):
+    """
+    :param position: name of the channel whose derivative it is
+    :param samples: by how many it comes late; negative: early
+    :param seconds: the same [s]
+    :param stderr: standard error of ``samples``
+    """
+
+    position: str
+    samples: float
+    seconds: float
+    stderr: float
+
+    @property
+    def sentence(self) -> str:
+        verb = "lags" if self.samples > 0 else "leads"
+        return (
+            f"'{self.channel}' {verb} the derivative of '{self.position}' by "
+            f"{abs(self.samples):.2f} +- {self.stderr:.2f} samples, "
+            f"{1e3 * abs(self.seconds):.3g} ms ({recordings(self.places)})."
+        )
+
+    remedy = (
+        "Shift it: audit.corrected(data). A filter in the drive is the usual cause; uncorrected, "
+        "it passes for a delay or for friction."
+    )
 
 
 class Lag(NamedTuple):
@@ -97,7 +125,7 @@ def velocity_shifts(
     :return: the lags that are longer than a backward difference has, beyond doubt, and either long
         or the cause of half of what the derivative leaves unexplained
     """
-    whole = tuple(Place(f"trajectory {i}", 0, int(n), i) for i, n in enumerate(data.lengths))
+    whole = all_samples(data)
     return [
         VelocityShift(
             names[lag.velocity],
@@ -287,54 +315,3 @@ class _Scores(NamedTuple):
         left, middle, right = self.correlation[i - 1 : i + 2]
         bend = left - 2.0 * middle + right
         return float(i - reach + (0.5 * (left - right) / bend if bend < 0.0 else 0.0))
-
-
-def backward_differences(
-    data: Trajectories, names: Sequence[str], matches: Sequence[Match], twin: Twin | None
-) -> list[BackwardDifference]:
-    """
-    :param data: at one interval
-    :param names: of the observation channels
-    :param matches: of the data
-    :param twin: whose own velocities may be the same, as semi-implicit Euler steps make them; where
-        there is none, only differences in which the noise of the position shows are told, which no
-        simulation has
-    """
-    found: dict[int, tuple[Match, bool]] = {}
-    for match in matches:
-        difference = difference_of(match.pairs, data.dt)
-        if match.agrees and difference.backward:
-            found[match.velocity] = match, difference.rough
-    own = _own(data, twin, [match for match, _ in found.values()]) if twin and found else None
-    whole = tuple(Place(f"trajectory {i}", 0, int(n), i) for i, n in enumerate(data.lengths))
-    return [
-        BackwardDifference(
-            names[v],
-            whole,
-            position=match.position,
-            samples=0.5,
-            seconds=0.5 * data.dt,
-            stderr=0.0,
-        )
-        for v, (match, rough) in found.items()
-        if (rough if own is None else v not in own)
-    ]
-
-
-def _own(data: Trajectories, twin: Twin, matches: Sequence[Match]) -> set[int] | None:
-    """Velocity channels that are backward differences in a simulation; None: it says nothing."""
-    stretches = stretches_in(data)
-    if stretches is None:
-        return None
-    obs = replayed(twin, stretches, np.ones(data.n_obs)).obs
-    obs = obs[np.isfinite(obs).all((1, 2))]
-    if not len(obs):
-        return None
-    own = set()
-    for match in matches:
-        first, *second = (obs[..., part] for part in match.parts)
-        position = np.unwrap(np.arctan2(second[0], first), axis=1) if second else first
-        pairs = list(zip(position, obs[..., match.velocity], strict=True))
-        if difference_of(pairs, data.dt).backward:
-            own.add(match.velocity)
-    return own
