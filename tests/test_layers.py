@@ -204,7 +204,7 @@ def test_every_folder_is_a_layer():
 
 def test_the_rule_forbids_what_it_should():
     for path, source in (
-        ("sb3_hds/twins/pendulum.py", "import sb3_hds.effects.joint"),
+        ("sb3_hds/twins/environments/pendulum.py", "import sb3_hds.effects.joint"),
         ("sb3_hds/planning/ilqr.py", "import importlib\nimportlib.import_module('sb3_hds.algos')"),
         ("sb3_hds/envs/mirror.py", "from sb3_hds import twins, HDS"),
         ("sb3_hds/algos/hds.py", "from .networks import Policy"),

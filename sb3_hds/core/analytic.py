@@ -1,4 +1,4 @@
-"""Twins given by their equation of motion."""
+"""Twins that are given by their equation of motion."""
 
 import abc
 import math
@@ -54,7 +54,7 @@ class AnalyticTwin(Twin):
     def accelerate(self, state: State, command: Action, added: Force, params: Params) -> Velocity:
         """
         :param command: what reaches the actuators
-        :param added: force besides that of the actuators, shape ``(dof,)``
+        :param added: generalised force of the effects, shape ``(dof,)``
         :return: the acceleration; override where the equation of motion is solved another way
         """
         force = self.actuate(state, command, params) + added
@@ -65,11 +65,11 @@ class AnalyticTwin(Twin):
         return (*super().structure(), self.integrator)
 
     def limit_velocity(self, v: Velocity) -> Velocity:
-        """Where the environment clips speeds."""
+        """Override where the environment clips velocities."""
         return v
 
     def limit(self, q: Position, v: Velocity) -> tuple[Position, Velocity]:
-        """Where the environment clips or wraps the state, after each sub-step."""
+        """Override where the environment clips or wraps the state after each sub-step."""
         return q, v
 
     def typical_forces(self) -> tuple[float, ...]:
@@ -114,7 +114,7 @@ class AnalyticTwin(Twin):
 
 @lru_cache(maxsize=64)
 def _typical_forces(twin: AnalyticTwin) -> tuple[float, ...]:
-    """What actuators and gravity can do to each joint, with the parameters at their nulls."""
+    """Largest force of actuators and gravity at each joint, with parameters at their nulls."""
     params = {name: jnp.asarray(parameter.null) for name, parameter in twin.parameters.items()}
     rotary = np.array([joint.unit == "rad" for joint in twin.joints], float)
     turned = np.concatenate(

@@ -1,4 +1,6 @@
-"""What a twin declares, and the shape and dtype of what its methods return: checked before use."""
+"""
+Checks of a user's twin before use: its declarations, and shapes and dtypes of what it returns.
+"""
 
 import inspect
 import traceback
@@ -31,10 +33,10 @@ def check_methods(twin: Twin) -> None:
     Check the declarations of a twin, and what each of its methods returns: type, shape, dtype.
 
     Methods are evaluated abstractly (``jax.eval_shape``), in single and in double precision:
-    nothing is computed or compiled. A twin is checked once, equal twins are not checked again, and
-    those of the library are left to its tests.
+    nothing is computed or compiled. Equal twins are checked once; those of the library are covered
+    by its tests and skipped.
 
-    :raises TwinError: in one line, with the method, what it should return, and what it does
+    :raises TwinError: in one line, with the method, the expected and the actual return value
     """
     try:
         hash(twin)
@@ -58,7 +60,7 @@ def _is_tested_here(layer: Twin) -> bool:
 @lru_cache(maxsize=256)
 def check_now(twin: Twin) -> None:
     """
-    :func:`check_methods` of one layer of a twin, whoever wrote it.
+    :func:`check_methods` for a single layer of a twin, tested here or not.
 
     :raises TwinError: as there
     """
@@ -167,7 +169,7 @@ def _n_positions(twin: Twin, state: Any, dof: int) -> int:
     try:
         own = state._replace(memory={})
         return shape[0] if jax.eval_shape(twin.difference, own, own).shape == (2 * dof,) else dof
-    except Exception:  # what is wrong with it is told where it is called
+    except Exception:  # reported by the caller
         return dof
 
 

@@ -1,7 +1,7 @@
 """
-Named extensions of a twin: what real hardware does and the twin does not.
+Effects: named physical extensions of a twin.
 
-An effect sits in one of three places on the way of a signal: between command and plant
+An effect sits at one of three places of the signal path: between command and plant
 (``ActionEffect``), in the equation of motion (``ForceEffect``), or between plant and measurement
 (``SensorEffect``). Action and force effects are evaluated at every internal sub-step, and may carry
 memory from one to the next.
@@ -45,7 +45,7 @@ class Moment(NamedTuple):
     :param q: position of each joint, shape ``(dof,)``
     :param v: generalised velocity, shape ``(dof,)``
     :param actuator: generalised force of the actuators, shape ``(dof,)``
-    :param load: generalised force that gravity and inertia take (``bias``), shape ``(dof,)``
+    :param load: generalised force of gravity and inertia (``bias``), shape ``(dof,)``
     :param mass_matrix: shape ``(dof, dof)``
     :param h: length of the sub-step [s]
     """
@@ -60,14 +60,14 @@ class Moment(NamedTuple):
 
 class JointMoment(NamedTuple):
     """
-    The view of one joint. All entries are scalars.
+    A :class:`Moment` as one joint sees it. All entries are scalars.
 
     :param q: position [rad] or [m]
     :param v: velocity [rad/s] or [m/s]
     :param actuator: force of the actuators on this joint [N m] or [N]
-    :param load: force that gravity and inertia take at this joint [N m] or [N]
-    :param inertia: what a force at this joint accelerates, ``1 / (M^-1)_jj`` [kg m2] or [kg]; a
-        constant to derivatives, as it only bounds what a sub-step may do
+    :param load: force of gravity and inertia at this joint [N m] or [N]
+    :param inertia: effective inertia, ``1 / (M^-1)_jj`` [kg m2] or [kg]; treated as constant in
+        derivatives, because it only bounds the effect of one sub-step
     :param h: length of the sub-step [s]
     """
 
@@ -81,7 +81,7 @@ class JointMoment(NamedTuple):
 
 class Ranges(NamedTuple):
     """
-    What the data of one place cover, for grids of parameters.
+    The range that the data of one joint or actuator cover, for grids of parameters.
 
     :param excursion: how far the joint moves [rad] or [m]
     :param speed: how fast it moves, root mean square [rad/s] or [m/s]
@@ -103,7 +103,7 @@ class Ranges(NamedTuple):
 
 class Effect(abc.ABC):
     """
-    Something real hardware does and the twin does not. It vanishes when its parameters are null.
+    A physical effect of real hardware that the twin lacks. It vanishes at its null parameters.
 
     :param where: index or name of the joint, actuator or channel that it acts on
     :param values: values of its parameters by name; default: null, where it changes nothing
@@ -121,20 +121,18 @@ class Effect(abc.ABC):
     explanation: ClassVar[str]
     #: where the equation comes from
     source: ClassVar[str]
-    #: names of causes that data cannot tell from this one -> the condition under which they cannot;
-    #: a cause is an effect, or a parameter of the twin: ``"parameter.mass"``
+    #: aliased causes (data cannot distinguish them from this one) -> the condition for it; a cause
+    #: is an effect, or a parameter of the twin: ``"parameter.mass"``
     equivalents: ClassVar[Mapping[str, str]] = {}
-    #: parameters of which none may be smaller than the one before, or a diagnosis does not give the
-    #: effect's name to what it fitted
+    #: parameters that must ascend in this order; otherwise a diagnosis does not report the effect
     ascending: ClassVar[tuple[str, ...]] = ()
-    #: the one parameter that it has, if it is not linear in it: an equation error interpolates
+    #: its one parameter, where the effect is not linear in it: the equation error is interpolated
     #: between the values of ``grid``
     chained: ClassVar[str] = ""
-    #: a parameter that two slopes, taken at two values of it, stand for: where a spring rests, the
-    #: phase of a wave
+    #: a parameter that a combination of two slopes determines, taken at two values of it: the rest
+    #: position of a spring, the phase of a wave
     blended: ClassVar[str] = ""
-    #: after how long its memory, if it has one, no longer tells how it began, in periods of the
-    #: motion
+    #: time after which its memory has forgotten its initial value [periods of the motion]
     forgets: ClassVar[float] = 0.4
     #: learned arrays by name, pytrees that travel with the parameters; most effects have none
     tensors: Mapping[str, Any] = MappingProxyType({})
@@ -160,23 +158,24 @@ class Effect(abc.ABC):
         return changed
 
     def fitted_to(self: _Effect, twin: "Twin") -> _Effect:
-        """:return: the same effect, with whatever depends on the twin that it is attached to"""
+        """:return: the same effect, with everything that depends on the twin it is attached to"""
         return self
 
     def starts(self, excursion: float, speed: float) -> tuple[Mapping[str, float], ...]:
         """
         :param excursion: how far the joint moves in the data [rad] or [m], a turn at most
         :param speed: how fast it moves there [rad/s] or [m/s]
-        :return: where a search may begin, for parameters that have no slope where nothing is wrong
-            and many optima elsewhere: values by name; empty for effects that one start serves
+        :return: initial values of a search by name, for parameters with a zero gradient at the null
+            and many local optima; empty where one start suffices
         """
         return ()
 
     def grid(self, ranges: Ranges) -> tuple[Mapping[str, float], ...]:
         """
         :param ranges: what the data cover
-        :return: values by name between which an equation error interpolates (``chained``), or at
-            which it takes slopes by the other parameters; empty where slopes at the null will do
+        :return: values by name between which the equation error is interpolated (``chained``), or
+            at which its slopes by the other parameters are taken; empty where the slopes at the
+            null suffice
         """
         return self.starts(ranges.excursion, 2.0 * ranges.speed)
 
@@ -186,16 +185,17 @@ class Effect(abc.ABC):
         """
         :param sizes: of the effect's first parameter in two settings that differ in ``blended``
         :param settings: values by name
-        :return: values of the one effect that does what both do together
+        :return: values of the single effect that equals the sum of both
         """
-        raise NotImplementedError(f"{self.name} is no blend of two settings.")
+        raise NotImplementedError(f"{self.name} is no combination of two settings.")
 
     def doubt(self, twin: "Twin", state: Any, action: Action, base: Params, own: Params) -> Scalar:
         """
         :param twin: the twin that the effect is attached to
         :param base: parameters of that twin
         :param own: the effect's own parameters, without prefix
-        :return: what planning pays for relying on the effect here, in the reward's unit
+        :return: penalty in planning for the uncertainty of the effect here, in the unit of the
+            reward
         """
         return jnp.zeros(())
 
@@ -242,7 +242,7 @@ class ForceEffect(Effect):
     held: ClassVar[bool] = False
 
     def memory(self, twin: "Twin") -> Memory:
-        """:return: what the effect remembers when an episode starts; a pytree of float arrays"""
+        """:return: the memory at the start of an episode; a pytree of float arrays"""
         return ()
 
     @abc.abstractmethod
@@ -264,7 +264,7 @@ class ForceEffect(Effect):
 
 
 class JointEffect(ForceEffect):
-    """A force effect that looks at one joint and acts on it alone."""
+    """A force effect that depends on one joint and acts on that joint alone."""
 
     @abc.abstractmethod
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
@@ -281,7 +281,7 @@ class ActionEffect(Effect):
     slot: ClassVar[str] = "actuator"
 
     def memory(self, twin: "Twin") -> Memory:
-        """:return: what the effect remembers when an episode starts; a pytree of float arrays"""
+        """:return: the memory at the start of an episode; a pytree of float arrays"""
         return ()
 
     @abc.abstractmethod
@@ -289,7 +289,7 @@ class ActionEffect(Effect):
         self, command: Scalar, memory: Memory, h: float, params: Params
     ) -> tuple[Scalar, Memory]:
         """
-        :param command: what this actuator is told, in its unit
+        :param command: of this actuator, in its unit
         :param memory: as it was at the start of the sub-step
         :param h: length of the sub-step [s]
         :param params: the effect's own parameters, without prefix
@@ -301,14 +301,14 @@ class SensorEffect(Effect):
     """
     Changes one measurement on its way out of the plant, once per control interval.
 
-    Of several at one channel, each measures what the one before it reports. What is reported may
-    lie beyond the limits that the channel declares.
+    Of several sensors at one channel, each takes the output of the one before it. Reported values
+    may exceed the limits that the channel declares.
     """
 
     slot: ClassVar[str] = "channel"
 
     def memory(self, measured: Scalar, twin: "Twin") -> Memory:
-        """:return: what the sensor remembers when an episode starts; a pytree of float arrays"""
+        """:return: the memory at the start of an episode; a pytree of float arrays"""
         return ()
 
     @abc.abstractmethod
@@ -323,7 +323,9 @@ class SensorEffect(Effect):
 
     @abc.abstractmethod
     def invert(self, reported: Scalar, params: Params) -> Scalar:
-        """:return: the true value, as well as one report at the start of an episode tells"""
+        """
+        :return: the best estimate of the true value from a single report at the start of an episode
+        """
 
     def advance(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Memory:
         """:return: the memory after a control interval that ends with the value ``measured``"""

@@ -1,4 +1,4 @@
-"""The effects of an extended twin, evaluated at every sub-step of its simulation."""
+"""The effects attached to a twin, as its ``step`` evaluates them."""
 
 import dataclasses
 from collections.abc import Callable, Collection, Mapping
@@ -36,14 +36,14 @@ class Attached:
 
 class Chosen(NamedTuple):
     """
-    Which of an extended twin's force effects are computed; the others are taken to be null. It may
-    change from call to call of a compiled program, which then costs what these cost, not what all
-    do. Derivatives can be taken forwards only.
+    The subset of force effects that is evaluated; the others are taken to be null. It may change
+    between calls of one compiled program, whose run time is that of the subset. Forward-mode
+    derivatives only.
 
-    :param free: positions of those evaluated at every stage, among all that are, first those that
-        are chosen; and their number
-    :param held: likewise, of those that are held
-    :param on: by key, whether an effect is chosen
+    :param free: indices of the effects evaluated at every stage, the chosen ones first, and how
+        many are chosen
+    :param held: the same for the held effects
+    :param on: whether each effect is chosen, by key
     """
 
     free: tuple[Any, Any]
@@ -54,7 +54,7 @@ class Chosen(NamedTuple):
     def of(cls, attached: tuple[Attached, ...], keys: Collection[str]) -> "Chosen":
         """
         :param attached: all effects of the twin that are simulated
-        :param keys: of those to compute
+        :param keys: of the effects to evaluate
         """
         forces = {a.key: a.effect for a in attached if isinstance(a.effect, ForceEffect)}
         on = {key: np.array(key in keys) for key in forces}
@@ -68,11 +68,11 @@ class Chosen(NamedTuple):
 
 class EffectChain:
     """
-    The attached effects with their values, as a twin's ``step`` meets them at each sub-step.
+    The attached effects with their values, as ``Twin.step`` evaluates them at each sub-step.
 
-    :param attached: the effects, in the order in which the signal meets them; sensors are left out
+    :param attached: the effects, in the order of the signal path; sensors are left out
     :param params: full parameters of the extended twin
-    :param chosen: which forces are computed; None: all
+    :param chosen: the forces that are evaluated; None: all
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class EffectChain:
         self._chosen = chosen
 
     def __add__(self, other: "EffectChain") -> "EffectChain":
-        """:return: the effects of both; commands meet ``other`` last"""
+        """:return: the effects of both; commands pass ``other`` last"""
         both = EffectChain((), {}, self._chosen or other._chosen)
         both._actions = self._actions + other._actions
         both._forces = self._forces + other._forces

@@ -182,7 +182,9 @@ class ExtendedTwin(Twin):
         return own
 
     def _remember(self, state: State, params: Params) -> State:
-        """Give every effect its first memory; ``scan`` needs one structure and dtype throughout."""
+        """
+        Initialise the memory of every effect; ``scan`` needs one structure and dtype throughout.
+        """
         memory, dtype = {}, state.q.dtype
         for a in self._simulated:
             if isinstance(a.effect, ForceEffect | ActionEffect):
@@ -199,22 +201,22 @@ class ExtendedTwin(Twin):
 def with_native(own: Any, value: Any, parameter: Parameter) -> Any:
     """
     :param own: the twin's parameter
-    :param value: of an effect's parameter for the same thing
-    :param parameter: the latter
-    :return: both together: their sum, or their product where an effect is absent at one
+    :param value: of the corresponding parameter of an effect
+    :param parameter: that parameter
+    :return: their sum, or their product where the null of the effect is one
     """
     return own * value if parameter.null == 1.0 else own + value
 
 
 def _holding(attached: Attached, params: Params) -> Effect:
-    """The effect with its share of ``params``."""
+    """The effect with its values from ``params``."""
     own, effect = attached.own(params), attached.effect
     tensors = {name: own.pop(name) for name in effect.tensors}
     return effect.with_values(**own).with_tensors(**tensors)
 
 
 def _attach(effect: Effect, twin: Twin) -> Attached:
-    """Find the place that an effect names by index or by name."""
+    """Resolve the joint, actuator or channel that an effect names."""
     places = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}[
         effect.slot
     ]
@@ -231,8 +233,8 @@ def _attach(effect: Effect, twin: Twin) -> Attached:
 
 def _in_units_of(parameter: Parameter, twin: Twin, attached: Attached) -> Parameter:
     """
-    Effects state the units of a rotary joint, and those of commands and channels by name; scales of
-    forces are shares of what is typical at that joint, scales of commands of the largest one.
+    Convert units and scales, which effects declare for a rotary joint or by name: scales of forces
+    are relative to the typical force at the joint, scales of commands to the largest command.
     """
     slot, index = attached.effect.slot, attached.index
     if slot == "joint":

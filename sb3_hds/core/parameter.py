@@ -1,4 +1,4 @@
-"""A physical constant that data can inform."""
+"""A physical constant that can be estimated from data."""
 
 import dataclasses
 import math
@@ -20,9 +20,9 @@ _PRISMATIC_UNIT = {
 @dataclasses.dataclass(frozen=True)
 class Parameter:
     """
-    One unknown number of a twin or an effect, with what is believed about it.
+    One unknown constant of a twin or an effect, with its prior and its bounds.
 
-    :param null: value before seeing any data; for an effect, the value at which it vanishes
+    :param null: nominal value; for an effect, the value at which it vanishes
     :param scale: typical deviation from ``null``, in the same unit; must be positive
     :param unit: SI unit, for example ``"N m s/rad"``; ``"1"`` where there is none
     :param lower: smallest admissible value

@@ -1,4 +1,6 @@
-"""What a twin does under given actions or under a policy. Pure and unbatched: callers ``vmap``."""
+"""
+Rollouts of a twin under given actions or under a policy. Pure and unbatched: callers ``vmap``.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -43,11 +45,12 @@ def rollout(
     """
     Apply a sequence of actions.
 
-    The step that terminates the episode is rewarded; from there on the state stays and rewards are
-    zero, so that nothing a fallen system does can spoil a gradient. There is no reset.
+    The step that terminates the episode is still rewarded; afterwards the state is frozen and
+    rewards are zero, so that the motion of a fallen system does not enter a gradient. There is no
+    reset.
 
     :param actions: shape ``(steps, n_act)``
-    :param reward: what is rewarded, for example ``twin.planning_reward``; default: ``twin.reward``
+    :param reward: for example ``twin.planning_reward``; default: ``twin.reward``
     """
     return _simulate(twin, params, state, lambda _, action: action, actions, reward)
 
@@ -65,7 +68,7 @@ def rollout_policy(
 
     :param policy: observation, shape ``(n_obs,)``, to action, shape ``(n_act,)``
     :param n_steps: length of the rollout
-    :param reward: what is rewarded, for example ``twin.planning_reward``; default: ``twin.reward``
+    :param reward: for example ``twin.planning_reward``; default: ``twin.reward``
     """
 
     def choose(state: State, _: Array) -> Action:

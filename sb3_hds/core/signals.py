@@ -1,4 +1,4 @@
-"""What moves, what drives it, what is measured. Names and units are data: every table has them."""
+"""Joints, actuators and observation channels, with the names and units that every table prints."""
 
 from typing import NamedTuple
 
@@ -9,8 +9,8 @@ class Joint(NamedTuple):
 
     :param name: unique within the twin
     :param unit: unit of its position: ``"rad"`` for a hinge, ``"m"`` for a slider
-    :param low: where a stop of the machine begins that the twin does not simulate
-    :param high: likewise
+    :param low: position of the lower end stop, which the twin does not simulate
+    :param high: position of the upper end stop
     """
 
     name: str

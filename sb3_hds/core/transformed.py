@@ -1,4 +1,4 @@
-"""A twin seen through a wrapper is again a twin."""
+"""A twin behind a wrapper, which is again a twin."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -38,16 +38,16 @@ from sb3_hds.errors import ParameterError
 class TransformedTwin(Twin):
     """
     A twin whose observations or actions pass through a wrapper. Parameters, states and rewards are
-    those of the twin below, but for what a stateful wrapper remembers and charges.
+    those of the wrapped twin; a stateful wrapper adds its memory and its penalty.
 
     Effects belong to the plant: :meth:`extend` attaches them to the twin below the wrapper, where
     commands and measurements have their physical units.
 
     :param base: the twin below
-    :param observation: what happens to observations; None leaves them
-    :param action: what happens to actions; None leaves them
-    :param stateful: what happens to both, with a memory or with an eye on the observation; instead
-        of the other two
+    :param observation: transform of observations; None: identity
+    :param action: transform of actions; None: identity
+    :param stateful: transform of both, with memory or access to the observation; excludes the
+        other two
     :raises ParameterError: if a transform does not fit the twin below, or comes with another
     """
 
@@ -160,7 +160,7 @@ class TransformedTwin(Twin):
         return f"{type(self).__name__}({inside})"
 
     def command(self, state: State, action: Action, params: Params) -> Float[Array, " inner"]:
-        """:return: what the twin below is told"""
+        """:return: the command of the wrapped twin"""
         return self._act(state, action, params)[0]
 
     def _act(
@@ -201,7 +201,7 @@ def seen_through(
     known: Iterable[type[Transform]] = TRANSFORMS,
 ) -> Twin:
     """
-    Put a twin behind saved wrappers again.
+    Rebuild the saved wrappers around a twin.
 
     :param base: the twin below all of them
     :param layers: ``to_spec()["transforms"]``, the wrapper next to ``base`` first
@@ -216,12 +216,12 @@ def seen_through(
 
 
 def _place_of(transform: Transform) -> str:
-    """The argument that a transform is passed as."""
+    """The argument of ``TransformedTwin`` for a transform."""
     if isinstance(transform, StatefulTransform):
         return "stateful"
     return "observation" if isinstance(transform, ObservationTransform) else "action"
 
 
 def _depth(base: Twin) -> int:
-    """Wrappers around the plant so far, which tells memories of one kind apart."""
+    """Number of wrappers around the plant; it makes the keys of memories unique."""
     return 1 + _depth(base.base) if isinstance(base, TransformedTwin) else 0

@@ -36,12 +36,12 @@ _Twin = TypeVar("_Twin", bound="Twin")
 
 class State(NamedTuple):
     """
-    Everything that the next step depends on besides the action and the parameters.
+    The state of a simulation: all that the next step depends on besides action and parameters.
 
     :param q: generalised position [rad] or [m], shape ``(dof,)``; longer where quaternions are
         among its numbers
     :param v: generalised velocity [rad/s] or [m/s], shape ``(dof,)``
-    :param memory: what attached effects remember, keyed by the effect's full name
+    :param memory: memories of the attached effects, by full name of the effect
     """
 
     q: Position
@@ -54,9 +54,9 @@ class Twin(abc.ABC):
     A differentiable simulator of one system.
 
     Its methods are pure and unbatched, and safe under ``jit``, ``vmap``, ``scan`` and forward-mode
-    differentiation: batching is the caller's business. Values of parameters always arrive in
-    ``params``; a method never reads them from ``self``. So two twins that differ in nothing else
-    are equal, and one compiled program serves both.
+    differentiation; callers do the batching. Values of parameters are always passed in ``params``;
+    a method never reads them from ``self``. Twins that differ in nothing else are therefore equal
+    and share one compiled program.
 
     A subclass declares its signals and parameters as class attributes and implements the abstract
     methods. Mechanical systems with a mass matrix are shorter as an ``AnalyticTwin``.
@@ -84,8 +84,8 @@ class Twin(abc.ABC):
     #: (effect name, index of its place) -> {its parameter: the twin's parameter that it adds to, or
     #: multiplies where the effect is absent at one}
     native_effects: Mapping[tuple[str, int], Mapping[str, str]] = {}
-    #: Parameters that someone has set and knows: a diagnosis does not question them, and a
-    #: calibration leaves them alone unless they are named.
+    #: Parameters that are known exactly: a diagnosis takes them as given, and a calibration keeps
+    #: them unless it is asked to estimate them.
     known_parameters: frozenset[str] = frozenset()
     #: Structural choices with their defaults, set by keyword: ``{"goal": "stop"}``.
     options: ClassVar[Mapping[str, Any]] = {}
@@ -182,8 +182,8 @@ class Twin(abc.ABC):
 
     def typical_forces(self) -> tuple[float, ...]:
         """
-        :return: the largest force that actuators and gravity exert on each joint at rest [N m or
-            N], which says how large friction and the like may be; 0 where that is not known
+        :return: the largest force of actuators and gravity on each joint at rest [N m] or [N], a
+            scale for friction and the like; 0 where it is unknown
         """
         return (0.0,) * len(self.joints)
 
@@ -194,14 +194,14 @@ class Twin(abc.ABC):
     @abc.abstractmethod
     def infer(self, obs: Obs, params: Params) -> State:
         """
-        The state that a measurement stands for: the inverse of :meth:`observe`.
+        The state that corresponds to an observation: the inverse of :meth:`observe`.
 
-        Unobserved parts are zero, and the subclass says so.
+        Unobserved parts are set to zero, and the subclass documents which they are.
         """
 
     @abc.abstractmethod
     def observe(self, state: State, params: Params) -> Obs:
-        """What the sensors report, in the order of ``channels``."""
+        """The observation, in the order of ``channels``."""
 
     @abc.abstractmethod
     def step(
@@ -215,28 +215,28 @@ class Twin(abc.ABC):
         """
 
     def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        """The environment's own reward for this step; zero where there is no task."""
+        """The reward of the environment for this step; zero where there is no task."""
         return jnp.zeros(())
 
     def planning_reward(
         self, state: State, action: Action, next_state: State, params: Params
     ) -> Scalar:
         """
-        What planning maximises: the reward, or a smooth surrogate where that has no gradient.
+        The objective of planning: the reward, or a smooth surrogate where that has no gradient.
 
-        It is counted up to and including the step that terminates, and is zero afterwards. So where
-        surviving is good it must stay positive, otherwise planning learns to die early.
+        It counts up to and including the terminating step and is zero afterwards. Where survival is
+        the goal it must therefore be positive; otherwise planning learns to terminate early.
         """
         return self.reward(state, action, next_state, params)
 
     def terminated(self, state: State, params: Params) -> Flag:
-        """Whether the episode ends in this state for a reason of the task, not of time."""
+        """Whether the task ends in this state; time limits do not count."""
         return jnp.zeros((), bool)
 
     def coordinates(self, q: Position) -> Coordinates:
         """
-        :return: the position of each joint, which is what effects see and what is told of a motion;
-            override it for quaternions
+        :return: the position of each joint, as effects and reports use it; override it for
+            quaternions
         """
         return q
 
@@ -270,7 +270,7 @@ class Twin(abc.ABC):
         }
 
     def structure(self) -> tuple[Any, ...]:
-        """What makes two twins different programs: everything but the values of parameters."""
+        """The key of the compiled program: everything but the values of parameters."""
         return (type(self), self.dt, self.substeps, *(getattr(self, name) for name in self.options))
 
     def __eq__(self, other: object) -> bool:
@@ -284,7 +284,7 @@ class Twin(abc.ABC):
         return f"{type(self).__name__}({values})"
 
     def _check_declared(self) -> None:
-        """What has to be there before there are values."""
+        """Check the declarations that values depend on."""
         kind = type(self).__name__
         if not isinstance(getattr(self, "name", None), str):
             raise TwinError(f"{kind} has no name. Write it into the class: name = 'MyTwin'.")
@@ -297,7 +297,7 @@ class Twin(abc.ABC):
             )
 
     def _mirror(self, base: "Twin") -> None:
-        """Take over what a twin that wraps ``base`` has in common with it."""
+        """Copy the attributes that a wrapping twin shares with ``base``."""
         self.name, self.env_id = base.name, base.env_id
         self.dt, self.substeps = base.dt, base.substeps
         self.joints, self.actuators, self.channels = base.joints, base.actuators, base.channels
@@ -322,7 +322,7 @@ class Twin(abc.ABC):
 
 
 def layers_of(twin: Twin) -> Iterator[Twin]:
-    """:return: the twin, what it wraps, what that wraps, ..., last the plant"""
+    """:return: the twin, the twin inside it, and so on down to the plant"""
     layer: Any = twin
     while layer is not None:
         yield layer
@@ -330,6 +330,6 @@ def layers_of(twin: Twin) -> Iterator[Twin]:
 
 
 def plant_of(twin: Twin) -> Twin:
-    """:return: the twin without any effect or wrapper"""
+    """:return: the innermost twin, without effects and wrappers"""
     *_, plant = layers_of(twin)
     return plant

@@ -1,11 +1,11 @@
-"""What the arrays mean. Shapes are checked whenever the tests run."""
+"""Aliases for annotated arrays. The tests check shapes at every call."""
 
 from typing import Any, TypeAlias
 
 from jaxtyping import Array, Bool, Float
 
 Position: TypeAlias = Float[Array, " position"]  # [rad], [m], quaternions; else one for each dof
-Coordinates: TypeAlias = Float[Array, " dof"]  # a position told joint by joint, [rad] or [m]
+Coordinates: TypeAlias = Float[Array, " dof"]  # position of each joint, [rad] or [m]
 Velocity: TypeAlias = Float[Array, " dof"]  # [rad/s] or [m/s]
 Force: TypeAlias = Float[Array, " dof"]  # generalised force, [N m] or [N]
 MassMatrix: TypeAlias = Float[Array, "dof dof"]
@@ -17,4 +17,4 @@ Flag: TypeAlias = Bool[Array, ""]
 Memory: TypeAlias = (
     Any  # what an effect carries from sub-step to sub-step: a pytree of float arrays
 )
-Params: TypeAlias = dict[str, Any]  # full parameter name -> value (a float or a scalar array)
+Params: TypeAlias = dict[str, Any]  # by full parameter name: a float or a scalar array

@@ -1,25 +1,25 @@
 """The library of twins, one file per system, and the registry that finds them."""
 
-from sb3_hds.twins.acrobot import Acrobot
-from sb3_hds.twins.cart_pole import CartPole
 from sb3_hds.twins.check import check
 from sb3_hds.twins.check_result import CheckItem, TwinCheck
-from sb3_hds.twins.double_pendulum import DoublePendulum
-from sb3_hds.twins.duffing import Duffing
-from sb3_hds.twins.free_pendulum import FreePendulum
-from sb3_hds.twins.furuta import Furuta
-from sb3_hds.twins.inverted_double_pendulum import InvertedDoublePendulum
-from sb3_hds.twins.inverted_pendulum import InvertedPendulum
-from sb3_hds.twins.inverted_pendulum_friction import InvertedPendulumFriction
-from sb3_hds.twins.linear_axis import LinearAxis
-from sb3_hds.twins.mountain_car import MountainCar
+from sb3_hds.twins.environments.acrobot import Acrobot
+from sb3_hds.twins.environments.cart_pole import CartPole
+from sb3_hds.twins.environments.inverted_double_pendulum import InvertedDoublePendulum
+from sb3_hds.twins.environments.inverted_pendulum import InvertedPendulum
+from sb3_hds.twins.environments.inverted_pendulum_friction import InvertedPendulumFriction
+from sb3_hds.twins.environments.mountain_car import MountainCar
+from sb3_hds.twins.environments.payload_pendulum import PayloadPendulum
+from sb3_hds.twins.environments.pendulum import Pendulum
+from sb3_hds.twins.environments.pendulum_real import PendulumReal
 from sb3_hds.twins.mujoco import MechanismTwin, Written, from_mujoco, write_model
-from sb3_hds.twins.payload_pendulum import PayloadPendulum
-from sb3_hds.twins.pendulum import Pendulum
-from sb3_hds.twins.pendulum_real import PendulumReal
 from sb3_hds.twins.registry import all_ids, from_env, from_spec, get, make, names, register
-from sb3_hds.twins.rig import Rig
-from sb3_hds.twins.servo_pendulum import ServoPendulum
+from sb3_hds.twins.rigs.double_pendulum import DoublePendulum
+from sb3_hds.twins.rigs.duffing import Duffing
+from sb3_hds.twins.rigs.free_pendulum import FreePendulum
+from sb3_hds.twins.rigs.furuta import Furuta
+from sb3_hds.twins.rigs.linear_axis import LinearAxis
+from sb3_hds.twins.rigs.rig import Rig
+from sb3_hds.twins.rigs.servo_pendulum import ServoPendulum
 
 for _twin in (
     Acrobot,

@@ -1,9 +1,8 @@
 """
-One sub-step of ``dq/dt = v, dv/dt = a(q, v)``, as the environments that twins mirror do it.
+Integrators of ``dq/dt = v, dv/dt = a(q, v)`` over one sub-step, as in the mirrored environments.
 
-An integrator is called with the acceleration, ``q``, ``v``, the step and what limits velocities;
-and, by a twin whose positions hold quaternions, with ``displace``, which moves a position along a
-velocity times a time.
+An integrator takes the acceleration, ``q``, ``v``, the step and a function that limits velocities.
+Twins with quaternions also pass ``displace``, which moves a position by a velocity times a time.
 """
 
 import operator

@@ -15,7 +15,7 @@ _UNROLLED, _LOOPED = 4, 16
 
 class Factor(NamedTuple):
     """
-    Of a symmetric positive definite matrix :math:`L D L^T`.
+    Factors of a symmetric positive definite matrix :math:`L D L^T`.
 
     :param lower: :math:`L`, shape ``(n, n)``; what is not below its diagonal is not read
     :param pivot: the diagonal of :math:`D`, shape ``(n,)``
@@ -28,7 +28,7 @@ class Factor(NamedTuple):
 def uses_lapack(n: int) -> bool:
     """
     :param n: rows of matrices
-    :return: whether they are solved by LAPACK: no two programs that do may run at once
+    :return: whether LAPACK solves them; two such programs must not run at once
     """
     return n > _LOOPED
 
@@ -90,9 +90,9 @@ def factorised(matrix: Float[Array, "n n"]) -> Factor:
 
 def solve_factored(factor: Factor, right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """
-    :param factor: of a matrix
+    :param factor: of ``matrix``
     :param right: shape ``(n,)`` or ``(n, k)``
-    :return: ``x`` of ``matrix @ x = right``
+    :return: the solution of ``matrix @ x = right``, in the shape of ``right``
     """
     n = len(factor.pivot)
     columns, pivot = right.reshape(n, -1), factor.pivot[:, None]

@@ -1,4 +1,4 @@
-"""Lists of episodes of unequal length: checked at the door, padded to one length."""
+"""Lists of episodes of unequal length: validated, and padded to one length."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -9,7 +9,7 @@ import numpy as np
 from sb3_hds.errors import TrajectoryError
 
 SAME_RATE = 1e-3
-"""Relative difference of two sampling rates that counts as none."""
+"""Relative difference below which two sampling rates count as equal."""
 
 
 def check_dt(dt: Any) -> float:
@@ -29,7 +29,7 @@ def check_dt(dt: Any) -> float:
 
 
 def same_interval(dt: float, other: float) -> bool:
-    """Whether two sampling intervals are the same to 0.1 %, which is what logs tell."""
+    """Whether two sampling intervals agree to 0.1 %, the accuracy of logs."""
     return math.isclose(dt, other, rel_tol=SAME_RATE)
 
 

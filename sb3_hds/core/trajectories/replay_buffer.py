@@ -1,4 +1,4 @@
-"""Episodes out of the replay buffer of Stable-Baselines3, which is read but not imported."""
+"""Episodes from a replay buffer of Stable-Baselines3, by its attributes alone."""
 
 from typing import Any
 

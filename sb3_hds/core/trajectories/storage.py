@@ -1,4 +1,4 @@
-"""Files that are written as a whole or not at all; arrays among them, never pickled."""
+"""Atomic writes of files; arrays are stored without pickle."""
 
 import contextlib
 import os

@@ -44,7 +44,7 @@ class Trajectories:
     :param dt: sampling interval [s]
     :param conditions: a label for what was different, one per trajectory: a load, a gain
     :param origin: number of the recorded trajectory that each is a part of, shape ``(n,)``; windows
-        of one recording share it, because they are one piece of evidence
+        of one recording share it, because their errors are correlated (one cluster)
     :param report: what reading logs changed, a ``data.Reading``; a note that goes with selections
         and windows, but neither into files nor through transformations of JAX
     :raises TrajectoryError: if these do not fit together
@@ -263,7 +263,7 @@ class Trajectories:
 
     def windows(self, length: int, stride: int | None = None) -> "Trajectories":
         """
-        Cut into pieces of equal length that hold real data throughout.
+        Cut into windows of equal length without padding.
 
         :param length: steps per window
         :param stride: steps from one window to the next; default: ``length``, without overlap
@@ -373,9 +373,9 @@ _log_reader: _LogReader | None = None
 
 def read_logs_by(reader: _LogReader) -> None:
     """
-    Say who reads logs: ``core`` may not know tables.
+    Register the reader of logs, which lives in a layer above ``core``.
 
-    :param reader: of files and columns, as :meth:`Trajectories.load` takes them
+    :param reader: takes files and columns, as :meth:`Trajectories.load` does
     """
     global _log_reader
     _log_reader = reader
@@ -403,7 +403,7 @@ def _flatten_with_keys(data: Trajectories) -> tuple[Any, tuple[float, tuple[str,
 
 
 def _unflatten(static: tuple[float, tuple[str, ...]], leaves: Iterable[Any]) -> Trajectories:
-    """Past the checks: under ``vmap`` and ``tree.map``, leaves are whatever JAX puts there."""
+    """Skip the checks: under ``vmap`` and ``tree.map``, leaves can be any object."""
     data = object.__new__(Trajectories)
     names = (*_LEAVES, "dt", "conditions", "report")
     for name, value in zip(names, (*leaves, *static, None), strict=True):

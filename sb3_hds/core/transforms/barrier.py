@@ -1,4 +1,4 @@
-"""Speeds that keep joints within their limits."""
+"""A control barrier function for joint limits, for joints that are commanded by their speed."""
 
 import dataclasses
 import math

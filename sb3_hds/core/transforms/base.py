@@ -1,4 +1,4 @@
-"""Wrappers that remember, or that look before they let an action through."""
+"""Interfaces of transforms: what a wrapper does to actions and observations, as pure functions."""
 
 import abc
 import dataclasses
@@ -20,10 +20,10 @@ Recalled: TypeAlias = Float[Any, " memory"]
 
 class Signals(NamedTuple):
     """
-    What enters an environment or a twin, and what leaves it.
+    The commands and the observations of an environment or a twin.
 
-    :param actuators: the commands that it takes
-    :param channels: the entries of its observation
+    :param actuators: one for each command
+    :param channels: one for each entry of the observation
     """
 
     actuators: tuple[Actuator, ...]
@@ -34,20 +34,23 @@ class Signals(NamedTuple):
         return np.array([a.low for a in self.actuators]), np.array([a.high for a in self.actuators])
 
     def rest(self) -> np.ndarray:
-        """:return: the command nearest to zero, shape ``(n_act,)``: what acts before an episode"""
+        """
+        :return: the admissible command nearest to zero, shape ``(n_act,)``; it acts before an
+            episode
+        """
         return np.clip(0.0, *self.limits())
 
 
 @dataclasses.dataclass(frozen=True)
 class ObservationTransform(abc.ABC):
     """
-    What the policy sees, as a function of what the twin below reports.
+    Maps the observation of the wrapped twin to that of the policy.
 
     A subclass is a frozen dataclass whose fields are plain data: it can be saved and compared.
     ``below`` are the channels of the twin below.
     """
 
-    #: under which it is saved
+    #: the name it is saved under
     name: ClassVar[str]
 
     @abc.abstractmethod
@@ -73,13 +76,13 @@ class ObservationTransform(abc.ABC):
 @dataclasses.dataclass(frozen=True)
 class ActionTransform(abc.ABC):
     """
-    What the twin below is told, as a function of what the policy says.
+    Maps the action of the policy to the command of the wrapped twin.
 
     A subclass is a frozen dataclass whose fields are plain data: it can be saved and compared.
     ``below`` are the actuators of the twin below.
     """
 
-    #: under which it is saved
+    #: the name it is saved under
     name: ClassVar[str]
 
     @abc.abstractmethod
@@ -99,19 +102,19 @@ class ActionTransform(abc.ABC):
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StatefulTransform(abc.ABC):
     r"""
-    What a wrapper does to actions and observations, with what it remembers:
+    A wrapper with memory :math:`m`, which may look at the observation before it commands:
 
     .. math:: u_k, m_{k+1} = f(a_k, o_k, m_k), \qquad \text{seen: } (o_k, m_k)
 
     A subclass is a frozen dataclass whose fields are plain data: it can be saved and compared. Its
     methods take NumPy and JAX arrays alike, so that the wrapper of an environment and the twin
-    behind that wrapper run the same lines. ``below`` is what lies below the wrapper.
+    behind that wrapper run the same code. ``below`` are the signals of what it wraps.
 
     :param observed: whether the policy sees :math:`m_k`; without it the task is no longer Markov,
         and a twin infers the memory of the start of an episode
     """
 
-    #: under which it is saved
+    #: the name it is saved under
     name: ClassVar[str]
     #: whether the memory outlives the episode
     persists: ClassVar[bool] = False
@@ -125,7 +128,7 @@ class StatefulTransform(abc.ABC):
     @abc.abstractmethod
     def remembers(self, below: Signals) -> tuple[Channel, ...]:
         """
-        :return: a channel for each number that it remembers
+        :return: one channel for each entry of the memory
         :raises ParameterError: if the transform does not fit what lies below
         """
 
@@ -143,7 +146,7 @@ class StatefulTransform(abc.ABC):
         """:return: the memory at the start of an episode that begins with ``obs``"""
 
     def cost(self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals) -> Any:
-        """:return: what is taken off the reward of this step"""
+        """:return: the penalty that is subtracted from the reward of this step"""
         return 0.0
 
     def actuators(self, below: Signals) -> tuple[Actuator, ...]:
@@ -166,7 +169,7 @@ class StatefulTransform(abc.ABC):
         return namespace(obs).concatenate([obs, memory]) if self.observed else obs
 
     def infer(self, seen: Seen, below: Signals) -> tuple[InnerObs, Recalled]:
-        """:return: what is observed below and what is remembered; see ``observed``"""
+        """:return: the observation below and the memory; see ``observed``"""
         obs = seen[: len(below.channels)]
         return obs, seen[len(below.channels) :] if self.observed else self.start(obs, below)
 

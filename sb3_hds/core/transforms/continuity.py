@@ -1,4 +1,4 @@
-"""Commands that change cost."""
+"""A penalty on changes of the command."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""A rhythm under a policy: what it adds to actions, what it remembers and shows."""
+"""A central pattern generator that a policy modulates."""
 
 import dataclasses
 import math

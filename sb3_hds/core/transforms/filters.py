@@ -1,4 +1,4 @@
-"""What makes commands smooth, late or small, between a policy and what it commands."""
+"""Transforms of commands: rate limit, low-pass filter, delay, scale."""
 
 import dataclasses
 import math
@@ -158,12 +158,13 @@ class LowPass(StatefulTransform):
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Delay(StatefulTransform):
     """
-    Commands arrive a whole number of steps late; until the first arrives, the one nearest to zero.
+    Delays commands by a whole number of steps; until the first arrives, the command nearest to zero
+    acts.
 
-    Remembers the commands on their way, the oldest first. A delay that is no multiple of the step,
-    or is to be estimated, is :class:`sb3_hds.effects.ActionDelay`.
+    The memory holds the commands in transit, the oldest first. For a delay that is no multiple of
+    the step, or that is to be estimated, use :class:`sb3_hds.effects.ActionDelay`.
 
-    :param steps: how late [control intervals]
+    :param steps: length of the delay [control intervals]
     :raises ParameterError: unless it is a positive whole number
     """
 
@@ -194,17 +195,17 @@ class Delay(StatefulTransform):
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Scale(StatefulTransform):
     r"""
-    Commands reach only a share :math:`s` of the range around its middle :math:`m`:
+    Scales commands to a share :math:`s` of their range, around its middle :math:`m`:
 
     .. math:: u = m + s\,(a - m)
 
-    Those of other actuators than ``axes`` reach all of theirs. The share follows a schedule, linear
-    between its points and constant outside. Where it changes, it remembers how much of the schedule
-    has passed, from 0 to 1, over all episodes; an episode of a twin begins anywhere in it. Without
-    ``observed``, a twin infers the beginning of the schedule.
+    Actuators that are not among ``axes`` keep their full range. The share follows a schedule,
+    piecewise linear and constant beyond its ends. The memory is the progress along a schedule that
+    changes, from 0 to 1, over all episodes; an episode of a twin starts at a random progress.
+    Without ``observed``, a twin infers the beginning of the schedule.
 
     :param schedule: ``((steps, share), ...)``, steps growing from 0, shares above 0 and at most 1
-    :param axes: numbers of the actuators concerned, from 0; None: all
+    :param axes: indices of the scaled actuators; None: all
     :raises ParameterError: for any other schedule, or actuators that there are not
     """
 

@@ -1,4 +1,4 @@
-"""What was seen and done before."""
+"""A history of observations and actions."""
 
 import dataclasses
 from typing import ClassVar
@@ -22,7 +22,7 @@ from sb3_hds.core.transforms.filters import clipped
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class History(StatefulTransform):
     """
-    Remembers the last observations and actions, the latest first; zeros before an episode.
+    Appends the last observations and actions, the latest first; zeros before an episode.
 
     :param n_observations: observations before the present one
     :param n_actions: actions before the one that is to be chosen

@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 
 from sb3_hds.core import Action, Force, MassMatrix, Params, Position, Velocity
 from sb3_hds.core.types import Coordinates
-from sb3_hds.twins.mujoco import algebra
 from sb3_hds.twins.mujoco.mechanism import BALL, FREE, Drive, Mechanism
+from sb3_hds.twins.mujoco.rigid_body import algebra
 
 Each = Float[Array, " drives"]
 

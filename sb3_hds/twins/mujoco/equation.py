@@ -13,7 +13,9 @@ from jaxtyping import Array
 
 from sb3_hds.core import Force, MassMatrix, Params, Position, Velocity
 from sb3_hds.core.numerics.linear import Factor, factorised, solve_factored
-from sb3_hds.twins.mujoco.dynamics import (
+from sb3_hds.twins.mujoco.mechanism import BALL, FREE, Link, Mechanism, Place
+from sb3_hds.twins.mujoco.parameters import bodies_of, compensated, gravity_of, of_plant, typical
+from sb3_hds.twins.mujoco.rigid_body.dynamics import (
     Configuration,
     Tree,
     configuration,
@@ -21,9 +23,7 @@ from sb3_hds.twins.mujoco.dynamics import (
     inverse_dynamics,
     mass_matrix,
 )
-from sb3_hds.twins.mujoco.mechanism import BALL, FREE, Link, Mechanism, Place
-from sb3_hds.twins.mujoco.parameters import bodies_of, compensated, gravity_of, of_plant, typical
-from sb3_hds.twins.mujoco.quaternions import turn_between, turning
+from sb3_hds.twins.mujoco.rigid_body.quaternions import turn_between, turning
 
 # Speed over which dry friction builds up [rad/s] or [m/s].
 _STANDSTILL = 0.01

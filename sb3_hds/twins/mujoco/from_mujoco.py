@@ -7,12 +7,12 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from sb3_hds.errors import ModelFileError, ParameterError, did_you_mean
+from sb3_hds.twins.mujoco.files.load import load
+from sb3_hds.twins.mujoco.files.reading import integrator_of, n_actuators, read
+from sb3_hds.twins.mujoco.files.refusals import refuse
+from sb3_hds.twins.mujoco.files.shapes import shapes_of
 from sb3_hds.twins.mujoco.identifiability import unidentifiable
-from sb3_hds.twins.mujoco.load import load
 from sb3_hds.twins.mujoco.mechanism import BALL, FREE, Drive, Link, Mechanism
-from sb3_hds.twins.mujoco.reading import integrator_of, n_actuators, read
-from sb3_hds.twins.mujoco.refusals import refuse
-from sb3_hds.twins.mujoco.shapes import shapes_of
 from sb3_hds.twins.mujoco.twin import MechanismTwin, Reward, Terminated
 
 _KINDS = ("torque", "position", "velocity")

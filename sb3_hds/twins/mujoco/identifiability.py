@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.twins.mujoco.dynamics import Tree, configuration, inverse_dynamics
 from sb3_hds.twins.mujoco.parameters import bodies_of, compensated, gravity_of, random_positions
+from sb3_hds.twins.mujoco.rigid_body.dynamics import Tree, configuration, inverse_dynamics
 
 if TYPE_CHECKING:
     from sb3_hds.twins.mujoco.twin import MechanismTwin

@@ -13,10 +13,6 @@ import numpy as np
 
 from sb3_hds.core import Parameter
 from sb3_hds.errors import ParameterError, did_you_mean
-from sb3_hds.twins.mujoco import algebra as alg
-from sb3_hds.twins.mujoco import dynamics
-from sb3_hds.twins.mujoco.algebra import Number, Symmetric, Vector
-from sb3_hds.twins.mujoco.dynamics import Tree, configuration, inverse_dynamics, mass_matrix
 from sb3_hds.twins.mujoco.mechanism import (
     BALL,
     FREE,
@@ -27,6 +23,15 @@ from sb3_hds.twins.mujoco.mechanism import (
     Link,
     Mechanism,
     Place,
+)
+from sb3_hds.twins.mujoco.rigid_body import algebra as alg
+from sb3_hds.twins.mujoco.rigid_body import spatial
+from sb3_hds.twins.mujoco.rigid_body.algebra import Number, Symmetric, Vector
+from sb3_hds.twins.mujoco.rigid_body.dynamics import (
+    Tree,
+    configuration,
+    inverse_dynamics,
+    mass_matrix,
 )
 
 Values = Mapping[str, Number]
@@ -184,7 +189,7 @@ def gravity_of(mechanism: Mechanism, p: Values) -> Vector:
 
 def bodies_of(
     mechanism: Mechanism, payload: Place | None, masses: bool, p: Values
-) -> list[dynamics.Body]:
+) -> list[spatial.Body]:
     """:return: of each link that has one, with its payload"""
     found = []
     for i, link in enumerate(mechanism.links):
@@ -199,32 +204,32 @@ def bodies_of(
     return found
 
 
-def compensated(mechanism: Mechanism) -> list[dynamics.Body | None]:
+def compensated(mechanism: Mechanism) -> list[spatial.Body | None]:
     """:return: of each link that has a body, the mass whose weight something else carries"""
-    found: list[dynamics.Body | None] = []
+    found: list[spatial.Body | None] = []
     for link in mechanism.links:
         if link.body is not None:
             mass, *centre = link.body.gravcomp or (0.0, 0.0, 0.0, 0.0)
-            point = dynamics.Body(mass, (centre[0], centre[1], centre[2]), alg.NOTHING)
+            point = spatial.Body(mass, (centre[0], centre[1], centre[2]), alg.NOTHING)
             found.append(point if link.body.gravcomp else None)
     return found
 
 
-def _as_given(body: Body) -> dynamics.Body:
-    return dynamics.Body(body.mass, body.centre, _second_moments(body.inertia))
+def _as_given(body: Body) -> spatial.Body:
+    return spatial.Body(body.mass, body.centre, _second_moments(body.inertia))
 
 
-def _loaded(own: dynamics.Body, mass: Number, place: Vector) -> dynamics.Body:
+def _loaded(own: spatial.Body, mass: Number, place: Vector) -> spatial.Body:
     """A body and a point mass as one."""
     whole = alg.add(own.mass, mass)
     share = alg.div(mass, whole)
     way = alg.vadd(place, alg.scale(-1.0, own.centre))
     apart = alg.outer(alg.scale(alg.mul(own.mass, share), way), alg.scale(0.5, way))
     centre = alg.vadd(own.centre, alg.scale(share, way))
-    return dynamics.Body(whole, centre, alg.sadd(own.second_moments, apart))
+    return spatial.Body(whole, centre, alg.sadd(own.second_moments, apart))
 
 
-def _with_values(body: Body, p: Values) -> dynamics.Body:
+def _with_values(body: Body, p: Values) -> spatial.Body:
     r"""
     Log-Cholesky: the second moments of mass about the centre, per unit of mass, become
     :math:`U \Sigma U^T` with an upper triangular :math:`U` of positive diagonal.
@@ -243,7 +248,7 @@ def _with_values(body: Body, p: Values) -> dynamics.Body:
     shape = alg.congruent(alg.product(turn, stretch), own)  # type: ignore[arg-type]
     second = tuple(alg.mul(mass, entry) for entry in shape)
     place = alg.vadd(body.origin, alg.apply(turn, centre))
-    return dynamics.Body(mass, place, second)  # type: ignore[arg-type]
+    return spatial.Body(mass, place, second)  # type: ignore[arg-type]
 
 
 def _second_moments(inertia: Symmetric) -> Symmetric:

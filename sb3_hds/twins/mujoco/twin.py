@@ -27,13 +27,13 @@ from sb3_hds.core.types import (
     Velocity,
 )
 from sb3_hds.errors import ParameterError
-from sb3_hds.twins.mujoco import algebra as alg
 from sb3_hds.twins.mujoco.actuators import Actuation, Moving
-from sb3_hds.twins.mujoco.dynamics import frames_of
 from sb3_hds.twins.mujoco.equation import Equation
 from sb3_hds.twins.mujoco.mechanism import BALL, FREE, SLIDE, Link, Mechanism
 from sb3_hds.twins.mujoco.parameters import dof_names, native_effects, of_drives, place_of
-from sb3_hds.twins.mujoco.quaternions import normalized, turn_between, turned
+from sb3_hds.twins.mujoco.rigid_body import algebra as alg
+from sb3_hds.twins.mujoco.rigid_body.dynamics import frames_of
+from sb3_hds.twins.mujoco.rigid_body.quaternions import normalized, turn_between, turned
 
 # How far an episode begins from where the model stands [rad] or [m].
 _NEAR_START = 0.1

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from sb3_hds.errors import ModelFileError
+from sb3_hds.twins.mujoco.files.reading import n_actuators
 from sb3_hds.twins.mujoco.library import mujoco
-from sb3_hds.twins.mujoco.reading import n_actuators
 
 #: what may be left out of a twin on request
 IGNORABLE = ("contacts", "equality", "fluid", "limits", "tendons")

@@ -7,7 +7,7 @@ from jaxtyping import PRNGKeyArray
 
 from sb3_hds.core import Channel, State
 from sb3_hds.core.types import Action, Flag, Force, Obs, Params, Position, Scalar, Velocity
-from sb3_hds.twins.inverted_pendulum import InvertedPendulum
+from sb3_hds.twins.environments.inverted_pendulum import InvertedPendulum
 
 _MAX_COMMAND = 3.0
 _RAIL_END = 1.0  # [m]

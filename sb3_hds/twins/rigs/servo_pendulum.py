@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from sb3_hds.core import Actuator, Joint, Parameter, State
 from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Velocity
 from sb3_hds.errors import ParameterError
-from sb3_hds.twins.rig import TILT, Rig
+from sb3_hds.twins.rigs.rig import TILT, Rig
 
 _GOAL = Actuator("goal", "rad", -math.pi, math.pi)
 _ENABLE = Actuator("enable", "1", 0.0, 1.0)

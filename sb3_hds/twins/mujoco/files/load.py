@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_hds.errors import ModelFileError
+from sb3_hds.twins.mujoco.files.shapes import visuals_of
 from sb3_hds.twins.mujoco.library import mujoco
-from sb3_hds.twins.mujoco.shapes import visuals_of
 
 
 class Loaded(NamedTuple):

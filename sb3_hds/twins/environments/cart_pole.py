@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.core import Actuator, Channel, Joint, Parameter, State, rk4, semi_implicit_euler
 from sb3_hds.core.types import Action, Force, MassMatrix, Obs, Params, Position, Scalar, Velocity
-from sb3_hds.twins.rig import Rig
+from sb3_hds.twins.rigs.rig import Rig
 
 _MAX_FORCE = 10.0  # [N]
 

@@ -18,7 +18,7 @@ from sb3_hds.core.types import (
     Scalar,
     Velocity,
 )
-from sb3_hds.twins import cart_and_poles
+from sb3_hds.twins.environments import cart_and_poles
 
 _MAX_COMMAND = 3.0
 _MAX_ANGLE = 0.2  # [rad]

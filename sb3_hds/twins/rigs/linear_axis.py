@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from sb3_hds.core import Actuator, Joint, Parameter, State
 from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Velocity
-from sb3_hds.twins.rig import Rig
+from sb3_hds.twins.rigs.rig import Rig
 
 
 class LinearAxis(Rig):

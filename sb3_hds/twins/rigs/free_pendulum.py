@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from sb3_hds.core import Actuator, Joint, Parameter, State
 from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Velocity
 from sb3_hds.errors import ParameterError
-from sb3_hds.twins.rig import TILT, Rig, check_length
+from sb3_hds.twins.rigs.rig import TILT, Rig, check_length
 
 _ZEROS = ("down", "up")
 _MOTOR = Actuator("motor", "N m", -math.inf, math.inf)

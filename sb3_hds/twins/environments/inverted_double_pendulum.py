@@ -18,7 +18,7 @@ from sb3_hds.core.types import (
     Scalar,
     Velocity,
 )
-from sb3_hds.twins import cart_and_poles
+from sb3_hds.twins.environments import cart_and_poles
 
 _MAX_REPORTED = 10.0  # [m/s], [rad/s]
 _MIN_HEIGHT = 1.0  # [m]

@@ -5,7 +5,7 @@ from typing import Any, Self
 import jax.numpy as jnp
 
 from sb3_hds.core import Channel, Force, MassMatrix, Parameter, Params, Position, Velocity, rk4
-from sb3_hds.twins.pendulum import Pendulum
+from sb3_hds.twins.environments.pendulum import Pendulum
 
 
 class PendulumReal(Pendulum):

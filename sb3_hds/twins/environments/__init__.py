@@ -1,0 +1,1 @@
+"""Twins of environments, one file each."""

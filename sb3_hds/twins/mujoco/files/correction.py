@@ -1,0 +1,93 @@
+"""What a model file has to say of a corrected twin."""
+
+import dataclasses
+
+import numpy as np
+
+from sb3_hds.core import ExtendedTwin, Twin
+from sb3_hds.core.extended import with_native
+from sb3_hds.core.twin import layers_of
+from sb3_hds.twins.mujoco.mechanism import Mechanism
+from sb3_hds.twins.mujoco.parameters import bodies_of
+from sb3_hds.twins.mujoco.rigid_body import spatial
+from sb3_hds.twins.mujoco.twin import MechanismTwin
+
+OF_JOINTS = ("damping", "frictionloss", "armature", "stiffness")
+DIGITS = 9
+# Smaller changes of a body, relative to it, are rounding.
+_SAME = 1e-12
+
+
+@dataclasses.dataclass
+class Correction:
+    """
+    The changes that a file has to carry, and what became of them.
+
+    :param plant: the twin of the file, without effects
+    :param values: of the plant, with what effects add to them
+    :param effects: others: name, index and place of each, with its values
+    :param changed: what was written, a line each
+    :param left_out: what such a file cannot say, a line each
+    """
+
+    plant: MechanismTwin
+    values: dict[str, float]
+    effects: list[tuple[str, int, str, dict[str, float]]]
+    changed: list[str] = dataclasses.field(default_factory=list)
+    left_out: list[str] = dataclasses.field(default_factory=list)
+
+    @classmethod
+    def of(cls, twin: Twin, plant: MechanismTwin) -> "Correction":
+        values = {name: float(twin.values.get(name, plant.values[name])) for name in plant.values}
+        found = cls(plant, values, [])
+        for layer in layers_of(twin):
+            if layer is plant:
+                continue
+            if not isinstance(layer, ExtendedTwin):
+                found.left_out.append(f"{type(layer).__name__}, a layer around the twin")
+                continue
+            for a in layer.attached:
+                own = {name: float(layer.values[f"{a.key}.{name}"]) for name in a.effect.parameters}
+                native = plant.native_effects.get((a.effect.name, a.index))
+                if native is None:
+                    found.effects.append((a.effect.name, a.index, a.key, own))
+                    continue
+                for name, target in native.items():
+                    parameter = a.effect.parameters[name]
+                    values[target] = float(with_native(values[target], own[name], parameter))
+        return found
+
+    @property
+    def mechanism(self) -> Mechanism:
+        return self.plant.mechanism
+
+    def difference(self, name: str) -> float:
+        """:return: from the value that the file has"""
+        if name not in self.values:
+            return 0.0
+        return self.values[name] - self.plant.parameters[name].null
+
+    def record_change(self, name: str) -> None:
+        parameter = self.plant.parameters[name]
+        value, unit = self.values[name], parameter.unit
+        self.changed.append(f"{name}: {value:.6g} {unit} (was {parameter.null:.6g})")
+
+    def record_left_out(self, name: str) -> None:
+        self.left_out.append(f"{name}: {self.values[name]:.6g} {self.plant.parameters[name].unit}")
+
+
+def changed_bodies(correction: Correction) -> dict[int, spatial.Body]:
+    """:return: by link, what is not as the file has it"""
+    mechanism, plant = correction.mechanism, correction.plant
+    null = {name: parameter.null for name, parameter in plant.parameters.items()}
+    with_body = [i for i, link in enumerate(mechanism.links) if link.body is not None]
+    pairs = zip(
+        with_body,
+        *(bodies_of(mechanism, plant.payload, plant.masses, p) for p in (null, correction.values)),
+        strict=True,
+    )
+    return {i: new for i, old, new in pairs if not np.allclose(_flat(old), _flat(new), _SAME, 0.0)}
+
+
+def _flat(body: spatial.Body) -> np.ndarray:
+    return np.array([body.mass, *body.centre, *body.second_moments], float)

@@ -1,0 +1,281 @@
+"""A corrected twin as MJCF: the source of the model, changed by MuJoCo itself."""
+
+import dataclasses
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_hds.errors import ModelFileError
+from sb3_hds.twins.mujoco.files.correction import DIGITS, OF_JOINTS, Correction, changed_bodies
+from sb3_hds.twins.mujoco.files.load import spec_of
+from sb3_hds.twins.mujoco.files.reading import read
+from sb3_hds.twins.mujoco.library import mujoco
+from sb3_hds.twins.mujoco.mechanism import Drive, Link, Mechanism
+from sb3_hds.twins.mujoco.parameters import gravity_of
+from sb3_hds.twins.mujoco.rigid_body import algebra as alg
+
+# Share of a joint's motion that its dry friction may stop in a step: MuJoCo's impedance.
+_DAMPED = 0.99
+
+
+def mjcf_of(correction: Correction, source: Any, target: Path) -> str:
+    mj, mechanism = mujoco(), correction.mechanism
+    spec, model, _ = spec_of(source)
+    file = read(model, integrator=mechanism.integrator)
+    _check_same(mechanism, file)
+    spec.option.timestep = correction.plant.dt / correction.plant.substeps
+    spec.option.integrator = getattr(mj.mjtIntegrator, f"mjINT_{mechanism.integrator.upper()}")
+    by_id = {joint.id: joint for joint in spec.joints}
+    for index, link in enumerate(mechanism.links):
+        _write_joint(correction, by_id[index], link, float(spec.option.timestep))
+    tilted = [
+        name
+        for name in correction.values
+        if name.startswith("tilt_") and correction.difference(name)
+    ]
+    if tilted:
+        spec.option.gravity = np.array(gravity_of(mechanism, correction.values), float)
+        for name in tilted:
+            correction.record_change(name)
+    _write_bodies(correction, spec, model)
+    drives = [_corrected(correction, drive) for drive in mechanism.drives]
+    if [d.name for d in file.drives] == [d.name for d in mechanism.drives]:
+        actuators = sorted(spec.actuators, key=lambda actuator: actuator.id)
+    else:
+        for actuator in list(spec.actuators):
+            spec.delete(actuator)
+        actuators = [_added(spec, by_id[d.link], d) for d in mechanism.drives]
+        correction.changed += [f"actuator {drive.name}" for drive in mechanism.drives]
+    for actuator, drive, before in zip(actuators, drives, mechanism.drives, strict=True):
+        # A damping ratio is of the masses that the file came with; its damping stays what it was.
+        by_ratio = drive.kind != "dcmotor" and float(actuator.biasprm[2]) > 0.0
+        if drive != before or by_ratio:
+            _write_gains(actuator, drive)
+    _write_effects(correction, spec, actuators)
+    if isinstance(source, os.PathLike) or not str(source).lstrip().startswith("<"):
+        _keep_assets(spec, Path(str(source)), target)
+    try:
+        spec.compile()
+    except ValueError as error:
+        told = str(error).strip().splitlines()[0]
+        raise ModelFileError(f"MuJoCo refuses the corrected model: {told}") from None
+    return spec.to_xml()
+
+
+def _check_same(mechanism: Mechanism, file: Mechanism) -> None:
+    ours, theirs = ([link.joint for link in m.links] for m in (mechanism, file))
+    if ours != theirs:
+        raise ModelFileError(
+            f"The source is that of another robot: its joints are {', '.join(theirs)}, and those "
+            f"of {mechanism.name} are {', '.join(ours)}."
+        )
+
+
+def _write_joint(correction: Correction, joint: Any, link: Link, step: float) -> None:
+    for name in OF_JOINTS:
+        full = f"{link.joint}_{name}"
+        change = correction.difference(full)
+        if not change:
+            continue
+        # What actuators bring along stays theirs.
+        now = np.array(getattr(joint, name), float)
+        now.reshape(-1)[0] = max(0.0, round(float(now.reshape(-1)[0]) + change, DIGITS))
+        setattr(joint, name, now if now.ndim else float(now))
+        correction.record_change(full)
+    if correction.values.get(f"{link.joint}_frictionloss", link.friction[0]) > 0.0:
+        # By default MuJoCo's dry friction is soft: below some speed, of a light joint a fast one,
+        # it is viscous. The twin's is not, and so this stops what it can stop within a step.
+        share = _DAMPED
+        joint.solimp_friction = np.array([share, share, *np.array(joint.solimp_friction)[2:]])
+        joint.solref_friction = np.array([-1.0, -share / step])
+        correction.changed.append(
+            f"dry friction of {link.joint} holds within a step (solreffriction)"
+        )
+
+
+def _corrected(correction: Correction, drive: Drive) -> Drive:
+    """With calibrated gains."""
+    own = {
+        name: correction.values[f"{drive.name}_{name}"]
+        for name in ("gain", "kp", "kv", "motorconst", "resistance")
+        if correction.difference(f"{drive.name}_{name}")
+    }
+    for name in own:
+        correction.record_change(f"{drive.name}_{name}")
+    gain, bias, motor = list(drive.gain), list(drive.bias), dict(drive.motor)
+    if "gain" in own:
+        gain[0] = own["gain"]
+    if "kp" in own:
+        gain[0], bias[1] = own["kp"], -own["kp"]
+    if "kv" in own:
+        bias[2] = -own["kv"]
+        gain[0] = own["kv"] if drive.role == "velocity" else gain[0]
+    if "motorconst" in own:
+        motor["constant"] = own["motorconst"]
+    if "resistance" in own:
+        motor["resistance"] = own["resistance"]
+    return dataclasses.replace(
+        drive, gain=tuple(gain), bias=tuple(bias), motor=tuple(motor.items())
+    )
+
+
+def _added(spec: Any, joint: Any, drive: Drive) -> Any:
+    mj = mujoco()
+    if not joint.name:
+        raise ModelFileError("Joints without names cannot be driven by actuators. Name them.")
+    actuator = spec.add_actuator(name=drive.name, target=joint.name)
+    actuator.trntype = mj.mjtTrn.mjTRN_JOINT
+    actuator.gear = np.array([*drive.gear, *np.zeros(6 - len(drive.gear))])
+    actuator.gaintype = mj.mjtGain.mjGAIN_FIXED
+    actuator.biastype = mj.mjtBias.mjBIAS_AFFINE if any(drive.bias) else mj.mjtBias.mjBIAS_NONE
+    (limits,) = drive.ranges
+    if limits is not None:
+        actuator.ctrllimited, actuator.ctrlrange = True, np.array(limits)
+    if drive.force_limit is not None:
+        actuator.forcelimited, actuator.forcerange = True, np.array(drive.force_limit)
+    _write_gains(actuator, drive)
+    return actuator
+
+
+def _write_gains(actuator: Any, drive: Drive) -> None:
+    gain, bias = np.array(actuator.gainprm, float), np.array(actuator.biasprm, float)
+    if drive.kind == "dcmotor":
+        motor = dict(drive.motor)
+        gain[:2] = motor["resistance"], motor["constant"]
+    else:
+        gain[0] = drive.gain[0]
+        bias[:3] = drive.bias
+        actuator.biasprm = bias
+    actuator.gainprm = gain
+
+
+def _write_effects(correction: Correction, spec: Any, actuators: list[Any]) -> None:
+    firsts = np.cumsum([0, *(len(drive.inputs) for drive in correction.mechanism.drives)]).tolist()
+    step = float(spec.option.timestep)
+    for name, index, key, own in correction.effects:
+        single = name in _OF_ACTUATORS and index in firsts[:-1]
+        row = firsts.index(index) if single else -1
+        alone = single and len(correction.mechanism.drives[row].inputs) == 1
+        if alone and _OF_ACTUATORS[name](
+            actuators[row], correction.mechanism.drives[row], own, step
+        ):
+            correction.changed += [f"{key}.{short}: {value:.6g}" for short, value in own.items()]
+        else:
+            correction.left_out += [f"{key}.{short}: {value:.6g}" for short, value in own.items()]
+
+
+def _write_delay(actuator: Any, drive: Drive, own: Mapping[str, float], step: float) -> bool:
+    """MuJoCo keeps samples of commands, one for each step, since 3.5."""
+    if not hasattr(actuator, "delay"):
+        return False
+    if own["delay"] > 0.0:
+        actuator.delay = round(own["delay"], DIGITS)
+        actuator.nsample = math.ceil(own["delay"] / step - 1e-9) + 1
+    return True
+
+
+def _write_lag(actuator: Any, drive: Drive, own: Mapping[str, float], step: float) -> bool:
+    mj = mujoco()
+    if own["time_constant"] > 0.0:
+        actuator.dyntype = mj.mjtDyn.mjDYN_FILTEREXACT
+        dynamics_of = np.array(actuator.dynprm, float)
+        dynamics_of[0] = round(own["time_constant"], DIGITS)
+        actuator.dynprm = dynamics_of
+    return True
+
+
+def _write_limit(actuator: Any, drive: Drive, own: Mapping[str, float], step: float) -> bool:
+    """A limit of zero is none."""
+    limit = own["limit"]
+    if limit > 0.0:
+        low, high = drive.ranges[0] or (-math.inf, math.inf)
+        actuator.ctrllimited = True
+        actuator.ctrlrange = np.array([max(low, -limit), min(high, limit)])
+    return True
+
+
+def _write_gain(actuator: Any, drive: Drive, own: Mapping[str, float], step: float) -> bool:
+    """Of a servo: its target counts for more, or less."""
+    if drive.kind != "affine":
+        return False
+    gain = np.array(actuator.gainprm, float)
+    gain[:3] *= own["gain"]
+    actuator.gainprm = gain
+    return True
+
+
+_OF_ACTUATORS = {
+    "action_delay": _write_delay,
+    "motor_lag": _write_lag,
+    "saturation": _write_limit,
+    "torque_gain": _write_gain,
+}
+
+
+def _write_bodies(correction: Correction, spec: Any, model: Any) -> None:
+    """What is rigidly carried by a joint is one body of the twin: the first of them changes."""
+    wanted = changed_bodies(correction)
+    if not wanted:
+        return
+    mj, mechanism = mujoco(), correction.mechanism
+    by_id = {body.id: body for body in spec.bodies}
+    link_of: dict[int, int] = {0: -1}
+    for b in range(1, model.nbody):
+        n = int(model.body_jntnum[b])
+        last = int(model.body_jntadr[b]) + n - 1
+        link_of[b] = last if n else link_of[int(model.body_parentid[b])]
+    data = mj.MjData(model)
+    mj.mj_kinematics(model, data)
+    for i, new in wanted.items():
+        link = mechanism.links[i]
+        assert link.body is not None
+        own = [b for b, at in link_of.items() if at == i and model.body_mass[b] > 0.0]
+        first = own[0]
+        turn, origin = np.array(link.body.rotation), np.array(link.body.origin)
+        # Of the whole, in the frame of the first body: mass, first and second moments.
+        mass = float(new.mass)
+        centre = turn.T @ (np.array([float(x) for x in new.centre]) - origin)
+        second = turn.T @ np.array(alg.full(new.second_moments), float) @ turn
+        second = second + mass * np.outer(centre, centre)
+        axes, at = data.xmat[first].reshape(3, 3), data.xpos[first]
+        moment = mass * centre
+        for b in own[1:]:
+            other, held = data.ximat[b].reshape(3, 3), float(model.body_mass[b])
+            place = axes.T @ (data.xipos[b] - at)
+            inertia = axes.T @ other @ np.diag(model.body_inertia[b]) @ other.T @ axes
+            mass, moment = mass - held, moment - held * place
+            second = second - (0.5 * np.trace(inertia) * np.eye(3) - inertia)
+            second = second - held * np.outer(place, place)
+        body = by_id[first]
+        _write_inertial(correction, body, mass, moment, second)
+
+
+def _write_inertial(
+    correction: Correction, body: Any, mass: float, moment: np.ndarray, second: np.ndarray
+) -> None:
+    centre = moment / mass if mass > 0.0 else np.zeros(3)
+    about = second - mass * np.outer(centre, centre)
+    if mass <= 0.0 or np.linalg.eigvalsh(about)[0] < 0.0:
+        correction.left_out.append(f"mass and inertia of {body.name}: its rigid parts outweigh it")
+        return
+    inertia = np.trace(about) * np.eye(3) - about
+    body.explicitinertial = True
+    body.mass = mass
+    body.ipos = centre
+    body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    correction.changed.append(f"inertial of {body.name}: {mass:.6g} kg")
+
+
+def _keep_assets(spec: Any, source: Path, target: Path) -> None:
+    """Meshes and textures stay where they are."""
+    there, here = source.resolve().parent, target.resolve().parent
+    if there == here or not (spec.meshes or spec.hfields or spec.textures or spec.skins):
+        return
+    for name in ("meshdir", "texturedir"):
+        old = getattr(spec.compiler, name) or ""
+        if not os.path.isabs(old):
+            setattr(spec.compiler, name, Path(os.path.relpath(there / old, here)).as_posix())

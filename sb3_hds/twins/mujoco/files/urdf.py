@@ -1,0 +1,106 @@
+"""A corrected twin as URDF: its damping, friction and inertials."""
+
+import math
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from sb3_hds.errors import ModelFileError
+from sb3_hds.twins.mujoco.files.correction import DIGITS, OF_JOINTS, Correction, changed_bodies
+from sb3_hds.twins.mujoco.mechanism import Link
+from sb3_hds.twins.mujoco.rigid_body import algebra as alg
+from sb3_hds.twins.mujoco.rigid_body import spatial
+
+
+def urdf_of(correction: Correction, source: Any) -> str:
+    text = str(source).lstrip()
+    if not text.startswith("<"):
+        file = Path(str(source))
+        if not file.is_file():
+            raise ModelFileError(f"There is no file '{file}'. Pass the URDF of the twin.")
+        text = file.read_text(errors="replace")
+    builder = ElementTree.TreeBuilder(insert_comments=True)
+    try:
+        robot = ElementTree.fromstring(text, ElementTree.XMLParser(target=builder))
+    except ElementTree.ParseError as error:
+        raise ModelFileError(f"The source is no XML: {error}.") from None
+    if robot.tag != "robot":
+        raise ModelFileError(
+            "A URDF is written only where the twin comes from one. Write MJCF: name the file .xml."
+        )
+    joints = {joint.get("name"): joint for joint in robot.iter("joint")}
+    for link in correction.mechanism.links:
+        _write_urdf_joint(correction, joints.get(link.joint), link)
+    links = {link.get("name"): link for link in robot.iter("link")}
+    for i, new in changed_bodies(correction).items():
+        body = correction.mechanism.links[i].body
+        assert body is not None
+        _write_urdf_inertial(correction, links.get(body.name), body, new)
+    in_file = {
+        f"{link.joint}_{name}" for link in correction.mechanism.links for name in OF_JOINTS[:2]
+    }
+    inertial = correction.plant.masses or correction.plant.payload is not None
+    bodies = (
+        [link.body.name for link in correction.mechanism.links if link.body] if inertial else []
+    )
+    ends = ("_mass", "_com_", "_stretch_", "_shear_")
+    in_bodies = {
+        n for n in correction.values for b in bodies for e in ends if n.startswith(f"{b}{e}")
+    }
+    in_bodies |= {name for name in correction.values if "_payload" in name}
+    for name in correction.values:
+        if correction.difference(name) and name not in in_file | in_bodies:
+            correction.record_left_out(name)
+    for _, _, key, own in correction.effects:
+        correction.left_out += [f"{key}.{short}: {value:.6g}" for short, value in own.items()]
+    body = ElementTree.tostring(robot, encoding="unicode")
+    return f'<?xml version="1.0"?>\n{body}\n'
+
+
+def _write_urdf_joint(correction: Correction, joint: Any, link: Link) -> None:
+    for name, attribute in (("damping", "damping"), ("frictionloss", "friction")):
+        full = f"{link.joint}_{name}"
+        if not correction.difference(full):
+            continue
+        if joint is None:
+            correction.record_left_out(full)
+            continue
+        dynamics_of = joint.find("dynamics")
+        if dynamics_of is None:
+            dynamics_of = ElementTree.SubElement(joint, "dynamics")
+            dynamics_of.tail = "\n"
+        dynamics_of.set(attribute, f"{correction.values[full]:.{DIGITS}g}")
+        correction.record_change(full)
+
+
+def _write_urdf_inertial(correction: Correction, link: Any, body: Any, new: spatial.Body) -> None:
+    """Only where nothing else is rigidly carried: then the link is the twin's body."""
+    own = None if link is None else link.find("inertial")
+    mass = None if own is None else own.find("mass")
+    told = math.nan if mass is None else float(mass.get("value", "nan"))
+    if own is None or mass is None or not math.isclose(told, body.mass, rel_tol=1e-9):
+        correction.left_out.append(
+            f"mass and inertia of {body.name}, which carries other links rigidly"
+        )
+        return
+    turn, origin = np.array(body.rotation), np.array(body.origin)
+    centre = turn.T @ (np.array([float(x) for x in new.centre]) - origin)
+    second = turn.T @ np.array(alg.full(new.second_moments), float) @ turn
+    inertia = np.trace(second) * np.eye(3) - second
+    number = lambda x: f"{float(x):.{DIGITS}g}"  # noqa: E731
+    mass.set("value", number(new.mass))
+    place = own.find("origin")
+    if place is None:
+        place = ElementTree.SubElement(own, "origin")
+    place.set("xyz", " ".join(map(number, centre)))
+    place.set("rpy", "0 0 0")
+    matrix = own.find("inertia")
+    if matrix is None:
+        matrix = ElementTree.SubElement(own, "inertia")
+    for i, row in enumerate("xyz"):
+        for j, column in enumerate("xyz"):
+            if j >= i:
+                matrix.set(f"i{row}{column}", number(inertia[i, j]))
+    correction.changed.append(f"inertial of {body.name}: {float(new.mass):.6g} kg")

@@ -1,0 +1,71 @@
+"""A corrected twin back into the model file of its robot: as MJCF, or as URDF where that can."""
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+from sb3_hds.core import Twin
+from sb3_hds.core.trajectories.storage import check_target, write_bytes
+from sb3_hds.core.twin import plant_of
+from sb3_hds.errors import ModelFileError
+from sb3_hds.twins.mujoco.files.correction import Correction
+from sb3_hds.twins.mujoco.files.mjcf import mjcf_of
+from sb3_hds.twins.mujoco.files.urdf import urdf_of
+from sb3_hds.twins.mujoco.twin import MechanismTwin
+
+
+@dataclasses.dataclass(frozen=True)
+class Written:
+    """
+    :param path: of the file
+    :param changed: what is in it that the source did not say, a line each
+    :param left_out: what the twin has and such a file cannot say, a line each
+    """
+
+    path: Path
+    changed: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+    def __str__(self) -> str:
+        kind = "URDF" if self.path.suffix.lower() == ".urdf" else "MJCF"
+        lines = [f"{self.path} holds the corrected model: {len(self.changed)} changes."]
+        if self.left_out:
+            lines += [f"{kind} does not say:", *(f"  {line}" for line in self.left_out)]
+        return "\n".join(lines)
+
+
+def write_model(twin: Twin, path: str | os.PathLike[str], source: Any) -> Written:
+    """
+    Write a calibrated or extended twin of a model file as such a file: its source, corrected.
+
+    An MJCF file carries friction loss, damping, armature, stiffness, gains, gravity, masses with
+    centres and inertias, a payload, and delays, time constants and limits of actuators; besides,
+    the step and the integrator of the twin, so that ``mj_step``, ``substeps`` times a control
+    interval, does what the twin does. Dry friction is MuJoCo's then, at which a joint sticks. A
+    URDF carries damping, friction and inertials; what a file cannot say is listed. Meshes that are
+    missing are left out of MJCF.
+
+    :param twin: made by ``twins.from_mujoco``, with other parameters, or with effects
+    :param path: ``.xml`` or ``.mjcf`` for MJCF, ``.urdf`` for a URDF, which needs one as its source
+    :param source: of the twin: path or text of an MJCF or URDF file, or an ``MjSpec``
+    :raises ModelFileError: for another twin, or another robot than the twin's
+    :raises OSError: if the file cannot be written
+    """
+    target = Path(path)
+    check_target(target)
+    plant = plant_of(twin)
+    if not isinstance(plant, MechanismTwin):
+        raise ModelFileError(
+            f"{twin.name} was not made from a model file, so there is none to correct. Save its "
+            "numbers: twin.to_spec()."
+        )
+    kind = target.suffix.lower()
+    if kind not in (".xml", ".mjcf", ".urdf"):
+        raise ModelFileError(f"A model file ends in .xml, .mjcf or .urdf, not in '{kind}'.")
+    correction = Correction.of(twin, plant)
+    content = (
+        urdf_of(correction, source) if kind == ".urdf" else mjcf_of(correction, source, target)
+    )
+    write_bytes(target, content.encode())
+    return Written(target, tuple(correction.changed), tuple(correction.left_out))

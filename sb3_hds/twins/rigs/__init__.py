@@ -1,0 +1,1 @@
+"""Twins of machines on a bench, one file each."""
