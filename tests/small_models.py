@@ -13,7 +13,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_hds import algos
-from sb3_hds.algos.twin_algorithm import TwinAlgorithm
+from sb3_hds.algos.twin.algorithm import TwinAlgorithm
 
 # One set for all that plan in a twin: equal settings are one compiled program.
 _PLANNING = {

@@ -18,11 +18,13 @@ from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_hds import DroQ
-from sb3_hds.algos import off_policy, soft_actor_critic, td7_update
-from sb3_hds.algos.bodies import SimbaBody
-from sb3_hds.algos.lap import LapReplayBuffer
-from sb3_hds.algos.off_policy import Trained
-from sb3_hds.algos.sampling import batches_of
+from sb3_hds.algos.model_free.replay import batches_of
+from sb3_hds.algos.model_free.sac import algorithm as soft_actor_critic
+from sb3_hds.algos.model_free.sac import update as off_policy
+from sb3_hds.algos.model_free.sac.update import Trained
+from sb3_hds.algos.model_free.td7 import update as td7_update
+from sb3_hds.algos.model_free.td7.prioritized_replay import LapReplayBuffer
+from sb3_hds.algos.nets.mlp import SimbaBody
 from sb3_hds.errors import EnvironmentMismatchError
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")

@@ -30,7 +30,7 @@ from small_models import (
 )
 
 from sb3_hds import algos, effects, twins
-from sb3_hds.algos import persistence
+from sb3_hds.algos.base import files as persistence
 from sb3_hds.errors import NoTwinError
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
