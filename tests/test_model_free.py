@@ -299,10 +299,6 @@ def test_learning_rates_of_every_form_may_be_changed_while_loading():
     changed._current_progress_remaining = 0.5
     assert changed.learning_rates() == pytest.approx((1.5e-4, 2.5e-4))
     assert reloaded(changed).qf_learning_rate == "lin_5e-4"
-    # Files from before there was a rate of the critics have it beside SBX's number.
-    model.critic_learning_rate, model.qf_learning_rate = 2e-4, 1e-4
-    assert reloaded(model).qf_learning_rate == 2e-4
-    assert reloaded(model, qf_learning_rate=5e-4).qf_learning_rate == 5e-4
 
 
 def test_losses_of_the_actor_are_logged_where_it_was_updated_in_whichever_program(monkeypatch):

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sb3_hds.algos.model_free.sac.simba import SimbaSAC
     from sb3_hds.algos.model_free.sac.tqc import TQC
     from sb3_hds.algos.model_free.td7.algorithm import TD7
+    from sb3_hds.algos.model_free.td7.prioritized_replay import LapReplayBuffer, SumTree
     from sb3_hds.algos.open_loop.algorithm import OpenLoop
     from sb3_hds.algos.open_loop.policy import OscillatorPolicy
     from sb3_hds.algos.twin.hds.algorithm import HDS
@@ -36,11 +37,13 @@ _OTHERS = {
     "Episodes": "model_free.sac.compiled",
     "ExecutedDictReplayBuffer": "base.executed_actions",
     "ExecutedReplayBuffer": "base.executed_actions",
+    "LapReplayBuffer": "model_free.td7.prioritized_replay",
+    "SumTree": "model_free.td7.prioritized_replay",
     "TrainBeside": "base.threaded_training",
     "learn_compiled": "model_free.sac.compiled",
     "load_policy": "base.policy_file",
 }
-_MODULES = registry.modules() | _OTHERS
+_MODULES = registry.MODULES | _OTHERS
 
 __all__ = ["ALL", *sorted(_MODULES)]  # pyright: ignore[reportUnsupportedDunderAll]
 

@@ -50,11 +50,10 @@ ALGORITHMS: dict[str, Entry] = {
 }
 
 
-def modules() -> dict[str, str]:
-    """:return: module below ``sb3_hds.algos`` of every algorithm and policy, by its class name"""
-    entries = ALGORITHMS.values()
-    policies = {name: module for entry in entries for name, module in entry.policies.items()}
-    return {entry.name: entry.module for entry in entries} | policies
+#: module below ``sb3_hds.algos`` of every policy, by its class name
+POLICIES = {name: home for entry in ALGORITHMS.values() for name, home in entry.policies.items()}
+#: that of every algorithm and every policy
+MODULES = {entry.name: entry.module for entry in ALGORITHMS.values()} | POLICIES
 
 
 def load(name: str) -> Any:
@@ -62,7 +61,13 @@ def load(name: str) -> Any:
     :param name: of an algorithm's class or a policy's
     :raises KeyError: for one that is not in the table
     """
-    return getattr(importlib.import_module(f"sb3_hds.algos.{modules()[name]}"), name)
+    return getattr(importlib.import_module(f"sb3_hds.algos.{MODULES[name]}"), name)
+
+
+def registered_name(kind: Any) -> str | None:
+    """:return: the name by which :func:`load` finds this class; None for a class of one's own"""
+    home = f"sb3_hds.algos.{MODULES.get(kind.__name__)}"
+    return kind.__name__ if kind.__module__ == home else None
 
 
 def load_all() -> dict[str, Any]:

@@ -18,6 +18,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_hds.algos import registry
 from sb3_hds.algos.base.checks import check_action_space, checked_env
 from sb3_hds.algos.twin.epoch import PLANNERS
 from sb3_hds.errors import EnvironmentMismatchError, did_you_mean
@@ -101,8 +102,7 @@ def policy_and_env(
         if isinstance(env, gym.Env) and not monitor_wrapper:
             # SBX does not hand the argument on to SB3, which leaves vectorised ones as they are.
             env = DummyVecEnv([partial(_itself, env)])
-    _check_policy(algorithm, policy)
-    return policy, env
+    return _checked_policy(algorithm, policy), env
 
 
 def _itself(env: gym.Env) -> gym.Env:
@@ -141,19 +141,23 @@ def check_policy_kwargs(policy: type, policy_kwargs: Iterable[str]) -> None:
         )
 
 
-def _check_policy(algorithm: Any, policy: Any) -> None:
+def _checked_policy(algorithm: Any, policy: Any) -> Any:
     """
+    :return: the policy, a class where it was the name of one
     :raises ValueError: for a name that the algorithm does not know, and for a policy class of
         another algorithm, as its saved files name it
     """
     known = algorithm.policy_aliases
     if isinstance(policy, str) and policy not in known:
+        if policy in registry.POLICIES:  # as saved files name them
+            return _checked_policy(algorithm, registry.load(policy))
         raise ValueError(f"{algorithm.__name__} has no policy {policy!r}: use {', '.join(known)}.")
     if isinstance(policy, type) and not issubclass(policy, algorithm.policy_family):
         raise ValueError(
             f"{algorithm.__name__} cannot use the policy {policy.__name__}: pass 'MlpPolicy'. "
             "A file that another algorithm saved is loaded by the class of that algorithm."
         )
+    return policy
 
 
 def check_origin(algorithm: type, saved_by: str) -> None:

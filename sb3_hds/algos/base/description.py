@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_hds.algos import registry
 from sb3_hds.algos.base.policy import TensorPolicy
 from sb3_hds.algos.nets.activations import activation, activation_name
 
@@ -19,8 +20,8 @@ def described(policy: TensorPolicy) -> dict[str, Any] | None:
     :return: plain data from which ``load_policy`` builds the policy, without its weights; None for
         a class, a space or an activation that only Python knows
     """
-    kind = type(policy)
-    if not kind.__module__.startswith("sb3_hds."):
+    name = registry.registered_name(type(policy))
+    if name is None:
         return None
     arguments = {
         name: activation_name(activation(value)) if name.endswith("activation_fn") else value
@@ -29,11 +30,10 @@ def described(policy: TensorPolicy) -> dict[str, Any] | None:
     }
     try:
         description = {
-            "class": kind.__name__,
+            "class": name,
             "observation_space": space_to_plain(policy.observation_space),
             "action_space": space_to_plain(policy.action_space),
             "arguments": arguments,
-            "state": dict(policy.plain_state),
         }
         return json.loads(json.dumps(description, default=_plain))
     except TypeError:

@@ -100,3 +100,7 @@ def _scaled(space: spaces.Box, action: np.ndarray) -> np.ndarray:
             "outside that layer rescales actions: put it below, or use store='raw'."
         )
     return np.clip(scaled, -1.0, 1.0)
+
+
+# Pickles of a buffer name the public package, which stays where it is.
+ExecutedReplayBuffer.__module__ = ExecutedDictReplayBuffer.__module__ = "sb3_hds.algos"

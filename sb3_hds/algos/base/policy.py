@@ -1,7 +1,5 @@
 """Policies whose networks are pytrees, saved as tensors."""
 
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
@@ -52,8 +50,6 @@ class TensorPolicy(BaseJaxPolicy):
 
     #: of the constructor, but for the spaces
     arguments: dict[str, Any]
-    #: what prediction needs besides arguments and weights, as plain data
-    plain_state: Mapping[str, Any] = MappingProxyType({})
 
     def predict(  # type: ignore[override]
         self,
@@ -124,18 +120,10 @@ class TensorPolicy(BaseJaxPolicy):
         with damage_reported(path):
             # As SB3 says, spaces are no tensors.
             saved = th.load(path, map_location="cpu", weights_only=False)
-        policy = cls(**cls.arguments_of_file(saved["data"]))
+        policy = cls(**saved["data"])
         policy.load_state_dict(saved["state_dict"])
         policy.to(get_device(device))
         return policy
-
-    @classmethod
-    def arguments_of_file(cls, saved: Mapping[str, Any]) -> dict[str, Any]:
-        """
-        :param saved: arguments of the constructor
-        :return: what they meant when they were saved
-        """
-        return dict(saved)
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, th.Tensor]:
         return to_state_dict(self.weights)

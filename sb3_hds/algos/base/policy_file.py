@@ -48,7 +48,7 @@ def load_policy(path: str | os.PathLike[str] | io.BufferedIOBase) -> TensorPolic
     if description is None:
         raise ValueError(
             f"{name_of(path)} does not describe its policy in plain data: another library saved "
-            "it, an older version of this one, or its policy has a class or function of your own. "
+            "it, or its policy has a class or function of your own. "
             "If you trust whoever saved it, load it with its algorithm, for example HDS.load(path)."
         )
     policy = _built(description)
@@ -69,9 +69,8 @@ def _built(description: Mapping[str, Any]) -> TensorPolicy:
         make = registry.load(description["class"])
         observation_space = space_from_plain(description["observation_space"])
         action_space: Any = space_from_plain(description["action_space"])
-        arguments = make.arguments_of_file(description["arguments"])
+        arguments = description["arguments"]
         policy = make(observation_space, action_space, lr_schedule=_no_rate, **arguments)  # type: ignore[call-arg]
-        policy.plain_state = description["state"]
     # Whatever a constructor makes of numbers that a stranger wrote.
     except Exception as error:
         raise ValueError(

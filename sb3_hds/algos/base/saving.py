@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
+from sb3_hds.algos import registry
 from sb3_hds.algos.base.checks import (
     callbacks_of,
     check_given,
@@ -41,9 +42,23 @@ def _misfits_told() -> Iterator[None]:
         ) from error
 
 
+class _ByName:
+    """A policy class that a model holds, and saves, by its name in the registry if it has one."""
+
+    def __get__(self, model: Any, owner: type | None = None) -> Any:
+        if model is None:
+            return self
+        held = vars(model)["policy_class"]
+        return registry.load(held) if isinstance(held, str) else held
+
+    def __set__(self, model: Any, kind: Any) -> None:
+        vars(model)["policy_class"] = registry.registered_name(kind) or kind
+
+
 class SavesTensors(BaseAlgorithm):
     """Abstract: an algorithm whose policy is a :class:`~sb3_hds.algos.base.policy.TensorPolicy`."""
 
+    policy_class = _ByName()  # type: ignore[assignment]  # SB3 annotates what it returns
     policy_description: dict[str, Any] | None
 
     def __new__(cls, *args: Any, **given: Any) -> Self:

@@ -35,7 +35,6 @@ from sb3_hds.errors import DivergedError, EnvironmentMismatchError
 
 # What is logged of updates of the actor, which not every call of ``train`` makes.
 _OF_ACTOR = ("actor_loss", "ent_coef", "ent_coef_loss")
-_NOT_THERE = object()
 _USUAL_BATCH = 256
 # What networks compute in.
 _LARGEST = float(np.finfo(np.float32).max)
@@ -425,8 +424,6 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             self.learning_rate = schedule_of(self.learning_rate)
         elif isinstance(self.learning_rate, numbers.Real):
             self.learning_rate = float(self.learning_rate)
-        self._take_older_rate()
-        self._take_older_widths()
         # Of None, SBX makes the first number of ``learning_rate``.
         given, self._before = self.qf_learning_rate, None
         derived = self.replay_buffer_class in (None, self._derived_buffer)
@@ -454,21 +451,6 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     def _usual_buffer(self) -> type[ReplayBuffer] | None:
         """:return: what is used where none is passed; None: what SB3 uses"""
         return None
-
-    def _take_older_rate(self) -> None:
-        """Older files have ``qf_learning_rate`` under another name, beside SBX's number."""
-        older = vars(self).pop("critic_learning_rate", _NOT_THERE)
-        if older is not _NOT_THERE and self.qf_learning_rate == self.lr_schedule(1.0):
-            self.qf_learning_rate = older
-
-    def _take_older_widths(self) -> None:
-        """Of a file that does not say its widths, they are the default of when it was saved."""
-        described = vars(self).get("policy_description")
-        if described is None or "net_arch" in self.policy_kwargs:
-            return
-        kind: Any = self.policy_class
-        saved = kind.arguments_of_file(described["arguments"])["net_arch"]
-        self.policy_kwargs = {**self.policy_kwargs, "net_arch": saved}
 
     def _maybe_reset_params(self) -> None:
         resets = self.param_resets or []

@@ -90,8 +90,6 @@ class GaussianPolicy(LearningPolicy):
     }
     #: arguments that these networks do not use
     unused: ClassVar[tuple[str, ...]] = ()
-    #: ``net_arch`` of files that do not say it: the default of their day, where that changed
-    of_older_files: ClassVar[Mapping[str, Sequence[int]] | None] = None
 
     def __init__(
         self,
@@ -173,11 +171,6 @@ class GaussianPolicy(LearningPolicy):
         self.flatten = flattener(observation_space)
         self.forget_noise()
         self._noise = np.random.default_rng(0)
-
-    @classmethod
-    def arguments_of_file(cls, saved: Mapping[str, Any]) -> dict[str, Any]:
-        older = cls.of_older_files if saved.get("net_arch") is None else None
-        return dict(saved) if older is None else {**saved, "net_arch": dict(older)}
 
     def _refuse_unused(self, has_batch_norm: bool) -> None:
         unused = self.unused if has_batch_norm else (*self.unused, "batch_norm_momentum")
@@ -347,7 +340,6 @@ class SimbaPolicy(GaussianPolicy):
     }
     unused = ("renorm_warmup_steps", "ortho_init")
     narrow = 128
-    of_older_files = {"pi": (128,), "qf": (512, 512)}
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
         return SimbaBody(net_arch, self.activation_fn)
@@ -382,7 +374,6 @@ class CrossQPolicy(GaussianPolicy):
         "normalize_observations": False,
         "renorm_warmup_steps": 100_000,
     }
-    of_older_files = {"pi": (256, 256), "qf": (2048, 2048)}
 
 
 def widths(

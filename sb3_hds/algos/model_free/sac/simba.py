@@ -33,8 +33,7 @@ class SimbaSAC(SoftActorCritic):
     2] and start near 1. With gSDE (``use_sde=True``), the deviation is that of the noise matrix,
     which is neither. The loss of the entropy coefficient has the coefficient itself, as theirs,
     where SBX has its logarithm. Critics are updated before the actor, as in SBX and in the other
-    algorithms here; the authors' code updates them last. What was saved before there was
-    ``squash_log_std`` goes on clipping.
+    algorithms here; the authors' code updates them last.
 
     SBX's variant is ``learning_rate=3e-4, ent_coef="auto", target_entropy=-n_act,
     linear_ent_coef=False, gradient_steps=1`` with ``policy_kwargs={"net_arch": [256, 256],

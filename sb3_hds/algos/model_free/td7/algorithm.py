@@ -190,9 +190,6 @@ class TD7(ModelFreeAlgorithm):
     def _setup_model(self) -> None:
         self._choose_train_freq()
         super()._setup_model()
-        if self.best_worst_return > -np.inf:
-            # ``load`` comes by here; older files say only what their checkpoint was worth.
-            self.policy.keep_checkpoint()
         if self.action_noise is None and self.exploration_noise:
             # SB3 adds it to actions of the space's shape.
             size = np.full(self.policy.action_shape, self.exploration_noise, np.float32)

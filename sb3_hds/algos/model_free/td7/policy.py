@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
@@ -33,8 +32,6 @@ from sb3_hds.core.compilation import GENERATOR
 
 # Of the policy's constructor: what is no argument.
 _NO_ARGUMENTS = ("self", "observation_space", "action_space", "__class__", "use_sde")
-# The name of ``Checkpoint.kept`` among the tensors of a policy.
-_KEPT = "checkpoint.kept"
 
 
 class TD7Policy(LearningPolicy):
@@ -109,21 +106,6 @@ class TD7Policy(LearningPolicy):
         self.recipe = recipe
         key = jax.random.key(seed, impl=GENERATOR)
         self.learner = jax.device_put(begin(recipe, self.n_obs, self.n_act, key), device)
-
-    @property
-    def plain_state(self) -> Mapping[str, bool]:  # type: ignore[override]
-        """Empty; of older files, it says what their tensors do not: whether a checkpoint acts."""
-        return {}
-
-    @plain_state.setter
-    def plain_state(self, state: Mapping[str, bool]) -> None:
-        if state.get("uses_checkpoints", False):
-            self.keep_checkpoint()
-
-    def load_state_dict(self, state_dict: dict, strict: bool = True, assign: bool = False) -> None:
-        """Tensors that do not say whether a checkpoint was kept leave that as it is."""
-        own = {_KEPT: th.as_tensor(float(self.has_checkpoint))}
-        super().load_state_dict(own | state_dict, strict, assign)
 
     @property
     def has_checkpoint(self) -> bool:

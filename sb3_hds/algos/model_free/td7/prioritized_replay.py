@@ -102,3 +102,7 @@ class LapReplayBuffer(ReplayBuffer):
     def forget_highest(self) -> None:
         """New transitions are as important as the most important one that is left."""
         self.highest = self.priorities.largest()
+
+
+# Pickles of a buffer name the public package, which stays where it is.
+SumTree.__module__ = LapReplayBuffer.__module__ = "sb3_hds.algos"

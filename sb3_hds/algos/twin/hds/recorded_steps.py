@@ -233,10 +233,8 @@ def _tensors_of(data: Trajectories) -> dict[str, th.Tensor]:
 def _unpadded(saved: dict[str, th.Tensor]) -> Trajectories:
     obs, actions = (saved[name].cpu().numpy() for name in ("obs", "actions"))
     lengths = saved["lengths"].cpu().numpy()
-    labels, origin = "earlier", np.arange(len(lengths))
-    if "conditions" in saved:  # files of the first versions have neither
-        labels = json.loads(saved["conditions"].cpu().numpy().tobytes())
-        origin = saved["origin"].cpu().numpy()
+    labels = json.loads(saved["conditions"].cpu().numpy().tobytes())
+    origin = saved["origin"].cpu().numpy()
     found = Trajectories.from_arrays(
         [x[: n + 1] for x, n in zip(obs, lengths, strict=True)],
         [u[:n] for u, n in zip(actions, lengths, strict=True)],
