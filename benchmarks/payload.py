@@ -129,7 +129,7 @@ def backpropagation(model):
 
     import jax
 
-    from sb3_hds.algos.learner import optimiser, resets
+    from sb3_hds.algos.twin.state import optimiser, resets
     from sb3_hds.planning import Problem, follow
 
     twin, actor = model.twin, model.policy.actor_network
@@ -170,7 +170,7 @@ def make_measure(model):
     """Mean objective and mean return of the policy over 500 unseen start states."""
     import jax
 
-    from sb3_hds.algos.learner import resets
+    from sb3_hds.algos.twin.state import resets
     from sb3_hds.planning import Problem, follow
 
     twin, actor = model.twin, model.policy.actor_network

@@ -9,20 +9,7 @@ from typing import Any
 
 from rl_zoo_plugin import trials
 from rl_zoo_plugin.lazy import LazyAlgorithm
-
-ALGORITHMS = {
-    "pods": "PODS",
-    "hds": "HDS",
-    "gsde_sac": "GSDESAC",
-    "droq": "DroQ",
-    "crossq_jax": "CrossQ",
-    "tqc_jax": "TQC",
-    "simba": "SimbaSAC",
-    "td7": "TD7",
-    "bro": "BRO",
-    "openloop": "OpenLoop",
-}
-"""Id in the zoo (lower case, as it names a folder) to public name in ``sb3_hds``."""
+from sb3_hds.algos.registry import ALGORITHMS  # registers our environments with Gymnasium, too
 
 _PROGRESS = "rl_zoo_plugin.trial_progress.TrialProgress"
 _PROGRESS_BAR = "stable_baselines3.common.callbacks.ProgressBarCallback"
@@ -30,7 +17,7 @@ _PROGRESS_BAR = "stable_baselines3.common.callbacks.ProgressBarCallback"
 
 def hyperparams_file(algo: str) -> Path:
     """
-    :param algo: an id of ``ALGORITHMS``
+    :param algo: an id of ``sb3_hds.algos.registry.ALGORITHMS``
     :return: its zoo-format yml file: next to this module in a wheel, in the root of a checkout
     """
     here = Path(__file__).parent
@@ -41,17 +28,17 @@ def hyperparams_file(algo: str) -> Path:
 
 
 def _extend_algorithms(utils: ModuleType) -> None:
-    for algo, class_name in ALGORITHMS.items():
-        utils.ALGOS.setdefault(algo, LazyAlgorithm(class_name))
-    import sb3_hds  # noqa: F401  registers our environments
+    for algo, entry in ALGORITHMS.items():
+        utils.ALGOS.setdefault(algo, LazyAlgorithm(entry.name))
 
 
 def _extend_samplers(hyperparams_opt: ModuleType) -> None:
-    from rl_zoo_plugin.samplers import CONVERTERS, SAMPLERS
+    from rl_zoo_plugin.samplers import SAMPLERS
 
-    for algo in ALGORITHMS:
-        if hyperparams_opt.HYPERPARAMS_SAMPLER.setdefault(algo, SAMPLERS[algo]) is SAMPLERS[algo]:
-            hyperparams_opt.HYPERPARAMS_CONVERTER.setdefault(algo, CONVERTERS[algo])
+    for algo, entry in ALGORITHMS.items():
+        sampler = SAMPLERS[entry.sampler]
+        if hyperparams_opt.HYPERPARAMS_SAMPLER.setdefault(algo, sampler) is sampler:
+            hyperparams_opt.HYPERPARAMS_CONVERTER.setdefault(algo, sampler.convert)
 
 
 def _extend_manager(exp_manager: ModuleType) -> None:

@@ -1,3 +1,4 @@
+# ruff: noqa: F401  what editors know of names that are imported on first use
 """
 Learn through a differentiable simulation of your environment, and find out what it gets wrong.
 
@@ -8,6 +9,7 @@ our environments with Gymnasium.
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from sb3_hds.algos.registry import ALGORITHMS
 from sb3_hds.envs.registration import register_environments
 
 if TYPE_CHECKING:
@@ -30,56 +32,25 @@ if TYPE_CHECKING:
 
     __version__: str
 
-__all__ = [
-    "BRO",
-    "GSDESAC",
-    "HDS",
-    "PODS",
-    "TD7",
-    "TQC",
-    "CrossQ",
-    "DroQ",
-    "OpenLoop",
-    "SimbaSAC",
-    "Trajectories",
-    "audit",
-    "calibrate",
-    "data",
-    "diagnose",
-    "effects",
-    "envs",
-    "load_policy",
-    "planning",
-    "sysid",
-    "twins",
-    "wrappers",
-]
-
-_CLASSES = {
-    "BRO": "algos",
-    "CrossQ": "algos",
-    "DroQ": "algos",
-    "GSDESAC": "algos",
-    "HDS": "algos",
-    "OpenLoop": "algos",
-    "PODS": "algos",
-    "SimbaSAC": "algos",
-    "TD7": "algos",
-    "TQC": "algos",
+_MODULES = {
+    **dict.fromkeys((entry.name for entry in ALGORITHMS.values()), "algos"),
     "Trajectories": "data",
     "audit": "data",
     "calibrate": "sysid",
     "diagnose": "sysid",
     "load_policy": "algos",
 }
+_LAYERS = ("data", "effects", "envs", "planning", "sysid", "twins", "wrappers")
+
+__all__ = sorted([*_MODULES, *_LAYERS])  # pyright: ignore[reportUnsupportedDunderAll]
 
 register_environments()
 
 
 def __getattr__(name: str) -> Any:
-    if name in _CLASSES:
-        return getattr(importlib.import_module(f"sb3_hds.{_CLASSES[name]}"), name)
-    if name in __all__:
+    if name in _MODULES:
+        return getattr(importlib.import_module(f"sb3_hds.{_MODULES[name]}"), name)
+    if name in _LAYERS:
         return importlib.import_module(f"sb3_hds.{name}")
     if name == "__version__":
         return _version()

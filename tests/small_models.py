@@ -13,7 +13,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_hds import algos
-from sb3_hds.algos.twin_algorithm import TwinAlgorithm
+from sb3_hds.algos.twin.algorithm import TwinAlgorithm
 
 # One set for all that plan in a twin: equal settings are one compiled program.
 _PLANNING = {
@@ -39,18 +39,12 @@ _MODEL_FREE = {
     "buffer_size": 500,
     "policy_kwargs": {"net_arch": [8]},
 }
-#: an algorithm is tested as soon as it has an entry here, under its id in ``algos.ALL``
-SMALL: dict[str, dict[str, Any]] = {
-    "pods": _PLANNING,
-    "hds": _PLANNING | {"residual_kwargs": {"n_members": 2, "net_arch": [4]}},
-    "gsde_sac": _MODEL_FREE,
-    "droq": _MODEL_FREE,
-    "crossq_jax": _MODEL_FREE,
-    "tqc_jax": _MODEL_FREE | {"policy_kwargs": {"net_arch": [8], "n_quantiles": 5}},
-    "simba": _MODEL_FREE,
-    "td7": _MODEL_FREE
-    | {"use_checkpoints": False, "policy_kwargs": {"net_arch": [8], "embedding_size": 8}},
-    "bro": _MODEL_FREE | {"policy_kwargs": {"net_arch": [8], "n_quantiles": 5}},
+# What an algorithm has besides.
+_OWN = {
+    "hds": {"residual_kwargs": {"n_members": 2, "net_arch": [4]}},
+    "tqc_jax": {"policy_kwargs": {"net_arch": [8], "n_quantiles": 5}},
+    "td7": {"use_checkpoints": False, "policy_kwargs": {"net_arch": [8], "embedding_size": 8}},
+    "bro": {"policy_kwargs": {"net_arch": [8], "n_quantiles": 5}},
     "openloop": {"population_size": 3, "horizon": 4, "n_elites": 2, "ranking_share": 0.0},
 }
 
@@ -60,6 +54,12 @@ PLANNERS = [name for name in NAMES if issubclass(algos.ALL[name], TwinAlgorithm)
 #: the algorithms that learn from a replay buffer, by gradients
 OFF_POLICY = [name for name in NAMES if issubclass(algos.ALL[name], OffPolicyAlgorithm)]
 MODEL_FREE = [name for name in OFF_POLICY if name not in PLANNERS]
+#: arguments of each
+SMALL: dict[str, dict[str, Any]] = {
+    name: (_PLANNING if name in PLANNERS else _MODEL_FREE if name in MODEL_FREE else {})
+    | _OWN.get(name, {})
+    for name in NAMES
+}
 
 #: observations of Pendulum-v1
 STATES = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, -2.0]], np.float32)

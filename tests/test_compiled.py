@@ -13,8 +13,9 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_hds import algos, twins
-from sb3_hds.algos import compiled, learn_compiled
-from sb3_hds.algos.compiled_run import run_rounds
+from sb3_hds.algos import learn_compiled
+from sb3_hds.algos.model_free.sac import compiled
+from sb3_hds.algos.model_free.sac.compiled_run import run_rounds
 from sb3_hds.envs import twin_of
 from sb3_hds.errors import EnvironmentMismatchError, SeedsDivergedError
 from sb3_hds.wrappers import ActionRateLimit

@@ -15,9 +15,9 @@ import pytest
 import yaml
 
 from rl_zoo_plugin.lazy import OF_POLICY, parameters_of
-from rl_zoo_plugin.tables import ALGORITHMS
 from sb3_hds import HDS, PODS, algos, cli, effects, twins
-from sb3_hds.algos.log import record_epoch
+from sb3_hds.algos.registry import ALGORITHMS
+from sb3_hds.algos.twin.log import record_epoch
 from sb3_hds.envs.registration import HARDWARE, STEP_LIMITS, TASKS
 
 ROOT = Path(__file__).parent.parent

@@ -7,7 +7,7 @@ from gymnasium.utils.env_checker import check_env as check_gymnasium
 from stable_baselines3.common.env_checker import check_env as check_sb3
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_hds.algos.body import body_of
+from sb3_hds.algos.open_loop.robot import body_of
 from sb3_hds.envs import ElasticQuadruped
 from sb3_hds.wrappers import CPGPrior
 

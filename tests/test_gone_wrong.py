@@ -11,9 +11,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_hds import HDS, TD7, CrossQ
-from sb3_hds.algos.gaussian_policy import GaussianPolicy
-from sb3_hds.algos.networks import finite_leaves
-from sb3_hds.algos.td7 import TD7Policy
+from sb3_hds.algos.model_free.sac.policy import GaussianPolicy
+from sb3_hds.algos.model_free.td7.algorithm import TD7Policy
+from sb3_hds.algos.nets.activations import finite_leaves
 from sb3_hds.errors import DivergedError
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")

@@ -12,8 +12,8 @@ from stable_baselines3.common.distributions import StateDependentNoiseDistributi
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_hds.algos import learn_compiled
-from sb3_hds.algos.off_policy import act
-from sb3_hds.algos.squashed import Gaussian, exploration_std, log_probability, marginal_std
+from sb3_hds.algos.model_free.sac.update import act
+from sb3_hds.algos.nets.squashed import Gaussian, exploration_std, log_probability, marginal_std
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 

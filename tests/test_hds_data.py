@@ -13,10 +13,10 @@ from small_models import logged, reloaded, same, small
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_hds import HDS, PODS, effects, twins
-from sb3_hds.algos.correction import Correction, Wishes, correct
-from sb3_hds.algos.hds import _effects_of, _native_of
-from sb3_hds.algos.log import record_correction
-from sb3_hds.algos.windows import Since
+from sb3_hds.algos.twin.hds.algorithm import _effects_of, _native_of
+from sb3_hds.algos.twin.hds.correction import Correction, Wishes, correct
+from sb3_hds.algos.twin.hds.windows import Since
+from sb3_hds.algos.twin.log import record_correction
 from sb3_hds.core import Trajectories
 from sb3_hds.effects import force_of
 from sb3_hds.errors import TrajectoryError
@@ -212,7 +212,7 @@ def test_on_a_planted_mismatch_hds_does_better_than_pods():
 def test_what_is_diagnosed_is_the_twin_as_it_was_before_any_data(heavier, monkeypatch):
     model = real(pretrain_data=heavier)
     model.twin = model.twin.with_parameters(mass=1.3)
-    monkeypatch.setattr("sb3_hds.algos.hds.diagnose", lambda *given, **_: given)
+    monkeypatch.setattr("sb3_hds.algos.twin.hds.algorithm.diagnose", lambda *given, **_: given)
 
     twin, data = model.diagnose()
 
@@ -337,7 +337,7 @@ def test_data_from_a_file_correct_the_model_and_travel_with_it(
         np.testing.assert_array_equal(data.obs, heavier.obs)
         return Correction(twin.with_parameters(damping=0.1), 0.0, changed=True)
 
-    monkeypatch.setattr("sb3_hds.algos.hds.correct", rubs)
+    monkeypatch.setattr("sb3_hds.algos.twin.hds.algorithm.correct", rubs)
     path = heavier.save(tmp_path / "log")
     model = real(pretrain_data=str(path), refit_freq=0, train_freq=50).learn(50)
     assert model.twin.values["damping"] == 0.1
@@ -373,7 +373,7 @@ def test_what_counts_since_a_change_is_remembered_in_real_steps(monkeypatch, no_
         found = Correction(twin, 0.0, changed=True, attached={"friction": 0.0})
         return dataclasses.replace(found, since=Since(15, 0) if len(counted) == 2 else None)
 
-    monkeypatch.setattr("sb3_hds.algos.hds.correct", changed_once)
+    monkeypatch.setattr("sb3_hds.algos.twin.hds.algorithm.correct", changed_once)
     model = real(train_freq=10, replan_epochs=2, gradient_steps=3).learn(10).learn(20)
 
     assert (model.num_timesteps, model.real_timesteps) == (20, 30)

@@ -7,7 +7,7 @@ from measuring import measured
 from small_models import small
 
 from sb3_hds import HDS, twins
-from sb3_hds.algos import correction
+from sb3_hds.algos.twin.hds import correction
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.prediction import hold_out
 

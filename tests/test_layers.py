@@ -207,7 +207,7 @@ def test_the_rule_forbids_what_it_should():
         ("sb3_hds/twins/environments/pendulum.py", "import sb3_hds.effects.joint"),
         ("sb3_hds/planning/ilqr.py", "import importlib\nimportlib.import_module('sb3_hds.algos')"),
         ("sb3_hds/envs/mirror.py", "from sb3_hds import twins, HDS"),
-        ("sb3_hds/algos/hds.py", "from .networks import Policy"),
+        ("sb3_hds/algos/twin/hds/algorithm.py", "from .networks import Policy"),
         ("sb3_hds/envs/twin_env.py", "from stable_baselines3.sac import SAC"),
         ("sb3_hds/sysid/plots.py", "if True:\n    import matplotlib"),
     ):

@@ -18,11 +18,13 @@ from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_hds import DroQ
-from sb3_hds.algos import off_policy, soft_actor_critic, td7_update
-from sb3_hds.algos.bodies import SimbaBody
-from sb3_hds.algos.lap import LapReplayBuffer
-from sb3_hds.algos.off_policy import Trained
-from sb3_hds.algos.sampling import batches_of
+from sb3_hds.algos.model_free.replay import batches_of
+from sb3_hds.algos.model_free.sac import algorithm as soft_actor_critic
+from sb3_hds.algos.model_free.sac import update as off_policy
+from sb3_hds.algos.model_free.sac.update import Trained
+from sb3_hds.algos.model_free.td7 import update as td7_update
+from sb3_hds.algos.model_free.td7.prioritized_replay import LapReplayBuffer
+from sb3_hds.algos.nets.mlp import SimbaBody
 from sb3_hds.errors import EnvironmentMismatchError
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -297,10 +299,6 @@ def test_learning_rates_of_every_form_may_be_changed_while_loading():
     changed._current_progress_remaining = 0.5
     assert changed.learning_rates() == pytest.approx((1.5e-4, 2.5e-4))
     assert reloaded(changed).qf_learning_rate == "lin_5e-4"
-    # Files from before there was a rate of the critics have it beside SBX's number.
-    model.critic_learning_rate, model.qf_learning_rate = 2e-4, 1e-4
-    assert reloaded(model).qf_learning_rate == 2e-4
-    assert reloaded(model, qf_learning_rate=5e-4).qf_learning_rate == 5e-4
 
 
 def test_losses_of_the_actor_are_logged_where_it_was_updated_in_whichever_program(monkeypatch):

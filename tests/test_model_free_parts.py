@@ -11,12 +11,17 @@ import torch as th
 from gymnasium import spaces
 from small_models import small
 
-from sb3_hds.algos import off_policy
-from sb3_hds.algos.bodies import Dropout
-from sb3_hds.algos.observations import flattener
-from sb3_hds.algos.off_policy import Trained
-from sb3_hds.algos.optimizers import optimizer_of
-from sb3_hds.algos.quantiles import all_targets, sorted_by_columns, sorted_by_rows, target_by_target
+from sb3_hds.algos.model_free.sac import update as off_policy
+from sb3_hds.algos.model_free.sac.quantiles import (
+    all_targets,
+    sorted_by_columns,
+    sorted_by_rows,
+    target_by_target,
+)
+from sb3_hds.algos.model_free.sac.update import Trained
+from sb3_hds.algos.nets.mlp import Dropout
+from sb3_hds.algos.nets.observations import flattener
+from sb3_hds.algos.nets.optimizers import optimizer_of
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 

@@ -12,8 +12,9 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_hds.algos import TwinPolicy
-from sb3_hds.algos import networks as nets
-from sb3_hds.algos.networks import ACTIVATIONS, Actor, activation, value_of
+from sb3_hds.algos.nets.activations import ACTIVATIONS, activation
+from sb3_hds.algos.twin import networks as nets
+from sb3_hds.algos.twin.networks import Actor, value_of
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 

@@ -15,8 +15,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
 from sb3_hds import OpenLoop
-from sb3_hds.algos import gait_search
-from sb3_hds.algos.gait_space import Constants, GaitSpace
+from sb3_hds.algos.open_loop.algorithm import cma_es as gait_search
+from sb3_hds.algos.open_loop.gait import Constants, GaitSpace
 from sb3_hds.core.transforms.oscillators import Gait, target_at
 from sb3_hds.envs import TwinVecEnv
 from sb3_hds.errors import EnvironmentMismatchError

@@ -5,8 +5,8 @@ import warnings
 import pytest
 from small_models import small
 
-from sb3_hds.algos import pace
-from sb3_hds.algos.pace import Pace
+from sb3_hds.algos.base import pace
+from sb3_hds.algos.base.pace import Pace
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from rl_zoo_plugin.tables import ALGORITHMS
+from sb3_hds.algos.registry import ALGORITHMS
 
 ROOT = Path(__file__).parent.parent
 needs_build = pytest.mark.skipif(

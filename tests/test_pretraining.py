@@ -21,7 +21,7 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_hds import algos
-from sb3_hds.algos import twin_algorithm
+from sb3_hds.algos.twin import algorithm as twin_algorithm
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 

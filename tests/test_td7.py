@@ -17,8 +17,8 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_hds import TD7
-from sb3_hds.algos import td7_update
-from sb3_hds.algos.lap import LapReplayBuffer, SumTree
+from sb3_hds.algos.model_free.td7 import update as td7_update
+from sb3_hds.algos.model_free.td7.prioritized_replay import LapReplayBuffer, SumTree
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sb3_hds.algos.thin import Hidden, Last, hidden_product, product
+from sb3_hds.algos.nets.dense import Hidden, Last, hidden_product, product
 
 pytestmark = pytest.mark.usefixtures("x64", "quick_compilation")
 

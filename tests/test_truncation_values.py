@@ -14,8 +14,8 @@ from stable_baselines3.common.buffers import NStepReplayBuffer
 
 from sb3_hds import algos
 from sb3_hds.algos import learn_compiled
-from sb3_hds.algos.off_policy import judge
-from sb3_hds.algos.sampling import batches_of
+from sb3_hds.algos.model_free.replay import batches_of
+from sb3_hds.algos.model_free.sac.update import judge
 from sb3_hds.core import State
 from sb3_hds.envs import ConstantReward, TwinEnv
 from sb3_hds.errors import ParameterError

@@ -15,11 +15,11 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_hds import twins
-from sb3_hds.algos import twin_algorithm
-from sb3_hds.algos.arguments import knobs_of, visited_states
-from sb3_hds.algos.learner import problem_of
-from sb3_hds.algos.regression import regress
-from sb3_hds.algos.twin_policy import all_finite
+from sb3_hds.algos.twin import algorithm as twin_algorithm
+from sb3_hds.algos.twin.config import knobs_of, visited_states
+from sb3_hds.algos.twin.policy import all_finite
+from sb3_hds.algos.twin.regression import regress
+from sb3_hds.algos.twin.state import problem_of
 from sb3_hds.core import Twin
 from sb3_hds.errors import RewardError
 

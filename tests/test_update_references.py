@@ -31,10 +31,10 @@ from numpy_networks import (
 from odd_envs import AnySpaces
 
 from sb3_hds import algos
-from sb3_hds.algos import td7_update
-from sb3_hds.algos.bodies import Dropout
-from sb3_hds.algos.observations import Seen
-from sb3_hds.algos.off_policy import Batch, Knobs, Report, average, before_any, update
+from sb3_hds.algos.model_free.sac.update import Batch, Knobs, Report, average, before_any, update
+from sb3_hds.algos.model_free.td7 import update as td7_update
+from sb3_hds.algos.nets.mlp import Dropout
+from sb3_hds.algos.nets.observations import Seen
 
 pytestmark = pytest.mark.usefixtures("x64", "quick_compilation")
 

@@ -22,8 +22,8 @@ from rl_zoo_plugin import (
     trials,
 )
 from rl_zoo_plugin.lazy import LazyAlgorithm
-from rl_zoo_plugin.samplers import CONVERTERS, SAMPLERS
-from sb3_hds import algos
+from rl_zoo_plugin.samplers import SAMPLERS
+from sb3_hds.algos.registry import ALGORITHMS
 
 STOCK = {"a2c", "ars", "crossq", "ddpg", "dqn", "ppo", "ppo_lstm", "qrdqn", "sac", "td3", "tqc"}
 USUAL = {"Pendulum-v1", "MountainCarContinuous-v0", "InvertedPendulum-v5", "Hopper-v5"}
@@ -84,14 +84,12 @@ def test_an_algorithm_is_known_to_the_zoo_unless_its_id_is_taken():
 
     assert zoo.ALGOS["hds"] == "somebody else's"
     assert isinstance(zoo.ALGOS["pods"], LazyAlgorithm)
-    assert not set(tables.ALGORITHMS) & STOCK
-    assert {algo: each.__name__ for algo, each in algos.ALL.items()} == tables.ALGORITHMS
-    assert set(tables.ALGORITHMS.values()) <= set(sb3_hds.__all__)
+    assert not set(ALGORITHMS) & STOCK
 
 
-@pytest.mark.parametrize("algo", tables.ALGORITHMS)
+@pytest.mark.parametrize("algo", ALGORITHMS)
 def test_a_yml_file_has_published_settings_for_every_environment_that_it_is_meant_for(algo):
-    algorithm, entries = LazyAlgorithm(tables.ALGORITHMS[algo]).resolve(), load_yml(algo)
+    algorithm, entries = LazyAlgorithm(ALGORITHMS[algo].name).resolve(), load_yml(algo)
     known = set(lazy.parameters_of(algorithm)) | CONSUMED_BY_THE_ZOO
     environments = sb3_hds.twins.all_ids() if algo in ("pods", "hds") else USUAL
 
@@ -110,18 +108,19 @@ def study():
     return optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
 
 
-@pytest.mark.parametrize("algo", tables.ALGORITHMS)
+@pytest.mark.parametrize("algo", ALGORITHMS)
 def test_a_trial_is_recreated_exactly_has_arguments_and_steps_left_to_learn_from(algo, study):
-    algorithm = LazyAlgorithm(tables.ALGORITHMS[algo]).resolve()
+    algorithm = LazyAlgorithm(ALGORITHMS[algo].name).resolve()
     known = set(lazy.parameters_of(algorithm))
     of_policies = set(lazy.parameters_of(algorithm.policy_aliases["MlpPolicy"]))
+    sampler = SAMPLERS[ALGORITHMS[algo].sampler]
 
     for i in range(8):
         trial, n_timesteps = study.ask(), (50, 20_000)[i % 2]
         with trials.running(0, n_timesteps):
-            sampled = SAMPLERS[algo](trial, n_actions=1, n_envs=1 + i // 2 % 2, additional_args={})
+            sampled = sampler(trial, n_actions=1, n_envs=1 + i // 2 % 2, additional_args={})
         study.tell(trial, 0.0)
-        assert CONVERTERS[algo](study.trials[-1].params) == sampled
+        assert sampler.convert(study.trials[-1].params) == sampled
         # The zoo writes them to config.yml, which has to be readable without this package.
         assert yaml.safe_load(yaml.safe_dump(sampled)) == sampled
         arguments, of_policy = lazy._apart(sampled)
@@ -147,8 +146,10 @@ def test_what_is_sampled_goes_with_what_the_file_says_of_the_policy(algo, study,
 
     with trials.running(0, 40):
         # The zoo updates the one with the other.
-        given |= SAMPLERS[algo](study.ask(), n_actions=1, n_envs=1, additional_args={})
-        model = LazyAlgorithm(tables.ALGORITHMS[algo])(env="Pendulum-v1", **given)
+        given |= SAMPLERS[ALGORITHMS[algo].sampler](
+            study.ask(), n_actions=1, n_envs=1, additional_args={}
+        )
+        model = LazyAlgorithm(ALGORITHMS[algo].name)(env="Pendulum-v1", **given)
 
     assert model.policy_kwargs["net_arch"] == (narrow if algo == "bro" else [8, 8])
     if algo == "tqc_jax":
@@ -284,7 +285,7 @@ def test_a_zoo_is_extended_before_and_after_it_is_imported(tmp_path, before):
     assert ours == str(tables.hyperparams_file("hds"))
     assert users == "mine.yml" and stock == "None"
     # Known by name only: neither jax nor torch is imported before an algorithm is used.
-    assert names == f"{['sac', *tables.ALGORITHMS]} False False"
+    assert names == f"{['sac', *ALGORITHMS]} False False"
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
+# ruff: noqa: F401  what editors know of names that are imported on first use
 """
-Learning algorithms behind Stable-Baselines3's API, one file each.
+Learning algorithms behind Stable-Baselines3's API.
 
 Names are imported on first use: who learns without a twin does not wait for what fits one to data.
 """
@@ -7,74 +8,50 @@ Names are imported on first use: who learns without a twin does not wait for wha
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from sb3_hds.algos import registry
+
 if TYPE_CHECKING:
-    from sb3_hds.algos.bro import BRO
-    from sb3_hds.algos.compiled import Episodes, learn_compiled
-    from sb3_hds.algos.crossq import CrossQ
-    from sb3_hds.algos.droq import DroQ
-    from sb3_hds.algos.every import ALL
-    from sb3_hds.algos.executed_actions import ExecutedDictReplayBuffer, ExecutedReplayBuffer
-    from sb3_hds.algos.gaussian_policy import GaussianPolicy
-    from sb3_hds.algos.gsde_sac import GSDESAC
-    from sb3_hds.algos.hds import HDS
-    from sb3_hds.algos.open_loop import OpenLoop
-    from sb3_hds.algos.oscillator_policy import OscillatorPolicy
-    from sb3_hds.algos.pods import PODS
-    from sb3_hds.algos.policy_file import load_policy
-    from sb3_hds.algos.simba import SimbaSAC
-    from sb3_hds.algos.td7 import TD7
-    from sb3_hds.algos.tqc import TQC
-    from sb3_hds.algos.train_beside import TrainBeside
-    from sb3_hds.algos.twin_policy import TwinPolicy
+    from sb3_hds.algos.base.executed_actions import ExecutedDictReplayBuffer, ExecutedReplayBuffer
+    from sb3_hds.algos.base.policy_file import load_policy
+    from sb3_hds.algos.base.threaded_training import TrainBeside
+    from sb3_hds.algos.model_free.sac.bro import BRO
+    from sb3_hds.algos.model_free.sac.compiled import Episodes, learn_compiled
+    from sb3_hds.algos.model_free.sac.crossq import CrossQ
+    from sb3_hds.algos.model_free.sac.droq import DroQ
+    from sb3_hds.algos.model_free.sac.gsde_sac import GSDESAC
+    from sb3_hds.algos.model_free.sac.policy import GaussianPolicy
+    from sb3_hds.algos.model_free.sac.simba import SimbaSAC
+    from sb3_hds.algos.model_free.sac.tqc import TQC
+    from sb3_hds.algos.model_free.td7.algorithm import TD7
+    from sb3_hds.algos.model_free.td7.prioritized_replay import LapReplayBuffer, SumTree
+    from sb3_hds.algos.open_loop.algorithm import OpenLoop
+    from sb3_hds.algos.open_loop.policy import OscillatorPolicy
+    from sb3_hds.algos.twin.hds.algorithm import HDS
+    from sb3_hds.algos.twin.pods import PODS
+    from sb3_hds.algos.twin.policy import TwinPolicy
 
-__all__ = [
-    "ALL",
-    "BRO",
-    "GSDESAC",
-    "HDS",
-    "PODS",
-    "TD7",
-    "TQC",
-    "CrossQ",
-    "DroQ",
-    "Episodes",
-    "ExecutedDictReplayBuffer",
-    "ExecutedReplayBuffer",
-    "GaussianPolicy",
-    "OpenLoop",
-    "OscillatorPolicy",
-    "SimbaSAC",
-    "TrainBeside",
-    "TwinPolicy",
-    "learn_compiled",
-    "load_policy",
-]
+    #: every algorithm by its id in the zoo
+    ALL: dict[str, Any]
 
-_MODULES = {
-    "ALL": "every",
-    "BRO": "bro",
-    "CrossQ": "crossq",
-    "DroQ": "droq",
-    "Episodes": "compiled",
-    "ExecutedDictReplayBuffer": "executed_actions",
-    "ExecutedReplayBuffer": "executed_actions",
-    "GSDESAC": "gsde_sac",
-    "GaussianPolicy": "gaussian_policy",
-    "HDS": "hds",
-    "OpenLoop": "open_loop",
-    "OscillatorPolicy": "oscillator_policy",
-    "PODS": "pods",
-    "SimbaSAC": "simba",
-    "TD7": "td7",
-    "TQC": "tqc",
-    "TrainBeside": "train_beside",
-    "TwinPolicy": "twin_policy",
-    "learn_compiled": "compiled",
-    "load_policy": "policy_file",
+_OTHERS = {
+    "Episodes": "model_free.sac.compiled",
+    "ExecutedDictReplayBuffer": "base.executed_actions",
+    "ExecutedReplayBuffer": "base.executed_actions",
+    "LapReplayBuffer": "model_free.td7.prioritized_replay",
+    "SumTree": "model_free.td7.prioritized_replay",
+    "TrainBeside": "base.threaded_training",
+    "learn_compiled": "model_free.sac.compiled",
+    "load_policy": "base.policy_file",
 }
+_MODULES = registry.MODULES | _OTHERS
+
+__all__ = ["ALL", *sorted(_MODULES)]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "ALL":
+        globals()["ALL"] = found = registry.load_all()
+        return found
     if name not in _MODULES:
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
     return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

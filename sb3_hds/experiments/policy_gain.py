@@ -18,7 +18,7 @@ from scipy.stats import trim_mean
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_hds.algos import HDS
-from sb3_hds.algos.twin_algorithm import TwinAlgorithm
+from sb3_hds.algos.twin.algorithm import TwinAlgorithm
 from sb3_hds.core import Twin
 from sb3_hds.core.trajectories.storage import write_bytes
 from sb3_hds.envs import TwinEnv, true_twin

@@ -1,0 +1,223 @@
+"""What all our algorithms share: one way in, weights as tensors, files that are whole or not there,
+and no measurement that is not finite."""
+
+import copy
+import io
+import pathlib
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from sbx.common.off_policy_algorithm import OffPolicyAlgorithmJax
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import MaybeCallback, RolloutReturn
+
+from sb3_hds.algos.base.checks import check_buffer, check_buffer_class, check_log_interval
+from sb3_hds.algos.base.construct import check_origin, check_policy_kwargs
+from sb3_hds.algos.base.executed_actions import executed
+from sb3_hds.algos.base.files import by_names, damaged, write_whole
+from sb3_hds.algos.base.pace import Pace
+from sb3_hds.algos.base.policy import TensorPolicy
+from sb3_hds.algos.base.saving import SavesTensors
+from sb3_hds.errors import EnvironmentMismatchError
+
+_STATISTICS = ("obs_rms", "ret_rms", "returns")
+
+
+class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
+    """Abstract: an off-policy algorithm whose policy is a :class:`TensorPolicy`."""
+
+    default_timesteps: ClassVar[int] = 1_000
+    #: whether a layer around the environment may decide that executed actions are stored
+    stores_executed: ClassVar[bool] = True
+    #: what a policy class must extend
+    policy_family: ClassVar[type[TensorPolicy]] = TensorPolicy
+    policy: TensorPolicy
+    saved_by: str
+    #: of ``VecNormalize``, as they were after the last step that was stored
+    _statistics: dict[str, Any] | None = None
+
+    def _constructed(self, device: Any, set_up: bool) -> None:
+        """
+        The end of every constructor.
+
+        :param device: as it was passed
+        :param set_up: whether networks are made now; ``load`` has them made later
+        :raises ValueError: if there is no environment to make them for
+        """
+        self.saved_by, self._device_name = type(self).__name__, str(device)
+        self._pace = Pace()
+        if not set_up:
+            return
+        if self.env is None:
+            raise ValueError(
+                f"{type(self).__name__} needs an environment, for example "
+                f"{type(self).__name__}('Pendulum-v1')."
+            )
+        self._setup_model()
+
+    @property
+    def network_seed(self) -> int:
+        """After a reset of the networks, another one."""
+        return int(np.asarray(self.key)[-1]) + self.reset_idx
+
+    def learn(  # type: ignore[override]
+        self,
+        total_timesteps: int | None = None,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """
+        Act in the environment and learn from it.
+
+        :param total_timesteps: steps of the *environment*; default ``default_timesteps``
+        :param callback: called at every step of the environment
+        :param log_interval: episodes between two log lines
+        :param tb_log_name: name of the run for TensorBoard; default: the class's name
+        :param reset_num_timesteps: False goes on counting
+        :param progress_bar: show one
+        """
+        check_log_interval(log_interval)
+        if total_timesteps is None:
+            total_timesteps = self.default_timesteps
+        learned = super().learn(
+            total_timesteps,
+            callback,
+            log_interval,  # type: ignore[arg-type]
+            tb_log_name or type(self).__name__,
+            reset_num_timesteps,
+            progress_bar,
+        )
+        self.check_weights()
+        return learned
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        """
+        :raises ValueError: where what the environment begins with is not finite
+        """
+        self._keep_statistics()
+        self._pace.pause()
+        found = super()._setup_learn(*args, **kwargs)
+        self._refuse_unless_finite("What the environment begins with", self._last_obs)
+        return found
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        self._pace.updated(self)
+        before = self.num_timesteps
+        collected = super().collect_rollouts(*args, **kwargs)
+        self._pace.collected(self, self.num_timesteps - before)
+        return collected
+
+    def remedies(self, updates_per_step: float) -> list[str]:
+        """:return: what would make a slow learner faster, as arguments"""
+        raise NotImplementedError
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        :raises ValueError: for a measurement that is not finite; the steps before it are kept, and
+            the next call of ``learn`` resets the environment
+        """
+        ends = [info["terminal_observation"] for info in infos if "terminal_observation" in info]
+        step = f"Step {self.num_timesteps} of the environment"
+        self._refuse_unless_finite(step, new_obs, reward, *ends)
+        self._keep_statistics()
+        if self.stores_executed:
+            buffer_action = executed(self.action_space, buffer_action, infos)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
+
+    def _keep_statistics(self) -> None:
+        normalizer = self._vec_normalize_env
+        if normalizer is not None:
+            held = [name for name in _STATISTICS if hasattr(normalizer, name)]
+            self._statistics = {name: copy.deepcopy(getattr(normalizer, name)) for name in held}
+
+    def _refuse_unless_finite(self, what: str, *measured: Any) -> None:
+        """``VecNormalize`` has counted it already, and clips what is infinite."""
+        normalizer = self._vec_normalize_env
+        given = measured
+        if normalizer is not None:
+            own = normalizer.get_original_obs(), normalizer.get_original_reward()
+            given = own[: len(measured)]
+        if all(map(_is_finite, (*measured, *given))):
+            return
+        for name, value in (self._statistics or {}).items():
+            setattr(normalizer, name, value)
+        self._last_obs = None
+        named = zip(("observation", "reward"), given, strict=False)
+        raise ValueError(
+            f"{what} is not finite: {', '.join(f'{name} {value}' for name, value in named)}. The "
+            "model and the steps before are as they were: mend the sensor, then learn(..., "
+            "reset_num_timesteps=False)."
+        )
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        write_whole(path, "pkl", super().save_replay_buffer)
+
+    def load_replay_buffer(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        truncate_last_traj: bool = True,
+    ) -> None:
+        """
+        SB3's ``load_replay_buffer``, which unpickles: load what you have saved yourself.
+
+        :param path: of a file that ``save_replay_buffer`` wrote; ``.pkl`` may be left out
+        :param truncate_last_traj: of a buffer of HER, whether its last episode has ended
+        :raises ValueError: for a damaged file, and for a buffer of another environment; that of
+            before is then still there
+        """
+        before: Any = getattr(self, "replay_buffer", None)
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+        except (OSError, AssertionError):
+            raise
+        # Where pickle meets damage, it may raise anything.
+        except Exception as error:
+            if getattr(self, "replay_buffer", None) is not before:
+                raise
+            raise damaged(path, error) from error
+        try:
+            check_buffer(self, self.replay_buffer, path)
+        except EnvironmentMismatchError:
+            self.replay_buffer = before
+            raise
+        # SBX marks the buffer as the CPU's, where SB3 has the model's device.
+        self.replay_buffer.device = self.device  # type: ignore[union-attr]
+
+    def _setup_model(self) -> None:
+        check_origin(type(self), self.saved_by)
+        check_policy_kwargs(self.policy_class, self.policy_kwargs)
+        self.policy_kwargs = by_names(self.policy_kwargs)
+        self.check_arguments()
+        check_buffer_class(type(self), self.replay_buffer_class, self.observation_space)
+        try:
+            super()._setup_model()
+        except MemoryError as error:
+            raise MemoryError(
+                f"{type(self).__name__}(buffer_size={self.buffer_size}): the replay buffer does "
+                f"not fit into memory ({error}). Pass a smaller buffer_size."
+            ) from error
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_statistics", "_pace"]
+
+    def check_arguments(self) -> None:
+        """
+        :raises ValueError: for an argument that would otherwise fail later, or not at all
+        """
+
+
+def _is_finite(measured: Any) -> bool:
+    parts = measured.values() if isinstance(measured, dict) else [measured]
+    return all(np.isfinite(part).all() for part in parts)

@@ -1,0 +1,215 @@
+"""
+Weights as tensors inside SB3's own zip format, so that a saved model outlives the JAX that wrote
+it.
+
+SB3 saves every attribute that an algorithm lists in ``_get_torch_save_params`` by its
+``state_dict``, and reads it back with ``torch.load(weights_only=True)``. A policy built on
+:class:`TensorPolicy` answers that protocol for its pytrees; nothing of JAX or Flax is pickled.
+
+A file appears under its name only when it is complete (:func:`write_whole`).
+"""
+
+import contextlib
+import io
+import json
+import os
+import pickle
+import secrets
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import torch as th
+
+from sb3_hds.algos.nets.activations import activation_name
+from sb3_hds.algos.nets.optimizers import optimizer_name
+
+
+def write_whole(
+    path: str | os.PathLike[str] | io.BufferedIOBase,
+    suffix: str,
+    write: Callable[[io.BufferedIOBase], None],
+) -> None:
+    """
+    Write under a temporary name in the same folder, then rename: whoever reads the folder, also
+    after the process was killed, finds the new file, or the older one of that name, never a half.
+
+    :param path: of the file, whose folders are made; something open for writing is just written to
+    :param suffix: without a dot, appended to a name that has none, as SB3 does
+    :param write: is called with the open file
+    :raises OSError: if the file cannot be written; an older one is then left as it was
+    """
+    if not isinstance(path, str | os.PathLike):
+        write(path)
+        return
+    target = Path(path)
+    target = target if target.suffix else target.with_name(f"{target.name}.{suffix}")
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.ExitStack() as stack:
+            stack.callback(_remove, temporary)
+            with temporary.open("xb") as file:
+                write(file)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, target)
+    except OSError as error:
+        reason = (
+            f"'{target}' could not be written: {error.strerror or error}. An older file there is "
+            "unchanged. The folder must be writable, with space left on the disk"
+        )
+        raise OSError(error.errno, reason) from error
+
+
+def refuse_damaged(path: str | os.PathLike[str] | io.BufferedIOBase, *parts: str) -> None:
+    """
+    Read a zip file once, so that what fails later is not the file.
+
+    A file that was cut off may still look like a zip file, because the weights in it are one each.
+
+    :param path: of the file, or the file; ``.zip`` may be left out
+    :param parts: that must be in it
+    :raises OSError: if it is not there, or cannot be opened
+    :raises ValueError: in one line, if it is damaged, or is something else
+    """
+    with _opened(path) as file:
+        begin = file.tell()
+        try:
+            with zipfile.ZipFile(file) as archive:
+                # What zipfile raises where a header is damaged has many types.
+                broken, missing = archive.testzip(), set(parts) - set(archive.namelist())
+        except Exception as error:
+            raise damaged(path, error) from error
+        file.seek(begin)
+    if broken or missing:
+        raise damaged(path, f"'{broken}' was changed" if broken else f"no '{min(missing)}'")
+
+
+def damaged(path: Any, reason: Any) -> ValueError:
+    """
+    :param path: of a file, or the file
+    :param reason: why it cannot be read
+    :return: the error that says so, in one line
+    """
+    kind = f"{type(reason).__name__}: " if isinstance(reason, Exception) else ""
+    found = kind + " ".join(str(reason).split())
+    return ValueError(
+        f"{name_of(path)} is damaged, or is no saved model ({found:.120}): copy it once more "
+        "from where it was saved, or load an older checkpoint."
+    )
+
+
+def name_of(path: Any) -> str:
+    """:return: of a file, to begin a message with"""
+    return f"'{path}'" if isinstance(path, str | os.PathLike) else "The file"
+
+
+def existing(path: Any, suffix: str = "zip") -> Any:
+    """:return: the path with the suffix, where SB3 would look for it; a file as it is"""
+    if not isinstance(path, str | os.PathLike):
+        return path
+    named = Path(path)
+    return named if named.exists() else named.with_name(f"{named.name}.{suffix}")
+
+
+def _opened(path: Any) -> contextlib.AbstractContextManager[Any]:
+    path = existing(path)
+    if not (isinstance(path, Path) or hasattr(path, "seek")):
+        raise TypeError(f"Expected the path of a file, or an open file, got {path!r}.")
+    return path.open("rb") if isinstance(path, Path) else contextlib.nullcontext(path)
+
+
+@contextlib.contextmanager
+def damage_reported(path: Any) -> Iterator[None]:
+    """
+    :raises ValueError: where SB3 takes a file that misses some parts for an old one of its own
+    """
+    try:
+        yield
+    except KeyError as error:
+        if not isinstance(error.__context__, ValueError):
+            raise
+        raise ValueError(
+            f"{name_of(path)} does not fit this model, or is damaged: {error.__context__}"
+        ) from error
+    except (pickle.UnpicklingError, json.JSONDecodeError, UnicodeDecodeError, EOFError) as error:
+        raise damaged(path, error) from error
+    except RuntimeError as error:
+        if "PytorchStreamReader" not in str(error):
+            raise
+        raise damaged(path, error) from error
+
+
+def to_state_dict(tree: Any) -> dict[str, th.Tensor]:
+    """:return: one tensor for each leaf, under its path in the pytree, in the leaves' order"""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {_name(path): th.as_tensor(np.array(leaf)) for path, leaf in leaves}
+
+
+def from_state_dict(tree: Any, tensors: dict[str, th.Tensor], strict: bool = True) -> Any:
+    """
+    :param tree: a pytree of the wanted structure; gives shapes and dtypes
+    :param tensors: what :func:`to_state_dict` made of such a pytree
+    :param strict: whether names must match exactly; otherwise missing leaves keep their value
+    :return: the pytree with the tensors' values, on the devices where its leaves are
+    :raises RuntimeError: for missing or unexpected names, or another shape; as torch does
+    """
+    leaves, structure = jax.tree_util.tree_flatten_with_path(tree)
+    expected = {_name(path): leaf for path, leaf in leaves}
+    missing, unexpected = expected.keys() - tensors.keys(), tensors.keys() - expected.keys()
+    if strict and (missing or unexpected):
+        raise RuntimeError(
+            f"The saved weights do not fit this network: missing {sorted(missing)}, "
+            f"unexpected {sorted(unexpected)}. Was it built with other policy_kwargs?"
+        )
+    values = []
+    for name, leaf in expected.items():
+        if name in tensors and tuple(tensors[name].shape) != np.shape(leaf):
+            raise RuntimeError(
+                f"The saved weight '{name}' has shape {tuple(tensors[name].shape)}, this network "
+                f"needs {np.shape(leaf)}. Was it built with other policy_kwargs?"
+            )
+        value = tensors[name].cpu().numpy() if name in tensors else leaf
+        values.append(_where(leaf, value))
+    return jax.tree_util.tree_unflatten(structure, values)
+
+
+def by_names(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Files hold arguments, too, and a function of JAX is pickled by parts of JAX that change.
+
+    :return: the same, with the names of activations and optimisers where their functions were
+        given, and lists where arrays were, whose truth SB3 asks for
+    """
+    named = dict(policy_kwargs)
+    for argument, value in policy_kwargs.items():
+        if isinstance(value, np.ndarray):
+            named[argument] = value.tolist()
+        elif argument.endswith("activation_fn"):
+            named[argument] = activation_name(value)
+        elif argument == "optimizer_class":
+            named[argument] = optimizer_name(value)
+    return named
+
+
+def _remove(file: Path) -> None:
+    with contextlib.suppress(OSError):
+        file.unlink()
+
+
+def _where(leaf: Any, value: Any) -> Any:
+    """:return: the value, where the leaf is and of its type"""
+    if isinstance(leaf, np.ndarray):
+        return value
+    if isinstance(leaf, jax.Array) and leaf.committed:
+        return jax.device_put(np.asarray(value, leaf.dtype), leaf.sharding)
+    return jnp.asarray(value, dtype=leaf.dtype)
+
+
+def _name(path: tuple) -> str:
+    return jax.tree_util.keystr(path, simple=True, separator=".")

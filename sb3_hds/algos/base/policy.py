@@ -1,0 +1,151 @@
+"""Policies whose networks are pytrees, saved as tensors."""
+
+from typing import Any, Self
+
+import numpy as np
+import torch as th
+from sbx.common.policies import BaseJaxPolicy
+from stable_baselines3.common.utils import get_device
+
+from sb3_hds.algos.base.files import (
+    by_names,
+    damage_reported,
+    from_state_dict,
+    refuse_damaged,
+    to_state_dict,
+)
+
+
+def refuse_odd(observation: Any) -> None:
+    """
+    :raises ValueError: for what ``reset`` returns beside an observation, and for one that is not
+        finite
+    """
+    if isinstance(observation, tuple) and len(observation) == 2:
+        raise ValueError(
+            "predict() got a tuple instead of an observation. Gymnasium's reset() returns "
+            "(obs, info) where a VecEnv's returns obs, mixing Gym API with SB3 VecEnv API: use "
+            "`obs, info = env.reset()`, or `obs = vec_env.reset()`."
+        )
+    parts = observation.values() if isinstance(observation, dict) else [observation]
+    if not all(np.asarray(part).dtype.kind in "biuf" for part in parts):
+        raise ValueError(
+            f"predict() got {observation!s:.100}, which is no observation: pass what reset() and "
+            "step() return, an array of numbers."
+        )
+    if not all(np.isfinite(part).all() for part in parts):
+        raise ValueError(
+            f"predict() got an observation that is not finite: {observation}. No "
+            "action follows from it: repeat the last one, or stop the robot safely."
+        )
+
+
+class TensorPolicy(BaseJaxPolicy):
+    """
+    A policy whose networks are pytrees, saved as tensors.
+
+    Subclasses implement ``weights`` and ``training_state``, each with a setter, and keep what they
+    were made with in ``arguments``.
+    """
+
+    #: of the constructor, but for the spaces
+    arguments: dict[str, Any]
+
+    def predict(  # type: ignore[override]
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        :param observation: one, or a batch with one row for each copy of the environment
+        :return: action of the same number of rows, in the units of the action space; ``state``
+        :raises ValueError: if the observation has another shape than the observation space, or is
+            not finite
+        """
+        refuse_odd(observation)
+        return super().predict(observation, state, episode_start, deterministic)
+
+    def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
+        """Rounding may lead out of the bounds, by one unit in the last place."""
+        low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
+        return np.clip(super().unscale_action(scaled_action), low, high)
+
+    def move_to(self, device: Any) -> None:
+        """
+        Nothing to move: its numbers are on the host.
+
+        :param device: of JAX
+        """
+
+    @property
+    def weights(self) -> Any:
+        """The pytree that prediction needs."""
+        raise AttributeError("weights")
+
+    @weights.setter
+    def weights(self, tree: Any) -> None:
+        raise AttributeError("weights")
+
+    @property
+    def training_state(self) -> Any:
+        """What only training needs: optimiser states, counters, random keys as integers."""
+        raise AttributeError("training_state")
+
+    @training_state.setter
+    def training_state(self, tree: Any) -> None:
+        raise AttributeError("training_state")
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        """What ``save`` keeps of the policy besides its weights, and ``load`` makes it from."""
+        spaces_and_more = super()._get_constructor_parameters()
+        spaces_and_more.pop("normalize_images")
+        arguments = by_names(self.arguments)
+        if "lr_schedule" in arguments:
+            # As SB3: what acts needs none, and a function of one's own cannot be pickled.
+            arguments["lr_schedule"] = self._dummy_schedule
+        return spaces_and_more | arguments
+
+    @classmethod
+    def load(cls, path: str, device: Any = "auto") -> Self:
+        """
+        SB3's ``load`` of a policy alone, which unpickles: load what you have saved yourself.
+
+        :param path: of a file that ``save`` of a policy wrote
+        :param device: as in SB3
+        :raises ValueError: for a damaged file
+        """
+        refuse_damaged(path)
+        with damage_reported(path):
+            # As SB3 says, spaces are no tensors.
+            saved = th.load(path, map_location="cpu", weights_only=False)
+        policy = cls(**saved["data"])
+        policy.load_state_dict(saved["state_dict"])
+        policy.to(get_device(device))
+        return policy
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, th.Tensor]:
+        return to_state_dict(self.weights)
+
+    def load_state_dict(self, state_dict: dict, strict: bool = True, assign: bool = False) -> None:
+        self.weights = from_state_dict(self.weights, state_dict, strict)
+
+
+class TrainingTensors:
+    """
+    What SB3 takes for the optimiser of a policy: it has ``state_dict`` and ``load_state_dict``.
+
+    :param policy: whose training state is saved
+    """
+
+    def __init__(self, policy: TensorPolicy) -> None:
+        self._policy = policy
+
+    def state_dict(self) -> dict[str, th.Tensor]:
+        return to_state_dict(self._policy.training_state)
+
+    def load_state_dict(self, state_dict: dict[str, th.Tensor], strict: bool = True) -> None:
+        self._policy.training_state = from_state_dict(
+            self._policy.training_state, state_dict, strict
+        )

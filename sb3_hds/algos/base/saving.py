@@ -1,0 +1,179 @@
+"""Saving and loading of every algorithm: tensors, in files that are whole or not there."""
+
+import contextlib
+import io
+import pathlib
+from collections.abc import Iterable, Iterator
+from typing import Any, Self
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+
+from sb3_hds.algos import registry
+from sb3_hds.algos.base.checks import (
+    callbacks_of,
+    check_given,
+    check_has_env,
+    checked_env,
+    in_one_line,
+    whole_steps,
+)
+from sb3_hds.algos.base.construct import device_or_cpu
+from sb3_hds.algos.base.description import described
+from sb3_hds.algos.base.files import by_names, damage_reported, name_of, refuse_damaged, write_whole
+from sb3_hds.errors import EnvironmentMismatchError
+
+
+@contextlib.contextmanager
+def _misfits_told() -> Iterator[None]:
+    """
+    :raises EnvironmentMismatchError: where SB3 finds other spaces, in one line
+    """
+    try:
+        yield
+    except ValueError as error:
+        if "spaces do not match" not in str(error):
+            raise
+        raise EnvironmentMismatchError(
+            f"{in_one_line(error)}: this model learned in an environment with the former. Pass one "
+            "like it, or make a new model."
+        ) from error
+
+
+class _ByName:
+    """A policy class that a model holds, and saves, by its name in the registry if it has one."""
+
+    def __get__(self, model: Any, owner: type | None = None) -> Any:
+        if model is None:
+            return self
+        held = vars(model)["policy_class"]
+        return registry.load(held) if isinstance(held, str) else held
+
+    def __set__(self, model: Any, kind: Any) -> None:
+        vars(model)["policy_class"] = registry.registered_name(kind) or kind
+
+
+class SavesTensors(BaseAlgorithm):
+    """Abstract: an algorithm whose policy is a :class:`~sb3_hds.algos.base.policy.TensorPolicy`."""
+
+    policy_class = _ByName()  # type: ignore[assignment]  # SB3 annotates what it returns
+    policy_description: dict[str, Any] | None
+
+    def __new__(cls, *args: Any, **given: Any) -> Self:
+        check_given(cls, given)
+        return super().__new__(cls)
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Write a zip file as SB3 does, whole or not at all.
+
+        :param path: of the file; ``.zip`` is appended where it has no suffix
+        :param exclude: attributes to leave out besides the usual ones
+        :param include: attributes to write although they are usually left out
+        :raises OSError: if the file cannot be written; an older one is then left as it was
+        :raises DivergedError: for weights that are not finite
+        """
+        self.check_weights()
+        self.policy_description = described(self.policy)  # type: ignore[arg-type]
+        write = super().save
+        write_whole(path, "zip", lambda file: write(file, exclude, include))
+
+    @classmethod
+    def load(
+        cls,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: Any = "auto",
+        *args: Any,
+        **kwargs: Any,
+    ) -> Self:
+        """
+        SB3's ``load``.
+
+        :param path: of a file that this class saved
+        :param env: to go on training in; none is needed to predict
+        :param device: where to; ``"cuda"`` means the CPU where there is none, with a warning
+        :raises ValueError: for a damaged file, or one that another algorithm saved
+        :raises TypeError: for an argument that neither this nor the constructor has
+        """
+        check_given(cls, kwargs, loading=True)
+        env = None if env is None else checked_env(cls, env)
+        if kwargs.get("policy_kwargs"):
+            kwargs["policy_kwargs"] = by_names(kwargs["policy_kwargs"])
+        refuse_damaged(path, "data", "policy.pth")
+        with damage_reported(path), _misfits_told():
+            return super().load(path, env, device_or_cpu(device), *args, **kwargs)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        SB3's ``set_env``.
+
+        :param env: with the spaces of the one before, or its id
+        :param force_reset: False goes on from where the environment is
+        :raises EnvironmentMismatchError: for one with other spaces, and for what is none
+        """
+        with _misfits_told():
+            super().set_env(checked_env(type(self), env), force_reset)
+
+    def _setup_learn(
+        self, total_timesteps: int, *args: Any, **kwargs: Any
+    ) -> tuple[int, BaseCallback]:
+        check_has_env(self)
+        return super()._setup_learn(whole_steps(total_timesteps), *args, **kwargs)
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        return super()._init_callback(callbacks_of(callback), progress_bar)  # type: ignore[arg-type]
+
+    def check_weights(self) -> None:
+        """
+        :raises DivergedError: for weights that are not finite, of algorithms that may have some
+        """
+
+    def get_parameters(self) -> dict[str, dict]:
+        """:return: by the object's name its tensors by theirs; objects that have some"""
+        return {name: tensors for name, tensors in super().get_parameters().items() if tensors}
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | dict[str, Any],
+        exact_match: bool = True,
+        device: Any = "auto",
+    ) -> None:
+        """
+        SB3's ``set_parameters``.
+
+        :param load_path_or_dict: of a file, or what ``get_parameters`` returned
+        :param exact_match: whether nothing may be missing
+        :param device: where to
+        :raises ValueError: for names of objects that this model does not have, or has and misses,
+            and for a damaged file
+        :raises RuntimeError: for tensors that do not fit
+        """
+        given = load_path_or_dict
+        if not isinstance(given, dict):
+            refuse_damaged(given, "policy.pth")
+            with damage_reported(load_path_or_dict):
+                _, given, _ = load_from_zip_file(given, device=device, load_data=False)
+        own, (names, _) = self.get_parameters(), self._get_torch_save_params()
+        empty: dict[str, Any] = {name: {} for name in names if name not in own}
+        try:
+            super().set_parameters(empty | given, exact_match, device)
+        except ValueError as error:
+            if isinstance(load_path_or_dict, dict):
+                raise
+            raise ValueError(
+                f"{name_of(load_path_or_dict)} does not fit this model, or is damaged: {error}"
+            ) from error
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer"], []
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "policy", "key", "_device_name"]

@@ -1,0 +1,1 @@
+"""Off-policy algorithms that learn from transitions."""

@@ -1,0 +1,474 @@
+"""What model-free algorithms share: SB3 collects steps and calls ``train``, which updates."""
+
+import inspect
+import itertools
+import math
+import numbers
+import warnings
+from abc import abstractmethod
+from collections import ChainMap
+from typing import Any, ClassVar, NoReturn
+
+import jax
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    MaybeCallback,
+    Schedule,
+    TrainFreq,
+    TrainFrequencyUnit,
+)
+from stable_baselines3.her import HerReplayBuffer
+
+from sb3_hds.algos.base.algorithm import TensorAlgorithm
+from sb3_hds.algos.base.construct import between, is_count, policy_and_env, schedule_of
+from sb3_hds.algos.model_free.policy import LearningPolicy
+from sb3_hds.algos.nets.activations import finite_leaves
+from sb3_hds.algos.nets.observations import check_actions, check_observations
+from sb3_hds.algos.nets.optimizers import Trained
+from sb3_hds.errors import DivergedError, EnvironmentMismatchError
+
+# What is logged of updates of the actor, which not every call of ``train`` makes.
+_OF_ACTOR = ("actor_loss", "ent_coef", "ent_coef_loss")
+_USUAL_BATCH = 256
+# What networks compute in.
+_LARGEST = float(np.finfo(np.float32).max)
+
+
+class ModelFreeAlgorithm(TensorAlgorithm):
+    """
+    Abstract: off-policy learning from transitions.
+
+    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` for Dict observations, ``"SimbaPolicy"``
+        (not CrossQ, TD7 and BRO), a policy class, or the environment itself
+    :param env: an environment, its id, or a vectorised environment
+    :param learning_rate: of the actor and the entropy coefficient; number, schedule or
+        ``"lin_3e-4"``
+    :param qf_learning_rate: of the critics, likewise; None: as ``learning_rate``
+    :param buffer_size: transitions that are kept
+    :param learning_starts: steps with random actions before learning starts; where a paper has
+        more (DroQ, CrossQ and SimBa 5,000, BRO 2,500), the files in ``hyperparams/`` have as many
+        on the tasks of that paper
+    :param batch_size: transitions per update
+    :param tau: how far the target networks follow in each update
+    :param gamma: discount per step
+    :param train_freq: steps between two calls of ``train``, or ``(n, "episode")``
+    :param gradient_steps: updates in each of them; -1: as many as steps were made
+    :param policy_delay: updates of the critics for each of the actor
+    :param action_noise: added to the actions
+    :param replay_buffer_class: as in SB3
+    :param replay_buffer_kwargs: as in SB3
+    :param optimize_memory_usage: as in SB3; needs
+        ``replay_buffer_kwargs={"handle_timeout_termination": False}``
+    :param n_steps: of the returns that critics are regressed on; above 1, neither with Dict
+        observations nor with ``optimize_memory_usage``
+    :param use_sde: explore by gSDE instead of independent noise at each step; not with TD7, which
+        adds noise to its actions
+    :param sde_sample_freq: steps after which its noise matrix is drawn again, in how many
+        collections (``train_freq``) they are made, where SB3 draws in each; -1: at the start of
+        each collection. Where collections are episodes, each begins with a new one
+    :param use_sde_at_warmup: whether it also acts before ``learning_starts``
+    :param stats_window_size: episodes in the averages that are logged
+    :param tensorboard_log: folder for TensorBoard
+    :param policy_kwargs: see :class:`~sb3_hds.algos.model_free.sac.policy.GaussianPolicy`
+    :param param_resets: steps of the environment at which networks and their optimisers start
+        afresh; the entropy coefficient stays, but with BRO, and so does TD7's checkpoint
+    :param verbose: 0 nothing, 1 information, 2 debugging
+    :param seed: of all random numbers
+    :param device: ``"auto"``, ``"cpu"`` or ``"cuda"``, as JAX has it
+    :param monitor_wrapper: as in SB3
+    :param _init_setup_model: as in SB3
+    """
+
+    #: steps of ``learn()`` without a number
+    default_timesteps: ClassVar[int] = 20_000
+    policy: LearningPolicy
+    qf_learning_rate: Any
+    #: the replay buffer that arguments led to, where none was passed
+    _derived_buffer: type[ReplayBuffer] | None = None
+    #: the learner before the last update
+    _before: Any = None
+    #: the ``param_resets`` that ``reset_idx`` counts in
+    _counted_resets: list[int] | None = None
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
+        env: GymEnv | str | None = None,
+        learning_rate: float | str | Schedule = 3e-4,
+        *,
+        qf_learning_rate: float | str | Schedule | None = None,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        policy_delay: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        use_sde_at_warmup: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        param_resets: list[int] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: str = "auto",
+        monitor_wrapper: bool = True,
+        _init_setup_model: bool = True,
+    ) -> None:
+        policy_class, made_env = policy_and_env(
+            type(self), policy, env, check_observations, monitor_wrapper
+        )
+        super().__init__(
+            policy=policy_class,
+            env=made_env,
+            learning_rate=learning_rate,  # type: ignore[arg-type]  # a name until it is set up
+            qf_learning_rate=None,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            # SB3 and SBX write into both: two models that were given the same are still two.
+            replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            policy_kwargs=dict(policy_kwargs or {}),
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            # Python's own generator, which SB3 seeds as well, takes no number of NumPy.
+            seed=None if seed is None else int(seed),
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            use_sde_at_warmup=use_sde_at_warmup,
+            param_resets=param_resets,
+            monitor_wrapper=monitor_wrapper,
+            supported_action_spaces=(spaces.Box,),
+            support_multi_env=True,
+        )
+        if n_steps > 1 and replay_buffer_class is not None:
+            warnings.warn(
+                f"n_steps={n_steps} is ignored with replay_buffer_class="
+                f"{replay_buffer_class.__name__}: use SB3's NStepReplayBuffer with "
+                f"replay_buffer_kwargs={{'n_steps': {n_steps}, 'gamma': {gamma}}}."
+            )
+        self.qf_learning_rate = qf_learning_rate
+        self.policy_delay = policy_delay
+        self._constructed(device, _init_setup_model)
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """
+        As in SB3; what updates and policies draw by is the model's own, and begins anew, too.
+
+        :param seed: None: nothing changes
+        """
+        super().set_random_seed(seed)
+        if seed is not None and hasattr(self, "policy"):
+            self.policy.set_random_seed(seed)
+
+    @abstractmethod
+    def _build(self, seed: int) -> None:
+        """Draw fresh networks."""
+
+    @abstractmethod
+    def _restart(self, seed: int) -> None:
+        """Draw fresh networks, and keep what is no network."""
+
+    @abstractmethod
+    def _updates(self, n: int, batch_size: int) -> dict[str, float]:
+        """
+        :param n: of the critics
+        :return: by name, what is logged: of the last one; the actor's of its last one among them
+        """
+
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        """
+        Updates on what the replay buffer holds.
+
+        :param gradient_steps: how many
+        :param batch_size: transitions in each
+        :raises DivergedError: if one of them diverged; the model keeps its last good state
+        :raises ValueError: if there is nothing to learn from
+        """
+        self._maybe_reset_params()
+        rate, qf_rate = self.learning_rates()
+        if gradient_steps > 0 and self.replay_buffer.size() == 0:  # type: ignore[union-attr]
+            raise ValueError(
+                f"{type(self).__name__} has nothing to learn from: its replay buffer is empty. "
+                "Call learn(), or load_replay_buffer(path) first."
+            )
+        before = int(self.policy.learner.n_updates)
+        try:
+            report = self._updates(gradient_steps, batch_size)
+        finally:
+            # Interrupted, some of them were made.
+            now = int(self.policy.learner.n_updates)
+            self._n_updates += now - before
+        improved = now // self.policy_delay > before // self.policy_delay
+        silent = () if improved else _OF_ACTOR
+        self.logger.record("train/learning_rate", rate)
+        if self.qf_learning_rate is not None:
+            self.logger.record("train/qf_learning_rate", qf_rate)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, value in report.items():
+            if name not in silent:
+                self.logger.record(f"train/{name}", value)
+
+    def _take(self, learner: Any, report: dict[str, float]) -> None:
+        """
+        Go on with what an update made of the networks.
+
+        :param report: its losses, which show whether the networks before it are good
+        :raises DivergedError: if it diverged; the model keeps its last good state
+        """
+        if not all(map(math.isfinite, report.values())):
+            self._give_up(f"an update diverged ({report})")
+        self._before, self.policy.learner = self.policy.learner, learner
+
+    def remedies(self, updates_per_step: float) -> list[str]:
+        (pi, qf), narrow, freq = self.policy.widths, self.policy.narrow, self.train_freq
+        found = []
+        if max(qf) > narrow:
+            arch = {"pi": list(pi), "qf": [narrow for _ in qf]}
+            found.append(f"policy_kwargs={{'net_arch': {arch}}}, with critics of {list(qf)} now")
+        if updates_per_step > 1.0:
+            found.append(f"fewer gradient_steps, {updates_per_step:.3g} for each step now")
+        elif isinstance(freq, TrainFreq) and freq.unit is TrainFrequencyUnit.STEP:
+            more = 4 * freq.frequency
+            found.append(f"train_freq={more} with gradient_steps={max(1, self.gradient_steps)}")
+        if self.batch_size > _USUAL_BATCH:
+            found.append(f"batch_size={_USUAL_BATCH}, {self.batch_size} now")
+        return [*found, "a GPU"]
+
+    def check_weights(self) -> None:
+        if not finite_leaves(_trained(self.policy.learner)):
+            self._give_up("an update made weights that are not finite")
+
+    def _give_up(self, what: str) -> NoReturn:
+        if self._before is not None and not finite_leaves(_trained(self.policy.learner)):
+            self.policy.learner = self._before
+            self.policy.forget_noise()
+        raise DivergedError(
+            f"{type(self).__name__}: {what}. The model keeps its last good state; lower "
+            "learning_rate, or scale rewards."
+        )
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        actions = super()._sample_action(learning_starts, action_noise, n_envs)
+        if not np.isfinite(actions[1]).all():
+            self._give_up("its actions are not finite")
+        return actions
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if reset_num_timesteps or self._last_obs is None:
+            self._end_episode()
+        resets = list(self.param_resets or [])
+        if resets != self._counted_resets:
+            # Others than those of the model that was loaded.
+            self._counted_resets = resets
+            self.reset_idx = sum(at <= self.num_timesteps for at in resets)
+        return super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+
+    def _end_episode(self) -> None:
+        """What was stored last shall not go on where the environment is reset to."""
+        buffer: Any = self.replay_buffer
+        if buffer is None or not (buffer.full or buffer.pos):
+            return
+        if isinstance(buffer, HerReplayBuffer):
+            with warnings.catch_warnings(action="ignore"):
+                buffer.truncate_last_trajectory()
+            return
+        goes_on = buffer.dones[buffer.pos - 1] == 0.0
+        buffer.dones[buffer.pos - 1, goes_on] = 1.0
+        if buffer.handle_timeout_termination:
+            buffer.timeouts[buffer.pos - 1, goes_on] = 1.0
+
+    def learning_rates(self) -> tuple[float, float]:
+        """:return: of the actor and of the critics, at this point of the training"""
+        rate = self._rate("learning_rate", self.lr_schedule)
+        if self.qf_learning_rate is None:
+            return rate, rate
+        return rate, self._rate("qf_learning_rate", schedule_of(self.qf_learning_rate))
+
+    def _rate(self, name: str, schedule: Schedule) -> float:
+        """
+        :raises ValueError: for one that is no learning rate
+        """
+        # The last collection may go beyond the steps that were asked for.
+        remaining = max(0.0, self._current_progress_remaining)
+        rate = float(schedule(remaining))
+        if not between(rate, 0.0, _LARGEST):
+            raise ValueError(
+                f"{type(self).__name__}({name}={getattr(self, name)!r}): {name} must be a finite "
+                f"number of at least 0 all the time; where {remaining:.3g} of the training "
+                f"remains, the schedule says {rate}."
+            )
+        return rate
+
+    def check_arguments(self) -> None:
+        check_actions(self.action_space)  # type: ignore[arg-type]  # SB3 has refused all but Box
+        counts = {
+            "buffer_size": 1,
+            "learning_starts": 0,
+            "batch_size": 1,
+            "policy_delay": 1,
+            "gradient_steps": -1,
+            "n_steps": 1,
+            "sde_sample_freq": -1,
+        }
+        for name, fewest in counts.items():
+            fine = is_count(getattr(self, name), fewest)
+            self.refuse_unless(fine, name, f"a whole number of at least {fewest}")
+        self._check_collection()
+        for name in ("tau", "gamma"):
+            self.refuse_unless(between(getattr(self, name), 0.0, 1.0), name, "from 0 to 1")
+        for name in ("learning_rate", "qf_learning_rate"):
+            rate = getattr(self, name)
+            fine = not isinstance(rate, numbers.Real) or between(rate, 0.0, math.inf)
+            self.refuse_unless(fine, name, "a number of at least 0, or a schedule")
+        if self.qf_learning_rate is not None:
+            schedule_of(self.qf_learning_rate)
+        self.refuse_unless(
+            self.param_resets is None or _are_rising_steps(self.param_resets),
+            "param_resets",
+            "None or a rising list of steps, such as [15_000, 50_000]",
+        )
+        made_with = self.policy_kwargs.get("use_sde", self.use_sde)
+        self.refuse_unless(
+            self.use_sde == made_with, "use_sde", f"{made_with}, as when the networks were made"
+        )
+        usual_buffer = self.replay_buffer_class is None
+        if usual_buffer and self.n_steps > 1:
+            self._check_n_step_buffer()
+        ends = self.replay_buffer_kwargs.get("handle_timeout_termination", True)
+        self.refuse_unless(
+            not (self.optimize_memory_usage and ends),
+            "optimize_memory_usage",
+            "False, unless time limits may count as ends: "
+            "replay_buffer_kwargs={'handle_timeout_termination': False}",
+        )
+
+    def _check_n_step_buffer(self) -> None:
+        if isinstance(self.observation_space, spaces.Dict):
+            raise EnvironmentMismatchError(
+                "n_steps > 1 needs SB3's NStepReplayBuffer, which has no Dict observation spaces: "
+                "use n_steps=1, or gymnasium.wrappers.FlattenObservation."
+            )
+        self.refuse_unless(
+            not self.optimize_memory_usage, "optimize_memory_usage", "False where n_steps > 1"
+        )
+
+    def _check_collection(self) -> None:
+        freq: Any = self.train_freq
+        fewest, unit = freq if isinstance(freq, tuple) and len(freq) == 2 else (freq, "step")
+        units = [each.value for each in TrainFrequencyUnit]
+        fine = is_count(fewest, 1) and getattr(unit, "value", unit) in units
+        self.refuse_unless(fine, "train_freq", "a number of at least 1, or (n, 'episode')")
+        fine = self.action_noise is None or isinstance(self.action_noise, ActionNoise)
+        self.refuse_unless(fine, "action_noise", "None or an ActionNoise of SB3")
+        given: Any = self.replay_buffer_class
+        fine = given is None or (isinstance(given, type) and issubclass(given, ReplayBuffer))
+        self.refuse_unless(fine, "replay_buffer_class", "None or a class of replay buffers")
+
+    def refuse_unless(self, fine: bool, name: str, allowed: str) -> None:
+        """
+        :raises ValueError: unless it is fine
+        """
+        if not fine:
+            got = getattr(self, name)
+            raise ValueError(f"{type(self).__name__}({name}={got!r}): {name} must be {allowed}.")
+
+    def warn_unless_usual(self, *names: str, why: str) -> None:
+        """
+        :param names: of arguments that do nothing here
+        :param why: not
+        """
+        usual = ChainMap(
+            *({**inspect.signature(kind.__init__).parameters} for kind in type(self).__mro__)
+        )
+        idle = [name for name in names if getattr(self, name) != usual[name].default]
+        if idle:
+            warnings.warn(f"{type(self).__name__} does not look at {', '.join(idle)}: {why}.")
+
+    def _setup_model(self) -> None:
+        if isinstance(self.learning_rate, str):
+            self.learning_rate = schedule_of(self.learning_rate)
+        elif isinstance(self.learning_rate, numbers.Real):
+            self.learning_rate = float(self.learning_rate)
+        # Of None, SBX makes the first number of ``learning_rate``.
+        given, self._before = self.qf_learning_rate, None
+        derived = self.replay_buffer_class in (None, self._derived_buffer)
+        if derived:
+            self._derive_buffer()
+        super()._setup_model()
+        self.qf_learning_rate = given
+        self._derived_buffer = self.replay_buffer_class if derived else None
+        self.policy = self.policy_class(  # type: ignore[assignment]
+            self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
+        )
+        self._build(self.network_seed)
+        # SB3 draws gSDE's noise and reads its deviation from the actor.
+        self.actor: Any = self.policy.actor
+        self.critic: Any = self.policy.critic
+
+    def _derive_buffer(self) -> None:
+        """What ``load`` was passed counts, not what it read."""
+        if self._derived_buffer is NStepReplayBuffer:
+            held = self.replay_buffer_kwargs.items()
+            own = {name: value for name, value in held if name not in ("n_steps", "gamma")}
+            self.replay_buffer_kwargs = own
+        self.replay_buffer_class = self._usual_buffer()
+
+    def _usual_buffer(self) -> type[ReplayBuffer] | None:
+        """:return: what is used where none is passed; None: what SB3 uses"""
+        return None
+
+    def _maybe_reset_params(self) -> None:
+        resets = self.param_resets or []
+        if self.reset_idx < len(resets) and self.num_timesteps >= resets[self.reset_idx]:
+            self.reset_idx += 1
+            self._restart(self.network_seed)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "actor", "critic", "_before"]
+
+
+def _are_rising_steps(given: Any) -> bool:
+    if not isinstance(given, list | tuple) or not all(is_count(step, 1) for step in given):
+        return False
+    return all(before < after for before, after in itertools.pairwise(given))
+
+
+def _trained(learner: Any) -> list[Any]:
+    """:return: all that optimisers change, with their own state"""
+    parts = jax.tree.leaves(learner, is_leaf=lambda part: isinstance(part, Trained))
+    return [part for part in parts if isinstance(part, Trained)]

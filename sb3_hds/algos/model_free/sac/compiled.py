@@ -1,0 +1,329 @@
+"""Several seeds of an algorithm at once, in the twin of its environment and in one program."""
+
+import io
+import warnings
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from rich.progress import track
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.type_aliases import TrainFrequencyUnit
+
+from sb3_hds.algos.base.construct import is_count
+from sb3_hds.algos.model_free.sac.algorithm import SoftActorCritic
+from sb3_hds.algos.model_free.sac.compiled_run import (
+    Loop,
+    Round,
+    Run,
+    Step,
+    begin_run,
+    run_rounds,
+    runs_axes,
+)
+from sb3_hds.algos.model_free.sac.update import Knobs
+from sb3_hds.core import Twin
+from sb3_hds.core.numerics.compilation import GENERATOR
+from sb3_hds.envs.mirror import check_mirrors, twin_of
+from sb3_hds.errors import SeedsDivergedError
+
+Algorithm = TypeVar("Algorithm", bound=SoftActorCritic)
+
+_STEPS_PER_CALL = 1_000
+_LEAST_CAPACITY = 1 << 14
+_NO_LIMIT = np.iinfo(np.int32).max
+
+
+class Episodes(NamedTuple):
+    """
+    What the episodes of one seed earned while it learned.
+
+    :param timesteps: when each of them ended
+    :param returns: undiscounted sums of rewards
+    """
+
+    timesteps: np.ndarray
+    returns: np.ndarray
+
+
+def learn_compiled(
+    model: Algorithm,
+    total_timesteps: int,
+    seeds: Iterable[int] = (0,),
+    progress_bar: bool = False,
+    twin: Twin | None = None,
+) -> tuple[list[Algorithm], list[Episodes]]:
+    """
+    Learn from scratch, once for each seed, without leaving the accelerator: the environment is its
+    twin, stepped inside the program that also updates.
+
+    Compiled once for all numbers of steps up to 16,384, again where they double, or ``buffer_size``
+    is less, and for another number of seeds. What SB3 does around its steps is not done: callbacks,
+    loggers, monitors. Schedules act round by round. Interrupted (Ctrl-C), it returns what was
+    learned by then.
+
+    :param model: says how to learn, and is left as it is: any algorithm of the SAC family, with an
+        environment that has a twin; BRO starts afresh after 15,000 steps unless it is made with
+        ``param_resets=[]``, and so is refused for more
+    :param total_timesteps: of each seed, rounded up to whole rounds of ``train_freq``
+    :param seeds: begin with the networks that the algorithm has with this seed
+    :param progress_bar: show one
+    :param twin: to step in place of the one that the environment, as wrapped, is known to have
+    :return: for each seed a model that can act, be saved, and go on learning from the transitions
+        that it saw, and its episodes
+    :raises NoTwinError: for an environment without a twin
+    :raises EnvironmentMismatchError: for a wrapper that its twin does not have, and for a twin with
+        other actions or observations
+    :raises ValueError: for what only steps in Python can do: other algorithms, several
+        environments, ``VecNormalize``, another replay buffer, ``optimize_memory_usage``, n-step
+        returns, action noise, ``param_resets``, episodes as ``train_freq``, a layer that stores
+        what was executed
+    :raises SeedsDivergedError: if a seed diverged, when the others are done; it has what they
+        learned
+    """
+    if not isinstance(seeds, Iterable):
+        raise ValueError(f"learn_compiled(seeds={seeds!r}): pass several, such as range(4).")
+    seeds = [int(seed) for seed in seeds]
+    _refuse_what_needs_python(model, total_timesteps, seeds)
+    models = [_copy_of(model, seed) for seed in seeds]
+    loop = _loop_of(models[0], total_timesteps, _twin_for(model.get_env(), twin))
+    runs, done = _begun(loop, models, seeds), []
+    lost = np.zeros(len(seeds), bool)
+    try:
+        for rounds in _calls(model, loop, total_timesteps, progress_bar):
+            runs, now, report = run_rounds(loop, loop.twin.params, runs, rounds)
+            done.append((now, rounds))
+            lost |= _diverged(report)
+            if lost.all():
+                break
+    except KeyboardInterrupt:
+        n_done = _n_steps([_that_happened(*call) for call in done])
+        warnings.warn(f"Interrupted after {n_done} of {total_timesteps} steps.")
+    steps = [_that_happened(*call) for call in done]
+    whole = jax.device_get(runs._replace(key=jax.random.key_data(runs.key)))
+    kept = np.flatnonzero(~lost).tolist()
+    for i in kept:
+        _take_over(models[i], _of_seed(runs, i), _of_seed(whole, i), _n_steps(steps))
+    episodes = [_episodes(steps, i) for i in range(len(seeds))]
+    if lost.any():
+        raise SeedsDivergedError(
+            f"Learning diverged with the seeds {[seeds[i] for i in np.flatnonzero(lost)]}. Lower "
+            "the learning rate, or scale rewards. What others learned is in this error's models "
+            "and episodes.",
+            {seeds[i]: models[i] for i in kept},
+            {seeds[i]: episodes[i] for i in kept},
+        )
+    return models, episodes
+
+
+def _refuse_what_needs_python(model: Any, total_timesteps: Any, seeds: Sequence[int]) -> None:
+    if not isinstance(model, SoftActorCritic):
+        raise ValueError(
+            f"learn_compiled() knows the SAC family, not {type(model).__name__}: use its learn()."
+        )
+    if not is_count(total_timesteps, 1) or not seeds:
+        raise ValueError(
+            "learn_compiled() needs at least one step and one seed, got "
+            f"total_timesteps={total_timesteps!r} and seeds={list(seeds)!r}."
+        )
+    frequency: Any = model.train_freq
+    unfit = {
+        "several environments (n_envs > 1)": (model.n_envs != 1, "make one"),
+        "VecNormalize": (model.get_vec_normalize_env() is not None, "leave it out"),
+        "n_steps > 1": (model.n_steps > 1, "pass n_steps=1"),
+        "another replay buffer": (
+            model.replay_buffer_class not in (None, ReplayBuffer),
+            "leave it out",
+        ),
+        "action_noise": (model.action_noise is not None, "leave it out"),
+        "time limits that count as ends, which optimize_memory_usage needs": (
+            not (model.replay_buffer_kwargs or {}).get("handle_timeout_termination", True),
+            "leave out replay_buffer_kwargs and optimize_memory_usage",
+        ),
+        "param_resets": (
+            any(at < total_timesteps for at in model.param_resets or []),
+            "pass param_resets=[]",
+        ),
+        "episodes as train_freq": (
+            frequency.unit is not TrainFrequencyUnit.STEP,
+            "pass a number of steps",
+        ),
+        "observations that are no vector": (
+            not isinstance(model.observation_space, spaces.Box),
+            "flatten them",
+        ),
+        "layers with store='executed'": (_stores_executed(model.get_env()), "use store='raw'"),
+    }
+    for what, (is_so, remedy) in unfit.items():
+        if is_so:
+            raise ValueError(
+                f"learn_compiled() cannot do {what}: {remedy}, or use {type(model).__name__}"
+                ".learn()."
+            )
+
+
+def _stores_executed(env: Any) -> bool:
+    """:return: whether the outermost layer asks for it"""
+    try:
+        return "executed" in env.get_attr("store")
+    except AttributeError:
+        return False
+
+
+def _copy_of(model: Algorithm, seed: int) -> Algorithm:
+    """:return: the same, as if it had been made with this seed"""
+    file = io.BytesIO()
+    model.save(file)
+    file.seek(0)
+    copy = type(model).load(file, env=model.get_env(), seed=seed, device=model._device_name)
+    copy._build(copy.network_seed)
+    copy.num_timesteps = copy._n_updates = 0
+    return copy
+
+
+def _twin_for(env: Any, given: Twin | None) -> Twin:
+    if given is None:
+        return twin_of(env)
+    check_mirrors(env, given)
+    return given
+
+
+def _loop_of(model: SoftActorCritic, total_timesteps: int, twin: Twin) -> Loop:
+    env: Any = model.get_env()
+    frequency = model.train_freq.frequency  # type: ignore[union-attr]
+    return Loop(
+        twin=twin,
+        recipe=model.policy.recipe,
+        limit=_limit_of(env),
+        capacity=min(model.buffer_size, _capacity(_rounded_up(total_timesteps, frequency))),
+        learning_starts=model.learning_starts,
+        train_freq=frequency,
+        gradient_steps=frequency if model.gradient_steps == -1 else model.gradient_steps,
+        batch_size=model.batch_size,
+        gamma=model.gamma,
+        sde_sample_freq=model.sde_sample_freq,
+        warm=model.use_sde_at_warmup,
+    )
+
+
+def _limit_of(env: Any) -> int:
+    """:return: steps after which the environment cuts an episode off"""
+    for name in ("_max_episode_steps", "max_episode_steps"):
+        try:
+            return env.get_attr(name)[0] or _NO_LIMIT
+        except AttributeError:
+            continue
+    return _NO_LIMIT
+
+
+def _begun(loop: Loop, models: Sequence[SoftActorCritic], seeds: Sequence[int]) -> Run:
+    """Each seed has random numbers of its own, which do not depend on the seeds beside it."""
+    singles = []
+    for model, seed in zip(models, seeds, strict=True):
+        network_key, key = jax.random.split(jax.random.key(seed, impl="threefry2x32"))
+        learner = model.policy.learner._replace(key=network_key)
+        singles.append(begin_run(loop, loop.twin.params, learner, key))
+    stacked = jax.tree.map(lambda *parts: jnp.stack(parts), *singles)
+    learner = stacked.learner._replace(n_updates=singles[0].learner.n_updates)
+    # What a program returns has a device of its own: arrays without would be compiled for apart.
+    (device,) = models[0].policy.learner.key.devices()
+    return jax.device_put(stacked._replace(learner=learner), device)
+
+
+def _calls(
+    model: SoftActorCritic, loop: Loop, total_timesteps: int, progress_bar: bool
+) -> Iterable[Round]:
+    """The rounds of each call of the program, with the rates that the schedules have then."""
+    total = _rounded_up(total_timesteps, loop.train_freq)
+    begins = np.arange(0, total, loop.train_freq)
+    table = np.array([_knobs_at(model, 1.0 - begin / total) for begin in begins], np.float32)
+    per_call = max(1, _STEPS_PER_CALL // loop.train_freq)
+    calls = [
+        _filled_up(begins[at : at + per_call], table[at : at + per_call], per_call)
+        for at in range(0, len(begins), per_call)
+    ]
+    return track(calls, "learning", disable=not progress_bar)
+
+
+def _knobs_at(model: SoftActorCritic, remaining: float) -> Knobs:
+    now, model._current_progress_remaining = model._current_progress_remaining, remaining
+    knobs = model.knobs()
+    model._current_progress_remaining = now
+    return knobs
+
+
+def _filled_up(begins: np.ndarray, table: np.ndarray, n: int) -> Round:
+    more = n - len(begins)
+    happens = np.arange(n) < len(begins)
+    begins, table = np.pad(begins, (0, more)), np.pad(table, ((0, more), (0, 0)))
+    columns: Any = jnp.asarray(table).T
+    return Round(jnp.asarray(begins, jnp.int32), jnp.asarray(happens), Knobs(*columns))
+
+
+def _take_over(model: SoftActorCritic, run: Run, on_host: Run, n_steps: int) -> None:
+    """The model goes on from where the run is."""
+    key = jax.random.key(int(on_host.key[-1]), impl=GENERATOR)
+    device = next(iter(model.policy.learner.key.devices()))
+    model.policy.learner = jax.device_put(run.learner._replace(key=key), device)
+    model.num_timesteps = n_steps
+    model._n_updates = int(run.learner.n_updates)
+    buffer: Any = model.replay_buffer
+    memory, held = on_host.memory, min(n_steps, buffer.buffer_size)
+    shape = buffer.observations.shape[2:]
+    buffer.observations[:held, 0] = memory.obs[:held].reshape(held, *shape)
+    if buffer.optimize_memory_usage:
+        buffer.observations[held % buffer.buffer_size, 0] = memory.next_obs[held - 1]
+    else:
+        buffer.next_observations[:held, 0] = memory.next_obs[:held].reshape(held, *shape)
+    buffer.actions[:held, 0] = memory.action[:held]
+    buffer.rewards[:held, 0] = memory.reward[:held]
+    buffer.dones[:held, 0] = memory.terminated[:held]
+    buffer.pos, buffer.full = n_steps % buffer.buffer_size, n_steps >= buffer.buffer_size
+
+
+def _of_seed(runs: Run, i: int) -> Run:
+    pick = lambda axis: lambda x: x if axis is None else x[i]  # noqa: E731
+    axes = runs_axes()
+    learner = type(runs.learner)(
+        *(
+            jax.tree.map(pick(axis), part)
+            for axis, part in zip(axes.learner, runs.learner, strict=True)
+        )
+    )
+    rest = runs._replace(learner=None)  # type: ignore[arg-type]
+    return jax.tree.map(pick(0), rest)._replace(learner=learner)
+
+
+def _episodes(steps: Sequence[Step], i: int) -> Episodes:
+    if not steps:
+        return Episodes(np.zeros(0, int), np.zeros(0))
+    ended = np.concatenate([step.ended[i].ravel() for step in steps])
+    totals = np.concatenate([step.total[i].ravel() for step in steps])
+    return Episodes(1 + np.flatnonzero(ended), totals[ended])
+
+
+def _that_happened(steps: Step, rounds: Round) -> Step:
+    n = int(rounds.happens.sum())
+    return jax.tree.map(lambda x: np.asarray(x)[:, :n], steps)
+
+
+def _n_steps(steps: Sequence[Step]) -> int:
+    return sum(step.ended[0].size for step in steps)
+
+
+def _diverged(report: Any) -> np.ndarray:
+    """:return: of each seed, whether a number of its last updates is not finite"""
+    values = jax.device_get(report)
+    return ~np.logical_and.reduce([np.isfinite(value) for value in values])
+
+
+def _capacity(n: int) -> int:
+    """:return: a power of 2 from ``n`` on: few sizes are few compiled programs"""
+    return max(_LEAST_CAPACITY, 1 << (n - 1).bit_length())
+
+
+def _rounded_up(total_timesteps: int, frequency: int) -> int:
+    return -(-total_timesteps // frequency) * frequency

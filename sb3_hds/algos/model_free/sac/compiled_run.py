@@ -1,0 +1,260 @@
+"""
+Learning in one compiled program: the twin of the environment, the replay buffer and the updates,
+with several seeds side by side.
+
+SB3 steps an environment in Python and hands batches over to JAX. Where the environment has a twin,
+nothing needs to leave the program, and seeds are one more axis of every array (``vmap``).
+"""
+
+import dataclasses
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from sb3_hds.algos.model_free.sac.update import (
+    Batch,
+    Knobs,
+    Learner,
+    Recipe,
+    Report,
+    before_any,
+    explored,
+    update_once,
+)
+from sb3_hds.algos.nets.heads import ExploringActor, noise_std
+from sb3_hds.algos.nets.observations import Seen, seen
+from sb3_hds.core import Params, State, Twin
+
+
+@dataclasses.dataclass(frozen=True)
+class Loop:
+    """
+    What does not change while a program runs. Static: equal loops share compiled programs.
+
+    :param limit: steps after which an episode is truncated
+    :param capacity: transitions that are kept
+    :param learning_starts: steps with random actions before learning starts
+    :param train_freq: steps in a round
+    :param gradient_steps: updates after them
+    :param sde_sample_freq: steps after which gSDE's noise matrix is drawn again; -1: once a round
+    :param warm: whether gSDE acts before learning starts, too
+    """
+
+    twin: Twin
+    recipe: Recipe
+    limit: int
+    capacity: int
+    learning_starts: int
+    train_freq: int
+    gradient_steps: int
+    batch_size: int
+    gamma: float
+    sde_sample_freq: int
+    warm: bool
+
+    @property
+    def use_sde(self) -> bool:
+        return isinstance(self.recipe.actor, ExploringActor)
+
+
+class Run(NamedTuple):
+    """
+    One seed, on its way.
+
+    :param elapsed: steps since the episode began
+    :param memory: the replay buffer; with a leading axis of ``capacity``
+    :param matrix: of gSDE's noise; empty without
+    :param total: return of the episode so far
+    """
+
+    learner: Learner
+    state: State
+    obs: Float[Array, " obs"]
+    elapsed: Int[Array, ""]
+    memory: Batch
+    matrix: Float[Array, "latent act"]
+    total: Float[Array, ""]
+    key: PRNGKeyArray
+
+
+class Step(NamedTuple):
+    """
+    :param ended: whether an episode did
+    :param total: its return
+    """
+
+    ended: Bool[Array, ""]
+    total: Float[Array, ""]
+
+
+class Round(NamedTuple):
+    """
+    :param steps: steps of the environment before it
+    :param happens: False fills up a call of the program, so that all calls are of one length
+    :param knobs: in it
+    """
+
+    steps: Int[Array, ""]
+    happens: Bool[Array, ""]
+    knobs: Knobs
+
+
+def begin_run(loop: Loop, params: Params, learner: Learner, key: PRNGKeyArray) -> Run:
+    """
+    :param learner: fresh networks
+    :return: a run that stands at the start of its first episode, with nothing remembered
+    """
+    key, start_key = jax.random.split(key)
+    state = loop.twin.initial(start_key, params)
+    obs = loop.twin.observe(state, params)
+    n_act, many = len(loop.twin.actuators), (loop.capacity,)
+    memory = Batch(
+        obs=jnp.zeros((*many, len(obs))),
+        action=jnp.zeros((*many, n_act)),
+        next_obs=jnp.zeros((*many, len(obs))),
+        reward=jnp.zeros(many),
+        terminated=jnp.zeros(many),
+        discount=jnp.full(many, loop.gamma),
+    )
+    empty = jnp.zeros((0, n_act))
+    matrix = _std_of(loop, learner) if loop.use_sde else empty
+    count, total = jnp.zeros((), jnp.int32), jnp.zeros(())
+    return Run(learner, state, obs, count, memory, matrix, total, key)
+
+
+@partial(jax.jit, static_argnums=0, donate_argnums=2)
+def run_rounds(loop: Loop, params: Params, runs: Run, rounds: Round) -> tuple[Run, Step, Report]:
+    """
+    :param runs: leading axis: seeds, everywhere but in the number of updates, which they share
+    :param rounds: leading axis: one after the other
+    :return: the runs after them; what each step was, axes seeds, rounds, ``train_freq``; the report
+        of the last update of each
+    """
+    axes = runs_axes()
+
+    def one(run: Run) -> tuple[Run, Step, Report]:
+        before = run, before_any(Report)
+        (run, report), steps = jax.lax.scan(partial(_round, loop, params), before, rounds)
+        return run, steps, report
+
+    return jax.vmap(one, in_axes=(axes,), out_axes=(axes, 0, 0))(runs)
+
+
+def runs_axes() -> Run:
+    """
+    :return: where the axis of the seeds is. The number of updates has none: were it one for each
+        seed, the actor would be updated every time, for those seeds whose turn it might be.
+    """
+    fields: Any = dict.fromkeys(Run._fields, 0)
+    learner: Any = dict.fromkeys(Learner._fields, 0) | {"n_updates": None}
+    return Run(**fields | {"learner": Learner(**learner)})
+
+
+def _round(
+    loop: Loop, params: Params, carry: tuple[Run, Report], now: Round
+) -> tuple[tuple[Run, Report], Step]:
+    def happen() -> tuple[tuple[Run, Report], Step]:
+        run, steps = jax.lax.scan(partial(_step, loop, params, now.steps), carry[0], counts)
+        after = now.steps + loop.train_freq
+        learn = lambda: _learn(loop, run, now.knobs, carry[1], after)  # noqa: E731
+        return jax.lax.cond(after > loop.learning_starts, learn, lambda: (run, carry[1])), steps
+
+    counts = jnp.arange(loop.train_freq)
+    nothing = Step(jnp.zeros(loop.train_freq, bool), jnp.zeros(loop.train_freq))
+    return jax.lax.cond(now.happens, happen, lambda: (carry, nothing))
+
+
+def _step(loop: Loop, params: Params, before: Array, run: Run, count: Array) -> tuple[Run, Step]:
+    """One step of the environment, remembered; where an episode ends, the next one begins."""
+    twin, t = loop.twin, before + count
+    key, act_key, noise_key, start_key = jax.random.split(run.key, 4)
+    matrix = _noise_matrix(loop, run, count, t, noise_key)
+    action = _action(loop, run, matrix, t, act_key)
+    low, high = jnp.array([(a.low, a.high) for a in twin.actuators]).T
+    command = low + 0.5 * (action + 1.0) * (high - low)
+    state = twin.step(run.state, command, params)
+    obs, terminated = twin.observe(state, params), twin.terminated(state, params)
+    reward = twin.reward(run.state, command, state, params)
+    elapsed, total = run.elapsed + 1, run.total + reward
+    ended = terminated | (elapsed >= loop.limit)
+    gamma = jnp.asarray(loop.gamma)
+    row = Batch(run.obs, action, obs, reward, terminated.astype(jnp.float32), gamma)
+    at = t % loop.capacity
+    memory = jax.tree.map(lambda rows, new: rows.at[at].set(new), run.memory, row)
+    learner = run.learner
+    if loop.recipe.normalize:
+        learner = learner._replace(seen=_with_one_more(learner.seen, obs))
+    fresh = twin.initial(start_key, params)
+    start = fresh, twin.observe(fresh, params)
+    state, obs = jax.tree.map(partial(jnp.where, ended), start, (state, obs))
+    after = Run(
+        learner,
+        state,
+        obs,
+        jnp.where(ended, 0, elapsed),
+        memory,
+        matrix,
+        jnp.where(ended, 0.0, total),
+        key,
+    )
+    return after, Step(ended, total)
+
+
+def _learn(
+    loop: Loop, run: Run, knobs: Knobs, report: Report, n_steps: Array
+) -> tuple[Run, Report]:
+    held = jnp.minimum(n_steps, loop.capacity)
+
+    def one(_: Array, carry: tuple[Learner, Report, Any]) -> tuple[Learner, Report, Any]:
+        learner, report, key = carry
+        key, drawn = jax.random.split(key)
+        rows = jax.random.randint(drawn, (loop.batch_size,), 0, held)
+        batch = jax.tree.map(lambda x: x[rows], run.memory)
+        return *update_once(loop.recipe, learner, batch, knobs, report), key
+
+    learner, report, key = jax.lax.fori_loop(
+        0, loop.gradient_steps, one, (run.learner, report, run.key)
+    )
+    return run._replace(learner=learner, key=key), report
+
+
+def _action(
+    loop: Loop, run: Run, matrix: Array, t: Array, key: PRNGKeyArray
+) -> Float[Array, " act"]:
+    """From -1 to 1: random before learning starts, then as the algorithm explores."""
+    recipe, learner = loop.recipe, run.learner
+    random_key, noise_key = jax.random.split(key)
+    n_act = len(loop.twin.actuators)
+    obs = seen(learner.seen, run.obs[None])
+    drawn = jax.random.normal(noise_key, (1, n_act))
+    noise = lambda g: g.latent @ matrix if loop.use_sde else g.std * drawn  # noqa: E731
+    action = explored(recipe, learner.actor.weights, learner.extra, obs, noise)
+    if loop.use_sde and loop.warm:
+        return action[0]
+    random = jax.random.uniform(random_key, (n_act,), minval=-1.0, maxval=1.0)
+    return jnp.where(t < loop.learning_starts, random, action[0])
+
+
+def _noise_matrix(loop: Loop, run: Run, count: Array, t: Array, key: PRNGKeyArray) -> Array:
+    if not loop.use_sde:
+        return run.matrix
+    std, every = _std_of(loop, run.learner), loop.sde_sample_freq
+    due = count == 0 if every <= 0 else t % every == 0
+    return jnp.where(due, std * jax.random.normal(key, std.shape), run.matrix)
+
+
+def _std_of(loop: Loop, learner: Learner) -> Array:
+    actor: Any = loop.recipe.actor
+    return noise_std(actor, dict(learner.actor.weights))
+
+
+def _with_one_more(scales: Seen, obs: Array) -> Seen:
+    """Welford's update, in single precision."""
+    count = scales.count + 1.0
+    away = obs - scales.mean
+    mean = scales.mean + away / count
+    variance = (scales.variance * scales.count + away * (obs - mean)) / count
+    return Seen(mean, variance, count)

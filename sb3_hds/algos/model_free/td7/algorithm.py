@@ -1,0 +1,354 @@
+"""TD7: learned embeddings, prioritised replay, and policies that are kept once they proved good."""
+
+import io
+import pathlib
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule, TrainFreq
+
+from sb3_hds.algos.base.construct import between, is_count, jax_device
+from sb3_hds.algos.model_free.algorithm import ModelFreeAlgorithm
+from sb3_hds.algos.model_free.replay import batches_of, transitions
+from sb3_hds.algos.model_free.sac.update import Batch, before_any
+from sb3_hds.algos.model_free.td7.policy import TD7Policy
+from sb3_hds.algos.model_free.td7.prioritized_replay import LapReplayBuffer
+from sb3_hds.algos.model_free.td7.update import (
+    Recipe,
+    Report,
+    update,
+)
+
+
+class TD7(ModelFreeAlgorithm):
+    """
+    TD3 with state-action embeddings, prioritised replay, value clipping and checkpoints of the
+    policy.
+
+    Source: Fujimoto et al., *For SALE: State-Action Representation Learning for Deep Reinforcement
+    Learning*, NeurIPS 2023, with its constants (appendix): target networks are copied every 250
+    updates, noise of 0.1 explores, 25,000 steps are random, priorities are errors to the power of
+    0.4, and 20 episodes assess a policy from 750,000 updates on, one before. Layers start as those
+    of the authors' code, by the defaults of torch: kernels and biases are uniform. Unlike there,
+    noise is added to random actions, too, as SB3 does it.
+
+    With checkpoints, as in the paper, a policy acts for whole episodes and is assessed by the worst
+    of them, in rewards of the environment itself; only then it is updated, once for each step that
+    it made. That needs one environment, and episodes that end: from one that never does, ``learn``
+    never returns, unless ``use_checkpoints=False``. ``gradient_steps`` is then not looked at; nor,
+    ever, is ``tau``: target networks are copied whole. Networks that start afresh
+    (``param_resets``) leave the checkpoint and its assessment as they are. Where a model with a
+    checkpoint goes on learning without assessments, the first update drops it. Without a
+    checkpoint, the policy as it is acts.
+    SBX has no TD7.
+
+    Prioritised replay draws from SB3's plain buffer. With ``n_steps`` above 1, Dict observations,
+    ``optimize_memory_usage`` or a buffer of one's own (``HerReplayBuffer``), transitions are drawn
+    uniformly, and weights in the loss make its expected gradient the same (Fujimoto, Meger and
+    Precup, NeurIPS 2020).
+
+    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` for Dict observations, a policy class, or
+        the environment itself
+    :param env: an environment, its id, or a vectorised environment
+    :param learning_rate: of encoder, actor and critics; number, schedule or ``"lin_3e-4"``
+    :param learning_starts: steps with random actions before learning starts
+    :param train_freq: steps between two calls of ``train``, or ``(n, "episode")``; None: one
+        episode where policies are assessed, one step where not
+    :param policy_delay: updates of the critics for each of the actor
+    :param target_update_interval: updates between two copies into the target networks
+    :param target_policy_noise: standard deviation of the noise on the target policy's actions,
+        which lie in [-1, 1]
+    :param target_noise_clip: its limit
+    :param exploration_noise: standard deviation of the noise on actions, unless ``action_noise`` is
+        passed
+    :param priority_exponent: how much priorities depend on errors; 0: not at all
+    :param use_checkpoints: whether policies are assessed; None: where there is one environment
+    :param max_episodes_per_checkpoint: episodes that assess a policy, after
+        ``updates_before_checkpointing``
+    :param updates_before_checkpointing: after as many or fewer, one episode does
+    :param reset_weight: factor on the best assessment at that moment
+    :param arguments: those of :class:`~sb3_hds.algos.model_free.algorithm.ModelFreeAlgorithm`
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": TD7Policy,
+        "MultiInputPolicy": TD7Policy,
+    }
+    policy_family = TD7Policy
+    #: steps of ``learn()`` without a number: twice as many as are random
+    default_timesteps: ClassVar[int] = 50_000
+    policy: TD7Policy
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
+        env: GymEnv | str | None = None,
+        learning_rate: float | str | Schedule = 3e-4,
+        *,
+        learning_starts: int = 25_000,
+        train_freq: int | tuple[int, str] | None = None,
+        policy_delay: int = 2,
+        target_update_interval: int = 250,
+        target_policy_noise: float = 0.2,
+        target_noise_clip: float = 0.5,
+        exploration_noise: float = 0.1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        priority_exponent: float = 0.4,
+        use_checkpoints: bool | None = None,
+        max_episodes_per_checkpoint: int = 20,
+        updates_before_checkpointing: int = 750_000,
+        reset_weight: float = 0.9,
+        **arguments: Any,
+    ) -> None:
+        self.target_update_interval = target_update_interval
+        self.target_policy_noise = target_policy_noise
+        self.target_noise_clip = target_noise_clip
+        self.exploration_noise = exploration_noise
+        self.priority_exponent = priority_exponent
+        self.use_checkpoints = use_checkpoints
+        self.max_episodes_per_checkpoint = max_episodes_per_checkpoint
+        self.updates_before_checkpointing = updates_before_checkpointing
+        self.reset_weight = reset_weight
+        self.assessed_episodes, self.assessed_steps = 0, 0
+        self.worst_return, self.best_worst_return = np.inf, -np.inf
+        self._finished: list[tuple[float, int]] = []
+        self._begin_episode()
+        self._chosen_freq = train_freq
+        self._derived_noise: ActionNoise | None = None
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            learning_starts=learning_starts,
+            train_freq=train_freq,  # type: ignore[arg-type]  # None until it is derived
+            policy_delay=policy_delay,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            **arguments,
+        )
+
+    def recipe(self) -> Recipe:
+        """:return: what an update is made of"""
+        return Recipe(
+            **self.policy.parts,
+            target_every=self.target_update_interval,
+            policy_delay=self.policy_delay,
+            target_noise=self.target_policy_noise,
+            noise_clip=self.target_noise_clip,
+            alpha=self.priority_exponent,
+            uniform=not self.prioritised,
+        )
+
+    @property
+    def assesses(self) -> bool:
+        """Whether policies are assessed before they are updated."""
+        return self.n_envs == 1 if self.use_checkpoints is None else self.use_checkpoints
+
+    @property
+    def prioritised(self) -> bool:
+        """Whether transitions are drawn by their errors."""
+        return isinstance(self.replay_buffer_class, type) and issubclass(
+            self.replay_buffer_class, LapReplayBuffer
+        )
+
+    def check_arguments(self) -> None:
+        super().check_arguments()
+        for name in ("target_update_interval", "max_episodes_per_checkpoint"):
+            self.refuse_unless(
+                is_count(getattr(self, name), 1), name, "a whole number of at least 1"
+            )
+        for name in ("target_policy_noise", "target_noise_clip", "exploration_noise"):
+            fine = between(getattr(self, name), 0.0, np.inf)
+            self.refuse_unless(fine, name, "a number of at least 0")
+        for name in ("priority_exponent", "reset_weight"):
+            self.refuse_unless(between(getattr(self, name), 0.0, 1.0), name, "from 0 to 1")
+        several = self.n_envs > 1 and self.use_checkpoints
+        self.refuse_unless(not several, "use_checkpoints", "False with several environments")
+        self.refuse_unless(not self.use_sde, "use_sde", "False: noise is added to the actions")
+        self.warn_unless_usual("tau", why="target networks are copied whole")
+        if self.assesses:
+            why = "with checkpoints, there are as many updates as steps (use_checkpoints=False)"
+            self.warn_unless_usual("gradient_steps", why=why)
+        if self.prioritised:
+            self.refuse_unless(self.n_steps == 1, "n_steps", "1 with LapReplayBuffer")
+            compressed = self.optimize_memory_usage
+            self.refuse_unless(
+                not compressed, "optimize_memory_usage", "False with LapReplayBuffer"
+            )
+
+    def _usual_buffer(self) -> type[ReplayBuffer] | None:
+        is_dict = isinstance(self.observation_space, spaces.Dict)
+        plain = self.n_steps == 1 and not self.optimize_memory_usage and not is_dict
+        return LapReplayBuffer if plain else None
+
+    def _setup_model(self) -> None:
+        self._choose_train_freq()
+        super()._setup_model()
+        if self.action_noise is None and self.exploration_noise:
+            # SB3 adds it to actions of the space's shape.
+            size = np.full(self.policy.action_shape, self.exploration_noise, np.float32)
+            self.action_noise = NormalActionNoise(np.zeros_like(size), size)
+            self._derived_noise = self.action_noise
+
+    def _choose_train_freq(self) -> None:
+        """What ``load`` was passed counts; what it read, only where it was passed before."""
+        given: Any = self.train_freq
+        if given is not None and not isinstance(given, TrainFreq):
+            self._chosen_freq = given
+        elif self._chosen_freq is None or given is None:
+            self.train_freq = (1, "episode") if self.assesses else 1  # type: ignore[assignment]
+
+    def _excluded_save_params(self) -> list[str]:
+        """The noise that ``exploration_noise`` means is derived from it again."""
+        excluded = [*super()._excluded_save_params(), "_derived_noise"]
+        # With several environments, SB3 has one for each of them.
+        noise = getattr(self.action_noise, "base_noise", self.action_noise)
+        return excluded if noise is not self._derived_noise else [*excluded, "action_noise"]
+
+    def load_replay_buffer(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        truncate_last_traj: bool = True,
+    ) -> None:
+        """
+        Unpickles, as SB3's does: load what you have saved yourself.
+
+        :param path: of what ``save_replay_buffer`` wrote
+        :param truncate_last_traj: of ``HerReplayBuffer``: as in SB3
+        :raises ValueError: for a buffer without priorities, where transitions are drawn by them;
+            the model then keeps the one that it has
+        """
+        before = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        found = self.replay_buffer
+        if self.prioritised and not isinstance(found, LapReplayBuffer):
+            self.replay_buffer = before
+            raise ValueError(
+                f"'{path}' holds a {type(found).__name__}, which has no priorities to draw by. "
+                "Load it into TD7(..., replay_buffer_class=ReplayBuffer), which draws uniformly."
+            )
+
+    def _build(self, seed: int) -> None:
+        self.policy.build(self.recipe(), seed, jax_device(self._device_name))
+
+    def _restart(self, seed: int) -> None:
+        """The policy of the last checkpoint goes on acting until a new one does no worse."""
+        before = self.policy.learner
+        self._build(seed)
+        kept: dict[str, Any] = {"n_updates": before.n_updates}
+        if before.checkpoint.kept > 0.0:
+            kept["checkpoint"] = before.checkpoint
+        self.policy.learner = self.policy.learner._replace(**kept)
+
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        """
+        Updates, where policies are assessed once for each step that the last one made, and none
+        while it is assessed.
+
+        :param gradient_steps: how many, where policies are not assessed
+        :param batch_size: transitions in each
+        :raises DivergedError: if one of them diverged; the model keeps its last good state
+        """
+        if self.assesses:
+            gradient_steps = self._assessed()
+        elif gradient_steps > 0:
+            self._forget_assessments()
+        if gradient_steps > 0:
+            super().train(gradient_steps, batch_size)
+
+    def _forget_assessments(self) -> None:
+        """What is updated without being assessed has left the checkpoint behind."""
+        if self.policy.has_checkpoint:
+            self.policy.drop_checkpoint()
+        self._finished, self.best_worst_return = [], -np.inf
+        self._begin_assessment()
+
+    def _begin_assessment(self) -> None:
+        self.assessed_episodes, self.assessed_steps, self.worst_return = 0, 0, np.inf
+
+    def _assessed(self) -> int:
+        """
+        Judge the policy by the episodes that it has made since it was updated last.
+
+        :return: how many updates are due: none while it is still to be seen how good it is
+        """
+        for reward, length in self._finished:
+            self.assessed_episodes += 1
+            self.assessed_steps += length
+            self.worst_return = min(self.worst_return, reward)
+        self._finished = []
+        late = self._n_updates > self.updates_before_checkpointing
+        enough = self.max_episodes_per_checkpoint if late else 1
+        good = self.worst_return >= self.best_worst_return
+        if good and self.assessed_episodes < enough:
+            return 0
+        if good:
+            self.best_worst_return = self.worst_return
+            self.policy.keep_checkpoint()
+        due = self.assessed_steps
+        if not late and self._n_updates + due > self.updates_before_checkpointing:
+            self.best_worst_return *= self.reset_weight
+        self._begin_assessment()
+        return due
+
+    def _updates(self, n: int, batch_size: int) -> dict[str, float]:
+        """One after the other: what is drawn depends on the errors of the update before."""
+        buffer: Any = self.replay_buffer
+        rates, policy = self.learning_rates(), self.policy
+        report, found = {}, before_any(Report)
+        for _ in range(n):
+            batch, drawn = self._drawn(batch_size)
+            learner, found, priorities = update(policy.recipe, policy.learner, batch, *rates, found)
+            found = jax.device_get(found)  # as before the first update, or it is compiled twice
+            report = {name: float(value) for name, value in found._asdict().items()}
+            self._take(learner, report)
+            if drawn is None:
+                continue
+            buffer.set_priorities(*drawn, np.asarray(priorities))
+            if int(learner.n_updates) % self.target_update_interval == 0:
+                buffer.forget_highest()
+        return report
+
+    def _drawn(self, batch_size: int) -> tuple[Batch, tuple[np.ndarray, np.ndarray] | None]:
+        """:return: a batch, and which transitions it is made of, where these have priorities"""
+        if not self.prioritised:
+            return Batch(*(rows[0] for rows in batches_of(self, 1, batch_size, 1))), None
+        buffer: Any = self.replay_buffer
+        drawn = buffer.draw(batch_size)
+        return Batch(**transitions(self, buffer, *drawn)), drawn  # type: ignore[arg-type]
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        if not self.assesses:
+            return
+        normalizer = self.get_vec_normalize_env()
+        # The scale of normalised rewards drifts, and an assessment may be compared much later.
+        earned = reward if normalizer is None else normalizer.get_original_reward()
+        self._episode_return += float(earned[0])
+        self._episode_length += 1
+        if dones[0]:
+            # What random actions earned says nothing of a policy.
+            if self.num_timesteps - self._episode_length >= self.learning_starts:
+                self._finished.append((self._episode_return, self._episode_length))
+            self._begin_episode()
+
+    def _end_episode(self) -> None:
+        super()._end_episode()
+        self._begin_episode()
+
+    def _begin_episode(self) -> None:
+        self._episode_return, self._episode_length = 0.0, 0

@@ -1,0 +1,1 @@
+"""Building blocks of networks, their optimisers, and observations as networks see them."""

@@ -1,0 +1,138 @@
+"""Activation functions by name, of JAX or of torch, and small questions about networks."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import torch as th
+from torch.nn import functional
+
+Activation = Callable[[jax.Array], jax.Array]
+
+ACTIVATIONS: dict[str, Activation] = {
+    "tanh": nn.tanh,
+    "relu": nn.relu,
+    "elu": nn.elu,
+    "gelu": nn.gelu,
+    "gelu_exact": partial(nn.gelu, approximate=False),
+    "silu": nn.silu,
+    "leaky_relu": nn.leaky_relu,
+    "softplus": nn.softplus,
+    "celu": jax.nn.celu,
+    "selu": jax.nn.selu,
+    "mish": jax.nn.mish,
+    "relu6": jax.nn.relu6,
+    "sigmoid": jax.nn.sigmoid,
+    "log_sigmoid": jax.nn.log_sigmoid,
+    "hard_sigmoid": jax.nn.hard_sigmoid,
+    "hard_swish": jax.nn.hard_swish,
+    "hard_tanh": jax.nn.hard_tanh,
+    "soft_sign": jax.nn.soft_sign,
+}
+
+_TORCH_MODULES: dict[type, str] = {
+    th.nn.Tanh: "tanh",
+    th.nn.ReLU: "relu",
+    th.nn.ELU: "elu",
+    th.nn.GELU: "gelu_exact",
+    th.nn.SiLU: "silu",
+    th.nn.LeakyReLU: "leaky_relu",
+    th.nn.Softplus: "softplus",
+    th.nn.CELU: "celu",
+    th.nn.SELU: "selu",
+    th.nn.Mish: "mish",
+    th.nn.ReLU6: "relu6",
+    th.nn.Sigmoid: "sigmoid",
+    th.nn.LogSigmoid: "log_sigmoid",
+    th.nn.Hardsigmoid: "hard_sigmoid",
+    th.nn.Hardswish: "hard_swish",
+    th.nn.Hardtanh: "hard_tanh",
+    th.nn.Softsign: "soft_sign",
+}
+# Functions of the same names, of which torch has some twice; the first entry counts.
+_OF_TORCH: list[tuple[Any, str]] = [
+    *_TORCH_MODULES.items(),
+    (functional.gelu, "gelu_exact"),
+    *(
+        (getattr(home, spelled), name)
+        for home in (th, functional)
+        for name in ACTIVATIONS
+        for spelled in (name, name.replace("_", ""))
+        if hasattr(home, spelled)
+    ),
+]
+
+
+def activation(choice: str | Activation | type) -> Activation:
+    """
+    :param choice: a name ("relu", any case; "gelu" is JAX's approximation by tanh, "gelu_exact"
+        what torch means by ``GELU``), a JAX function, which is taken as it is, or of torch a
+        function, a module class, or a module without settings of its own
+    :raises ValueError: for a name, or something of torch, without an equal here, and for a function
+        that JAX cannot trace, or that changes the shape of what it is given
+    """
+    name = choice if isinstance(choice, str) else _torch_name(choice)
+    known = {key.replace("_", ""): function for key, function in ACTIVATIONS.items()}
+    found = known.get(name.lower().replace("_", ""))
+    if found is not None:
+        return found
+    if isinstance(choice, str | type | th.nn.Module) or not callable(choice):
+        raise ValueError(
+            f"activation_fn must be one of {', '.join(ACTIVATIONS)}, a torch class of such a name, "
+            f"or a JAX function, which may have settings of its own, got {choice!r}."
+        )
+    return _checked(choice)
+
+
+def activation_name(choice: Any) -> Any:
+    """:return: of a function that is known here, its name; anything else as it is"""
+    names = (name for name, known in ACTIVATIONS.items() if known is choice)
+    return next(names, choice)
+
+
+def _checked(function: Activation) -> Activation:
+    given = jax.ShapeDtypeStruct((2, 3), jnp.float32)
+    try:
+        shape = getattr(jax.eval_shape(function, given), "shape", None)
+    except (TypeError, ValueError, AttributeError) as error:
+        raise ValueError(
+            f"activation_fn={function!r} is no JAX function ({str(error).splitlines()[0]}): use "
+            f"one of jax.nn or jax.numpy, or a name among {', '.join(ACTIVATIONS)}."
+        ) from error
+    if shape != given.shape:
+        raise ValueError(
+            f"activation_fn={function!r} must keep the shape of an array, and makes {shape} of "
+            f"{given.shape}."
+        )
+    return function
+
+
+def _torch_name(choice: Any) -> str:
+    """:return: of an activation of torch itself; of anything else, the empty string"""
+    if isinstance(choice, th.nn.GELU) and choice.approximate == "tanh":
+        return "gelu"
+    kind = type(choice)
+    if kind in _TORCH_MODULES and choice.extra_repr() == kind().extra_repr():
+        choice = kind
+    return next((name for ours, name in _OF_TORCH if ours is choice), "")
+
+
+def widths_of(given: Any) -> tuple[int, ...] | None:
+    """:return: widths of layers as Python has them; None unless all are whole numbers above 0"""
+    if isinstance(given, np.ndarray):
+        given = given.tolist()
+    if not isinstance(given, Sequence):
+        return None
+    if not all(isinstance(width, int | np.integer) and width > 0 for width in given):
+        return None
+    return tuple(map(int, given))
+
+
+def finite_leaves(tree: Any) -> bool:
+    """:return: whether no number in it is infinite or not a number"""
+    numbers = (leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact))
+    return all(np.isfinite(leaf).all() for leaf in numbers)

@@ -1,0 +1,1 @@
+"""Open-loop oscillators whose constants a black-box search finds."""

@@ -1,0 +1,538 @@
+"""Open loop: a few oscillators move the joints, and CMA-ES finds their constants."""
+
+import math
+import secrets
+import sys
+import time
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.utils import safe_mean
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_hds.algos.base.checks import check_log_interval, whole_steps
+from sb3_hds.algos.base.construct import between, check_origin, is_count, jax_device, policy_and_env
+from sb3_hds.algos.base.policy import TensorPolicy
+from sb3_hds.algos.base.saving import SavesTensors
+from sb3_hds.algos.open_loop import cma_es
+from sb3_hds.algos.open_loop.gait import Constants, GaitSpace
+from sb3_hds.algos.open_loop.policy import OscillatorPolicy
+from sb3_hds.algos.open_loop.robot import (
+    Body,
+    body_of,
+    refuse_without_state,
+    space_of,
+    state_vectors,
+)
+from sb3_hds.algos.open_loop.rollouts import Trial, Trials
+from sb3_hds.core.transforms.oscillators import LEADS
+from sb3_hds.errors import EnvironmentMismatchError, ParameterError
+
+
+class OpenLoop(SavesTensors):
+    r"""
+    One oscillator per joint, :math:`q_i^*(t) = a_i \sin(\theta_i(t) + \varphi_i) + b_i`, with one
+    frequency while it swings and one while it stands, and a loop that tracks it,
+    :math:`u = k_p (q^* - q) - k_d\,\dot q`. Nothing else of the observation is looked at.
+
+    Source: Raffin et al., *An Open-Loop Baseline for Reinforcement Learning Locomotion Tasks*, RLJ
+    2024. It searches by CMA-ES too; what its ranges were and how it reckoned with the noise of
+    resets is not published. Here:
+
+    - all candidates of a generation start from the same resets, and are judged by the mean return
+    - rollouts are cut off after ``horizon`` steps, so that there are more of them
+    - the last ``ranking_share`` of the steps compares the best candidates and the mean of the
+      distribution over whole episodes from fresh resets; the worse half drops out each time
+
+    **Where joints come from.** In environments of MuJoCo every actuator tracks the joint that the
+    model says it drives (``actuator_trnid``). Position and velocity are read from the observation
+    where it has them all (HalfCheetah, Ant, Hopper, Walker2d, Swimmer, Humanoid, ...), so a model
+    predicts in any copy of the environment, also in one that ``rl_zoo3 enjoy`` made. Otherwise
+    (Reacher, Pusher) they are read from the environment itself: then ``predict`` works for the
+    environment that the model has, or that ``read_joints_from`` names, and for no other, unless
+    the wrapper ``ShowJoints`` adds them to the observation. Where there are no joints (Pendulum-v1)
+    the oscillators are the commands. Observations that ``VecNormalize`` scales do not show joints,
+    and are refused.
+
+    **The phase** is the recurrent state of ``predict``: pass on what it returned, as
+    ``evaluate_policy``, ``EvalCallback`` and ``rl_zoo3 enjoy`` do. Without it every call is the
+    first of an episode.
+
+    Resets between the ends of episodes have to be allowed (``Monitor(allow_early_resets=True)``,
+    the default). A ``VecEnv`` that cannot reset one of its copies runs whole episodes from whatever
+    starts it draws.
+
+    :param policy: ``"MlpPolicy"`` (there is no other, and no network in it), or the environment
+    :param env: an environment, its id, or a vectorised environment: candidates run in parallel
+    :param population_size: candidates in a generation; None: ``4 + 3 log(dim)``
+    :param n_resets: episodes of each candidate in a generation
+    :param horizon: steps of such an episode; None: until it ends
+    :param initial_sigma: standard deviation of the first generation, before squashing
+    :param n_elites: best candidates so far that are ranked in the end
+    :param ranking_share: of the steps of ``learn``, for the ranking
+    :param kp: command per rad of error
+    :param kd: command per rad/s
+    :param gain_factor: gains are searched up and down by it; 1: not
+    :param amplitude: largest one [rad]; where there are no joints, in half ranges of the command
+    :param offset: largest one [rad] up and down from where the model rests, likewise
+    :param frequency: smallest and largest [Hz]
+    :param same_frequency: one for swing and stance
+    :param phases: False: all joints move together
+    :param gait: all legs do the same, each with a lead of its own: ``"trot"``, ``"pace"``,
+        ``"bound"`` or ``"walk"`` of the legs front left, front right, hind left, hind right, or a
+        lead for each leg [rad]. Joints come leg by leg, of the same sense. None: each for itself
+    :param control: ``"track"`` joints, ``"direct"`` commands, or ``"auto"``
+    :param joints: read from the ``"observation"``, from the ``"env"``, or ``"auto"``
+    :param dt: how long a step takes [s]; None: as the environment says
+    :param stats_window_size: episodes in the averages that are logged
+    :param tensorboard_log: folder for TensorBoard
+    :param policy_kwargs: the policy has none
+    :param verbose: 0 nothing, 1 information, 2 debugging
+    :param seed: of all random numbers
+    :param device: ``"auto"``, ``"cpu"`` or ``"cuda"``, as JAX has it
+    :param monitor_wrapper: as in SB3
+    :param _init_setup_model: as in SB3
+    """
+
+    default_timesteps: ClassVar[int] = 200_000
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": OscillatorPolicy,
+        "MultiInputPolicy": OscillatorPolicy,
+    }
+    #: what a policy class must extend
+    policy_family: ClassVar[type[TensorPolicy]] = OscillatorPolicy
+    policy: OscillatorPolicy
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
+        env: GymEnv | str | None = None,
+        *,
+        population_size: int | None = None,
+        n_resets: int = 2,
+        horizon: int | None = None,
+        initial_sigma: float = 1.0,
+        n_elites: int = 5,
+        ranking_share: float = 0.15,
+        kp: float = 3.0,
+        kd: float = 0.2,
+        gain_factor: float = 4.5,
+        amplitude: float = 1.0,
+        offset: float = 0.5,
+        frequency: Sequence[float] = (0.4, 4.0),
+        same_frequency: bool = False,
+        phases: bool = True,
+        gait: str | Sequence[float] | None = None,
+        control: str = "auto",
+        joints: str = "auto",
+        dt: float | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: str = "auto",
+        monitor_wrapper: bool = True,
+        _init_setup_model: bool = True,
+    ) -> None:
+        policy_class, made_env = policy_and_env(
+            type(self), policy, env, lambda space: None, monitor_wrapper
+        )
+        self.population_size = population_size
+        self.n_resets = n_resets
+        self.horizon = horizon
+        self.initial_sigma = initial_sigma
+        self.n_elites = n_elites
+        self.ranking_share = ranking_share
+        self.kp, self.kd, self.gain_factor = kp, kd, gain_factor
+        self.amplitude, self.offset = amplitude, offset
+        self.frequency = np.atleast_1d(np.asarray(frequency, float)).tolist()
+        self.same_frequency, self.phases = same_frequency, phases
+        self.gait: Any = gait
+        if isinstance(gait, Sequence) and not isinstance(gait, str):
+            self.gait = list(gait)
+        self.control, self.joints, self.dt = control, joints, dt
+        self.body: dict[str, Any] | None = None
+        super().__init__(
+            policy=policy_class,
+            env=made_env,
+            learning_rate=0.0,  # SB3 wants one; nothing here has it
+            policy_kwargs=dict(policy_kwargs or {}),
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            monitor_wrapper=monitor_wrapper,
+            seed=seed,
+            supported_action_spaces=(spaces.Box,),
+            support_multi_env=True,
+        )
+        self.saved_by = type(self).__name__
+        self._device_name = str(device)
+        if _init_setup_model:
+            if self.env is None:
+                raise ValueError(
+                    f"{type(self).__name__} needs an environment, for example "
+                    f"{type(self).__name__}('Swimmer-v5')."
+                )
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        check_origin(type(self), self.saved_by)
+        self.check_arguments()
+        jax_device(self._device_name)
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        if self.env is not None:
+            self._meet(self.env)
+        assert self.body is not None
+        self.policy = self.policy_class(  # type: ignore[assignment]
+            self.observation_space,
+            self.action_space,
+            self.lr_schedule,
+            body=self.body,
+            **self.policy_kwargs,
+        )
+        self._bind()
+        self._restart(np.zeros(self.gait_space.dim))
+        self.policy.constants = self.gait_space.decode(self.policy.search.mean)
+
+    def check_arguments(self) -> None:
+        """
+        :raises ValueError: for an argument that would otherwise fail later, or not at all
+        """
+        counts = {"population_size": 2, "n_resets": 1, "horizon": 1, "n_elites": 1}
+        derived = ("population_size", "horizon")
+        for name, fewest in counts.items():
+            fine = is_count(getattr(self, name), fewest, may_be_none=name in derived)
+            allowed = f"a whole number of at least {fewest}" + " or None" * (name in derived)
+            self._refuse_unless(fine, name, allowed)
+        for name in ("initial_sigma", "amplitude", "offset"):
+            fine = between(value := getattr(self, name), 0.0, math.inf) and value > 0.0
+            self._refuse_unless(fine, name, "a finite number above 0")
+        for name in ("kp", "kd"):
+            fine = between(getattr(self, name), 0.0, math.inf)
+            self._refuse_unless(fine, name, "a finite number of at least 0")
+        self._refuse_unless(between(self.ranking_share, 0.0, 1.0), "ranking_share", "from 0 to 1")
+        self._refuse_unless(
+            between(self.gain_factor, 1.0, math.inf), "gain_factor", "a finite number of at least 1"
+        )
+        fine = len(self.frequency) == 2 and 0.0 < self.frequency[0] < self.frequency[1] < math.inf
+        self._refuse_unless(fine, "frequency", "two numbers, 0 < lowest < highest")
+        if self.dt is not None:
+            fine = between(self.dt, 0.0, math.inf) and self.dt > 0.0
+            self._refuse_unless(fine, "dt", "a finite number above 0, or None")
+        if isinstance(self.gait, list):
+            fine = bool(self.gait) and all(between(x, -math.inf, math.inf) for x in self.gait)
+        else:
+            fine = self.gait is None or self.gait in LEADS
+        named = ", ".join(map(repr, LEADS))
+        self._refuse_unless(fine, "gait", f"one of {named}, a lead [rad] for each leg, or None")
+        choices = {"control": ("auto", "track", "direct"), "joints": ("auto", "observation", "env")}
+        for name, allowed in choices.items():
+            fine = getattr(self, name) in allowed
+            self._refuse_unless(fine, name, f"one of {', '.join(map(repr, allowed))}")
+
+    def _refuse_unless(self, fine: bool, name: str, allowed: str) -> None:
+        if not fine:
+            got = getattr(self, name)
+            raise ValueError(f"{type(self).__name__}({name}={got!r}): {name} must be {allowed}.")
+
+    @property
+    def gait_space(self) -> GaitSpace:
+        """The gaits that are searched."""
+        assert self.body is not None
+        return space_of(
+            Body(**self.body),
+            amplitude=self.amplitude,
+            offset=self.offset,
+            frequency=(self.frequency[0], self.frequency[1]),
+            kp=self.kp,
+            kd=self.kd,
+            gain_factor=self.gain_factor,
+            same_frequency=self.same_frequency,
+            phases=self.phases,
+            leads=self._leads,
+        )
+
+    @property
+    def _leads(self) -> tuple[float, ...]:
+        if self.gait is None:
+            return (0.0,)
+        return LEADS[self.gait] if isinstance(self.gait, str) else tuple(self.gait)
+
+    @property
+    def constants(self) -> dict[str, Any]:
+        """What acts, as plain data that :meth:`set_constants` takes [rad, rad/s]."""
+        return {name: part.tolist() for name, part in self.policy.constants._asdict().items()}
+
+    def set_constants(
+        self,
+        *,
+        omega_swing: float,
+        omega_stance: float,
+        amplitude: Sequence[float] | float = 1.0,
+        offset: Sequence[float] | float = 0.0,
+        phase: Sequence[float] | float = 0.0,
+        kp: Sequence[float] | float | None = None,
+        kd: Sequence[float] | float | None = None,
+    ) -> Self:
+        """
+        Let a known gait act: a published one, or ``constants`` of another model. A search that
+        follows starts there, and replaces it by what is better on fresh resets.
+
+        One number stands for all joints, whose order is that of the actuators.
+
+        :param omega_swing: while the sine is positive [rad/s]
+        :param omega_stance: while it is not [rad/s]
+        :param amplitude: [rad]
+        :param offset: [rad]
+        :param phase: [rad]
+        :param kp: default: that of the constructor
+        :param kd: likewise
+        :raises ParameterError: for another number of joints than there are, and for values that
+            are not finite or frequencies that are not above 0
+        """
+        given = {
+            "amplitude": amplitude,
+            "offset": offset,
+            "phase": phase,
+            "omega_swing": omega_swing,
+            "omega_stance": omega_stance,
+            "kp": self.kp if kp is None else kp,
+            "kd": self.kd if kd is None else kd,
+        }
+        assert self.body is not None
+        names = self.body["names"]
+        constants = Constants(**{name: _sized(name, v, names) for name, v in given.items()})
+        self.policy.constants = constants
+        self._restart(self.gait_space.encode(constants))
+        self.policy.search = self.policy.search._replace(ranked=np.asarray(True))
+        return self
+
+    def read_joints_from(self, env: VecEnv | None) -> None:
+        """
+        Let ``predict`` read joints from an environment, as motors have encoders of their own,
+        whatever happens to the observation.
+
+        :param env: with as many copies as there will be observations; None: from the observation
+        :raises EnvironmentMismatchError: if it is none of MuJoCo
+        """
+        if env is not None:
+            refuse_without_state(env)
+        self.policy.read_states = None if env is None else partial(state_vectors, env)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        SB3's ``set_env``; what is known of joints and time is found out again.
+
+        :raises EnvironmentMismatchError: if it has other joints
+        """
+        before, body = self.env, self.body
+        super().set_env(env, force_reset)
+        if self.env is before:
+            return
+        assert self.env is not None
+        self._meet(self.env)
+        assert body is not None and self.body is not None
+        if self.body["names"] != body["names"]:
+            raise EnvironmentMismatchError(
+                f"The gait is one of the joints {', '.join(body['names'])}; this environment has "
+                f"{', '.join(self.body['names'])}."
+            )
+        self.policy.body = Body(**self.body)
+        self.policy.constants = self.policy.constants
+        self._bind()
+
+    def learn(
+        self,
+        total_timesteps: int | None = None,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 1,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """
+        Search for better constants. Called again, it goes on where it stopped.
+
+        :param total_timesteps: steps of the environment; default ``default_timesteps``
+        :param callback: called at every step of the environment
+        :param log_interval: generations between two log lines; None: no lines
+        :param tb_log_name: name of the run for TensorBoard; default: the class's name
+        :param reset_num_timesteps: False goes on counting
+        :param progress_bar: show one
+        """
+        check_log_interval(log_interval)
+        total = whole_steps(self.default_timesteps if total_timesteps is None else total_timesteps)
+        name = tb_log_name or type(self).__name__
+        total_timesteps, callback = self._setup_learn(
+            total, callback, reset_num_timesteps, name, progress_bar
+        )
+        callback.on_training_start(locals(), globals())
+        search_until = total_timesteps - self.ranking_share * total
+        trials = Trials(self, callback, total_timesteps)
+        going, latest = True, 0
+        # A generation more must not take the steps of the ranking.
+        while going and self.num_timesteps + max(latest, 1) <= search_until:
+            before = self.num_timesteps
+            going = self._generation(trials, callback, log_interval)
+            latest = self.num_timesteps - before
+        if going and self.num_timesteps < total_timesteps:
+            self._rank(trials, log_interval)
+        callback.on_training_end()
+        return self
+
+    def _generation(self, trials: Trials, callback: BaseCallback, log_interval: int | None) -> bool:
+        """:return: whether all of its candidates were tried"""
+        search, space = self.policy.search, self.gait_space
+        gaits = _stacked([space.decode(point) for point in cma_es.candidates(search)])
+        seeds = cma_es.reset_seeds(search)
+        due = np.argwhere(~np.isfinite(search.returns))
+
+        def keep(trial: Trial, value: float) -> None:
+            known = self.policy.search.returns.copy()
+            known[trial.place] = value
+            self.policy.search = self.policy.search._replace(returns=known)
+
+        callback.on_rollout_start()
+        wanted = [Trial(int(row), int(seeds[reset]), (row, reset)) for row, reset in due]
+        done = trials.run(gaits, wanted, keep, self.horizon)
+        callback.on_rollout_end()
+        if not done:
+            return False
+        returns = self.policy.search.returns.mean(axis=1)
+        self.policy.search = search = cma_es.tell(self.policy.search)
+        if not search.ranked:
+            self.policy.constants = space.decode(search.elites[0])
+        self._log(returns, log_interval)
+        return True
+
+    def _rank(self, trials: Trials, log_interval: int | None) -> None:
+        """Rounds of whole episodes, all finalists from the same fresh reset in each."""
+        space, search = self.gait_space, self.policy.search
+        found = np.isfinite(search.elite_returns)
+        points = [search.mean, *search.elites[found]]
+        finalists = [self.policy.constants, *(space.decode(point) for point in points)]
+        scores: list[list[float]] = [[] for _ in finalists]
+        left = list(range(len(finalists)))
+        while True:
+            values: dict[int, float] = {}
+
+            def keep(trial: Trial, value: float, values: dict[int, float] = values) -> None:
+                values[trial.row] = value
+
+            seed = cma_es.round_seed(self.policy.search)
+            n_rounds = np.asarray(self.policy.search.n_rounds + 1)
+            self.policy.search = self.policy.search._replace(n_rounds=n_rounds)
+            done = trials.run(_stacked(finalists), [Trial(i, seed, ()) for i in left], keep, None)
+            if not done:
+                return
+            for i, value in values.items():
+                scores[i].append(value)
+            left.sort(key=lambda i: -float(np.mean(scores[i])))
+            self.policy.constants = finalists[left[0]]
+            self.policy.search = self.policy.search._replace(ranked=np.asarray(True))
+            self.logger.record("search/best_whole_episodes", float(np.mean(scores[left[0]])))
+            self._dump(log_interval)
+            if len(scores[left[0]]) > 1 and len(left) > 2:
+                left = left[: max(2, len(left) // 2)]
+
+    def _log(self, returns: np.ndarray, log_interval: int | None) -> None:
+        search = self.policy.search
+        record = self.logger.record
+        record("search/mean_return", float(returns.mean()))
+        record("search/best_return", float(returns.max()))
+        record("search/best_return_so_far", float(search.elite_returns[0]))
+        record("search/sigma", float(search.sigma))
+        if log_interval is not None and int(search.generation) % log_interval == 0:
+            self._dump(log_interval)
+
+    def _dump(self, log_interval: int | None) -> None:
+        if log_interval is not None:
+            self.dump_logs()
+
+    def dump_logs(self) -> None:
+        """Write a log line."""
+        seconds = max((time.time_ns() - self.start_time) / 1e9, sys.float_info.epsilon)
+        record = self.logger.record
+        if self.ep_info_buffer:
+            record("rollout/ep_rew_mean", safe_mean([e["r"] for e in self.ep_info_buffer]))
+            record("rollout/ep_len_mean", safe_mean([e["l"] for e in self.ep_info_buffer]))
+        if self.ep_success_buffer:
+            record("rollout/success_rate", safe_mean(self.ep_success_buffer))
+        made = self.num_timesteps - self._num_timesteps_at_start
+        record("time/fps", int(made / seconds))
+        record("time/time_elapsed", int(seconds), exclude="tensorboard")
+        record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.dump(step=self.num_timesteps)
+
+    @property
+    def _n_updates(self) -> int:
+        """Complete generations."""
+        return int(self.policy.search.generation)
+
+    @_n_updates.setter
+    def _n_updates(self, n: int) -> None:
+        """SB3 sets it to zero at first; the search counts itself."""
+
+    def _restart(self, start: np.ndarray) -> None:
+        dim = len(start)
+        self.policy.search = cma_es.begin(
+            start,
+            self.initial_sigma,
+            secrets.randbelow(2**31) if self.seed is None else int(self.seed),
+            self.population_size or cma_es.default_population(dim),
+            self.n_resets,
+            self.n_elites,
+        )
+
+    def _meet(self, env: VecEnv) -> None:
+        """
+        Find out what there is to know of an environment.
+
+        :raises EnvironmentMismatchError: if its joints do not come in as many legs as the gait has
+        """
+        body = body_of(env, self.control, self.joints, self.dt)
+        normalises = getattr(self.get_vec_normalize_env(), "norm_obs", False)
+        if body.control == "track" and self.joints != "env" and normalises:
+            raise ValueError(
+                "OpenLoop reads joints from observations, which VecNormalize scales: use "
+                "VecNormalize(norm_obs=False), or joints='env'."
+            )
+        n_legs = len(self._leads)
+        if len(body.names) % n_legs:
+            raise EnvironmentMismatchError(
+                f"A gait of {n_legs} legs needs as many joints in each, leg by leg; there are "
+                f"{len(body.names)}: {', '.join(body.names)}."
+            )
+        self.body = body.to_dict()
+
+    def _bind(self) -> None:
+        """Where the observation does not show the joints, they are read from the environment."""
+        body = self.policy.body
+        assert body is not None
+        unseen = body.control == "track" and not body.seen_position
+        self.read_joints_from(self.env if unseen else None)
+
+
+def _stacked(gaits: Sequence[Constants]) -> Constants:
+    return Constants(*(np.stack(parts) for parts in zip(*gaits, strict=True)))
+
+
+def _sized(name: str, value: Any, joints: Sequence[str]) -> np.ndarray:
+    """One number per joint, or the number that both frequencies are."""
+    array = np.asarray(value, float)
+    of_all = name.startswith("omega")
+    if array.shape not in (((),) if of_all else ((), (len(joints),))):
+        wanted = "one number" if of_all else f"one number, or one for each of {', '.join(joints)}"
+        raise ParameterError(f"{name} must be {wanted}, got {value}.")
+    if not np.isfinite(array).all() or (of_all and array <= 0.0):
+        raise ParameterError(f"{name} must be finite{' and above 0' * of_all}, got {value}.")
+    return array if of_all else np.broadcast_to(array, (len(joints),)).copy()

@@ -1,0 +1,220 @@
+"""A policy that is a handful of oscillators, and the loop that makes joints follow them."""
+
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from jaxtyping import Array, Float, Int
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import is_vectorized_observation
+
+from sb3_hds.algos.base.policy import TensorPolicy, TrainingTensors, refuse_odd
+from sb3_hds.algos.open_loop.cma_es import SearchState
+from sb3_hds.algos.open_loop.gait import Constants
+from sb3_hds.algos.open_loop.robot import Body
+from sb3_hds.core.transforms.oscillators import Gait, target_at
+from sb3_hds.errors import EnvironmentMismatchError
+from sb3_hds.wrappers.actuated_joints import track
+
+# Steps for which targets are computed at a time.
+_CHUNK = 1_000
+
+Targets = Float[np.ndarray, "n_envs act"]
+
+
+class Timetable:
+    """
+    Targets of several gaits at every step, computed a thousand steps at a time.
+
+    Action k, which acts from k dt to (k + 1) dt, aims at the middle of that interval.
+
+    :param gaits: stacked, one per row
+    :param dt: [s]
+    """
+
+    def __init__(self, gaits: Constants, dt: float) -> None:
+        # Double precision: the phase is kept over a thousand turns and more.
+        with jax.enable_x64(True):
+            self._gait = Gait(*(jnp.asarray(part, float) for part in gaits[:5]))
+        self._dt = dt
+        self._targets = np.zeros((len(gaits.amplitude), 0, gaits.amplitude.shape[1]))
+
+    def at(self, rows: Int[np.ndarray, " n"], steps: Int[np.ndarray, " n"]) -> Targets:
+        """:return: what each of the gaits ``rows`` aims at in its step of ``steps``"""
+        while steps.size and self._targets.shape[1] <= int(steps.max()):
+            with jax.enable_x64(True):
+                more = _targets(self._gait, float(self._targets.shape[1]), self._dt)
+            self._targets = np.concatenate([self._targets, np.asarray(more)], axis=1)
+        return self._targets[rows, steps]
+
+
+class OscillatorPolicy(TensorPolicy):
+    """
+    ``"MlpPolicy"`` of :class:`~sb3_hds.algos.OpenLoop`, which has no network.
+
+    The recurrent ``state`` of ``predict`` is how many steps ago each episode started.
+
+    :param observation_space: of any kind; a Box with one axis where joints are read from it
+    :param action_space: a bounded Box of any shape
+    :param lr_schedule: as SB3 passes it; not looked at
+    :param body: what is known of the system, see :class:`~sb3_hds.algos.open_loop.robot.Body`
+    :param use_sde: accepted for SB3's sake
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        body: Body | Mapping[str, Any] | None = None,
+        use_sde: bool = False,
+    ) -> None:
+        super().__init__(observation_space, action_space, squash_output=False)
+        n = int(np.prod(action_space.shape))
+        self.body = body if isinstance(body, Body) or body is None else Body(**body)
+        self.arguments = {
+            "lr_schedule": lr_schedule,
+            "body": None if self.body is None else self.body.to_dict(),
+        }
+        zero, one = np.zeros(n), np.asarray(1.0)
+        self.constants = Constants(zero, zero, zero, one, one, zero, zero)
+        self.search: SearchState
+        #: returns the states of all copies of the environment, where joints are not observed
+        self.read_states: Callable[[], np.ndarray] | None = None
+        self._lone_calls = 0
+        self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
+
+    @property
+    def constants(self) -> Constants:
+        """What acts."""
+        return self._constants
+
+    @constants.setter
+    def constants(self, constants: Constants) -> None:
+        self._constants = Constants(*(np.asarray(part, float) for part in constants))
+        rows = Constants(*(part[None] for part in self._constants))
+        self._timetable = Timetable(rows, self.body.dt if self.body else 1.0)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        :param observation: one, or a batch with one row for each copy of the environment
+        :param state: what the last call returned; None: all episodes start now
+        :param episode_start: which episodes start now
+        :return: action of the same number of rows, in the units of the action space; the state to
+            pass next time
+        :raises ValueError: if the observation has another shape than the observation space, or is
+            not finite
+        :raises EnvironmentMismatchError: if joints have to be read from an environment that the
+            policy does not have
+        """
+        refuse_odd(observation)
+        rows, several = self._as_rows(observation)
+        n = len(next(iter(rows.values()))) if isinstance(rows, dict) else len(rows)
+        if state is None:
+            self._warn_of_lone_calls(episode_start)
+            steps = np.zeros(n, np.int64)
+        else:
+            steps = np.asarray(state[0]).copy()
+        if episode_start is not None:
+            steps[np.broadcast_to(np.asarray(episode_start, bool), steps.shape)] = 0
+        targets = self._timetable.at(np.zeros(n, int), steps)
+        actions = self.command(targets, rows, self.constants.kp, self.constants.kd)
+        return actions if several else actions[0], (steps + 1,)
+
+    def command(self, targets: Targets, observations: Any, kp: Any, kd: Any) -> np.ndarray:
+        """
+        :param targets: one row for each copy of the environment
+        :param observations: likewise
+        :param kp: gains, one row for each, or one for all
+        :param kd: likewise
+        :return: actions, within their bounds
+        """
+        body = self.body
+        if body is not None and body.control == "track":
+            positions, velocities = self._joints(observations, len(targets))
+            targets = track(targets, positions, velocities, kp, kd)
+        box = self.action_space
+        assert isinstance(box, spaces.Box)
+        return np.clip(targets.reshape(-1, *box.shape), box.low, box.high).astype(box.dtype)
+
+    def _joints(self, observations: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
+        body = self.body
+        assert body is not None
+        if self.read_states is None:
+            if body.seen_position:
+                return body.in_observations(observations)
+            raise EnvironmentMismatchError(
+                "The joints are not in the observation, and this policy has no environment to read "
+                "them from: model.read_joints_from(env), with the VecEnv that it acts in. Or train "
+                "with the wrapper sb3_hds.wrappers.ShowJoints, which adds them to the observation."
+            )
+        states = self.read_states()
+        if len(states) != n:
+            raise EnvironmentMismatchError(
+                f"Joints are read from {len(states)} copies of the environment, and there are {n} "
+                "observations: model.read_joints_from(env), with the VecEnv that it acts in."
+            )
+        return body.in_states(states)
+
+    def _as_rows(self, observation: Any) -> tuple[Any, bool]:
+        """Observations with one row for each copy, and whether there were rows."""
+        if isinstance(observation, dict):
+            (key, space), *_ = self.observation_space.items()  # type: ignore[attr-defined]
+            several = np.ndim(observation[key]) > len(space.shape)
+            return (
+                observation if several else {k: np.asarray(v)[None] for k, v in observation.items()}
+            ), several
+        rows = np.asarray(observation)
+        several = is_vectorized_observation(rows, self.observation_space)
+        return rows if several else rows[None], several
+
+    def _warn_of_lone_calls(self, episode_start: np.ndarray | None) -> None:
+        self._lone_calls += episode_start is None
+        if self._lone_calls == 2:
+            warnings.warn(
+                "predict() was called again without the state that it returned: the oscillators "
+                "start over. Pass it on: "
+                "action, state = model.predict(obs, state=state, episode_start=done)."
+            )
+
+    def forward(self, obs: Any, deterministic: bool = False) -> np.ndarray:
+        return self.predict(obs)[0]
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
+        return self.predict(np.asarray(observation))[0]
+
+    def reset_noise(self, batch_size: int = 1) -> None:
+        """Nothing to reset: nothing is drawn."""
+
+    @property
+    def weights(self) -> Any:
+        return self.constants
+
+    @weights.setter
+    def weights(self, tree: Any) -> None:
+        self.constants = tree
+
+    @property
+    def training_state(self) -> Any:
+        return self.search
+
+    @training_state.setter
+    def training_state(self, tree: Any) -> None:
+        self.search = tree
+
+
+@jax.jit
+def _targets(gaits: Gait, first: float, dt: float) -> Float[Array, "gaits chunk act"]:
+    times = (first + jnp.arange(_CHUNK) + 0.5) * dt
+    of_one = jax.vmap(target_at, in_axes=(None, 0))
+    return jax.vmap(of_one, in_axes=(0, None))(gaits, times)

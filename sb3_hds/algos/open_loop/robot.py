@@ -1,0 +1,237 @@
+"""What an open-loop policy knows of the system that it moves: its time step and its joints."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from jaxtyping import Float
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_hds.algos.open_loop.gait import GaitSpace
+from sb3_hds.errors import EnvironmentMismatchError
+from sb3_hds.wrappers.actuated_joints import (
+    COMMANDS_POSITIONS,
+    ActuatedJoints,
+    actuated_joints,
+    refuse_servos,
+)
+from sb3_hds.wrappers.interval import interval_told
+
+# Resets, which differ from each other, that must agree on where a joint is in the observation.
+_N_RESETS = 3
+_EQUAL = 1e-6
+# Of a joint without a range [rad] or [m].
+_WIDEST_OFFSET = np.pi
+
+
+@dataclasses.dataclass(frozen=True)
+class Body:
+    """
+    Plain data, saved with a model.
+
+    :param dt: how long a step takes [s]
+    :param control: ``"track"``: actuators follow joint positions; ``"direct"``: oscillators are the
+        commands
+    :param names: of the actuated joints, in the order of the actuators
+    :param position: of each in ``qpos`` followed by ``qvel``; empty where nothing is tracked
+    :param velocity: of each, likewise
+    :param seen_position: of each in the observation; empty if that does not have them all
+    :param seen_velocity: of each, likewise
+    :param lower: ends of their ranges, or of the commands
+    :param upper: likewise
+    :param rest: where the model puts them at first, or the middle of the commands
+    """
+
+    dt: float
+    control: str
+    names: tuple[str, ...]
+    position: tuple[int, ...]
+    velocity: tuple[int, ...]
+    seen_position: tuple[int, ...]
+    seen_velocity: tuple[int, ...]
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    rest: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):  # JSON has lists only
+            value = getattr(self, field.name)
+            if isinstance(value, list):
+                object.__setattr__(self, field.name, tuple(value))
+
+    def to_dict(self) -> dict[str, Any]:
+        """:return: plain data for JSON, from which ``Body(**data)`` makes it again"""
+        return {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in dataclasses.asdict(self).items()
+        }
+
+    def in_states(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :param states: ``qpos`` followed by ``qvel``, shape ``(n_envs, state)``
+        :return: positions and velocities of the joints, shape ``(n_envs, act)``
+        """
+        return states[:, list(self.position)], states[:, list(self.velocity)]
+
+    def in_observations(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :param observations: shape ``(n_envs, obs)``
+        :return: positions and velocities of the joints, shape ``(n_envs, act)``
+        """
+        return observations[:, list(self.seen_position)], observations[:, list(self.seen_velocity)]
+
+
+def body_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Body:
+    """
+    Resets the environment a few times to find out where in its observations the joints are.
+
+    :param control: ``"track"``, ``"direct"``, or ``"auto"``: track where actuators drive joints
+    :param joints: ``"observation"``, ``"env"``, or ``"auto"``: the observation if it has them all
+    :param dt: how long a step takes [s]; None: as the environment says
+    :raises EnvironmentMismatchError: if the environment does not have what is asked for
+    """
+    attribute, error = functools.partial(_attribute, env), EnvironmentMismatchError
+    interval = (
+        interval_told(attribute, "The environment", error, drawn=True) if dt is None else float(dt)
+    )
+    driven = _driven(env, control)
+    if driven is None:
+        low, high = _commands(env)
+        return Body(
+            dt=interval,
+            control="direct",
+            names=tuple(f"action[{i}]" for i in range(low.size)),
+            position=(),
+            velocity=(),
+            seen_position=(),
+            seen_velocity=(),
+            lower=tuple(low.tolist()),
+            upper=tuple(high.tolist()),
+            rest=tuple((0.5 * (low + high)).tolist()),
+        )
+    found = None if joints == "env" else _in_observation(env, driven)
+    if found is None and joints == "observation":
+        raise EnvironmentMismatchError(
+            f"The observations do not show position and velocity of every joint that is driven "
+            f"({', '.join(driven.names)}). Add them by the wrapper sb3_hds.wrappers.ShowJoints, or "
+            "let them be read from the environment itself: joints='env'."
+        )
+    seen_position, seen_velocity = found or ((), ())
+    return Body(
+        dt=interval,
+        control="track",
+        names=driven.names,
+        position=tuple(driven.position.tolist()),
+        velocity=tuple((driven.n_positions + driven.velocity).tolist()),
+        seen_position=seen_position,
+        seen_velocity=seen_velocity,
+        lower=tuple(driven.lower.tolist()),
+        upper=tuple(driven.upper.tolist()),
+        rest=tuple(driven.rest.tolist()),
+    )
+
+
+def space_of(
+    body: Body,
+    *,
+    amplitude: float,
+    offset: float,
+    frequency: tuple[float, float],
+    kp: float,
+    kd: float,
+    gain_factor: float,
+    same_frequency: bool,
+    phases: bool,
+    leads: tuple[float, ...],
+) -> GaitSpace:
+    """
+    :param amplitude: largest one: of a joint [rad] or [m]; where commands are direct, in shares of
+        half their range
+    :param offset: largest one, up and down from where the joint rests, within its range; likewise
+    """
+    lower, upper, rest = (np.array(ends) for ends in (body.lower, body.upper, body.rest))
+    half = 0.5 * (upper - lower) if body.control == "direct" else np.ones(len(rest))
+    centre = np.clip(rest, lower, upper)
+    return GaitSpace(
+        amplitude=amplitude * half,
+        offset=np.stack([centre - offset * half, centre + offset * half], axis=1),
+        frequency=frequency,
+        kp=kp,
+        kd=kd,
+        gain_factor=gain_factor if body.control == "track" else 1.0,
+        same_frequency=same_frequency,
+        phases=phases,
+        leads=leads,
+    )
+
+
+def state_vectors(env: VecEnv) -> Float[np.ndarray, "n_envs state"]:
+    """:return: ``qpos`` and ``qvel`` of each copy of a MuJoCo environment"""
+    return np.stack(env.env_method("state_vector"))
+
+
+def refuse_without_state(env: VecEnv) -> None:
+    """
+    :raises EnvironmentMismatchError: if the environment does not show its state
+    """
+    if not env.has_attr("state_vector"):
+        raise EnvironmentMismatchError(
+            "Joints can be read from Gymnasium's MuJoCo environments, which have a method "
+            "state_vector(); this environment has none. Let the oscillators be the commands: "
+            "control='direct'."
+        )
+
+
+def _driven(env: VecEnv, control: str) -> ActuatedJoints | None:
+    if control == "direct":
+        return None
+    model = _attribute(env, "model")
+    if hasattr(model, "actuator_trnid") and model.nu == _commands(env)[0].size:
+        try:
+            refuse_servos(model, _attribute(env, COMMANDS_POSITIONS))
+            return actuated_joints(model)
+        except EnvironmentMismatchError:
+            if control == "track":
+                raise
+            return None
+    if control == "track":
+        raise EnvironmentMismatchError(
+            "control='track' needs an environment of MuJoCo with one action for each actuator. "
+            "Let the oscillators be the commands: control='direct'."
+        )
+    return None
+
+
+def _attribute(env: VecEnv, name: str) -> Any:
+    # In another process, asking for an attribute that is not there ends it.
+    return env.get_attr(name, indices=[0])[0] if env.has_attr(name) else None
+
+
+def _commands(env: VecEnv) -> tuple[np.ndarray, np.ndarray]:
+    box = env.action_space
+    assert isinstance(box, spaces.Box)
+    return box.low.astype(float).ravel(), box.high.astype(float).ravel()
+
+
+def _in_observation(
+    env: VecEnv, driven: ActuatedJoints
+) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
+    """Entries of the observation that agree with the state at several resets, if there are all."""
+    space = env.observation_space
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        return None
+    pairs = [(np.asarray(env.reset()), state_vectors(env)) for _ in range(_N_RESETS)]
+    observed = np.concatenate([obs for obs, _ in pairs])
+    there = [
+        np.concatenate(part) for part in zip(*(driven.of_state(s) for _, s in pairs), strict=True)
+    ]
+    columns = []
+    for truth in there:
+        matches = np.abs(observed[:, :, None] - truth[:, None, :]).max(axis=0) < _EQUAL
+        # A joint that every reset puts at the same place cannot be told from other constants.
+        if not (matches.any(axis=0) & (np.ptp(truth, axis=0) > _EQUAL)).all():
+            return None
+        columns.append(tuple(np.argmax(matches, axis=0).tolist()))
+    return columns[0], columns[1]

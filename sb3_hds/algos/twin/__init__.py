@@ -1,0 +1,1 @@
+"""Algorithms that plan in a differentiable simulation and regress the policy on the plans."""

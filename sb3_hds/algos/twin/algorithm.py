@@ -1,0 +1,454 @@
+"""
+The shell of every algorithm that learns through a twin.
+
+SB3 collects real steps and calls ``train``; a call of ``train`` is one planning epoch in the twin
+(the pure function in ``epoch.py``). A timestep is a step of the environment that the user passed
+in, nothing else; simulated steps are counted apart.
+"""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, ClassVar, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    MaybeCallback,
+    RolloutReturn,
+    Schedule,
+    TrainFreq,
+)
+
+from sb3_hds.algos.base.algorithm import TensorAlgorithm
+from sb3_hds.algos.base.checks import callbacks_of
+from sb3_hds.algos.base.construct import (
+    check_arguments,
+    check_twin_observes,
+    jax_device,
+    policy_and_env,
+)
+from sb3_hds.algos.twin.config import knobs_of, settings_of
+from sb3_hds.algos.twin.epoch import Report, epoch, twin_steps_per_epoch
+from sb3_hds.algos.twin.log import record_epoch
+from sb3_hds.algos.twin.model import Tensors, check_reward, required, twin_from_spec, twin_given
+from sb3_hds.algos.twin.normalization import prepare_statistics, view_of
+from sb3_hds.algos.twin.policy import TwinPolicy, all_finite
+from sb3_hds.algos.twin.pretraining import Pretraining, meanwhile, nothing
+from sb3_hds.algos.twin.selection import choose_policy, programs, twin_steps_per_comparison
+from sb3_hds.algos.twin.state import Learner, Settings, Workspace, begin, longest_episode
+from sb3_hds.core import Params, Twin
+from sb3_hds.core.contract import check_methods
+from sb3_hds.core.numerics.compilation import GENERATOR
+from sb3_hds.envs.mirror import check_mirrors, twin_of
+from sb3_hds.errors import DivergedError
+
+# Decay of what counts as recent in the pretraining, per epoch, and the fewest epochs to judge by.
+_RECENT = 0.9
+_FEWEST_EPOCHS = 20
+
+
+class TwinAlgorithm(TensorAlgorithm):
+    """
+    Abstract: what PODS and HDS share. Arguments are documented there.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": TwinPolicy}
+    policy_family = TwinPolicy
+    policy: TwinPolicy
+    #: the twin contains the layers: it has to be told what they were told
+    stores_executed: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] | GymEnv,
+        env: GymEnv | str | None,
+        *,
+        learning_rate: float | Schedule,
+        value_learning_rate: float | str | Schedule | None,
+        buffer_size: int,
+        learning_starts: int,
+        batch_size: int,
+        gamma: float,
+        train_freq: int | tuple[int, str],
+        gradient_steps: int,
+        action_noise: ActionNoise | None,
+        replay_buffer_class: type[ReplayBuffer] | None,
+        replay_buffer_kwargs: dict[str, Any] | None,
+        optimize_memory_usage: bool,
+        twin: Twin | str | None,
+        pretrain_epochs: int,
+        n_rollouts: int,
+        horizon: int | None,
+        order: int,
+        planner: str | None,
+        n_iterations: int,
+        n_step_sizes: int,
+        n_random_plans: int,
+        random_share: float,
+        lookahead: int | None,
+        terminal_value: bool,
+        shift_ends: bool,
+        reset_share: float,
+        exploration_noise: float,
+        exploration_decay: float,
+        temperature: float,
+        temperature_decay: float,
+        relabel_share: float,
+        plan_memory: int,
+        learned_share: float,
+        loss: str,
+        gain_weight: float,
+        sensitivity_weight: float,
+        averaging: float,
+        adapt_scales: bool,
+        compare_every: int,
+        least_gain: float,
+        randomisation: float,
+        policy_kwargs: dict[str, Any] | None,
+        stats_window_size: int,
+        tensorboard_log: str | None,
+        verbose: int,
+        device: str,
+        seed: int | None,
+        monitor_wrapper: bool,
+        _init_setup_model: bool,
+    ) -> None:
+        policy_class, made_env = policy_and_env(
+            type(self), policy, env, check_twin_observes, monitor_wrapper
+        )
+        super().__init__(
+            policy=policy_class,
+            env=made_env,
+            learning_rate=learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            policy_kwargs=dict(policy_kwargs or {}),
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            seed=seed,
+            monitor_wrapper=monitor_wrapper,
+            sde_support=False,
+            supported_action_spaces=(spaces.Box,),
+            support_multi_env=True,
+        )
+        self.value_learning_rate = value_learning_rate
+        self.twin: Twin | None = twin_given(twin)
+        self.twin_spec: dict[str, Any] | None = None
+        self.pretrain_epochs = pretrain_epochs
+        self.n_rollouts = n_rollouts
+        self.horizon = horizon
+        self.order = order
+        self.planner = planner
+        self.n_iterations = n_iterations
+        self.n_step_sizes = n_step_sizes
+        self.n_random_plans = n_random_plans
+        self.random_share = random_share
+        self.lookahead = lookahead
+        self.terminal_value = terminal_value
+        self.shift_ends = shift_ends
+        self.reset_share = reset_share
+        self.exploration_noise = exploration_noise
+        self.exploration_decay = exploration_decay
+        self.temperature = temperature
+        self.temperature_decay = temperature_decay
+        self.relabel_share = relabel_share
+        self.plan_memory = plan_memory
+        self.learned_share = learned_share
+        self.loss = loss
+        self.gain_weight = gain_weight
+        self.sensitivity_weight = sensitivity_weight
+        self.averaging = averaging
+        self.adapt_scales = adapt_scales
+        self.compare_every = compare_every
+        self.least_gain = least_gain
+        self.randomisation = randomisation
+        self.recent_gain, self.recent_return = 0.0, 0.0
+        self.unstored_step: dict[str, Any] | None = None
+        self.real_timesteps = 0
+        self.learned_force = Tensors(self)
+        self.n_pretrained = 0
+        self.twin_timesteps = 0
+        self._n_updates = 0
+        self._epochs_planned, self._epochs_done = 0, 0
+        self._workspace: Workspace | None = None
+        self._compiled: Settings | None = None
+        self.stopped = False
+        self.poll: Callable[[], None] = nothing
+        self._constructed(device, _init_setup_model)
+
+    def learn(  # type: ignore[override]
+        self,
+        total_timesteps: int | None = None,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """
+        Plan in the twin until the pretraining is done, then act in the environment and plan on.
+
+        :param total_timesteps: steps of the *environment*; default ``default_timesteps``. With 0,
+            only the pretraining runs, and the environment is not stepped.
+        :param callback: called at every step of the environment, and before the first one after
+            every planning epoch, with ``locals["pretraining"]`` and no timestep counted
+        :param log_interval: episodes between two log lines
+        :param tb_log_name: name of the run for TensorBoard; default: the class's name
+        :param reset_num_timesteps: False goes on counting
+        :param progress_bar: show one for planning and one for acting
+        """
+        return super().learn(
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+        )
+
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        """One planning epoch with ``gradient_steps`` regression steps, between real steps."""
+        self._n_updates += gradient_steps
+        self.run_epoch(gradient_steps)
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        if self.stopped:
+            # By a callback, before the first step.
+            return RolloutReturn(0, 0, continue_training=False)
+        return super().collect_rollouts(*args, **kwargs)
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray,  # type: ignore[override]
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        self.unstored_step = None
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self.real_timesteps += self.n_envs
+
+    def run_epoch(self, gradient_steps: int) -> Report:
+        """
+        Improve plans in the twin and regress the policy on them, once.
+
+        :param gradient_steps: regression steps
+        :return: what happened, on the device
+        :raises NoTwinError: if the model was loaded without environment and without twin
+        :raises DivergedError: if the regression diverged; the model keeps its last good state
+        """
+        learner, settings = self._learner(), self._settings
+        knobs = knobs_of(self, settings.twin, self._progress_remaining(), gradient_steps)
+        if settings != self._compiled:
+            compares = self.compare_every > 0 and (
+                self.comparison_due or self.compare_every <= self._epochs_planned
+            )
+            meanwhile(programs(settings, learner, knobs, compares), self.poll)
+            self._compiled = settings
+        learner, report = epoch(settings, learner, knobs)
+        learner, returns = choose_policy(
+            settings, learner, knobs, self.compare_every, self.comparison_due
+        )
+        losses = float(report.policy_loss), float(report.value_loss)
+        if not (all(map(math.isfinite, losses)) and all_finite(learner.networks)):
+            raise DivergedError(
+                f"The regression diverged (losses {losses}); the model keeps the state before this "
+                "epoch. Lower learning_rate."
+            )
+        self.policy.networks, self.policy.progress = learner.networks, learner.progress
+        self._workspace = learner.workspace
+        self._epochs_done += 1
+        self.twin_timesteps += twin_steps_per_epoch(settings)
+        if returns is not None:
+            self.twin_timesteps += twin_steps_per_comparison(settings)
+        record_epoch(self, report, knobs, returns)
+        return report
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        :param env: has the spaces of the one before, as many copies, and a twin
+        :param force_reset: False goes on from where the environment is
+        :raises NoTwinError: if it has no twin; the model then keeps the environment that it had
+        """
+        before = self.env, self.n_envs, self._vec_normalize_env, self._last_obs
+        super().set_env(env, force_reset)
+        try:
+            self._meet_env()
+        except Exception:
+            self.env, self.n_envs, self._vec_normalize_env, self._last_obs = before
+            raise
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        device = jax_device(self._device_name)
+        self.policy = self.policy_class(  # type: ignore[assignment]
+            self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
+        )
+        self.policy.build(jax.random.key(self.network_seed, impl=GENERATOR), device)
+        self._workspace = None
+        self._setup_twin()
+
+    def check_arguments(self) -> None:
+        check_arguments(self)
+
+    def remedies(self, updates_per_step: float) -> list[str]:
+        return [
+            f"n_rollouts={max(1, self.n_rollouts // 4)}, {self.n_rollouts} now",
+            "a larger train_freq",
+            f"fewer gradient_steps, {updates_per_step:.3g} for each step now",
+            "a GPU",
+        ]
+
+    def _setup_twin(self) -> None:
+        """The twin that was passed, or saved because it had been, or the environment's own."""
+        given: Any = self.twin  # a name, where one was passed to `load`
+        if given is not None and not isinstance(given, Twin):
+            self.twin = twin_given(given)
+        elif given is None and self.twin_spec is not None:
+            self.twin = twin_from_spec(self.twin_spec)
+        if self.twin is not None:
+            self.twin_spec = self.twin.to_spec()
+        self._meet_env()
+
+    def _meet_env(self) -> None:
+        """Plan with the twin of the environment, unless one was passed."""
+        twin = self.twin
+        if self.env is not None:
+            if self.twin_spec is None:
+                twin = twin_of(self.env)
+            elif twin is not None:
+                check_mirrors(self.env, twin)
+        if twin is not None:
+            check_methods(twin)
+            check_reward(twin)
+            twin = self._prepared(twin)
+            if self.twin is not None and (twin != self.twin or twin.values != self.twin.values):
+                self._workspace = None
+        self.twin = twin
+
+    def _prepared(self, twin: Twin) -> Twin:
+        """:return: what to plan in, given the twin of the environment or the one that was passed"""
+        return twin
+
+    @property
+    def comparison_due(self) -> bool:
+        """Whether policies are compared after this epoch, whatever ``compare_every`` says."""
+        return False
+
+    def varied(self, twin: Twin) -> Params:
+        """
+        :return: parameters that differ between the rollouts of an epoch, each of shape
+            ``(n_rollouts,)``
+        """
+        if not self.randomisation:
+            return {}
+        drawn = {}
+        for name, parameter in twin.parameters.items():
+            deviation = self.randomisation * parameter.scale * np.random.randn(self.n_rollouts)
+            values = np.clip(twin.values[name] + deviation, parameter.lower, parameter.upper)
+            drawn[name] = jnp.asarray(values, jnp.float32)
+        return drawn
+
+    def before_planning(self) -> None:
+        """Called when a training starts, before the first planning epoch."""
+
+    @property
+    def _settings(self) -> Settings:
+        return settings_of(self, required(self.twin, self.twin_spec))
+
+    def _learner(self) -> Learner:
+        """What an epoch changes. Before the first one, the scales of the task are found."""
+        settings, policy = self._settings, self.policy
+        workspace = self._workspace
+        if workspace is None:
+            fresh = int(policy.progress.n_epochs) == 0
+            if fresh:
+                seed = int(np.asarray(policy.progress.key)[0])
+                prepare_statistics(self._vec_normalize_env, settings.twin, jax.random.key(seed))
+            view = view_of(self._vec_normalize_env, len(settings.twin.channels))
+            started = partial(begin, settings, settings.twin.params, view, policy.progress)
+            [(workspace, scales, progress)] = meanwhile([started], self.poll)
+            if fresh:
+                policy.networks = policy.networks._replace(inside=scales.inside)
+                progress = progress._replace(
+                    reward_scale=scales.reward_scale, reward_offset=scales.reward_offset
+                )
+            self._workspace, policy.progress = workspace, progress
+        return Learner(policy.networks, policy.progress, workspace)
+
+    def _progress_remaining(self) -> float:
+        """From 1 to 0 over the planning epochs of this call of ``learn``, pretraining included."""
+        if not self._epochs_planned:
+            return 1.0
+        return max(0.0, 1.0 - self._epochs_done / self._epochs_planned)
+
+    def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any):
+        total_timesteps, callback = super()._setup_learn(total_timesteps, *args, **kwargs)
+        steps = total_timesteps - self.num_timesteps
+        self._epochs_planned = self.pretraining_due + math.ceil(steps / self._steps_per_epoch)
+        self._epochs_done, self.stopped = 0, False
+        return total_timesteps, callback
+
+    @property
+    def _steps_per_epoch(self) -> int:
+        """Real steps between two epochs; where ``train_freq`` counts episodes, the most."""
+        assert isinstance(self.train_freq, TrainFreq)
+        if self.train_freq.unit.value == "step":
+            return self.train_freq.frequency * self.n_envs
+        return self.train_freq.frequency * longest_episode(self._settings.twin)
+
+    @property
+    def pretraining_due(self) -> int:
+        """Planning epochs that are left to do before the next real step."""
+        enough = self.least_gain * self.recent_return
+        if self.n_pretrained >= _FEWEST_EPOCHS and self.recent_gain < enough:
+            return 0
+        return max(0, self.pretrain_epochs - self.n_pretrained)
+
+    def pretrain_epoch(self) -> None:
+        """
+        One planning epoch before the first real step, like any other. Where plans gain nothing
+        more, it is the last one, and schedules jump over those that are spared.
+        """
+        planned = self.pretraining_due
+        steps = self.gradient_steps if self.gradient_steps >= 0 else self._steps_per_epoch
+        report = self.run_epoch(steps)
+        before, after = float(report.before), float(report.after)
+        self.recent_gain = _RECENT * self.recent_gain + max(0.0, after - before)
+        self.recent_return = _RECENT * self.recent_return + abs(before)
+        self.n_pretrained += 1
+        self._epochs_done += planned - 1 - self.pretraining_due
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        around = Pretraining(callbacks_of(callback), progress_bar)
+        return super()._init_callback(around, progress_bar)
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        names, variables = super()._get_torch_save_params()
+        return [*names, "learned_force"], variables
+
+    def _excluded_save_params(self) -> list[str]:
+        ours = [
+            "twin",
+            "_workspace",
+            "_compiled",
+            "poll",
+            "stopped",
+            "unstored_step",
+            "learned_force",
+        ]
+        return [*super()._excluded_save_params(), *ours]

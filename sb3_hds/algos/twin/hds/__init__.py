@@ -1,0 +1,1 @@
+"""Hybrid differentiable simulation: planning in a model that measured data correct."""

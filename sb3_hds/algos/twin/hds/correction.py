@@ -1,0 +1,341 @@
+"""Correct the twin by what was measured: its parameters with those of effects, then a force."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sb3_hds.algos.twin.hds.recorded_steps import latest_steps
+from sb3_hds.algos.twin.hds.windows import (
+    EXACT,
+    FEWEST,
+    Since,
+    Windows,
+    divided,
+    latest_windows,
+    mean_error,
+    shares_of,
+    since_change,
+    windows_of,
+)
+from sb3_hds.algos.twin.model import missing_effects, nulls_of
+from sb3_hds.core import Trajectories, Twin
+from sb3_hds.errors import CalibrationError, TrajectoryError
+from sb3_hds.sysid import Fit
+from sb3_hds.sysid.calibrate import check_fits, fit_windows, spread_of
+from sb3_hds.sysid.free import each, every_name, free_names
+from sb3_hds.sysid.prediction import (
+    gain,
+    is_better,
+    probability_before,
+    single_step_errors,
+)
+from sb3_hds.sysid.residual import Residual, fit_force
+
+# As `EXACT`, for nearly all of the latest single steps, since at rest any twin is exact: how
+# little, which share, of how many.
+_EXACT_STEP, _MOST_STEPS, _N_SINGLE = 1e-4, 0.98, 256
+# Of the solver, in each of its passes: the next correction goes on where this one ends.
+_SOLVER_STEPS = 20
+# Plans are made anew where the corrected model's error is lower by this share.
+_NOTICEABLE = 0.1
+# A calibrated twin needs less proof than a learned force: it has few parameters, and a prior.
+_LEAST_OF_CALIBRATION = 0.02
+# A suspected effect stays where the error would be higher without it by this share.
+_LEAST_OF_SUSPECT = 0.01
+# Where held-out windows are of the same few recordings, values that the prior holds for so
+# improbable are not believed: a system that dry friction holds fast looks like a heavier one.
+_IMPROBABLE = 1e-3
+# A learned force that lowers the error by this share is planned in exclusively.
+_TRUSTED = 0.25
+
+
+@dataclasses.dataclass(frozen=True)
+class Wishes:
+    """
+    What is to be corrected.
+
+    :param names: parameters that are estimated; empty: none
+    :param nominal: values that are believed before any data, by name
+    :param residual: whether a force is learned
+    :param residual_kwargs: further arguments of ``sysid.fit_residual``
+    :param beta: share of rollouts in the learned model, or ``"auto"``
+    :param seed: of whatever is drawn
+    :param suspected: effects that are estimated with the rest once the twin proves inexact, and
+        stay attached where they explain something
+    """
+
+    names: tuple[str, ...]
+    nominal: Mapping[str, float]
+    residual: bool
+    residual_kwargs: Mapping[str, Any]
+    beta: float | str
+    seed: int
+    suspected: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Correction:
+    """
+    What the data say. Errors are root mean squares over held-out windows, in shares of the
+    channels' spread; not a number where there was nothing to compare.
+
+    :param twin: to plan in from now on
+    :param beta: share of rollouts in the learned model
+    :param changed: whether the model is so different that plans should be made anew
+    :param since: what counts from now on, if data from before a change of the system were left out
+    :param attached: what was believed of the parameters of effects that the twin has now and had
+        not before
+    :param fit: of the parameters, if they were estimated
+    :param residual: the learned force, if it was learned
+    :param error_twin: of the twin as it was before any data
+    :param error_calibrated: of the calibrated one
+    :param error_hybrid: of that with the learned force
+    """
+
+    twin: Twin
+    beta: float
+    changed: bool
+    since: Since | None = None
+    attached: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    fit: Fit | None = None
+    residual: Residual | None = None
+    error_twin: float = np.nan
+    error_calibrated: float = np.nan
+    error_hybrid: float = np.nan
+
+    @property
+    def forgotten(self) -> bool:
+        """Whether data from before a change of the system were left out."""
+        return self.since is not None
+
+
+def correct(
+    twin: Twin,
+    data: Trajectories,
+    wishes: Wishes,
+    beta: float,
+    learn_force: bool,
+    n_new: int,
+    since: Since | None = None,
+) -> Correction:
+    """
+    Estimate parameters, then learn what remains; keep each only if held-out windows say so.
+
+    :param twin: as it is now
+    :param data: everything measured, oldest first; ``origin`` numbers the recordings
+    :param wishes: what is to be corrected
+    :param beta: as it is now
+    :param learn_force: whether it is time to learn the force again
+    :param n_new: steps that came since the last correction
+    :param since: what counts of the data; None: everything
+    :raises CalibrationError: for data that cannot have been measured on what the twin simulates
+    """
+    check_fits(twin, data)
+    recent = data if since is None else latest_steps(data, since.n_steps)
+    spread = spread_of(recent)
+    if twin.values == wishes.nominal:
+        single = single_step_errors(twin, recent, spread, _N_SINGLE)
+        typical = float(np.quantile(single, _MOST_STEPS))
+        if typical < _EXACT_STEP:
+            return Correction(twin, beta, changed=False, error_twin=typical)
+    try:
+        windows = windows_of(data, twin, spread, since)
+    except TrajectoryError:
+        return Correction(twin, beta, changed=False)
+    nominal = twin.with_parameters(**wishes.nominal)
+    bare, now = (windows.errors(t) for t in (nominal, twin))
+    real = windows.counted
+    if len(real) < FEWEST:
+        return Correction(twin, beta, changed=False, error_twin=mean_error(bare[real]))
+    latest = latest_windows(windows, n_new)
+    if max(mean_error(bare[real]), mean_error(bare[latest])) < EXACT:
+        changed = gain(bare[real], now[real]) > _NOTICEABLE
+        return Correction(nominal, 0.0, changed=changed, error_twin=mean_error(bare[real]))
+    windows, forgotten = since_change(windows, now, latest, n_new)
+    windows = divided(windows, forgotten or since)
+    real = windows.counted
+    if len(real) < FEWEST or not windows.held.any():
+        return Correction(
+            twin, beta, changed=False, since=forgotten, error_twin=mean_error(bare[real])
+        )
+    found = _corrected(nominal, twin, wishes, windows, bare, now, beta, learn_force)
+    return dataclasses.replace(found, since=forgotten)
+
+
+def _corrected(
+    nominal: Twin,
+    twin: Twin,
+    wishes: Wishes,
+    windows: Windows,
+    bare: np.ndarray,
+    now: np.ndarray,
+    beta: float,
+    learn_force: bool,
+) -> Correction:
+    """
+    :param nominal: as the twin was before any data
+    :param bare: errors of that
+    :param now: errors of the twin as it is
+    """
+    nominal, twin, wishes, added = _with_suspects(nominal, twin, wishes)
+    fit = _calibrated(nominal, twin, windows, wishes)
+    calibrated, errors = _best(nominal, twin, fit, bare, now, windows)
+    calibrated, errors, added = _cleared(calibrated, errors, added, windows)
+    held = windows.held
+    found = Correction(
+        calibrated,
+        0.0,
+        changed=False,
+        attached=added,
+        fit=fit,
+        error_twin=mean_error(bare[held]),
+        error_calibrated=mean_error(errors[held]),
+    )
+    if beta > 0.0:
+        now = windows.errors(twin, twin.params)
+    found, errors = _with_residual(found, windows, errors, wishes, learn_force)
+    return dataclasses.replace(found, changed=gain(errors[held], now[held]) > _NOTICEABLE)
+
+
+def _with_suspects(
+    nominal: Twin, twin: Twin, wishes: Wishes
+) -> tuple[Twin, Twin, Wishes, dict[str, float]]:
+    """
+    Errors that are known already stay valid: new effects change nothing yet.
+
+    :return: both twins with the suspected effects, the wishes with their parameters, and what is
+        believed of these
+    """
+    missing = missing_effects(twin, wishes.suspected)
+    if not missing:
+        return nominal, twin, wishes, {}
+    nominal, twin = nominal.extend(*missing), twin.extend(*missing)
+    added = nulls_of(missing)
+    wishes = dataclasses.replace(
+        wishes, names=(*wishes.names, *added), nominal={**wishes.nominal, **added}
+    )
+    return nominal, twin, wishes, added
+
+
+def _cleared(
+    twin: Twin,
+    errors: np.ndarray,
+    added: Mapping[str, float],
+    windows: Windows,
+) -> tuple[Twin, np.ndarray, dict[str, float]]:
+    """
+    What was suspected and explains nothing is let go, since simulating it costs time; it is
+    suspected again next time.
+
+    :return: the twin without those effects, its errors, and ``added`` without their parameters
+    """
+    left = dict(added)
+    for key in dict.fromkeys(name.rpartition(".")[0] for name in added):
+        own = {name: null for name, null in added.items() if name.startswith(f"{key}.")}
+        cleared = twin.with_parameters(**own)
+        without = windows.errors(cleared)
+        if gain(errors[windows.held], without[windows.held]) < _LEAST_OF_SUSPECT:
+            twin, errors = cleared.without(key), without
+            left = {name: null for name, null in left.items() if name not in own}
+    return twin, errors, left
+
+
+def _calibrated(
+    nominal: Twin,
+    twin: Twin,
+    windows: Windows,
+    wishes: Wishes,
+) -> Fit | None:
+    """From the values as they are, with what was believed before any data as prior."""
+    if not wishes.names:
+        return None
+    believed = np.array([nominal.values[name] for name in wishes.names])
+    start = twin.with_parameters(**{k: 0.0 for k in shares_of(twin)})
+    try:
+        return fit_windows(
+            start,
+            each(wishes.names),
+            windows.learned,
+            windows.origin,
+            windows.spread,
+            prior=1.0,
+            believed=believed,
+            max_steps=_SOLVER_STEPS,
+        )
+    except CalibrationError:
+        return None
+
+
+def _best(
+    nominal: Twin,
+    twin: Twin,
+    fit: Fit | None,
+    bare: np.ndarray,
+    now: np.ndarray,
+    windows: Windows,
+) -> tuple[Twin, np.ndarray]:
+    """:return: the calibrated twin if it predicts better, otherwise the twin as it is or was"""
+    held = windows.held
+    current = (twin, now) if now[held].mean() < bare[held].mean() else (nominal, bare)
+    if fit is None or not all(np.isfinite(e.estimate) for e in fit.estimates):
+        return current
+    if not windows.of_other_recordings and probability_before(fit, nominal) < _IMPROBABLE:
+        return current
+    new = twin.with_parameters(**{e.name: e.estimate for e in fit.estimates})
+    errors = windows.errors(new)
+    if (
+        gain(errors[held], bare[held]) > _LEAST_OF_CALIBRATION
+        and gain(errors[held], now[held]) >= 0.0
+    ):
+        return new, errors
+    return current
+
+
+def _with_residual(
+    found: Correction,
+    windows: Windows,
+    errors: np.ndarray,
+    wishes: Wishes,
+    learn_force: bool,
+) -> tuple[Correction, np.ndarray]:
+    """:return: the correction, and the errors of the model that is planned in"""
+    twin, residual, held = found.twin, None, windows.held
+    wanted = wishes.residual and wishes.beta != 0.0 and mean_error(errors[held]) > EXACT
+    if wanted and learn_force:
+        scale = 0.05 * windows.spread if found.fit is None else found.fit.noise
+        scale = np.maximum(scale, 1e-3 * windows.spread)
+        try:
+            residual = fit_force(
+                twin, windows.shots, held, scale, seed=wishes.seed, **wishes.residual_kwargs
+            )
+        except CalibrationError:
+            residual = None
+    hybrid = twin if residual is None else residual.twin
+    key = next(iter(shares_of(hybrid)), None)
+    if key is None:
+        return found, errors
+    whole = windows.errors(hybrid, {**hybrid.params, key: 1.0})
+    found = dataclasses.replace(found, residual=residual, error_hybrid=mean_error(whole[held]))
+    # Simulating a force that does not help costs time.
+    if residual is not None and not (residual.accepted or shares_of(twin)):
+        return found, errors
+    helps = is_better(whole[held], errors[held])
+    share = 0.0
+    if helps:
+        trust = min(1.0, gain(whole[held], errors[held]) / _TRUSTED)
+        share = trust if wishes.beta == "auto" else float(wishes.beta)
+    twin = hybrid.with_parameters(**{key: 1.0 if helps else 0.0})
+    found = dataclasses.replace(found, twin=twin, beta=share)
+    return found, whole if share > 0.0 else errors
+
+
+def names_to_estimate(twin: Twin, wanted: str | Sequence[str] | None) -> tuple[str, ...]:
+    """
+    :param wanted: ``"all"``, names of parameters, or None
+    :raises CalibrationError: for a name that the twin does not have
+    """
+    if wanted == "all":
+        return every_name(twin)
+    return free_names(twin, wanted) if wanted else ()

@@ -1,0 +1,143 @@
+"""Which twin an algorithm plans in, and whether it can."""
+
+import warnings
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import torch as th
+
+from sb3_hds import effects, twins
+from sb3_hds.algos.base.checks import in_one_line
+from sb3_hds.algos.base.files import from_state_dict, to_state_dict
+from sb3_hds.core import Effect, Twin
+from sb3_hds.core.twin import plant_of
+from sb3_hds.errors import NoTwinError, RewardError
+
+
+def check_reward(twin: Twin) -> None:
+    """
+    :raises RewardError: if planning has nothing to climb in this twin
+    """
+    base = plant_of(twin)
+    surrogate = type(base).planning_reward is not Twin.planning_reward
+    if not surrogate and type(base).reward is Twin.reward:
+        raise RewardError(
+            f"{twin.name} has no reward: it simulates a system without a task. Implement `reward`."
+        )
+    if not surrogate and not base.reward_has_gradient:
+        raise RewardError(
+            f"The reward of {twin.name} is flat almost everywhere, so its gradient tells nothing. "
+            "Implement `planning_reward`: a smooth surrogate that is best where the reward is best."
+        )
+
+
+def twin_given(twin: Any) -> Twin | None:
+    """
+    :param twin: one, its name, or None
+    :raises NoTwinError: for a name that is not registered
+    :raises TypeError: for anything else
+    """
+    if twin is None or isinstance(twin, Twin):
+        return twin
+    if isinstance(twin, str):
+        return twins.make(twin)
+    raise TypeError(
+        f"twin={in_one_line(twin)}: twin must be a twin, as from twins.make('Pendulum'), its name, "
+        "or None for that of the environment."
+    )
+
+
+def required(twin: Twin | None, spec: dict[str, Any] | None) -> Twin:
+    """
+    :param spec: of a saved twin that is not registered here
+    :return: the twin
+    :raises NoTwinError: if there is none
+    """
+    if twin is not None:
+        return twin
+    way_out = "" if spec else "Set an environment that has one (set_env). "
+    raise NoTwinError(
+        f"This model has no twin to plan in. {way_out}"
+        "Load it with one: load(path, env=env, twin=...)."
+    )
+
+
+def twin_from_spec(spec: dict[str, Any]) -> Twin | None:
+    """:return: the twin that a file describes, or None, with a warning, if it is not registered"""
+    try:
+        return twins.from_spec(spec, effects.KNOWN)
+    except NoTwinError as error:
+        warnings.warn(
+            f"The model can predict but not train, because its twin '{spec['twin']}' is not "
+            f"registered here. Register it, or load with twin=... ({str(error).splitlines()[0]})"
+        )
+        return None
+
+
+def missing_effects(twin: Twin, wanted: Sequence[str | dict[str, Any]]) -> list[Effect]:
+    """
+    :param wanted: names of effects, each meant at every place that it may have, or specs of effects
+    :return: those that the twin does not have yet
+    :raises EffectError: for a name that is not in the catalogue
+    """
+    found: list[Effect] = []
+    for entry in wanted:
+        if isinstance(entry, str):
+            effect = effects.effect_named(entry, effects.KNOWN)
+            found += [effect(place.name) for place in _places(twin)[effect.slot]]
+        else:
+            effect = effects.effect_named(entry["effect"], effects.KNOWN)
+            options = entry.get("options", {})
+            found.append(effect(entry["where"], **options, **entry["parameters"]))
+    return [effect for effect in found if not _has(twin, effect)]
+
+
+def check_known(names: Iterable[str]) -> None:
+    """
+    :raises EffectError: for a name that is not in the catalogue
+    """
+    for name in names:
+        effects.effect_named(name, effects.KNOWN)
+
+
+def nulls_of(attached: Sequence[Effect]) -> dict[str, float]:
+    """
+    :param attached: effects that name their place
+    :return: what is believed of their parameters before any data, by full name
+    """
+    return {
+        f"{effect.name}.{effect.where}.{name}": parameter.null
+        for effect in attached
+        for name, parameter in effect.parameters.items()
+    }
+
+
+def _has(twin: Twin, effect: Effect) -> bool:
+    places = _places(twin)[effect.slot]
+    where = places[effect.where].name if isinstance(effect.where, int) else effect.where
+    return any(name.startswith(f"{effect.name}.{where}.") for name in twin.values)
+
+
+def _places(twin: Twin) -> dict[str, Any]:
+    return {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}
+
+
+class Tensors:
+    """
+    The learned arrays of a model's twin, as SB3 saves a network.
+
+    :param model: whose ``twin`` has them
+    """
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+
+    def state_dict(self) -> dict[str, th.Tensor]:
+        twin = self._model.twin
+        return {} if twin is None else to_state_dict(dict(twin.tensors))
+
+    def load_state_dict(self, state_dict: dict[str, th.Tensor], strict: bool = True) -> None:
+        twin = self._model.twin
+        if twin is not None and (twin.tensors or state_dict):
+            tensors = from_state_dict(dict(twin.tensors), state_dict, strict)
+            self._model.twin = twin.with_tensors(tensors)

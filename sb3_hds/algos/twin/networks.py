@@ -1,0 +1,121 @@
+"""Policy and value networks of the algorithms that learn through a twin."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sb3_hds.algos.nets.activations import Activation
+
+# Width around zero where the value is linear rather than a square root, in units of the scaled
+# reward.
+_NEAR_ZERO = 0.3
+# Squares in the value.
+_N_SQUARES = 8
+# Uniform rather than normal: half a second less to compile. Small in a last layer, so that a
+# network starts near zero.
+_HIDDEN = nn.initializers.variance_scaling(1.0, "fan_in", "uniform")
+_SMALL = nn.initializers.variance_scaling(1e-4, "fan_in", "uniform")
+
+
+class Actor(nn.Module):
+    """
+    Observation to control in (-1, 1), with a small last layer, so that it starts near zero.
+
+    :param n_act: number of controls
+    :param net_arch: widths of the hidden layers
+    :param activation_fn: between the layers
+    :param linear_path: whether a linear map goes from input to output beside the hidden layers:
+        near a balance the best control is linear in the state, and many units agree on a line
+        slowly
+    """
+
+    n_act: int
+    net_arch: Sequence[int]
+    activation_fn: Activation
+    linear_path: bool = True
+
+    @nn.compact
+    def __call__(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch act"]:
+        hidden = _mlp(obs, self.net_arch, self.activation_fn)
+        control = nn.Dense(self.n_act, kernel_init=_SMALL, name="last")(hidden)
+        if self.linear_path:
+            control += nn.Dense(self.n_act, False, kernel_init=_SMALL, name="linear")(obs)
+        return jnp.tanh(control)
+
+
+class Value(nn.Module):
+    """
+    Observation to roots :math:`\rho` of the value, see :func:`value_of`.
+
+    :param net_arch: widths of the hidden layers
+    :param activation_fn: between the layers
+    """
+
+    net_arch: Sequence[int]
+    activation_fn: Activation
+
+    @nn.compact
+    def __call__(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch roots"]:
+        hidden = _mlp(obs, self.net_arch, self.activation_fn)
+        return nn.Dense(1 + _N_SQUARES, kernel_init=_SMALL)(hidden)
+
+
+def output(network: Actor | Value, weights: Mapping[str, Any], obs: jax.Array) -> jax.Array:
+    """:return: what a network puts out for one observation or a batch"""
+    return cast(jax.Array, network.apply(weights, obs))
+
+
+def with_input_scales(weights: Mapping[str, Any], old: Any, new: Any) -> Mapping[str, Any]:
+    """
+    :param weights: of an ``Actor`` or ``Value`` whose input is ``(obs - old.mean) / old.scale``
+    :param new: mean and scale from now on, each of shape ``(n_obs,)``
+    :return: weights that compute the same of ``(obs - new.mean) / new.scale``
+    """
+    layers = dict(weights["params"])
+    first = "Dense_0" if "Dense_0" in layers else "last"
+    kernel, bias = layers[first]["kernel"], layers[first]["bias"]
+    layers[first] = {
+        "kernel": kernel * (new.scale / old.scale)[:, None],
+        "bias": bias + ((new.mean - old.mean) / old.scale) @ kernel,
+    }
+    if "linear" in layers:
+        slope, last = layers["linear"]["kernel"], layers["last"]
+        layers["linear"] = {"kernel": slope * (new.scale / old.scale)[:, None]}
+        bias = last["bias"] + ((new.mean - old.mean) / old.scale) @ slope
+        layers["last"] = {"kernel": last["kernel"], "bias": bias}
+    return {**weights, "params": layers}
+
+
+def value_of(roots: Float[Array, "*batch roots"]) -> Float[Array, "*batch"]:
+    r"""
+    :math:`V = u(\rho_0) - \sum_{i \geq 1} \rho_i^2`, with :func:`unsquash` for :math:`u`.
+
+    Near a goal the value is minus a quadratic form. Squares have one without effort, and its
+    curvature is known from their slopes.
+    """
+    return unsquash(roots[..., 0]) - jnp.sum(roots[..., 1:] ** 2, -1)
+
+
+def squash(value: jax.Array) -> jax.Array:
+    r"""
+    The root that the value network learns: :math:`y\,(|y| + 0.3) = V`.
+
+    A network that learns V itself errs by a share of its range, which near the goal is more than
+    all that is left to gain; the root has relative precision there.
+    """
+    return jnp.sign(value) * (jnp.sqrt(_NEAR_ZERO**2 + 4.0 * jnp.abs(value)) - _NEAR_ZERO) / 2.0
+
+
+def unsquash(root: jax.Array) -> jax.Array:
+    """:return: the value for what the network puts out; the inverse of :func:`squash`"""
+    return root * (jnp.abs(root) + _NEAR_ZERO)
+
+
+def _mlp(x: jax.Array, net_arch: Sequence[int], activation_fn: Activation) -> jax.Array:
+    for width in net_arch:
+        x = activation_fn(nn.Dense(width, kernel_init=_HIDDEN)(x))
+    return x

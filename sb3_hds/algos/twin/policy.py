@@ -1,0 +1,141 @@
+"""The deterministic policy of PODS and HDS, as SB3 sees it."""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_hds.algos.base.policy import TensorPolicy, TrainingTensors
+from sb3_hds.algos.nets.activations import Activation, activation, finite_leaves, widths_of
+from sb3_hds.algos.twin.networks import Actor, Value
+from sb3_hds.algos.twin.state import Networks, Progress, fresh_networks
+from sb3_hds.core.numerics.compilation import GENERATOR
+
+_POLICY_WIDTHS, _VALUE_WIDTHS = (96, 96), (64, 64)
+
+
+class TwinPolicy(TensorPolicy):
+    """
+    A policy network with a value network beside it, both with their own input normalisation.
+
+    :param observation_space: a Box of one dimension
+    :param action_space: a bounded Box of one dimension
+    :param lr_schedule: learning rate of the policy by remaining progress
+    :param net_arch: hidden widths of both networks, or ``{"pi": [...], "vf": [...]}``; default
+        96, 96 for the policy and 64, 64 for the value
+    :param activation_fn: name, JAX function or torch module class
+    :param linear_path: whether a linear map leads from the policy's input to its output beside the
+        hidden layers (the paper: no)
+    :param max_grad_norm: gradients of both networks are clipped to this norm
+    :param use_sde: accepted for SB3's sake; the policy is deterministic
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: Sequence[int] | dict[str, Sequence[int]] | None = None,
+        activation_fn: str | Activation | type = "tanh",
+        linear_path: bool = True,
+        max_grad_norm: float = 1.0,
+        use_sde: bool = False,
+    ) -> None:
+        super().__init__(observation_space, action_space, squash_output=True)
+        pi, vf = _widths(net_arch)
+        function = activation(activation_fn)
+        if not max_grad_norm > 0.0:
+            raise ValueError(f"max_grad_norm must be above 0, got {max_grad_norm!r}.")
+        self.arguments = {
+            "lr_schedule": lr_schedule,
+            "net_arch": net_arch,
+            "activation_fn": activation_fn,
+            "linear_path": linear_path,
+            "max_grad_norm": max_grad_norm,
+        }
+        self.actor_network = Actor(int(np.prod(action_space.shape)), pi, function, linear_path)
+        self.value_network = Value(vf, function)
+        self.max_grad_norm = max_grad_norm
+        self.networks: Networks
+        self.progress: Progress
+        self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
+        self.build(jax.random.key(0, impl=GENERATOR), jax.devices()[0])
+
+    def build(self, key: jax.Array, device: Any) -> None:
+        """
+        Draw fresh networks.
+
+        :param key: of the generator ``unsafe_rbg``
+        """
+        n_obs = spaces.flatdim(self.observation_space)
+        networks, progress = fresh_networks(
+            self.actor_network, self.value_network, n_obs, self.max_grad_norm, key
+        )
+        self.networks, self.progress = jax.device_put((networks, progress), device)
+
+    def move_to(self, device: Any) -> None:
+        self.networks, self.progress = jax.device_put((self.networks, self.progress), device)
+
+    @property
+    def weights(self) -> Networks:
+        return self.networks
+
+    @weights.setter
+    def weights(self, tree: Networks) -> None:
+        self.networks = tree
+
+    @property
+    def training_state(self) -> Progress:
+        """Random keys are stored as 64-bit integers, which torch can hold."""
+        return self.progress._replace(key=np.asarray(self.progress.key, np.int64))
+
+    @training_state.setter
+    def training_state(self, tree: Progress) -> None:
+        key = jnp.asarray(np.asarray(tree.key).astype(np.uint32))
+        placed = jax.device_put(key, self.progress.key.sharding)
+        self.progress = tree._replace(key=placed)
+
+    def forward(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
+        return self._predict(obs, deterministic)
+
+    def _predict(self, observation: np.ndarray, deterministic: bool = True) -> np.ndarray:  # type: ignore[override]
+        flat = observation.reshape(observation.shape[0], -1)
+        return np.asarray(_act(self.actor_network, self.networks, flat))
+
+    def reset_noise(self, batch_size: int = 1) -> None:
+        """Nothing to reset: the policy is deterministic."""
+
+
+@partial(jax.jit, static_argnums=0)
+def _act(actor: Actor, networks: Networks, obs: Any) -> Any:
+    """Controls of the acting policy for a batch of observations."""
+    return actor.apply(networks.acting, networks.acting_inside(jnp.asarray(obs, jnp.float32)))
+
+
+def all_finite(networks: Networks) -> bool:
+    """:return: whether no weight is infinite or not a number"""
+    return finite_leaves((networks.actor, networks.average, networks.value, networks.acting))
+
+
+def _widths(
+    net_arch: Sequence[int] | dict[str, Sequence[int]] | None,
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """
+    :return: hidden widths of the policy and of the value
+    :raises ValueError: for other keys than ``pi`` and ``vf``, or widths that are no counts
+    """
+    given = net_arch if isinstance(net_arch, dict) else {"pi": net_arch, "vf": net_arch}
+    usual = {"pi": _POLICY_WIDTHS, "vf": _VALUE_WIDTHS}
+    widths = usual | {name: some for name, some in given.items() if some is not None}
+    pi, vf = (widths_of(widths[name]) for name in usual)
+    if widths.keys() != usual.keys() or pi is None or vf is None:
+        raise ValueError(
+            "net_arch must be a list of widths such as [64, 64], or {'pi': [64, 64], 'vf': [64]}, "
+            f"got {net_arch!r}."
+        )
+    return pi, vf
