@@ -27,7 +27,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_hds import algos
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 every_algorithm = pytest.mark.parametrize("name", EVERY_NAME)
 #: one of each way of collecting steps
 every_kind = pytest.mark.parametrize("name", ["droq", "hds", "openloop"])

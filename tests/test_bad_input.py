@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+from cases import each
 from gymnasium import spaces
 from odd_envs import ACT, OBS, AnySpaces
 from small_models import SMALL, saved, small
@@ -12,7 +13,6 @@ from stable_baselines3.her import HerReplayBuffer
 from sb3_hds import algos, twins
 from sb3_hds.errors import EnvironmentMismatchError, NoTwinError
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 #: one of each constructor that looks at its arguments
 KINDS = ("droq", "td7", "hds", "openloop")
 every_kind = pytest.mark.parametrize("name", KINDS)
@@ -127,30 +127,27 @@ def test_a_path_that_cannot_be_written_is_named_and_nothing_is_left(name, models
     assert (tmp_path / "file").read_text() == "not a folder"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ({"n_rollouts": 8.5}, "n_rollouts must be a whole number.*1"),
-        ({"lookahead": -1}, "lookahead must be a whole number of at least 0"),
-        ({"pretrain_epochs": None}, "pretrain_epochs must be"),
-        ({"order": 3}, "order must be one of"),
-        ({"gamma": 1.01}, "gamma must be a number above 0 and at most 1"),
-        ({"reset_share": 1.5}, "reset_share must be a number from 0 to 1"),
-        ({"exploration_noise": np.inf}, "exploration_noise must be a finite number"),
-        ({"learning_rate": -1e-3}, "learning_rate must be a finite number"),
-        ({"value_learning_rate": "cosine_1e-3"}, "'lin_NUMBER'"),
-        ({"policy_kwargs": {"net_arch": [0]}}, r"net_arch must be.*got \[0\]"),
-        ({"policy_kwargs": {"net_arch": {"pi": [8], "qf": [8]}}}, "net_arch must be.*'pi'"),
-        ({"policy_kwargs": {"activation_fn": "sigmoids"}}, "activation_fn must be one of"),
-        ({"policy_kwargs": {"max_grad_norm": 0.0}}, "max_grad_norm must be above 0"),
-        ({"env": AnySpaces(spaces.Dict({"a": OBS}))}, "A twin observes a Box with one axis"),
-        ({"env": AnySpaces()}, r"'AnySpaces'(.|\n)*Pendulum-v1(.|\n)*twins\.register"),
-        ({"twin": "MountainCar"}, "MountainCar"),
-        ({"twin": "Pendulun"}, "Did you mean 'Pendulum'"),
-        ({"twin": twins.Pendulum}, "twin must be a twin"),
-        ({"effects": [3]}, "effects must be a list of names"),
-        ({"suspected": 3}, "suspected must be a list of names"),
-    ],
+@each(
+    ({"n_rollouts": 8.5}, "n_rollouts must be a whole number.*1"),
+    ({"lookahead": -1}, "lookahead must be a whole number of at least 0"),
+    ({"pretrain_epochs": None}, "pretrain_epochs must be"),
+    ({"order": 3}, "order must be one of"),
+    ({"gamma": 1.01}, "gamma must be a number above 0 and at most 1"),
+    ({"reset_share": 1.5}, "reset_share must be a number from 0 to 1"),
+    ({"exploration_noise": np.inf}, "exploration_noise must be a finite number"),
+    ({"learning_rate": -1e-3}, "learning_rate must be a finite number"),
+    ({"value_learning_rate": "cosine_1e-3"}, "'lin_NUMBER'"),
+    ({"policy_kwargs": {"net_arch": [0]}}, r"net_arch must be.*got \[0\]"),
+    ({"policy_kwargs": {"net_arch": {"pi": [8], "qf": [8]}}}, "net_arch must be.*'pi'"),
+    ({"policy_kwargs": {"activation_fn": "sigmoids"}}, "activation_fn must be one of"),
+    ({"policy_kwargs": {"max_grad_norm": 0.0}}, "max_grad_norm must be above 0"),
+    ({"env": AnySpaces(spaces.Dict({"a": OBS}))}, "A twin observes a Box with one axis"),
+    ({"env": AnySpaces()}, r"'AnySpaces'(.|\n)*Pendulum-v1(.|\n)*twins\.register"),
+    ({"twin": "MountainCar"}, "MountainCar"),
+    ({"twin": "Pendulun"}, "Did you mean 'Pendulum'"),
+    ({"twin": twins.Pendulum}, "twin must be a twin"),
+    ({"effects": [3]}, "effects must be a list of names"),
+    ({"suspected": 3}, "suspected must be a list of names"),
 )
 def test_what_planning_cannot_use_is_named_with_what_it_may_be(arguments, said):
     with pytest.raises((ValueError, TypeError, NoTwinError), match=said):

@@ -14,8 +14,6 @@ from model_free import LENGTHS, ONLY_ON, OURS, PEERS
 
 from rl_zoo_plugin.lazy import parameters_of
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 def runs_of(cell, seeds, methods=("wrong_twin", "ceiling", "randomised", "hds")):
     """The wrong twin gets 0, the ceiling 100; HDS closes 0.2, 0.6 and 0.9 of it."""

@@ -5,6 +5,7 @@ import copy
 import gymnasium
 import numpy as np
 import pytest
+from cases import each
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from odd_envs import AnySpaces
@@ -118,18 +119,15 @@ def test_a_cost_for_each_step_is_no_constant_reward_where_something_ends_it():
     assert topics(TimeLimit(Drawn(until_the_goal), 200)) == []
 
 
-@pytest.mark.parametrize(
-    ("env_id", "expected"),
-    [
-        # Its limits are [-2, 2].
-        ("Pendulum-v1", ["Action space"]),
-        ("CartPole-v1", []),
-        ("Hopper-v5", []),
-        # A speed of 0.006 and -1 in each step; nothing but a cost of effort.
-        ("MountainCar-v0", ["Observation scale", "Constant reward"]),
-        ("MountainCarContinuous-v0", ["Sparse reward"]),
-        ("sb3_hds/ConstantReward-v0", ["Constant reward", "Episode length"]),
-    ],
+@each(
+    # Its limits are [-2, 2].
+    ("Pendulum-v1", ["Action space"]),
+    ("CartPole-v1", []),
+    ("Hopper-v5", []),
+    # A speed of 0.006 and -1 in each step; nothing but a cost of effort.
+    ("MountainCar-v0", ["Observation scale", "Constant reward"]),
+    ("MountainCarContinuous-v0", ["Sparse reward"]),
+    ("sb3_hds/ConstantReward-v0", ["Constant reward", "Episode length"]),
 )
 def test_what_is_said_of_stock_environments_is_true(env_id, expected):
     assert topics(gymnasium.make(env_id)) == expected

@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 import small_robots as robots
+from cases import each
 
 from sb3_hds import cli
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 SERVOS = ["--actuators", "position", "kp:30", "kv:1.5"]
 
 
@@ -116,17 +116,14 @@ def test_names_of_joints_come_from_the_map_where_the_log_has_none(arm, asked, tm
     np.testing.assert_allclose(data.obs[0, :5], rows[:5, [2, 1]])
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--twin", "Pendulum", "--ignore", "limits"], "--ignore is about a model file"),
-        (["--model", "missing.urdf"], "There is no file 'missing.urdf'"),
-        (["--model", "ARM", "--actuators", "magic"], "actuators is one of 'torque'"),
-        (["--model", "ARM", "--set", "weight:1"], "no parameter 'weight'"),
-        (["--model", "ARM", "--write", "no/a.xml"], "there is no such folder"),
-    ],
+@each(
+    (["--twin", "Pendulum", "--ignore", "limits"], "--ignore is about a model file"),
+    (["--model", "missing.urdf"], "There is no file 'missing.urdf'"),
+    (["--model", "ARM", "--actuators", "magic"], "actuators is one of 'torque'"),
+    (["--model", "ARM", "--set", "weight:1"], "no parameter 'weight'"),
+    (["--model", "ARM", "--write", "no/a.xml"], "there is no such folder"),
 )
-def test_a_question_that_makes_no_sense_is_one_message(arm, words, message, capsys):
+def test_a_question_that_makes_no_sense_is_one_message(words, message, arm, capsys):
     words = [str(arm / "arm2.xml") if word == "ARM" else word for word in words]
 
     assert cli.main(["calibrate", "--data", str(arm / "log2.csv"), *words]) == 1

@@ -7,6 +7,7 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
+from cases import each
 from point_mass import N_STEPS, linear_controller, point_mass_env, returns_of
 from small_models import SMALL, greedy, saved, small
 from stable_baselines3.common.noise import NormalActionNoise
@@ -18,8 +19,6 @@ from sb3_hds.algos.compiled_run import run_rounds
 from sb3_hds.envs import twin_of
 from sb3_hds.errors import EnvironmentMismatchError, SeedsDivergedError
 from sb3_hds.wrappers import ActionRateLimit
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def weights_of(model) -> list[np.ndarray]:
@@ -129,18 +128,15 @@ def pendulums(n: int) -> DummyVecEnv:
     return DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")] * n)
 
 
-@pytest.mark.parametrize(
-    ("words", "arguments"),
-    [
-        ("n_envs", {"env": pendulums(2)}),
-        ("VecNormalize", {"env": VecNormalize(pendulums(1))}),
-        ("n_steps", {"n_steps": 3}),
-        ("action_noise", {"action_noise": NormalActionNoise(np.zeros(1), np.ones(1))}),
-        ("param_resets", {"param_resets": [50]}),
-        ("episodes", {"train_freq": (1, "episode")}),
-        ("count as ends", {"replay_buffer_kwargs": {"handle_timeout_termination": False}}),
-        ("store='raw'", {"env": ActionRateLimit(pendulums(1).envs[0], 4.0, store="executed")}),
-    ],
+@each(
+    ("n_envs", {"env": pendulums(2)}),
+    ("VecNormalize", {"env": VecNormalize(pendulums(1))}),
+    ("n_steps", {"n_steps": 3}),
+    ("action_noise", {"action_noise": NormalActionNoise(np.zeros(1), np.ones(1))}),
+    ("param_resets", {"param_resets": [50]}),
+    ("episodes", {"train_freq": (1, "episode")}),
+    ("count as ends", {"replay_buffer_kwargs": {"handle_timeout_termination": False}}),
+    ("store='raw'", {"env": ActionRateLimit(pendulums(1).envs[0], 4.0, store="executed")}),
 )
 def test_what_needs_python_is_refused(words, arguments):
     model = small("tqc_jax", **arguments)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from measuring import measured
 
 from sb3_hds import Trajectories, audit, twins
@@ -16,10 +17,7 @@ from sb3_hds.effects import CoulombFriction
 from sb3_hds.errors import TrajectoryError
 from sb3_hds.sysid.timing import in_step
 
-pytestmark = [
-    pytest.mark.usefixtures("quick_compilation"),
-    pytest.mark.filterwarnings("ignore::sb3_hds.data.SamplingWarning"),
-]
+pytestmark = pytest.mark.filterwarnings("ignore::sb3_hds.data.SamplingWarning")
 
 
 @pytest.fixture(scope="module")
@@ -70,15 +68,7 @@ def logged(data, path, times=None):
 
 
 # Twins whose data neither end nor reach a limit, with a position, angles, and both; seed and noise.
-@pytest.mark.parametrize(
-    ("name", "seed", "noise"),
-    [
-        ("PendulumReal", 1, 0.01),
-        ("CartPole", 2, 0.01),
-        ("Acrobot", 1, 0.0),
-        ("MountainCar", 0, 0.01),
-    ],
-)
+@each(("PendulumReal", 1, 0.01), ("CartPole", 2, 0.01), ("Acrobot", 1, 0), ("MountainCar", 0, 0.01))
 def test_clean_data_raise_no_alarm(name, seed, noise, tmp_path):
     exact = measured(twins.make(name), n_steps=200, seed=seed, share=0.5)
 
@@ -134,16 +124,13 @@ def some_held(k):
     return k - np.r_[False, np.random.default_rng(0).random(len(k) - 1) < 0.1]
 
 
-@pytest.mark.parametrize(
-    ("held", "of", "channel", "share"),
-    [
-        (some_held, slice(3), "cos, sin, speed", 0.1),
-        (lambda k: k // 2 * 2, slice(3), "cos, sin, speed", 0.5),
-        (lambda k: k // 4 * 4, [2], "speed", 0.75),
-    ],
+@each(
+    (some_held, slice(3), "cos, sin, speed", 0.1),
+    (lambda k: k // 2 * 2, slice(3), "cos, sin, speed", 0.5),
+    (lambda k: k // 4 * 4, [2], "speed", 0.75),
     ids=["some", "half the rate", "one channel"],
 )
-def test_repeated_samples_are_found(data, held, of, channel, share):
+def test_repeated_samples_are_found(held, of, channel, share, data):
     def repeat(_, obs, actions):
         obs[:, of] = obs[held(np.arange(len(obs)))][:, of]
         return obs, actions
@@ -244,11 +231,8 @@ def test_a_jump_in_resampled_rows_is_cut_without_the_sample_between(tmp_path):
     assert max(jumps) < 0.5 * finding.size
 
 
-@pytest.mark.parametrize(
-    ("first", "last", "lost", "also"),
-    [(0, 0, 1, None), (200, 200, 1, None), (80, 90, 12, slice(84, 86))],
-)
-def test_values_beyond_all_measure_are_refused_by_name_and_cut_out(data, first, last, lost, also):
+@each((0, 0, 1, None), (200, 200, 1, None), (80, 90, 12, slice(84, 86)))
+def test_values_beyond_all_measure_are_refused_by_name_and_cut_out(first, last, lost, also, data):
     def spoil(i, obs, actions):
         if i == 3:
             obs[first : last + 1, 2] = 1e6
@@ -380,16 +364,13 @@ def test_motion_within_noise_is_not_usable_and_rest_most_of_the_time_is():
     assert still.usable and "MostlyStill" in kinds(still)
 
 
-@pytest.mark.parametrize(
-    ("command", "kind", "says"),
-    [
-        # Interpolation makes it of a gain that nobody changed, and drift of a set point.
-        (lambda obs, noise: 100.0 + 1e-13 * noise, "ConstantCommand", "is 100 throughout"),
-        (lambda obs, noise: 100.0 + 0.4 * noise, "ConstantCommand", "between 99.6 and 100.4"),
-        (lambda obs, noise: obs[:-1] @ [[0.3], [1.0], [-0.2]], "DependentCommand", "action[0]"),
-    ],
+@each(
+    # Interpolation makes it of a gain that nobody changed, and drift of a set point.
+    (lambda obs, noise: 100.0 + 1e-13 * noise, "ConstantCommand", "is 100 throughout"),
+    (lambda obs, noise: 100.0 + 0.4 * noise, "ConstantCommand", "between 99.6 and 100.4"),
+    (lambda obs, noise: obs[:-1] @ [[0.3], [1.0], [-0.2]], "DependentCommand", "action[0]"),
 )
-def test_a_command_that_tells_nothing_of_its_own_is_found(data, command, kind, says):
+def test_a_command_that_tells_nothing_of_its_own_is_found(command, kind, says, data):
     rng = np.random.default_rng(0)
 
     def commanded(_, obs, actions):
@@ -461,15 +442,12 @@ def pendulum_data(dt=0.01, noise=0.0, n=400):
 KNOWN = (Channel("angle", "rad"), Channel("speed", "rad/s"))
 
 
-@pytest.mark.parametrize(
-    ("channels", "noise", "scales", "says"),
-    [
-        (KNOWN, 0.05, (180.0 / np.pi, 1.0), "as if 'angle' were in degrees"),
-        (("angle", "speed"), 0.0, (1.0, 180.0 / np.pi), "as if 'speed' were in degrees"),
-        (KNOWN, 0.05, (1.0, 30.0), "one of them is in other units."),
-        (KNOWN, 0.0, (1.0, 30.0 / np.pi), "as if 'speed' were in revolutions per minute"),
-        ("wrapped", 0.0, (180.0 / np.pi, 1.0), "as if 'angle' were in degrees"),
-    ],
+@each(
+    (KNOWN, 0.05, (180.0 / np.pi, 1.0), "as if 'angle' were in degrees"),
+    (("angle", "speed"), 0.0, (1.0, 180.0 / np.pi), "as if 'speed' were in degrees"),
+    (KNOWN, 0.05, (1.0, 30.0), "one of them is in other units."),
+    (KNOWN, 0.0, (1.0, 30.0 / np.pi), "as if 'speed' were in revolutions per minute"),
+    ("wrapped", 0.0, (180.0 / np.pi, 1.0), "as if 'angle' were in degrees"),
 )
 def test_a_position_in_other_units_than_its_velocity_is_refused(channels, noise, scales, says):
     data = changed(pendulum_data(noise=noise), lambda _, obs, actions: (obs * scales, actions))

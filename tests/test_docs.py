@@ -26,8 +26,6 @@ sys.path.insert(0, str(DOCS / "extensions"))
 
 import catalogue  # noqa: E402
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 PAGES = sorted([*DOCS.glob("*.md"), *DOCS.glob("[!_]*/[!_]*.md"), ROOT / "README.md"])
 
 # The pages show the defaults that a user wants; here it is enough that the code runs.

@@ -8,14 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from free_mass import Mass, moved
 
 from sb3_hds import effects, twins
 from sb3_hds.core import EffectChain, rollout
 from sb3_hds.effects import CoulombFriction, ViscousFriction
 from sb3_hds.errors import EffectError, ParameterError
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 class DampedMass(Mass):
@@ -162,9 +161,8 @@ def test_an_effect_says_what_it_is_and_where_it_comes_from(effect):
 
 def test_what_cannot_be_told_apart_is_known_and_says_so_on_both_sides():
     declared = {effect.name: effect.equivalents for effect in effects.ALL}
-    parameters = {
-        f"parameter.{name}" for twin in twins.names() for name in twins.get(twin).parameters
-    }
+    owners = map(twins.get, twins.names())
+    parameters = {f"parameter.{name}" for twin in owners for name in twin.parameters}
     for name, others in declared.items():
         assert set(others) <= set(declared) | parameters
         for other, condition in others.items():
@@ -274,14 +272,11 @@ def test_forces_add_up_and_one_that_the_twin_has_itself_adds_to_its_parameter(x6
     assert "viscous_friction.rail" not in native.infer(jnp.zeros(2), native.params).memory
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Mass().extend(ViscousFriction("hinge")), "joint 'hinge', but Mass has: 0 (rail)"),
-        (lambda: Mass().extend(effects.SensorBias(2)), "Mass has: 0 (position), 1 (speed)"),
-        (lambda: Mass().extend(effects.TorqueGain(-1)), "actuator -1, but Mass has: 0 (push)"),
-        (lambda: ViscousFriction(tau_c=0.1), "has no parameter 'tau_c'. Its parameters are: b."),
-    ],
+@each(
+    (lambda: Mass().extend(ViscousFriction("hinge")), "joint 'hinge', but Mass has: 0 (rail)"),
+    (lambda: Mass().extend(effects.SensorBias(2)), "Mass has: 0 (position), 1 (speed)"),
+    (lambda: Mass().extend(effects.TorqueGain(-1)), "actuator -1, but Mass has: 0 (push)"),
+    (lambda: ViscousFriction(tau_c=0.1), "has no parameter 'tau_c'. Its parameters are: b."),
 )
 def test_a_wrong_extension_is_refused_with_what_exists(make, message):
     with pytest.raises(EffectError, match=re.escape(message)):
@@ -289,10 +284,8 @@ def test_a_wrong_extension_is_refused_with_what_exists(make, message):
 
 
 def test_a_sensor_behind_another_measures_what_that_one_reports(x64):
-    biased, halved = (
-        effects.SensorBias("position", bias=3.0),
-        effects.SensorScale("position", scale=0.5),
-    )
+    biased = effects.SensorBias("position", bias=3.0)
+    halved = effects.SensorScale("position", scale=0.5)
     late = effects.SensorDelay("position", delay=0.1)
     true = np.maximum(0.1 * np.arange(11) - 0.1, 0.0)  # 1 m/s, one sample ago
 

@@ -2,29 +2,27 @@
 
 import first_users
 import pytest
+from cases import each
 
 from sb3_hds import diagnose
 
 pytestmark = pytest.mark.expensive  # a whole diagnosis each
 
 
-@pytest.mark.parametrize(
-    ("given", "calibrate", "expected"),
-    [
-        # Beside an inertia that nobody believed.
-        (
-            lambda: first_users.joint_with_friction(believed=8.0),
-            ["mass"],
-            {"viscous_friction.axis": {"b": 22.0}, "coulomb_friction.axis": {"tau_c": 13.0}},
-        ),
-        (first_users.free_pendulum, [], {"coulomb_friction.hinge": {"tau_c": 0.012}}),
-        # The sensor's, and no spring.
-        (
-            first_users.scaled_angle,
-            ["inertia", "damping"],
-            {"sensor_scale.hinge": {"scale": pytest.approx(1.04, abs=0.005)}},
-        ),
-    ],
+@each(
+    # Beside an inertia that nobody believed.
+    (
+        lambda: first_users.joint_with_friction(believed=8.0),
+        ["mass"],
+        {"viscous_friction.axis": {"b": 22.0}, "coulomb_friction.axis": {"tau_c": 13.0}},
+    ),
+    (first_users.free_pendulum, [], {"coulomb_friction.hinge": {"tau_c": 0.012}}),
+    # The sensor's, and no spring.
+    (
+        first_users.scaled_angle,
+        ["inertia", "damping"],
+        {"sensor_scale.hinge": {"scale": pytest.approx(1.04, abs=0.005)}},
+    ),
     ids=["friction", "let go", "scaled"],
 )
 def test_what_somebody_had_is_found(given, calibrate, expected):

@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 import stable_baselines3
+from cases import each
 from counting import Counting, CountingVector, Row, length_of, truth
 from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
@@ -115,12 +116,9 @@ def test_steps_that_are_no_transitions_are_refused_at_the_door():
     assert GymnasiumVecEnv(silent, autoreset_mode="SameStep").num_envs == N
 
 
-@pytest.mark.parametrize(
-    ("env", "message"),
-    [
-        (CountingVector(N, AutoresetMode.SAME_STEP, None), "no 'final_obs'"),
-        (CountingVector(N, AutoresetMode.DISABLED, knows_masks=False), "others changed as well"),
-    ],
+@each(
+    (CountingVector(N, AutoresetMode.SAME_STEP, None), "no 'final_obs'"),
+    (CountingVector(N, AutoresetMode.DISABLED, knows_masks=False), "others changed as well"),
 )
 def test_an_environment_that_does_not_keep_to_its_mode_is_found_when_it_ends(env, message):
     adapted = GymnasiumVecEnv(env)

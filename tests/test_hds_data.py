@@ -8,6 +8,7 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
+from cases import each
 from measuring import measured
 from small_models import logged, reloaded, same, small
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -302,19 +303,16 @@ def test_effects_are_attached_by_name_or_as_they_are():
     assert model.twin.values["quadratic_drag.hinge.c"] == 0.01
 
 
-@pytest.mark.parametrize(
-    ("settings", "says"),
-    [
-        ({"effects": ["magic"]}, "viscous_friction"),
-        ({"suspected": ["magic"]}, "magic"),
-        ({"calibrated": ["weight"]}, "Its parameters are: gravity"),
-        ({"pretrain_data": "missing.npz"}, "no file"),
-        ({"pretrain_data": 3}, "Trajectories or the path"),
-        ({"beta": "always"}, "a number from 0 to 1"),
-        ({"residual_kwargs": {"members": 3}}, "n_members, net_arch, caution"),
-        ({"refit_freq": -1}, "at least 0"),
-        ({"max_saved_steps": 0}, "at least 1"),
-    ],
+@each(
+    ({"effects": ["magic"]}, "viscous_friction"),
+    ({"suspected": ["magic"]}, "magic"),
+    ({"calibrated": ["weight"]}, "Its parameters are: gravity"),
+    ({"pretrain_data": "missing.npz"}, "no file"),
+    ({"pretrain_data": 3}, "Trajectories or the path"),
+    ({"beta": "always"}, "a number from 0 to 1"),
+    ({"residual_kwargs": {"members": 3}}, "n_members, net_arch, caution"),
+    ({"refit_freq": -1}, "at least 0"),
+    ({"max_saved_steps": 0}, "at least 1"),
 )
 def test_settings_of_learning_from_data_are_checked_at_the_door(settings, says):
     with pytest.raises(ValueError, match=says):
@@ -330,9 +328,7 @@ def columns(model):
     }
 
 
-def test_data_from_a_file_correct_the_model_and_travel_with_it(
-    tmp_path, heavier, monkeypatch, no_planning
-):
+def test_a_file_corrects_the_model_and_travels_with_it(tmp_path, heavier, monkeypatch, no_planning):
     def rubs(twin, data, *_, **__):
         np.testing.assert_array_equal(data.obs, heavier.obs)
         return Correction(twin.with_parameters(damping=0.1), 0.0, changed=True)
@@ -385,18 +381,13 @@ def test_what_counts_since_a_change_is_remembered_in_real_steps(monkeypatch, no_
     assert model._n_updates == 3 * (2 + 1) * 3
 
 
-@pytest.mark.parametrize(
-    ("settings", "n_real", "n_early"),
-    [
-        ({"max_saved_steps": 200}, 60, 120),
-        ({"max_saved_steps": 90}, 60, 30),
-        ({"max_saved_steps": 40}, 40, 0),
-        ({"save_data": False}, 0, 0),
-    ],
+@each(
+    ({"max_saved_steps": 200}, 60, 120),
+    ({"max_saved_steps": 90}, 60, 30),
+    ({"max_saved_steps": 40}, 40, 0),
+    ({"save_data": False}, 0, 0),
 )
-def test_data_from_before_share_the_limit_and_the_latest_stay(
-    settings, n_real, n_early, no_planning
-):
+def test_early_data_share_the_limit_and_the_latest_stay(settings, n_real, n_early, no_planning):
     """Recordings of 60 steps: as many whole ones as there is room for, or the end of the last."""
     data = measured(twins.make("PendulumReal"), n=3)
     model = real(pretrain_data=data, train_freq=20, refit_freq=0, **settings).learn(60)

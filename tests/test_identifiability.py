@@ -33,9 +33,8 @@ def linear(rng, effect=0.0, colour=0.95):
         return 0.5 * np.sum(left**2), np.einsum("nri,nr->ni", by_theta, left)
 
     without, _ = best_with([0])
-    cost, scores = min(
-        (best_with([0, 1 + c]) for c in range(N_CANDIDATES)), key=lambda found: found[0]
-    )
+    every = [best_with([0, 1 + c]) for c in range(N_CANDIDATES)]
+    cost, scores = min(every, key=lambda found: found[0])
     return Slopes(curvature, scores), without - cost
 
 

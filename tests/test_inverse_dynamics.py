@@ -8,7 +8,6 @@ from sb3_hds import Trajectories, effects, twins
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid import calibrate
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 LIGHT = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/>
   <default><geom contype="0" conaffinity="0"/></default>
   <worldbody><body name="a"><joint name="hinge" axis="0 1 0"/>

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import scipy.io
 import yaml
+from cases import each
 from damage import damaged
 
 from sb3_hds import Trajectories, audit, cli, twins
 from sb3_hds.data import Recorder
 from sb3_hds.data.columns import columns_from
-from sb3_hds.data.conversion import same_quantity, unit_of
+from sb3_hds.data.conversion import unit_of
 from sb3_hds.errors import CalibrationError, TrajectoryError
 from sb3_hds.sysid import calibrate, diagnose
 
@@ -57,26 +58,23 @@ NANO = [(f"16000000000{t}0000000", x, u) for t, (_, x, u) in enumerate(ROWS)]
 SPLIT = [("7", "990000000", "0.1", "0"), ("8", "0", "0.2", "0"), ("8", "10000000", "0.3", "0")]
 
 
-@pytest.mark.parametrize(
-    ("content", "columns"),
-    [
-        (lay("t;q;u", ";", ","), {}),
-        (lay("t q u", " ", ","), {}),
-        (lay("t;q;u;", ";", end=";"), {}),
-        (lay("t,\tq,\tu", ",\t"), {}),
-        (lay("t q u\n[s] [rad] [Nm]", " "), {}),
-        (lay("t,q,u\n(ms),(mrad),(-)", rows=MILLI), {}),
-        (lay("# rig 3, Monday\n# Tuesday\nt,q,u"), {}),
-        (lay("% t q u", " "), {}),
-        (lay("# t,  q , u"), {}),
-        (lay("sep=;\nt;q;u", ";"), {}),
-        (lay("rig 3\n\nt,q,u"), {"skip": 1}),
-        (lay(""), BY_NUMBER),
-        (lay("0,1,2"), BY_NUMBER),
-        (lay("%time,q,u", rows=NANO), {"time": "%time"}),
-        (lay("sec,nanosec,q,u", rows=SPLIT), STAMPED),
-        (lay("t [ms];a [mrad];u", ";", rows=MILLI), {"time": "t [ms]", "obs": ["a [mrad]"]}),
-    ],
+@each(
+    (lay("t;q;u", ";", ","), {}),
+    (lay("t q u", " ", ","), {}),
+    (lay("t;q;u;", ";", end=";"), {}),
+    (lay("t,\tq,\tu", ",\t"), {}),
+    (lay("t q u\n[s] [rad] [Nm]", " "), {}),
+    (lay("t,q,u\n(ms),(mrad),(-)", rows=MILLI), {}),
+    (lay("# rig 3, Monday\n# Tuesday\nt,q,u"), {}),
+    (lay("% t q u", " "), {}),
+    (lay("# t,  q , u"), {}),
+    (lay("sep=;\nt;q;u", ";"), {}),
+    (lay("rig 3\n\nt,q,u"), {"skip": 1}),
+    (lay(""), BY_NUMBER),
+    (lay("0,1,2"), BY_NUMBER),
+    (lay("%time,q,u", rows=NANO), {"time": "%time"}),
+    (lay("sec,nanosec,q,u", rows=SPLIT), STAMPED),
+    (lay("t [ms];a [mrad];u", ";", rows=MILLI), {"time": "t [ms]", "obs": ["a [mrad]"]}),
 )
 def test_a_table_of_text_is_read_in_any_layout(content, columns, tmp_path):
     data = load(tmp_path / "log.csv", COLUMNS | columns, content)
@@ -116,32 +114,26 @@ def test_dates_of_this_century_are_told_by_their_size_and_not_rounded(unit, per_
     assert data.report.notes == ((f"t counts {unit} since 1970.",) if unit != "s" else ())
 
 
-@pytest.mark.parametrize(
-    ("unit", "factor", "name"),
-    [
-        ("deg", np.pi / 180.0, "rad"),
-        ("turns", 2.0 * np.pi, "rad"),
-        ("rpm", np.pi / 30.0, "rad/s"),
-        ("N mm", 1e-3, "N m"),
-        ("kgf cm", 0.0980665, "N m"),
-        ("degC", 1.0, "degC"),
-        ("g0", 9.80665, "m/s2"),
-        ("%", 0.01, "1"),
-        ("N\N{MIDDLE DOT}m\N{MIDDLE DOT}s/rad", 1.0, "N m s/rad"),
-    ],
+@each(
+    ("deg", np.pi / 180.0, "rad"),
+    ("turns", 2.0 * np.pi, "rad"),
+    ("rpm", np.pi / 30.0, "rad/s"),
+    ("N mm", 1e-3, "N m"),
+    ("kgf cm", 0.0980665, "N m"),
+    ("degC", 1.0, "degC"),
+    ("g0", 9.80665, "m/s2"),
+    ("%", 0.01, "1"),
+    ("N\N{MIDDLE DOT}m\N{MIDDLE DOT}s/rad", 1.0, "N m s/rad"),
 )
 def test_a_unit_has_a_factor_to_a_name_in_the_si(unit, factor, name):
     assert unit_of(unit).factor == pytest.approx(factor, rel=1e-12) and unit_of(unit).name == name
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"obs": [{"column": "q", "unit": "furlong"}]}, "'furlong' is not known. Known are rad"),
-        ({"obs": [{"column": "q", "unit": "counts"}]}, "mean nothing without a scale"),
-        ({"obs": [{"column": "q", "unit": "mm", "angle": True}]}, "an angle is in rad, deg or"),
-        ({"time": {"column": "t", "unit": "deg"}}, "time is in one of s, ms, us"),
-    ],
+@each(
+    ({"obs": [{"column": "q", "unit": "furlong"}]}, "'furlong' is not known. Known are rad"),
+    ({"obs": [{"column": "q", "unit": "counts"}]}, "mean nothing without a scale"),
+    ({"obs": [{"column": "q", "unit": "mm", "angle": True}]}, "an angle is in rad, deg or"),
+    ({"time": {"column": "t", "unit": "deg"}}, "time is in one of s, ms, us"),
 )
 def test_a_unit_that_cannot_be_converted_is_refused(change, says):
     with pytest.raises(TrajectoryError, match=says):
@@ -172,12 +164,6 @@ def test_files_that_name_different_units_are_told_apart(tmp_path):
         load(str(tmp_path / "*.csv"), COLUMNS)
 
 
-def test_units_measure_the_same_or_not():
-    assert same_quantity("N m", "kg m2/s2") and same_quantity("deg", "rad")
-    assert same_quantity("1/s", "rad/s") is False and same_quantity("m", "rad") is False
-    assert same_quantity("", "rad") is None and same_quantity("command unit", "N") is None
-
-
 def test_a_channel_in_the_unit_of_something_else_is_refused_with_the_line_to_write(tmp_path):
     content = text({"t": T, "angle": TABLE["q"], "speed": TABLE["v"], "u": TABLE["u"]})
     columns = COLUMNS | {"obs": [{"column": "angle", "unit": "mm"}, "speed"], "actions": []}
@@ -201,23 +187,20 @@ ALL_ROWS = [{"run": i} | row for i, rows in enumerate(RECORDS) for row in rows]
 KEYED = {key: {str(k): x for k, x in enumerate(EPISODES[0][key])} for key in "tq"}
 
 
-@pytest.mark.parametrize(
-    ("content", "more", "lengths"),
-    [
-        (EPISODES, {}, [4, 1]),
-        ({"config": {"hz": 10}, "data": EPISODES}, {}, [4, 1]),
-        ({"data": EPISODES, "old": EPISODES[:1]}, {"records": "data"}, [4, 1]),
-        ({"a": {"b": EPISODES}, "c": [{"x": 1}]}, {"records": "a.b"}, [4, 1]),
-        ({"run_2": EPISODES[0], "run_10": EPISODES[1]}, {}, [4, 1]),
-        ({"data": {"wide": EPISODES[0], "xs": EPISODES[1]}}, {"records": "data"}, [4, 1]),
-        ([{"load": 3, "steps": rows} for rows in RECORDS], {}, [4, 1]),
-        ({key: [episode[key] for episode in EPISODES] for key in "tqu"}, {}, [4, 1]),
-        (ALL_ROWS, {"episode": "run"}, [4, 1]),
-        (RECORDS[0], {}, [4]),
-        ([{"t": 0.1 * k, "s": {"q": [9, k]}, "u": 0} for k in range(5)], {"obs": ["s.q[1]"]}, [4]),
-        (KEYED | {"u": 0}, {}, [4]),
-        ([[0.1 * k, k, 0] for k in range(5)], BY_NUMBER, [4]),
-    ],
+@each(
+    (EPISODES, {}, [4, 1]),
+    ({"config": {"hz": 10}, "data": EPISODES}, {}, [4, 1]),
+    ({"data": EPISODES, "old": EPISODES[:1]}, {"records": "data"}, [4, 1]),
+    ({"a": {"b": EPISODES}, "c": [{"x": 1}]}, {"records": "a.b"}, [4, 1]),
+    ({"run_2": EPISODES[0], "run_10": EPISODES[1]}, {}, [4, 1]),
+    ({"data": {"wide": EPISODES[0], "xs": EPISODES[1]}}, {"records": "data"}, [4, 1]),
+    ([{"load": 3, "steps": rows} for rows in RECORDS], {}, [4, 1]),
+    ({key: [episode[key] for episode in EPISODES] for key in "tqu"}, {}, [4, 1]),
+    (ALL_ROWS, {"episode": "run"}, [4, 1]),
+    (RECORDS[0], {}, [4]),
+    ([{"t": 0.1 * k, "s": {"q": [9, k]}, "u": 0} for k in range(5)], {"obs": ["s.q[1]"]}, [4]),
+    (KEYED | {"u": 0}, {}, [4]),
+    ([[0.1 * k, k, 0] for k in range(5)], BY_NUMBER, [4]),
 )
 def test_episodes_are_found_wherever_json_nests_them(content, more, lengths, tmp_path):
     data = load(tmp_path / "log.json", COLUMNS | more, json.dumps(content))
@@ -257,9 +240,7 @@ def test_a_list_in_each_row_of_parquet_is_columns_and_episode_index_tells_record
         load(tmp_path / "log.parquet", columns | {"obs": ["observation.state"]})
 
 
-@pytest.mark.parametrize(
-    ("groups", "more"), [("data/demo_{}", {}), ("{}", {}), ("set/x{}", {"records": "set"})]
-)
+@each(("data/demo_{}", {}), ("{}", {}), ("a/x{}", {"records": "a"}))
 def test_groups_of_hdf5_are_episodes(groups, more, tmp_path):
     with h5py.File(tmp_path / "log.h5", "w") as file:
         for i, n in ((2, 10), (10, 7)):
@@ -494,13 +475,10 @@ def test_the_maps_on_the_page_about_logs_are_understood():
     assert [unit for unit in units if unit != "scale" and unit_of(unit) is None] == []
 
 
-@pytest.mark.parametrize(
-    ("at", "byte", "says"),
-    [
-        (145, 0x08, "an array of class 6 that lacks a part"),  # complex, without an imaginary part
-        (177, 0x55, "an element of type"),
-        (144, 0x01, "lacks a part"),  # a cell array of numbers
-    ],
+@each(
+    (145, 0x08, "an array of class 6 that lacks a part"),  # complex, without an imaginary part
+    (177, 0x55, "an element of type"),
+    (144, 0x01, "lacks a part"),  # a cell array of numbers
 )
 def test_a_damaged_matlab_file_does_not_end_the_process(at, byte, says, tmp_path):
     scipy.io.savemat(tmp_path / "log.mat", TABLE)
@@ -516,9 +494,8 @@ def files(tmp_path_factory):
     """A small file of each kind: name, content, and the map that reads it."""
     folder = tmp_path_factory.mktemp("healthy")
     own = {"time": "t", "obs": ["q", "v"], "actions": ["u"]}
-    lists = [
-        dict(zip(TABLE, map(float, row), strict=True)) for row in zip(*TABLE.values(), strict=True)
-    ]
+    every = zip(*TABLE.values(), strict=True)
+    lists = [dict(zip(TABLE, map(float, row), strict=True)) for row in every]
     nested = {"data": [{k: v[:n].tolist() for k, v in TABLE.items()} for n in (10, 12)]}
     texts = {
         "comma.csv": (text(), own),
@@ -560,11 +537,8 @@ def files(tmp_path_factory):
     maps = dict.fromkeys(("log.db3", "log.mcap", "log.bag"), BAG)
     maps["log.npy"] = texts["names.csv"][1]
     maps["log.parquet"] = own | {"obs": ["q", "x[0]"]}
-    for name, form in (
-        ("fields.npz", "run.{}"),
-        ("new struct.mat", "run.{}"),
-        ("new cells.mat", "c{}"),
-    ):
+    forms = {"fields.npz": "run.{}", "new struct.mat": "run.{}", "new cells.mat": "c{}"}
+    for name, form in forms.items():
         t, q, u = map(form.format, "tqu")
         maps[name] = {"time": t, "obs": [q], "actions": [u]}
     maps["new cells.mat"]["condition"] = {"column": "text"}

@@ -8,6 +8,7 @@ import numpy as np
 import optax
 import pytest
 import torch as th
+from cases import each
 from gymnasium import spaces
 from small_models import small
 
@@ -22,8 +23,6 @@ from sb3_hds.algos.quantiles import (
     sorted_by_rows,
     target_by_target,
 )
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def test_every_processor_sorts_and_compares_quantiles_alike():
@@ -70,18 +69,15 @@ def test_choices_become_one_hot_and_dictionaries_one_row():
     np.testing.assert_array_equal(flat[7:12], [0, 1, 0, 0, 1])
 
 
-@pytest.mark.parametrize(
-    ("make", "arguments"),
-    [
-        (th.optim.Adam, {"betas": (0.8, 0.99), "eps": 1e-5}),
-        (th.optim.AdamW, {"weight_decay": 0.1}),
-        (th.optim.RMSprop, {"alpha": 0.9, "momentum": 0.5}),
-        (th.optim.RAdam, {}),
-        (th.optim.SGD, {"momentum": 0.9, "nesterov": True}),
-        (th.optim.Adamax, {}),
-        (th.optim.Adadelta, {"rho": 0.8}),
-        (th.optim.Adagrad, {}),
-    ],
+@each(
+    (th.optim.Adam, {"betas": (0.8, 0.99), "eps": 1e-5}),
+    (th.optim.AdamW, {"weight_decay": 0.1}),
+    (th.optim.RMSprop, {"alpha": 0.9, "momentum": 0.5}),
+    (th.optim.RAdam, {}),
+    (th.optim.SGD, {"momentum": 0.9, "nesterov": True}),
+    (th.optim.Adamax, {}),
+    (th.optim.Adadelta, {"rho": 0.8}),
+    (th.optim.Adagrad, {}),
 )
 def test_a_torch_class_means_what_it_does_in_torch(make, arguments):
     rng = np.random.default_rng(0)

@@ -13,8 +13,6 @@ from sb3_hds.sysid.film import STYLE, check_film, section_of, write_film
 from sb3_hds.sysid.moving import moving_of
 from sb3_hds.sysid.pictures import replay_of
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 def replayed(twin, n=2, rows=30):
     """Windows of a smooth motion, and predictions that leave it, one of them faster."""

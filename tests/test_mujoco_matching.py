@@ -6,6 +6,7 @@ import types
 import numpy as np
 import pytest
 import small_robots as robots
+from cases import each
 
 from sb3_hds import Trajectories, twins
 from sb3_hds.errors import TrajectoryError
@@ -30,14 +31,11 @@ CAMEL = ["ShoulderPan", "Wrist1", "Wrist2"]
 
 
 # How a log may call position, velocity and command of a joint.
-@pytest.mark.parametrize(
-    ("spelt", "forms"),
-    [
-        (NAMES, [f"/joint_states:{kind}[{{}}]" for kind in ("position", "velocity", "effort")]),
-        (SHORT, ["observation.{}.pos", "observation.{}.vel", "action.{}"]),
-        (SHORT, ["q_{}", "dq_{}", "tau_des_{}"]),
-        (CAMEL, ["{}Position", "{}Speed", "{}Command"]),
-    ],
+@each(
+    (NAMES, [f"/joint_states:{kind}[{{}}]" for kind in ("position", "velocity", "effort")]),
+    (SHORT, ["observation.{}.pos", "observation.{}.vel", "action.{}"]),
+    (SHORT, ["q_{}", "dq_{}", "tau_des_{}"]),
+    (CAMEL, ["{}Position", "{}Speed", "{}Command"]),
 )
 def test_columns_are_found_by_the_names_of_joints(spelt, forms):
     columns = [form.format(name) for form in forms for name in spelt]

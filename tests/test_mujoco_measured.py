@@ -19,7 +19,6 @@ from sb3_hds.sysid.equation.smoothing import smooth
 pytestmark = [
     pytest.mark.measured,
     pytest.mark.skipif("SB3_HDS_DATA" not in os.environ, reason="data outside the repository"),
-    pytest.mark.usefixtures("quick_compilation"),
 ]
 UR10 = Path(os.environ.get("SB3_HDS_DATA", "."), "ur10")
 # Of SOURCE.txt: least squares on inverse dynamics, accelerations by a Savitzky-Golay filter.

@@ -6,6 +6,7 @@ import gymnasium
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from gymnasium import spaces
 from gymnasium.wrappers import TransformObservation
 from odd_envs import ACT, AnySpaces
@@ -22,7 +23,6 @@ from sb3_hds.envs import TwinVecEnv
 from sb3_hds.errors import EnvironmentMismatchError
 from sb3_hds.wrappers import ShowJoints
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 TAU = 2.0 * np.pi
 
 # Gaits that the authors of the open-loop paper published: kp, kd in commands per rad and rad/s.
@@ -77,9 +77,7 @@ def hidden():
     return TransformObservation(env, lambda _: np.zeros(1, np.float32), nothing)
 
 
-@pytest.mark.parametrize(
-    "kind", [DummyVecEnv, pytest.param(SubprocVecEnv, marks=pytest.mark.expensive)]
-)
+@each(DummyVecEnv, pytest.param(SubprocVecEnv, marks=pytest.mark.expensive))
 def test_joints_that_are_not_observed_are_read_from_the_environment(kind):
     shown = make_vec_env("Swimmer-v5", env_kwargs={"max_episode_steps": 50}, seed=5)
     expected = OpenLoop("MlpPolicy", shown, seed=5).set_constants(**SWIMMER)
@@ -254,39 +252,30 @@ def test_points_and_gaits_are_two_names_of_the_same():
     assert space.dim == 2 + 2 + 1 + 2 + 2
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        *(("population_size", 1), ("n_resets", 0), ("frequency", [2.0, 1.0]), ("dt", 0.0)),
-        *(("gain_factor", 0.5), ("control", "maybe"), ("kp", -1.0), ("gait", "gallop")),
-        *(("gait", []), ("amplitude", 0.0)),
-    ],
+@each(
+    *(("population_size", 1), ("n_resets", 0), ("frequency", [2.0, 1.0]), ("dt", 0.0)),
+    *(("gain_factor", 0.5), ("control", "maybe"), ("kp", -1.0), ("gait", "gallop")),
+    *(("gait", []), ("amplitude", 0.0)),
 )
 def test_an_argument_out_of_range_is_named_with_its_range(name, value):
     with pytest.raises(ValueError, match=rf"OpenLoop\({name}=.*: {name} must be"):
         small("openloop", **{name: value})
 
 
-@pytest.mark.parametrize(
-    ("attempt", "says"),
-    [
-        (lambda: swimmer().set_constants(**SWIMMER | {"amplitude": [1.0] * 3}), "one for each of"),
-        (lambda: swimmer().set_constants(**SWIMMER | {"omega_swing": 0.0}), "finite and above 0"),
-        (lambda: swimmer(VecNormalize(make_vec_env("Swimmer-v5"))), "norm_obs=False"),
-        (lambda: swimmer("HalfCheetah-v5", gait="trot"), "4 legs needs as many joints in each"),
-    ],
+@each(
+    (lambda: swimmer().set_constants(**SWIMMER | {"amplitude": [1.0] * 3}), "one for each of"),
+    (lambda: swimmer().set_constants(**SWIMMER | {"omega_swing": 0.0}), "finite and above 0"),
+    (lambda: swimmer(VecNormalize(make_vec_env("Swimmer-v5"))), "norm_obs=False"),
+    (lambda: swimmer("HalfCheetah-v5", gait="trot"), "4 legs needs as many joints in each"),
 )
 def test_what_does_not_fit_the_body_is_refused(attempt, says):
     with pytest.raises((ValueError, EnvironmentMismatchError), match=says):
         attempt()
 
 
-@pytest.mark.parametrize(
-    ("make", "steps"),
-    [
-        (lambda: VecFrameStack(make_vec_env(Tune, n_envs=2), 2), 40),
-        (lambda: TwinVecEnv("Pendulum", n_envs=2), 200),
-    ],
+@each(
+    (lambda: VecFrameStack(make_vec_env(Tune, n_envs=2), 2), 40),
+    (lambda: TwinVecEnv("Pendulum", n_envs=2), 200),
     ids=["frames", "twin"],
 )
 def test_where_single_copies_cannot_be_reset_whole_episodes_are_run(make, steps):

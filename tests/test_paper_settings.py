@@ -13,8 +13,6 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_hds import algos
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 EVERY_EPISODE = TrainFreq(1, TrainFrequencyUnit.EPISODE)
 EVERY_EIGHT_STEPS = TrainFreq(8, TrainFrequencyUnit.STEP)
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch as th
+from cases import each
 from gymnasium import spaces
 from small_models import STATES, greedy, repacked, saved, small
 from stable_baselines3 import SAC
@@ -15,8 +16,6 @@ from stable_baselines3 import SAC
 import sb3_hds
 from sb3_hds import algos
 from sb3_hds.algos.policy_description import space_from_plain, space_to_plain
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 @pytest.mark.parametrize("name", ["simba", "td7", "hds", "openloop"])
@@ -43,36 +42,28 @@ def test_checkpoints_of_td7_act_in_the_policy_alone(no_pickle, tmp_path):
     model.policy.learner = learner._replace(checkpoint=other)
 
     model.policy.save(tmp_path / "policy.pth")
-    for policy in (
-        sb3_hds.load_policy(saved(model)),
-        type(model.policy).load(tmp_path / "policy.pth"),
-    ):
+    alone = type(model.policy).load(tmp_path / "policy.pth")
+    for policy in (sb3_hds.load_policy(saved(model)), alone):
         np.testing.assert_array_equal(greedy(policy), greedy(model))
     model.policy.drop_checkpoint()
     assert (greedy(model) != greedy(policy)).any()
 
 
-@pytest.mark.parametrize(
-    "space",
-    [
-        spaces.Box(np.array([-np.inf, -1.0]), np.array([np.inf, 2.5]), dtype=np.float64),
-        spaces.Box(0, 255, (2, 3), np.uint8),
-        spaces.Discrete(4, start=-1),
-        spaces.MultiDiscrete([2, 3], start=[0, 1]),
-        spaces.MultiBinary([2, 2]),
-        spaces.Dict([("z", spaces.Discrete(2)), ("a", spaces.Box(-1.0, 1.0, (1,)))]),
-    ],
+@each(
+    spaces.Box(np.array([-np.inf, -1.0]), np.array([np.inf, 2.5]), dtype=np.float64),
+    spaces.Box(0, 255, (2, 3), np.uint8),
+    spaces.Discrete(4, start=-1),
+    spaces.MultiDiscrete([2, 3], start=[0, 1]),
+    spaces.MultiBinary([2, 2]),
+    spaces.Dict([("z", spaces.Discrete(2)), ("a", spaces.Box(-1.0, 1.0, (1,)))]),
 )
 def test_spaces_come_back_from_plain_data(space):
     assert space_from_plain(space_to_plain(space)) == space
 
 
-@pytest.mark.parametrize(
-    ("name", "kwargs", "plain"),
-    [
-        ("bro", {"n_quantiles": np.int64(5), "net_arch": np.array([8, 8])}, ("net_arch", [8, 8])),
-        ("droq", {"net_arch": [8], "activation_fn": th.nn.GELU}, ("activation_fn", "gelu_exact")),
-    ],
+@each(
+    ("bro", {"n_quantiles": np.int64(5), "net_arch": np.array([8, 8])}, ("net_arch", [8, 8])),
+    ("droq", {"net_arch": [8], "activation_fn": th.nn.GELU}, ("activation_fn", "gelu_exact")),
 )
 def test_numbers_of_numpy_and_classes_of_torch_become_plain_data(name, kwargs, plain, no_pickle):
     model = small(name, policy_kwargs=kwargs)

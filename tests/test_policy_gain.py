@@ -5,6 +5,7 @@ import dataclasses
 import gymnasium
 import numpy as np
 import pytest
+from cases import each
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -130,13 +131,8 @@ def test_a_truth_that_is_known_is_the_ceiling_and_what_was_made_here_is_closed_h
 
     # One that never ends is cut off as the twin is.
     endless = gymnasium.make(ROBOT, max_episode_steps=20).unwrapped
-    names = []
-    for env, ceiling in (
-        (simulated, True),
-        (own := OneStep(), truth),
-        (factory, True),
-        (endless, 0),
-    ):
+    names, own = [], OneStep()
+    for env, ceiling in ((simulated, True), (own, truth), (factory, True), (endless, False)):
         gain = measure_policy_gain(a_diagnosis(), env, ceiling=ceiling, **settings)
         names.append([*gain.returns])
 
@@ -144,20 +140,17 @@ def test_a_truth_that_is_known_is_the_ceiling_and_what_was_made_here_is_closed_h
     assert [env.closed for env in made] == [True] and not own.closed
 
 
-@pytest.mark.parametrize(
-    ("real", "changes", "error", "message"),
-    [
-        (OneStep(n_obs=4), {}, EnvironmentMismatchError, r"observations of shape \(4,\).*\(3,\)"),
-        (OneStep(most=1.0), {}, EnvironmentMismatchError, r"actions in \[-1\] to \[1\]"),
-        (DummyVecEnv([OneStep]), {}, ParameterError, "got DummyVecEnv"),
-        (ROBOT, {"speed": 1}, ParameterError, "'speed'"),
-        (ROBOT, {"pretrain_epochs": 0}, TrajectoryError, "HDS learns nothing in 0 steps"),
-        (ROBOT, {"algorithm": SAC}, TrajectoryError, "SAC learns nothing in 0 steps"),
-        (ROBOT, {"seeds": 0}, TrajectoryError, "at least"),
-        (ROBOT, {"n_episodes": 0}, TrajectoryError, "at least"),
-        (ROBOT, {"budget": -1}, TrajectoryError, "at least"),
-        (ROBOT, {"of": "LinearAxis"}, TrajectoryError, "no episode length"),
-    ],
+@each(
+    (OneStep(n_obs=4), {}, EnvironmentMismatchError, r"observations of shape \(4,\).*\(3,\)"),
+    (OneStep(most=1.0), {}, EnvironmentMismatchError, r"actions in \[-1\] to \[1\]"),
+    (DummyVecEnv([OneStep]), {}, ParameterError, "got DummyVecEnv"),
+    (ROBOT, {"speed": 1}, ParameterError, "'speed'"),
+    (ROBOT, {"pretrain_epochs": 0}, TrajectoryError, "HDS learns nothing in 0 steps"),
+    (ROBOT, {"algorithm": SAC}, TrajectoryError, "SAC learns nothing in 0 steps"),
+    (ROBOT, {"seeds": 0}, TrajectoryError, "at least"),
+    (ROBOT, {"n_episodes": 0}, TrajectoryError, "at least"),
+    (ROBOT, {"budget": -1}, TrajectoryError, "at least"),
+    (ROBOT, {"of": "LinearAxis"}, TrajectoryError, "no episode length"),
 )
 def test_what_cannot_be_compared_is_refused(real, changes, error, message):
     changes = {"of": "PendulumReal"} | changes

@@ -23,8 +23,6 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_hds import algos
 from sb3_hds.algos import twin_algorithm
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 class Noting(BaseCallback):
     """
@@ -48,9 +46,8 @@ def test_what_is_logged_and_evaluated_has_a_series_of_its_own_whose_axis_moves(t
     model = small("hds", pretrain_epochs=21)
     lines = logged(model)
     env = Monitor(gymnasium.make("Pendulum-v1", max_episode_steps=20))
-    evaluation = EvalCallback(
-        env, eval_freq=10, n_eval_episodes=1, verbose=0, log_path=str(tmp_path)
-    )
+    how = {"eval_freq": 10, "n_eval_episodes": 1, "verbose": 0}
+    evaluation = EvalCallback(env, log_path=str(tmp_path), **how)
 
     model.learn(50, callback=evaluation, log_interval=1)
 
@@ -81,9 +78,7 @@ def test_callbacks_are_called_after_each_epoch_and_no_timestep_is_counted():
     assert names[False] - names[True] <= {"__class__"}
 
 
-def test_a_callback_that_says_no_ends_the_pretraining_and_a_checkpoint_goes_on(
-    monkeypatch, tmp_path
-):
+def test_a_callback_that_says_no_ends_pretraining_and_a_checkpoint_goes_on(monkeypatch, tmp_path):
     model = small("hds", pretrain_epochs=5)
     monkeypatch.setattr(PendulumEnv, "step", None)
 

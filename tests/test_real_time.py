@@ -5,6 +5,7 @@ import time
 import gymnasium
 import numpy as np
 import pytest
+from cases import each
 from gymnasium import spaces
 from small_models import small
 
@@ -173,9 +174,9 @@ def interrupt(seconds):
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize(
-    ("sleep", "action", "error"),
-    [(interrupt, GO, KeyboardInterrupt), (None, np.array([np.nan]), ValueError)],
+@each(
+    (interrupt, GO, KeyboardInterrupt),
+    (None, np.array([np.nan]), ValueError),
     ids=["interrupted", "refused"],
 )
 def test_the_watchdog_goes_on_where_a_step_was_not_finished(sleep, action, error):
@@ -195,13 +196,10 @@ def test_the_watchdog_goes_on_where_a_step_was_not_finished(sleep, action, error
     assert env.step(GO)[-1]["missed_steps"] == 6
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        ({"period": 0.0}, "period must be above 0"),
-        ({"period": 0.1, "grace": 1.5}, "grace must be from 0 to 1"),
-        ({"period": 0.1, "safe_action": [3.0]}, "must be in Box"),
-    ],
+@each(
+    ({"period": 0.0}, "period must be above 0"),
+    ({"period": 0.1, "grace": 1.5}, "grace must be from 0 to 1"),
+    ({"period": 0.1, "safe_action": [3.0]}, "must be in Box"),
 )
 def test_arguments_out_of_range_are_refused(arguments, says):
     with pytest.raises(ParameterError, match=says):

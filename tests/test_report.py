@@ -39,9 +39,8 @@ def crowded(rubbing):
         for name, size in first.parameters.items()
         for side in ("positive", "negative")
     }
-    alike = dataclasses.replace(
-        first, alternatives=(f"{name}0", f"{name}1"), parameters=first.parameters | sizes
-    )
+    sizes = first.parameters | sizes
+    alike = dataclasses.replace(first, alternatives=(f"{name}0", f"{name}1"), parameters=sizes)
     return dataclasses.replace(
         rubbing,
         twin=rubbing.twin.with_parameters(mass=1.2),

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import stable_baselines3 as sb3
+from cases import each
 from gymnasium.wrappers import TimeLimit
 from moving_joints import DT, MovingJoints
 from small_models import small
@@ -31,9 +32,6 @@ from sb3_hds.wrappers import (
     LowPassAction,
 )
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
-
 SCHEDULE = [[0, 0.3], [50, 1.0]]
 
 
@@ -43,11 +41,10 @@ def nested(env):
     return HistoryObservation(ContinuityCost(env, 0.3), n_observations=2, n_actions=2)
 
 
+BARRIER = {"low": -2.0, "high": 2.0, "position": [[0, 1]], "gain": 0.5, "on_breach": "ignore"}
 LAYERS = {
     # No speed is commanded here: what the twin does beyond its assumptions has to agree, too.
-    "barrier": lambda env: JointLimitBarrier(
-        env, -2.0, 2.0, position=[[0, 1]], gain=0.5, on_breach="ignore"
-    ),
+    "barrier": lambda env: JointLimitBarrier(env, **BARRIER),
     "rhythm_residual": lambda env: CPGPrior(env, mode="residual", omega_swing=3.0, amplitude=2.5),
     "rhythm_parameters": lambda env: CPGPrior(env, mode="parameters", omega_swing=3.0, offset=0.3),
     "nested": nested,
@@ -192,9 +189,9 @@ def within_06(obs):
 
 
 @pytest.mark.expensive
-@pytest.mark.parametrize(
-    "guard",
-    [lambda env: JointLimitBarrier(env, -0.6, 0.6), lambda env: ActionShield(env, within_06)],
+@each(
+    lambda env: JointLimitBarrier(env, -0.6, 0.6),
+    lambda env: ActionShield(env, within_06),
     ids=["barrier", "shield"],
 )
 def test_a_policy_trained_behind_a_layer_that_does_not_bind_solves_the_task(guard):

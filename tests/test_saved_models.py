@@ -21,13 +21,9 @@ from small_models import EVERY_NAME, MODEL_FREE, SMALL, greedy, reloaded, repack
 import sb3_hds
 from sb3_hds import algos
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 SAVED = Path(__file__).parent / "saved"
 NEWEST = "0.1.0-2026-11-28"
-OBSERVATIONS = np.array(
-    [[1.0, 0.0, 0.0], [-1.0, 0.0, 2.0], [0.6, -0.8, -7.5], [0.0, 1.0, 1.0]], np.float32
-)
+OBSERVATIONS = np.float32([[1.0, 0.0, 0.0], [-1.0, 0.0, 2.0], [0.6, -0.8, -7.5], [0.0, 1.0, 1.0]])
 #: enough for updates, a real episode, and another network than at the start
 N_STEPS = {"pods": 25, "hds": 50, "openloop": 24}
 FILES = sorted(SAVED.glob("*/*.zip"))

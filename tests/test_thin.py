@@ -8,7 +8,7 @@ import pytest
 
 from sb3_hds.algos.thin import Hidden, Last, hidden_product, product
 
-pytestmark = pytest.mark.usefixtures("x64", "quick_compilation")
+pytestmark = pytest.mark.usefixtures("x64")
 
 # Where a kernel has few rows, one column, and both.
 cases = pytest.mark.parametrize(

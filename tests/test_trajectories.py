@@ -8,6 +8,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 import pytest
+from cases import each
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 
@@ -63,20 +64,17 @@ def spoilt(obs, value):
     return obs
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda obs, u: (obs, [u[0][:-1], u[1]]), "obs[0] must have one row more than actions[0]"),
-        (lambda obs, u: ([x[1:] for x in obs], u), "drop that one: actions=[a[:-1] for a"),
-        (lambda obs, u: (u, obs), "Are obs and actions swapped?"),
-        (lambda obs, u: ([obs[0][:1], obs[1]], [u[0][:0], u[1]]), "must be at least one action"),
-        (lambda obs, u: (obs[0], u[0]), "obs[0] must have shape (T + 1, n_obs), got (2,)"),
-        (lambda obs, u: (obs, u[:1]), "one array per trajectory, got 2 in obs and 1 in actions."),
-        (lambda obs, u: ([obs[0], obs[1][:, :1]], u), "All trajectories must have the same chan"),
-        (lambda obs, u: (obs, [u[0], u[1].astype(str)]), "actions[1] must be an array of real"),
-        (lambda obs, u: ([[[1.0, 2.0], [3.0]], obs[1]], u), "obs[0] must be an array of real"),
-        (lambda obs, u: (spoilt(obs, np.nan), u), "got nan at row 2, column 1 (2 such values"),
-    ],
+@each(
+    (lambda obs, u: (obs, [u[0][:-1], u[1]]), "obs[0] must have one row more than actions[0]"),
+    (lambda obs, u: ([x[1:] for x in obs], u), "drop that one: actions=[a[:-1] for a"),
+    (lambda obs, u: (u, obs), "Are obs and actions swapped?"),
+    (lambda obs, u: ([obs[0][:1], obs[1]], [u[0][:0], u[1]]), "must be at least one action"),
+    (lambda obs, u: (obs[0], u[0]), "obs[0] must have shape (T + 1, n_obs), got (2,)"),
+    (lambda obs, u: (obs, u[:1]), "one array per trajectory, got 2 in obs and 1 in actions."),
+    (lambda obs, u: ([obs[0], obs[1][:, :1]], u), "All trajectories must have the same chan"),
+    (lambda obs, u: (obs, [u[0], u[1].astype(str)]), "actions[1] must be an array of real"),
+    (lambda obs, u: ([[[1.0, 2.0], [3.0]], obs[1]], u), "obs[0] must be an array of real"),
+    (lambda obs, u: (spoilt(obs, np.nan), u), "got nan at row 2, column 1 (2 such values"),
 )
 def test_arrays_that_are_no_trajectories_are_refused_with_the_way_out(change, message):
     obs, actions = change(*recording(3, 5))
@@ -135,9 +133,8 @@ def test_it_is_a_pytree_whose_labels_are_static():
     assert (doubled.dt, doubled.conditions) == (0.1, ("a", "b"))
     np.testing.assert_array_equal(doubled.obs, 2 * data.obs)
     # float32 sums of 24 numbers of size one
-    np.testing.assert_allclose(
-        sums, data.obs.sum((1, 2)) + data.actions.sum((1, 2)), rtol=1e-5, atol=1e-5
-    )
+    expected = data.obs.sum((1, 2)) + data.actions.sum((1, 2))
+    np.testing.assert_allclose(sums, expected, rtol=1e-5, atol=1e-5)
     paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(data)]
     assert paths == [".obs", ".actions", ".mask", ".origin"]
 
@@ -332,15 +329,12 @@ def test_episodes_of_a_replay_buffer_end_at_dones_timeouts_and_resets_from_outsi
 SHARED = {"optimize_memory_usage": True, "handle_timeout_termination": False}
 
 
-@pytest.mark.parametrize(
-    ("n_steps", "more", "steps"),
-    [
-        (17, {"size": 10, "done_at": (11,)}, [(7, 12), (12, 17)]),
-        (6, {"n_envs": 3, "done_at": (1,)}, [(0, 2), (2, 6)]),
-        # Nothing has overwritten the newest yet.
-        (8, {"done_at": (3, 7)} | SHARED, [(0, 3), (4, 8)]),
-        (17, {"size": 10, "done_at": (11,)} | SHARED, [(8, 11), (12, 17)]),
-    ],
+@each(
+    (17, {"size": 10, "done_at": (11,)}, [(7, 12), (12, 17)]),
+    (6, {"n_envs": 3, "done_at": (1,)}, [(0, 2), (2, 6)]),
+    # Nothing has overwritten the newest yet.
+    (8, {"done_at": (3, 7)} | SHARED, [(0, 3), (4, 8)]),
+    (17, {"size": 10, "done_at": (11,)} | SHARED, [(8, 11), (12, 17)]),
     ids=["full ring", "several environments", "shared memory", "shared memory, full ring"],
 )
 def test_a_replay_buffer_is_read_oldest_first_and_by_environment(n_steps, more, steps):
@@ -373,14 +367,11 @@ def test_what_sb3_collected_replays_in_the_environment(tmp_path):
 IMAGE, CHOICE = gym.spaces.Box(0, 1, (4, 4)), gym.spaces.Discrete(3)
 
 
-@pytest.mark.parametrize(
-    ("spaces", "message"),
-    [
-        ((BOX, TORQUE), "holds no step yet"),
-        ((IMAGE, TORQUE), "buffers of flat Box observations"),
-        ((BOX, CHOICE), r"a Box with finite limits, got Discrete\(3\)"),
-        ((BOX, gym.spaces.Box(-np.inf, np.inf, (1,))), "a Box with finite limits"),
-    ],
+@each(
+    ((BOX, TORQUE), "holds no step yet"),
+    ((IMAGE, TORQUE), "buffers of flat Box observations"),
+    ((BOX, CHOICE), r"a Box with finite limits, got Discrete\(3\)"),
+    ((BOX, gym.spaces.Box(-np.inf, np.inf, (1,))), "a Box with finite limits"),
 )
 def test_a_buffer_that_holds_no_trajectories_is_refused(spaces, message):
     with pytest.raises(TrajectoryError, match=message):

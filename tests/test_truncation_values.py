@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from free_mass import Mass
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
@@ -92,9 +93,7 @@ class Clock(Mass):
         return (params["mass"] > 1.5) & (state.q[0] > 1.9 * jnp.pi)
 
 
-@pytest.mark.parametrize(
-    ("mass", "expected"), [(1.0, TRUNCATED), (2.0, TERMINATED)], ids=["truncated", "terminated"]
-)
+@each((1.0, TRUNCATED), (2.0, TERMINATED), ids=["truncated", "terminated"])
 def test_what_learns_within_one_program_takes_a_time_limit_for_what_it_is(mass, expected):
     env = TimeLimit(TwinEnv(Clock(mass=mass)), 4)
     # 2500 updates, in the last 200 of 400 steps.

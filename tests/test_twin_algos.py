@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from point_mass import PointMass, point_mass_env
 from small_models import logged, same, small
 from stable_baselines3.common.env_util import make_vec_env
@@ -22,8 +23,6 @@ from sb3_hds.algos.regression import regress
 from sb3_hds.algos.twin_policy import all_finite
 from sb3_hds.core import Twin
 from sb3_hds.errors import RewardError
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 class Lossy(PointMass):
@@ -245,14 +244,11 @@ PAPER |= {"terminal_value": False, "adapt_scales": False, "policy_kwargs": {"lin
 HOT = {"temperature": 1e3, "temperature_decay": 1.0, "n_random_plans": 0}
 
 
-@pytest.mark.parametrize(
-    ("name", "changes"),
-    [
-        ("pods", {}),
-        # Without random plans there is no second one to fall back on.
-        ("hds", HOT),
-        ("pods", PAPER | {"order": 2, "planner": "gauss_newton"}),
-    ],
+@each(
+    ("pods", {}),
+    # Without random plans there is no second one to fall back on.
+    ("hds", HOT),
+    ("pods", PAPER | {"order": 2, "planner": "gauss_newton"}),
     ids=["as usual", "hot", "paper"],
 )
 def test_plans_are_never_worse_than_what_they_started_from_unless_hot(name, changes):

@@ -5,6 +5,7 @@ import inspect
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from free_mass import Mass
 from test_twin_contract import broken
 
@@ -20,8 +21,6 @@ from sb3_hds.core import (
 from sb3_hds.core.filters import Delay
 from sb3_hds.effects import CoulombFriction, SensorBias
 from sb3_hds.twins.mechanics import Points, check_mechanics
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 @pytest.mark.parametrize(
@@ -76,17 +75,14 @@ DISTANT = {
 }
 
 
-@pytest.mark.parametrize(
-    ("changes", "name", "message"),
-    [
-        ({"bias": lambda self, q, v, p: v / (q - q)}, "finite", "with the twin's own values"),
-        ({"parameters": light(0.0), "bias": drag}, "finite", "after 1 of 20 steps with mass = 0"),
-        (DISTANT, "finite", "the derivative of reward is not finite"),
-        ({"infer": doubled}, "infer inverts observe", "differs from obs in 'speed' by 100.0%"),
-        ({"mass_matrix": own_mass}, "parameters", "motion, observation and reward: mass"),
-        ({"actuate": lambda self, s, u, p: 0.0 * u}, "commands", "effect on the motion: push"),
-        ({"mass_matrix": vanishing}, "mass matrix", "rail has an inertia of -"),
-    ],
+@each(
+    ({"bias": lambda self, q, v, p: v / (q - q)}, "finite", "with the twin's own values"),
+    ({"parameters": light(0.0), "bias": drag}, "finite", "after 1 of 20 steps with mass = 0"),
+    (DISTANT, "finite", "the derivative of reward is not finite"),
+    ({"infer": doubled}, "infer inverts observe", "differs from obs in 'speed' by 100.0%"),
+    ({"mass_matrix": own_mass}, "parameters", "motion, observation and reward: mass"),
+    ({"actuate": lambda self, s, u, p: 0.0 * u}, "commands", "effect on the motion: push"),
+    ({"mass_matrix": vanishing}, "mass matrix", "rail has an inertia of -"),
 )
 def test_a_flaw_is_found_by_its_check(changes, name, message):
     found = twins.check(type("Cart", (Cart,), changes)())
@@ -147,29 +143,26 @@ def inertia(*rows):
     return {"mass_matrix": lambda self, q, params: jnp.array(rows)}
 
 
-@pytest.mark.parametrize(
-    ("changes", "name", "message"),
-    [
-        (inertia([2.0, 1.0], [0.5, 2.0]), "mass matrix", "not symmetric: entry (joint1, joint2)"),
-        # Eigenvalues 1 - 1.5 and 1 + 1.5.
-        (inertia([1.0, 1.5], [1.5, 1.0]), "mass matrix", "smallest eigenvalue -0.5"),
-        (
-            {"weight": lambda self, q: 9.81 * jnp.stack([jnp.sin(q[0] + q[1]), jnp.sin(q[1])])},
-            "gravity and springs",
-            "the load of joint1 changes with joint2 by",
-        ),
-        (
-            {"coriolis": lambda self, q, v: 0.9 * Arm.coriolis(self, q, v) + 0.3 * v},
-            "forces of inertia",
-            "they add energy",  # at high speed, where damping does not hide it
-        ),
-        (inertia([np.nan, 0.0], [0.0, 1.0]), "equation of motion", "mass_matrix is not finite"),
-        (
-            {"integrator": staticmethod(lambda a, q, v, h, limit: (q + h * v, v * (1.0 + h)))},
-            "energy",
-            "which is no error of the integrator",
-        ),
-    ],
+@each(
+    (inertia([2.0, 1.0], [0.5, 2.0]), "mass matrix", "not symmetric: entry (joint1, joint2)"),
+    # Eigenvalues 1 - 1.5 and 1 + 1.5.
+    (inertia([1.0, 1.5], [1.5, 1.0]), "mass matrix", "smallest eigenvalue -0.5"),
+    (
+        {"weight": lambda self, q: 9.81 * jnp.stack([jnp.sin(q[0] + q[1]), jnp.sin(q[1])])},
+        "gravity and springs",
+        "the load of joint1 changes with joint2 by",
+    ),
+    (
+        {"coriolis": lambda self, q, v: 0.9 * Arm.coriolis(self, q, v) + 0.3 * v},
+        "forces of inertia",
+        "they add energy",  # at high speed, where damping does not hide it
+    ),
+    (inertia([np.nan, 0.0], [0.0, 1.0]), "equation of motion", "mass_matrix is not finite"),
+    (
+        {"integrator": staticmethod(lambda a, q, v, h, limit: (q + h * v, v * (1.0 + h)))},
+        "energy",
+        "which is no error of the integrator",
+    ),
 )
 def test_what_is_not_mechanical_is_named(changes, name, message, x64):
     failed = [item for item in judged(**changes) if not item.ok]

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from cases import each
 from scipy.integrate import solve_ivp
 from scipy.stats import ks_2samp
 
@@ -118,14 +119,11 @@ def test_declared_constants_are_those_of_the_shipped_model(env_id):
     assert twin.values == pytest.approx(twins.make(env_id).values, rel=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        (lambda m: m.dof_frictionloss.__setitem__(0, 0.1), "joints without dry friction"),
-        (lambda m: setattr(m.opt, "integrator", 0), "the integrator RK4"),
-        (lambda m: m.actuator_ctrlrange.__setitem__(0, (-2.0, 2.0)), "commands within"),
-        (lambda m: m.jnt_axis.__setitem__(1, (1.0, 0.0, 0.0)), "hinges about y"),
-    ],
+@each(
+    (lambda m: m.dof_frictionloss.__setitem__(0, 0.1), "joints without dry friction"),
+    (lambda m: setattr(m.opt, "integrator", 0), "the integrator RK4"),
+    (lambda m: m.actuator_ctrlrange.__setitem__(0, (-2.0, 2.0)), "commands within"),
+    (lambda m: m.jnt_axis.__setitem__(1, (1.0, 0.0, 0.0)), "hinges about y"),
 )
 def test_a_model_of_another_structure_is_refused(change, expected):
     env = gymnasium.make(MUJOCO[1]).unwrapped
@@ -293,6 +291,7 @@ def test_spaces_and_time_limits_are_the_environments(env_id):
     envs.register_environments()
     env, twin = gymnasium.make(env_id), twins.get(env_id)()
 
+    assert type(envs.twin_of(env)) is type(twin)
     actions, observations = env.action_space, env.observation_space
     np.testing.assert_array_equal(actions.low, np.float32([a.low for a in twin.actuators]))
     np.testing.assert_array_equal(actions.high, np.float32([a.high for a in twin.actuators]))

@@ -36,7 +36,7 @@ from sb3_hds.algos.bodies import Dropout
 from sb3_hds.algos.observations import Seen
 from sb3_hds.algos.off_policy import Batch, Knobs, Report, average, before_any, update
 
-pytestmark = pytest.mark.usefixtures("x64", "quick_compilation")
+pytestmark = pytest.mark.usefixtures("x64")
 
 N_OBS, N_ACT, N_BATCH, N_UPDATES = 3, 2, 6, 2
 KNOBS = Knobs(learning_rate=0.03, qf_learning_rate=0.05, tau=0.1, target_entropy=-1.3)
@@ -190,10 +190,8 @@ class Soft:
         return self.report
 
     def follow(self) -> None:
-        share = KNOBS.tau
-        self.target = jax.tree.map(
-            lambda old, new: (1.0 - share) * old + share * new, self.target, self.critic
-        )
+        nearer = lambda old, new: (1.0 - KNOBS.tau) * old + KNOBS.tau * new  # noqa: E731
+        self.target = jax.tree.map(nearer, self.target, self.critic)
 
     def explore(self, batch: Batch, key: Any) -> None:
         """What follows the actor."""
@@ -568,9 +566,8 @@ class Sale:
 
 def test_td7_learns_embeddings_clips_targets_and_copies_them_late():
     recipe, learner = begun("td7", {"embedding_size": 5}, target_update_interval=2)
-    fixed = td7_update.Copies(
-        *(getattr(learner, n).weights for n in ("encoder", "actor", "critic", "encoder"))
-    )
+    encoder, actor, critic = (getattr(learner, n).weights for n in ("encoder", "actor", "critic"))
+    fixed = td7_update.Copies(encoder, actor, critic, encoder)
     learner = learner._replace(copies=fixed)
     expected = Sale(recipe, learner)
     report, given = before_any(td7_update.Report), batches(4)

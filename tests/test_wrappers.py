@@ -155,9 +155,7 @@ def test_spaces_contain_what_comes_out_and_the_seed_decides_what_follows(name, t
 
 
 @every_wrapper
-def test_seeds_options_and_actions_reach_the_environment_and_layers_tell_what_they_did(
-    name, tmp_path
-):
+def test_seeds_options_and_actions_arrive_and_layers_tell_what_they_did(name, tmp_path):
     case, heard = CASES[name], []
 
     class Listening(gymnasium.Wrapper):

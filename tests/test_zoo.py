@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from cases import each
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_hds import HDS
@@ -157,14 +158,11 @@ def test_optuna_trials_are_stored_and_one_of_them_can_be_trained(zoo):
     assert "policy_kwargs.net_arch" in used
 
 
-@pytest.mark.parametrize(
-    ("algo", "params"),
-    [
-        ("openloop", ("population_size:3", "n_resets:1", "horizon:20", "n_elites:2", "n_envs:2")),
-        ("td7", (*FEW, "policy_kwargs:dict(net_arch=[8])")),
-    ],
+@each(
+    ("openloop", ("population_size:3", "n_resets:1", "horizon:20", "n_elites:2", "n_envs:2")),
+    ("td7", (*FEW, "policy_kwargs:dict(net_arch=[8])")),
 )
-def test_other_algorithms_are_trained_and_replayed(zoo, algo, params):
+def test_other_algorithms_are_trained_and_replayed(algo, params, zoo):
     agent = of(algo, "-f", "brief", "-n", "200")
 
     zoo.succeeds(*CONSOLE, "train", *agent, "--eval-freq", "-1", "-params", *params)

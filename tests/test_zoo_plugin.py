@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import jax
 import pytest
 import yaml
+from cases import each
 from small_models import small
 
 import sb3_hds
@@ -194,12 +195,9 @@ class Manager:
         self.found = self.objective(SimpleNamespace(number=3))
 
 
-@pytest.mark.parametrize(
-    ("given", "shown"),
-    [
-        ({"show_progress": True}, "stable_baselines3.common.callbacks.ProgressBarCallback"),
-        ({"show_progress": True, "n_jobs": 2}, "rl_zoo_plugin.trial_progress.TrialProgress"),
-    ],
+@each(
+    ({"show_progress": True}, "stable_baselines3.common.callbacks.ProgressBarCallback"),
+    ({"show_progress": True, "n_jobs": 2}, "rl_zoo_plugin.trial_progress.TrialProgress"),
 )
 def test_trials_of_ours_know_their_steps_and_show_where_they_are(given, shown, monkeypatch):
     manager = type("Manager", (Manager,), dict(vars(Manager)))
@@ -287,14 +285,11 @@ def test_a_zoo_is_extended_before_and_after_it_is_imported(tmp_path, before):
     assert names == f"{['sac', *tables.ALGORITHMS]} False False"
 
 
-@pytest.mark.parametrize(
-    ("environ", "expected"),
-    [
-        ({"SB3_HDS_CACHE": "/tmp/mine"}, "/tmp/mine"),
-        ({"SB3_HDS_CACHE": ""}, None),
-        ({"XDG_CACHE_HOME": "/tmp/xdg"}, "/tmp/xdg/sb3_hds/xla"),
-        ({"JAX_COMPILATION_CACHE_DIR": "/tmp/jax", "SB3_HDS_CACHE": "/tmp/mine"}, None),
-    ],
+@each(
+    ({"SB3_HDS_CACHE": "/tmp/mine"}, "/tmp/mine"),
+    ({"SB3_HDS_CACHE": ""}, None),
+    ({"XDG_CACHE_HOME": "/tmp/xdg"}, "/tmp/xdg/sb3_hds/xla"),
+    ({"JAX_COMPILATION_CACHE_DIR": "/tmp/jax", "SB3_HDS_CACHE": "/tmp/mine"}, None),
 )
 def test_programs_are_kept_where_the_user_wants_them(environ, expected, monkeypatch):
     for name in ("JAX_COMPILATION_CACHE_DIR", "SB3_HDS_CACHE", "XDG_CACHE_HOME"):
