@@ -48,16 +48,14 @@ MISTAKES = {
     "a seed below 0": (PENDULUM, {"seed": -1}, "seed must be"),
     "a seed that is a word": (PENDULUM, {"seed": "zero"}, "seed must be None or a whole number"),
     "policy_kwargs as a word": (PENDULUM, {"policy_kwargs": "dict()"}, "must be a dictionary"),
-    "a device that is not there": (PENDULUM, {"device": "cuda:7"}, "'cuda:7'.*it has: .*cpu"),
+    "no such device": (PENDULUM, {"device": "cuda:7"}, "'cuda:7'.*it has: .*cpu"),
 }
 REFUSED = (ValueError, TypeError, AssertionError, gymnasium.error.NameNotFound)
 
 
 @pytest.mark.parametrize(
     ("mistake", "name"),
-    asked_of_each(
-        MISTAKES, "an unknown argument", "a class", "choices", "a device that is not there"
-    ),
+    asked_of_each(MISTAKES, "an unknown argument", "a class", "choices", "no such device"),
 )
 def test_a_constructor_says_in_one_line_what_to_do_instead_of(mistake, name):
     arguments, named, said = MISTAKES[mistake]
@@ -81,16 +79,14 @@ LATER = {
     "no number": (lambda model: model.predict(np.array([1.0, 0.0, np.nan])), "not finite"),
     "what reset returns": (lambda model: model.predict((np.zeros(3), {})), "mixing Gym API"),
     "loading for another": (lambda model: load(model, env=CAR), "spaces do not match: .*like it"),
-    "loading with an unknown argument": (lambda model: load(model, sed=3), "Did you mean 'seed'"),
+    "loading with a typo": (lambda model: load(model, sed=3), "Did you mean 'seed'"),
     "nowhere to learn": (lambda model: load(model).learn(10), r"call set_env\(env\), or load it"),
 }
 
 
 @pytest.mark.parametrize(
     ("mistake", "name"),
-    asked_of_each(
-        LATER, "half a step", "another environment", "no number", "loading with an unknown argument"
-    ),
+    asked_of_each(LATER, "half a step", "another environment", "no number", "loading with a typo"),
 )
 def test_a_model_says_what_to_do_instead_of(mistake, name, models):
     call, said = LATER[mistake]

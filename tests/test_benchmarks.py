@@ -79,42 +79,6 @@ def test_every_setting_of_a_method_is_an_argument_of_its_class():
             assert len(model_free.marks(env, method)) > 1
 
 
-def test_a_long_run_goes_on_from_its_last_mark(tmp_path, monkeypatch):
-    env, method = "InvertedPendulum-v5", "td7"
-    monkeypatch.setattr(model_free, "LENGTHS", {env: (150, 50)})
-    monkeypatch.setattr(model_free, "CACHE", tmp_path)
-    made_of = model_free.made_of
-    small = {"learning_starts": 20, "buffer_size": 1000, "batch_size": 16}
-    small["policy_kwargs"] = {"net_arch": [8], "embedding_size": 8}
-    monkeypatch.setattr(model_free, "made_of", lambda *run: (made_of(*run)[0], small))
-
-    def interrupted_after(mark):
-        def evaluate(model):
-            if model.num_timesteps > mark:
-                raise KeyboardInterrupt
-            return np.array([float(model.num_timesteps)])
-
-        return evaluate
-
-    monkeypatch.setattr(model_free, "evaluation", lambda env: interrupted_after(140))
-    with pytest.raises(KeyboardInterrupt):
-        model_free.worker(env, method, 0)
-    kept = runs.InterruptedRun(tmp_path / "model_free" / f"{env}_{method}_0")
-    before = kept.rows()
-    model = kept.model(model_free.class_of(env, method), env)
-
-    monkeypatch.setattr(model_free, "evaluation", lambda env: interrupted_after(1e9))
-    rows = model_free.worker(env, method, 0)
-
-    assert len(before) == 2
-    assert model.num_timesteps == model.replay_buffer.size() == before[-1]["steps"] < 140
-    assert model._n_updates > 0
-    assert rows[:2] == before
-    assert [row["mark"] for row in rows] == [50, 100, 150]
-    assert 150 <= rows[-1]["steps"] <= 180
-    assert not kept.folder.exists()
-
-
 def test_intervals_are_those_of_rliable():
     library = pytest.importorskip("rliable.library")
     metrics = pytest.importorskip("rliable.metrics")

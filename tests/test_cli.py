@@ -63,8 +63,7 @@ def test_an_audit_needs_no_twin_and_says_what_the_clock_was(swings, tmp_path, ca
 def test_an_audit_with_a_twin_sees_degrees_and_any_verdict_is_success(swings, tmp_path, capsys):
     twin = ["--twin", "FreePendulum", "--set", "mass:0.3", "dt:0.00666667"]
 
-    assert question(swings, "audit", "deg") == 0
-    assert "usable: yes" in capsys.readouterr().out
+    assert question(swings, "audit", "deg") == 0 and "usable: yes" in capsys.readouterr().out
     assert question(swings, "audit", "deg", *twin) == 0
     assert "{column: angle, unit: deg}" in " ".join(capsys.readouterr().out.split())
     assert question(swings, "calibrate", "deg", *twin, "--write", tmp_path / "twin.json") == 1

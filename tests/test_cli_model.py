@@ -73,8 +73,7 @@ def test_a_calibration_writes_the_corrected_file(arm, tmp_path, capsys):
     assert code == 0 and "Time is taken from 't'." in shown
     assert "corrected.xml holds the corrected model" in shown
     (estimate,) = json.loads(told.read_text())["estimates"]
-    assert estimate["name"] == "j0_damping"
-    assert estimate["estimate"] == pytest.approx(2.0, rel=0.02)
+    assert estimate["name"] == "j0_damping" and estimate["estimate"] == pytest.approx(2.0, rel=0.02)
     model = mujoco.MjModel.from_xml_path(str(file))
     assert model.dof_damping == pytest.approx([2.0], rel=0.02)
     assert model.nu == 1 and model.opt.timestep == 0.002

@@ -39,8 +39,7 @@ def test_what_is_remembered_are_steps_of_the_environment():
         np.testing.assert_allclose(buffer.rewards[i, 0], reward, rtol=1e-4, atol=1e-5)
     follows = np.abs(buffer.next_observations[:419, 0] - buffer.observations[1:420, 0]).max(1)
     np.testing.assert_array_equal(np.flatnonzero(follows > 0.0), [199, 399])
-    assert not buffer.dones.any()
-    assert episodes.timesteps.tolist() == [200, 400]
+    assert not buffer.dones.any() and episodes.timesteps.tolist() == [200, 400]
     np.testing.assert_allclose(episodes.returns[0], buffer.rewards[:200].sum(), rtol=1e-5)
     copy, before = algos.TQC.load(saved(model)), weights_of(model)
     np.testing.assert_allclose(greedy(copy), greedy(model), rtol=1e-6)
@@ -108,8 +107,7 @@ def test_what_was_learned_before_an_interruption_is_returned(monkeypatch):
         (model,), (episodes,) = learn_compiled(small("tqc_jax", buffer_size=5_000), 3_000)
 
     assert model.num_timesteps == model.replay_buffer.size() == 2_000
-    assert episodes.timesteps[-1] == 2_000
-    assert model._n_updates == 2 * (2_000 - 10) // 5
+    assert episodes.timesteps[-1] == 2_000 and model._n_updates == 2 * (2_000 - 10) // 5
 
 
 def test_a_twin_may_be_passed_for_what_a_wrapper_changes_and_the_time_limit_is_the_environments():

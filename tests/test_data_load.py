@@ -93,8 +93,7 @@ def test_episodes_are_told_apart_by_a_column_and_by_another_condition(tmp_path):
 
     data = Trajectories.load(tmp_path / "log.csv", columns=columns)
 
-    assert data.lengths.tolist() == [19, 29, 29]
-    assert data.conditions == ("0.5", "1", "2")
+    assert data.lengths.tolist() == [19, 29, 29] and data.conditions == ("0.5", "1", "2")
     assert data.origin.tolist() == [0, 1, 2]
 
 

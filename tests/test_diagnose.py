@@ -82,8 +82,7 @@ def test_nothing_is_named_where_nothing_is_wrong():
     found = asked(on_engine())
 
     assert found.verdict == "none", found
-    assert not found.findings and not found.unexplained
-    assert found.twin == TWIN
+    assert not found.findings and not found.unexplained and found.twin == TWIN
 
 
 def test_what_the_data_cannot_tell_apart_is_said():
@@ -144,8 +143,7 @@ def test_a_joint_that_is_counted_the_other_way_round_is_a_matter_of_convention()
     found = asked(turned, pushed, effects=[effects.ViscousFriction])
 
     assert (found.verdict, found.convention) == ("unknown", "direction.hinge")
-    assert "hinge is counted the other way round" in found.unexplained
-    assert found.twin == pushed
+    assert "hinge is counted the other way round" in found.unexplained and found.twin == pushed
 
 
 @each(
@@ -230,8 +228,7 @@ def test_one_short_recording_supports_no_verdict():
 def test_what_would_have_been_seen_is_said(both):
     """Dry friction of the size that is said to be detectable is found, a tenth of it is not."""
     size = both.detectable["coulomb_friction.hinge"]["tau_c"]
-    assert 0.0 < size < 0.1
-    assert asked(on_engine(friction=2.0 * size, n=20)).verdict == "named"
+    assert 0.0 < size < 0.1 and asked(on_engine(friction=2.0 * size, n=20)).verdict == "named"
     assert asked(on_engine(friction=0.1 * size, n=20)).verdict == "none"
 
 
@@ -357,8 +354,7 @@ def test_windows_of_both_halves_count_alike_where_all_the_data_choose():
         return float((windows.mean((1, 2)) + np.mean((unminded / noise) ** 2)).sum())
 
     error, ahead = chosen(0, 1)
-    assert error == pytest.approx(summed(after))
-    assert chosen(1, 0) == pytest.approx((error, ahead))
+    assert error == pytest.approx(summed(after)) and chosen(1, 0) == pytest.approx((error, ahead))
     price = ahead - chosen(0, 1, ("tau_c", "mu"))[1]
     assert np.exp(price) * np.log(summed(before) / error) == pytest.approx(ahead + price)
 
@@ -384,8 +380,7 @@ def test_friction_that_changes_with_place_or_time_is_left_over(where, seed):
 
     found = remainder(missing, data, ("hinge",), seed=0)
 
-    assert found is not None
-    assert {"velocity", where} <= set(found.goes_with)
+    assert found is not None and {"velocity", where} <= set(found.goes_with)
 
 
 @each(("speed", 0.08, True), ("speed", 0.12, False), ("time", 0.03, True), ("time", 0.08, False))

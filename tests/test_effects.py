@@ -69,18 +69,6 @@ def test_the_whole_catalogue_at_null_changes_nothing(x64):
     )
 
 
-def test_effects_act_at_every_joint_and_actuator(x64):
-    plain, kinds = twins.make("DoublePendulum"), (effects.ViscousFriction, effects.TorqueGain)
-    twin = plain.extend(*(kind(place) for kind in kinds for place in range(2)))
-    start = twin.initial(jax.random.key(0), twin.params)._replace(v=jnp.ones(2))
-
-    speed = lambda params: twin.step(start, 0.1 * jnp.ones(2), params).v  # noqa: E731
-
-    slopes = jax.jit(jax.jacfwd(speed))(twin.params)
-
-    assert all(slopes[key].any() for key in twin.params if key not in plain.params)
-
-
 GROUPS = {
     slot: [effect for effect in ENTRIES if effect.__module__.endswith(slot)]
     for slot in ("joint", "position", "nameless", "transmission", "actuator", "sensor")

@@ -63,8 +63,7 @@ def test_an_end_becomes_one_of_the_other_kind_and_info_says_so(wrapper, flags, e
     found, infos = played(wrapper(Script(GOES_ON, flags)), 2)
     _, told = played(wrapper(Script(flags, told={"TimeLimit.truncated": not expected[1]})), 1)
 
-    assert found == [GOES_ON, expected]
-    assert infos == [{}, {said: True} if said else {}]
+    assert found == [GOES_ON, expected] and infos == [{}, {said: True} if said else {}]
     # The old entry for time-outs is set right where the end became another.
     assert told[0]["TimeLimit.truncated"] is (expected[1] == bool(said))
 
@@ -103,8 +102,7 @@ def test_the_remaining_time_falls_from_one_to_zero():
     np.testing.assert_array_equal([obs[-1] for obs in seen], remaining)
     assert all(flat.observation_space.contains(obs) for obs in seen)
     assert [obs["remaining_time"] for obs in told] == remaining and set(space) < set(told[0])
-    assert all(named.observation_space.contains(obs) for obs in told)
-    assert flat.reset()[0][-1] == 1.0
+    assert all(named.observation_space.contains(obs) for obs in told) and flat.reset()[0][-1] == 1.0
     assert TimeAware(TimeLimit(Script(GOES_ON), 7)).max_episode_steps == 7
 
 

@@ -85,16 +85,6 @@ def test_a_noise_matrix_lasts_over_as_many_collections_as_it_takes(compiled):
     assert misfit(slice(10, 30)) > 1e-3
 
 
-def test_noise_does_not_act_before_learning_starts_unless_it_is_told_to():
-    model = small("gsde_sac", learning_starts=100, train_freq=10).learn(10)
-    seen, taken = model.replay_buffer.observations[:10, 0], model.replay_buffer.actions[:10, 0]
-
-    explored = model.policy.scale_action(model.predict(seen)[0])
-
-    assert not np.allclose(explored, taken, atol=1e-5)
-    assert model._n_updates == 0
-
-
 def test_the_optimistic_actor_of_bro_explores_by_gsde_too():
     model = small("bro", use_sde=True, std_multiplier=0.5)
     policy, recipe = model.policy, model.policy.recipe

@@ -106,8 +106,7 @@ def test_once_corrected_nothing_changes_any_more(found, heavier):
     own = wishes(twins.make("PendulumReal"))
     again = correct(found.twin, heavier, own, 0.0, learn_force=False, n_new=1000)
 
-    assert not again.changed
-    assert again.error_calibrated <= found.error_calibrated * 1.001
+    assert not again.changed and again.error_calibrated <= found.error_calibrated * 1.001
 
 
 def test_a_system_that_friction_holds_fast_is_not_taken_for_a_heavier_one():
@@ -150,8 +149,7 @@ def test_what_has_no_parameter_is_left_to_the_learned_force():
 
     found = corrected(twin, data, residual=True, suspected=())
 
-    assert found.beta > 0.0
-    assert force_of(found.twin) is not None
+    assert found.beta > 0.0 and force_of(found.twin) is not None
     assert found.error_hybrid < 0.9 * found.error_calibrated < 0.9 * found.error_twin
 
 
@@ -166,8 +164,7 @@ def test_an_attached_force_that_no_longer_helps_is_switched_off(heavier):
 
     ((key, _),) = [force_of(found.twin)]
     assert found.beta == 0.0 and found.twin.values[f"{key}.share"] == 0.0
-    assert found.error_hybrid > 1.5 * found.error_calibrated
-    assert found.changed
+    assert found.error_hybrid > 1.5 * found.error_calibrated and found.changed
 
 
 def test_data_from_before_a_change_are_forgotten():
@@ -190,8 +187,7 @@ def test_a_wrong_twin_is_seen_though_the_system_mostly_rests():
 
     found = corrected(twins.make("PendulumReal"), Trajectories.concatenate([resting, moving]))
 
-    assert found.changed
-    assert found.error_calibrated < 0.1 * found.error_twin
+    assert found.changed and found.error_calibrated < 0.1 * found.error_twin
 
 
 @pytest.mark.expensive
@@ -245,8 +241,7 @@ def test_what_a_diagnosis_finds_is_attached_unless_the_twin_has_a_parameter_for_
     before = model.twin
     found.findings = findings[1:]
     model.extend_model()
-    assert model.twin is before
-    assert small("hds", REAL).extend_model() is None
+    assert model.twin is before and small("hds", REAL).extend_model() is None
 
 
 @pytest.mark.expensive  # a whole diagnosis
@@ -342,8 +337,7 @@ def test_a_file_corrects_the_model_and_travels_with_it(tmp_path, heavier, monkey
 
     for name, values in columns(model).items():
         np.testing.assert_array_equal(columns(loaded)[name], values, err_msg=name)
-    assert loaded.twin.values == model.twin.values
-    assert loaded.nominal == model.nominal
+    assert loaded.twin.values == model.twin.values and loaded.nominal == model.nominal
     assert loaded.measured.trajectories().n_steps == heavier.n_steps + 50
 
 

@@ -467,8 +467,7 @@ def test_the_maps_on_the_page_about_logs_are_understood():
     page = Path(__file__).parent.parent / "docs/guide/reading_logs.md"
     maps = re.findall(r"^```yml\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
 
-    assert len(maps) == 9
-    assert all(columns_from(yaml.safe_load(text)).obs for text in maps)
+    assert len(maps) == 9 and all(columns_from(yaml.safe_load(text)).obs for text in maps)
     table = page.read_text().partition("## Units")[2].partition("Prefixes")[0]
     units = re.findall(r"`([^`]+)`", table.partition("|---|")[2])
     assert len(units) > 30

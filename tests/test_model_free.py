@@ -84,14 +84,8 @@ def test_arguments_that_say_nothing_are_warned_of(name, arguments, message):
 def test_spaces_that_cannot_be_learned_in_are_refused(given, message):
     with pytest.raises(EnvironmentMismatchError, match=message):
         DroQ(env=AnySpaces(**given))
-
-
-def test_returns_of_several_steps_need_observations_that_are_no_dictionary():
     with pytest.raises(EnvironmentMismatchError, match="no Dict observation spaces"):
         DroQ("MultiInputPolicy", AnySpaces(CHOICES, ACT), n_steps=3)
-
-
-def test_a_choice_that_there_is_not_gets_no_action():
     with pytest.raises(ValueError, match="none of the choices"):
         small("droq", AnySpaces(spaces.Discrete(4, start=2), ACT)).predict(np.array(1))
 

@@ -67,17 +67,6 @@ def test_a_name_within_a_longer_one_is_another_joint():
     assert match(twin, prefixed).obs == tuple(reversed(prefixed))
 
 
-def test_targets_are_the_commands_of_servos():
-    twin = twins.from_mujoco(robots.quadruped(), observe="q")
-    legs = [f"{leg}_{part}" for leg in ("FR", "FL") for part in ("hip", "thigh", "calf")]
-    columns = [f"{name}_{kind}" for kind in ("target", "position") for name in legs]
-
-    found = match(twin, shuffled(columns))
-
-    assert found.actions[:2] == ("FL_hip_target", "FL_thigh_target")
-    assert found.obs[:2] == ("FL_hip_position", "FL_thigh_position")
-
-
 def test_data_are_put_into_the_order_of_the_twin():
     obs = np.arange(12.0).reshape(2, 6)
     columns = [f"{name}_{kind}" for kind in ("vel", "pos") for name in reversed(NAMES)]

@@ -120,8 +120,7 @@ def test_its_corrected_file_predicts_held_out_seconds_as_well_as_the_twin(ur10, 
     ours, before = (error(of(twin)[:, 1:, :6]) for twin in (corrected, nominal))
     theirs = error(np.array([stepped(k) for k in begins]))
 
-    assert ours < 0.5 < before
-    assert theirs < 1.1 * ours
+    assert ours < 0.5 < before and theirs < 1.1 * ours
 
 
 GO2 = UR10.parent / "go2"

@@ -72,8 +72,7 @@ def test_it_turns_with_a_hinge_and_is_bounded(x64):
 
     once = force.forces(q, v, u, own)
     np.testing.assert_allclose(force.forces(q + 2.0 * jnp.pi, v, u, own), once, rtol=1e-12)
-    assert np.abs(force.forces(q, 1e9 * v, u, own)).max() <= 3.0
-    assert once.shape == (5, 1)
+    assert np.abs(force.forces(q, 1e9 * v, u, own)).max() <= 3.0 and once.shape == (5, 1)
     assert force.disagreement(q, v, u, own) > 0.0
 
 
@@ -87,8 +86,7 @@ def test_caution_makes_disagreement_cost_something():
         t.planning_reward(state, action, state, t.params) - t.reward(state, action, state, t.params)
         for t in (bold, careful)
     ]
-    assert paid[0] == 0.0
-    assert paid[1] < 0.0
+    assert paid[0] == 0.0 and paid[1] < 0.0
 
 
 def test_it_survives_a_file_and_its_spec_with_its_tensors(tmp_path):
@@ -130,8 +128,7 @@ def test_it_learns_a_friction_that_the_twin_lacks():
 
     found = fit_residual(twin, data, **SMALL)
 
-    assert found.accepted
-    assert found.twin.values[f"{found.key}.share"] == 1.0
+    assert found.accepted and found.twin.values[f"{found.key}.share"] == 1.0
     ratio = np.sqrt(np.mean(found.error_after**2) / np.mean(found.error_before**2))
     assert ratio < 0.5
     # Against the direction of motion.

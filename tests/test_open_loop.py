@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 
 from sb3_hds import OpenLoop
 from sb3_hds.algos import gait_search
-from sb3_hds.algos.gait_space import Constants, GaitSpace
+from sb3_hds.algos.gait_space import Constants
 from sb3_hds.core.oscillators import Gait, target_at
 from sb3_hds.envs import TwinVecEnv
 from sb3_hds.errors import EnvironmentMismatchError
@@ -236,22 +236,6 @@ def test_legs_that_do_the_same_are_searched_as_one_each_ahead_by_its_lead():
     np.testing.assert_allclose(now[6:8], now[:2], atol=1e-4)
 
 
-def test_points_and_gaits_are_two_names_of_the_same():
-    space = GaitSpace(
-        amplitude=np.array([1.0, 2.0]),
-        offset=np.array([[-0.5, 0.5], [0.0, 1.0]]),
-        frequency=(0.5, 4.0),
-        kp=3.0,
-        kd=0.2,
-        gain_factor=4.0,
-    )
-    point = np.random.default_rng(0).normal(size=space.dim)
-    point[4] = 0.3  # turns, from 0 to 1
-
-    np.testing.assert_allclose(space.encode(space.decode(point)), point, atol=1e-5)
-    assert space.dim == 2 + 2 + 1 + 2 + 2
-
-
 @each(
     *(("population_size", 1), ("n_resets", 0), ("frequency", [2.0, 1.0]), ("dt", 0.0)),
     *(("gain_factor", 0.5), ("control", "maybe"), ("kp", -1.0), ("gait", "gallop")),
@@ -283,8 +267,7 @@ def test_where_single_copies_cannot_be_reset_whole_episodes_are_run(make, steps)
 
     model.learn(2 * steps + 2)
 
-    assert int(model.policy.search.generation) == 1
-    assert model.num_timesteps == 2 * steps + 2
+    assert int(model.policy.search.generation) == 1 and model.num_timesteps == 2 * steps + 2
 
 
 def test_a_reward_that_is_not_finite_is_an_error_and_no_result():

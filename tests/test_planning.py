@@ -189,8 +189,7 @@ def test_a_plan_is_never_worse_within_limits_and_a_start_that_is_no_number_harms
     assert jnp.all((plan.value >= before - 1e-3)[good])
     assert jnp.mean((plan.value > before)[good]) > 0.9
     assert plan.value[7] == -jnp.inf and jnp.all(jnp.isfinite(plan.controls))
-    assert jnp.max(jnp.abs(beyond.controls)) <= 1.0
-    assert jnp.any(jnp.abs(beyond.controls) < 1.0)
+    assert jnp.max(jnp.abs(beyond.controls)) <= 1.0 and jnp.any(jnp.abs(beyond.controls) < 1.0)
 
 
 def test_after_an_end_nothing_counts_and_shifted_rewards_shift_the_objective(x64):
@@ -203,8 +202,7 @@ def test_after_an_end_nothing_counts_and_shifted_rewards_shift_the_objective(x64
     expansion = planning.expand(plain, plan)
 
     end = int(jnp.argmin(plan.alive))
-    assert not plan.alive[-1]
-    assert plan.value == pytest.approx(sum(discount**t for t in range(end)))
+    assert not plan.alive[-1] and plan.value == pytest.approx(sum(discount**t for t in range(end)))
     difference = plan.value - planning.simulate(shifted, start, controls).value
     assert difference == pytest.approx(offset / (1.0 - discount))
     alone = planning.simulate(dataclasses.replace(shifted, shift_ends=False), start, controls).value

@@ -102,6 +102,7 @@ def test_one_motor_leaves_the_other_joint_alone(x64):
 
 
 ROD = {"mass": 0.2, "com": 0.2, "inertia": 1e-3}
+LOGGED = {"commands": "goal, enable, gain"}
 MOTOR = {"torque_constant": 0.5, "resistance": 2.0}
 
 
@@ -143,24 +144,15 @@ def test_one_joint_moves_as_its_equation_says(name, settings, acceleration, x64)
     np.testing.assert_allclose(replayed(twin, [0.4], actions), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_a_servo_that_is_switched_off_swings_freely(x64):
-    off = twins.make("ServoPendulum", commands="goal, enable")
-    length, mass, armature = 0.1, 0.5, 0.002
-    free = twins.make("FreePendulum", mass=mass, com=length, inertia=armature, dt=off.dt)
+def test_a_servo_is_switched_off_by_a_command_and_its_gain_may_be_another(x64):
+    logged, plain = (twins.make("ServoPendulum", **how) for how in (LOGGED, {"kp": 123.0}))
+    free = twins.make("FreePendulum", mass=0.5, com=0.1, inertia=0.002, dt=plain.dt)
+    goals, ones = torques(40, 1, 1.0), np.ones((40, 1))
 
-    found = replayed(off, [0.5], np.tile([2.0, 0.0], (50, 1)))
+    on, off = (replayed(logged, [0.5], np.c_[goals, on * ones, 123.0 * ones]) for on in (1, 0))
 
-    np.testing.assert_allclose(found, replayed(free, [0.5], np.zeros((50, 0))), rtol=1e-9)
-
-
-def test_a_logged_gain_takes_the_place_of_the_parameter(x64):
-    plain = twins.make("ServoPendulum", kp=123.0)
-    logged = twins.make("ServoPendulum", commands="goal, enable, gain")
-    goals = torques(40, 1, 1.0)
-
-    found = replayed(logged, [0.1], np.column_stack([goals, np.ones(40), np.full(40, 123.0)]))
-
-    np.testing.assert_allclose(found, replayed(plain, [0.1], goals), rtol=1e-9)
+    np.testing.assert_allclose(on, replayed(plain, [0.5], goals), rtol=1e-9)
+    np.testing.assert_allclose(off, replayed(free, [0.5], np.zeros((40, 0))), rtol=1e-9)
     assert "kp" in plain.parameters and "kp" not in logged.parameters
 
 

@@ -47,8 +47,7 @@ def test_they_matter_where_the_loop_sees_what_the_policy_sees(swimmer):
         swimmer, short, perturbations=kinds, n_episodes=2, encoders="observation", progress=False
     )
 
-    assert found.share("noise 0.5") < 0.9
-    assert swimmer.policy.read_states is None
+    assert found.share("noise 0.5") < 0.9 and swimmer.policy.read_states is None
 
 
 def test_a_table_has_shares_of_the_return_without_perturbation_where_they_mean_something():

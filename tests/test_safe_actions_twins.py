@@ -206,8 +206,7 @@ def test_a_policy_trained_behind_a_layer_that_does_not_bind_solves_the_task(guar
             total += reward
 
     # Who stays where it begins gets -50 (0.3^2 + 0.45^2 / 3) = -8; the best of all, about -0.2.
-    assert total / 20 > -0.8
-    assert before.n > 0 and after.n == 0
+    assert total / 20 > -0.8 and before.n > 0 and after.n == 0
 
 
 @pytest.mark.expensive

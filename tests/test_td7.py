@@ -48,8 +48,7 @@ def test_each_transition_has_its_priority_also_where_old_ones_are_replaced():
     everything = np.arange(4).repeat(2), np.tile([0, 1], 4)
     buffer.set_priorities(*everything, np.where(np.arange(8) == 5, 2.0, 0.0))
     steps, copies = buffer.draw(10)
-    assert set(steps) == {2} and set(copies) == {1}
-    assert buffer.highest == 5.0
+    assert set(steps) == {2} and set(copies) == {1} and buffer.highest == 5.0
     buffer.forget_highest()
     assert buffer.highest == 2.0
 
@@ -207,8 +206,7 @@ def test_a_policy_of_td7_is_kept_only_if_it_did_no_worse():
 
     for earned, kept, best in ((-500.0, False, -300.0), (-100.0, True, -100.0)):
         model._finished = [(earned, 200)]
-        assert model._assessed() == 200
-        assert (model.policy.learner.checkpoint is not begun) == kept
+        assert model._assessed() == 200 and (model.policy.learner.checkpoint is not begun) == kept
         assert model.best_worst_return == best
 
 
@@ -220,5 +218,4 @@ def test_td7_assesses_by_more_episodes_once_it_has_gone_beyond_the_mark():
         accounts.append((model._assessed(), model.best_worst_return))
 
     # As in the authors' code: the update that would be the 401st scales the best assessment.
-    assert accounts == [(200, -100.0), (200, -90.0), (0, -90.0)]
-    assert model.assessed_episodes == 1
+    assert accounts == [(200, -100.0), (200, -90.0), (0, -90.0)] and model.assessed_episodes == 1

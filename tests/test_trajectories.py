@@ -144,8 +144,7 @@ def test_windows_lie_inside_real_data_and_know_where_they_are_from():
 
     windows = data.windows(3, stride=2)
 
-    assert windows.origin.tolist() == [0, 1, 1, 1]
-    assert windows.conditions == ("a", "b", "b", "b")
+    assert windows.origin.tolist() == [0, 1, 1, 1] and windows.conditions == ("a", "b", "b", "b")
     assert windows.mask.all() and windows.actions.shape == (4, 3, 1)
     for window, start in ((1, 0), (2, 2), (3, 4)):
         np.testing.assert_array_equal(windows.obs[window], data.obs[1, start : start + 4])

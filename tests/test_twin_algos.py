@@ -118,8 +118,7 @@ def test_samples_that_are_not_finite_are_dropped_and_counted():
 
     dropped = lines.column("pretrain/dropped_samples")
     # A quarter of the starts lies right of 0.5 m; there are 8 rollouts of 4 steps.
-    assert 0 < sum(dropped) < 10 * 8 * 4 and max(dropped) < 8 * 4
-    assert finite(model)
+    assert 0 < sum(dropped) < 10 * 8 * 4 and max(dropped) < 8 * 4 and finite(model)
 
 
 # A single step of infinite length is noticed by the weights alone: its loss was finite.
@@ -276,8 +275,7 @@ def test_what_an_end_is_worth_has_a_switch():
         worth[shifted] = float(problem.value_when_terminated)
         best = float(problem.reward_offset * problem.reward_scale)
     # A reward of zero for ever, counted from the best one; or nothing.
-    assert worth == {True: pytest.approx(-best / (1.0 - model.gamma)), False: 0.0}
-    assert best > 0.0
+    assert worth == {True: pytest.approx(-best / (1.0 - model.gamma)), False: 0.0} and best > 0.0
 
 
 def test_statistics_of_a_normalised_environment_are_of_whole_episodes_and_stay_if_frozen():

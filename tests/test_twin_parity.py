@@ -148,8 +148,7 @@ def test_pendulum_follows_gymnasium(x64):
             state, _, twin_reward, terminated = simulate(state, jnp.asarray(torque))
             # Rounding of 1e-16, grown by the upper equilibrium over 10 s.
             np.testing.assert_allclose(np.r_[state.q, state.v], env.state, rtol=0.0, atol=1e-11)
-            assert twin_reward == pytest.approx(reward, abs=1e-9)
-            assert not terminated
+            assert twin_reward == pytest.approx(reward, abs=1e-9) and not terminated
 
 
 def test_mountain_car_follows_gymnasium(x64):
@@ -170,14 +169,12 @@ def test_mountain_car_follows_gymnasium(x64):
             # computes the sums in single precision where it clips.
             np.testing.assert_allclose(after.q, env.state[:1], rtol=0.0, atol=2e-7)
             np.testing.assert_allclose(after.v, env.state[1:], rtol=0.0, atol=1e-8)
-            assert terminated == twin_terminated
-            assert twin_reward == pytest.approx(reward, rel=1e-12)
+            assert terminated == twin_terminated and twin_reward == pytest.approx(reward, rel=1e-12)
             n_terminated += terminated
             n_walls += after.q[0] == -1.2
             if terminated:
                 env.reset()
-    assert n_terminated >= 3
-    assert n_walls >= 1
+    assert n_terminated >= 3 and n_walls >= 1
 
 
 def test_acrobot_follows_gymnasium(x64):

@@ -278,8 +278,7 @@ def test_droq_drops_out_in_every_pass_of_its_critics_each_with_a_mask_of_its_own
 
     # Three passes of two critics in each update; masks of 24 entries agree by chance in none.
     kept = [mask for both in drawn.values() for mask in both]
-    assert len(kept) == 6 * N_UPDATES
-    assert len({mask.tobytes() for mask in kept}) == len(kept)
+    assert len(kept) == 6 * N_UPDATES and len({mask.tobytes() for mask in kept}) == len(kept)
 
 
 def _after_dropout(critic: Any, obs: Any, action: Any, w: Weights, key: Any) -> Any:

@@ -67,8 +67,7 @@ def load_yml(algo: str) -> dict:
 
 
 def test_a_stand_in_is_called_loaded_and_read_like_the_class(walker):
-    assert walker.__name__ == "Walker"
-    assert walker("MlpPolicy", stride=0.7).stride == 0.7
+    assert walker.__name__ == "Walker" and walker("MlpPolicy", stride=0.7).stride == 0.7
     assert walker.load("agent.zip", custom_objects={}, stride=0.7).stride == 0.7
     # A single argument of the policy is not asked for when one is loaded.
     assert walker.load("agent.zip", **{"policy_kwargs.net_arch": [4]}).stride == 0.5
@@ -83,8 +82,7 @@ def test_an_algorithm_is_known_to_the_zoo_unless_its_id_is_taken():
 
     tables.EXTENSIONS["rl_zoo3.utils"](zoo)
 
-    assert zoo.ALGOS["hds"] == "somebody else's"
-    assert isinstance(zoo.ALGOS["pods"], LazyAlgorithm)
+    assert zoo.ALGOS["hds"] == "somebody else's" and isinstance(zoo.ALGOS["pods"], LazyAlgorithm)
     assert not set(tables.ALGORITHMS) & STOCK
     assert {algo: each.__name__ for algo, each in algos.ALL.items()} == tables.ALGORITHMS
     assert set(tables.ALGORITHMS.values()) <= set(sb3_hds.__all__)
@@ -279,8 +277,7 @@ def test_a_zoo_is_extended_before_and_after_it_is_imported(tmp_path, before):
 
     assert done.returncode == 0, done.stderr
     ours, users, stock, names = done.stdout.splitlines()
-    assert ours == str(tables.hyperparams_file("hds"))
-    assert users == "mine.yml" and stock == "None"
+    assert ours == str(tables.hyperparams_file("hds")) and users == "mine.yml" and stock == "None"
     # Known by name only: neither jax nor torch is imported before an algorithm is used.
     assert names == f"{['sac', *tables.ALGORITHMS]} False False"
 
