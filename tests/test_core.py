@@ -56,10 +56,6 @@ class Slider(Mass):
         return state.q[0] > self.end
 
 
-def at_rest(speed=0.0):
-    return State(jnp.zeros(1), jnp.full(1, speed), {})
-
-
 def kilograms(**settings):
     return Parameter(**{"null": 0.0, "scale": 1.0, "unit": "kg"} | settings)
 
@@ -283,8 +279,9 @@ def test_a_rollout_is_a_loop_of_steps(x64):
 def test_rewards_stop_with_the_step_that_terminates(x64):
     # At 1 m/s and 0.1 s the mass passes 0.95 m in the tenth step.
     twin, over = Slider(), State(jnp.ones(1), jnp.zeros(1), {})
-    result = rollout(twin, twin.params, at_rest(1.0), jnp.zeros((15, 1)))
-    planned = rollout(twin, twin.params, at_rest(1.0), jnp.zeros((5, 1)), twin.planning_reward)
+    begin = State(jnp.zeros(1), jnp.ones(1), {})
+    result = rollout(twin, twin.params, begin, jnp.zeros((15, 1)))
+    planned = rollout(twin, twin.params, begin, jnp.zeros((5, 1)), twin.planning_reward)
     ended = rollout(twin, twin.params, over, jnp.ones((3, 1)))
 
     assert result.rewards.tolist() == [1.0] * 10 + [0.0] * 5

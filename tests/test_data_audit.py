@@ -46,9 +46,8 @@ def changed(data, change):
     return Trajectories.from_arrays(obs, actions, dt=data.dt)
 
 
-def alone(obs, seed=1):
-    """One recording, whose command is noise."""
-    command = np.random.default_rng(seed).standard_normal((len(obs) - 1, 1))
+def alone(obs):
+    command = np.random.default_rng(1).standard_normal((len(obs) - 1, 1))
     return Trajectories.from_arrays([obs], [command], dt=0.01)
 
 
@@ -272,20 +271,14 @@ def test_what_motion_makes_is_no_outlier_and_no_glitch(what):
     assert not kinds(audit(changed(pendulum_data(), shape), KNOWN)) & {"Outliers", "Glitches"}
 
 
-def late(data, channel, lag):
-    """A channel that comes late by a whole number of samples; the ends are cut off."""
-
-    def shift(_, obs, actions):
-        k = np.arange(10, len(obs) - 10)
-        obs[k, channel] = np.copy(obs[:, channel])[k - lag]
-        return obs[k], actions[10 : len(obs) - 11]
-
-    return changed(data, shift)
-
-
 @pytest.mark.parametrize("lag", [-3, 1])
 def test_a_velocity_that_comes_late_or_early_is_found_and_shifted(data, lag):
-    recorded, names = late(data, 2, lag), channels_of("PendulumReal")
+    def shift(_, obs, actions):
+        k = np.arange(10, len(obs) - 10)
+        obs[k, 2] = np.copy(obs[:, 2])[k - lag]
+        return obs[k], actions[10 : len(obs) - 11]
+
+    recorded, names = changed(data, shift), channels_of("PendulumReal")
 
     found = audit(recorded, names)
     corrected = found.corrected(recorded)
@@ -409,9 +402,6 @@ def test_it_prints_in_80_columns_and_is_plain_json(data):
     plain = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert {f["kind"] for f in plain["findings"]} == kinds(found) and len(kinds(found)) == 2
     assert plain["channels"][2]["unit"] == "rad/s" and plain["findings"][0]["text"]
-
-
-def test_every_kind_of_finding_is_a_sentence_with_a_remedy():
     for kind in Finding.__subclasses__():
         assert dataclasses.is_dataclass(kind) and kind.remedy.endswith(".")
         assert kind.sentence is not Finding.sentence
@@ -491,9 +481,7 @@ def degrees(swings):
 
 
 @pytest.mark.parametrize("changes", [{}, {"mass": 0.6, "damping": 0.02}])
-def test_an_angle_in_degrees_is_refused_if_the_twin_says_so_whatever_else_is_wrong(
-    changes, swings, degrees, tmp_path
-):
+def test_an_angle_in_degrees_is_refused_if_the_twin_says_so(changes, swings, degrees, tmp_path):
     twin = twins.make("FreePendulum", **PENDULUM | changes)
 
     found = audit(degrees, twin=twin)
@@ -504,11 +492,8 @@ def test_an_angle_in_degrees_is_refused_if_the_twin_says_so_whatever_else_is_wro
     # Of a log, the column.
     read = logged(degrees, tmp_path / "log.csv")
     assert "{column: x0, unit: deg}" in audit(read, twin=twin).reason
-
-
-def test_an_angle_in_degrees_under_a_twin_that_is_all_wrong_is_a_caveat(degrees):
+    # Under a twin that is all wrong, it is a caveat.
     found = audit(degrees, ["angle"], twins.make("FreePendulum", **PENDULUM, zero="up"))
-
     assert found.usable and kinds(found) == {"LikelyUnits"}
     assert "'angle' spans" in str(found) and "degrees" in str(found.findings[0])
 
@@ -557,12 +542,9 @@ def test_a_backward_difference_is_recognised_and_offered_as_a_correction(digits)
     assert found.velocity_shift == {"speed": 0.005} and "-5 ms" in found.corrections[0]
     central = np.gradient(better.obs[..., 0], 0.01, axis=1)[:, 1:-1]
     np.testing.assert_allclose(better.obs[:, 1:-1, 1], central, atol=0.02)
-
-
-def test_a_speed_that_a_sensor_measures_half_a_sample_late_is_no_backward_difference():
+    # A speed that a sensor measures half a sample late is none.
     rng, t = np.random.default_rng(0), 0.01 * np.arange(1000)
     obs = np.stack([np.sin(3.0 * t), 3.0 * np.cos(3.0 * (t - 0.005))], 1)
-
     for noise in ([0.0, 0.0], [1e-4, 3e-2]):
         seen = obs + noise * rng.standard_normal(obs.shape)
         assert kinds(audit(alone(seen), KNOWN)) <= {"PoorExcitation"}

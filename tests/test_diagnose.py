@@ -51,13 +51,9 @@ def expensive(*values):
     return pytest.param(*values, marks=pytest.mark.expensive)
 
 
-def late_and_rubbing():
-    return asked(on_engine(friction=0.1, delay=0.05), budget="quick")
-
-
 @pytest.fixture(scope="module")
 def both():
-    return late_and_rubbing()
+    return asked(on_engine(friction=0.1, delay=0.05), budget="quick")
 
 
 def test_two_causes_are_named_with_their_sizes_and_the_intervals_of_a_t_test(both):
@@ -234,7 +230,8 @@ def test_what_would_have_been_seen_is_said(both):
 
 @pytest.mark.expensive
 def test_the_same_seed_tells_the_same(both):
-    assert late_and_rubbing().to_dict() == both.to_dict()
+    again = asked(on_engine(friction=0.1, delay=0.05), budget="quick")
+    assert again.to_dict() == both.to_dict()
 
 
 def test_both_halves_see_every_condition_and_few_recordings_are_cut_into_stretches():

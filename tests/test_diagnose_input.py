@@ -12,8 +12,6 @@ from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.calibrate import check_fits
 
 FRICTION = (effects.ViscousFriction, effects.CoulombFriction)
-
-
 TWIN = twins.make("FreePendulum", driven=True, dt=0.02)
 
 

@@ -26,7 +26,6 @@ from sb3_hds.effects import (
 
 
 def torque_of(effect, v=0.0, q=0.0, actuator=0.0, load=0.0, inertia=1.0, h=1e-3):
-    """:return: what an effect with values does to a joint [N m]"""
     joint = JointMoment(*map(jnp.asarray, (q, v, actuator, load, inertia)), h)
     return float(effect.torque(joint, (), effect.values))
 

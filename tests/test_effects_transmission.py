@@ -19,7 +19,6 @@ every_transmission = pytest.mark.parametrize(
 
 
 def lead_of(states, key):
-    """Lead of the motor over the load, and its speed."""
     memory = states.memory[key]
     return np.asarray(memory["lead"]), np.asarray(memory["speed"])
 

@@ -43,7 +43,6 @@ class Script(AnySpaces):
 
 
 def played(env, n):
-    """:return: flags and infos of ``n`` steps"""
     env.reset(seed=0)
     steps = [env.step(STILL) for _ in range(n)]
     assert [step[1] for step in steps] == list(range(1, n + 1))

@@ -92,13 +92,9 @@ def test_a_sign_of_degrees_is_read_in_any_encoding(encoding, tmp_path):
 
     np.testing.assert_allclose(data.obs[0, :, 0], [np.pi, -np.pi / 2.0])
     assert data.report.units == ("rad",) and data.report.action_units == ("N",)
-
-
-def test_decimal_commas_that_come_late_are_seen(tmp_path):
+    # Decimal commas may come late.
     lines = [f"{i};0;0" for i in range(100)] + [f"{i};{i},5;0" for i in range(100, 200)]
-
-    data = load(tmp_path / "log.csv", COLUMNS, "t;q;u\n" + "\n".join(lines))
-
+    data = load(tmp_path / "log.csv", COLUMNS, "\n".join(["t;q;u", *lines]))
     assert data.obs[0, 150, 0] == 150.5
 
 
@@ -420,8 +416,8 @@ def test_header_stamps_count_more_than_the_time_of_recording(tmp_path):
     assert (shortest, longest) == pytest.approx((0.006, 0.014))
 
 
-def described(capsys, *words):
-    assert cli.main(["columns", *map(str, words)]) == 0
+def described(capsys, path):
+    assert cli.main(["columns", str(path)]) == 0
     return capsys.readouterr().out
 
 

@@ -27,8 +27,7 @@ from sb3_hds.twins import Pendulum
 from sb3_hds.wrappers import ActionDelay, ActionShield
 
 
-class Tinted(gymnasium.Wrapper):
-    """Somebody's own, which Gymnasium cannot record."""
+class Tinted(gymnasium.Wrapper): ...
 
 
 class Monitor(gymnasium.Wrapper):

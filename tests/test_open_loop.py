@@ -71,9 +71,7 @@ def swimmer(env="Swimmer-v5", **settings):
 
 
 def hidden():
-    """Shows nothing of the joints."""
-    env = gymnasium.make("Swimmer-v5", max_episode_steps=50)
-    nothing = spaces.Box(0.0, 0.0, (1,))
+    env, nothing = gymnasium.make("Swimmer-v5", max_episode_steps=50), spaces.Box(0.0, 0.0, (1,))
     return TransformObservation(env, lambda _: np.zeros(1, np.float32), nothing)
 
 

@@ -33,8 +33,6 @@ class Rail(Mass):
 
 
 class Ahead(Rail):
-    """Rewarded for where a step ends."""
-
     name = "Ahead"
 
     def reward(self, state, action, next_state, params):

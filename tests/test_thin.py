@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from sb3_hds.algos.thin import Hidden, Last, hidden_product, product
 

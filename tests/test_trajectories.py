@@ -117,6 +117,8 @@ def test_indexing_gives_trajectories_padded_no_longer_than_needed():
     np.testing.assert_array_equal(some.episode(1)[0], data.episode(0)[0])
     assert rest.lengths.tolist() == [7, 5]
     assert_same(data[data.lengths > 4], rest)
+    # Put together again, recordings stay apart.
+    assert_same(Trajectories.concatenate([data[:1], data[1:]]), data)
     assert [len(part) for part in data] == [1, 1, 1]
     with pytest.raises(IndexError):
         data[3]
@@ -169,16 +171,6 @@ def test_a_split_shares_no_recording_or_no_condition_and_depends_on_the_seed_alo
     assert len(light) + len(heavy) == len(windows)
     for fraction in (0.01, 0.99):
         assert min(map(len, windows.split(fraction=fraction))) >= 1
-
-
-def test_concatenation_keeps_recordings_apart():
-    one, other = data_of(3, 4, conditions="a"), data_of(6, conditions="b", seed=1)
-
-    joined = Trajectories.concatenate([one, other])
-
-    assert joined.lengths.tolist() == [3, 4, 6]
-    assert (joined.conditions, joined.origin.tolist()) == (("a", "a", "b"), [0, 1, 2])
-    np.testing.assert_array_equal(joined.episode(2)[0], other.episode(0)[0])
 
 
 def test_upsampling_interpolates_observations_and_holds_actions():

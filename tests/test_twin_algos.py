@@ -35,15 +35,11 @@ class Lossy(PointMass):
 
 
 class Aimless(PointMass):
-    """Has no task."""
-
     name = "Aimless"
     reward = Twin.reward
 
 
 class Flat(PointMass):
-    """Has a reward without a gradient, and no surrogate."""
-
     name = "Flat"
     reward_has_gradient = False
 

@@ -67,7 +67,6 @@ def begun(name: str, policy_kwargs: dict[str, Any] | None = None, **arguments: A
 
 
 def plain(tree: Any) -> Any:
-    """:return: writable arrays of NumPy"""
     return jax.tree.map(lambda leaf: np.array(leaf, np.float64), tree)
 
 
@@ -103,7 +102,6 @@ class Keys(NamedTuple):
 
 
 def keys_of(learner: Any) -> Iterator[Keys]:
-    """:return: of one update after the other"""
     key = learner.key
     while True:
         key, critic_key, actor_key = jax.random.split(key, 3)
@@ -141,7 +139,6 @@ class Soft:
         self.keys, self.n, self.report = keys_of(learner), 0, {}
 
     def values(self, critic: Weights, obs: np.ndarray, action: np.ndarray, key: Any) -> np.ndarray:
-        """:param key: of dropout masks, where there are some"""
         both = np.concatenate([obs, action], -1)
         each = [member(critic, i) for i in range(len(critic["Dense_0"]["kernel"]))]
         return np.stack([dense(w["Dense_0"], self.body(w["body"], both)) for w in each])
@@ -193,8 +190,7 @@ class Soft:
         nearer = lambda old, new: (1.0 - KNOBS.tau) * old + KNOBS.tau * new  # noqa: E731
         self.target = jax.tree.map(nearer, self.target, self.critic)
 
-    def explore(self, batch: Batch, key: Any) -> None:
-        """What follows the actor."""
+    def explore(self, batch: Batch, key: Any) -> None: ...
 
 
 def check(recipe, learner, expected, seen=lambda obs: obs, n=N_UPDATES, seed=0) -> Any:
