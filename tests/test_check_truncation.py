@@ -28,14 +28,7 @@ every_mode = pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mod
 
 
 class Drawn(AnySpaces):
-    """
-    Observations that are drawn; an episode fails in each step with the same probability.
-
-    :param failing: the probability
-    :param limit: steps after which it calls itself terminated
-    :param how: in which the limit is told: ``"terminated"``, ``"truncated"``, or ``"info"`` (a
-        termination with ``TimeLimit.truncated``)
-    """
+    """Fails by chance; its limit is told as an end, as a truncation or in ``info``."""
 
     def __init__(self, failing: float = 0.0, limit: int | None = None, how: str = "terminated"):
         super().__init__()
@@ -51,14 +44,7 @@ class Drawn(AnySpaces):
 
 
 class Foreign(VecEnvWrapper):
-    """
-    Somebody's own ``VecEnv``.
-
-    :param flag: whether ``TimeLimit.truncated`` is told ``"always"``, only ``"where true"``, or
-        ``"never"``
-    :param last: which ``terminal_observation``: ``"right"``, ``"none"``, that of the ``"next"``
-        episode, or ``"all"`` rows
-    """
+    """Somebody's own ``VecEnv``: how it flags time-outs, and what it tells last."""
 
     def __init__(self, failing: float = 0.0, flag: str = "always", last: str = "right"):
         super().__init__(DummyVecEnv([lambda: limited(failing)] * 2))

@@ -28,13 +28,7 @@ class PatchyFriction(JointEffect):
 
 
 def windows(rng, change=0.0, shift=0.0):
-    """
-    Curvatures and scores of windows whose errors are a linear function of three parameters.
-
-    :param change: of the one in question, from one end of a quantity to the other, in standard
-        errors of that parameter
-    :param shift: of all three, likewise
-    """
+    """Of three linear parameters, all off and one changing, in standard errors of that one."""
     slopes = rng.standard_normal((N_WINDOWS, 10, N_FITTED)) * rng.gamma(1.0, 1.0, (N_WINDOWS, 1, 1))
     curvature = np.einsum("nif,nig->nfg", slopes, slopes)
     stderr = 1.0 / np.sqrt(curvature[:, SIZE, SIZE].sum())

@@ -80,10 +80,7 @@ GROUPS["sensor"].append(effects.Saturation)
 
 @pytest.mark.parametrize("group", GROUPS)
 def test_derivatives_are_those_of_differences_in_both_modes_at_null_and_off_it(group):
-    """
-    At rest without a command and in motion, of what a few steps lead to, by all that they depend
-    on. Searches begin at null; where that is a bound, the slope is that to the side that is left.
-    """
+    """At rest and in motion. Where null is a bound, the slope is that to the side that is left."""
     kinds = GROUPS[group]
     twin = twins.make("Pendulum").extend(*(kind(0) for kind in kinds))
     keys = [key for key in twin.params if key not in twin.base.params]

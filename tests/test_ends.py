@@ -25,12 +25,7 @@ GOES_ON, FALLS, IS_CUT, BOTH = (False, False), (True, False), (False, True), (Tr
 
 
 class Script(AnySpaces):
-    """
-    Does what is written, and pays the number of the step.
-
-    :param flags: of each step; after the last, of the last
-    :param told: further entries of ``info``
-    """
+    """Ends as written, the last flags for ever, and pays the number of the step."""
 
     def __init__(self, *flags, space=OBS, told=None):
         super().__init__(space)

@@ -181,11 +181,8 @@ def euler(start, torques, shifted=False):
     """
     Where the steps of Pendulum-v1 lead, without its limit of the speed.
 
-    Angles at whole steps and speeds at half ones are a leapfrog, which is of second order: Euler's
-    steps are that, started with a speed half a step too late and read half a step too early, and
-    with each torque half a step too late.
-
-    :param shifted: moves both back
+    Angles at whole steps and speeds at half ones are a leapfrog, of second order: Euler's steps are
+    that, with speeds and torques half a step too late.
     """
     dt, (angle, speed) = 0.05, start
     accelerated = lambda angle, torque: 15.0 * np.sin(angle) + 3.0 * torque  # noqa: E731

@@ -13,11 +13,7 @@ N_WINDOWS, N_ROWS, N_CANDIDATES = 30, 40, 25
 
 
 def linear(rng, effect=0.0, colour=0.95):
-    """
-    Windows of a linear model with coloured noise, a nuisance first and candidates after it.
-
-    :return: slopes at the fit of the best candidate, and by how much that lowers the cost
-    """
+    """Slopes of coloured windows at the best candidate's fit, and what that gains."""
     by_theta = rng.standard_normal((N_WINDOWS, N_ROWS, 1 + N_CANDIDATES)).cumsum(1) / 5.0
     noise = rng.standard_normal((N_WINDOWS, N_ROWS))
     for row in range(1, N_ROWS):

@@ -299,11 +299,7 @@ BAG = {"obs": ["/joints:position[elbow]", "/joints:velocity[1]"], "actions": ["/
 
 
 def write_bag(path, messages, kind="db3"):
-    """
-    :param path: a folder, or the file of a bag of ROS 1
-    :param messages: topic, time of recording [ns], type, and fields without their header
-    :param kind: ``"db3"``, ``"mcap"`` or ``"bag"``
-    """
+    """Of topic, time of recording [ns], type, and fields without their header."""
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore

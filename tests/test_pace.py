@@ -21,11 +21,7 @@ class Learner:
 
 
 def said(monkeypatch, seconds: list[float], n_updates: int = 1, n_steps: int = 1) -> list[str]:
-    """
-    :param seconds: that the calls of ``train`` take, one after the other
-    :param n_updates: in each of them
-    :param n_steps: between them
-    """
+    """By a learner whose calls of ``train`` take these times."""
     now, learner, looking = 0.0, Learner(), Pace()
     monkeypatch.setattr(pace.time, "perf_counter", lambda: now)
     with warnings.catch_warnings(record=True) as caught:

@@ -25,11 +25,7 @@ from sb3_hds.algos import twin_algorithm
 
 
 class Noting(BaseCallback):
-    """
-    Notes what it is called with, once.
-
-    :param stop_at: the number of the call at which it says no
-    """
+    """Notes what it is called with, and says no at one call."""
 
     def __init__(self, stop_at: int | None = None) -> None:
         super().__init__()

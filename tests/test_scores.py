@@ -22,13 +22,7 @@ def coloured(rng, shape, colour):
 
 
 def errors(rng, effect, colour=0.0, common=0.0, guess=0.3, excited=1.0):
-    """
-    What a model without an effect leaves of windows, and one that has guessed its size.
-
-    :param effect: its size
-    :param common: share of the noise that is the same in all windows of a recording
-    :param excited: how strongly each window shows the effect
-    """
+    """What a model without an effect leaves of windows, and one that has guessed its size."""
     shape = (N_UNITS * N_WINDOWS, N_ROWS, 1)
     noise = coloured(rng, shape, colour)
     noise += common * coloured(rng, (N_UNITS, N_ROWS, 1), colour)[UNIT]

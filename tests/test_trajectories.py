@@ -272,10 +272,7 @@ TORQUE = gym.spaces.Box(np.array([-2.0, 0.0]), np.array([2.0, 10.0]), dtype=np.f
 
 
 def filled(n_steps, size=100, n_envs=1, done_at=(), timeout_at=(), **kwargs):
-    """
-    A buffer and what was put in. Observations count (environment, step); where an episode ends, the
-    step leads to a terminal observation of its own, and the next episode starts 1000 further.
-    """
+    """A buffer of (environment, step), whose next episodes start 1000 further."""
     buffer = ReplayBuffer(size * n_envs, BOX, TORQUE, device="cpu", n_envs=n_envs, **kwargs)
     rng = np.random.default_rng(0)
     envs = np.arange(n_envs, dtype=np.float32)

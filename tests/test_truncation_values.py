@@ -67,10 +67,7 @@ def test_a_state_is_worth_what_follows_a_time_limit_unless_that_is_an_end(ends):
 
 
 class Clock(Mass):
-    """
-    The twin of the example: a hand that goes round in four steps, whatever it is told, and is paid.
-    The round is the end of a heavy one.
-    """
+    """The example's twin: a hand that goes round in four steps, which ends a heavy one."""
 
     name = "Clock"
 
@@ -121,11 +118,7 @@ def test_the_example_is_a_clock_that_pays_the_same_for_ever():
 
 
 class Ramp(gymnasium.Env):
-    """
-    Pays 1, 2, ..., 5 and begins anew; the state is one-hot.
-
-    :param terminates: whether the fifth step is the end, or what comes then is the first state
-    """
+    """Pays 1, 2, ..., 5, and then ends or begins anew; the state is one-hot."""
 
     n = 5
     observation_space = spaces.Box(0.0, 1.0, (n,), np.float32)

@@ -1,8 +1,4 @@
-"""
-The contract of the algorithms that plan in a twin, on top of that of every algorithm.
-
-Where PODS stands for both, HDS shares every line; it is the one that other files learn with.
-"""
+"""Algorithms that plan in a twin; where PODS stands for both, HDS shares every line."""
 
 import gymnasium
 import jax

@@ -48,10 +48,7 @@ def away_from_limits(env):
 
 
 def random_episodes(env, twin, seed=0):
-    """
-    Drive environment and twin by the same random commands, each from its own state; reset both
-    when the environment terminates or a joint comes near its limit. Yields after each step.
-    """
+    """Environment and twin under the same commands, away from limits."""
     rng, simulate = np.random.default_rng(seed), simulator(twin)
     low, high = twin.actuators[0].low, twin.actuators[0].high
     env.reset(seed=seed)

@@ -117,11 +117,7 @@ def test_a_compiled_batch_of_steps_equals_a_plain_one(twin, x64):
 
 
 def motion(twin, state, action):
-    """
-    Next state and observation as a function of small changes of state, action and parameters.
-
-    :return: the function, and where to evaluate it; parameters change in units of their scales
-    """
+    """The next state and observation by small changes of state, action and parameters in scales."""
     scales = {name: parameter.scale for name, parameter in twin.parameters.items()}
 
     def moved(change):

@@ -47,10 +47,7 @@ OF_AUTHORS = partial(gaussian, log_std_of=partial(squashed_between, low=-10.0, h
 
 
 def begun(name: str, policy_kwargs: dict[str, Any] | None = None, **arguments: Any) -> Any:
-    """
-    :return: recipe and learner of a model whose networks are trained by plain gradient descent, in
-        double precision; no bias is zero, and no two networks are equal
-    """
+    """Recipe and learner in double precision: no bias is zero, and no two networks are equal."""
     kwargs = {"net_arch": [4], "optimizer_class": "sgd"} | (policy_kwargs or {})
     env = AnySpaces(action_space=spaces.Box(-1.0, 1.0, (N_ACT,)))
     model = algos.ALL[name](env=env, seed=0, buffer_size=10, policy_kwargs=kwargs, **arguments)
@@ -116,11 +113,8 @@ class Soft:
     """
     Soft actor-critic (Haarnoja et al. 2018): equations 5 to 9 and 18 of arXiv 1812.05905.
 
-    :param target_of: next values of all critics, shape ``(critics, batch, values)``, to what
-        becomes a target, shape ``(batch, targets)``
-    :param error: of the values of one critic, given targets
-    :param worth: values of all critics to what the actor climbs, shape ``(batch,)``
-    :param b1: Adam's, of the entropy coefficient
+    :param target_of: next values ``(critics, batch, values)`` to targets ``(batch, targets)``
+    :param worth: values of all critics to what the actor climbs
     :param linear: whether the loss of the entropy coefficient has it itself, not its logarithm
     """
 
@@ -481,8 +475,7 @@ def test_crossq_normalises_both_pairs_together_and_has_no_target_networks():
 
 
 class Sale:
-    """Fujimoto et al., NeurIPS 2023, section 4 and appendix; LAP's loss is equation 10 of its own
-    paper (NeurIPS 2020)."""
+    """Fujimoto et al., NeurIPS 2023, section 4; LAP is equation 10 of NeurIPS 2020."""
 
     def __init__(self, recipe, learner) -> None:
         self.recipe, self.key = recipe, learner.key

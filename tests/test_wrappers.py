@@ -1,8 +1,4 @@
-"""
-One contract for every Gymnasium wrapper.
-
-Whoever adds a wrapper adds one entry to ``CASES``.
-"""
+"""One contract for every Gymnasium wrapper: whoever adds one adds an entry to ``CASES``."""
 
 import contextlib
 import copy
@@ -27,14 +23,7 @@ from sb3_hds.wrappers.action_layer import ActionLayer
 
 
 class Case(NamedTuple):
-    """
-    :param wrapper: the class
-    :param arguments: of its constructor, besides the environment; a function of a folder where it
-        writes files
-    :param env_id: of an environment that it fits
-    :param pickles: False where it holds what no other process can have
-    :param remade: False where ``env.spec`` cannot tell how to wrap again
-    """
+    """What it is made with, and whether another process or ``env.spec`` can have it again."""
 
     wrapper: type[gymnasium.Wrapper]
     arguments: Mapping[str, Any] | Callable[[Path], Mapping[str, Any]] = {}
