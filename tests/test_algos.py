@@ -107,7 +107,6 @@ def test_it_learns_a_task_that_a_linear_controller_solves(name):
 @pytest.mark.parametrize("name", ["droq", "td7", "hds", "openloop"])
 def test_two_runs_with_one_seed_end_with_the_same_weights(name):
     first, second, other = (small(name, seed=seed).learn(75).get_parameters() for seed in (3, 3, 4))
-
     assert same(first, second) and not same(first, other)
 
 
@@ -236,7 +235,6 @@ def test_another_environment_may_be_set(name):
 @pytest.mark.parametrize("name", ["droq", "td7", "hds"])
 def test_several_copies_of_the_environment_are_stepped_together(name):
     model = small(name, pendulums(4), train_freq=5).learn(60)
-
     assert model.num_timesteps == 60
     assert model.replay_buffer.size() == 15 and model.replay_buffer.n_envs == 4
     assert greedy(model, model.get_env().reset()).shape == (4, 1)

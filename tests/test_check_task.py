@@ -58,7 +58,6 @@ def test_a_defect_is_found_and_what_has_it_not_is_left_alone(defect):
 
 def test_nothing_is_wrong_with_a_healthy_task_and_a_report_says_so():
     report, bad = check_task(toy()), check_task(toy(limit=4, units=1e3, reward="constant"))
-
     assert report.ok and report.problems == [] and "no problem" in str(report)
     assert not bad.ok and len(bad.problems) == 3 and "3. Episode length" in str(bad)
     assert max(map(len, str(bad).splitlines())) <= 80

@@ -108,7 +108,6 @@ class OldReset(OldStyle):
 )
 def test_what_is_right_is_fine_and_where_no_time_out_was_seen_a_note_says_so(env, noted):
     report = check_truncation(env())
-
     assert report.ok and report.problems == []
     assert noted in report.notes[0] if noted else report.notes == []
 

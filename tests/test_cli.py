@@ -101,19 +101,16 @@ def test_a_calibrated_twin_is_printed_written_and_read_again(swings, tmp_path, c
     ("diagnose --twin FreePendulum --data missing.npz", "missing.npz"),
     ("diagnose {} --effects CoulombFrction", "Did you mean 'coulomb_friction'?"),
     ("diagnose {} --set mass=2", "--set takes NAME:VALUE, got 'mass=2'"),
-    ("diagnose {} --set mass:heavy", "must be a number [kg]"),
     ("diagnose {} --set mas:1", "Did you mean 'mass'?"),
     ("diagnose {} --columns missing.yml", "missing.yml"),
     ("diagnose {} --report nowhere/out.html", "cannot be written"),
     ("diagnose {} --report r.pdf", "r.html in place of r.pdf"),
     ("diagnose {} --json .", "is a folder"),
-    ("diagnose {} --env Nothing-v0", "Nothing"),
     ("diagnose {} --env Pendulum-v1 --algo magic", "no algorithm 'magic'"),
     ("diagnose {} --env Pendulum-v1 --hyperparams speed:1", "speed"),
     ("diagnose {} --env Pendulum-v1 --algo sac", "learns nothing"),
     ("audit --data {} --set mass:1", "--set changes the twin"),
     ("audit --twin CartPole --data {}", "CartPole has 5 channels"),
-    ("calibrate {} --set dt:0.01", "steps by 0.01 s"),
     ("calibrate {} --free weight", "free must name parameters"),
     ("effects frictoin", "Did you mean 'friction'?"),
     ("twins chek Pendulum", "Did you mean 'check'?"),
@@ -139,7 +136,6 @@ def test_a_question_that_makes_no_sense_is_one_message(words, message, swings, c
 def test_words_that_are_not_understood_are_one_line(words, message, capsys):
     with pytest.raises(SystemExit) as end:
         cli.main(words)
-
     told = capsys.readouterr().err
     assert end.value.code == 2 and message in told and told.count("\n") == 1
 
@@ -290,7 +286,6 @@ def test_a_diagnosis_and_the_gain_in_policy_are_printed_and_written(tmp_path, ca
 
 def test_where_nothing_was_found_no_policies_are_compared(asked, tmp_path, capsys):
     words = ["--twin", "PendulumReal", "--data", empty_log(tmp_path, 3, 1, 0.05)]
-
     assert ask(*words, "--env", "sb3_hds/PendulumReal-v1") == 0
     assert "no policies to compare" in capsys.readouterr().out
 

@@ -124,7 +124,6 @@ def test_names_of_joints_come_from_the_map_where_the_log_has_none(arm, asked, tm
 )
 def test_a_question_that_makes_no_sense_is_one_message(words, message, arm, capsys):
     words = [str(arm / "arm2.xml") if word == "ARM" else word for word in words]
-
     assert cli.main(["calibrate", "--data", str(arm / "log2.csv"), *words]) == 1
     told = capsys.readouterr().err
     assert message in told and "Traceback" not in told

@@ -169,9 +169,7 @@ def test_an_interval_is_round_only_where_the_stamps_cannot_tell(hz, dt):
 
 def test_an_interval_that_is_said_leaves_rows_that_agree_with_it():
     t = regular(30)
-
     [obs], _, report = read(np.round(t, 3), values=[motion(t)], dt=0.03333)
-
     np.testing.assert_array_equal(obs, motion(t))
     assert report.dt == 0.03333 and not report.altered
 
@@ -194,7 +192,6 @@ def test_rows_that_were_held_up_and_catch_up_are_no_gap():
 def test_stamps_that_tell_no_interval_are_refused_with_the_way_out(stamps, says):
     with pytest.raises(TrajectoryError, match=says) as refusal:
         read(stamps, values=[motion(regular(n=len(stamps)))])
-
     assert "leave 'time' out of columns and say the interval: dt: SECONDS" in str(refusal.value)
 
 

@@ -48,7 +48,6 @@ def asked(rng, **wrong):
 def test_a_constant_is_called_one_at_the_stated_rate_however_far_it_is_off(shift):
     rng = np.random.default_rng(0)
     p_values = np.array([asked(rng, shift=shift).p_value for _ in range(400)])
-
     # 400 draws at a level of 5 %: 20 are expected, more than 35 or fewer than 8 come once in 1000.
     assert 8 <= np.sum(p_values < 0.05) <= 35
 

@@ -243,7 +243,6 @@ def test_an_environment_says_whether_its_actions_are_positions():
     (pendulum, {"position": [0]}, "as many as positions"),
     (pendulum, {"position": [0], "velocity": [3]}, "an observation has 3"),
     (perturbed, {"noise": np.nan}, "noise=nan"),
-    (perturbed, {"push_probability": np.nan}, "push_probability=nan"),
     # Joints are read from MuJoCo, which no twin sees.
     (lambda: twin_of(inverted(omega_swing=3.0)), {}, "CPGPrior may change"),
 )

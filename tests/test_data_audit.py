@@ -297,9 +297,7 @@ def test_a_velocity_that_comes_late_or_early_is_found_and_shifted(data, lag):
 def test_a_lag_of_a_fraction_of_a_sample_is_left_alone(lag, seen):
     t = np.arange(3000.0)
     obs = np.stack([np.sin(0.1 * t), 10.0 * np.cos(0.1 * (t - lag))], axis=1)
-
     shift = audit(alone(obs), ["q", "v"]).velocity_shift
-
     assert shift == ({"v": pytest.approx(0.01 * lag, abs=2e-4)} if seen else {})
 
 
@@ -337,9 +335,7 @@ def test_standing_still_is_not_usable_and_tells_the_noise(resolution):
 @pytest.mark.parametrize("n_steps", [1, 2, 41])
 def test_the_shortest_data_are_not_usable_and_break_nothing(n_steps):
     obs = np.random.default_rng(0).standard_normal((2, n_steps + 1, 1))
-
     found = audit(Trajectories.from_arrays(obs, np.zeros((2, n_steps, 0)), dt=0.01))
-
     assert not found.usable and f"{2 * n_steps} steps in all; a verdict needs" in found.reason
     assert found.velocity_shift == {}
 
@@ -454,7 +450,6 @@ def test_a_position_in_other_units_than_its_velocity_is_refused(channels, noise,
 @pytest.mark.parametrize(("factor", "dt"), [(0.2, 0.01), (0.8, 0.2), (1.25, 0.05), (8.0, 0.2)])
 def test_a_factor_that_a_scale_of_the_sensor_explains_is_left_to_it(factor, dt):
     data = changed(pendulum_data(dt), lambda _, obs, actions: (obs * [factor, 1.0], actions))
-
     assert "OtherUnits" not in kinds(audit(data, KNOWN)) | kinds(audit(data))
 
 
@@ -571,9 +566,7 @@ def test_a_backward_difference_is_told_from_the_steps_of_a_twin_and_moved_back_f
 
 def test_a_position_and_a_velocity_that_are_swapped_are_refused_if_units_tell():
     data = changed(pendulum_data(), lambda _, obs, actions: (obs[:, ::-1], actions))
-
     found = audit(data, KNOWN)
-
     assert kinds(found) == {"Swapped"} and not found.usable
     assert "'angle' should be a position" in found.reason and audit(data, ["a", "b"]).findings == ()
 

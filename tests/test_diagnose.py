@@ -76,7 +76,6 @@ def test_two_causes_are_named_with_their_sizes_and_the_intervals_of_a_t_test(bot
 
 def test_nothing_is_named_where_nothing_is_wrong():
     found = asked(on_engine())
-
     assert found.verdict == "none", found
     assert not found.findings and not found.unexplained and found.twin == TWIN
 

@@ -76,7 +76,6 @@ def test_an_extended_twin_is_asked_again_by_names_and_a_glitch_is_cut_out_and_sa
 
 def test_less_of_what_the_twin_has_is_told_as_what_is_added_to_it():
     found = asked(TWIN.with_parameters(damping=0.003), recorded(TWIN))
-
     estimate = found.findings[0].parameters["b"]
     assert estimate.estimate == pytest.approx(-0.003, rel=0.05)
     assert estimate.added_to == pytest.approx(0.003)
@@ -122,7 +121,6 @@ class Nondescript(JointEffect):
 )
 def test_mistakes_are_named_at_the_door(changes, error, says, rubbing):
     given = {"data": rubbing, "progress": False} | changes
-
     with pytest.raises(error, match=says):
         diagnose(TWIN, **given)
 
@@ -134,7 +132,6 @@ def test_mistakes_are_named_at_the_door(changes, error, says, rubbing):
 )
 def test_another_interval_says_how_to_change_it_and_which_unit_it_may_be_in(factor, says):
     data = Trajectories.from_arrays([np.zeros((9, 2))], [np.zeros((8, 0))], dt=0.01 * factor)
-
     with pytest.raises(CalibrationError, match=says):
         diagnose(twins.make("FreePendulum"), data, progress=False)
 

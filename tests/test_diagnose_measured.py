@@ -58,7 +58,6 @@ def rollout_error(twin, data, seconds):
 
 def test_a_free_pendulum_lacks_nothing():
     found = asked(measured_rigs.multiarm())
-
     assert found.verdict == "none", found
 
 

@@ -181,9 +181,7 @@ def test_every_twin_effect_and_environment_is_listed_with_its_parameters():
 @pytest.mark.skipif(find_spec("sphinx") is None, reason="needs the extra 'dev'")
 def test_the_documentation_builds_without_warnings(tmp_path):
     sphinx = (sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html")
-
     done = subprocess.run([*sphinx, DOCS, tmp_path], text=True, capture_output=True)
-
     assert done.returncode == 0, done.stderr
 
 

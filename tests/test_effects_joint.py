@@ -143,9 +143,7 @@ def test_load_dependent_friction_counts_both_sides_of_the_gear(x64):
 def test_a_spring_makes_a_mass_oscillate_about_its_rest(x64):
     # omega = sqrt(k / m) = 2 rad/s.
     twin = mass_with(rk4, dt=0.05, mass=0.5).extend(Stiffness(k=2.0, q0=0.3))
-
     q = moved(twin, np.zeros(400), position=1.3).states.q[:, 0]
-
     # RK4: a phase error of (omega h)^5 / 120 per step, 3e-5 rad after 20 s.
     np.testing.assert_allclose(q, 0.3 + np.cos(2.0 * 0.05 * np.arange(401)), atol=1e-4)
 
@@ -183,9 +181,7 @@ def test_springs_beyond_what_a_sub_step_can_follow_stay_bounded(effect, integrat
     # The stiffest that acts is m / h^2, where omega h = 1: symplectic Euler and RK4 stay bounded;
     # explicit Euler grows by sqrt(2) per step, as it does with any spring of that frequency.
     twin = mass_with(integrator, dt=h, mass=0.5).extend(effect)
-
     q = moved(twin, np.zeros(30), position=1.0).states.q[:, 0]
-
     assert np.isfinite(q).all() and np.abs(q).max() < most
 
 

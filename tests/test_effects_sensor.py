@@ -51,7 +51,6 @@ def test_a_late_sensor_reports_the_signal_shifted(x64, delay):
 )
 def test_a_joint_the_wrong_way_round_turns_what_is_odd_in_it(twin, joint, channels):
     flips = reversed_joint(twins.make(twin) if isinstance(twin, str) else twin, joint)
-
     assert all(isinstance(flip, SignFlip) and flip.values == {"flipped": 1.0} for flip in flips)
     assert [flip.where for flip in flips] == channels
 

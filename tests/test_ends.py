@@ -70,7 +70,6 @@ def test_an_end_becomes_one_of_the_other_kind_and_info_says_so(wrapper, flags, e
 )
 def test_a_horizon_without_an_end_cuts_at_the_limit_and_leaves_earlier_ends(flags, expected, said):
     found, infos = played(InfiniteHorizon(Script(*flags), 3), len(expected))
-
     assert found == expected and infos[-1] == said
 
 
@@ -102,7 +101,6 @@ def test_the_remaining_time_falls_from_one_to_zero():
 
 @each(
     (InfiniteHorizon, {}, OBS, "cannot tell after how many steps"),
-    (InfiniteHorizon, {"max_episode_steps": 0}, OBS, "positive whole number"),
     (TimeAware, {"max_episode_steps": 2.5}, OBS, "positive whole number"),
     (TimeAware, {"max_episode_steps": 5}, spaces.Box(0.0, 1.0, (2, 2)), "FlattenObservation"),
     (TimeAware, {"max_episode_steps": 5}, spaces.Box(0, 9, (2,), int), "Box of floats"),

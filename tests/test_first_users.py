@@ -40,8 +40,6 @@ def test_what_somebody_had_is_found(given, calibrate, expected):
 
 def test_a_flipped_command_is_a_wrong_sign_and_never_a_mass_of_a_billion():
     twin, data = first_users.flipped_command()
-
     found = diagnose(twin, data, calibrate=["mass"], progress=False)
-
     assert found.verdict == "unknown" or [f.effect for f in found.findings] == ["sign_flip"]
     assert 0.1 <= found.twin.values["mass"] <= 40.0

@@ -145,7 +145,6 @@ def test_with_shared_memory_a_cut_counts_as_an_end():
 @pytest.mark.parametrize("name", ["droq", "hds"])
 def test_without_its_monitor_an_environment_is_left_as_it_is(name):
     bare = small(name, monitor_wrapper=False).get_env().envs[0]
-
     assert not isinstance(bare, Monitor)
 
 

@@ -168,7 +168,6 @@ def test_a_payload_may_come_between_two_steps():
     (lambda: gymnasium.make(PENDULUM, friction=-0.1), "friction must be finite, at least 0"),
     (lambda: gymnasium.make(PENDULUM, delay=0.5), "at most 0.2"),
     (lambda: envs.true_twin(gymnasium.make("Pendulum-v1")), r"twins\.make"),
-    (lambda: gymnasium.make(CART, hinge_friction=-1.0), "hinge_friction must be finite"),
     (lambda: gymnasium.make(PENDULUM).unwrapped.reset(options={"angle": 1.0}), "'state'"),
     (lambda: driven(gymnasium.make(PENDULUM), [[np.nan]], start_of(PENDULUM)), "one finite"),
 )

@@ -105,7 +105,6 @@ def test_parameters_are_corrected_and_suspects_that_explain_nothing_let_go(found
 def test_once_corrected_nothing_changes_any_more(found, heavier):
     own = wishes(twins.make("PendulumReal"))
     again = correct(found.twin, heavier, own, 0.0, learn_force=False, n_new=1000)
-
     assert not again.changed and again.error_calibrated <= found.error_calibrated * 1.001
 
 
@@ -293,7 +292,6 @@ def test_each_rollout_is_planned_in_a_twin_of_its_own():
 
 def test_effects_are_attached_by_name_or_as_they_are():
     model = small("hds", REAL, effects=["coulomb_friction", effects.QuadraticDrag(0, c=0.01)])
-
     assert model.twin.values["coulomb_friction.hinge.tau_c"] == 0.0
     assert model.twin.values["quadratic_drag.hinge.c"] == 0.01
 
@@ -307,7 +305,6 @@ def test_effects_are_attached_by_name_or_as_they_are():
     ({"beta": "always"}, "a number from 0 to 1"),
     ({"residual_kwargs": {"members": 3}}, "n_members, net_arch, caution"),
     ({"refit_freq": -1}, "at least 0"),
-    ({"max_saved_steps": 0}, "at least 1"),
 )
 def test_settings_of_learning_from_data_are_checked_at_the_door(settings, says):
     with pytest.raises(ValueError, match=says):

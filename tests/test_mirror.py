@@ -98,7 +98,6 @@ def test_wrappers_that_leave_the_problem_alone_are_looked_through(wrap):
 )
 def test_other_wrappers_are_refused_by_name(name, wrap):
     env = wrap(gymnasium.make("Pendulum-v1"))
-
     for one in (env, DummyVecEnv([lambda: env])):
         with pytest.raises(EnvironmentMismatchError, match=rf"wrapper {name} may .* pass a twin="):
             twin_of(one)
@@ -155,6 +154,5 @@ def test_a_twin_that_differs_is_found_out(difference):
 
 def test_a_state_that_cannot_be_observed_is_not_compared():
     blind = twins.make("CartPole", observe="q")
-
     with pytest.warns(UserWarning, match="does not tell the state of CartPole"):
         assert math.isnan(verify_mirror(TwinEnv(blind), blind))

@@ -45,9 +45,7 @@ def test_every_processor_sorts_and_compares_quantiles_alike():
 
 def test_dropout_zeroes_its_share():
     x, key = jnp.ones((400, 500)), jax.random.key(0)
-
     zeroed = np.asarray(Dropout(0.1).apply({}, x, rngs={"dropout": key})) == 0.0
-
     # Six standard deviations of a share of 200,000.
     assert zeroed.mean() == pytest.approx(0.1, abs=6 * np.sqrt(0.09 / x.size))
 

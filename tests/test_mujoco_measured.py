@@ -59,7 +59,6 @@ def ur10(tmp_path_factory):
 
 def test_friction_of_a_ur10_is_that_of_its_publishers_within_a_quarter(tmp_path):
     found = {e["name"]: e["estimate"] for e in calibrated(tmp_path, BAG)["estimates"]}
-
     for joint, coulomb, viscous in zip(JOINTS, COULOMB, VISCOUS, strict=True):
         assert found[f"{joint}_joint_frictionloss"] == pytest.approx(coulomb, rel=0.25)
         assert found[f"{joint}_joint_damping"] == pytest.approx(viscous, rel=0.25)

@@ -32,7 +32,6 @@ def end_of(twin, params=None, n_steps=20):
 def test_with_no_share_it_changes_nothing(x64):
     twin = twins.make("CartPole")
     none, whole = (end_of(twin.extend(NeuralForce(share=share))) for share in (0.0, 1.0))
-
     np.testing.assert_allclose(none, end_of(twin), rtol=1e-9, atol=1e-9)
     assert np.abs(whole - end_of(twin)).max() > 1e-6
 

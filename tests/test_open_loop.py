@@ -262,9 +262,7 @@ def test_what_does_not_fit_the_body_is_refused(attempt, says):
 )
 def test_where_single_copies_cannot_be_reset_whole_episodes_are_run(make, steps):
     model = OpenLoop("MlpPolicy", make(), seed=0, population_size=2, n_resets=1, horizon=3)
-
     model.learn(2 * steps + 2)
-
     assert int(model.policy.search.generation) == 1 and model.num_timesteps == 2 * steps + 2
 
 

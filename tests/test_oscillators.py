@@ -34,7 +34,6 @@ def apart(one, other) -> np.ndarray:
 def test_with_one_frequency_a_joint_follows_a_sine():
     omega, time = 3.0, 123.4
     one = gait(omega_swing=jnp.asarray(omega), omega_stance=jnp.asarray(omega))
-
     expected = one.amplitude * jnp.sin(omega * time + one.phase) + one.offset
     np.testing.assert_allclose(oscillators.target_at(one, time), expected, atol=1e-10)
 

@@ -54,7 +54,6 @@ def test_a_slow_learner_says_so_once_after_seconds_and_what_compiles_does_not_co
 )
 def test_it_goes_by_steps_of_the_environment(seconds, n_updates, n_steps, slow, monkeypatch):
     found = said(monkeypatch, 200 * [seconds], n_updates, n_steps)
-
     assert len(found) == slow and (not slow or f"{n_updates / n_steps:g} updates" in found[0])
 
 

@@ -107,6 +107,5 @@ def test_arguments_and_networks_are_those_of_the_paper(name):
 
 def test_bro_with_the_ratio_of_the_paper_starts_afresh_as_often_as_there():
     model = algos.BRO(env="Pendulum-v1", buffer_size=1000, gradient_steps=10)
-
     in_thousands = [15, 50, 250, 500, 750, 1_000, 1_500, 2_000]
     assert model.param_resets == [1_000 * n for n in in_thousands]

@@ -238,7 +238,5 @@ def test_a_policy_can_be_saved_alone(name, tmp_path):
 @every_kind
 def test_saving_does_not_change_what_training_does(name):
     quiet, saving = small(name).learn(50), small(name)
-
     saving.learn(50, callback=lambda *_: saving.num_timesteps % 10 or saved(saving) is not None)
-
     assert same(quiet.get_parameters(), saving.get_parameters())

@@ -224,7 +224,6 @@ def test_candidates_are_taken_as_boltzmann_says_and_without_temperature_the_firs
 
 def test_step_sizes_begin_with_no_change_and_fall_to_the_smallest():
     sizes = planning.step_sizes(6, smallest=0.01)
-
     assert sizes[0] == 0.0 and sizes[1:] == pytest.approx(np.geomspace(1.0, 0.01, 5))
 
 

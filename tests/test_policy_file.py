@@ -78,7 +78,6 @@ def test_numbers_of_numpy_and_classes_of_torch_become_plain_data(name, kwargs, p
 def test_a_function_of_ones_own_is_no_plain_data():
     kwargs = {"net_arch": [8], "activation_fn": lambda x: jnp.sin(x)}
     file = saved(small("gsde_sac", policy_kwargs=kwargs))
-
     with pytest.raises(ValueError, match=r"class or function of your own.*HDS\.load"):
         sb3_hds.load_policy(file)
 
@@ -94,15 +93,12 @@ def test_a_file_of_another_library_is_reported(tmp_path):
 
 def test_a_description_of_a_newer_version_is_reported():
     newer = lambda data: data.replace(b'"GaussianPolicy"', b'"TransformerPolicy"')  # noqa: E731
-
     with pytest.raises(ValueError, match=r"TransformerPolicy.*newer"):
         sb3_hds.load_policy(repacked(small("droq"), "data", newer))
 
 
 def test_widths_that_do_not_fit_the_weights_are_damage_and_no_reason_to_unpickle():
     other = lambda data: re.sub(rb'"net_arch": \[[^]]*\]', b'"net_arch": [3]', data)  # noqa: E731
-
     with pytest.raises(ValueError, match="damaged, or") as caught:
         sb3_hds.load_policy(repacked(small("droq"), "data", other))
-
     assert "weights_only" not in "".join(traceback.format_exception(caught.value))

@@ -95,9 +95,7 @@ def slow_programs(monkeypatch) -> None:
 def test_a_limit_of_time_acts_while_programs_compile(monkeypatch):
     slow_programs(monkeypatch)
     model, begin = small("hds"), time.monotonic()
-
     model.learn(50, callback=lambda *_: time.monotonic() < begin + 1.0)
-
     assert time.monotonic() - begin < 2.5 and (model.n_pretrained, model.num_timesteps) == (0, 0)
 
 

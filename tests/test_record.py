@@ -136,7 +136,6 @@ def test_a_recording_is_never_overwritten_but_can_be_continued(tmp_path):
     (lambda path: recorder(path, obs=[]), "at least one observation channel"),
     (lambda path: recorder(path, obs=["u", "q"]), "a name of its own"),
     (lambda path: recorder(path, obs=["time"]), "other than time and condition"),
-    (lambda path: recorder(path, obs="qv"), "list of names"),
     (lambda path: recorder(path).step([0.0], [0.0, 0.0]), "call start(obs)"),
     (lambda path: recorder(path).start([0.0]), "obs must have 2 numbers (q, v)"),
     (lambda path: begun(path).step(["a"], [0.0, 0.0]), "action must hold numbers (u)"),

@@ -39,5 +39,4 @@ def test_what_is_met_in_few_recordings_is_seen_in_their_windows():
     rng = np.random.default_rng(2)
     found, unit = rng.standard_normal((N_SETS, 8 * 20)), np.repeat(np.arange(8), 20)
     found[5, :60] += 3.0
-
     assert _by_chance(found, unit)[5] < 0.01

@@ -196,7 +196,6 @@ LOOK = """(page, done) => {
 @needs_chromium
 def test_the_report_fits_a_narrow_browser(page, tmp_path):
     found, console = in_chromium(page, LOOK, 400, tmp_path)
-
     assert found["laid_out"] <= found["shown"] <= 400 and not found["overrun"]
     # A picture has at least as many pixels as it is shown with.
     assert len(found["pictures"]) == 5 and min(found["pictures"]) >= 1.0 and console == []

@@ -170,9 +170,7 @@ def test_encoders_report_positions_and_if_wanted_velocities(name):
 def test_a_rig_is_pushed_as_hard_as_it_was():
     rig = twins.make("CartPole", observe="qv")
     state = State(jnp.zeros(2), jnp.zeros(2), {})
-
     weak, strong = (rig.step(state, jnp.array([force]), rig.params).v[0] for force in (10.0, 30.0))
-
     assert float(strong) == pytest.approx(3.0 * float(weak), rel=0.05)
 
 

@@ -141,7 +141,6 @@ def test_our_learners_store_what_was_executed():
 @pytest.mark.parametrize(("limit", "says"), [(1.0, "changes actions"), (0.1, "rescales actions")])
 def test_a_layer_below_another_that_rescales_is_found_out(limit, says):
     env = gymnasium.wrappers.RescaleAction(jumping(), np.float32(-limit), np.float32(limit))
-
     with pytest.raises(ValueError, match=f"outside that layer {says}"):
         small("droq", env, learning_starts=40).learn(30)
 

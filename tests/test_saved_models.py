@@ -38,9 +38,7 @@ def test_a_file_holds_what_the_newest_stored_one_holds(name):
     """Where this fails, files have another format: store some of it under a new name."""
     # Updates change numbers, and neither names nor shapes.
     without = {"learning_starts": 1_000} if name in MODEL_FREE else {}
-
     now = contents(saved(trained(name, **without)))
-
     assert now == contents(SAVED / NEWEST / f"{name}.zip")
 
 

@@ -44,13 +44,11 @@ def test_an_effect_that_recordings_show_unevenly_is_confirmed():
     excited = np.repeat([0.6, 1.0, 6.0, 4.0], N_WINDOWS)
     new, old, unit = errors(np.random.default_rng(1), 1.0, guess=0.9, excited=excited)
     by_gain = compare(*(np.mean(r**2, (1, 2)) for r in (new, old)), unit)
-
     assert by_gain.gain > 0.3 and by_gain.p_value > 0.025 and by_scores(new, old, unit) < 0.01
 
 
 def test_a_wrong_direction_equal_models_and_a_single_recording_confirm_nothing():
     new, old, unit = errors(np.random.default_rng(2), 1.0, guess=-1.0)
-
     assert by_scores(new, old, unit) > 0.5 and by_scores(old, old, unit) == 1.0
     assert by_scores(0.5 * old, old, np.zeros_like(unit)) == 1.0
 

@@ -78,7 +78,6 @@ def spoilt(obs, value):
 )
 def test_arrays_that_are_no_trajectories_are_refused_with_the_way_out(change, message):
     obs, actions = change(*recording(3, 5))
-
     with pytest.raises(TrajectoryError, match=re.escape(message)):
         Trajectories.from_arrays(obs=obs, actions=actions, dt=0.1)
 
@@ -93,10 +92,8 @@ def test_parts_that_do_not_fit_together_are_refused():
         (lambda: Trajectories(data.obs[:, 1:], data.actions, data.mask, *rest), "do not fit"),
         (lambda: Trajectories(data.obs, data.actions, hole, *rest), "mask must be True for the"),
         (lambda: data_of(3, dt=0.0), "interval in seconds, .* got 0.0"),
-        (lambda: data_of(3, dt=np.nan), "interval in seconds, .* got nan"),
         (lambda: data_of(3, 4, conditions=["heavy"]), "one label per trajectory, got 1 for 2"),
         (lambda: data_of(10).windows(11), "No trajectory has 11 steps; the longest has 10"),
-        (lambda: data_of(10).windows(0), "length and stride must be at least 1 step"),
         (lambda: data.split(by="condition"), "A split by condition needs at least two of them"),
         (lambda: data.split(fraction=1.0), "split takes a fraction between 0 and 1"),
         (lambda: data_of(5, 2).resample(dt=0.3), "1 lasts 0.2 s, less than one step of 0.3"),
@@ -201,9 +198,7 @@ def test_downsampling_by_an_integer_keeps_samples_exactly_and_drops_the_rest():
 
 def test_an_angle_turns_the_shorter_way_across_the_seam():
     data = Trajectories.from_arrays(obs=[[[3.0, 3.0], [-3.0, -3.0]]], actions=[[[0.0]]], dt=0.1)
-
     middle = data.resample(dt=0.05, angles=[0]).obs[0, 1]
-
     assert abs(middle[0]) == pytest.approx(np.pi)  # half way from 3 to 2 pi - 3
     assert middle[1] == pytest.approx(0.0)  # the other column is no angle
 

@@ -221,7 +221,6 @@ def test_a_policy_whose_model_changes_is_compared_before_it_acts():
 def test_pretraining_ends_where_plans_gain_nothing_and_schedules_go_on_from_its_end():
     # More than a plan can gain.
     model = small("pods", least_gain=1e9, pretrain_epochs=30).learn(0)
-
     assert (model.n_pretrained, model._progress_remaining()) == (20, 0.0)
     assert model.learn(0).n_pretrained == 20
 

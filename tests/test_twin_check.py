@@ -33,7 +33,6 @@ from sb3_hds.twins.mechanics import Points, check_mechanics
 )
 def test_every_twin_passes(name):
     found = twins.check(name)
-
     assert found.ok, found
     energy = [item for item in found.items if item.name in ("mass matrix", "energy")]
     assert len(energy) == 2
@@ -166,7 +165,6 @@ def inertia(*rows):
 )
 def test_what_is_not_mechanical_is_named(changes, name, message, x64):
     failed = [item for item in judged(**changes) if not item.ok]
-
     assert failed[0].name == name and message in failed[0].found and failed[0].way_out
 
 
@@ -183,9 +181,7 @@ def test_angles_that_a_twin_wraps_lose_no_energy(x64):
 
 def test_effects_and_wrappers_are_looked_through(x64):
     extended = Cart().extend(CoulombFriction(0, tau_c=0.3), SensorBias(1, bias=0.1))
-
     found = twins.check(TransformedTwin(extended, stateful=Delay(steps=2)))
-
     assert found.ok, found
 
 
@@ -206,7 +202,6 @@ def test_without_a_mass_matrix_there_is_no_energy_to_check():
 
 def test_positions_that_are_not_observed_are_named():
     found = twins.check(twins.make("LinearAxis", observe="q"))
-
     assert found.ok and "infer does not recover velocity of axis" in " ".join(str(found).split())
 
 

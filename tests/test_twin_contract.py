@@ -73,10 +73,8 @@ FORGETFUL = {"initial": clocked, "step": lambda self, state, u, p: state._replac
     ({"initial": lambda self, k, p: State(*jnp.ones((2, 3)), None)}, "memory returns None"),
     (FORGETFUL, "Leg.step(...).memory returns {}, expected {'clock': 'float32[]'}"),
     ({"reward": lambda self, state, u, after, p: after.q}, "expected (): one number"),
-    ({"planning_reward": lambda self, s, u, after, p: after.q}, "planning_reward returns s"),
     ({"terminated": lambda self, state, p: state.q[0]}, "returns float32, expected bool"),
     ({"limit": lambda self, q, v: v}, "expected the pair (q, v)."),
-    ({"limit_velocity": lambda self, v: jnp.max(v)}, "limit_velocity returns shape ()"),
     ({"sketch": lambda self, state, p: state.q}, "expected shape (points, 2)"),
     ({"bias": lambda self, q, v, p: p["mass"] * q}, "'mass'. Its parameters are: inertia."),
     ({"bias": lambda self, q, v, p: q @ jnp.ones((2, 2))}, "TypeError (test_twin_contract.py"),
@@ -91,7 +89,6 @@ FORGETFUL = {"initial": clocked, "step": lambda self, state, u, p: state._replac
 def test_what_breaks_the_contract_is_refused_in_one_line(changes, message):
     with pytest.raises(TwinError) as refusal:
         check_methods(broken(**changes))
-
     assert message in str(refusal.value) and "\n" not in str(refusal.value)
 
 

@@ -110,7 +110,6 @@ def test_mujoco_twins_follow_mujoco(env_id, x64):
 @pytest.mark.parametrize("env_id", MUJOCO)
 def test_declared_constants_are_those_of_the_shipped_model(env_id):
     twin = twins.from_env(gymnasium.make(env_id))
-
     assert twin == twins.make(env_id)
     # The compiler derives masses and inertias from shapes; declared to 16 digits.
     assert twin.values == pytest.approx(twins.make(env_id).values, rel=1e-14)
@@ -125,7 +124,6 @@ def test_declared_constants_are_those_of_the_shipped_model(env_id):
 def test_a_model_of_another_structure_is_refused(change, expected):
     env = gymnasium.make(MUJOCO[1]).unwrapped
     change(env.model)
-
     with pytest.raises(EnvironmentMismatchError, match=f"The twin expects .*{expected}"):
         twins.from_env(env)
 

@@ -221,7 +221,6 @@ def mean_worth(values: np.ndarray) -> np.ndarray:
 
 def test_soft_actor_critic_with_state_dependent_noise():
     recipe, learner = begun("gsde_sac", {"log_std_init": -1.0})
-
     check(recipe, learner, Soft(learner, mlp, least, half_square, least_worth))
 
 

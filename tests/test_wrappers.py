@@ -121,7 +121,6 @@ def same(first: list[np.ndarray], second: list[np.ndarray]) -> bool:
 def test_every_wrapper_has_a_case():
     public = [getattr(wrappers, name) for name in wrappers.__all__]
     classes = {o for o in public if isinstance(o, type) and issubclass(o, gymnasium.Wrapper)}
-
     assert classes == {case.wrapper for case in CASES.values()}
 
 
