@@ -33,24 +33,10 @@ every_kind = pytest.mark.parametrize("name", ["droq", "hds", "openloop"])
 
 #: what it takes to learn PointMass in seconds
 LEARNING = {
-    "hds": {
-        "pretrain_epochs": 40,
-        "n_rollouts": 16,
-        "horizon": 8,
-        "gradient_steps": 40,
-        "batch_size": 64,
-        "learning_rate": 5e-3,
-        "policy_kwargs": {"net_arch": [16]},
-    },
-    "droq": {
-        "learning_rate": 3e-3,
-        "gradient_steps": 5,
-        "train_freq": 5,
-        "gamma": 0.95,
-        "learning_starts": 100,
-        "batch_size": 64,
-        "policy_kwargs": {"net_arch": [32, 32]},
-    },
+    "hds": {"learning_rate": 5e-3, "gradient_steps": 40, "policy_kwargs": {"net_arch": [16]}}
+    | {"pretrain_epochs": 40, "n_rollouts": 16, "horizon": 8, "batch_size": 64},
+    "droq": {"learning_rate": 3e-3, "gradient_steps": 5, "policy_kwargs": {"net_arch": [32, 32]}}
+    | {"train_freq": 5, "gamma": 0.95, "learning_starts": 100, "batch_size": 64},
 }
 
 
@@ -245,9 +231,8 @@ def test_a_policy_learns_and_acts_in_a_normalised_environment():
     idle = returns_of(lambda obs: np.zeros(1, np.float32)).mean()
     env = VecNormalize(DummyVecEnv([point_mass_env]))
     model = small("hds", env, **LEARNING["hds"]).learn(30)
-    elsewhere = VecNormalize(
-        DummyVecEnv([lambda: Monitor(point_mass_env())]), training=False, norm_reward=False
-    )
+    monitored = DummyVecEnv([lambda: Monitor(point_mass_env())])
+    elsewhere = VecNormalize(monitored, training=False, norm_reward=False)
     elsewhere.obs_rms = env.obs_rms
 
     score, _ = evaluate_policy(model, elsewhere, n_eval_episodes=20)

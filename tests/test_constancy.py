@@ -76,12 +76,9 @@ def test_friction_that_depends_on_position_is_no_friction_of_the_catalogue():
     kinds = (effects.CoulombFriction, effects.ViscousFriction, effects.ConstantForce)
     rubbing = {"commands": jumping(10), "n": 10, "noise": 1e-3}
 
-    patchy = diagnose(
-        twin, measured(twin.extend(PatchyFriction(0, tau_c=0.5)), **rubbing), effects=kinds
-    )
-    even = diagnose(
-        twin, measured(twin.extend(effects.CoulombFriction(0, tau_c=0.5)), **rubbing), effects=kinds
-    )
+    hidden = (PatchyFriction(0, tau_c=0.5), effects.CoulombFriction(0, tau_c=0.5))
+    data = [measured(twin.extend(effect), **rubbing) for effect in hidden]
+    patchy, even = (diagnose(twin, each, effects=kinds) for each in data)
 
     assert patchy.verdict == "unknown" and not patchy.findings
     assert "coulomb_friction.axis comes nearest" in patchy.unexplained

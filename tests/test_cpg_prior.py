@@ -23,15 +23,8 @@ BELOW = Signals(
     tuple(Actuator(name, "1", -1.0, 1.0) for name in "ab"),
     tuple(Channel(f"obs[{i}]", "1") for i in range(8)),
 )
-SETTINGS = {
-    "omega_swing": TAU * 0.6,
-    "omega_stance": TAU * 0.9,
-    "amplitude": [0.8, 1.2],
-    "phase": [0.3, 4.0],
-    "offset": [0.1, -0.1],
-    "kp": 10.0,
-    "kd": 0.5,
-}
+SETTINGS = {"omega_swing": TAU * 0.6, "omega_stance": TAU * 0.9, "kp": 10.0, "kd": 0.5}
+SETTINGS |= {"amplitude": [0.8, 1.2], "phase": [0.3, 4.0], "offset": [0.1, -0.1]}
 
 
 def swimmer(mode: str = "offset", **changes) -> CPGPrior:

@@ -31,7 +31,7 @@ def load(name):
     return measured_rigs.load(f"{name}/*.json", measured_rigs.SERVO)
 
 
-CONSTANT = "ConstantCommand"
+LATE = "UnevenSampling VelocityShift"
 # Of the channels: from the data sets' own descriptions, and of numpy on the raw columns.
 RANGES = {
     "emps": [(-2.2e-5, 0.2465073865)],
@@ -45,8 +45,8 @@ RANGES = {
 @each(
     # One slow profile, and one with pulses.
     ("emps", [24840] * 2, 0.001, "PoorExcitation"),
-    ("bam_xl330", None, 0.0053, "UnevenSampling VelocityShift"),
-    ("bam_sts3250", None, 0.0205, "UnevenSampling VelocityShift PoorExcitation " + CONSTANT),
+    ("bam_xl330", None, 0.0053, LATE),
+    ("bam_sts3250", None, 0.0205, f"{LATE} PoorExcitation ConstantCommand"),
     ("multiarm", [9166] * 4, 0.001, ""),
     # A regular clock that took a few steps to start.
     ("dfki", [4998] * 2, 0.002, "JitteredStamps MissingRows"),

@@ -62,9 +62,8 @@ def test_an_extended_twin_is_asked_again_by_names_and_a_glitch_is_cut_out_and_sa
     glitched = Trajectories.from_arrays(list(obs), list(rubbing.actions), dt=0.02)
     names = ["CoulombFriction", "viscous_friction"]
 
-    found = diagnose(
-        twin, glitched, effects=names, calibrate="mass", budget="quick", progress=False
-    )
+    how = {"calibrate": "mass", "budget": "quick", "progress": False}
+    found = diagnose(twin, glitched, effects=names, **how)
 
     [finding] = found.findings
     assert (finding.effect, finding.alternatives) == ("coulomb_friction", ())

@@ -102,7 +102,7 @@ def test_rhythms_find_its_motors():
 
 @each(
     ({"control": "speed"}, "one of"),
-    ({"stiffness": 0}, "stiffness"),
+    ({"stiffness": 0}, "stiff"),
     ({"noise": np.nan}, "noise"),
 )
 def test_what_makes_no_sense_is_refused(changes, message):

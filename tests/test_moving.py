@@ -92,10 +92,8 @@ PLAY = """(page, done) => {
 @needs_chromium
 @pytest.mark.parametrize("width", [400, 1200])
 def test_a_browser_plays_it(moving, width, tmp_path):
-    head = (
-        '<!DOCTYPE html><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-    )
-    page = f"{head}<style>{STYLE}</style>{section_of(moving)}"
+    meta = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+    page = f"<!DOCTYPE html>{meta}<style>{STYLE}</style>{section_of(moving)}"
     assert "http" not in page.replace("http://www.w3.org", "")
 
     found, console = in_chromium(page, PLAY, width, tmp_path)

@@ -69,12 +69,11 @@ def test_a_diagnosis_of_a_ur10_names_both_frictions_at_all_six_joints(tmp_path):
     words = ["diagnose", "--model", UR10 / "ur10.urdf", "--data", BAG, "--budget", "quick"]
     assert cli.main([*map(str, words), "--json", str(tmp_path / "found.json")]) == 0
     told = json.loads((tmp_path / "found.json").read_text())
-    sizes = {
-        (f["effect"], f["where"]["name"].removesuffix("_joint")): next(
-            iter(f["parameters"].values())
-        )["estimate"]
-        for f in told["findings"]
-    }
+    sizes = {}
+    for f in told["findings"]:
+        [parameter] = f["parameters"].values()
+        joint = f["where"]["name"].removesuffix("_joint")
+        sizes[f["effect"], joint] = parameter["estimate"]
 
     for joint, coulomb, viscous in zip(JOINTS, COULOMB, VISCOUS, strict=True):
         assert sizes["coulomb_friction", joint] == pytest.approx(coulomb, rel=0.25)
@@ -123,9 +122,8 @@ def test_its_corrected_file_predicts_held_out_seconds_as_well_as_the_twin(ur10, 
 
 
 GO2 = UR10.parent / "go2"
-LEGS = [
-    f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")
-]
+PARTS = ("hip", "thigh", "calf")
+LEGS = [f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in PARTS]
 MAP = {
     "time": "time",
     "obs": [{"column": f"position[{i}]", "name": f"{j}_position"} for i, j in enumerate(LEGS)],
@@ -140,11 +138,7 @@ def test_a_quadruped_s_loop_is_calibrated_and_its_file_steps_held_out_seconds_be
     time, q, target = (log[name] for name in ("time", "position", "target"))
     np.savez(tmp_path / "a.npz", time=time[:3200], position=q[:3200], target=target[:3200])
     (tmp_path / "map.yml").write_text(json.dumps(MAP))
-    kinds = [
-        f"*_{part}_joint_{word}"
-        for part in ("hip", "thigh", "calf")
-        for word in ("damping", "frictionloss")
-    ]
+    kinds = [f"*_{part}_joint_{word}" for part in PARTS for word in ("damping", "frictionloss")]
     words = ["calibrate", "--model", GO2 / "go2.urdf", "--data", tmp_path / "a.npz"]
     words += ["--columns", tmp_path / "map.yml", "--actuators", "position", "kp:20", "kv:1.5"]
     words += ["--free", "*_damping", "*_frictionloss", "--tied", *kinds, "--windows", 16]

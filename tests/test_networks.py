@@ -23,9 +23,8 @@ class Scales(NamedTuple):
 
 
 def policy(low: float = -1.0, high: float = 1.0, **kwargs) -> TwinPolicy:
-    return TwinPolicy(
-        spaces.Box(-1.0, 1.0, (3,)), spaces.Box(low, high, (2,)), FloatSchedule(1e-3), **kwargs
-    )
+    seen, done = spaces.Box(-1.0, 1.0, (3,)), spaces.Box(low, high, (2,))
+    return TwinPolicy(seen, done, FloatSchedule(1e-3), **kwargs)
 
 
 def widths(weights) -> list[int]:

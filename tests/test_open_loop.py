@@ -26,14 +26,8 @@ from sb3_hds.wrappers import ShowJoints
 TAU = 2.0 * np.pi
 
 # Gaits that the authors of the open-loop paper published: kp, kd in commands per rad and rad/s.
-SWIMMER = {
-    "amplitude": 1.0,
-    "phase": [0.0, TAU * 0.95],
-    "omega_swing": TAU * 0.62,
-    "omega_stance": TAU * 0.62,
-    "kp": 10.0,
-    "kd": 0.5,
-}
+SWIMMER = {"amplitude": 1.0, "phase": [0.0, TAU * 0.95], "kp": 10.0, "kd": 0.5}
+SWIMMER |= dict.fromkeys(("omega_swing", "omega_stance"), TAU * 0.62)
 
 
 class Tune(AnySpaces):

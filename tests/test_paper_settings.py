@@ -29,28 +29,14 @@ OF_THE_MODEL: dict[str, dict[str, Any]] = {
     # Lee et al. 2025.
     "simba": {"gradient_steps": 2, "batch_size": 256, "ent_coef": "auto_0.01", "tau": 0.005},
     # Nauman et al. 2024.
-    "bro": {
-        "gradient_steps": 2,
-        "batch_size": 128,
-        "kl_target": 0.05,
-        "std_multiplier": 0.75,
-        "param_resets": [15_000],
-    },
+    "bro": {"gradient_steps": 2, "batch_size": 128, "kl_target": 0.05, "std_multiplier": 0.75}
+    | {"param_resets": [15_000]},
     # Fujimoto et al. 2023.
-    "td7": {
-        "learning_starts": 25_000,
-        "train_freq": EVERY_EPISODE,
-        "batch_size": 256,
-        "policy_delay": 2,
-        "target_update_interval": 250,
-        "target_policy_noise": 0.2,
-        "target_noise_clip": 0.5,
-        "exploration_noise": 0.1,
-        "priority_exponent": 0.4,
-        "max_episodes_per_checkpoint": 20,
-        "updates_before_checkpointing": 750_000,
-        "reset_weight": 0.9,
-    },
+    "td7": {"learning_starts": 25_000, "train_freq": EVERY_EPISODE, "batch_size": 256}
+    | {"policy_delay": 2, "target_update_interval": 250, "target_policy_noise": 0.2}
+    | {"target_noise_clip": 0.5, "exploration_noise": 0.1, "priority_exponent": 0.4}
+    | {"max_episodes_per_checkpoint": 20, "updates_before_checkpointing": 750_000}
+    | {"reset_weight": 0.9},
 }
 #: by id: learning rate and, for one control, target entropy
 RATES = {

@@ -117,10 +117,8 @@ def write() -> None:
         model = trained(name)
         model.save(folder / f"{name}.zip")
         actions, _ = model.predict(OBSERVATIONS, deterministic=True)
-        told = {
-            "actions": np.asarray(actions, float).round(7).tolist(),
-            "num_timesteps": model.num_timesteps,
-        }
+        rounded = np.asarray(actions, float).round(7).tolist()
+        told = {"actions": rounded, "num_timesteps": model.num_timesteps}
         (folder / f"{name}.json").write_text(json.dumps(told) + "\n")
 
 

@@ -30,19 +30,9 @@ TERMINATED = (1.0 - GAMMA**4) / (1.0 - GAMMA)
 # No bonus for entropy, or values would not be those of the reward. All actions are drawn from the
 # whole range: a critic guesses too much where none was tried, and the actor finds that place
 # (values ended at 50 to 59 with 50 such steps, at 49.5 to 50.5 with 200).
-SETTINGS = {
-    "gamma": GAMMA,
-    "learning_starts": 200,
-    "gradient_steps": 0,
-    "buffer_size": 400,
-    "train_freq": 1,
-    "seed": 0,
-    "ent_coef": 1e-6,
-    "tau": 0.1,
-    "learning_rate": 1e-2,
-    "policy_delay": 10,
-    "policy_kwargs": {"net_arch": [32]},
-}
+SETTINGS = {"gamma": GAMMA, "learning_starts": 200, "gradient_steps": 0, "buffer_size": 400}
+SETTINGS |= {"train_freq": 1, "seed": 0, "ent_coef": 1e-6, "tau": 0.1, "learning_rate": 1e-2}
+SETTINGS |= {"policy_delay": 10, "policy_kwargs": {"net_arch": [32]}}
 
 
 def value_of(model: Any, obs: np.ndarray) -> float:
