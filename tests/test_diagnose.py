@@ -170,8 +170,9 @@ def test_nothing_is_not_the_verdict_where_held_out_recordings_surely_prefer_some
     assert not contradiction([*by_chance, gains(0.04, 1e-9)])
 
 
+RUBBING = effects.ViscousFriction("hinge", b=0.01)
 YIELDING = effects.Hysteresis("hinge", tau_c=0.03, slip=0.4, n=2.0)
-SLACK = effects.ClearanceSpring("hinge", k=0.3, low=-0.3, high=0.3)
+SLACK = effects.ClearanceSpring("hinge", k=0.3, low=-0.3, high=0.3), RUBBING
 
 
 @each(
@@ -181,10 +182,7 @@ SLACK = effects.ClearanceSpring("hinge", k=0.3, low=-0.3, high=0.3)
     expensive([YIELDING], ["Stiffness", "CoulombFriction"], [], "hysteresis.hinge (tau_c = 0."),
     # Beside one, a cause is still named.
     expensive(
-        [SLACK, effects.ViscousFriction("hinge", b=0.01)],
-        ["Stiffness", "ViscousFriction"],
-        ["viscous_friction"],
-        "clearance_spring.hinge",
+        SLACK, ["Stiffness", "ViscousFriction"], ["viscous_friction"], "clearance_spring.hin"
     ),
     # Whoever asks about one gets its name.
     expensive([YIELDING], [*effects.NAMELESS, "CoulombFriction"], ["hysteresis"], ""),

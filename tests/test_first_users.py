@@ -7,22 +7,16 @@ from cases import each
 from sb3_hds import diagnose
 
 pytestmark = pytest.mark.expensive  # a whole diagnosis each
+FRICTION = {"viscous_friction.axis": {"b": 22.0}, "coulomb_friction.axis": {"tau_c": 13.0}}
+SCALE = pytest.approx(1.04, abs=0.005)
 
 
 @each(
     # Beside an inertia that nobody believed.
-    (
-        lambda: first_users.joint_with_friction(believed=8.0),
-        ["mass"],
-        {"viscous_friction.axis": {"b": 22.0}, "coulomb_friction.axis": {"tau_c": 13.0}},
-    ),
+    (lambda: first_users.joint_with_friction(believed=8.0), ["mass"], FRICTION),
     (first_users.free_pendulum, [], {"coulomb_friction.hinge": {"tau_c": 0.012}}),
     # The sensor's, and no spring.
-    (
-        first_users.scaled_angle,
-        ["inertia", "damping"],
-        {"sensor_scale.hinge": {"scale": pytest.approx(1.04, abs=0.005)}},
-    ),
+    (first_users.scaled_angle, ["inertia", "damping"], {"sensor_scale.hinge": {"scale": SCALE}}),
     ids=["friction", "let go", "scaled"],
 )
 def test_what_somebody_had_is_found(given, calibrate, expected):

@@ -30,20 +30,14 @@ def sync(mode: AutoresetMode, n: int = N) -> SyncVectorEnv:
 def stored(model) -> list[list[Row]]:
     """:return: what the replay buffer holds, of each copy, in the order in which it came"""
     buffer = model.replay_buffer
-    rows = [
-        [
-            Row(
-                tuple(buffer.observations[k, i].tolist()),
-                float(buffer.actions[k, i, 0]),
-                float(buffer.rewards[k, i]),
-                tuple(buffer.next_observations[k, i].tolist()),
-                bool(buffer.dones[k, i]),
-                bool(buffer.timeouts[k, i]),
-            )
-            for k in range(buffer.pos)
-        ]
-        for i in range(buffer.n_envs)
-    ]
+
+    def row(k, i):
+        seen, after = (x[k, i].tolist() for x in (buffer.observations, buffer.next_observations))
+        done, cut = bool(buffer.dones[k, i]), bool(buffer.timeouts[k, i])
+        action, reward = float(buffer.actions[k, i, 0]), float(buffer.rewards[k, i])
+        return Row(tuple(seen), action, reward, tuple(after), done, cut)
+
+    rows = [[row(k, i) for k in range(buffer.pos)] for i in range(buffer.n_envs)]
     assert sum(map(len, rows)) == model.num_timesteps
     return rows
 

@@ -73,16 +73,8 @@ def test_an_outlier_moves_no_interquartile_mean_and_a_single_run_has_no_interval
 
 
 def test_other_algorithms_train_in_the_simulation_for_a_budget():
-    found = measure_policy_gain(
-        a_diagnosis(),
-        gymnasium.make("Pendulum-v1"),
-        SAC,
-        budget=30,
-        seeds=1,
-        n_episodes=1,
-        progress=False,
-        learning_starts=10,
-    )
+    how = {"budget": 30, "seeds": 1, "n_episodes": 1, "progress": False, "learning_starts": 10}
+    found = measure_policy_gain(a_diagnosis(), gymnasium.make("Pendulum-v1"), SAC, **how)
 
     assert set(found.returns) == {"believed", "extended"} and found.to_dict()["runs"] == 1
 

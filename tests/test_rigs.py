@@ -44,25 +44,17 @@ S, C = 9.81 * np.sin(0.2), 9.81 * np.cos(0.2)
 
 
 # Where the inertia is that about the joint: about the centre of mass, and Steiner's share.
+DOUBLE = {"mass1": 0.5, "mass2": 0.6, "length1": 0.3, "com1": 0.25, "com2": 0.15, "tilt": 0.2}
+DOUBLE |= {"inertia1": 0.02 + 0.5 * 0.25**2, "inertia2": 0.015 + 0.6 * 0.15**2}
+DOUBLE |= {"damping1": 0.01, "damping2": 0.02, "tip_payload": 0.15, "tip": 0.25}
+ROTARY = {"arm_inertia": 6e-4, "arm_length": 0.1, "mass": 0.03, "com": 0.07, "inertia": 4e-5}
+ROTARY |= {"arm_damping": 1e-3, "pendulum_damping": 1e-4, "tilt_x": 0.2, "tilt_y": -0.1}
+ROTARY |= {"tip_payload": 0.01, "tip": 0.12}
+
+
 @each(
-    (
-        "DoublePendulum",
-        DOUBLE_PENDULUM,
-        0.5,
-        (-S, 0.0, -C),
-        {"mass1": 0.5, "mass2": 0.6, "length1": 0.3, "com1": 0.25, "com2": 0.15}
-        | {"inertia1": 0.02 + 0.5 * 0.25**2, "inertia2": 0.015 + 0.6 * 0.15**2}
-        | {"damping1": 0.01, "damping2": 0.02, "tilt": 0.2, "tip_payload": 0.15, "tip": 0.25},
-    ),
-    (
-        "Furuta",
-        FURUTA,
-        0.01,
-        (S, C * np.sin(-0.1), -C * np.cos(-0.1)),
-        {"arm_inertia": 6e-4, "arm_length": 0.1, "mass": 0.03, "com": 0.07, "inertia": 4e-5}
-        | {"arm_damping": 1e-3, "pendulum_damping": 1e-4}
-        | {"tilt_x": 0.2, "tilt_y": -0.1, "tip_payload": 0.01, "tip": 0.12},
-    ),
+    ("DoublePendulum", DOUBLE_PENDULUM, 0.5, (-S, 0.0, -C), DOUBLE),
+    ("Furuta", FURUTA, 0.01, (S, C * np.sin(-0.1), -C * np.cos(-0.1)), ROTARY),
 )
 def test_two_joints_move_as_in_mujoco(name, xml, size, gravity, parameters, x64):
     twin, start = twins.make(name, **parameters), np.array([0.3, 1.0])
@@ -101,7 +93,10 @@ def test_one_motor_leaves_the_other_joint_alone(x64):
         np.testing.assert_array_equal(one, replayed(twins.make("DoublePendulum"), [0.1, 0.2], pair))
 
 
+SPRING = {"mass": 0.5, "damping": 0.1, "stiffness": -1.0, "cubic_stiffness": 3.0}
 ROD = {"mass": 0.2, "com": 0.2, "inertia": 1e-3}
+UP = ROD | {"damping": 1e-3, "zero": "up"}
+TILTED = ROD | {"tilt": 0.3, "tip_payload": 0.1, "tip": 0.4}
 LOGGED = {"commands": "goal, enable, gain"}
 MOTOR = {"torque_constant": 0.5, "resistance": 2.0}
 
@@ -114,21 +109,9 @@ def servo(q, v, u):
 
 @each(
     ("LinearAxis", {"mass": 2.0, "damping": 0.3}, lambda q, v, u: (u - 0.3 * v) / 2.0),
-    (
-        "Duffing",
-        {"mass": 0.5, "damping": 0.1, "stiffness": -1.0, "cubic_stiffness": 3.0},
-        lambda q, v, u: (u - 0.1 * v + q - 3.0 * q**3) / 0.5,
-    ),
-    (
-        "FreePendulum",
-        ROD | {"damping": 1e-3, "zero": "up"},
-        lambda q, v, u: (0.04 * 9.81 * np.sin(q) - 1e-3 * v) / (1e-3 + 0.2**3),
-    ),
-    (
-        "FreePendulum",
-        ROD | {"tilt": 0.3, "tip_payload": 0.1, "tip": 0.4},
-        lambda q, v, u: -9.81 * 0.08 * np.sin(q + 0.3) / (1e-3 + 0.2**3 + 0.1 * 0.4**2),
-    ),
+    ("Duffing", SPRING, lambda q, v, u: (u - 0.1 * v + q - 3.0 * q**3) / 0.5),
+    ("FreePendulum", UP, lambda q, v, u: (0.04 * 9.81 * np.sin(q) - 1e-3 * v) / (1e-3 + 0.2**3)),
+    ("FreePendulum", TILTED, lambda q, v, u: -0.08 * 9.81 * np.sin(q + 0.3) / (0.009 + 0.1 * 0.16)),
     ("ServoPendulum", MOTOR | {"kp": 200.0, "voltage": 6.0, "tilt": -0.2}, servo),
 )
 def test_one_joint_moves_as_its_equation_says(name, settings, acceleration, x64):

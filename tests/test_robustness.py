@@ -90,14 +90,8 @@ def test_what_wrappers_add_is_no_sensor():
             return observation
 
     kinds = {name: PERTURBATIONS[name] for name in ("none", "noise 0.5")}
-    measure_robustness(
-        model,
-        "Pendulum-v1",
-        wrapper=lambda env: Seeing(wrap(env)),
-        perturbations=kinds,
-        n_episodes=1,
-        progress=False,
-    )
+    how = {"perturbations": kinds, "n_episodes": 1, "progress": False}
+    measure_robustness(model, "Pendulum-v1", wrapper=lambda env: Seeing(wrap(env)), **how)
 
     calm, noisy = np.array_split(np.array(seen), 2)
     # Cosine and sine of the angle, which the sensors show; sine and cosine of the clock.

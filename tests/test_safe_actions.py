@@ -68,32 +68,25 @@ def commands_of(env, actions):
     return np.array(told)
 
 
+LIMITED, TOGETHER = [[1, -2], [2, -4], [3, -5], [2, -3]], ([[1.0, 1.0]], [2.0])
+
+
 @each(
     # 20 and 40 units per second, 0.05 s: steps of 1 and 2, from the rest at zero.
-    (
-        lambda env: ActionRateLimit(env, max_rate=[20.0, 40.0]),
-        (-5.0, 5.0),
-        [[5, -5], [5, -5], [5, -5], [0, 0]],
-        [[1, -2], [2, -4], [3, -5], [2, -3]],
-    ),
-    (lambda env: ActionDelay(env, 2), (-5, 5), [[1, -1]] * 3, [[0, 0], [0, 0], [1, -1]]),
+    (ActionRateLimit, [20.0, 40.0], (-5, 5), [[5, -5]] * 3 + [[0, 0]], LIMITED),
+    (ActionDelay, 2, (-5, 5), [[1, -1], [2, -2], [3, -3]], [[0, 0], [0, 0], [1, -1]]),
     # Before an episode, the command nearest to zero.
-    (lambda env: ActionDelay(env, 1), (2.0, 5.0), [[5, 4]] * 2, [[2, 2], [5, 4]]),
+    (ActionDelay, 1, (2.0, 5.0), [[5, 4]] * 2, [[2, 2], [5, 4]]),
     # Around the middle of the range.
-    (lambda env: ActionScale(env, 0.25), (0.0, 4.0), [[4, 0], [0, 2]], [[2.5, 1.5], [1.5, 2]]),
+    (ActionScale, 0.25, (0.0, 4.0), [[4, 0], [0, 2]], [[2.5, 1.5], [1.5, 2]]),
     # Onto u1 + u2 <= 2, along its normal; what is allowed stays.
-    (
-        lambda env: ActionShield(env, ([[1.0, 1.0]], [2.0])),
-        (-5.0, 5.0),
-        [[3, 3], [4, 0], [1, 0.5]],
-        [[1, 1], [3, -1], [1, 0.5]],
-    ),
+    (ActionShield, TOGETHER, (-5, 5), [[3, 3], [4, 0], [1, 0.5]], [[1, 1], [3, -1], [1, 0.5]]),
     ids=["rate limit", "delay", "delay of a push", "scale", "shield"],
 )
-def test_a_layer_makes_of_commands_what_its_formula_says(layer, limits, actions, expected):
+def test_a_layer_makes_of_commands_what_its_formula_says(layer, given, limits, actions, expected):
     env = joints()
     env.unwrapped.action_space = spaces.Box(*limits, (2,))
-    np.testing.assert_allclose(commands_of(layer(env), actions), expected, atol=1e-5)
+    np.testing.assert_allclose(commands_of(layer(env, given), actions), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("order", [1, 8])

@@ -146,14 +146,9 @@ def test_a_layer_below_another_that_rescales_is_found_out(limit, says):
 
 
 def test_learners_of_sb3_store_what_was_executed_with_our_buffer():
-    model = sb3.SAC(
-        "MlpPolicy",
-        jumping(),
-        learning_starts=50,
-        buffer_size=100,
-        seed=0,
-        replay_buffer_class=ExecutedReplayBuffer,
-    ).learn(30)
+    how = {"learning_starts": 50, "buffer_size": 100, "seed": 0}
+    model = sb3.SAC("MlpPolicy", jumping(), replay_buffer_class=ExecutedReplayBuffer, **how)
+    model.learn(30)
 
     buffer = model.replay_buffer
     told = buffer.next_observations[:30, 0, 3]

@@ -142,26 +142,20 @@ def inertia(*rows):
     return {"mass_matrix": lambda self, q, params: jnp.array(rows)}
 
 
+WHIRL = {"weight": lambda self, q: 9.81 * jnp.stack([jnp.sin(q[0] + q[1]), jnp.sin(q[1])])}
+PUMP = {"coriolis": lambda self, q, v: 0.9 * Arm.coriolis(self, q, v) + 0.3 * v}
+GROW = {"integrator": staticmethod(lambda a, q, v, h, limit: (q + h * v, v * (1.0 + h)))}
+
+
 @each(
     (inertia([2.0, 1.0], [0.5, 2.0]), "mass matrix", "not symmetric: entry (joint1, joint2)"),
     # Eigenvalues 1 - 1.5 and 1 + 1.5.
     (inertia([1.0, 1.5], [1.5, 1.0]), "mass matrix", "smallest eigenvalue -0.5"),
-    (
-        {"weight": lambda self, q: 9.81 * jnp.stack([jnp.sin(q[0] + q[1]), jnp.sin(q[1])])},
-        "gravity and springs",
-        "the load of joint1 changes with joint2 by",
-    ),
-    (
-        {"coriolis": lambda self, q, v: 0.9 * Arm.coriolis(self, q, v) + 0.3 * v},
-        "forces of inertia",
-        "they add energy",  # at high speed, where damping does not hide it
-    ),
+    (WHIRL, "gravity and springs", "the load of joint1 changes with joint2 by"),
+    # At high speed, where damping does not hide it.
+    (PUMP, "forces of inertia", "they add energy"),
     (inertia([np.nan, 0.0], [0.0, 1.0]), "equation of motion", "mass_matrix is not finite"),
-    (
-        {"integrator": staticmethod(lambda a, q, v, h, limit: (q + h * v, v * (1.0 + h)))},
-        "energy",
-        "which is no error of the integrator",
-    ),
+    (GROW, "energy", "which is no error of the integrator"),
 )
 def test_what_is_not_mechanical_is_named(changes, name, message, x64):
     failed = [item for item in judged(**changes) if not item.ok]

@@ -22,18 +22,15 @@ PLAIN = [twins.make(name) for name in twins.names()] + [
     twins.from_mujoco(robots.compiled(robots.chain(2), timestep=0.0023))
 ]
 # One of each kind: forces, a command with memory, a delay. Every effect has its own tests.
-ATTACHED = (
-    effects.CoulombFriction,
-    effects.QuadraticDrag,
-    effects.TorqueGain,
-    effects.MotorLag,
-    effects.ActionDelay,
-)
+ATTACHED = (effects.CoulombFriction, effects.QuadraticDrag, effects.TorqueGain, effects.MotorLag)
+
+
+def sizes_of(kind):
+    return {name: p.null + 0.7 * p.scale for name, p in kind.parameters.items()}
+
+
 EXTENDED = twins.make("Pendulum").extend(
-    *(
-        kind(0, **{n: p.null + 0.7 * p.scale for n, p in kind.parameters.items()})
-        for kind in ATTACHED
-    )
+    *(kind(0, **sizes_of(kind)) for kind in (*ATTACHED, effects.ActionDelay))
 )
 name_of = {"ids": lambda twin: twin.name + "+" * isinstance(twin, ExtendedTwin)}
 every_twin = pytest.mark.parametrize("twin", [*PLAIN, EXTENDED], **name_of)

@@ -271,14 +271,9 @@ def test_droq_drops_out_in_every_pass_of_its_critics_each_with_a_mask_of_its_own
 
 
 def _after_dropout(critic: Any, obs: Any, action: Any, w: Weights, key: Any) -> Any:
-    _, seen = critic.apply(
-        {"params": w},
-        obs,
-        action,
-        rngs={"dropout": key},
-        capture_intermediates=lambda module, _: isinstance(module, Dropout),
-        mutable=["intermediates"],
-    )
+    is_dropout = lambda module, _: isinstance(module, Dropout)  # noqa: E731
+    how = {"capture_intermediates": is_dropout, "mutable": ["intermediates"]}
+    _, seen = critic.apply({"params": w}, obs, action, rngs={"dropout": key}, **how)
     return seen["intermediates"]["body"]["Dropout_0"]["__call__"][0]
 
 

@@ -39,15 +39,9 @@ class Zoo:
         self.environ = {**os.environ, **own}
 
     def succeeds(self, *words: str, **environ: str) -> str:
-        done = subprocess.run(
-            words,
-            cwd=self.folder,
-            env={**self.environ, **environ},
-            text=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            timeout=500,
-        )
+        into = {"text": True, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        where = {"cwd": self.folder, "env": {**self.environ, **environ}}
+        done = subprocess.run(words, timeout=500, **into, **where)
         assert done.returncode == 0, done.stdout[-6000:]
         return done.stdout
 
