@@ -51,6 +51,16 @@ def expensive(*values):
     return pytest.param(*values, marks=pytest.mark.expensive)
 
 
+def test_horizons_at_which_a_named_cause_makes_it_worse_are_told():
+    better = HorizonGain(10, 2.0, 1.0, 0.4, 0.6)
+    unsure = HorizonGain(5, 1.0, 1.1, -0.2, 0.01)
+    worse = HorizonGain(1, 1.0, 1.2, -0.3, -0.1)
+
+    assert errs_more({5: unsure, 10: better}) == []
+    (told,) = errs_more({1: worse, 5: unsure, 10: better})
+    assert "1 (+20%)" in told and "5" not in told
+
+
 @pytest.fixture(scope="module")
 def both():
     return asked(on_engine(friction=0.1, delay=0.05), budget="quick")
@@ -89,16 +99,6 @@ def test_what_the_data_cannot_tell_apart_is_said():
     assert {finding.effect, *finding.alternatives} >= {"parameter.mass"}
     assert any("torque_gain" in name for name in (finding.effect, *finding.alternatives))
     assert any("look alike where the mass scales" in caveat for caveat in found.caveats)
-
-
-def test_horizons_at_which_a_named_cause_makes_it_worse_are_told():
-    better = HorizonGain(10, 2.0, 1.0, 0.4, 0.6)
-    unsure = HorizonGain(5, 1.0, 1.1, -0.2, 0.01)
-    worse = HorizonGain(1, 1.0, 1.2, -0.3, -0.1)
-
-    assert errs_more({5: unsure, 10: better}) == []
-    (told,) = errs_more({1: worse, 5: unsure, 10: better})
-    assert "1 (+20%)" in told and "5" not in told
 
 
 def test_causes_look_alike_at_one_place_only():

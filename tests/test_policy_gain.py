@@ -26,22 +26,6 @@ def a_diagnosis(believed="PendulumReal"):
     return Diagnosis(verdict="named", believed=twin, twin=extended, data_hash="", seed=0)
 
 
-def robot():
-    return gymnasium.make(ROBOT, friction=0.3, max_episode_steps=20)
-
-
-@pytest.fixture(scope="module")
-def measured():
-    return measure_policy_gain(a_diagnosis(), robot, seeds=2, n_episodes=3, progress=False, **SMALL)
-
-
-def test_every_twin_gets_the_same_runs_and_start_states(measured):
-    assert set(measured.returns) == {"believed", "extended", "true"}
-    assert all(values.shape == (2, 3) for values in measured.returns.values())
-    # The extended twin is the true one here, so its policies are the same.
-    np.testing.assert_array_equal(measured.returns["extended"], measured.returns["true"])
-
-
 def gain_of(believed, extended, **true):
     returns = {"believed": np.array(believed), "extended": np.array(extended)} | true
     return PolicyGain(returns, _summarised(returns["extended"] - returns["believed"]))
@@ -70,6 +54,22 @@ def test_an_outlier_moves_no_interquartile_mean_and_a_single_run_has_no_interval
     gain = gain_of(np.arange(16.0)[None], np.arange(16.0)[None] + 1.0)
     assert "over 16 start states, one run" in str(gain) and "interval" not in str(gain)
     assert gain.to_dict()["gain"] == {"mean": 1.0, "low": None, "high": None}
+
+
+def robot():
+    return gymnasium.make(ROBOT, friction=0.3, max_episode_steps=20)
+
+
+@pytest.fixture(scope="module")
+def measured():
+    return measure_policy_gain(a_diagnosis(), robot, seeds=2, n_episodes=3, progress=False, **SMALL)
+
+
+def test_every_twin_gets_the_same_runs_and_start_states(measured):
+    assert set(measured.returns) == {"believed", "extended", "true"}
+    assert all(values.shape == (2, 3) for values in measured.returns.values())
+    # The extended twin is the true one here, so its policies are the same.
+    np.testing.assert_array_equal(measured.returns["extended"], measured.returns["true"])
 
 
 def test_other_algorithms_train_in_the_simulation_for_a_budget():
