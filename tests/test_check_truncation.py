@@ -157,7 +157,7 @@ REMOTE = "20 of 20 .* cut after exactly 20 .* 1000 steps of the outermost wrappe
     (lambda: Foreign(last="all"), "of shape .2, 3. instead of one observation"),
     (lambda: CountingVector(3, AutoresetMode.SAME_STEP, final_obs=None), "final_obs"),
     (lambda: CountingVector(3, AutoresetMode.NEXT_STEP), "partial_reset="),
-    (lambda: NormalizeObservation(gymnasium.make_vec("Pendulum-v1", 2)), "VecNormalize"),
+    (lambda: NormalizeObservation(gymnasium.make_vec("CartPole-v1", 2, "sync")), "VecNormalize"),
     # Limits around shorter ones.
     (outrun, NEVER_ACTS),
     (lambda: InfiniteHorizon(Monitor(limited()), 1_000), NEVER_ACTS),

@@ -114,8 +114,9 @@ def test_indexing_gives_trajectories_padded_no_longer_than_needed():
     np.testing.assert_array_equal(some.episode(1)[0], data.episode(0)[0])
     assert rest.lengths.tolist() == [7, 5]
     assert_same(data[data.lengths > 4], rest)
-    # Put together again, recordings stay apart.
-    assert_same(Trajectories.concatenate([data[:1], data[1:]]), data)
+    joined = Trajectories.concatenate([data, data_of(6, conditions="d", seed=1)])
+    assert (joined.lengths.tolist(), joined.origin.tolist()) == ([3, 7, 5, 6], [0, 1, 2, 3])
+    assert joined.conditions == ("a", "b", "c", "d")
     assert [len(part) for part in data] == [1, 1, 1]
     with pytest.raises(IndexError):
         data[3]
