@@ -18,12 +18,7 @@ _HOST = """<!DOCTYPE html><title></title><script>addEventListener("load", () => 
 
 
 def in_chromium(page: str, look: str, width: int, folder: Path) -> tuple[dict, list[str]]:
-    """
-    A page in a frame of that many pixels: by itself, Chromium shows nothing narrower than 500.
-
-    :param look: a function of JavaScript, of the document and of what takes the result
-    :return: that result, and what the console says
-    """
+    """A page in a frame of so many pixels, as JavaScript looks at it; and the console."""
     host = folder / f"host{width}.html"
     host.write_text(_HOST.format(look=look, width=width, page=html.escape(page)))
     words = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr"]

@@ -47,10 +47,7 @@ def truth(copy: int, actions: np.ndarray) -> list[Row]:
 
 
 class Counting(gymnasium.Env):
-    """
-    :param copy: its number
-    :param render_mode: of images as dark as the number
-    """
+    """Whose images are as dark as its number."""
 
     metadata = {"render_modes": ["rgb_array"]}
     observation_space = spaces.Box(-np.inf, np.inf, (4,), np.float32)
@@ -87,13 +84,7 @@ class Counting(gymnasium.Env):
 
 
 class CountingVector(VectorEnv):
-    """
-    Copies of ``Counting`` in a ``VectorEnv`` of somebody's own, whose observations are one buffer
-    that it writes into again and again.
-
-    :param final_obs: the name under which it tells the last observation; None: it does not
-    :param knows_masks: whether ``reset_mask`` resets some copies only
-    """
+    """Somebody's own ``VectorEnv``: one buffer of observations, written again and again."""
 
     def __init__(
         self,

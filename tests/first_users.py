@@ -35,12 +35,7 @@ def flipped_command():
 
 
 def free_pendulum(factor=1.0, zero="down", dry=0.012):
-    """
-    A pendulum that is let go: dry friction of 0.012 N m beside a viscous one that the twin knows.
-
-    :param factor: of the angles: 180 / pi makes degrees
-    :param zero: of the twin; the log counts from hanging
-    """
+    """Let go: dry friction beside a viscous one that the twin knows; angles as told."""
     rng, h, runs = np.random.default_rng(3), 0.001, []
     total = 0.002 + 0.3 * 0.2**2
     for start in rng.uniform(0.6, 1.4, 8) * rng.choice([-1, 1], 8):
@@ -80,11 +75,7 @@ def scaled_angle():
 
 
 def fast_oscillator(slower=1.0):
-    """
-    A spring that hardens (6e5 N/m3) at 68 Hz, logged at 2.4 kHz.
-
-    :param slower: by which time is stretched, and nothing else changes
-    """
+    """A spring that hardens (6e5 N/m3) at 68 Hz, logged at 2.4 kHz, in a stretched time."""
     rng, dt, fine, obs, forces = np.random.default_rng(0), slower / 2441.4, 4, [], []
     k, d, k3, h = 1.8e5 / slower**2, 36 / slower, 6e5 / slower**2, dt / fine
     frequency = np.fft.rfftfreq(600, 1 / 2441.4)

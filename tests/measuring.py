@@ -30,9 +30,8 @@ def measured(twin, n=8, n_steps=60, noise=0.0, seed=0, share=0.8, commands=None)
     with jax.enable_x64(True):
         params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), twin.params)
         obs = np.asarray(_observed(twin, params, keys, jnp.asarray(actions)))
-    return Trajectories.from_arrays(
-        obs + noise * rng.standard_normal(obs.shape), actions, dt=twin.dt
-    )
+    obs = obs + noise * rng.standard_normal(obs.shape)
+    return Trajectories.from_arrays(obs, actions, dt=twin.dt)
 
 
 def jumping(n, n_levels=20, each=10, size=4.0):

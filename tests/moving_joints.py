@@ -8,15 +8,7 @@ DT = 0.05  # [s]
 
 
 class MovingJoints(gymnasium.Env):
-    """
-    Joints that move as fast as they are told, from a random place within [-0.45, 0.45]. The reward
-    is best at ``goal``. Actions outside of the action space are executed as they come.
-
-    :param n: how many
-    :param goal: of every joint
-    :param angles: observe cosine and sine instead of the position
-    :param lag: share of a command that a joint does not follow
-    """
+    """Joints that move as fast as they are told, but for a lag, and are best at ``goal``."""
 
     dt = DT
 

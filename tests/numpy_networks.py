@@ -1,9 +1,4 @@
-"""
-Networks, slopes and optimisers in plain NumPy and double precision, to hold updates against.
-
-Weights are nested dictionaries with the names of Flax. Slopes are central differences in every
-single weight: their error, about ``_STEP**2``, is far below what tests ask for.
-"""
+"""Updates in plain NumPy: slopes are central differences in every single weight."""
 
 from collections.abc import Callable
 from typing import Any

@@ -17,11 +17,7 @@ _DRAG = 0.5  # [N s/m]
 
 
 class PointMass(Mass):
-    r"""
-    :math:`m\dot v = u - 0.5\,v` with a force :math:`u` from -1 to 3 N, stronger one way.
-
-    The reward is :math:`-x^2 - 0.1\,v^2 - 0.01\,u^2` where the mass was before the step.
-    """
+    r""":math:`m\dot v = u - 0.5\,v`, -1 to 3 N; the reward is that of where the mass was."""
 
     name = "PointMass"
     dt = 0.2
@@ -52,10 +48,7 @@ def point_mass_env(dtype: type = np.float32) -> gymnasium.Env:
 
 
 def returns_of(policy, n_episodes: int = 20) -> np.ndarray:
-    """
-    :param policy: observation to action
-    :return: return of each of the first ``n_episodes``, whose starts are always the same
-    """
+    """Of the first episodes, whose starts are always the same."""
     env, returns = point_mass_env(), []
     for seed in range(n_episodes):
         obs, _ = env.reset(seed=seed)

@@ -88,10 +88,7 @@ GRIPPER = robot(
 
 
 def quadruped(base="", *, option="", actuator="position"):
-    """Four legs of three hinges.
-
-    :param base: joints of its trunk: none, ``<freejoint/>``, or others
-    """
+    """Four legs of three hinges, on a trunk with these joints."""
     legs, drives = "", ""
     for name, x, y in (("FL", 1, 1), ("FR", 1, -1), ("RL", -1, 1), ("RR", -1, -1)):
         legs += f"""

@@ -18,31 +18,16 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_hds import algos
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 every_algorithm = pytest.mark.parametrize("name", EVERY_NAME)
 #: one of each way of collecting steps
 every_kind = pytest.mark.parametrize("name", ["droq", "hds", "openloop"])
 
 #: what it takes to learn PointMass in seconds
 LEARNING = {
-    "hds": {
-        "pretrain_epochs": 40,
-        "n_rollouts": 16,
-        "horizon": 8,
-        "gradient_steps": 40,
-        "batch_size": 64,
-        "learning_rate": 5e-3,
-        "policy_kwargs": {"net_arch": [16]},
-    },
-    "droq": {
-        "learning_rate": 3e-3,
-        "gradient_steps": 5,
-        "train_freq": 5,
-        "gamma": 0.95,
-        "learning_starts": 100,
-        "batch_size": 64,
-        "policy_kwargs": {"net_arch": [32, 32]},
-    },
+    "hds": {"learning_rate": 5e-3, "gradient_steps": 40, "policy_kwargs": {"net_arch": [16]}}
+    | {"pretrain_epochs": 40, "n_rollouts": 16, "horizon": 8, "batch_size": 64},
+    "droq": {"learning_rate": 3e-3, "gradient_steps": 5, "policy_kwargs": {"net_arch": [32, 32]}}
+    | {"train_freq": 5, "gamma": 0.95, "learning_starts": 100, "batch_size": 64},
 }
 
 
@@ -99,7 +84,6 @@ def test_it_learns_a_task_that_a_linear_controller_solves(name):
 @pytest.mark.parametrize("name", ["droq", "td7", "hds", "openloop"])
 def test_two_runs_with_one_seed_end_with_the_same_weights(name):
     first, second, other = (small(name, seed=seed).learn(75).get_parameters() for seed in (3, 3, 4))
-
     assert same(first, second) and not same(first, other)
 
 
@@ -228,7 +212,6 @@ def test_another_environment_may_be_set(name):
 @pytest.mark.parametrize("name", ["droq", "td7", "hds"])
 def test_several_copies_of_the_environment_are_stepped_together(name):
     model = small(name, pendulums(4), train_freq=5).learn(60)
-
     assert model.num_timesteps == 60
     assert model.replay_buffer.size() == 15 and model.replay_buffer.n_envs == 4
     assert greedy(model, model.get_env().reset()).shape == (4, 1)
@@ -239,9 +222,8 @@ def test_a_policy_learns_and_acts_in_a_normalised_environment():
     idle = returns_of(lambda obs: np.zeros(1, np.float32)).mean()
     env = VecNormalize(DummyVecEnv([point_mass_env]))
     model = small("hds", env, **LEARNING["hds"]).learn(30)
-    elsewhere = VecNormalize(
-        DummyVecEnv([lambda: Monitor(point_mass_env())]), training=False, norm_reward=False
-    )
+    monitored = DummyVecEnv([lambda: Monitor(point_mass_env())])
+    elsewhere = VecNormalize(monitored, training=False, norm_reward=False)
     elsewhere.obs_rms = env.obs_rms
 
     score, _ = evaluate_policy(model, elsewhere, n_eval_episodes=20)

@@ -14,8 +14,6 @@ from model_free import LENGTHS, ONLY_ON, OURS, PEERS
 
 from rl_zoo_plugin.lazy import parameters_of
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 def runs_of(cell, seeds, methods=("wrong_twin", "ceiling", "randomised", "hds")):
     """The wrong twin gets 0, the ceiling 100; HDS closes 0.2, 0.6 and 0.9 of it."""
@@ -79,42 +77,6 @@ def test_every_setting_of_a_method_is_an_argument_of_its_class():
             known = parameters_of(algorithm) if method in OURS else signature(algorithm).parameters
             assert set(settings) <= set(known), (env, method)
             assert len(model_free.marks(env, method)) > 1
-
-
-def test_a_long_run_goes_on_from_its_last_mark(tmp_path, monkeypatch):
-    env, method = "InvertedPendulum-v5", "td7"
-    monkeypatch.setattr(model_free, "LENGTHS", {env: (150, 50)})
-    monkeypatch.setattr(model_free, "CACHE", tmp_path)
-    made_of = model_free.made_of
-    small = {"learning_starts": 20, "buffer_size": 1000, "batch_size": 16}
-    small["policy_kwargs"] = {"net_arch": [8], "embedding_size": 8}
-    monkeypatch.setattr(model_free, "made_of", lambda *run: (made_of(*run)[0], small))
-
-    def interrupted_after(mark):
-        def evaluate(model):
-            if model.num_timesteps > mark:
-                raise KeyboardInterrupt
-            return np.array([float(model.num_timesteps)])
-
-        return evaluate
-
-    monkeypatch.setattr(model_free, "evaluation", lambda env: interrupted_after(140))
-    with pytest.raises(KeyboardInterrupt):
-        model_free.worker(env, method, 0)
-    kept = runs.InterruptedRun(tmp_path / "model_free" / f"{env}_{method}_0")
-    before = kept.rows()
-    model = kept.model(model_free.class_of(env, method), env)
-
-    monkeypatch.setattr(model_free, "evaluation", lambda env: interrupted_after(1e9))
-    rows = model_free.worker(env, method, 0)
-
-    assert len(before) == 2
-    assert model.num_timesteps == model.replay_buffer.size() == before[-1]["steps"] < 140
-    assert model._n_updates > 0
-    assert rows[:2] == before
-    assert [row["mark"] for row in rows] == [50, 100, 150]
-    assert 150 <= rows[-1]["steps"] <= 180
-    assert not kept.folder.exists()
 
 
 def test_intervals_are_those_of_rliable():

@@ -5,6 +5,7 @@ import re
 import gymnasium
 import numpy as np
 import pytest
+from cases import each
 from counting import CountingVector
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
@@ -27,14 +28,7 @@ every_mode = pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mod
 
 
 class Drawn(AnySpaces):
-    """
-    Observations that are drawn; an episode fails in each step with the same probability.
-
-    :param failing: the probability
-    :param limit: steps after which it calls itself terminated
-    :param how: in which the limit is told: ``"terminated"``, ``"truncated"``, or ``"info"`` (a
-        termination with ``TimeLimit.truncated``)
-    """
+    """Fails by chance; its limit is told as an end, as a truncation or in ``info``."""
 
     def __init__(self, failing: float = 0.0, limit: int | None = None, how: str = "terminated"):
         super().__init__()
@@ -50,14 +44,7 @@ class Drawn(AnySpaces):
 
 
 class Foreign(VecEnvWrapper):
-    """
-    Somebody's own ``VecEnv``.
-
-    :param flag: whether ``TimeLimit.truncated`` is told ``"always"``, only ``"where true"``, or
-        ``"never"``
-    :param last: which ``terminal_observation``: ``"right"``, ``"none"``, that of the ``"next"``
-        episode, or ``"all"`` rows
-    """
+    """Somebody's own ``VecEnv``: how it flags time-outs, and what it tells last."""
 
     def __init__(self, failing: float = 0.0, flag: str = "always", last: str = "right"):
         super().__init__(DummyVecEnv([lambda: limited(failing)] * 2))
@@ -99,32 +86,28 @@ class OldReset(OldStyle):
         return super().reset(seed=0)[0]
 
 
-@pytest.mark.parametrize(
-    ("env", "noted"),
-    [
-        (lambda: limited(0.02), None),
-        (lambda: VecMonitor(DummyVecEnv([limited] * 2)), None),
-        (lambda: Foreign(0.03, flag="where true"), None),  # SB3 reads a missing entry as False
-        # Around a longer limit, or an equal one.
-        (lambda: TimeLimit(TimeLimit(Drawn(), 1_000), LIMIT), None),
-        (lambda: TimeLimit(limited(), LIMIT), None),
-        (lambda: gymnasium.make("Pendulum-v1", max_episode_steps=300), None),
-        # The remedy that is named for a limit that terminates.
-        (lambda: InfiniteHorizon(Drawn(limit=LIMIT), max_episode_steps=LIMIT), None),
-        # Copies of somebody's own: half of the episodes are cut, after one to four steps.
-        (lambda: CountingVector(3, AutoresetMode.SAME_STEP), None),
-        (lambda: CountingVector(3, AutoresetMode.DISABLED), None),
-        # A limit that ends the task is fine where observations tell the time.
-        (lambda: limited(wrap=lambda env: TruncateToTerminate(TimeAware(env))), "the limit of 20"),
-        (lambda: TimeLimit(Drawn(0.3), 500), "before the limit of 500"),
-        # Failures at any time are no limit.
-        (lambda: Drawn(0.01), "terminated"),
-        (lambda: Drawn(0.1), "terminated"),
-    ],
+@each(
+    (lambda: limited(0.02), None),
+    (lambda: VecMonitor(DummyVecEnv([limited] * 2)), None),
+    (lambda: Foreign(0.03, flag="where true"), None),  # SB3 reads a missing entry as False
+    # Around a longer limit, or an equal one.
+    (lambda: TimeLimit(TimeLimit(Drawn(), 1_000), LIMIT), None),
+    (lambda: TimeLimit(limited(), LIMIT), None),
+    (lambda: gymnasium.make("Pendulum-v1", max_episode_steps=300), None),
+    # The remedy that is named for a limit that terminates.
+    (lambda: InfiniteHorizon(Drawn(limit=LIMIT), max_episode_steps=LIMIT), None),
+    # Copies of somebody's own: half of the episodes are cut, after one to four steps.
+    (lambda: CountingVector(3, AutoresetMode.SAME_STEP), None),
+    (lambda: CountingVector(3, AutoresetMode.DISABLED), None),
+    # A limit that ends the task is fine where observations tell the time.
+    (lambda: limited(wrap=lambda env: TruncateToTerminate(TimeAware(env))), "the limit of 20"),
+    (lambda: TimeLimit(Drawn(0.3), 500), "before the limit of 500"),
+    # Failures at any time are no limit.
+    (lambda: Drawn(0.01), "terminated"),
+    (lambda: Drawn(0.1), "terminated"),
 )
 def test_what_is_right_is_fine_and_where_no_time_out_was_seen_a_note_says_so(env, noted):
     report = check_truncation(env())
-
     assert report.ok and report.problems == []
     assert noted in report.notes[0] if noted else report.notes == []
 
@@ -142,9 +125,7 @@ def test_failures_about_the_same_time_are_no_limit():
 
 @every_mode
 def test_time_outs_arrive_in_every_autoreset_mode_and_limits_that_terminate_are_found(mode):
-    right, wrong = (
-        [lambda how=how: limited(wrap=how)] * 2 for how in (lambda env: env, TruncateToTerminate)
-    )
+    right, wrong = [limited] * 2, [lambda: limited(wrap=TruncateToTerminate)] * 2
 
     report = check_truncation(SyncVectorEnv(right, autoreset_mode=mode))
 
@@ -157,49 +138,35 @@ def test_time_outs_arrive_in_every_autoreset_mode_and_limits_that_terminate_are_
 
 
 NEVER_ACTS = "limit of 1000 steps of .* never acts.* that of 20 steps of TimeLimit .*_steps=1000"
+SELDOM = "(1[2-9]|20) of 20 .* cut after exactly 20 .* limit of 500 steps of TimeLimit never"
+REMOTE = "20 of 20 .* cut after exactly 20 .* 1000 steps of the outermost wrapper never acts"
 
 
-@pytest.mark.parametrize(
-    ("env", "said"),
-    [
-        (
-            lambda: Drawn(limit=LIMIT),
-            "20 of 20 .* terminations after exactly 20 steps.*truncated=True.*max_episode_steps=20",
-        ),
-        # Of 20 episodes, 0.98^49 = 37 % reach the limit, all others end at times of their own.
-        (lambda: Drawn(0.02, limit=50), "[3-9] of 2. .* terminations after exactly 50 steps"),
-        # The number of steps gives it away as well: two paragraphs.
-        (lambda: Drawn(limit=LIMIT, how="info"), "20 time-outs of 20 ends stood only in info.*"),
-        (lambda: OldStyle(limit=LIMIT), "With a single 'done', a time-out cannot"),
-        (lambda: OldReset(limit=LIMIT), "from reset.seed=..., options=...."),
-        (Drawn, "No episode ended in 2000 steps"),
-        (lambda: Foreign(flag="never"), "had no 'TimeLimit.truncated'"),
-        (lambda: Foreign(last="none"), "had no 'terminal_observation'"),
-        (lambda: Foreign(last="next"), "was what step.. returned as well"),
-        (lambda: Foreign(last="all"), "of shape .2, 3. instead of one observation"),
-        (lambda: CountingVector(3, AutoresetMode.SAME_STEP, final_obs=None), "final_obs"),
-        (lambda: CountingVector(3, AutoresetMode.NEXT_STEP), "partial_reset="),
-        (
-            lambda: NormalizeObservation(gymnasium.make_vec("CartPole-v1", 2, "sync")),
-            "VecNormalize",
-        ),
-        # Limits around shorter ones.
-        (outrun, NEVER_ACTS),
-        (lambda: InfiniteHorizon(Monitor(limited()), 1_000), NEVER_ACTS),
-        (lambda: DummyVecEnv([limited, outrun]), NEVER_ACTS),
-        (lambda: RescaleAction(SyncVectorEnv([outrun] * 2), -1.0, 1.0), NEVER_ACTS),
-        (lambda: GymnasiumVecEnv(SyncVectorEnv([outrun] * 2)), NEVER_ACTS),
-        # Each step fails with 0.5 %: 0.995^19 = 91 % reach the inner limit.
-        (
-            lambda: TimeLimit(Drawn(0.005, limit=LIMIT, how="truncated"), 500),
-            "(1[2-9]|20) of 20 .* cut after exactly 20 .* limit of 500 steps of TimeLimit never",
-        ),
-        pytest.param(
-            lambda: SubprocVecEnv([outrun] * 2),
-            "20 of 20 .* cut after exactly 20 .* 1000 steps of the outermost wrapper never acts",
-            marks=pytest.mark.expensive,
-        ),
-    ],
+@each(
+    (lambda: Drawn(limit=LIMIT), "20 of 20 .* terminations after exactly 20 steps.*_steps=20"),
+    # Of 20 episodes, 0.98^49 = 37 % reach the limit, all others end at times of their own.
+    (lambda: Drawn(0.02, limit=50), "[3-9] of 2. .* terminations after exactly 50 steps"),
+    # The number of steps gives it away as well: two paragraphs.
+    (lambda: Drawn(limit=LIMIT, how="info"), "20 time-outs of 20 ends stood only in info.*"),
+    (lambda: OldStyle(limit=LIMIT), "With a single 'done', a time-out cannot"),
+    (lambda: OldReset(limit=LIMIT), "from reset.seed=..., options=...."),
+    (Drawn, "No episode ended in 2000 steps"),
+    (lambda: Foreign(flag="never"), "had no 'TimeLimit.truncated'"),
+    (lambda: Foreign(last="none"), "had no 'terminal_observation'"),
+    (lambda: Foreign(last="next"), "was what step.. returned as well"),
+    (lambda: Foreign(last="all"), "of shape .2, 3. instead of one observation"),
+    (lambda: CountingVector(3, AutoresetMode.SAME_STEP, final_obs=None), "final_obs"),
+    (lambda: CountingVector(3, AutoresetMode.NEXT_STEP), "partial_reset="),
+    (lambda: NormalizeObservation(gymnasium.make_vec("CartPole-v1", 2, "sync")), "VecNormalize"),
+    # Limits around shorter ones.
+    (outrun, NEVER_ACTS),
+    (lambda: InfiniteHorizon(Monitor(limited()), 1_000), NEVER_ACTS),
+    (lambda: DummyVecEnv([limited, outrun]), NEVER_ACTS),
+    (lambda: RescaleAction(SyncVectorEnv([outrun] * 2), -1.0, 1.0), NEVER_ACTS),
+    (lambda: GymnasiumVecEnv(SyncVectorEnv([outrun] * 2)), NEVER_ACTS),
+    # Each step fails with 0.5 %: 0.995^19 = 91 % reach the inner limit.
+    (lambda: TimeLimit(Drawn(0.005, limit=LIMIT, how="truncated"), 500), SELDOM),
+    pytest.param(lambda: SubprocVecEnv([outrun] * 2), REMOTE, marks=pytest.mark.expensive),
 )
 def test_what_is_wrong_is_found(env, said):
     env = env()

@@ -10,6 +10,7 @@ from importlib.metadata import version
 
 import numpy as np
 import pytest
+from cases import each
 from measuring import measured
 
 from sb3_hds import Trajectories, cli, effects, twins
@@ -62,8 +63,7 @@ def test_an_audit_needs_no_twin_and_says_what_the_clock_was(swings, tmp_path, ca
 def test_an_audit_with_a_twin_sees_degrees_and_any_verdict_is_success(swings, tmp_path, capsys):
     twin = ["--twin", "FreePendulum", "--set", "mass:0.3", "dt:0.00666667"]
 
-    assert question(swings, "audit", "deg") == 0
-    assert "usable: yes" in capsys.readouterr().out
+    assert question(swings, "audit", "deg") == 0 and "usable: yes" in capsys.readouterr().out
     assert question(swings, "audit", "deg", *twin) == 0
     assert "{column: angle, unit: deg}" in " ".join(capsys.readouterr().out.split())
     assert question(swings, "calibrate", "deg", *twin, "--write", tmp_path / "twin.json") == 1
@@ -75,11 +75,9 @@ def test_a_calibrated_twin_is_printed_written_and_read_again(swings, tmp_path, c
     twin, told = tmp_path / "twin.json", tmp_path / "fit.json"
     about = ["--twin", "FreePendulum", "--set", "dt:0.00666667", "mass:0.3"]
 
-    code = question(
-        swings, "calibrate", "rad", *about, "--free", "com,damping", "--json", told, "--write", twin
-    )
+    written = ["--json", told, "--write", twin]
+    assert question(swings, "calibrate", "rad", *about, "--free", "com,damping", *written) == 0
 
-    assert code == 0
     assert "com" in (shown := capsys.readouterr().out) and "95 % interval" in shown
     plain = json.loads(told.read_text())
     assert [e["name"] for e in plain["estimates"]] == ["com", "damping"] and plain["converged"]
@@ -98,33 +96,27 @@ def test_a_calibrated_twin_is_printed_written_and_read_again(swings, tmp_path, c
     assert "holds no twin: it has to be what" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("diagnose --twin Nothing --data {}", "no twin for 'Nothing'"),
-        ("diagnose --twin FreePendulum --data missing.npz", "missing.npz"),
-        ("diagnose {} --effects CoulombFrction", "Did you mean 'coulomb_friction'?"),
-        ("diagnose {} --set mass=2", "--set takes NAME:VALUE, got 'mass=2'"),
-        ("diagnose {} --set mass:heavy", "must be a number [kg]"),
-        ("diagnose {} --set mas:1", "Did you mean 'mass'?"),
-        ("diagnose {} --columns missing.yml", "missing.yml"),
-        ("diagnose {} --report nowhere/out.html", "cannot be written"),
-        ("diagnose {} --report r.pdf", "r.html in place of r.pdf"),
-        ("diagnose {} --json .", "is a folder"),
-        ("diagnose {} --env Nothing-v0", "Nothing"),
-        ("diagnose {} --env Pendulum-v1 --algo magic", "no algorithm 'magic'"),
-        ("diagnose {} --env Pendulum-v1 --hyperparams speed:1", "speed"),
-        ("diagnose {} --env Pendulum-v1 --algo sac", "learns nothing"),
-        ("audit --data {} --set mass:1", "--set changes the twin"),
-        ("audit --twin CartPole --data {}", "CartPole has 5 channels"),
-        ("calibrate {} --set dt:0.01", "steps by 0.01 s"),
-        ("calibrate {} --free weight", "free must name parameters"),
-        ("effects frictoin", "Did you mean 'friction'?"),
-        ("twins chek Pendulum", "Did you mean 'check'?"),
-        ("twins check", "Name one twin"),
-    ],
+@each(
+    ("diagnose --twin Nothing --data {}", "no twin for 'Nothing'"),
+    ("diagnose --twin FreePendulum --data missing.npz", "missing.npz"),
+    ("diagnose {} --effects CoulombFrction", "Did you mean 'coulomb_friction'?"),
+    ("diagnose {} --set mass=2", "--set takes NAME:VALUE, got 'mass=2'"),
+    ("diagnose {} --set mas:1", "Did you mean 'mass'?"),
+    ("diagnose {} --columns missing.yml", "missing.yml"),
+    ("diagnose {} --report nowhere/out.html", "cannot be written"),
+    ("diagnose {} --report r.pdf", "r.html in place of r.pdf"),
+    ("diagnose {} --json .", "is a folder"),
+    ("diagnose {} --env Pendulum-v1 --algo magic", "no algorithm 'magic'"),
+    ("diagnose {} --env Pendulum-v1 --hyperparams speed:1", "speed"),
+    ("diagnose {} --env Pendulum-v1 --algo sac", "learns nothing"),
+    ("audit --data {} --set mass:1", "--set changes the twin"),
+    ("audit --twin CartPole --data {}", "CartPole has 5 channels"),
+    ("calibrate {} --free weight", "free must name parameters"),
+    ("effects frictoin", "Did you mean 'friction'?"),
+    ("twins chek Pendulum", "Did you mean 'check'?"),
+    ("twins check", "Name one twin"),
 )
-def test_a_question_that_makes_no_sense_is_one_message(swings, capsys, words, message):
+def test_a_question_that_makes_no_sense_is_one_message(words, message, swings, capsys):
     data = f"{swings / 'rad.csv'} --columns {swings / 'map.yml'}"
     if " --data" not in words:
         data = f"--twin FreePendulum --data {data}"
@@ -135,19 +127,15 @@ def test_a_question_that_makes_no_sense_is_one_message(swings, capsys, words, me
     assert message in told and "Traceback" not in told and told.count("sb3-hds: ") == 1
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["diagnos"], "Did you mean 'diagnose'?"),
-        (["diagnose", "--twin", "a", "--data", "b", "--efects", "x"], "option '--efects'. Did"),
-        (["diagnose", "--twin", "a", "--data", "b", "--budget", "quik"], "mean 'quick'?"),
-        ([], "are required: command"),
-    ],
+@each(
+    (["diagnos"], "Did you mean 'diagnose'?"),
+    (["diagnose", "--twin", "a", "--data", "b", "--efects", "x"], "option '--efects'. Did"),
+    (["diagnose", "--twin", "a", "--data", "b", "--budget", "quik"], "mean 'quick'?"),
+    ([], "are required: command"),
 )
 def test_words_that_are_not_understood_are_one_line(words, message, capsys):
     with pytest.raises(SystemExit) as end:
         cli.main(words)
-
     told = capsys.readouterr().err
     assert end.value.code == 2 and message in told and told.count("\n") == 1
 
@@ -267,10 +255,8 @@ def test_what_the_audit_proposes_is_done_if_wanted_and_said(asked, tmp_path, cap
 
 
 def test_a_diagnosis_and_the_gain_in_policy_are_printed_and_written(tmp_path, capsys, monkeypatch):
-    compared, returns = (
-        [],
-        {"believed": np.array([[-9.0, -7.0]]), "extended": np.array([[-4.0, -2.0]])},
-    )
+    returns = {"believed": np.array([[-9.0, -7.0]]), "extended": np.array([[-4.0, -2.0]])}
+    compared = []
 
     def measure(found, env, learner, **given):
         compared.append((env.unwrapped.spec.id, learner.__name__, given))
@@ -300,7 +286,6 @@ def test_a_diagnosis_and_the_gain_in_policy_are_printed_and_written(tmp_path, ca
 
 def test_where_nothing_was_found_no_policies_are_compared(asked, tmp_path, capsys):
     words = ["--twin", "PendulumReal", "--data", empty_log(tmp_path, 3, 1, 0.05)]
-
     assert ask(*words, "--env", "sb3_hds/PendulumReal-v1") == 0
     assert "no policies to compare" in capsys.readouterr().out
 

@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 import small_robots as robots
+from cases import each
 
 from sb3_hds import cli
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 SERVOS = ["--actuators", "position", "kp:30", "kv:1.5"]
 
 
@@ -73,8 +73,7 @@ def test_a_calibration_writes_the_corrected_file(arm, tmp_path, capsys):
     assert code == 0 and "Time is taken from 't'." in shown
     assert "corrected.xml holds the corrected model" in shown
     (estimate,) = json.loads(told.read_text())["estimates"]
-    assert estimate["name"] == "j0_damping"
-    assert estimate["estimate"] == pytest.approx(2.0, rel=0.02)
+    assert estimate["name"] == "j0_damping" and estimate["estimate"] == pytest.approx(2.0, rel=0.02)
     model = mujoco.MjModel.from_xml_path(str(file))
     assert model.dof_damping == pytest.approx([2.0], rel=0.02)
     assert model.nu == 1 and model.opt.timestep == 0.002
@@ -116,19 +115,15 @@ def test_names_of_joints_come_from_the_map_where_the_log_has_none(arm, asked, tm
     np.testing.assert_allclose(data.obs[0, :5], rows[:5, [2, 1]])
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--twin", "Pendulum", "--ignore", "limits"], "--ignore is about a model file"),
-        (["--model", "missing.urdf"], "There is no file 'missing.urdf'"),
-        (["--model", "ARM", "--actuators", "magic"], "actuators is one of 'torque'"),
-        (["--model", "ARM", "--set", "weight:1"], "no parameter 'weight'"),
-        (["--model", "ARM", "--write", "no/a.xml"], "there is no such folder"),
-    ],
+@each(
+    (["--twin", "Pendulum", "--ignore", "limits"], "--ignore is about a model file"),
+    (["--model", "missing.urdf"], "There is no file 'missing.urdf'"),
+    (["--model", "ARM", "--actuators", "magic"], "actuators is one of 'torque'"),
+    (["--model", "ARM", "--set", "weight:1"], "no parameter 'weight'"),
+    (["--model", "ARM", "--write", "no/a.xml"], "there is no such folder"),
 )
-def test_a_question_that_makes_no_sense_is_one_message(arm, words, message, capsys):
+def test_a_question_that_makes_no_sense_is_one_message(words, message, arm, capsys):
     words = [str(arm / "arm2.xml") if word == "ARM" else word for word in words]
-
     assert cli.main(["calibrate", "--data", str(arm / "log2.csv"), *words]) == 1
     told = capsys.readouterr().err
     assert message in told and "Traceback" not in told

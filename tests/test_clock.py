@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cases import each
 
 from sb3_hds import Trajectories
 from sb3_hds.data.columns import columns_from
@@ -49,11 +50,7 @@ def test_rows_of_a_regular_clock_stay_as_they_are(logger, tmp_path):
     assert data.report.recordings[0].clock == logger and not data.report.altered
 
 
-@pytest.mark.parametrize(
-    ("hz", "tick"),
-    # In the last one, rows slip against ticks: 3 ms exactly, but for one in 3,333.
-    [(1000.0, 0.015625), (240.0, 0.01), (333.3, 0.001)],
-)
+@each((1000.0, 0.015625), (240.0, 0.01), (333.3, 0.001))
 def test_ticks_of_the_logger_may_be_longer_than_the_interval(hz, tick):
     t = regular(hz, 6000)
 
@@ -172,9 +169,7 @@ def test_an_interval_is_round_only_where_the_stamps_cannot_tell(hz, dt):
 
 def test_an_interval_that_is_said_leaves_rows_that_agree_with_it():
     t = regular(30)
-
     [obs], _, report = read(np.round(t, 3), values=[motion(t)], dt=0.03333)
-
     np.testing.assert_array_equal(obs, motion(t))
     assert report.dt == 0.03333 and not report.altered
 
@@ -190,17 +185,13 @@ def test_rows_that_were_held_up_and_catch_up_are_no_gap():
     assert report.recordings[0].gaps == () and report.recordings[0].clock == "late"
 
 
-@pytest.mark.parametrize(
-    ("stamps", "says"),
-    [
-        (FLOAT32_EPOCH, r"single precision \(float32\), numbers around 1.76e\+09 are 128 apart"),
-        (np.floor(regular(n=500)), "500 rows share 5 of them"),
-    ],
+@each(
+    (FLOAT32_EPOCH, r"single precision \(float32\), numbers around 1.76e\+09 are 128 apart"),
+    (np.floor(regular(n=500)), "500 rows share 5 of them"),
 )
 def test_stamps_that_tell_no_interval_are_refused_with_the_way_out(stamps, says):
     with pytest.raises(TrajectoryError, match=says) as refusal:
         read(stamps, values=[motion(regular(n=len(stamps)))])
-
     assert "leave 'time' out of columns and say the interval: dt: SECONDS" in str(refusal.value)
 
 

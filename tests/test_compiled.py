@@ -7,6 +7,7 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
+from cases import each
 from point_mass import N_STEPS, linear_controller, point_mass_env, returns_of
 from small_models import SMALL, greedy, saved, small
 from stable_baselines3.common.noise import NormalActionNoise
@@ -19,8 +20,6 @@ from sb3_hds.algos.model_free.sac.compiled_run import run_rounds
 from sb3_hds.envs import twin_of
 from sb3_hds.errors import EnvironmentMismatchError, SeedsDivergedError
 from sb3_hds.wrappers import ActionRateLimit
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def weights_of(model) -> list[np.ndarray]:
@@ -41,8 +40,7 @@ def test_what_is_remembered_are_steps_of_the_environment():
         np.testing.assert_allclose(buffer.rewards[i, 0], reward, rtol=1e-4, atol=1e-5)
     follows = np.abs(buffer.next_observations[:419, 0] - buffer.observations[1:420, 0]).max(1)
     np.testing.assert_array_equal(np.flatnonzero(follows > 0.0), [199, 399])
-    assert not buffer.dones.any()
-    assert episodes.timesteps.tolist() == [200, 400]
+    assert not buffer.dones.any() and episodes.timesteps.tolist() == [200, 400]
     np.testing.assert_allclose(episodes.returns[0], buffer.rewards[:200].sum(), rtol=1e-5)
     copy, before = algos.TQC.load(saved(model)), weights_of(model)
     np.testing.assert_allclose(greedy(copy), greedy(model), rtol=1e-6)
@@ -110,8 +108,7 @@ def test_what_was_learned_before_an_interruption_is_returned(monkeypatch):
         (model,), (episodes,) = learn_compiled(small("tqc_jax", buffer_size=5_000), 3_000)
 
     assert model.num_timesteps == model.replay_buffer.size() == 2_000
-    assert episodes.timesteps[-1] == 2_000
-    assert model._n_updates == 2 * (2_000 - 10) // 5
+    assert episodes.timesteps[-1] == 2_000 and model._n_updates == 2 * (2_000 - 10) // 5
 
 
 def test_a_twin_may_be_passed_for_what_a_wrapper_changes_and_the_time_limit_is_the_environments():
@@ -130,18 +127,15 @@ def pendulums(n: int) -> DummyVecEnv:
     return DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")] * n)
 
 
-@pytest.mark.parametrize(
-    ("words", "arguments"),
-    [
-        ("n_envs", {"env": pendulums(2)}),
-        ("VecNormalize", {"env": VecNormalize(pendulums(1))}),
-        ("n_steps", {"n_steps": 3}),
-        ("action_noise", {"action_noise": NormalActionNoise(np.zeros(1), np.ones(1))}),
-        ("param_resets", {"param_resets": [50]}),
-        ("episodes", {"train_freq": (1, "episode")}),
-        ("count as ends", {"replay_buffer_kwargs": {"handle_timeout_termination": False}}),
-        ("store='raw'", {"env": ActionRateLimit(pendulums(1).envs[0], 4.0, store="executed")}),
-    ],
+@each(
+    ("n_envs", {"env": pendulums(2)}),
+    ("VecNormalize", {"env": VecNormalize(pendulums(1))}),
+    ("n_steps", {"n_steps": 3}),
+    ("action_noise", {"action_noise": NormalActionNoise(np.zeros(1), np.ones(1))}),
+    ("param_resets", {"param_resets": [50]}),
+    ("episodes", {"train_freq": (1, "episode")}),
+    ("count as ends", {"replay_buffer_kwargs": {"handle_timeout_termination": False}}),
+    ("store='raw'", {"env": ActionRateLimit(pendulums(1).envs[0], 4.0, store="executed")}),
 )
 def test_what_needs_python_is_refused(words, arguments):
     model = small("tqc_jax", **arguments)

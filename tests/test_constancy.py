@@ -28,13 +28,7 @@ class PatchyFriction(JointEffect):
 
 
 def windows(rng, change=0.0, shift=0.0):
-    """
-    Curvatures and scores of windows whose errors are a linear function of three parameters.
-
-    :param change: of the one in question, from one end of a quantity to the other, in standard
-        errors of that parameter
-    :param shift: of all three, likewise
-    """
+    """Of three linear parameters, all off and one changing, in standard errors of that one."""
     slopes = rng.standard_normal((N_WINDOWS, 10, N_FITTED)) * rng.gamma(1.0, 1.0, (N_WINDOWS, 1, 1))
     curvature = np.einsum("nif,nig->nfg", slopes, slopes)
     stderr = 1.0 / np.sqrt(curvature[:, SIZE, SIZE].sum())
@@ -54,7 +48,6 @@ def asked(rng, **wrong):
 def test_a_constant_is_called_one_at_the_stated_rate_however_far_it_is_off(shift):
     rng = np.random.default_rng(0)
     p_values = np.array([asked(rng, shift=shift).p_value for _ in range(400)])
-
     # 400 draws at a level of 5 %: 20 are expected, more than 35 or fewer than 8 come once in 1000.
     assert 8 <= np.sum(p_values < 0.05) <= 35
 
@@ -74,8 +67,7 @@ def test_what_changes_less_than_anybody_minds_or_in_one_window_alone_is_constant
     curvature[1:, SIZE], curvature[1:, :, SIZE], scores[1:, SIZE] = 0.0, 0.0, 0.0
     alone = _tested(curvature, scores, SIZE, waves)
 
-    assert unminded.p_value > 0.5
-    assert np.isfinite(alone.gain) and alone.p_value > 0.05
+    assert unminded.p_value > 0.5 and np.isfinite(alone.gain) and alone.p_value > 0.05
 
 
 @pytest.mark.expensive
@@ -84,12 +76,9 @@ def test_friction_that_depends_on_position_is_no_friction_of_the_catalogue():
     kinds = (effects.CoulombFriction, effects.ViscousFriction, effects.ConstantForce)
     rubbing = {"commands": jumping(10), "n": 10, "noise": 1e-3}
 
-    patchy = diagnose(
-        twin, measured(twin.extend(PatchyFriction(0, tau_c=0.5)), **rubbing), effects=kinds
-    )
-    even = diagnose(
-        twin, measured(twin.extend(effects.CoulombFriction(0, tau_c=0.5)), **rubbing), effects=kinds
-    )
+    hidden = (PatchyFriction(0, tau_c=0.5), effects.CoulombFriction(0, tau_c=0.5))
+    data = [measured(twin.extend(effect), **rubbing) for effect in hidden]
+    patchy, even = (diagnose(twin, each, effects=kinds) for each in data)
 
     assert patchy.verdict == "unknown" and not patchy.findings
     assert "coulomb_friction.axis comes nearest" in patchy.unexplained

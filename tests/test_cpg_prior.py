@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from cases import each
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from moving_joints import MovingJoints
 
@@ -16,22 +17,14 @@ from sb3_hds.errors import EnvironmentMismatchError, ParameterError
 from sb3_hds.wrappers import ActionRateLimit, CPGPrior, Perturb, ShowJoints
 from sb3_hds.wrappers.actuated_joints import commands_positions, refuse_servos
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 TAU = 2.0 * np.pi
 #: two motors, and what Swimmer-v5 observes
 BELOW = Signals(
     tuple(Actuator(name, "1", -1.0, 1.0) for name in "ab"),
     tuple(Channel(f"obs[{i}]", "1") for i in range(8)),
 )
-SETTINGS = {
-    "omega_swing": TAU * 0.6,
-    "omega_stance": TAU * 0.9,
-    "amplitude": [0.8, 1.2],
-    "phase": [0.3, 4.0],
-    "offset": [0.1, -0.1],
-    "kp": 10.0,
-    "kd": 0.5,
-}
+SETTINGS = {"omega_swing": TAU * 0.6, "omega_stance": TAU * 0.9, "kp": 10.0, "kd": 0.5}
+SETTINGS |= {"amplitude": [0.8, 1.2], "phase": [0.3, 4.0], "offset": [0.1, -0.1]}
 
 
 def swimmer(mode: str = "offset", **changes) -> CPGPrior:
@@ -164,9 +157,8 @@ def test_show_joints_appends_what_the_actuators_drive():
     obs, _ = env.reset(seed=0)
     inner = env.unwrapped
 
-    joints = [
-        inner.model.joint(f"{part}_{leg}") for leg in (4, 1, 2, 3) for part in ("hip", "ankle")
-    ]
+    names = [f"{part}_{leg}" for leg in (4, 1, 2, 3) for part in ("hip", "ankle")]
+    joints = [inner.model.joint(name) for name in names]
     np.testing.assert_array_equal(obs[-16:-8], [inner.data.qpos[j.qposadr[0]] for j in joints])
     np.testing.assert_array_equal(obs[-8:], [inner.data.qvel[j.dofadr[0]] for j in joints])
     gymnasium_check(ShowJoints(gymnasium.make("Reacher-v5")), skip_render_check=True)
@@ -233,23 +225,19 @@ def test_an_environment_says_whether_its_actions_are_positions():
         refuse_servos(model, None)
 
 
-@pytest.mark.parametrize(
-    ("make", "settings", "says"),
-    [
-        (swimmer, {"mode": "offsets"}, "mode must be one of 'offset'"),
-        (swimmer, {"omega_swing": 0.0}, "omega_swing must be above 0"),
-        (swimmer, {"amplitude": [1.0, 2.0, 3.0]}, "3 values of amplitude"),
-        (swimmer, {"kp": np.nan}, "kp must be finite"),
-        (swimmer, {"frequency_factor": (0.0, 1.0)}, "0 <= lowest < highest"),
-        (pendulum, {"control": "track"}, "needs an environment of MuJoCo"),
-        (pendulum, {"control": "direct", "position": [0], "velocity": [2]}, "tracks no joints"),
-        (pendulum, {"position": [0]}, "as many as positions"),
-        (pendulum, {"position": [0], "velocity": [3]}, "an observation has 3"),
-        (perturbed, {"noise": np.nan}, "noise=nan"),
-        (perturbed, {"push_probability": np.nan}, "push_probability=nan"),
-        # Joints are read from MuJoCo, which no twin sees.
-        (lambda: twin_of(inverted(omega_swing=3.0)), {}, "CPGPrior may change"),
-    ],
+@each(
+    (swimmer, {"mode": "offsets"}, "mode must be one of 'offset'"),
+    (swimmer, {"omega_swing": 0.0}, "omega_swing must be above 0"),
+    (swimmer, {"amplitude": [1.0, 2.0, 3.0]}, "3 values of amplitude"),
+    (swimmer, {"kp": np.nan}, "kp must be finite"),
+    (swimmer, {"frequency_factor": (0.0, 1.0)}, "0 <= lowest < highest"),
+    (pendulum, {"control": "track"}, "needs an environment of MuJoCo"),
+    (pendulum, {"control": "direct", "position": [0], "velocity": [2]}, "tracks no joints"),
+    (pendulum, {"position": [0]}, "as many as positions"),
+    (pendulum, {"position": [0], "velocity": [3]}, "an observation has 3"),
+    (perturbed, {"noise": np.nan}, "noise=nan"),
+    # Joints are read from MuJoCo, which no twin sees.
+    (lambda: twin_of(inverted(omega_swing=3.0)), {}, "CPGPrior may change"),
 )
 def test_what_makes_no_sense_is_refused(make, settings, says):
     with pytest.raises((ParameterError, EnvironmentMismatchError), match=says):

@@ -10,7 +10,6 @@ from small_models import repacked, same, saved, small
 
 from sb3_hds import algos, load_policy
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 N = 18
 #: one of each way to write a model; the others share every line with one of these
 some_algorithms = pytest.mark.parametrize("name", ["hds", "droq", "openloop"])

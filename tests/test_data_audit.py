@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from measuring import measured
 
 from sb3_hds import Trajectories, audit, twins
@@ -16,10 +17,7 @@ from sb3_hds.effects import CoulombFriction
 from sb3_hds.errors import TrajectoryError
 from sb3_hds.sysid.timing import in_step
 
-pytestmark = [
-    pytest.mark.usefixtures("quick_compilation"),
-    pytest.mark.filterwarnings("ignore::sb3_hds.data.SamplingWarning"),
-]
+pytestmark = pytest.mark.filterwarnings("ignore::sb3_hds.data.SamplingWarning")
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +46,8 @@ def changed(data, change):
     return Trajectories.from_arrays(obs, actions, dt=data.dt)
 
 
-def alone(obs, seed=1):
-    """One recording, whose command is noise."""
-    command = np.random.default_rng(seed).standard_normal((len(obs) - 1, 1))
+def alone(obs):
+    command = np.random.default_rng(1).standard_normal((len(obs) - 1, 1))
     return Trajectories.from_arrays([obs], [command], dt=0.01)
 
 
@@ -70,15 +67,7 @@ def logged(data, path, times=None):
 
 
 # Twins whose data neither end nor reach a limit, with a position, angles, and both; seed and noise.
-@pytest.mark.parametrize(
-    ("name", "seed", "noise"),
-    [
-        ("PendulumReal", 1, 0.01),
-        ("CartPole", 2, 0.01),
-        ("Acrobot", 1, 0.0),
-        ("MountainCar", 0, 0.01),
-    ],
-)
+@each(("PendulumReal", 1, 0.01), ("CartPole", 2, 0.01), ("Acrobot", 1, 0), ("MountainCar", 0, 0.01))
 def test_clean_data_raise_no_alarm(name, seed, noise, tmp_path):
     exact = measured(twins.make(name), n_steps=200, seed=seed, share=0.5)
 
@@ -134,16 +123,13 @@ def some_held(k):
     return k - np.r_[False, np.random.default_rng(0).random(len(k) - 1) < 0.1]
 
 
-@pytest.mark.parametrize(
-    ("held", "of", "channel", "share"),
-    [
-        (some_held, slice(3), "cos, sin, speed", 0.1),
-        (lambda k: k // 2 * 2, slice(3), "cos, sin, speed", 0.5),
-        (lambda k: k // 4 * 4, [2], "speed", 0.75),
-    ],
+@each(
+    (some_held, slice(3), "cos, sin, speed", 0.1),
+    (lambda k: k // 2 * 2, slice(3), "cos, sin, speed", 0.5),
+    (lambda k: k // 4 * 4, [2], "speed", 0.75),
     ids=["some", "half the rate", "one channel"],
 )
-def test_repeated_samples_are_found(data, held, of, channel, share):
+def test_repeated_samples_are_found(held, of, channel, share, data):
     def repeat(_, obs, actions):
         obs[:, of] = obs[held(np.arange(len(obs)))][:, of]
         return obs, actions
@@ -244,11 +230,8 @@ def test_a_jump_in_resampled_rows_is_cut_without_the_sample_between(tmp_path):
     assert max(jumps) < 0.5 * finding.size
 
 
-@pytest.mark.parametrize(
-    ("first", "last", "lost", "also"),
-    [(0, 0, 1, None), (200, 200, 1, None), (80, 90, 12, slice(84, 86))],
-)
-def test_values_beyond_all_measure_are_refused_by_name_and_cut_out(data, first, last, lost, also):
+@each((0, 0, 1, None), (200, 200, 1, None), (80, 90, 12, slice(84, 86)))
+def test_values_beyond_all_measure_are_refused_by_name_and_cut_out(first, last, lost, also, data):
     def spoil(i, obs, actions):
         if i == 3:
             obs[first : last + 1, 2] = 1e6
@@ -288,20 +271,14 @@ def test_what_motion_makes_is_no_outlier_and_no_glitch(what):
     assert not kinds(audit(changed(pendulum_data(), shape), KNOWN)) & {"Outliers", "Glitches"}
 
 
-def late(data, channel, lag):
-    """A channel that comes late by a whole number of samples; the ends are cut off."""
-
-    def shift(_, obs, actions):
-        k = np.arange(10, len(obs) - 10)
-        obs[k, channel] = np.copy(obs[:, channel])[k - lag]
-        return obs[k], actions[10 : len(obs) - 11]
-
-    return changed(data, shift)
-
-
 @pytest.mark.parametrize("lag", [-3, 1])
 def test_a_velocity_that_comes_late_or_early_is_found_and_shifted(data, lag):
-    recorded, names = late(data, 2, lag), channels_of("PendulumReal")
+    def shift(_, obs, actions):
+        k = np.arange(10, len(obs) - 10)
+        obs[k, 2] = np.copy(obs[:, 2])[k - lag]
+        return obs[k], actions[10 : len(obs) - 11]
+
+    recorded, names = changed(data, shift), channels_of("PendulumReal")
 
     found = audit(recorded, names)
     corrected = found.corrected(recorded)
@@ -320,9 +297,7 @@ def test_a_velocity_that_comes_late_or_early_is_found_and_shifted(data, lag):
 def test_a_lag_of_a_fraction_of_a_sample_is_left_alone(lag, seen):
     t = np.arange(3000.0)
     obs = np.stack([np.sin(0.1 * t), 10.0 * np.cos(0.1 * (t - lag))], axis=1)
-
     shift = audit(alone(obs), ["q", "v"]).velocity_shift
-
     assert shift == ({"v": pytest.approx(0.01 * lag, abs=2e-4)} if seen else {})
 
 
@@ -360,9 +335,7 @@ def test_standing_still_is_not_usable_and_tells_the_noise(resolution):
 @pytest.mark.parametrize("n_steps", [1, 2, 41])
 def test_the_shortest_data_are_not_usable_and_break_nothing(n_steps):
     obs = np.random.default_rng(0).standard_normal((2, n_steps + 1, 1))
-
     found = audit(Trajectories.from_arrays(obs, np.zeros((2, n_steps, 0)), dt=0.01))
-
     assert not found.usable and f"{2 * n_steps} steps in all; a verdict needs" in found.reason
     assert found.velocity_shift == {}
 
@@ -380,16 +353,13 @@ def test_motion_within_noise_is_not_usable_and_rest_most_of_the_time_is():
     assert still.usable and "MostlyStill" in kinds(still)
 
 
-@pytest.mark.parametrize(
-    ("command", "kind", "says"),
-    [
-        # Interpolation makes it of a gain that nobody changed, and drift of a set point.
-        (lambda obs, noise: 100.0 + 1e-13 * noise, "ConstantCommand", "is 100 throughout"),
-        (lambda obs, noise: 100.0 + 0.4 * noise, "ConstantCommand", "between 99.6 and 100.4"),
-        (lambda obs, noise: obs[:-1] @ [[0.3], [1.0], [-0.2]], "DependentCommand", "action[0]"),
-    ],
+@each(
+    # Interpolation makes it of a gain that nobody changed, and drift of a set point.
+    (lambda obs, noise: 100.0 + 1e-13 * noise, "ConstantCommand", "is 100 throughout"),
+    (lambda obs, noise: 100.0 + 0.4 * noise, "ConstantCommand", "between 99.6 and 100.4"),
+    (lambda obs, noise: obs[:-1] @ [[0.3], [1.0], [-0.2]], "DependentCommand", "action[0]"),
 )
-def test_a_command_that_tells_nothing_of_its_own_is_found(data, command, kind, says):
+def test_a_command_that_tells_nothing_of_its_own_is_found(command, kind, says, data):
     rng = np.random.default_rng(0)
 
     def commanded(_, obs, actions):
@@ -428,9 +398,6 @@ def test_it_prints_in_80_columns_and_is_plain_json(data):
     plain = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert {f["kind"] for f in plain["findings"]} == kinds(found) and len(kinds(found)) == 2
     assert plain["channels"][2]["unit"] == "rad/s" and plain["findings"][0]["text"]
-
-
-def test_every_kind_of_finding_is_a_sentence_with_a_remedy():
     for kind in Finding.__subclasses__():
         assert dataclasses.is_dataclass(kind) and kind.remedy.endswith(".")
         assert kind.sentence is not Finding.sentence
@@ -461,15 +428,12 @@ def pendulum_data(dt=0.01, noise=0.0, n=400):
 KNOWN = (Channel("angle", "rad"), Channel("speed", "rad/s"))
 
 
-@pytest.mark.parametrize(
-    ("channels", "noise", "scales", "says"),
-    [
-        (KNOWN, 0.05, (180.0 / np.pi, 1.0), "as if 'angle' were in degrees"),
-        (("angle", "speed"), 0.0, (1.0, 180.0 / np.pi), "as if 'speed' were in degrees"),
-        (KNOWN, 0.05, (1.0, 30.0), "one of them is in other units."),
-        (KNOWN, 0.0, (1.0, 30.0 / np.pi), "as if 'speed' were in revolutions per minute"),
-        ("wrapped", 0.0, (180.0 / np.pi, 1.0), "as if 'angle' were in degrees"),
-    ],
+@each(
+    (KNOWN, 0.05, (180.0 / np.pi, 1.0), "as if 'angle' were in degrees"),
+    (("angle", "speed"), 0.0, (1.0, 180.0 / np.pi), "as if 'speed' were in degrees"),
+    (KNOWN, 0.05, (1.0, 30.0), "one of them is in other units."),
+    (KNOWN, 0.0, (1.0, 30.0 / np.pi), "as if 'speed' were in revolutions per minute"),
+    ("wrapped", 0.0, (180.0 / np.pi, 1.0), "as if 'angle' were in degrees"),
 )
 def test_a_position_in_other_units_than_its_velocity_is_refused(channels, noise, scales, says):
     data = changed(pendulum_data(noise=noise), lambda _, obs, actions: (obs * scales, actions))
@@ -486,7 +450,6 @@ def test_a_position_in_other_units_than_its_velocity_is_refused(channels, noise,
 @pytest.mark.parametrize(("factor", "dt"), [(0.2, 0.01), (0.8, 0.2), (1.25, 0.05), (8.0, 0.2)])
 def test_a_factor_that_a_scale_of_the_sensor_explains_is_left_to_it(factor, dt):
     data = changed(pendulum_data(dt), lambda _, obs, actions: (obs * [factor, 1.0], actions))
-
     assert "OtherUnits" not in kinds(audit(data, KNOWN)) | kinds(audit(data))
 
 
@@ -513,9 +476,7 @@ def degrees(swings):
 
 
 @pytest.mark.parametrize("changes", [{}, {"mass": 0.6, "damping": 0.02}])
-def test_an_angle_in_degrees_is_refused_if_the_twin_says_so_whatever_else_is_wrong(
-    changes, swings, degrees, tmp_path
-):
+def test_an_angle_in_degrees_is_refused_if_the_twin_says_so(changes, swings, degrees, tmp_path):
     twin = twins.make("FreePendulum", **PENDULUM | changes)
 
     found = audit(degrees, twin=twin)
@@ -526,11 +487,8 @@ def test_an_angle_in_degrees_is_refused_if_the_twin_says_so_whatever_else_is_wro
     # Of a log, the column.
     read = logged(degrees, tmp_path / "log.csv")
     assert "{column: x0, unit: deg}" in audit(read, twin=twin).reason
-
-
-def test_an_angle_in_degrees_under_a_twin_that_is_all_wrong_is_a_caveat(degrees):
+    # Under a twin that is all wrong, it is a caveat.
     found = audit(degrees, ["angle"], twins.make("FreePendulum", **PENDULUM, zero="up"))
-
     assert found.usable and kinds(found) == {"LikelyUnits"}
     assert "'angle' spans" in str(found) and "degrees" in str(found.findings[0])
 
@@ -579,12 +537,9 @@ def test_a_backward_difference_is_recognised_and_offered_as_a_correction(digits)
     assert found.velocity_shift == {"speed": 0.005} and "-5 ms" in found.corrections[0]
     central = np.gradient(better.obs[..., 0], 0.01, axis=1)[:, 1:-1]
     np.testing.assert_allclose(better.obs[:, 1:-1, 1], central, atol=0.02)
-
-
-def test_a_speed_that_a_sensor_measures_half_a_sample_late_is_no_backward_difference():
+    # A speed that a sensor measures half a sample late is none.
     rng, t = np.random.default_rng(0), 0.01 * np.arange(1000)
     obs = np.stack([np.sin(3.0 * t), 3.0 * np.cos(3.0 * (t - 0.005))], 1)
-
     for noise in ([0.0, 0.0], [1e-4, 3e-2]):
         seen = obs + noise * rng.standard_normal(obs.shape)
         assert kinds(audit(alone(seen), KNOWN)) <= {"PoorExcitation"}
@@ -611,12 +566,9 @@ def test_a_backward_difference_is_told_from_the_steps_of_a_twin_and_moved_back_f
 
 def test_a_position_and_a_velocity_that_are_swapped_are_refused_if_units_tell():
     data = changed(pendulum_data(), lambda _, obs, actions: (obs[:, ::-1], actions))
-
     found = audit(data, KNOWN)
-
     assert kinds(found) == {"Swapped"} and not found.usable
-    assert "'angle' should be a position" in found.reason
-    assert audit(data, ["a", "b"]).findings == ()
+    assert "'angle' should be a position" in found.reason and audit(data, ["a", "b"]).findings == ()
 
 
 @pytest.mark.parametrize(("channel", "noise"), [(0, 0.01), (1, 0.0)])

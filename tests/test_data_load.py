@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy.io
 import yaml
+from cases import each
 
 from sb3_hds import Trajectories
 from sb3_hds.core import Trajectories as CoreTrajectories
@@ -84,18 +85,15 @@ def test_patterns_give_files_in_alphabetical_order_and_lists_keep_theirs(tmp_pat
 def test_episodes_are_told_apart_by_a_column_and_by_another_condition(tmp_path):
     one, two = swing(20), swing(30)
     table = {name: np.concatenate([one[name], two[name], two[name]]) for name in one}
-    table |= {
-        "run": np.repeat([0, 1, 1], [20, 30, 30]),
-        "load": np.repeat([0.5, 1, 2], [20, 30, 30]),
-    }
+    run, load = (np.repeat(labels, [20, 30, 30]) for labels in ([0, 1, 1], [0.5, 1, 2]))
+    table |= {"run": run, "load": load}
     table["t"][50:] += 1.0
     write_csv(tmp_path / "log.csv", table)
     columns = COLUMNS | {"episode": "run", "condition": {"column": "load"}}
 
     data = Trajectories.load(tmp_path / "log.csv", columns=columns)
 
-    assert data.lengths.tolist() == [19, 29, 29]
-    assert data.conditions == ("0.5", "1", "2")
+    assert data.lengths.tolist() == [19, 29, 29] and data.conditions == ("0.5", "1", "2")
     assert data.origin.tolist() == [0, 1, 2]
 
 
@@ -192,27 +190,22 @@ def test_a_gap_ends_the_episode_and_both_parts_are_one_recording(tmp_path):
     np.testing.assert_array_equal(whole.actions[0, 18:27, 0], [1.8, *[1.9] * 7, 2.0])
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"tiem": "t"}, "Did you mean 'time'"),
-        ({"obs": "q"}, "obs must be a list of columns, got 'q'."),
-        ({"obs": [{"colum": "q"}]}, "obs[0] has the key 'colum'"),
-        ({"obs": [{"column": "q", "constant": 1.0}]}, "obs[0] needs either 'column'"),
-        ({"obs": [{"column": "q", "scale": "big"}]}, "scale must be a finite number, got 'big'"),
-        ({"obs": ["q", "q"]}, "two channels of obs are called 'q'"),
-        ({"time": None}, "time: NAME"),
-        ({"condition": "load"}, "condition must be {column: NAME} or {from: filename}"),
-        ({"dt": -1.0}, "dt must be the sampling interval"),
-        ({"obs": None}, "columns does not say which are the obs."),
-        ({"obs": ["Q"]}, "'log.csv' has no column 'Q'. It has: t, q, v, u."),
-        # Its stamps are milliseconds, of which a thousand fit into this dt.
-        ({"time": {"column": "t", "scale": 1e3}, "dt": 0.01}, "scale: 0.001"),
-    ],
+@each(
+    ({"tiem": "t"}, "Did you mean 'time'"),
+    ({"obs": "q"}, "obs must be a list of columns, got 'q'."),
+    ({"obs": [{"colum": "q"}]}, "obs[0] has the key 'colum'"),
+    ({"obs": [{"column": "q", "constant": 1.0}]}, "obs[0] needs either 'column'"),
+    ({"obs": [{"column": "q", "scale": "big"}]}, "scale must be a finite number, got 'big'"),
+    ({"obs": ["q", "q"]}, "two channels of obs are called 'q'"),
+    ({"time": None}, "time: NAME"),
+    ({"condition": "load"}, "condition must be {column: NAME} or {from: filename}"),
+    ({"obs": None}, "columns does not say which are the obs."),
+    ({"obs": ["Q"]}, "'log.csv' has no column 'Q'. It has: t, q, v, u."),
+    # Its stamps are milliseconds, of which a thousand fit into this dt.
+    ({"time": {"column": "t", "scale": 1e3}, "dt": 0.01}, "scale: 0.001"),
 )
 def test_columns_that_make_no_sense_are_refused_with_the_way_out(change, message, tmp_path):
     write_csv(tmp_path / "log.csv", swing())
-
     with pytest.raises(TrajectoryError, match=re.escape(message)):
         Trajectories.load(tmp_path / "log.csv", columns=COLUMNS | change)
 
@@ -227,33 +220,28 @@ def test_a_yml_file_runs_no_code(tmp_path):
 LINES = "0.0,1,2,3\n0.1,1,2,3\n"
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "says"),
-    [
-        ("text.json", '"hello"', "has no column 'q', 't', 'u', 'v'. It has: 0."),
-        ("log.mat", "nothing that MATLAB wrote" * 20, "is damaged or not a .mat file"),
-        ("log.csv", "", "is empty: nothing was logged"),
-        ("log.csv", "t,q,v,u\n", "no row"),
-        ("log.csv", LINES, "its 4 columns have no names: write their numb"),
-        ("log.csv", "rig,3,hot\nMonday\nt,q,v,u\n" + LINES, "before the names: skip: 2."),
-        ("log.csv", "t,q,v,u\nlow,high,low,low\n" + LINES, "what follows must be numbers, got"),
-        ("log.csv", "t,q,v,u\n0,1,2,3\n3,4,5,6,7\n", "has 5 fields in line 3 and 4 before"),
-        ("log.csv", "t,q,v,u\n0,00,1,5,0,0,0,0\n", "4 names in its first line and 8 fields"),
-        ("log.csv", f"t,q,v,u\n{LINES}0.2,off?,6,0\n", "must hold numbers, got 'off?' in row 2"),
-        ("log.csv", "t,q,v,u\n2024-05-01 12:00:00.1,1,0,0\n", "to seconds before"),
-        ("log.csv", f"t,q,v,u\n{LINES}0.2,nan,6,0\n", "must be finite, got nan in row 2"),
-        ("log.csv", f"t,q,v,u\n{LINES}0.05,0,6,0\n", "from 0.1 to 0.05 s at row 2"),
-        ("log.csv", b"\x89HDF\r\n\x1a\n" + bytes(99), "is an HDF5 file, in spite of its name"),
-        ("log.mat", b"PAR1" + bytes(99), "rename it to 'log.parquet'"),
-        ("log.db3", b"nothing", "'ros2 bag reindex' or 'rosbag reindex'"),
-        ("log.xls", "", "there are readers for .csv, .tsv"),
-        ("log.csv", bytes(range(256)), "is damaged or not a .csv file"),
-        ("nowhere.csv", None, "does not exist"),
-        ("log.npz", None, "must have the same length, got q 50, t 50, u 50, v 49"),
-        ("", None, "is a folder; name the files in it"),
-        ("[ab].csv", None, "b.csv' has not; it has: t, q, u"),
-        ("*.hdf", None, "No file matches"),
-    ],
+@each(
+    ("text.json", '"hello"', "has no column 'q', 't', 'u', 'v'. It has: 0."),
+    ("log.mat", "nothing that MATLAB wrote" * 20, "is damaged or not a .mat file"),
+    ("log.csv", "", "is empty: nothing was logged"),
+    ("log.csv", LINES, "its 4 columns have no names: write their numb"),
+    ("log.csv", "rig,3,hot\nMonday\nt,q,v,u\n" + LINES, "before the names: skip: 2."),
+    ("log.csv", "t,q,v,u\nlow,high,low,low\n" + LINES, "what follows must be numbers, got"),
+    ("log.csv", "t,q,v,u\n0,1,2,3\n3,4,5,6,7\n", "has 5 fields in line 3 and 4 before"),
+    ("log.csv", "t,q,v,u\n0,00,1,5,0,0,0,0\n", "4 names in its first line and 8 fields"),
+    ("log.csv", f"t,q,v,u\n{LINES}0.2,off?,6,0\n", "must hold numbers, got 'off?' in row 2"),
+    ("log.csv", "t,q,v,u\n2024-05-01 12:00:00.1,1,0,0\n", "to seconds before"),
+    ("log.csv", f"t,q,v,u\n{LINES}0.2,nan,6,0\n", "must be finite, got nan in row 2"),
+    ("log.csv", f"t,q,v,u\n{LINES}0.05,0,6,0\n", "from 0.1 to 0.05 s at row 2"),
+    ("log.csv", b"\x89HDF\r\n\x1a\n" + bytes(99), "is an HDF5 file, in spite of its name"),
+    ("log.mat", b"PAR1" + bytes(99), "rename it to 'log.parquet'"),
+    ("log.db3", b"nothing", "'ros2 bag reindex' or 'rosbag reindex'"),
+    ("log.csv", bytes(range(256)), "is damaged or not a .csv file"),
+    ("nowhere.csv", None, "does not exist"),
+    ("log.npz", None, "must have the same length, got q 50, t 50, u 50, v 49"),
+    ("", None, "is a folder; name the files in it"),
+    ("[ab].csv", None, "b.csv' has not; it has: t, q, u"),
+    ("*.hdf", None, "No file matches"),
 )
 def test_a_file_that_cannot_be_read_says_why(name, content, says, tmp_path):
     write_csv(tmp_path / "a.csv", swing())
@@ -283,7 +271,6 @@ def test_nothing_is_unpickled(tmp_path):
 def test_core_alone_reads_our_own_files_and_says_who_reads_logs(tmp_path, monkeypatch):
     monkeypatch.setattr(trajectories, "_log_reader", None)
     assert CoreTrajectories is Trajectories
-
     with pytest.raises(TrajectoryError, match="from sb3_hds import Trajectories"):
         CoreTrajectories.load(tmp_path / "log.csv", columns=COLUMNS)
 

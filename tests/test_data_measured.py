@@ -6,6 +6,7 @@ import os
 import measured_rigs
 import numpy as np
 import pytest
+from cases import each
 
 from sb3_hds import audit
 from sb3_hds.data.audit.velocity import lags_of
@@ -30,6 +31,7 @@ def load(name):
     return measured_rigs.load(f"{name}/*.json", measured_rigs.SERVO)
 
 
+LATE = "UnevenSampling VelocityShift"
 # Of the channels: from the data sets' own descriptions, and of numpy on the raw columns.
 RANGES = {
     "emps": [(-2.2e-5, 0.2465073865)],
@@ -40,22 +42,14 @@ RANGES = {
 }
 
 
-@pytest.mark.parametrize(
-    ("name", "lengths", "dt", "findings"),
-    [
-        # One slow profile, and one with pulses.
-        ("emps", [24840] * 2, 0.001, "PoorExcitation"),
-        ("bam_xl330", None, 0.0053, "UnevenSampling VelocityShift"),
-        (
-            "bam_sts3250",
-            None,
-            0.0205,
-            "UnevenSampling VelocityShift PoorExcitation ConstantCommand",
-        ),
-        ("multiarm", [9166] * 4, 0.001, ""),
-        # A regular clock that took a few steps to start.
-        ("dfki", [4998] * 2, 0.002, "JitteredStamps MissingRows"),
-    ],
+@each(
+    # One slow profile, and one with pulses.
+    ("emps", [24840] * 2, 0.001, "PoorExcitation"),
+    ("bam_xl330", None, 0.0053, LATE),
+    ("bam_sts3250", None, 0.0205, f"{LATE} PoorExcitation ConstantCommand"),
+    ("multiarm", [9166] * 4, 0.001, ""),
+    # A regular clock that took a few steps to start.
+    ("dfki", [4998] * 2, 0.002, "JitteredStamps MissingRows"),
 )
 def test_a_published_data_set_is_read_and_judged(name, lengths, dt, findings):
     data = load(name)
@@ -93,6 +87,5 @@ def test_servos_report_their_speed_some_20_ms_late_whatever_they_do(name):
 
 def test_backward_differences_are_half_a_sample_late_and_no_finding():
     lags = lags_of(load("dfki"), ["q1", "q2", "v1", "v2"])
-
     assert [(lag.velocity, lag.position) for lag in lags] == [(2, "q1"), (3, "q2")]
     np.testing.assert_allclose([lag.samples for lag in lags], 0.5, atol=0.02)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import gymnasium
 import numpy as np
 import pytest
+from cases import each
 from measuring import jumping, measured
 
 from sb3_hds import diagnose, effects, twins
@@ -50,13 +51,19 @@ def expensive(*values):
     return pytest.param(*values, marks=pytest.mark.expensive)
 
 
-def late_and_rubbing():
-    return asked(on_engine(friction=0.1, delay=0.05), budget="quick")
+def test_horizons_at_which_a_named_cause_makes_it_worse_are_told():
+    better = HorizonGain(10, 2.0, 1.0, 0.4, 0.6)
+    unsure = HorizonGain(5, 1.0, 1.1, -0.2, 0.01)
+    worse = HorizonGain(1, 1.0, 1.2, -0.3, -0.1)
+
+    assert errs_more({5: unsure, 10: better}) == []
+    (told,) = errs_more({1: worse, 5: unsure, 10: better})
+    assert "1 (+20%)" in told and "5" not in told
 
 
 @pytest.fixture(scope="module")
 def both():
-    return late_and_rubbing()
+    return asked(on_engine(friction=0.1, delay=0.05), budget="quick")
 
 
 def test_two_causes_are_named_with_their_sizes_and_the_intervals_of_a_t_test(both):
@@ -79,10 +86,8 @@ def test_two_causes_are_named_with_their_sizes_and_the_intervals_of_a_t_test(bot
 
 def test_nothing_is_named_where_nothing_is_wrong():
     found = asked(on_engine())
-
     assert found.verdict == "none", found
-    assert not found.findings and not found.unexplained
-    assert found.twin == TWIN
+    assert not found.findings and not found.unexplained and found.twin == TWIN
 
 
 def test_what_the_data_cannot_tell_apart_is_said():
@@ -94,16 +99,6 @@ def test_what_the_data_cannot_tell_apart_is_said():
     assert {finding.effect, *finding.alternatives} >= {"parameter.mass"}
     assert any("torque_gain" in name for name in (finding.effect, *finding.alternatives))
     assert any("look alike where the mass scales" in caveat for caveat in found.caveats)
-
-
-def test_horizons_at_which_a_named_cause_makes_it_worse_are_told():
-    better = HorizonGain(10, 2.0, 1.0, 0.4, 0.6)
-    unsure = HorizonGain(5, 1.0, 1.1, -0.2, 0.01)
-    worse = HorizonGain(1, 1.0, 1.2, -0.3, -0.1)
-
-    assert errs_more({5: unsure, 10: better}) == []
-    (told,) = errs_more({1: worse, 5: unsure, 10: better})
-    assert "1 (+20%)" in told and "5" not in told
 
 
 def test_causes_look_alike_at_one_place_only():
@@ -133,9 +128,7 @@ def swinging(*hidden, n=8, n_steps=120, strength=0.05):
     pushed = twins.make("FreePendulum", driven=True, dt=0.02)
     wander = np.random.default_rng(0).standard_normal((n, n_steps, 1)).cumsum(1)
     actions = strength * np.sin(0.7 * wander)
-    return pushed, measured(
-        pushed.extend(*hidden), n=n, n_steps=n_steps, noise=0.005, commands=actions
-    )
+    return pushed, measured(pushed.extend(*hidden), n, n_steps, 0.005, commands=actions)
 
 
 def test_a_joint_that_is_counted_the_other_way_round_is_a_matter_of_convention():
@@ -145,18 +138,14 @@ def test_a_joint_that_is_counted_the_other_way_round_is_a_matter_of_convention()
     found = asked(turned, pushed, effects=[effects.ViscousFriction])
 
     assert (found.verdict, found.convention) == ("unknown", "direction.hinge")
-    assert "hinge is counted the other way round" in found.unexplained
-    assert found.twin == pushed
+    assert "hinge is counted the other way round" in found.unexplained and found.twin == pushed
 
 
-@pytest.mark.parametrize(
-    ("effect", "strength"),
-    [
-        (effects.Backlash("hinge", gap=0.15), 0.4),
-        expensive(effects.JointElasticity("hinge", k=0.3, d=0.002), 0.05),
-        expensive(effects.Cogging("hinge", amplitude=0.03, period=0.3, phase=0.1), 0.05),
-        expensive(effects.StribeckFriction("hinge", tau_c=0.01, tau_s=0.03, v_s=0.6), 0.05),
-    ],
+@each(
+    (effects.Backlash("hinge", gap=0.15), 0.4),
+    expensive(effects.JointElasticity("hinge", k=0.3, d=0.002), 0.05),
+    expensive(effects.Cogging("hinge", amplitude=0.03, period=0.3, phase=0.1), 0.05),
+    expensive(effects.StribeckFriction("hinge", tau_c=0.01, tau_s=0.03, v_s=0.6), 0.05),
     ids=lambda value: getattr(value, "name", None),
 )
 def test_what_a_search_from_where_nothing_is_wrong_misses_is_found(effect, strength):
@@ -181,27 +170,22 @@ def test_nothing_is_not_the_verdict_where_held_out_recordings_surely_prefer_some
     assert not contradiction([*by_chance, gains(0.04, 1e-9)])
 
 
+RUBBING = effects.ViscousFriction("hinge", b=0.01)
 YIELDING = effects.Hysteresis("hinge", tau_c=0.03, slip=0.4, n=2.0)
-SLACK = effects.ClearanceSpring("hinge", k=0.3, low=-0.3, high=0.3)
+SLACK = effects.ClearanceSpring("hinge", k=0.3, low=-0.3, high=0.3), RUBBING
 
 
-@pytest.mark.parametrize(
-    ("planted", "kinds", "named", "told"),
-    [
-        # Where no cause comes near.
-        ([YIELDING], ["SensorBias"], [], "hysteresis.hinge"),
-        # What comes nearest is no cause where a force without a name predicts better.
-        expensive([YIELDING], ["Stiffness", "CoulombFriction"], [], "hysteresis.hinge (tau_c = 0."),
-        # Beside one, a cause is still named.
-        expensive(
-            [SLACK, effects.ViscousFriction("hinge", b=0.01)],
-            ["Stiffness", "ViscousFriction"],
-            ["viscous_friction"],
-            "clearance_spring.hinge",
-        ),
-        # Whoever asks about one gets its name.
-        expensive([YIELDING], [*effects.NAMELESS, "CoulombFriction"], ["hysteresis"], ""),
-    ],
+@each(
+    # Where no cause comes near.
+    ([YIELDING], ["SensorBias"], [], "hysteresis.hinge"),
+    # What comes nearest is no cause where a force without a name predicts better.
+    expensive([YIELDING], ["Stiffness", "CoulombFriction"], [], "hysteresis.hinge (tau_c = 0."),
+    # Beside one, a cause is still named.
+    expensive(
+        SLACK, ["Stiffness", "ViscousFriction"], ["viscous_friction"], "clearance_spring.hin"
+    ),
+    # Whoever asks about one gets its name.
+    expensive([YIELDING], [*effects.NAMELESS, "CoulombFriction"], ["hysteresis"], ""),
 )
 def test_a_force_without_a_name_is_told_and_no_finding(planted, kinds, named, told):
     pushed, data = swinging(*planted, n=10, n_steps=150)
@@ -237,14 +221,14 @@ def test_one_short_recording_supports_no_verdict():
 def test_what_would_have_been_seen_is_said(both):
     """Dry friction of the size that is said to be detectable is found, a tenth of it is not."""
     size = both.detectable["coulomb_friction.hinge"]["tau_c"]
-    assert 0.0 < size < 0.1
-    assert asked(on_engine(friction=2.0 * size, n=20)).verdict == "named"
+    assert 0.0 < size < 0.1 and asked(on_engine(friction=2.0 * size, n=20)).verdict == "named"
     assert asked(on_engine(friction=0.1 * size, n=20)).verdict == "none"
 
 
 @pytest.mark.expensive
 def test_the_same_seed_tells_the_same(both):
-    assert late_and_rubbing().to_dict() == both.to_dict()
+    again = asked(on_engine(friction=0.1, delay=0.05), budget="quick")
+    assert again.to_dict() == both.to_dict()
 
 
 def test_both_halves_see_every_condition_and_few_recordings_are_cut_into_stretches():
@@ -273,9 +257,7 @@ def test_the_gain_is_the_geometric_mean_over_units():
 
 # Binomial(1000, rate) is above the last number once in 1000 cases. Of the 5 units' 2.5 %, the test
 # on windows may add a tenth of a percent.
-@pytest.mark.parametrize(
-    ("judge", "n_units", "level", "most"), [(compare, 8, 0.05, 73), (confirm, 5, 0.025, 43)]
-)
+@each((compare, 8, 0.05, 73), (confirm, 5, 0.025, 43))
 def test_a_level_is_kept_where_errors_differ_by_chance(judge, n_units, level, most):
     rng, alarms = np.random.default_rng(0), 0
     unit = np.repeat(np.arange(n_units), 5)
@@ -300,15 +282,12 @@ def tried(name, criterion=60.0):
     return SimpleNamespace(kept=name, criterion=criterion, candidate=candidate)
 
 
-@pytest.mark.parametrize(
-    ("p_of_simple", "gain_over_simple", "p_over_simple", "chosen"),
-    [
-        (0.06, 0.2, 0.2, "tau_c mu"),
-        (0.01, 0.2, 0.2, "gain"),
-        (0.01, 0.2, 0.003, "tau_c mu"),
-        # However surely: a hundredth of the error is what any model may be off by.
-        (0.01, 0.005, 0.003, "gain"),
-    ],
+@each(
+    (0.06, 0.2, 0.2, "tau_c mu"),
+    (0.01, 0.2, 0.2, "gain"),
+    (0.01, 0.2, 0.003, "tau_c mu"),
+    # However surely: a hundredth of the error is what any model may be off by.
+    (0.01, 0.005, 0.003, "gain"),
 )
 def test_what_is_confirmed_is_given_up_only_for_something_simpler_that_is_as_good_and_confirmed(
     p_of_simple, gain_over_simple, p_over_simple, chosen
@@ -327,17 +306,14 @@ def test_what_is_confirmed_is_given_up_only_for_something_simpler_that_is_as_goo
     assert best.kept == chosen
 
 
-@pytest.mark.parametrize(
-    ("other", "ahead", "error", "p_value", "chosen"),
-    [
-        ("gain", 1.0, 0.99, 0.001, "gain"),
-        ("", 1.0, 0.99, 0.001, "tau_c"),
-        ("gain", -1.0, 0.99, 0.001, "tau_c"),
-        ("gain", 1.0, 0.99, 0.2, "tau_c"),
-        ("tau_c mu", 5.0, 0.9, 0.001, "tau_c"),
-        ("tau_c mu", 7.0, 0.96, 0.001, "tau_c"),
-        ("tau_c mu", 7.0, 0.9, 0.001, "tau_c mu"),
-    ],
+@each(
+    ("gain", 1.0, 0.99, 0.001, "gain"),
+    ("", 1.0, 0.99, 0.001, "tau_c"),
+    ("gain", -1.0, 0.99, 0.001, "tau_c"),
+    ("gain", 1.0, 0.99, 0.2, "tau_c"),
+    ("tau_c mu", 5.0, 0.9, 0.001, "tau_c"),
+    ("tau_c mu", 7.0, 0.96, 0.001, "tau_c"),
+    ("tau_c mu", 7.0, 0.9, 0.001, "tau_c mu"),
 )
 def test_of_what_is_confirmed_all_the_data_choose_but_more_freedom_has_to_be_surely_ahead(
     other, ahead, error, p_value, chosen
@@ -372,8 +348,7 @@ def test_windows_of_both_halves_count_alike_where_all_the_data_choose():
         return float((windows.mean((1, 2)) + np.mean((unminded / noise) ** 2)).sum())
 
     error, ahead = chosen(0, 1)
-    assert error == pytest.approx(summed(after))
-    assert chosen(1, 0) == pytest.approx((error, ahead))
+    assert error == pytest.approx(summed(after)) and chosen(1, 0) == pytest.approx((error, ahead))
     price = ahead - chosen(0, 1, ("tau_c", "mu"))[1]
     assert np.exp(price) * np.log(summed(before) / error) == pytest.approx(ahead + price)
 
@@ -399,15 +374,11 @@ def test_friction_that_changes_with_place_or_time_is_left_over(where, seed):
 
     found = remainder(missing, data, ("hinge",), seed=0)
 
-    assert found is not None
-    assert {"velocity", where} <= set(found.goes_with)
+    assert found is not None and {"velocity", where} <= set(found.goes_with)
 
 
-@pytest.mark.parametrize(
-    ("goes_with", "share", "steady"),
-    [("speed", 0.08, True), ("speed", 0.12, False), ("time", 0.03, True), ("time", 0.08, False)],
-)
-def test_a_size_may_change_less_with_time_than_with_speed(monkeypatch, goes_with, share, steady):
+@each(("speed", 0.08, True), ("speed", 0.12, False), ("time", 0.03, True), ("time", 0.08, False))
+def test_a_size_may_change_less_with_time_than_with_speed(goes_with, share, steady, monkeypatch):
     changes = Change(goes_with, 1e-6, gain=share)
     monkeypatch.setattr(inquiry, "change", lambda *_: changes)
     asking = SimpleNamespace(
@@ -441,9 +412,7 @@ def test_a_fit_stays_within_physical_bounds():
         np.testing.assert_array_equal(np.delete(found, moving), np.delete(hypotheses.null, moving))
 
 
-@pytest.mark.parametrize(
-    "effect", [effects.JointElasticity(0, k=12.0, d=0.15), effects.ActionDelay(0, delay=0.05)]
-)
+@each(effects.JointElasticity(0, k=12.0, d=0.15), effects.ActionDelay(0, delay=0.05))
 def test_every_window_begins_with_what_happened_before_it(effect):
     """A candidate as it was planted explains windows from the middle of a recording exactly."""
     axis = twins.make("LinearAxis", dt=0.02, damping=3.0)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cases import each
 from measuring import measured
 
 from sb3_hds import diagnose, effects, twins
@@ -11,8 +12,6 @@ from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.calibrate import check_fits
 
 FRICTION = (effects.ViscousFriction, effects.CoulombFriction)
-
-
 TWIN = twins.make("FreePendulum", driven=True, dt=0.02)
 
 
@@ -31,9 +30,8 @@ def rubbing():
 
 
 def test_angles_in_degrees_get_no_name(rubbing):
-    degrees = Trajectories.from_arrays(
-        list(rubbing.obs * [180.0 / np.pi, 1.0]), list(rubbing.actions), dt=0.02
-    )
+    angles = list(rubbing.obs * [180.0 / np.pi, 1.0])
+    degrees = Trajectories.from_arrays(angles, list(rubbing.actions), dt=0.02)
 
     found = asked(TWIN, degrees)
 
@@ -64,9 +62,8 @@ def test_an_extended_twin_is_asked_again_by_names_and_a_glitch_is_cut_out_and_sa
     glitched = Trajectories.from_arrays(list(obs), list(rubbing.actions), dt=0.02)
     names = ["CoulombFriction", "viscous_friction"]
 
-    found = diagnose(
-        twin, glitched, effects=names, calibrate="mass", budget="quick", progress=False
-    )
+    how = {"calibrate": "mass", "budget": "quick", "progress": False}
+    found = diagnose(twin, glitched, effects=names, **how)
 
     [finding] = found.findings
     assert (finding.effect, finding.alternatives) == ("coulomb_friction", ())
@@ -78,7 +75,6 @@ def test_an_extended_twin_is_asked_again_by_names_and_a_glitch_is_cut_out_and_sa
 
 def test_less_of_what_the_twin_has_is_told_as_what_is_added_to_it():
     found = asked(TWIN.with_parameters(damping=0.003), recorded(TWIN))
-
     estimate = found.findings[0].parameters["b"]
     assert estimate.estimate == pytest.approx(-0.003, rel=0.05)
     assert estimate.added_to == pytest.approx(0.003)
@@ -112,37 +108,29 @@ class Nondescript(JointEffect):
     parameters = {}
 
 
-@pytest.mark.parametrize(
-    ("changes", "error", "says"),
-    [
-        ({"effects": ["rubbing"]}, EffectError, "no effect 'rubbing'"),
-        ({"effects": [effects.CoulombFriction(0)]}, EffectError, "effects are classes"),
-        ({"effects": [Nondescript]}, EffectError, "lacks explanation"),
-        ({"calibrate": None}, CalibrationError, "got None"),
-        ({"calibrate": "weight"}, CalibrationError, "weight"),
-        ({"budget": "huge"}, CalibrationError, "'full' or 'quick'"),
-        ({"seed": -1}, CalibrationError, "seed must be"),
-        ({"data": np.zeros(3)}, CalibrationError, "got FreePendulum and ndarray"),
-    ],
+@each(
+    ({"effects": ["rubbing"]}, EffectError, "no effect 'rubbing'"),
+    ({"effects": [effects.CoulombFriction(0)]}, EffectError, "effects are classes"),
+    ({"effects": [Nondescript]}, EffectError, "lacks explanation"),
+    ({"calibrate": None}, CalibrationError, "got None"),
+    ({"calibrate": "weight"}, CalibrationError, "weight"),
+    ({"budget": "huge"}, CalibrationError, "'full' or 'quick'"),
+    ({"seed": -1}, CalibrationError, "seed must be"),
+    ({"data": np.zeros(3)}, CalibrationError, "got FreePendulum and ndarray"),
 )
-def test_mistakes_are_named_at_the_door(rubbing, changes, error, says):
+def test_mistakes_are_named_at_the_door(changes, error, says, rubbing):
     given = {"data": rubbing, "progress": False} | changes
-
     with pytest.raises(error, match=says):
         diagnose(TWIN, **given)
 
 
-@pytest.mark.parametrize(
-    ("factor", "says"),
-    [
-        (2.0, r"data\.resample\(dt=0\.01\).*--set dt:0\.02"),
-        (1.2e3, r"in milliseconds: .*scale: 0\.001}"),
-        (1e6, "in microseconds: .*scale: 1e"),
-    ],
+@each(
+    (2.0, r"data\.resample\(dt=0\.01\).*--set dt:0\.02"),
+    (1.2e3, r"in milliseconds: .*scale: 0\.001}"),
+    (1e6, "in microseconds: .*scale: 1e"),
 )
 def test_another_interval_says_how_to_change_it_and_which_unit_it_may_be_in(factor, says):
     data = Trajectories.from_arrays([np.zeros((9, 2))], [np.zeros((8, 0))], dt=0.01 * factor)
-
     with pytest.raises(CalibrationError, match=says):
         diagnose(twins.make("FreePendulum"), data, progress=False)
 

@@ -39,10 +39,7 @@ def error_over(twin, data, seconds):
 
 
 def rollout_error(twin, data, seconds):
-    """
-    Root mean square over windows that begin at the measured position, and at the velocity that its
-    differences say: nothing is fitted to the window.
-    """
+    """Of windows from measured positions and their differences: nothing is fitted to the window."""
     n = round(seconds / data.dt)
     obs, actions = data.episode(0)
     _, v = motion_of(twin, obs[None], data.dt)
@@ -61,7 +58,6 @@ def rollout_error(twin, data, seconds):
 
 def test_a_free_pendulum_lacks_nothing():
     found = asked(measured_rigs.multiarm())
-
     assert found.verdict == "none", found
 
 

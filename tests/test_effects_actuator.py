@@ -4,21 +4,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from free_mass import Mass, moved
 
 from sb3_hds.core import rollout
 from sb3_hds.effects import (
     ActionDelay,
-    ConstantForce,
-    CoulombFriction,
     DeadZone,
     DirectionalGain,
     MotorLag,
     Saturation,
     TorqueGain,
 )
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 COMMANDS = np.array([-5.0, -1.0, -0.2, 0.0, 0.2, 1.0, 5.0])
 
@@ -32,19 +29,16 @@ def carried_out(effect, differentiate=lambda f: f):
 ONES = np.ones(7)
 
 
-@pytest.mark.parametrize(
-    ("effect", "expected", "slopes"),
-    [
-        (TorqueGain(gain=0.8), 0.8 * COMMANDS, 0.8 * ONES),
-        (DirectionalGain(gain_pos=2.0, gain_neg=0.5), [-2.5, -0.5, -0.1, 0, 0.4, 2, 10], None),
-        # The zone is from -0.5 to 0.5.
-        (DeadZone(width=1.0), [-4.5, -0.5, 0, 0, 0, 0.5, 4.5], [1, 1, 0, 0, 0, 1, 1]),
-        (Saturation(limit=0.9), [-0.9, -0.9, -0.2, 0, 0.2, 0.9, 0.9], [0, 0, 1, 1, 1, 0, 0]),
-        # At null, where plans begin.
-        (DirectionalGain(), COMMANDS, ONES),
-    ],
+@each(
+    (TorqueGain(gain=0.8), 0.8 * COMMANDS, 0.8 * ONES),
+    (DirectionalGain(gain_pos=2.0, gain_neg=0.5), [-2.5, -0.5, -0.1, 0, 0.4, 2, 10], None),
+    # The zone is from -0.5 to 0.5.
+    (DeadZone(width=1.0), [-4.5, -0.5, 0, 0, 0, 0.5, 4.5], [1, 1, 0, 0, 0, 1, 1]),
+    (Saturation(limit=0.9), [-0.9, -0.9, -0.2, 0, 0.2, 0.9, 0.9], [0, 0, 1, 1, 1, 0, 0]),
+    # At null, where plans begin.
+    (DirectionalGain(), COMMANDS, ONES),
 )
-def test_a_drive_without_memory_has_this_curve_and_its_slope(x64, effect, expected, slopes):
+def test_a_drive_without_memory_has_this_curve_and_its_slope(effect, expected, slopes, x64):
     np.testing.assert_allclose(carried_out(effect), expected, rtol=1e-14, atol=1e-15)
     if slopes is not None:
         np.testing.assert_array_equal(carried_out(effect, jax.grad), slopes)
@@ -62,11 +56,8 @@ def test_a_lagging_drive_follows_exponentially_at_any_sub_step(x64):
         np.testing.assert_allclose(states.v[:, 0], reached, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("effect", "name", "at"),
-    [(MotorLag(), "time_constant", [0.0]), (ActionDelay(), "delay", [0.0, 0.05, 0.1])],
-)
-def test_a_lag_or_a_delay_takes_as_much_impulse_from_a_step(x64, effect, name, at):
+@each((MotorLag(), "time_constant", [0.0]), (ActionDelay(), "delay", [0.0, 0.05, 0.1]))
+def test_a_lag_or_a_delay_takes_as_much_impulse_from_a_step(effect, name, at, x64):
     # With a command of one from rest, speed is t - T once the lag is over; to first order in T.
     twin = Mass().extend(effect)
 
@@ -98,14 +89,3 @@ def test_a_late_command_is_the_same_command_shifted(x64, substeps):
     impulse = np.concatenate([[0.0], 0.1 * np.cumsum(pushes)])
     expected = [np.interp(np.maximum(time - delay, 0.0), time, impulse) for delay in delays]
     np.testing.assert_allclose(speeds(jnp.asarray(delays)), expected, rtol=1e-12, atol=1e-13)
-
-
-def test_while_it_is_driven_one_way_a_dead_zone_is_dry_friction_or_a_constant_force(x64):
-    pushes = np.random.default_rng(0).uniform(0.5, 1.0, 50)
-    causes = (DeadZone(width=0.4), CoulombFriction(tau_c=0.2), ConstantForce(tau_0=-0.2))
-
-    # Ten times as fast as the width over which dry friction is smoothed.
-    dead, dry, offset = (moved(Mass().extend(cause), pushes, speed=1.0).obs for cause in causes)
-
-    np.testing.assert_allclose(dead, dry, rtol=1e-12)
-    np.testing.assert_allclose(offset, dry, rtol=1e-12)

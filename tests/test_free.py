@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import small_robots as robots
+from cases import each
 from measuring import measured
 
 from sb3_hds import effects, twins
@@ -39,16 +40,13 @@ def test_what_is_tied_takes_one_value_and_counts_once(leg):
         assert {fit.twin.values[name] for name in members} == {fit[label].estimate}
 
 
-@pytest.mark.parametrize(
-    ("tied", "told"),
-    [
-        ({"damping": ("j0_damping", "j9_damping")}, "j9_damping"),
-        ({"a": DAMPING, "b": DAMPING}, "j0_damping"),
-        ({"j0_damping": DAMPING}, "name of its own"),
-        ({"both": ()}, "both"),
-        ({"both": ("j0_damping", "j0_armature")}, "unit, bounds or value differ"),
-    ],
+@each(
+    ({"damping": ("j0_damping", "j9_damping")}, "j9_damping"),
+    ({"a": DAMPING, "b": DAMPING}, "j0_damping"),
+    ({"j0_damping": DAMPING}, "name of its own"),
+    ({"both": ()}, "both"),
+    ({"both": ("j0_damping", "j0_armature")}, "unit, bounds or value differ"),
 )
-def test_what_cannot_take_one_value_is_refused(leg, tied, told):
+def test_what_cannot_take_one_value_is_refused(tied, told, leg):
     with pytest.raises(CalibrationError, match=told):
         tie(leg, DAMPING, tied)

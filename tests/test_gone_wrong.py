@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+from cases import each
 from odd_envs import Dead
 from small_models import greedy, small
 from stable_baselines3.common.envs import BitFlippingEnv
@@ -15,8 +16,6 @@ from sb3_hds.algos.model_free.sac.policy import GaussianPolicy
 from sb3_hds.algos.model_free.td7.algorithm import TD7Policy
 from sb3_hds.algos.nets.activations import finite_leaves
 from sb3_hds.errors import DivergedError
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def finite(model) -> bool:
@@ -39,9 +38,7 @@ def test_an_update_that_diverges_is_an_error_and_leaves_the_last_good_weights():
 
 
 @pytest.mark.parametrize("name", ["droq", "td7"])
-def test_weights_of_which_no_loss_tells_are_noticed_before_they_act_or_are_saved(
-    name, monkeypatch, tmp_path
-):
+def test_weights_of_which_no_loss_tells_neither_act_nor_are_saved(name, monkeypatch, tmp_path):
     model = small(name, gradient_steps=1, train_freq=5, policy_delay=1).learn(20)
     # The next update leaves no weight of the actor finite.
     monkeypatch.setattr(model, "learning_rates", lambda: (np.inf, 1e-3))
@@ -148,13 +145,10 @@ def test_with_shared_memory_a_cut_counts_as_an_end():
 @pytest.mark.parametrize("name", ["droq", "hds"])
 def test_without_its_monitor_an_environment_is_left_as_it_is(name):
     bare = small(name, monitor_wrapper=False).get_env().envs[0]
-
     assert not isinstance(bare, Monitor)
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "policy"), [(CrossQ, GaussianPolicy), (TD7, GaussianPolicy), (HDS, TD7Policy)]
-)
+@each((CrossQ, GaussianPolicy), (TD7, GaussianPolicy), (HDS, TD7Policy))
 def test_a_policy_of_another_family_is_refused(algorithm, policy):
     with pytest.raises(ValueError, match=f"cannot use the policy {policy.__name__}"):
         algorithm(policy, "Pendulum-v1")

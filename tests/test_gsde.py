@@ -15,8 +15,6 @@ from sb3_hds.algos import learn_compiled
 from sb3_hds.algos.model_free.sac.update import act
 from sb3_hds.algos.nets.squashed import Gaussian, exploration_std, log_probability, marginal_std
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 def both_noises(full_std: bool, use_expln: bool) -> tuple[Gaussian, np.ndarray, Any]:
     """:return: our Gaussian, actions before tanh, and SB3's distribution in double precision"""
@@ -35,9 +33,7 @@ def both_noises(full_std: bool, use_expln: bool) -> tuple[Gaussian, np.ndarray, 
     return Gaussian(jnp.asarray(means), std, latent), before, theirs
 
 
-@pytest.mark.parametrize(
-    ("full_std", "use_expln", "double"), [(False, True, True), (True, False, False)]
-)
+@pytest.mark.parametrize("full_std, use_expln, double", [(False, True, True), (True, False, False)])
 def test_state_dependent_noise_is_that_of_stable_baselines(full_std, use_expln, double):
     # SB3 has to find these from rounded actions again, which costs digits where they are near 1.
     rounding, of_actions = (1e-12, 1e-9) if double else (1e-5, 1e-5)
@@ -75,9 +71,8 @@ def test_a_noise_matrix_lasts_over_as_many_collections_as_it_takes(compiled):
     model = learn_compiled(model, 40)[0][0] if compiled else model.learn(40)
 
     buffer, policy = model.replay_buffer, model.policy
-    gaussian, _ = act(
-        policy.actor_network, policy.learner.actor.weights, buffer.observations[:40, 0]
-    )
+    weights, seen = policy.learner.actor.weights, buffer.observations[:40, 0]
+    gaussian, _ = act(policy.actor_network, weights, seen)
     apart = np.arctanh(buffer.actions[:40, 0]) - gaussian.mean
 
     def misfit(steps: slice) -> float:
@@ -88,16 +83,6 @@ def test_a_noise_matrix_lasts_over_as_many_collections_as_it_takes(compiled):
 
     assert misfit(slice(0, 20)) < 1e-5 and misfit(slice(20, 40)) < 1e-5
     assert misfit(slice(10, 30)) > 1e-3
-
-
-def test_noise_does_not_act_before_learning_starts_unless_it_is_told_to():
-    model = small("gsde_sac", learning_starts=100, train_freq=10).learn(10)
-    seen, taken = model.replay_buffer.observations[:10, 0], model.replay_buffer.actions[:10, 0]
-
-    explored = model.policy.scale_action(model.predict(seen)[0])
-
-    assert not np.allclose(explored, taken, atol=1e-5)
-    assert model._n_updates == 0
 
 
 def test_the_optimistic_actor_of_bro_explores_by_gsde_too():

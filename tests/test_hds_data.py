@@ -8,6 +8,7 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
+from cases import each
 from measuring import measured
 from small_models import logged, reloaded, same, small
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -104,9 +105,7 @@ def test_parameters_are_corrected_and_suspects_that_explain_nothing_let_go(found
 def test_once_corrected_nothing_changes_any_more(found, heavier):
     own = wishes(twins.make("PendulumReal"))
     again = correct(found.twin, heavier, own, 0.0, learn_force=False, n_new=1000)
-
-    assert not again.changed
-    assert again.error_calibrated <= found.error_calibrated * 1.001
+    assert not again.changed and again.error_calibrated <= found.error_calibrated * 1.001
 
 
 def test_a_system_that_friction_holds_fast_is_not_taken_for_a_heavier_one():
@@ -149,8 +148,7 @@ def test_what_has_no_parameter_is_left_to_the_learned_force():
 
     found = corrected(twin, data, residual=True, suspected=())
 
-    assert found.beta > 0.0
-    assert force_of(found.twin) is not None
+    assert found.beta > 0.0 and force_of(found.twin) is not None
     assert found.error_hybrid < 0.9 * found.error_calibrated < 0.9 * found.error_twin
 
 
@@ -165,8 +163,7 @@ def test_an_attached_force_that_no_longer_helps_is_switched_off(heavier):
 
     ((key, _),) = [force_of(found.twin)]
     assert found.beta == 0.0 and found.twin.values[f"{key}.share"] == 0.0
-    assert found.error_hybrid > 1.5 * found.error_calibrated
-    assert found.changed
+    assert found.error_hybrid > 1.5 * found.error_calibrated and found.changed
 
 
 def test_data_from_before_a_change_are_forgotten():
@@ -189,8 +186,7 @@ def test_a_wrong_twin_is_seen_though_the_system_mostly_rests():
 
     found = corrected(twins.make("PendulumReal"), Trajectories.concatenate([resting, moving]))
 
-    assert found.changed
-    assert found.error_calibrated < 0.1 * found.error_twin
+    assert found.changed and found.error_calibrated < 0.1 * found.error_twin
 
 
 @pytest.mark.expensive
@@ -244,8 +240,7 @@ def test_what_a_diagnosis_finds_is_attached_unless_the_twin_has_a_parameter_for_
     before = model.twin
     found.findings = findings[1:]
     model.extend_model()
-    assert model.twin is before
-    assert small("hds", REAL).extend_model() is None
+    assert model.twin is before and small("hds", REAL).extend_model() is None
 
 
 @pytest.mark.expensive  # a whole diagnosis
@@ -297,24 +292,19 @@ def test_each_rollout_is_planned_in_a_twin_of_its_own():
 
 def test_effects_are_attached_by_name_or_as_they_are():
     model = small("hds", REAL, effects=["coulomb_friction", effects.QuadraticDrag(0, c=0.01)])
-
     assert model.twin.values["coulomb_friction.hinge.tau_c"] == 0.0
     assert model.twin.values["quadratic_drag.hinge.c"] == 0.01
 
 
-@pytest.mark.parametrize(
-    ("settings", "says"),
-    [
-        ({"effects": ["magic"]}, "viscous_friction"),
-        ({"suspected": ["magic"]}, "magic"),
-        ({"calibrated": ["weight"]}, "Its parameters are: gravity"),
-        ({"pretrain_data": "missing.npz"}, "no file"),
-        ({"pretrain_data": 3}, "Trajectories or the path"),
-        ({"beta": "always"}, "a number from 0 to 1"),
-        ({"residual_kwargs": {"members": 3}}, "n_members, net_arch, caution"),
-        ({"refit_freq": -1}, "at least 0"),
-        ({"max_saved_steps": 0}, "at least 1"),
-    ],
+@each(
+    ({"effects": ["magic"]}, "viscous_friction"),
+    ({"suspected": ["magic"]}, "magic"),
+    ({"calibrated": ["weight"]}, "Its parameters are: gravity"),
+    ({"pretrain_data": "missing.npz"}, "no file"),
+    ({"pretrain_data": 3}, "Trajectories or the path"),
+    ({"beta": "always"}, "a number from 0 to 1"),
+    ({"residual_kwargs": {"members": 3}}, "n_members, net_arch, caution"),
+    ({"refit_freq": -1}, "at least 0"),
 )
 def test_settings_of_learning_from_data_are_checked_at_the_door(settings, says):
     with pytest.raises(ValueError, match=says):
@@ -330,9 +320,7 @@ def columns(model):
     }
 
 
-def test_data_from_a_file_correct_the_model_and_travel_with_it(
-    tmp_path, heavier, monkeypatch, no_planning
-):
+def test_a_file_corrects_the_model_and_travels_with_it(tmp_path, heavier, monkeypatch, no_planning):
     def rubs(twin, data, *_, **__):
         np.testing.assert_array_equal(data.obs, heavier.obs)
         return Correction(twin.with_parameters(damping=0.1), 0.0, changed=True)
@@ -346,8 +334,7 @@ def test_data_from_a_file_correct_the_model_and_travel_with_it(
 
     for name, values in columns(model).items():
         np.testing.assert_array_equal(columns(loaded)[name], values, err_msg=name)
-    assert loaded.twin.values == model.twin.values
-    assert loaded.nominal == model.nominal
+    assert loaded.twin.values == model.twin.values and loaded.nominal == model.nominal
     assert loaded.measured.trajectories().n_steps == heavier.n_steps + 50
 
 
@@ -385,18 +372,13 @@ def test_what_counts_since_a_change_is_remembered_in_real_steps(monkeypatch, no_
     assert model._n_updates == 3 * (2 + 1) * 3
 
 
-@pytest.mark.parametrize(
-    ("settings", "n_real", "n_early"),
-    [
-        ({"max_saved_steps": 200}, 60, 120),
-        ({"max_saved_steps": 90}, 60, 30),
-        ({"max_saved_steps": 40}, 40, 0),
-        ({"save_data": False}, 0, 0),
-    ],
+@each(
+    ({"max_saved_steps": 200}, 60, 120),
+    ({"max_saved_steps": 90}, 60, 30),
+    ({"max_saved_steps": 40}, 40, 0),
+    ({"save_data": False}, 0, 0),
 )
-def test_data_from_before_share_the_limit_and_the_latest_stay(
-    settings, n_real, n_early, no_planning
-):
+def test_early_data_share_the_limit_and_the_latest_stay(settings, n_real, n_early, no_planning):
     """Recordings of 60 steps: as many whole ones as there is room for, or the end of the last."""
     data = measured(twins.make("PendulumReal"), n=3)
     model = real(pretrain_data=data, train_freq=20, refit_freq=0, **settings).learn(60)

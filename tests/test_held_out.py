@@ -25,8 +25,7 @@ class Sides:
     def __call__(self, twin, names, shots, origin, spread, **options):
         learned = self._rows(shots.obs[shots.weight > 0.0])
         held = self._rows(shots.obs[(shots.weight == 0.0) & (origin >= 0)])
-        assert held and learned
-        assert not held & (self.learned | learned)
+        assert held and learned and not held & (self.learned | learned)
         self.learned |= learned
         self.held |= held
         self.n_corrections += 1
@@ -76,8 +75,7 @@ def test_windows_keep_their_side_while_recordings_come(longest):
         few = len(windows) < 24
         kept = hold_out(number, place, 0.5 if few else 0.25)
         now_held, now_learned = ({*map(tuple, windows[side])} for side in (kept, ~kept))
-        assert now_held and now_learned
-        assert not now_held & learned
+        assert now_held and now_learned and not now_held & learned
         if settled:
             assert not now_learned & held
         learned, held = learned | now_learned, (held if settled else set()) | now_held

@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import same_cause
+from cases import each
 from hidden_cases import NULLS, believed, nothing
 from hidden_scores import prepared, scores
 from independent_rigs import SYSTEMS, Planted, _moment, modelled, simulate
@@ -31,9 +32,7 @@ RUNS = 200
 
 
 #: of the twenty cases
-KINDS = Counter(
-    {"effect": 12, "null": 2, NULLS[1]: 1, NULLS[2]: 1, "outside": 2, "pair": 1, "still": 1}
-)
+KINDS = Counter(effect=12, null=2, outside=2, pair=1, still=1) + Counter(NULLS[1:3])
 
 
 @pytest.mark.parametrize("system", SYSTEMS)
@@ -64,10 +63,8 @@ def end_of(system, *planted):
 
 
 def test_a_late_sensor_keeps_its_bias_and_a_reversed_joint_turns_position_and_velocity():
-    late, biased = (
-        Planted("sensor_delay", 0, {"delay": 0.04}),
-        Planted("sensor_bias", 0, {"bias": 0.3}),
-    )
+    late = Planted("sensor_delay", 0, {"delay": 0.04})
+    biased = Planted("sensor_bias", 0, {"bias": 0.3})
     shifted = end_of("pendulum", late)
     np.testing.assert_allclose(end_of("pendulum", biased, late)[:, 0], shifted[:, 0] + 0.3)
     np.testing.assert_allclose(shifted[2:, 0], end_of("pendulum")[:-2, 0])
@@ -90,38 +87,27 @@ FALLING, SLOW = {"tau_c": 0.1, "tau_s": 0.2}, np.sin(np.arange(400) / 10.0)[:, N
 FORTH, BACK_AND_FORTH = np.full(400, 2.0), 2.0 * np.sin(np.arange(400) / 20.0)
 
 
-@pytest.mark.parametrize(
-    ("planted", "named", "v", "right", "more"),
-    [
-        # At its place only.
-        ("viscous_friction", ["viscous_friction.joint1"], BACK_AND_FORTH, True, {}),
-        ("viscous_friction", ["viscous_friction.joint2"], BACK_AND_FORTH, False, {}),
-        ("constant_force", ["coulomb_friction.joint2"], FORTH, False, {}),
-        # Equivalents under their condition only.
-        ("constant_force", ["coulomb_friction.joint1"], FORTH, True, {}),
-        ("constant_force", ["coulomb_friction.joint1"], BACK_AND_FORTH, False, {}),
-        ("dead_zone", ["coulomb_friction.joint1"], FORTH, True, {}),
-        ("stribeck_friction", PAIR[:1], FORTH, True, {"values": FALLING | {"v_s": 0.1}}),
-        ("stribeck_friction", PAIR[:1], FORTH, False, {"values": FALLING | {"v_s": 1.0}}),
-        # Two causes may be one, and the zero of the first angle a tilt.
-        ("directional_coulomb_friction", PAIR, BACK_AND_FORTH, True, {}),
-        ("directional_coulomb_friction", PAIR[:1], BACK_AND_FORTH, False, {}),
-        ("sensor_bias", ["parameter.tilt"], FORTH, True, {"values": {"bias": 0.1}}),
-        ("sensor_bias", ["parameter.tilt"], FORTH, False, {"values": {"bias": 0.1}, "index": 1}),
-        # A lag is a delay where commands are slow.
-        ("action_delay", LAG, FORTH, True, {"values": {"delay": 2e-3}, "u": SLOW}),
-        (
-            "action_delay",
-            ["motor_lag.motor1"],
-            FORTH,
-            False,
-            {"values": {"delay": 0.15}, "u": SLOW},
-        ),
-    ],
+@each(
+    # At its place only.
+    ("viscous_friction", ["viscous_friction.joint1"], BACK_AND_FORTH, True, {}),
+    ("viscous_friction", ["viscous_friction.joint2"], BACK_AND_FORTH, False, {}),
+    ("constant_force", ["coulomb_friction.joint2"], FORTH, False, {}),
+    # Equivalents under their condition only.
+    ("constant_force", ["coulomb_friction.joint1"], FORTH, True, {}),
+    ("constant_force", ["coulomb_friction.joint1"], BACK_AND_FORTH, False, {}),
+    ("dead_zone", ["coulomb_friction.joint1"], FORTH, True, {}),
+    ("stribeck_friction", PAIR[:1], FORTH, True, {"values": FALLING | {"v_s": 0.1}}),
+    ("stribeck_friction", PAIR[:1], FORTH, False, {"values": FALLING | {"v_s": 1.0}}),
+    # Two causes may be one, and the zero of the first angle a tilt.
+    ("directional_coulomb_friction", PAIR, BACK_AND_FORTH, True, {}),
+    ("directional_coulomb_friction", PAIR[:1], BACK_AND_FORTH, False, {}),
+    ("sensor_bias", ["parameter.tilt"], FORTH, True, {"values": {"bias": 0.1}}),
+    ("sensor_bias", ["parameter.tilt"], FORTH, False, {"values": {"bias": 0.1}, "index": 1}),
+    # A lag is a delay where commands are slow.
+    ("action_delay", LAG, FORTH, True, {"values": {"delay": 2e-3}, "u": SLOW}),
+    ("action_delay", LAG, FORTH, False, {"values": {"delay": 0.15}, "u": SLOW}),
 )
-def test_a_name_is_right_at_its_place_and_where_the_motion_cannot_tell(
-    planted, named, v, right, more
-):
+def test_a_name_is_right_where_it_is_or_no_motion_can_tell(planted, named, v, right, more):
     assert judged(planted, named, v, **more) is right
 
 
@@ -193,9 +179,8 @@ def table(tmp_path_factory):
     for place, kind in enumerate(KINDS.elements()):
         system = ("pendulum", "linear_axis")[place % 2]
         case = 1_000_000 + 1000 * SALT + place
-        rows.append(
-            hidden_effects.run(system, case, "quick", kind=kind, noise="1 %", most=10, rules=False)
-        )
+        how = {"kind": kind, "noise": "1 %", "most": 10, "rules": False}
+        rows.append(hidden_effects.run(system, case, "quick", **how))
     patch.undo()
     return prepared(pd.DataFrame(rows))
 
@@ -228,9 +213,7 @@ def test_names_are_right(table):
 
 @hidden
 def test_what_shows_is_found(table):
-    clear = table[
-        (table["kind"] == "effect") & (table["factor"] >= 4.0) & (table["disturbance"] == 0.0)
-    ]
+    clear = table.query("kind == 'effect' and factor >= 4.0 and disturbance == 0.0")
     missed = clear[~clear["within"]]
     assert len(missed) <= min(allowed([0.1] * len(clear)), 1 + len(clear) // 4), told(missed)
 

@@ -13,11 +13,7 @@ N_WINDOWS, N_ROWS, N_CANDIDATES = 30, 40, 25
 
 
 def linear(rng, effect=0.0, colour=0.95):
-    """
-    Windows of a linear model with coloured noise, a nuisance first and candidates after it.
-
-    :return: slopes at the fit of the best candidate, and by how much that lowers the cost
-    """
+    """Slopes of coloured windows at the best candidate's fit, and what that gains."""
     by_theta = rng.standard_normal((N_WINDOWS, N_ROWS, 1 + N_CANDIDATES)).cumsum(1) / 5.0
     noise = rng.standard_normal((N_WINDOWS, N_ROWS))
     for row in range(1, N_ROWS):
@@ -33,9 +29,8 @@ def linear(rng, effect=0.0, colour=0.95):
         return 0.5 * np.sum(left**2), np.einsum("nri,nr->ni", by_theta, left)
 
     without, _ = best_with([0])
-    cost, scores = min(
-        (best_with([0, 1 + c]) for c in range(N_CANDIDATES)), key=lambda found: found[0]
-    )
+    every = [best_with([0, 1 + c]) for c in range(N_CANDIDATES)]
+    cost, scores = min(every, key=lambda found: found[0])
     return Slopes(curvature, scores), without - cost
 
 

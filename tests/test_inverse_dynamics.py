@@ -8,7 +8,6 @@ from sb3_hds import Trajectories, effects, twins
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid import calibrate
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 LIGHT = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/>
   <default><geom contype="0" conaffinity="0"/></default>
   <worldbody><body name="a"><joint name="hinge" axis="0 1 0"/>
@@ -48,9 +47,7 @@ def test_friction_that_takes_all_of_the_torque_is_found_from_forces():
 def test_a_simulation_that_runs_away_begins_where_forces_lead():
     """From zero friction, simulated velocities are hundreds of times the measured ones."""
     twin = twins.from_mujoco(LIGHT, dt=0.008)
-
     fit = calibrate(twin, driven(n=120, noise=0.0), free=list(TRUE), window=10)
-
     for name, value in TRUE.items():
         assert fit[name].estimate == pytest.approx(value, rel=0.1)
 

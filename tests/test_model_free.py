@@ -9,6 +9,7 @@ import numpy as np
 import optax
 import pytest
 import torch as th
+from cases import each
 from gymnasium import spaces
 from odd_envs import ACT, AnySpaces
 from small_models import STATES, greedy, logged, reloaded, same, small
@@ -26,9 +27,6 @@ from sb3_hds.algos.model_free.td7 import update as td7_update
 from sb3_hds.algos.model_free.td7.prioritized_replay import LapReplayBuffer
 from sb3_hds.algos.nets.mlp import SimbaBody
 from sb3_hds.errors import EnvironmentMismatchError
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 CHOICES = spaces.Dict(
     a=spaces.Box(-1, 1, (2,)),
@@ -65,43 +63,31 @@ def test_after_the_same_seed_a_model_explores_and_learns_alike():
     np.testing.assert_array_equal(*keys)
 
 
-@pytest.mark.parametrize(
-    ("name", "arguments", "message"),
-    [
-        ("droq", {"policy_kwargs": {"log_std_init": -2.0}}, "log_std_init .* without use_sde"),
-        ("crossq_jax", {"tau": 0.01}, "does not look at tau"),
-        ("droq", {"use_sde": True, "train_freq": 1}, "a new noise matrix at each step"),
-        ("td7", {"gradient_steps": 2, "use_checkpoints": True}, "does not look at gradient_steps"),
-    ],
+@each(
+    ("droq", {"policy_kwargs": {"log_std_init": -2.0}}, "log_std_init .* without use_sde"),
+    ("crossq_jax", {"tau": 0.01}, "does not look at tau"),
+    ("droq", {"use_sde": True, "train_freq": 1}, "a new noise matrix at each step"),
+    ("td7", {"gradient_steps": 2, "use_checkpoints": True}, "does not look at gradient_steps"),
 )
 def test_arguments_that_say_nothing_are_warned_of(name, arguments, message):
     with pytest.warns(UserWarning, match=message):
         small(name, **arguments)
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"observation_space": spaces.Box(0, 255, (3, 36, 36), np.uint8)}, "is an image"),
-        ({"observation_space": spaces.MultiDiscrete([[2, 3], [3, 4]])}, "with 2 axes"),
-        ({"observation_space": spaces.Dict({})}, "has no numbers"),
-        ({"observation_space": spaces.Dict({"a": spaces.Box(-1, 1, ())})}, "without an axis"),
-        ({"action_space": spaces.Box(0, 5, (2,), np.int32)}, "whole numbers"),
-        ({"action_space": spaces.Box(np.float32([0, -1]), np.float32([0, 1]))}, "have no range"),
-    ],
+@each(
+    ({"observation_space": spaces.Box(0, 255, (3, 36, 36), np.uint8)}, "is an image"),
+    ({"observation_space": spaces.MultiDiscrete([[2, 3], [3, 4]])}, "with 2 axes"),
+    ({"observation_space": spaces.Dict({})}, "has no numbers"),
+    ({"observation_space": spaces.Dict({"a": spaces.Box(-1, 1, ())})}, "without an axis"),
+    ({"action_space": spaces.Box(0, 5, (2,), np.int32)}, "whole numbers"),
+    ({"action_space": spaces.Box(np.float32([0, -1]), np.float32([0, 1]))}, "have no range"),
     ids=str,
 )
 def test_spaces_that_cannot_be_learned_in_are_refused(given, message):
     with pytest.raises(EnvironmentMismatchError, match=message):
         DroQ(env=AnySpaces(**given))
-
-
-def test_returns_of_several_steps_need_observations_that_are_no_dictionary():
     with pytest.raises(EnvironmentMismatchError, match="no Dict observation spaces"):
         DroQ("MultiInputPolicy", AnySpaces(CHOICES, ACT), n_steps=3)
-
-
-def test_a_choice_that_there_is_not_gets_no_action():
     with pytest.raises(ValueError, match="none of the choices"):
         small("droq", AnySpaces(spaces.Discrete(4, start=2), ACT)).predict(np.array(1))
 
@@ -122,30 +108,24 @@ def of_policy(**arguments: Any) -> dict[str, Any]:
     return {"policy_kwargs": {"net_arch": [8]} | arguments}
 
 
-@pytest.mark.parametrize(
-    ("name", "arguments", "message"),
-    [
-        ("droq", {"tau": 2.0}, "tau must be from 0 to 1"),
-        ("droq", {"ent_coef": "auto_0"}, "ent_coef must be"),
-        ("droq", {"target_entropy": "low"}, "target_entropy must be"),
-        ("droq", {"n_steps": 3, "optimize_memory_usage": True}, "False where n_steps > 1"),
-        ("droq", {"optimize_memory_usage": True}, "handle_timeout_termination"),
-        ("droq", {"param_resets": [500, 100]}, "param_resets must be"),
-        ("droq", {"qf_learning_rate": "lin_-1e-3"}, "learning rate is a number of at least 0"),
-        ("droq", of_policy(net_arch={"pi": [8]}), "net_arch must be"),
-        ("droq", of_policy(optimizer_kwargs={"speed": 1}), "optimizer_kwargs"),
-        ("droq", of_policy(optimizer_class=th.optim.NAdam), "optimizer_class='nadam'"),
-        ("droq", of_policy(dropout_rate=1.0), "dropout_rate must be at least 0"),
-        ("simba", of_policy(batch_norm_momentum=0.9), "do not use batch_norm_momentum"),
-        ("simba", {"use_sde": True} | of_policy(squash_log_std=True), "with use_sde=True"),
-        ("gsde_sac", of_policy(log_std_init=np.nan), "log_std_init must be"),
-        ("crossq_jax", of_policy(batch_norm_momentum=1.5), "batch_norm_momentum must be"),
-        ("tqc_jax", {"top_quantiles_to_drop_per_net": 1.5}, "top_quantiles_to_drop_per_net must"),
-        ("bro", {"kl_target": -1}, "kl_target must be"),
-        ("td7", of_policy(embedding_size=0), "embedding_size must be"),
-        ("td7", {"use_sde": True}, "use_sde"),
-        ("td7", {"replay_buffer_class": LapReplayBuffer, "n_steps": 2}, "n_steps"),
-    ],
+@each(
+    ("droq", {"tau": 2.0}, "tau must be from 0 to 1"),
+    ("droq", {"ent_coef": "auto_0"}, "ent_coef must be"),
+    ("droq", {"target_entropy": "low"}, "target_entropy must be"),
+    ("droq", {"n_steps": 3, "optimize_memory_usage": True}, "False where n_steps > 1"),
+    ("droq", {"optimize_memory_usage": True}, "handle_timeout_termination"),
+    ("droq", {"param_resets": [500, 100]}, "param_resets must be"),
+    ("droq", {"qf_learning_rate": "lin_-1e-3"}, "learning rate is a number of at least 0"),
+    ("droq", of_policy(net_arch={"pi": [8]}), "net_arch must be"),
+    ("droq", of_policy(optimizer_kwargs={"speed": 1}), "optimizer_kwargs"),
+    ("droq", of_policy(optimizer_class=th.optim.NAdam), "optimizer_class='nadam'"),
+    ("simba", of_policy(batch_norm_momentum=0.9), "do not use batch_norm_momentum"),
+    ("simba", {"use_sde": True} | of_policy(squash_log_std=True), "with use_sde=True"),
+    ("gsde_sac", of_policy(log_std_init=np.nan), "log_std_init must be"),
+    ("crossq_jax", of_policy(batch_norm_momentum=1.5), "batch_norm_momentum must be"),
+    ("tqc_jax", {"top_quantiles_to_drop_per_net": 1.5}, "top_quantiles_to_drop_per_net must"),
+    ("td7", {"use_sde": True}, "use_sde"),
+    ("td7", {"replay_buffer_class": LapReplayBuffer, "n_steps": 2}, "n_steps"),
     ids=str,
 )
 @pytest.mark.filterwarnings("ignore:n_steps=2 is ignored")
@@ -359,7 +339,5 @@ def test_last_layers_start_as_in_the_code_of_the_authors(name, gain):
 def test_all_updates_run_one_program(name, updates):
     model = small(name).learn(20)
     before = updates.update._cache_size()
-
     model.learn(50, reset_num_timesteps=False)
-
     assert model._n_updates > 2 and updates.update._cache_size() == before

@@ -8,6 +8,7 @@ import numpy as np
 import optax
 import pytest
 import torch as th
+from cases import each
 from gymnasium import spaces
 from small_models import small
 
@@ -22,8 +23,6 @@ from sb3_hds.algos.model_free.sac.update import Trained
 from sb3_hds.algos.nets.mlp import Dropout
 from sb3_hds.algos.nets.observations import flattener
 from sb3_hds.algos.nets.optimizers import optimizer_of
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def test_every_processor_sorts_and_compares_quantiles_alike():
@@ -46,9 +45,7 @@ def test_every_processor_sorts_and_compares_quantiles_alike():
 
 def test_dropout_zeroes_its_share():
     x, key = jnp.ones((400, 500)), jax.random.key(0)
-
     zeroed = np.asarray(Dropout(0.1).apply({}, x, rngs={"dropout": key})) == 0.0
-
     # Six standard deviations of a share of 200,000.
     assert zeroed.mean() == pytest.approx(0.1, abs=6 * np.sqrt(0.09 / x.size))
 
@@ -70,18 +67,15 @@ def test_choices_become_one_hot_and_dictionaries_one_row():
     np.testing.assert_array_equal(flat[7:12], [0, 1, 0, 0, 1])
 
 
-@pytest.mark.parametrize(
-    ("make", "arguments"),
-    [
-        (th.optim.Adam, {"betas": (0.8, 0.99), "eps": 1e-5}),
-        (th.optim.AdamW, {"weight_decay": 0.1}),
-        (th.optim.RMSprop, {"alpha": 0.9, "momentum": 0.5}),
-        (th.optim.RAdam, {}),
-        (th.optim.SGD, {"momentum": 0.9, "nesterov": True}),
-        (th.optim.Adamax, {}),
-        (th.optim.Adadelta, {"rho": 0.8}),
-        (th.optim.Adagrad, {}),
-    ],
+@each(
+    (th.optim.Adam, {"betas": (0.8, 0.99), "eps": 1e-5}),
+    (th.optim.AdamW, {"weight_decay": 0.1}),
+    (th.optim.RMSprop, {"alpha": 0.9, "momentum": 0.5}),
+    (th.optim.RAdam, {}),
+    (th.optim.SGD, {"momentum": 0.9, "nesterov": True}),
+    (th.optim.Adamax, {}),
+    (th.optim.Adadelta, {"rho": 0.8}),
+    (th.optim.Adagrad, {}),
 )
 def test_a_torch_class_means_what_it_does_in_torch(make, arguments):
     rng = np.random.default_rng(0)
@@ -108,8 +102,7 @@ def test_an_optimiser_of_ones_own_may_have_a_known_name():
     class Adam(th.optim.Adam):
         pass
 
-    assert optimizer_of(adam, {}).make is adam
-    assert optimizer_of(optax.adam, {}).make is optax.adam
+    assert optimizer_of(adam, {}).make is adam and optimizer_of(optax.adam, {}).make is optax.adam
     with pytest.raises(ValueError, match="use optimizer_class='adam'"):
         optimizer_of(Adam, {})
 

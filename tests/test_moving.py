@@ -13,8 +13,6 @@ from sb3_hds.sysid.film import STYLE, check_film, section_of, write_film
 from sb3_hds.sysid.moving import moving_of
 from sb3_hds.sysid.pictures import replay_of
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 def replayed(twin, n=2, rows=30):
     """Windows of a smooth motion, and predictions that leave it, one of them faster."""
@@ -94,10 +92,8 @@ PLAY = """(page, done) => {
 @needs_chromium
 @pytest.mark.parametrize("width", [400, 1200])
 def test_a_browser_plays_it(moving, width, tmp_path):
-    head = (
-        '<!DOCTYPE html><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-    )
-    page = f"{head}<style>{STYLE}</style>{section_of(moving)}"
+    meta = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+    page = f"<!DOCTYPE html>{meta}<style>{STYLE}</style>{section_of(moving)}"
     assert "http" not in page.replace("http://www.w3.org", "")
 
     found, console = in_chromium(page, PLAY, width, tmp_path)

@@ -6,6 +6,7 @@ import types
 import numpy as np
 import pytest
 import small_robots as robots
+from cases import each
 
 from sb3_hds import Trajectories, twins
 from sb3_hds.errors import TrajectoryError
@@ -30,14 +31,11 @@ CAMEL = ["ShoulderPan", "Wrist1", "Wrist2"]
 
 
 # How a log may call position, velocity and command of a joint.
-@pytest.mark.parametrize(
-    ("spelt", "forms"),
-    [
-        (NAMES, [f"/joint_states:{kind}[{{}}]" for kind in ("position", "velocity", "effort")]),
-        (SHORT, ["observation.{}.pos", "observation.{}.vel", "action.{}"]),
-        (SHORT, ["q_{}", "dq_{}", "tau_des_{}"]),
-        (CAMEL, ["{}Position", "{}Speed", "{}Command"]),
-    ],
+@each(
+    (NAMES, [f"/joint_states:{kind}[{{}}]" for kind in ("position", "velocity", "effort")]),
+    (SHORT, ["observation.{}.pos", "observation.{}.vel", "action.{}"]),
+    (SHORT, ["q_{}", "dq_{}", "tau_des_{}"]),
+    (CAMEL, ["{}Position", "{}Speed", "{}Command"]),
 )
 def test_columns_are_found_by_the_names_of_joints(spelt, forms):
     columns = [form.format(name) for form in forms for name in spelt]
@@ -67,17 +65,6 @@ def test_a_name_within_a_longer_one_is_another_joint():
     assert match(twin, ["left_elbow_pos", "elbow_pos"]).obs == ("elbow_pos", "left_elbow_pos")
     prefixed = ["/robot1/left_elbow_pos", "/robot1/elbow_pos"]
     assert match(twin, prefixed).obs == tuple(reversed(prefixed))
-
-
-def test_targets_are_the_commands_of_servos():
-    twin = twins.from_mujoco(robots.quadruped(), observe="q")
-    legs = [f"{leg}_{part}" for leg in ("FR", "FL") for part in ("hip", "thigh", "calf")]
-    columns = [f"{name}_{kind}" for kind in ("target", "position") for name in legs]
-
-    found = match(twin, shuffled(columns))
-
-    assert found.actions[:2] == ("FL_hip_target", "FL_thigh_target")
-    assert found.obs[:2] == ("FL_hip_position", "FL_thigh_position")
 
 
 def test_data_are_put_into_the_order_of_the_twin():

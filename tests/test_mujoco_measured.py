@@ -19,7 +19,6 @@ from sb3_hds.sysid.equation.smoothing import smooth
 pytestmark = [
     pytest.mark.measured,
     pytest.mark.skipif("SB3_HDS_DATA" not in os.environ, reason="data outside the repository"),
-    pytest.mark.usefixtures("quick_compilation"),
 ]
 UR10 = Path(os.environ.get("SB3_HDS_DATA", "."), "ur10")
 # Of SOURCE.txt: least squares on inverse dynamics, accelerations by a Savitzky-Golay filter.
@@ -60,7 +59,6 @@ def ur10(tmp_path_factory):
 
 def test_friction_of_a_ur10_is_that_of_its_publishers_within_a_quarter(tmp_path):
     found = {e["name"]: e["estimate"] for e in calibrated(tmp_path, BAG)["estimates"]}
-
     for joint, coulomb, viscous in zip(JOINTS, COULOMB, VISCOUS, strict=True):
         assert found[f"{joint}_joint_frictionloss"] == pytest.approx(coulomb, rel=0.25)
         assert found[f"{joint}_joint_damping"] == pytest.approx(viscous, rel=0.25)
@@ -71,12 +69,11 @@ def test_a_diagnosis_of_a_ur10_names_both_frictions_at_all_six_joints(tmp_path):
     words = ["diagnose", "--model", UR10 / "ur10.urdf", "--data", BAG, "--budget", "quick"]
     assert cli.main([*map(str, words), "--json", str(tmp_path / "found.json")]) == 0
     told = json.loads((tmp_path / "found.json").read_text())
-    sizes = {
-        (f["effect"], f["where"]["name"].removesuffix("_joint")): next(
-            iter(f["parameters"].values())
-        )["estimate"]
-        for f in told["findings"]
-    }
+    sizes = {}
+    for f in told["findings"]:
+        [parameter] = f["parameters"].values()
+        joint = f["where"]["name"].removesuffix("_joint")
+        sizes[f["effect"], joint] = parameter["estimate"]
 
     for joint, coulomb, viscous in zip(JOINTS, COULOMB, VISCOUS, strict=True):
         assert sizes["coulomb_friction", joint] == pytest.approx(coulomb, rel=0.25)
@@ -121,14 +118,12 @@ def test_its_corrected_file_predicts_held_out_seconds_as_well_as_the_twin(ur10, 
     ours, before = (error(of(twin)[:, 1:, :6]) for twin in (corrected, nominal))
     theirs = error(np.array([stepped(k) for k in begins]))
 
-    assert ours < 0.5 < before
-    assert theirs < 1.1 * ours
+    assert ours < 0.5 < before and theirs < 1.1 * ours
 
 
 GO2 = UR10.parent / "go2"
-LEGS = [
-    f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")
-]
+PARTS = ("hip", "thigh", "calf")
+LEGS = [f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in PARTS]
 MAP = {
     "time": "time",
     "obs": [{"column": f"position[{i}]", "name": f"{j}_position"} for i, j in enumerate(LEGS)],
@@ -143,11 +138,7 @@ def test_a_quadruped_s_loop_is_calibrated_and_its_file_steps_held_out_seconds_be
     time, q, target = (log[name] for name in ("time", "position", "target"))
     np.savez(tmp_path / "a.npz", time=time[:3200], position=q[:3200], target=target[:3200])
     (tmp_path / "map.yml").write_text(json.dumps(MAP))
-    kinds = [
-        f"*_{part}_joint_{word}"
-        for part in ("hip", "thigh", "calf")
-        for word in ("damping", "frictionloss")
-    ]
+    kinds = [f"*_{part}_joint_{word}" for part in PARTS for word in ("damping", "frictionloss")]
     words = ["calibrate", "--model", GO2 / "go2.urdf", "--data", tmp_path / "a.npz"]
     words += ["--columns", tmp_path / "map.yml", "--actuators", "position", "kp:20", "kv:1.5"]
     words += ["--free", "*_damping", "*_frictionloss", "--tied", *kinds, "--windows", 16]

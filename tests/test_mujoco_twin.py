@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 import small_robots as robots
+from cases import each
 
 from sb3_hds import Trajectories, effects, twins
 from sb3_hds.core import State, rollout
@@ -22,7 +23,7 @@ from sb3_hds.errors import ModelFileError, ParameterError
 from sb3_hds.sysid.hypotheses import Hypotheses
 
 EXPENSIVE = pytest.mark.expensive
-pytestmark = pytest.mark.usefixtures("quick_compilation", "x64")
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 def commands_for(model, n, seed=0):
@@ -65,18 +66,15 @@ LARGE = {
 }
 
 
-@pytest.mark.parametrize(
-    ("make", "integrator"),
-    [
-        pytest.param(lambda: robots.CART_POLE, RK4, id="cart-pole"),
-        pytest.param(lambda: robots.GRIPPER, IMPLICIT, id="gripper"),
-        pytest.param(lambda: robots.BALL, EULER, id="ball joint"),
-        pytest.param(lambda: robots.chain(3, actuator="velocity"), IMPLICIT, id="speeds"),
-        *(
-            pytest.param(make, integrator, id=f"{name}, {integrator}", marks=EXPENSIVE)
-            for (name, make), integrator in itertools.product(LARGE.items(), (EULER, RK4, IMPLICIT))
-        ),
-    ],
+@each(
+    pytest.param(lambda: robots.CART_POLE, RK4, id="cart-pole"),
+    pytest.param(lambda: robots.GRIPPER, IMPLICIT, id="gripper"),
+    pytest.param(lambda: robots.BALL, EULER, id="ball joint"),
+    pytest.param(lambda: robots.chain(3, actuator="velocity"), IMPLICIT, id="speeds"),
+    *(
+        pytest.param(make, integrator, id=f"{name}, {integrator}", marks=EXPENSIVE)
+        for (name, make), integrator in itertools.product(LARGE.items(), (EULER, RK4, IMPLICIT))
+    ),
 )
 def test_a_twin_steps_as_mujoco_does(make, integrator):
     model = make()
@@ -118,18 +116,15 @@ def servo_arm():
 
 
 # In an arm of 3 servos: parameter, value, and the same in the model.
-@pytest.mark.parametrize(
-    ("name", "value", "numbers"),
-    [
-        ("j1_damping", 0.7, [("dof_damping", 1, 0.7)]),
-        ("j2_armature", 0.2, [("dof_armature", 2, 0.2)]),
-        ("j0_stiffness", 9.0, [("jnt_stiffness", 0, 9.0)]),
-        ("m1_kv", 7.0, [("actuator_biasprm", (1, 2), -7.0)]),
-        ("m2_kp", 80.0, [("actuator_gainprm", (2, 0), 80.0), ("actuator_biasprm", (2, 1), -80.0)]),
-        ("tilt_x", 0.3, [("gravity", (1, 2), 9.81 * np.array([np.sin(0.3), -np.cos(0.3)]))]),
-        ("tilt_y", -0.2, [("gravity", (0, 2), 9.81 * np.array([np.sin(0.2), -np.cos(0.2)]))]),
-        ("link1_mass", 3.0, [("body_mass", 2, 3.0)]),
-    ],
+@each(
+    ("j1_damping", 0.7, [("dof_damping", 1, 0.7)]),
+    ("j2_armature", 0.2, [("dof_armature", 2, 0.2)]),
+    ("j0_stiffness", 9.0, [("jnt_stiffness", 0, 9.0)]),
+    ("m1_kv", 7.0, [("actuator_biasprm", (1, 2), -7.0)]),
+    ("m2_kp", 80.0, [("actuator_gainprm", (2, 0), 80.0), ("actuator_biasprm", (2, 1), -80.0)]),
+    ("tilt_x", 0.3, [("gravity", (1, 2), 9.81 * np.array([np.sin(0.3), -np.cos(0.3)]))]),
+    ("tilt_y", -0.2, [("gravity", (0, 2), 9.81 * np.array([np.sin(0.2), -np.cos(0.2)]))]),
+    ("link1_mass", 3.0, [("body_mass", 2, 3.0)]),
 )
 def test_a_parameter_is_the_number_of_the_model(name, value, numbers):
     xml, twin = servo_arm()
@@ -240,13 +235,10 @@ def test_effects_are_the_models_own_friction_and_gains_and_add_to_them():
         assert ours == expected and not extended.infer(jnp.zeros(2), extended.params).memory
 
 
-@pytest.mark.parametrize(
-    ("xml", "options"),
-    [
-        (robots.BALL, {"payload": "lower", "integrator": "euler"}),
-        pytest.param(robots.GRIPPER, {"payload": "pad"}, marks=EXPENSIVE),
-        pytest.param(robots.chain(2), {"payload": "tip", "masses": True}, marks=EXPENSIVE),
-    ],
+@each(
+    (robots.BALL, {"payload": "lower", "integrator": "euler"}),
+    pytest.param(robots.GRIPPER, {"payload": "pad"}, marks=EXPENSIVE),
+    pytest.param(robots.chain(2), {"payload": "tip", "masses": True}, marks=EXPENSIVE),
     ids=["ball", "gripper", "masses"],
 )
 @pytest.mark.filterwarnings("ignore:Of .* inertial parameters")
@@ -365,9 +357,7 @@ def test_targets_of_joints_are_actions_where_a_controller_closes_the_loop():
 
 def test_the_interval_of_an_environment_is_the_twins():
     env = gymnasium.make("Reacher-v5")
-
     twin = twins.from_mujoco(env)
-
     assert (twin.dt, twin.substeps) == (0.02, 2) and twin.name == "reacher"
     assert twins.from_mujoco(env, dt=0.025).substeps == 3  # no longer than the model's 10 ms
 
@@ -379,24 +369,19 @@ FILTER = '<general name="slow" joint="j0" dyntype="filter" dynprm="0.1"/>'
 
 
 # What is passed, and a part of what is said.
-@pytest.mark.parametrize(
-    ("source", "options", "message"),
-    [
-        (TOUCHING, {}, "Contacts can happen (trunk and FL_hip, "),
-        (FOLLOWING, {}, "ignore=['equality']"),
-        (robots.chain(2, more=BELT), {}, "Tendons pull (belt)"),
-        (robots.chain(1, option='density="1.2"'), {}, "A medium of density 1.2"),
-        (robots.chain(1, actuator="none", drives=FILTER), {}, "internal dynamics (slow)"),
-        (robots.chain(1, option='integrator="implicit"'), {}, "integrator 'implicit' is"),
-        (robots.chain(1), {"ignore": "wind"}, "ignore takes contacts, equality"),
-        (robots.chain(1), {"engine": "engine"}, "engine must be 'smooth' or 'auto'"),
-        (robots.chain(1), {"actuators": "servo"}, "actuators is one of 'torque'"),
-        (robots.chain(1), {"actuators": {"kind": "position"}}, "kp is missing"),
-        (robots.chain(1), {"payload": "tpi"}, "no site or body 'tpi'"),
-        ("arm.xml", {}, "There is no file 'arm.xml'"),
-        ("<mujoco><arm/></mujoco>", {}, "MuJoCo refuses this text"),
-        (7, {}, "an environment of Gymnasium with MuJoCo inside, got int"),
-    ],
+@each(
+    (TOUCHING, {}, "Contacts can happen (trunk and FL_hip, "),
+    (FOLLOWING, {}, "ignore=['equality']"),
+    (robots.chain(2, more=BELT), {}, "Tendons pull (belt)"),
+    (robots.chain(1, option='density="1.2"'), {}, "A medium of density 1.2"),
+    (robots.chain(1, actuator="none", drives=FILTER), {}, "internal dynamics (slow)"),
+    (robots.chain(1, option='integrator="implicit"'), {}, "integrator 'implicit' is"),
+    (robots.chain(1), {"ignore": "wind"}, "ignore takes contacts, equality"),
+    (robots.chain(1), {"engine": "engine"}, "engine must be 'smooth' or 'auto'"),
+    (robots.chain(1), {"actuators": "servo"}, "actuators is one of 'torque'"),
+    (robots.chain(1), {"payload": "tpi"}, "no site or body 'tpi'"),
+    ("arm.xml", {}, "There is no file 'arm.xml'"),
+    ("<mujoco><arm/></mujoco>", {}, "MuJoCo refuses this text"),
     ids=lambda value: "" if isinstance(value, str) and "<" in value else None,
 )
 def test_what_a_twin_cannot_be_is_refused(source, options, message):
@@ -407,7 +392,6 @@ def test_what_a_twin_cannot_be_is_refused(source, options, message):
 def test_what_is_ignored_is_not_there():
     windy = robots.chain(2, option='density="1.2"', range="-1.5 1.2")
     one, other = (twins.from_mujoco(windy, ignore=how) for how in (["fluid"], ["fluid", "limits"]))
-
     assert one == twins.from_mujoco(windy, ignore="fluid") != other
     assert one.joints[0].high == 1.2 and np.isinf(other.joints[0].high)
 

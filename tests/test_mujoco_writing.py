@@ -6,12 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 import small_robots as robots
+from cases import each
 
 from sb3_hds import effects, twins
 from sb3_hds.core import rollout
 from sb3_hds.errors import ModelFileError
 
-pytestmark = pytest.mark.usefixtures("quick_compilation", "x64")
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 def written_and_moved_as_the_twin(twin, path, source):
@@ -106,9 +107,8 @@ def test_a_urdf_is_corrected_where_it_can_say_it(tmp_path):
     values = {"shoulder_damping": 0.5, "elbow_frictionloss": 0.25, "elbow_armature": 0.01}
     path = tmp_path / "robot.urdf"
 
-    found = twins.write_model(
-        twin.with_parameters(**values, lower_mass=1.3, lower_com_z=-0.2), path, robots.URDF
-    )
+    changed = twin.with_parameters(**values, lower_mass=1.3, lower_com_z=-0.2)
+    found = twins.write_model(changed, path, robots.URDF)
 
     assert "Measured on Tuesday" in path.read_text()
     assert found.left_out == ("elbow_armature: 0.01 kg m2",)
@@ -125,26 +125,21 @@ def test_meshes_stay_where_they_are(tmp_path):
     (tmp_path / "out").mkdir()
     square = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
     (tmp_path / "robot" / "part.obj").write_text(square)
-    xml = ARM.replace(
-        "<worldbody>", '<asset><mesh name="part" file="part.obj"/></asset><worldbody>'
-    )
+    mesh = '<asset><mesh name="part" file="part.obj"/></asset>'
     source = tmp_path / "robot" / "arm.xml"
-    source.write_text(xml)
+    source.write_text(ARM.replace("<worldbody>", f"{mesh}<worldbody>"))
 
     twins.write_model(twins.from_mujoco(source), tmp_path / "out" / "arm.xml", source)
 
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "arm.xml")).nmesh == 1
 
 
-@pytest.mark.parametrize(
-    ("name", "source", "message"),
-    [
-        ("a.txt", ARM, "not in '.txt'"),
-        ("a.urdf", ARM, "only where the twin comes from one"),
-        ("a.xml", robots.CART_POLE, "another robot: its joints are rail, hinge"),
-        ("a.xml", "missing.xml", "There is no file 'missing.xml'"),
-        ("of no file.xml", ARM, "was not made from a model file"),
-    ],
+@each(
+    ("a.txt", ARM, "not in '.txt'"),
+    ("a.urdf", ARM, "only where the twin comes from one"),
+    ("a.xml", robots.CART_POLE, "another robot: its joints are rail, hinge"),
+    ("a.xml", "missing.xml", "There is no file 'missing.xml'"),
+    ("of no file.xml", ARM, "was not made from a model file"),
 )
 def test_what_cannot_be_written_is_refused_and_leaves_no_file(name, source, message, tmp_path):
     twin = twins.make("Pendulum") if name.startswith("of no file") else twins.from_mujoco(ARM)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch as th
+from cases import each
 from gymnasium import spaces
 from stable_baselines3.common.utils import FloatSchedule
 
@@ -16,8 +17,6 @@ from sb3_hds.algos.nets.activations import ACTIVATIONS, activation
 from sb3_hds.algos.twin import networks as nets
 from sb3_hds.algos.twin.networks import Actor, value_of
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 class Scales(NamedTuple):
     mean: np.ndarray
@@ -25,9 +24,8 @@ class Scales(NamedTuple):
 
 
 def policy(low: float = -1.0, high: float = 1.0, **kwargs) -> TwinPolicy:
-    return TwinPolicy(
-        spaces.Box(-1.0, 1.0, (3,)), spaces.Box(low, high, (2,)), FloatSchedule(1e-3), **kwargs
-    )
+    seen, done = spaces.Box(-1.0, 1.0, (3,)), spaces.Box(low, high, (2,))
+    return TwinPolicy(seen, done, FloatSchedule(1e-3), **kwargs)
 
 
 def widths(weights) -> list[int]:
@@ -35,22 +33,14 @@ def widths(weights) -> list[int]:
     return [layer["bias"].shape[0] for layer in layers if "bias" in layer]
 
 
-@pytest.mark.parametrize(
-    "module",
-    [
-        th.nn.GELU,
-        lambda: th.nn.GELU(approximate="tanh"),
-        th.nn.Hardsigmoid,
-        lambda: th.sigmoid,
-    ],
-)
-def test_a_torch_module_stands_for_the_same_function(module):
+def test_a_torch_module_stands_for_the_same_function():
     x = np.linspace(-8.0, 8.0, 33, dtype=np.float32)
 
-    ours = activation(module if isinstance(module, type) else module())(jnp.asarray(x))
-
-    # Single precision, and torch's own approximations.
-    np.testing.assert_allclose(ours, module()(th.as_tensor(x)).numpy(), atol=1e-6)
+    for module in (th.nn.GELU, th.nn.GELU(approximate="tanh"), th.nn.Hardsigmoid, th.sigmoid):
+        theirs = module() if isinstance(module, type) else module
+        # Single precision, and torch's own approximations.
+        expected = theirs(th.as_tensor(x)).numpy()
+        np.testing.assert_allclose(activation(module)(jnp.asarray(x)), expected, atol=1e-6)
 
 
 def test_names_in_any_spelling_and_functions_of_jax_are_activations():
@@ -66,15 +56,12 @@ def test_names_in_any_spelling_and_functions_of_jax_are_activations():
     assert activation(th.nn.ReLU()) is nn.relu
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ("sigmoids", "must be one of tanh, relu"),
-        (np.tanh, "no JAX function"),
-        (jnp.sum, "must keep the shape"),
-        (th.nn.ELU(alpha=0.5), "settings of its own"),
-        (type("ReLU", (th.nn.ReLU,), {}), "settings of its own"),
-    ],
+@each(
+    ("sigmoids", "must be one of tanh, relu"),
+    (np.tanh, "no JAX function"),
+    (jnp.sum, "must keep the shape"),
+    (th.nn.ELU(alpha=0.5), "settings of its own"),
+    (type("ReLU", (th.nn.ReLU,), {}), "settings of its own"),
 )
 def test_what_is_no_activation_is_refused(wrong, message):
     with pytest.raises(ValueError, match=message):
@@ -102,9 +89,8 @@ def test_what_an_actor_computes_does_not_change_with_the_scales_of_its_input():
 
     before = actor.apply(weights, (obs - old.mean) / old.scale)
     # Single precision.
-    np.testing.assert_allclose(
-        actor.apply(moved, (obs - new.mean) / new.scale), before, rtol=1e-4, atol=1e-5
-    )
+    after = actor.apply(moved, (obs - new.mean) / new.scale)
+    np.testing.assert_allclose(after, before, rtol=1e-4, atol=1e-5)
 
 
 def test_a_linear_path_leads_past_the_hidden_layers_unless_it_is_switched_off():
@@ -120,13 +106,10 @@ def test_a_linear_path_leads_past_the_hidden_layers_unless_it_is_switched_off():
     assert "linear" not in policy(linear_path=False).networks.actor["params"]
 
 
-@pytest.mark.parametrize(
-    "net_arch, pi, vf", [([], [2], [9]), ({"pi": [4, 3]}, [4, 3, 2], [64, 64, 9])]
-)
-def test_net_arch_sets_the_widths_of_both_networks(net_arch, pi, vf):
-    networks = policy(net_arch=net_arch).networks
-
-    assert widths(networks.actor) == pi and widths(networks.value) == vf
+def test_net_arch_sets_the_widths_of_both_networks():
+    for net_arch, pi, vf in (([], [2], [9]), ({"pi": [4, 3]}, [4, 3, 2], [64, 64, 9])):
+        networks = policy(net_arch=net_arch).networks
+        assert widths(networks.actor) == pi and widths(networks.value) == vf
 
 
 def test_rounding_does_not_lead_out_of_the_bounds():

@@ -6,6 +6,7 @@ import gymnasium
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from gymnasium import spaces
 from gymnasium.wrappers import TransformObservation
 from odd_envs import ACT, AnySpaces
@@ -16,24 +17,17 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 
 from sb3_hds import OpenLoop
 from sb3_hds.algos.open_loop.algorithm import cma_es as gait_search
-from sb3_hds.algos.open_loop.gait import Constants, GaitSpace
+from sb3_hds.algos.open_loop.gait import Constants
 from sb3_hds.core.transforms.oscillators import Gait, target_at
 from sb3_hds.envs import TwinVecEnv
 from sb3_hds.errors import EnvironmentMismatchError
 from sb3_hds.wrappers import ShowJoints
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 TAU = 2.0 * np.pi
 
 # Gaits that the authors of the open-loop paper published: kp, kd in commands per rad and rad/s.
-SWIMMER = {
-    "amplitude": 1.0,
-    "phase": [0.0, TAU * 0.95],
-    "omega_swing": TAU * 0.62,
-    "omega_stance": TAU * 0.62,
-    "kp": 10.0,
-    "kd": 0.5,
-}
+SWIMMER = {"amplitude": 1.0, "phase": [0.0, TAU * 0.95], "kp": 10.0, "kd": 0.5}
+SWIMMER |= dict.fromkeys(("omega_swing", "omega_stance"), TAU * 0.62)
 
 
 class Tune(AnySpaces):
@@ -71,15 +65,11 @@ def swimmer(env="Swimmer-v5", **settings):
 
 
 def hidden():
-    """Shows nothing of the joints."""
-    env = gymnasium.make("Swimmer-v5", max_episode_steps=50)
-    nothing = spaces.Box(0.0, 0.0, (1,))
+    env, nothing = gymnasium.make("Swimmer-v5", max_episode_steps=50), spaces.Box(0.0, 0.0, (1,))
     return TransformObservation(env, lambda _: np.zeros(1, np.float32), nothing)
 
 
-@pytest.mark.parametrize(
-    "kind", [DummyVecEnv, pytest.param(SubprocVecEnv, marks=pytest.mark.expensive)]
-)
+@each(DummyVecEnv, pytest.param(SubprocVecEnv, marks=pytest.mark.expensive))
 def test_joints_that_are_not_observed_are_read_from_the_environment(kind):
     shown = make_vec_env("Swimmer-v5", env_kwargs={"max_episode_steps": 50}, seed=5)
     expected = OpenLoop("MlpPolicy", shown, seed=5).set_constants(**SWIMMER)
@@ -238,64 +228,36 @@ def test_legs_that_do_the_same_are_searched_as_one_each_ahead_by_its_lead():
     np.testing.assert_allclose(now[6:8], now[:2], atol=1e-4)
 
 
-def test_points_and_gaits_are_two_names_of_the_same():
-    space = GaitSpace(
-        amplitude=np.array([1.0, 2.0]),
-        offset=np.array([[-0.5, 0.5], [0.0, 1.0]]),
-        frequency=(0.5, 4.0),
-        kp=3.0,
-        kd=0.2,
-        gain_factor=4.0,
-    )
-    point = np.random.default_rng(0).normal(size=space.dim)
-    point[4] = 0.3  # turns, from 0 to 1
-
-    np.testing.assert_allclose(space.encode(space.decode(point)), point, atol=1e-5)
-    assert space.dim == 2 + 2 + 1 + 2 + 2
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        *(("population_size", 1), ("n_resets", 0), ("frequency", [2.0, 1.0]), ("dt", 0.0)),
-        *(("gain_factor", 0.5), ("control", "maybe"), ("kp", -1.0), ("gait", "gallop")),
-        *(("gait", []), ("amplitude", 0.0)),
-    ],
+@each(
+    *(("population_size", 1), ("n_resets", 0), ("frequency", [2.0, 1.0]), ("dt", 0.0)),
+    *(("gain_factor", 0.5), ("control", "maybe"), ("kp", -1.0), ("gait", "gallop")),
+    *(("gait", []), ("amplitude", 0.0)),
 )
 def test_an_argument_out_of_range_is_named_with_its_range(name, value):
     with pytest.raises(ValueError, match=rf"OpenLoop\({name}=.*: {name} must be"):
         small("openloop", **{name: value})
 
 
-@pytest.mark.parametrize(
-    ("attempt", "says"),
-    [
-        (lambda: swimmer().set_constants(**SWIMMER | {"amplitude": [1.0] * 3}), "one for each of"),
-        (lambda: swimmer().set_constants(**SWIMMER | {"omega_swing": 0.0}), "finite and above 0"),
-        (lambda: swimmer(VecNormalize(make_vec_env("Swimmer-v5"))), "norm_obs=False"),
-        (lambda: swimmer("HalfCheetah-v5", gait="trot"), "4 legs needs as many joints in each"),
-    ],
+@each(
+    (lambda: swimmer().set_constants(**SWIMMER | {"amplitude": [1.0] * 3}), "one for each of"),
+    (lambda: swimmer().set_constants(**SWIMMER | {"omega_swing": 0.0}), "finite and above 0"),
+    (lambda: swimmer(VecNormalize(make_vec_env("Swimmer-v5"))), "norm_obs=False"),
+    (lambda: swimmer("HalfCheetah-v5", gait="trot"), "4 legs needs as many joints in each"),
 )
 def test_what_does_not_fit_the_body_is_refused(attempt, says):
     with pytest.raises((ValueError, EnvironmentMismatchError), match=says):
         attempt()
 
 
-@pytest.mark.parametrize(
-    ("make", "steps"),
-    [
-        (lambda: VecFrameStack(make_vec_env(Tune, n_envs=2), 2), 40),
-        (lambda: TwinVecEnv("Pendulum", n_envs=2), 200),
-    ],
+@each(
+    (lambda: VecFrameStack(make_vec_env(Tune, n_envs=2), 2), 40),
+    (lambda: TwinVecEnv("Pendulum", n_envs=2), 200),
     ids=["frames", "twin"],
 )
 def test_where_single_copies_cannot_be_reset_whole_episodes_are_run(make, steps):
     model = OpenLoop("MlpPolicy", make(), seed=0, population_size=2, n_resets=1, horizon=3)
-
     model.learn(2 * steps + 2)
-
-    assert int(model.policy.search.generation) == 1
-    assert model.num_timesteps == 2 * steps + 2
+    assert int(model.policy.search.generation) == 1 and model.num_timesteps == 2 * steps + 2
 
 
 def test_a_reward_that_is_not_finite_is_an_error_and_no_result():

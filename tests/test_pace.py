@@ -3,12 +3,11 @@
 import warnings
 
 import pytest
+from cases import each
 from small_models import small
 
 from sb3_hds.algos.base import pace
 from sb3_hds.algos.base.pace import Pace
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 class Learner:
@@ -22,11 +21,7 @@ class Learner:
 
 
 def said(monkeypatch, seconds: list[float], n_updates: int = 1, n_steps: int = 1) -> list[str]:
-    """
-    :param seconds: that the calls of ``train`` take, one after the other
-    :param n_updates: in each of them
-    :param n_steps: between them
-    """
+    """By a learner whose calls of ``train`` take these times."""
     now, learner, looking = 0.0, Learner(), Pace()
     monkeypatch.setattr(pace.time, "perf_counter", lambda: now)
     with warnings.catch_warnings(record=True) as caught:
@@ -51,20 +46,15 @@ def test_a_slow_learner_says_so_once_after_seconds_and_what_compiles_does_not_co
     assert "4 steps/s" in text and text.endswith("1 updates.")
 
 
-@pytest.mark.parametrize(
-    ("seconds", "n_updates", "n_steps", "slow"),
-    [
-        (0.19, 1, 1, False),
-        (0.21, 20, 1, True),
-        (0.21, 1, 2, False),  # of two environments
-        (3.0, 200, 10, True),  # an episode
-    ],
+@each(
+    (0.19, 1, 1, False),
+    (0.21, 20, 1, True),
+    (0.21, 1, 2, False),  # of two environments
+    (3.0, 200, 10, True),  # an episode
 )
-def test_it_goes_by_steps_of_the_environment(monkeypatch, seconds, n_updates, n_steps, slow):
+def test_it_goes_by_steps_of_the_environment(seconds, n_updates, n_steps, slow, monkeypatch):
     found = said(monkeypatch, 200 * [seconds], n_updates, n_steps)
-
-    assert len(found) == slow
-    assert not slow or f"{n_updates / n_steps:g} updates" in found[0]
+    assert len(found) == slow and (not slow or f"{n_updates / n_steps:g} updates" in found[0])
 
 
 def test_a_learner_says_which_of_its_arguments_matters(monkeypatch):

@@ -87,18 +87,15 @@ def test_the_wheel_holds_both_packages_the_yml_files_and_the_start_up_files(whee
     assert files | {"sb3_hds.pth", "sb3_hds.start"} <= names
     folders = {name.split("/")[0] for name in names if ".dist-info" not in name}
     assert folders == {"sb3_hds", "rl_zoo_plugin", "sb3_hds.pth", "sb3_hds.start"}
-    line, entry = (
-        (ROOT / f"rl_zoo_plugin/sb3_hds.{kind}").read_text() for kind in ("pth", "start")
-    )
+    plugin = ROOT / "rl_zoo_plugin"
+    line, entry = ((plugin / f"sb3_hds.{kind}").read_text() for kind in ("pth", "start"))
     module, function = entry.strip().split(":")
     assert line.strip() == f"import {module}; {module}.{function}()"
 
 
 @needs_build
 @needs_zoo
-def test_with_the_wheel_the_zoo_knows_our_algorithms_and_interpreters_start_as_before(
-    tmp_path, wheel
-):
+def test_with_the_wheel_the_zoo_knows_our_algorithms_and_python_starts_as_before(tmp_path, wheel):
     environment = Environment(tmp_path)
     environment.install(wheel)
     python, folder = environment.python, environment.site_packages

@@ -13,8 +13,6 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_hds import algos
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 EVERY_EPISODE = TrainFreq(1, TrainFrequencyUnit.EPISODE)
 EVERY_EIGHT_STEPS = TrainFreq(8, TrainFrequencyUnit.STEP)
 
@@ -31,28 +29,14 @@ OF_THE_MODEL: dict[str, dict[str, Any]] = {
     # Lee et al. 2025.
     "simba": {"gradient_steps": 2, "batch_size": 256, "ent_coef": "auto_0.01", "tau": 0.005},
     # Nauman et al. 2024.
-    "bro": {
-        "gradient_steps": 2,
-        "batch_size": 128,
-        "kl_target": 0.05,
-        "std_multiplier": 0.75,
-        "param_resets": [15_000],
-    },
+    "bro": {"gradient_steps": 2, "batch_size": 128, "kl_target": 0.05, "std_multiplier": 0.75}
+    | {"param_resets": [15_000]},
     # Fujimoto et al. 2023.
-    "td7": {
-        "learning_starts": 25_000,
-        "train_freq": EVERY_EPISODE,
-        "batch_size": 256,
-        "policy_delay": 2,
-        "target_update_interval": 250,
-        "target_policy_noise": 0.2,
-        "target_noise_clip": 0.5,
-        "exploration_noise": 0.1,
-        "priority_exponent": 0.4,
-        "max_episodes_per_checkpoint": 20,
-        "updates_before_checkpointing": 750_000,
-        "reset_weight": 0.9,
-    },
+    "td7": {"learning_starts": 25_000, "train_freq": EVERY_EPISODE, "batch_size": 256}
+    | {"policy_delay": 2, "target_update_interval": 250, "target_policy_noise": 0.2}
+    | {"target_noise_clip": 0.5, "exploration_noise": 0.1, "priority_exponent": 0.4}
+    | {"max_episodes_per_checkpoint": 20, "updates_before_checkpointing": 750_000}
+    | {"reset_weight": 0.9},
 }
 #: by id: learning rate and, for one control, target entropy
 RATES = {
@@ -109,6 +93,5 @@ def test_arguments_and_networks_are_those_of_the_paper(name):
 
 def test_bro_with_the_ratio_of_the_paper_starts_afresh_as_often_as_there():
     model = algos.BRO(env="Pendulum-v1", buffer_size=1000, gradient_steps=10)
-
     in_thousands = [15, 50, 250, 500, 750, 1_000, 1_500, 2_000]
     assert model.param_resets == [1_000 * n for n in in_thousands]

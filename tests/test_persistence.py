@@ -33,7 +33,6 @@ from sb3_hds import algos, effects, twins
 from sb3_hds.algos.base import files as persistence
 from sb3_hds.errors import NoTwinError
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 every_algorithm = pytest.mark.parametrize("name", EVERY_NAME)
 #: one of each way of learning
 every_kind = pytest.mark.parametrize("name", ["droq", "hds", "openloop"])
@@ -77,9 +76,7 @@ def pickled_names(data: dict) -> list[str]:
 
 
 @every_algorithm
-def test_a_file_holds_tensors_and_no_objects_of_jax_and_its_model_acts_the_same_and_goes_on(
-    name, tmp_path
-):
+def test_a_file_holds_tensors_and_nothing_of_jax_and_its_model_goes_on(name, tmp_path):
     of_jax = {"activation_fn": flax.linen.silu} if name in OFF_POLICY else {}
     of_jax |= {"optimizer_class": optax.adamw} if name in MODEL_FREE else {}
     chosen = {"policy_kwargs": SMALL[name]["policy_kwargs"] | of_jax} if of_jax else {}
@@ -167,9 +164,7 @@ def test_parameters_make_a_round_trip_and_misfits_are_refused(name):
         small(name, **other_size).set_parameters(before)
 
 
-def test_a_file_appears_when_it_is_complete_and_a_failed_save_leaves_the_older_one(
-    tmp_path, monkeypatch
-):
+def test_a_file_appears_whole_and_a_failed_save_leaves_the_older_one(tmp_path, monkeypatch):
     model = small("droq")
     write, seen = th.save, []
 
@@ -190,13 +185,10 @@ def test_a_file_appears_when_it_is_complete_and_a_failed_save_leaves_the_older_o
     assert [path.name for path in tmp_path.iterdir()] == ["model.zip"]
 
 
-@pytest.mark.parametrize(
-    ("given", "expected"), [("model.best", "model.best"), ("a/b/model", "a/b/model.zip")]
-)
-def test_a_file_gets_the_suffix_that_stable_baselines_would_give_it(given, expected, tmp_path):
-    persistence.write_whole(str(tmp_path / given), "zip", lambda file: file.write(b"content"))
-
-    assert (tmp_path / expected).read_bytes() == b"content"
+def test_a_file_gets_the_suffix_that_stable_baselines_would_give_it(tmp_path):
+    for given, expected in (("model.best", "model.best"), ("a/b/model", "a/b/model.zip")):
+        persistence.write_whole(str(tmp_path / given), "zip", lambda file: file.write(b"content"))
+        assert (tmp_path / expected).read_bytes() == b"content"
 
 
 def test_epochs_and_optimisers_go_on_after_loading():
@@ -247,7 +239,5 @@ def test_a_policy_can_be_saved_alone(name, tmp_path):
 @every_kind
 def test_saving_does_not_change_what_training_does(name):
     quiet, saving = small(name).learn(50), small(name)
-
     saving.learn(50, callback=lambda *_: saving.num_timesteps % 10 or saved(saving) is not None)
-
     assert same(quiet.get_parameters(), saving.get_parameters())

@@ -23,15 +23,9 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_hds import algos
 from sb3_hds.algos.twin import algorithm as twin_algorithm
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 class Noting(BaseCallback):
-    """
-    Notes what it is called with, once.
-
-    :param stop_at: the number of the call at which it says no
-    """
+    """Notes what it is called with, and says no at one call."""
 
     def __init__(self, stop_at: int | None = None) -> None:
         super().__init__()
@@ -48,9 +42,8 @@ def test_what_is_logged_and_evaluated_has_a_series_of_its_own_whose_axis_moves(t
     model = small("hds", pretrain_epochs=21)
     lines = logged(model)
     env = Monitor(gymnasium.make("Pendulum-v1", max_episode_steps=20))
-    evaluation = EvalCallback(
-        env, eval_freq=10, n_eval_episodes=1, verbose=0, log_path=str(tmp_path)
-    )
+    how = {"eval_freq": 10, "n_eval_episodes": 1, "verbose": 0}
+    evaluation = EvalCallback(env, log_path=str(tmp_path), **how)
 
     model.learn(50, callback=evaluation, log_interval=1)
 
@@ -81,9 +74,7 @@ def test_callbacks_are_called_after_each_epoch_and_no_timestep_is_counted():
     assert names[False] - names[True] <= {"__class__"}
 
 
-def test_a_callback_that_says_no_ends_the_pretraining_and_a_checkpoint_goes_on(
-    monkeypatch, tmp_path
-):
+def test_a_callback_that_says_no_ends_pretraining_and_a_checkpoint_goes_on(monkeypatch, tmp_path):
     model = small("hds", pretrain_epochs=5)
     monkeypatch.setattr(PendulumEnv, "step", None)
 
@@ -104,11 +95,8 @@ def slow_programs(monkeypatch) -> None:
 def test_a_limit_of_time_acts_while_programs_compile(monkeypatch):
     slow_programs(monkeypatch)
     model, begin = small("hds"), time.monotonic()
-
     model.learn(50, callback=lambda *_: time.monotonic() < begin + 1.0)
-
-    assert time.monotonic() - begin < 2.5
-    assert (model.n_pretrained, model.num_timesteps) == (0, 0)
+    assert time.monotonic() - begin < 2.5 and (model.n_pretrained, model.num_timesteps) == (0, 0)
 
 
 def test_an_interrupt_acts_while_programs_compile(monkeypatch):
@@ -119,5 +107,4 @@ def test_an_interrupt_acts_while_programs_compile(monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         model.learn(50)
 
-    assert time.monotonic() - begin < 2.5
-    assert model.logger is not None and model.n_pretrained == 0
+    assert time.monotonic() - begin < 2.5 and model.logger is not None and model.n_pretrained == 0

@@ -22,8 +22,7 @@ def test_a_prior_is_as_wide_as_the_scale_in_proportion_to_the_value_and_ends_at_
     assert prior_of("mass", MASS, 2.0, belief=(1.0, 3.0))[1:] == (1.0, 3.0)
     assert prior_of("damping", DAMPING, 0.0)[1:] == (0.0, np.inf)
     # A bound where the value was believed to be is no news.
-    assert at_limit(40.0, 0.1, 40.0, believed=2.0)
-    assert not at_limit(0.0, 0.0, np.inf, believed=0.0)
+    assert at_limit(40.0, 0.1, 40.0, believed=2.0) and not at_limit(0.0, 0.0, np.inf, believed=0.0)
     assert not at_limit(2.1, 0.1, 40.0, believed=2.0)
 
 

@@ -5,6 +5,7 @@ import time
 import gymnasium
 import numpy as np
 import pytest
+from cases import each
 from gymnasium import spaces
 from small_models import small
 
@@ -132,8 +133,7 @@ def test_a_watchdog_that_was_held_up_does_not_make_up_for_ticks_in_a_burst():
     *_, info = env.step(GO)
 
     assert [command for _, command in env.unwrapped.told[1:]] == [-1.0, 1.0]
-    assert times(env) == pytest.approx([100.57, 100.6])
-    assert info["missed_steps"] == 1
+    assert times(env) == pytest.approx([100.57, 100.6]) and info["missed_steps"] == 1
 
 
 def test_an_episode_that_ends_under_the_watchdog_is_reported_and_the_command_dropped():
@@ -165,17 +165,16 @@ def test_no_tick_passes_while_a_learner_trains_between_episodes(reset_first):
     env.step(GO)
 
     assert not env.overrun and env.timing == Timing(steps=4)
-    assert times(env) == pytest.approx([100.1, 160.1, 160.2])
-    assert env.latencies()[0].sum() == 2
+    assert times(env) == pytest.approx([100.1, 160.1, 160.2]) and env.latencies()[0].sum() == 2
 
 
 def interrupt(seconds):
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize(
-    ("sleep", "action", "error"),
-    [(interrupt, GO, KeyboardInterrupt), (None, np.array([np.nan]), ValueError)],
+@each(
+    (interrupt, GO, KeyboardInterrupt),
+    (None, np.array([np.nan]), ValueError),
     ids=["interrupted", "refused"],
 )
 def test_the_watchdog_goes_on_where_a_step_was_not_finished(sleep, action, error):
@@ -195,13 +194,10 @@ def test_the_watchdog_goes_on_where_a_step_was_not_finished(sleep, action, error
     assert env.step(GO)[-1]["missed_steps"] == 6
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        ({"period": 0.0}, "period must be above 0"),
-        ({"period": 0.1, "grace": 1.5}, "grace must be from 0 to 1"),
-        ({"period": 0.1, "safe_action": [3.0]}, "must be in Box"),
-    ],
+@each(
+    ({"period": 0.0}, "period must be above 0"),
+    ({"period": 0.1, "grace": 1.5}, "grace must be from 0 to 1"),
+    ({"period": 0.1, "safe_action": [3.0]}, "must be in Box"),
 )
 def test_arguments_out_of_range_are_refused(arguments, says):
     with pytest.raises(ParameterError, match=says):
@@ -221,8 +217,7 @@ def test_in_real_time_a_learner_that_hangs_is_replaced_by_the_watchdog():
         env.close()
 
     # Never faster than the clock, and how much slower depends on the machine.
-    assert time.monotonic() - begin >= 4 * 0.02 + 0.3
-    assert 1 <= info["missed_steps"] <= 16
+    assert time.monotonic() - begin >= 4 * 0.02 + 0.3 and 1 <= info["missed_steps"] <= 16
     assert [command for _, command in env.unwrapped.told[-2:]] == [-1.0, 1.0]
     assert env.timing.steps == 6 and env.timing.safe_actions >= info["missed_steps"]
 

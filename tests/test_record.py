@@ -9,11 +9,12 @@ import sys
 import gymnasium
 import numpy as np
 import pytest
+from cases import each
 from gymnasium import spaces
 from odd_envs import AnySpaces
 
 from sb3_hds import Trajectories
-from sb3_hds.data import Recorder, SamplingWarning
+from sb3_hds.data import Recorder
 from sb3_hds.errors import TrajectoryError
 from sb3_hds.wrappers import Record
 
@@ -115,22 +116,6 @@ def test_a_loop_without_an_environment_and_its_conditions(tmp_path):
     assert data.actions[1, :, 0].tolist() == [0.0, 1.0, 2.0, 3.0]
 
 
-def test_steps_of_uneven_length_are_resampled_to_the_intended_interval(tmp_path):
-    rng = np.random.default_rng(0)
-    times = np.cumsum(rng.uniform(0.08, 0.14, 60))
-    with recorder(tmp_path / "run") as robot:
-        robot.start([2.0 * times[0], 2.0], time=times[0])
-        for t in times[1:]:
-            robot.step([0.0], [2.0 * t, 2.0], time=t)
-
-    with pytest.warns(SamplingWarning, match="resampled to dt = 0.1 s"):
-        data = Trajectories.load(tmp_path / "run.jsonl")
-
-    # A straight line survives linear interpolation.
-    expected = 2.0 * (times[0] + 0.1 * np.arange(data.lengths[0] + 1))
-    np.testing.assert_allclose(data.obs[0, :, 0], expected, rtol=1e-12)
-
-
 def test_a_recording_is_never_overwritten_but_can_be_continued(tmp_path):
     for run in range(2):
         with recorder(tmp_path / "run", append=True) as robot:
@@ -146,31 +131,25 @@ def test_a_recording_is_never_overwritten_but_can_be_continued(tmp_path):
         recorder(tmp_path / "run", append=True, actions=["torque"])
 
 
-@pytest.mark.parametrize(
-    ("use", "says"),
-    [
-        (lambda path: recorder(path.parent / "no" / "where"), "must exist and be writable"),
-        (lambda path: recorder(path, obs=[]), "at least one observation channel"),
-        (lambda path: recorder(path, obs=["u", "q"]), "a name of its own"),
-        (lambda path: recorder(path, obs=["time"]), "other than time and condition"),
-        (lambda path: recorder(path, obs="qv"), "list of names"),
-        (lambda path: recorder(path).step([0.0], [0.0, 0.0]), "call start(obs)"),
-        (lambda path: recorder(path).start([0.0]), "obs must have 2 numbers (q, v)"),
-        (lambda path: begun(path).step(["a"], [0.0, 0.0]), "action must hold numbers (u)"),
-        (lambda path: begun(path).step([0.0], [0.0, 0.0], time=np.nan), "time must be finite"),
-        (lambda path: Recorder(path, 0.0, obs=["q"], actions=[]), "dt must be the sampling"),
-        (lambda path: Record(AnySpaces(), path), "does not say how long a step is"),
-        (lambda path: Record(AnySpaces(spaces.Box(0.0, 1.0, (4, 4))), path, dt=0.1), "Flatten"),
-    ],
+@each(
+    (lambda path: recorder(path.parent / "no" / "where"), "must exist and be writable"),
+    (lambda path: recorder(path, obs=[]), "at least one observation channel"),
+    (lambda path: recorder(path, obs=["u", "q"]), "a name of its own"),
+    (lambda path: recorder(path, obs=["time"]), "other than time and condition"),
+    (lambda path: recorder(path).step([0.0], [0.0, 0.0]), "call start(obs)"),
+    (lambda path: recorder(path).start([0.0]), "obs must have 2 numbers (q, v)"),
+    (lambda path: begun(path).step(["a"], [0.0, 0.0]), "action must hold numbers (u)"),
+    (lambda path: begun(path).step([0.0], [0.0, 0.0], time=np.nan), "time must be finite"),
+    (lambda path: Recorder(path, 0.0, obs=["q"], actions=[]), "dt must be the sampling"),
+    (lambda path: Record(AnySpaces(), path), "does not say how long a step is"),
+    (lambda path: Record(AnySpaces(spaces.Box(0.0, 1.0, (4, 4))), path, dt=0.1), "Flatten"),
 )
 def test_wrong_use_is_refused_with_the_way_out(use, says, tmp_path):
     with pytest.raises(TrajectoryError, match=re.escape(says)):
         use(tmp_path / "run")
 
 
-def test_what_is_refused_costs_nothing_that_was_recorded_and_the_kind_of_action_does_not_matter(
-    tmp_path,
-):
+def test_what_is_refused_costs_nothing_that_was_recorded_whatever_the_actions_are(tmp_path):
     with begun(tmp_path / "a") as robot:
         robot.step([1.0], [1.0, 1.0])
         with pytest.raises(TrajectoryError, match="what was before it is kept"):
@@ -178,9 +157,8 @@ def test_what_is_refused_costs_nothing_that_was_recorded_and_the_kind_of_action_
         with pytest.raises(TrajectoryError, match="must not decrease"):
             robot.step([2.0], [2.0, 2.0], time=0.0)
         robot.step([3.0], [3.0, 3.0])
-    env = Record(
-        AnySpaces(action_space=spaces.Discrete(3)), tmp_path / "b", dt=0.1, action_names=["gear"]
-    )
+    choosing = AnySpaces(action_space=spaces.Discrete(3))
+    env = Record(choosing, tmp_path / "b", dt=0.1, action_names=["gear"])
     env.reset()
     env.step(2)
     env.close()

@@ -51,7 +51,6 @@ def test_new_scales_leave_what_the_networks_compute():
     for name, network in networks.items():
         old, new = (getattr(learner.networks, name) for learner in (before, after))
         expected = network.apply(old, before.networks.inside(obs))
-        np.testing.assert_allclose(
-            network.apply(new, after.networks.inside(obs)), expected, rtol=1e-4
-        )
-        assert not np.allclose(network.apply(old, after.networks.inside(obs)), expected, rtol=1e-2)
+        inside = after.networks.inside(obs)
+        np.testing.assert_allclose(network.apply(new, inside), expected, rtol=1e-4)
+        assert not np.allclose(network.apply(old, inside), expected, rtol=1e-2)

@@ -39,9 +39,8 @@ def crowded(rubbing):
         for name, size in first.parameters.items()
         for side in ("positive", "negative")
     }
-    alike = dataclasses.replace(
-        first, alternatives=(f"{name}0", f"{name}1"), parameters=first.parameters | sizes
-    )
+    sizes = first.parameters | sizes
+    alike = dataclasses.replace(first, alternatives=(f"{name}0", f"{name}1"), parameters=sizes)
     return dataclasses.replace(
         rubbing,
         twin=rubbing.twin.with_parameters(mass=1.2),
@@ -197,8 +196,6 @@ LOOK = """(page, done) => {
 @needs_chromium
 def test_the_report_fits_a_narrow_browser(page, tmp_path):
     found, console = in_chromium(page, LOOK, 400, tmp_path)
-
     assert found["laid_out"] <= found["shown"] <= 400 and not found["overrun"]
     # A picture has at least as many pixels as it is shown with.
-    assert len(found["pictures"]) == 5 and min(found["pictures"]) >= 1.0
-    assert console == []
+    assert len(found["pictures"]) == 5 and min(found["pictures"]) >= 1.0 and console == []

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import small_robots as robots
+from cases import each
 from scipy.integrate import solve_ivp
 
 from sb3_hds import twins
@@ -43,30 +44,19 @@ S, C = 9.81 * np.sin(0.2), 9.81 * np.cos(0.2)
 
 
 # Where the inertia is that about the joint: about the centre of mass, and Steiner's share.
-@pytest.mark.parametrize(
-    ("name", "xml", "size", "gravity", "parameters"),
-    [
-        (
-            "DoublePendulum",
-            DOUBLE_PENDULUM,
-            0.5,
-            (-S, 0.0, -C),
-            {"mass1": 0.5, "mass2": 0.6, "length1": 0.3, "com1": 0.25, "com2": 0.15}
-            | {"inertia1": 0.02 + 0.5 * 0.25**2, "inertia2": 0.015 + 0.6 * 0.15**2}
-            | {"damping1": 0.01, "damping2": 0.02, "tilt": 0.2, "tip_payload": 0.15, "tip": 0.25},
-        ),
-        (
-            "Furuta",
-            FURUTA,
-            0.01,
-            (S, C * np.sin(-0.1), -C * np.cos(-0.1)),
-            {"arm_inertia": 6e-4, "arm_length": 0.1, "mass": 0.03, "com": 0.07, "inertia": 4e-5}
-            | {"arm_damping": 1e-3, "pendulum_damping": 1e-4}
-            | {"tilt_x": 0.2, "tilt_y": -0.1, "tip_payload": 0.01, "tip": 0.12},
-        ),
-    ],
+DOUBLE = {"mass1": 0.5, "mass2": 0.6, "length1": 0.3, "com1": 0.25, "com2": 0.15, "tilt": 0.2}
+DOUBLE |= {"inertia1": 0.02 + 0.5 * 0.25**2, "inertia2": 0.015 + 0.6 * 0.15**2}
+DOUBLE |= {"damping1": 0.01, "damping2": 0.02, "tip_payload": 0.15, "tip": 0.25}
+ROTARY = {"arm_inertia": 6e-4, "arm_length": 0.1, "mass": 0.03, "com": 0.07, "inertia": 4e-5}
+ROTARY |= {"arm_damping": 1e-3, "pendulum_damping": 1e-4, "tilt_x": 0.2, "tilt_y": -0.1}
+ROTARY |= {"tip_payload": 0.01, "tip": 0.12}
+
+
+@each(
+    ("DoublePendulum", DOUBLE_PENDULUM, 0.5, (-S, 0.0, -C), DOUBLE),
+    ("Furuta", FURUTA, 0.01, (S, C * np.sin(-0.1), -C * np.cos(-0.1)), ROTARY),
 )
-def test_two_joints_move_as_in_mujoco(x64, name, xml, size, gravity, parameters):
+def test_two_joints_move_as_in_mujoco(name, xml, size, gravity, parameters, x64):
     twin, start = twins.make(name, **parameters), np.array([0.3, 1.0])
     actions = torques(100, len(twin.actuators), size)
     xml = xml.replace("{tip}", TIP.format(parameters["tip"], parameters["tip_payload"]))
@@ -103,7 +93,11 @@ def test_one_motor_leaves_the_other_joint_alone(x64):
         np.testing.assert_array_equal(one, replayed(twins.make("DoublePendulum"), [0.1, 0.2], pair))
 
 
+SPRING = {"mass": 0.5, "damping": 0.1, "stiffness": -1.0, "cubic_stiffness": 3.0}
 ROD = {"mass": 0.2, "com": 0.2, "inertia": 1e-3}
+UP = ROD | {"damping": 1e-3, "zero": "up"}
+TILTED = ROD | {"tilt": 0.3, "tip_payload": 0.1, "tip": 0.4}
+LOGGED = {"commands": "goal, enable, gain"}
 MOTOR = {"torque_constant": 0.5, "resistance": 2.0}
 
 
@@ -113,29 +107,14 @@ def servo(q, v, u):
     return (drive - 0.5 * 9.81 * 0.1 * np.sin(q - 0.2)) / (0.5 * 0.1**2 + 0.002)
 
 
-@pytest.mark.parametrize(
-    ("name", "settings", "acceleration"),
-    [
-        ("LinearAxis", {"mass": 2.0, "damping": 0.3}, lambda q, v, u: (u - 0.3 * v) / 2.0),
-        (
-            "Duffing",
-            {"mass": 0.5, "damping": 0.1, "stiffness": -1.0, "cubic_stiffness": 3.0},
-            lambda q, v, u: (u - 0.1 * v + q - 3.0 * q**3) / 0.5,
-        ),
-        (
-            "FreePendulum",
-            ROD | {"damping": 1e-3, "zero": "up"},
-            lambda q, v, u: (0.04 * 9.81 * np.sin(q) - 1e-3 * v) / (1e-3 + 0.2**3),
-        ),
-        (
-            "FreePendulum",
-            ROD | {"tilt": 0.3, "tip_payload": 0.1, "tip": 0.4},
-            lambda q, v, u: -9.81 * 0.08 * np.sin(q + 0.3) / (1e-3 + 0.2**3 + 0.1 * 0.4**2),
-        ),
-        ("ServoPendulum", MOTOR | {"kp": 200.0, "voltage": 6.0, "tilt": -0.2}, servo),
-    ],
+@each(
+    ("LinearAxis", {"mass": 2.0, "damping": 0.3}, lambda q, v, u: (u - 0.3 * v) / 2.0),
+    ("Duffing", SPRING, lambda q, v, u: (u - 0.1 * v + q - 3.0 * q**3) / 0.5),
+    ("FreePendulum", UP, lambda q, v, u: (0.04 * 9.81 * np.sin(q) - 1e-3 * v) / (1e-3 + 0.2**3)),
+    ("FreePendulum", TILTED, lambda q, v, u: -0.08 * 9.81 * np.sin(q + 0.3) / (0.009 + 0.1 * 0.16)),
+    ("ServoPendulum", MOTOR | {"kp": 200.0, "voltage": 6.0, "tilt": -0.2}, servo),
 )
-def test_one_joint_moves_as_its_equation_says(x64, name, settings, acceleration):
+def test_one_joint_moves_as_its_equation_says(name, settings, acceleration, x64):
     twin = twins.make(name, **settings)
     actions = torques(60, len(twin.actuators), 2.0)
     expected = [(0.4, 0.0)]
@@ -148,24 +127,15 @@ def test_one_joint_moves_as_its_equation_says(x64, name, settings, acceleration)
     np.testing.assert_allclose(replayed(twin, [0.4], actions), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_a_servo_that_is_switched_off_swings_freely(x64):
-    off = twins.make("ServoPendulum", commands="goal, enable")
-    length, mass, armature = 0.1, 0.5, 0.002
-    free = twins.make("FreePendulum", mass=mass, com=length, inertia=armature, dt=off.dt)
+def test_a_servo_is_switched_off_by_a_command_and_its_gain_may_be_another(x64):
+    logged, plain = (twins.make("ServoPendulum", **how) for how in (LOGGED, {"kp": 123.0}))
+    free = twins.make("FreePendulum", mass=0.5, com=0.1, inertia=0.002, dt=plain.dt)
+    goals, ones = torques(40, 1, 1.0), np.ones((40, 1))
 
-    found = replayed(off, [0.5], np.tile([2.0, 0.0], (50, 1)))
+    on, off = (replayed(logged, [0.5], np.c_[goals, on * ones, 123.0 * ones]) for on in (1, 0))
 
-    np.testing.assert_allclose(found, replayed(free, [0.5], np.zeros((50, 0))), rtol=1e-9)
-
-
-def test_a_logged_gain_takes_the_place_of_the_parameter(x64):
-    plain = twins.make("ServoPendulum", kp=123.0)
-    logged = twins.make("ServoPendulum", commands="goal, enable, gain")
-    goals = torques(40, 1, 1.0)
-
-    found = replayed(logged, [0.1], np.column_stack([goals, np.ones(40), np.full(40, 123.0)]))
-
-    np.testing.assert_allclose(found, replayed(plain, [0.1], goals), rtol=1e-9)
+    np.testing.assert_allclose(on, replayed(plain, [0.5], goals), rtol=1e-9)
+    np.testing.assert_allclose(off, replayed(free, [0.5], np.zeros((40, 0))), rtol=1e-9)
     assert "kp" in plain.parameters and "kp" not in logged.parameters
 
 
@@ -175,9 +145,7 @@ def test_encoders_report_positions_and_if_wanted_velocities(name):
     state = both.initial(jax.random.key(0), both.params)._replace(v=jnp.ones(len(both.joints)))
 
     np.testing.assert_array_equal(alone.observe(state, alone.params), state.q)
-    np.testing.assert_array_equal(
-        both.observe(state, both.params), np.concatenate([state.q, state.v])
-    )
+    np.testing.assert_array_equal(both.observe(state, both.params), np.r_[state.q, state.v])
     assert alone != both and len(both.channels) == 2 * len(alone.channels)
     assert twins.from_spec(alone.to_spec()).channels == alone.channels
 
@@ -185,22 +153,17 @@ def test_encoders_report_positions_and_if_wanted_velocities(name):
 def test_a_rig_is_pushed_as_hard_as_it_was():
     rig = twins.make("CartPole", observe="qv")
     state = State(jnp.zeros(2), jnp.zeros(2), {})
-
     weak, strong = (rig.step(state, jnp.array([force]), rig.params).v[0] for force in (10.0, 30.0))
-
     assert float(strong) == pytest.approx(3.0 * float(weak), rel=0.05)
 
 
-@pytest.mark.parametrize(
-    ("name", "setting", "message"),
-    [
-        ("LinearAxis", {"observe": "v"}, "can observe 'q' or 'qv', got 'v'"),
-        ("CartPole", {"observe": "v"}, "'task' or 'q' or 'qv'"),
-        ("FreePendulum", {"zero": "left"}, "'down' or 'up'"),
-        ("FreePendulum", {"tip": 0.0}, "tip of FreePendulum must be a length above 0 m, got 0"),
-        ("DoublePendulum", {"driven": "none"}, "'both', 'first', 'second'"),
-        ("ServoPendulum", {"commands": "torque"}, "'goal', 'goal, enable'"),
-    ],
+@each(
+    ("LinearAxis", {"observe": "v"}, "can observe 'q' or 'qv', got 'v'"),
+    ("CartPole", {"observe": "v"}, "'task' or 'q' or 'qv'"),
+    ("FreePendulum", {"zero": "left"}, "'down' or 'up'"),
+    ("FreePendulum", {"tip": 0.0}, "tip of FreePendulum must be a length above 0 m, got 0"),
+    ("DoublePendulum", {"driven": "none"}, "'both', 'first', 'second'"),
+    ("ServoPendulum", {"commands": "torque"}, "'goal', 'goal, enable'"),
 )
 def test_a_rig_that_does_not_exist_is_refused(name, setting, message):
     with pytest.raises(ParameterError, match=message):

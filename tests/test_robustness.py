@@ -8,6 +8,7 @@ import zipfile
 import gymnasium
 import numpy as np
 import pytest
+from cases import each
 from small_models import small
 from test_open_loop import SWIMMER
 
@@ -17,8 +18,7 @@ from sb3_hds.errors import EnvironmentMismatchError, TrajectoryError
 from sb3_hds.experiments import PERTURBATIONS, Robustness, measure_robustness, returns_of
 from sb3_hds.wrappers import CPGPrior, LowPassAction
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-N_STEPS = 60
+N_STEPS, EXPENSIVE = 60, pytest.mark.expensive
 
 
 def short() -> gymnasium.Env:
@@ -47,8 +47,7 @@ def test_they_matter_where_the_loop_sees_what_the_policy_sees(swimmer):
         swimmer, short, perturbations=kinds, n_episodes=2, encoders="observation", progress=False
     )
 
-    assert found.share("noise 0.5") < 0.9
-    assert swimmer.policy.read_states is None
+    assert found.share("noise 0.5") < 0.9 and swimmer.policy.read_states is None
 
 
 def test_a_table_has_shares_of_the_return_without_perturbation_where_they_mean_something():
@@ -91,14 +90,8 @@ def test_what_wrappers_add_is_no_sensor():
             return observation
 
     kinds = {name: PERTURBATIONS[name] for name in ("none", "noise 0.5")}
-    measure_robustness(
-        model,
-        "Pendulum-v1",
-        wrapper=lambda env: Seeing(wrap(env)),
-        perturbations=kinds,
-        n_episodes=1,
-        progress=False,
-    )
+    how = {"perturbations": kinds, "n_episodes": 1, "progress": False}
+    measure_robustness(model, "Pendulum-v1", wrapper=lambda env: Seeing(wrap(env)), **how)
 
     calm, noisy = np.array_split(np.array(seen), 2)
     # Cosine and sine of the angle, which the sensors show; sine and cosine of the clock.
@@ -129,13 +122,7 @@ def test_the_command_takes_what_the_environment_was_made_and_wrapped_with(tmp_pa
     assert without == 1 and "put the wrappers around it" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("name", "policy"),
-    [
-        ("sbx.SAC", "MlpPolicy"),
-        pytest.param("ppo_lstm", "MlpLstmPolicy", marks=pytest.mark.expensive),
-    ],
-)
+@each(("sbx.SAC", "MlpPolicy"), pytest.param("ppo_lstm", "MlpLstmPolicy", marks=EXPENSIVE))
 def test_the_command_runs_models_of_the_packages_around(name, policy, tmp_path, capsys):
     pytest.importorskip("sb3_contrib")
     classes.algorithm(name)(policy, "Pendulum-v1", seed=0).save(tmp_path / "model")
@@ -145,18 +132,14 @@ def test_the_command_runs_models_of_the_packages_around(name, policy, tmp_path, 
     assert "sensor constant" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--algo opneloop", "Did you mean 'openloop'?"),
-        ("--algo sbx.Nothing", "no class 'sbx.Nothing'"),
-        ("--env-wrapper [1,2]", "--env-wrapper takes"),
-        ("--env-kwargs g=5", "--env-kwargs takes NAME:VALUE"),
-        ("--env-kwargs weight:5", "no 'Pendulum-v1' with {'weight': 5}"),
-        ("--env Nothing-v0", "no 'Nothing-v0'"),
-        ("--model FOLDER/modle", "Did you mean 'FOLDER/model.zip'?"),
-        ("--model FOLDER/other.zip", "holds no model of droq"),
-    ],
+@each(
+    ("--algo opneloop", "Did you mean 'openloop'?"),
+    ("--algo sbx.Nothing", "no class 'sbx.Nothing'"),
+    ("--env-wrapper [1,2]", "--env-wrapper takes"),
+    ("--env-kwargs weight:5", "no 'Pendulum-v1' with {'weight': 5}"),
+    ("--env Nothing-v0", "no 'Nothing-v0'"),
+    ("--model FOLDER/modle", "Did you mean 'FOLDER/model.zip'?"),
+    ("--model FOLDER/other.zip", "holds no model of droq"),
 )
 def test_the_command_says_in_one_line_what_it_does_not_know(words, message, tmp_path, capsys):
     small("droq").save(tmp_path / "model")

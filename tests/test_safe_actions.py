@@ -4,6 +4,7 @@ import gymnasium
 import jaxtyping
 import numpy as np
 import pytest
+from cases import each
 from gymnasium import spaces
 from moving_joints import DT, MovingJoints, distances, walls
 from scipy import optimize, signal
@@ -38,16 +39,13 @@ def joints(n=2, **settings):
     return gymnasium.wrappers.TimeLimit(MovingJoints(n, **settings), 50)
 
 
-@pytest.mark.parametrize(
-    ("layer", "arguments"),
-    [
-        (ActionRateLimit, {"max_rate": 20.0}),
-        (LowPassAction, {"cutoff": 3.0}),
-        (ActionDelay, {"steps": 2}),
-        (ActionScale, {"schedule": [[0, 0.2], [10, 1.0]]}),
-        (ContinuityCost, {"weight": 0.1}),
-        (SharedControlTemplate, {"phases": PHASES}),
-    ],
+@each(
+    (ActionRateLimit, {"max_rate": 20.0}),
+    (LowPassAction, {"cutoff": 3.0}),
+    (ActionDelay, {"steps": 2}),
+    (ActionScale, {"schedule": [[0, 0.2], [10, 1.0]]}),
+    (ContinuityCost, {"weight": 0.1}),
+    (SharedControlTemplate, {"phases": PHASES}),
 )
 def test_the_memory_can_be_left_out_of_observations(layer, arguments):
     shown, hidden = (layer(joints(), **arguments, observe_state=seen) for seen in (True, False))
@@ -70,49 +68,31 @@ def commands_of(env, actions):
     return np.array(told)
 
 
-@pytest.mark.parametrize(
-    ("layer", "limits", "actions", "expected"),
-    [
-        # 20 and 40 units per second, 0.05 s: steps of 1 and 2, from the rest at zero.
-        (
-            lambda env: ActionRateLimit(env, max_rate=[20.0, 40.0]),
-            (-5.0, 5.0),
-            [[5, -5], [5, -5], [5, -5], [0, 0]],
-            [[1, -2], [2, -4], [3, -5], [2, -3]],
-        ),
-        (
-            lambda env: ActionDelay(env, 2),
-            (-5.0, 5.0),
-            [[1, -1], [2, -2], [3, -3]],
-            [[0, 0], [0, 0], [1, -1]],
-        ),
-        # Before an episode, the command nearest to zero.
-        (lambda env: ActionDelay(env, 1), (2.0, 5.0), [[5, 4]] * 2, [[2, 2], [5, 4]]),
-        # Around the middle of the range.
-        (lambda env: ActionScale(env, 0.25), (0.0, 4.0), [[4, 0], [0, 2]], [[2.5, 1.5], [1.5, 2]]),
-        # Onto u1 + u2 <= 2, along its normal; what is allowed stays.
-        (
-            lambda env: ActionShield(env, ([[1.0, 1.0]], [2.0])),
-            (-5.0, 5.0),
-            [[3, 3], [4, 0], [1, 0.5]],
-            [[1, 1], [3, -1], [1, 0.5]],
-        ),
-    ],
+LIMITED, TOGETHER = [[1, -2], [2, -4], [3, -5], [2, -3]], ([[1.0, 1.0]], [2.0])
+
+
+@each(
+    # 20 and 40 units per second, 0.05 s: steps of 1 and 2, from the rest at zero.
+    (ActionRateLimit, [20.0, 40.0], (-5, 5), [[5, -5]] * 3 + [[0, 0]], LIMITED),
+    (ActionDelay, 2, (-5, 5), [[1, -1], [2, -2], [3, -3]], [[0, 0], [0, 0], [1, -1]]),
+    # Before an episode, the command nearest to zero.
+    (ActionDelay, 1, (2.0, 5.0), [[5, 4]] * 2, [[2, 2], [5, 4]]),
+    # Around the middle of the range.
+    (ActionScale, 0.25, (0.0, 4.0), [[4, 0], [0, 2]], [[2.5, 1.5], [1.5, 2]]),
+    # Onto u1 + u2 <= 2, along its normal; what is allowed stays.
+    (ActionShield, TOGETHER, (-5, 5), [[3, 3], [4, 0], [1, 0.5]], [[1, 1], [3, -1], [1, 0.5]]),
     ids=["rate limit", "delay", "delay of a push", "scale", "shield"],
 )
-def test_a_layer_makes_of_commands_what_its_formula_says(layer, limits, actions, expected):
+def test_a_layer_makes_of_commands_what_its_formula_says(layer, given, limits, actions, expected):
     env = joints()
     env.unwrapped.action_space = spaces.Box(*limits, (2,))
-
-    np.testing.assert_allclose(commands_of(layer(env), actions), expected, atol=1e-5)
+    np.testing.assert_allclose(commands_of(layer(env, given), actions), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("order", [1, 8])
 def test_a_low_pass_is_scipy_s_butterworth(order):
     actions = np.random.default_rng(0).uniform(-3.0, 3.0, (60, 2))  # too small to be clipped
-
     told = commands_of(LowPassAction(joints(), 4.0, order), actions)
-
     b, a = signal.butter(order, 4.0, fs=1.0 / DT)
     np.testing.assert_allclose(told, signal.lfilter(b, a, actions, axis=0), atol=1e-5)
 
@@ -187,7 +167,6 @@ def test_a_continuity_cost_is_the_squared_change_of_the_action():
 
 def test_an_environment_that_does_not_tell_its_interval_needs_it_passed():
     env = gymnasium.make("MountainCarContinuous-v0")
-
     with pytest.raises(ParameterError, match="Pass dt=SECONDS"):
         ActionRateLimit(env, 1.0)
     assert ActionRateLimit(env, 1.0, dt=0.1).twin_transform.max_change == pytest.approx(0.1)
@@ -214,13 +193,10 @@ def test_nested_layers_tell_the_first_action_the_last_command_and_all_correction
     assert env.step(np.array([5.0], np.float32))[-1]["stored_action"] == pytest.approx(4.0)
 
 
-@pytest.mark.parametrize(
-    "safe",
-    [
-        lambda env: JointLimitBarrier(env, -1.0, 1.0),
-        lambda env: ActionShield(env, ([[1.0]], [1.0])),
-        lambda env: SharedControlTemplate(env, [Phase("only", [[1.0]])]),
-    ],
+@each(
+    lambda env: JointLimitBarrier(env, -1.0, 1.0),
+    lambda env: ActionShield(env, ([[1.0]], [1.0])),
+    lambda env: SharedControlTemplate(env, [Phase("only", [[1.0]])]),
 )
 def test_a_safety_layer_has_the_last_word(safe):
     with pytest.raises(ParameterError, match="ActionRateLimit below it changes commands"):
@@ -264,15 +240,12 @@ def rail(q):
     return np.minimum(q + 1.0, 1.2 - q)
 
 
-@pytest.mark.parametrize(
-    ("env", "margins", "closest"),
-    [
-        (barrier(MovingJoints(2), share=1.0), rail, 0.05),
-        (barrier(MovingJoints(2, angles=True), position=[[0, 2], [1, 3]], share=0.3), rail, 0.05),
-        # A drive that misses by 10 % of at most 5 rad/s in 0.05 s: 0.025 rad.
-        (barrier(MovingJoints(2, lag=0.1), tolerance=0.0251), rail, 0.1),
-        (ActionShield(MovingJoints(2), walls, guard=distances), distances, 0.02),
-    ],
+@each(
+    (barrier(MovingJoints(2), share=1.0), rail, 0.05),
+    (barrier(MovingJoints(2, angles=True), position=[[0, 2], [1, 3]], share=0.3), rail, 0.05),
+    # A drive that misses by 10 % of at most 5 rad/s in 0.05 s: 0.025 rad.
+    (barrier(MovingJoints(2, lag=0.1), tolerance=0.0251), rail, 0.1),
+    (ActionShield(MovingJoints(2), walls, guard=distances), distances, 0.02),
     ids=["barrier", "angles", "lagging drive", "coupled walls"],
 )
 def test_no_attack_gets_past_a_limit_in_150_episodes(env, margins, closest, unchecked):
@@ -318,37 +291,31 @@ UNBOUNDED = {"action_space": spaces.Box(-np.inf, np.inf, (2,))}
 FORWARD = {"action_space": spaces.Box(1.0, 5.0, (2,))}
 
 
-@pytest.mark.parametrize(
-    ("layer", "arguments", "says"),
-    [
-        (ActionDelay, {"steps": 2, **UNBOUNDED}, "bounded Box with one axis"),
-        (ActionRateLimit, {"max_rate": -1.0}, "max_rate must be above 0"),
-        (ActionRateLimit, {"max_rate": 1.0, "store": "both"}, "store must be one of"),
-        (LowPassAction, {"cutoff": 10.0}, "below 10 Hz"),
-        (LowPassAction, {"cutoff": 1.0, "order": 9}, "from 1 to 8"),
-        (ActionDelay, {"steps": 0}, "at least 1"),
-        (ActionScale, {}, "either a scale or a schedule"),
-        (ActionScale, {"scale": 0.5, "axes": [2]}, "from 0 to 1"),
-        (ActionScale, {"schedule": [[5, 0.1]]}, "growing from 0"),
-        (HistoryObservation, {"n_observations": 0, "n_actions": 0}, "must be positive"),
-        (barrier, {"low": 1.2}, "high must be above low"),
-        (barrier, {"position": [0, 7]}, "an observation has 2"),
-        (barrier, {"action": [0, 3]}, "command 3 is not"),
-        (barrier, {"low": -4.0, "position": [[0, 1], [1, 0]]}, "half a turn"),
-        (barrier, {"tolerance": 0.6}, "more than 2.4"),
-        (barrier, {"low": [-1.0] * 3}, "one for each of the 2 joints"),
-        (barrier, {"on_breach": "pray"}, "on_breach must be one of"),
-        (barrier, FORWARD, "zero and of either sign"),
-        (ActionShield, {"constraints": ([[1.0, 0.0, 0.0]], [1.0])}, "of shape"),
-        (ActionShield, {"constraints": ([[1.0, 0.0], [-1.0, 0.0]], [-1.0] * 2)}, "no command"),
-        (ActionShield, {"constraints": "nowhere.at_all"}, "no function"),
-        (SharedControlTemplate, {"phases": [Phase("a", TURN)] * 2}, "names of their own"),
-        (SharedControlTemplate, {"phases": [Phase("a", [[1.0]])]}, r"shape \(2, n_inputs\)"),
-        (one_phase, {"transitions": [{"to": "b", "when": distances}]}, "leads to"),
-        (one_phase, {"transitions": [{"to": "a", "when": {"channel": 9}}]}, "condition"),
-        (one_phase, {"constraints": ([[1.0, 0.0]], [-9.0])}, "No command between"),
-        (SharedControlTemplate, {"phases": [{"name": "a", "map": TURN}]}, "is a dictionary"),
-    ],
+@each(
+    (ActionDelay, {"steps": 2, **UNBOUNDED}, "bounded Box with one axis"),
+    (ActionRateLimit, {"max_rate": -1.0}, "max_rate must be above 0"),
+    (ActionRateLimit, {"max_rate": 1.0, "store": "both"}, "store must be one of"),
+    (LowPassAction, {"cutoff": 10.0}, "below 10 Hz"),
+    (LowPassAction, {"cutoff": 1.0, "order": 9}, "from 1 to 8"),
+    (ActionScale, {}, "either a scale or a schedule"),
+    (ActionScale, {"scale": 0.5, "axes": [2]}, "from 0 to 1"),
+    (ActionScale, {"schedule": [[5, 0.1]]}, "growing from 0"),
+    (HistoryObservation, {"n_observations": 0, "n_actions": 0}, "must be positive"),
+    (barrier, {"low": 1.2}, "high must be above low"),
+    (barrier, {"position": [0, 7]}, "an observation has 2"),
+    (barrier, {"low": -4.0, "position": [[0, 1], [1, 0]]}, "half a turn"),
+    (barrier, {"tolerance": 0.6}, "more than 2.4"),
+    (barrier, {"on_breach": "pray"}, "on_breach must be one of"),
+    (barrier, FORWARD, "zero and of either sign"),
+    (ActionShield, {"constraints": ([[1.0, 0.0, 0.0]], [1.0])}, "of shape"),
+    (ActionShield, {"constraints": ([[1.0, 0.0], [-1.0, 0.0]], [-1.0] * 2)}, "no command"),
+    (ActionShield, {"constraints": "nowhere.at_all"}, "no function"),
+    (SharedControlTemplate, {"phases": [Phase("a", TURN)] * 2}, "names of their own"),
+    (SharedControlTemplate, {"phases": [Phase("a", [[1.0]])]}, r"shape \(2, n_inputs\)"),
+    (one_phase, {"transitions": [{"to": "b", "when": distances}]}, "leads to"),
+    (one_phase, {"transitions": [{"to": "a", "when": {"channel": 9}}]}, "condition"),
+    (one_phase, {"constraints": ([[1.0, 0.0]], [-9.0])}, "No command between"),
+    (SharedControlTemplate, {"phases": [{"name": "a", "map": TURN}]}, "is a dictionary"),
 )
 def test_what_makes_no_sense_is_refused_at_the_door(layer, arguments, says):
     env, arguments = joints(2), dict(arguments)
@@ -358,9 +325,7 @@ def test_what_makes_no_sense_is_refused_at_the_door(layer, arguments, says):
         layer(env, **arguments)
 
 
-@pytest.mark.parametrize(
-    ("n", "scale", "unit"), [(2, 1.0, 1.0), (12, 1.0, 1.0), (3, 1e-9, 1.0), (3, 1e6, 1e-4)]
-)
+@each((2, 1.0, 1.0), (12, 1.0, 1.0), (3, 1e-9, 1.0), (3, 1e6, 1e-4))
 def test_a_projection_meets_the_conditions_of_optimality_in_any_units(n, scale, unit):
     generator, most = np.random.default_rng(n), np.ones(n)
     for _ in range(30):

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import stable_baselines3 as sb3
+from cases import each
 from gymnasium.wrappers import TimeLimit
 from moving_joints import DT, MovingJoints
 from small_models import small
@@ -31,9 +32,6 @@ from sb3_hds.wrappers import (
     LowPassAction,
 )
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
-
 SCHEDULE = [[0, 0.3], [50, 1.0]]
 
 
@@ -43,11 +41,10 @@ def nested(env):
     return HistoryObservation(ContinuityCost(env, 0.3), n_observations=2, n_actions=2)
 
 
+BARRIER = {"low": -2.0, "high": 2.0, "position": [[0, 1]], "gain": 0.5, "on_breach": "ignore"}
 LAYERS = {
     # No speed is commanded here: what the twin does beyond its assumptions has to agree, too.
-    "barrier": lambda env: JointLimitBarrier(
-        env, -2.0, 2.0, position=[[0, 1]], gain=0.5, on_breach="ignore"
-    ),
+    "barrier": lambda env: JointLimitBarrier(env, **BARRIER),
     "rhythm_residual": lambda env: CPGPrior(env, mode="residual", omega_swing=3.0, amplitude=2.5),
     "rhythm_parameters": lambda env: CPGPrior(env, mode="parameters", omega_swing=3.0, offset=0.3),
     "nested": nested,
@@ -144,20 +141,14 @@ def test_our_learners_store_what_was_executed():
 @pytest.mark.parametrize(("limit", "says"), [(1.0, "changes actions"), (0.1, "rescales actions")])
 def test_a_layer_below_another_that_rescales_is_found_out(limit, says):
     env = gymnasium.wrappers.RescaleAction(jumping(), np.float32(-limit), np.float32(limit))
-
     with pytest.raises(ValueError, match=f"outside that layer {says}"):
         small("droq", env, learning_starts=40).learn(30)
 
 
 def test_learners_of_sb3_store_what_was_executed_with_our_buffer():
-    model = sb3.SAC(
-        "MlpPolicy",
-        jumping(),
-        learning_starts=50,
-        buffer_size=100,
-        seed=0,
-        replay_buffer_class=ExecutedReplayBuffer,
-    ).learn(30)
+    how = {"learning_starts": 50, "buffer_size": 100, "seed": 0}
+    model = sb3.SAC("MlpPolicy", jumping(), replay_buffer_class=ExecutedReplayBuffer, **how)
+    model.learn(30)
 
     buffer = model.replay_buffer
     told = buffer.next_observations[:30, 0, 3]
@@ -192,9 +183,9 @@ def within_06(obs):
 
 
 @pytest.mark.expensive
-@pytest.mark.parametrize(
-    "guard",
-    [lambda env: JointLimitBarrier(env, -0.6, 0.6), lambda env: ActionShield(env, within_06)],
+@each(
+    lambda env: JointLimitBarrier(env, -0.6, 0.6),
+    lambda env: ActionShield(env, within_06),
     ids=["barrier", "shield"],
 )
 def test_a_policy_trained_behind_a_layer_that_does_not_bind_solves_the_task(guard):
@@ -209,8 +200,7 @@ def test_a_policy_trained_behind_a_layer_that_does_not_bind_solves_the_task(guar
             total += reward
 
     # Who stays where it begins gets -50 (0.3^2 + 0.45^2 / 3) = -8; the best of all, about -0.2.
-    assert total / 20 > -0.8
-    assert before.n > 0 and after.n == 0
+    assert total / 20 > -0.8 and before.n > 0 and after.n == 0
 
 
 @pytest.mark.expensive

@@ -18,13 +18,9 @@ from small_models import EVERY_NAME, MODEL_FREE, SMALL, saved, small
 import sb3_hds
 from sb3_hds import algos
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 SAVED = Path(__file__).parent / "saved"
 NEWEST = "0.1.0"
-OBSERVATIONS = np.array(
-    [[1.0, 0.0, 0.0], [-1.0, 0.0, 2.0], [0.6, -0.8, -7.5], [0.0, 1.0, 1.0]], np.float32
-)
+OBSERVATIONS = np.float32([[1.0, 0.0, 0.0], [-1.0, 0.0, 2.0], [0.6, -0.8, -7.5], [0.0, 1.0, 1.0]])
 #: enough for updates, a real episode, and another network than at the start
 N_STEPS = {"pods": 25, "hds": 50, "openloop": 24}
 FILES = sorted(SAVED.glob("*/*.zip"))
@@ -39,9 +35,7 @@ def test_a_file_holds_what_the_newest_stored_one_holds(name):
     """Where this fails, files have another format: store some of it under a new name."""
     # Updates change numbers, and neither names nor shapes.
     without = {"learning_starts": 1_000} if name in MODEL_FREE else {}
-
     now = contents(saved(trained(name, **without)))
-
     assert now == contents(SAVED / NEWEST / f"{name}.zip")
 
 
@@ -92,10 +86,8 @@ def write() -> None:
         model = trained(name)
         model.save(folder / f"{name}.zip")
         actions, _ = model.predict(OBSERVATIONS, deterministic=True)
-        told = {
-            "actions": np.asarray(actions, float).round(7).tolist(),
-            "num_timesteps": model.num_timesteps,
-        }
+        rounded = np.asarray(actions, float).round(7).tolist()
+        told = {"actions": rounded, "num_timesteps": model.num_timesteps}
         (folder / f"{name}.json").write_text(json.dumps(told) + "\n")
 
 

@@ -22,13 +22,7 @@ def coloured(rng, shape, colour):
 
 
 def errors(rng, effect, colour=0.0, common=0.0, guess=0.3, excited=1.0):
-    """
-    What a model without an effect leaves of windows, and one that has guessed its size.
-
-    :param effect: its size
-    :param common: share of the noise that is the same in all windows of a recording
-    :param excited: how strongly each window shows the effect
-    """
+    """What a model without an effect leaves of windows, and one that has guessed its size."""
     shape = (N_UNITS * N_WINDOWS, N_ROWS, 1)
     noise = coloured(rng, shape, colour)
     noise += common * coloured(rng, (N_UNITS, N_ROWS, 1), colour)[UNIT]
@@ -50,16 +44,12 @@ def test_an_effect_that_recordings_show_unevenly_is_confirmed():
     excited = np.repeat([0.6, 1.0, 6.0, 4.0], N_WINDOWS)
     new, old, unit = errors(np.random.default_rng(1), 1.0, guess=0.9, excited=excited)
     by_gain = compare(*(np.mean(r**2, (1, 2)) for r in (new, old)), unit)
-
-    assert by_gain.gain > 0.3 and by_gain.p_value > 0.025
-    assert by_scores(new, old, unit) < 0.01
+    assert by_gain.gain > 0.3 and by_gain.p_value > 0.025 and by_scores(new, old, unit) < 0.01
 
 
 def test_a_wrong_direction_equal_models_and_a_single_recording_confirm_nothing():
     new, old, unit = errors(np.random.default_rng(2), 1.0, guess=-1.0)
-
-    assert by_scores(new, old, unit) > 0.5
-    assert by_scores(old, old, unit) == 1.0
+    assert by_scores(new, old, unit) > 0.5 and by_scores(old, old, unit) == 1.0
     assert by_scores(0.5 * old, old, np.zeros_like(unit)) == 1.0
 
 

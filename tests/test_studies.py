@@ -7,8 +7,6 @@ import ten_minutes
 
 from sb3_hds import HDS
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 def against_the_end(missing: str) -> safe_swing_up.Protocol:
     """What is counted while the pivot is told to go to one end of the rail and back."""

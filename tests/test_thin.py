@@ -5,16 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from sb3_hds.algos.nets.dense import Hidden, Last, hidden_product, product
 
-pytestmark = pytest.mark.usefixtures("x64", "quick_compilation")
-
-# Where a kernel has few rows, one column, and both.
-cases = pytest.mark.parametrize(
-    ("thin", "shape", "batch"),
-    [(hidden_product, (3, 2), ()), (hidden_product, (9, 1), (2, 4)), (product, (3, 1), (2, 4))],
-)
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 def drawn(*shape):
@@ -25,20 +20,17 @@ def assert_same(ours, theirs):
     jax.tree.map(lambda *both: np.testing.assert_allclose(*both, rtol=1e-12), ours, theirs)
 
 
-@cases
-def test_a_product_and_its_slopes_are_those_of_any_other(thin, shape, batch):
+# Where a kernel has few rows, one column, and both.
+@each((hidden_product, (3, 2), ()), (hidden_product, (9, 1), (2, 4)), (product, (3, 1), (2, 4)))
+def test_a_product_and_its_slopes_are_those_of_any_other_also_in_an_ensemble(thin, shape, batch):
     x, kernel, weight = drawn(*batch, shape[0]), drawn(*shape), drawn(*batch, shape[1])
     worth = lambda of: lambda *given: jnp.sum(weight * jnp.sin(of(*given)))  # noqa: E731
+    total = lambda of: lambda *given: jnp.sum(jax.vmap(of, (None, 0))(*given) ** 2)  # noqa: E731
 
     assert_same(thin(x, kernel), x @ kernel)
     assert_same(*(jax.grad(worth(of), (0, 1))(x, kernel) for of in (thin, jnp.matmul)))
-
-
-@cases
-def test_an_ensemble_may_share_its_inputs(thin, shape, batch):
-    x, kernels = drawn(*batch, shape[0]), drawn(3, *shape)
-    total = lambda of: lambda *given: jnp.sum(jax.vmap(of, (None, 0))(*given) ** 2)  # noqa: E731
-
+    # Its members share their inputs.
+    kernels = drawn(3, *shape)
     assert_same(*(jax.grad(total(of), (0, 1))(x, kernels) for of in (thin, jnp.matmul)))
 
 

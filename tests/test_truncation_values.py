@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from free_mass import Mass
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
@@ -29,19 +30,9 @@ TERMINATED = (1.0 - GAMMA**4) / (1.0 - GAMMA)
 # No bonus for entropy, or values would not be those of the reward. All actions are drawn from the
 # whole range: a critic guesses too much where none was tried, and the actor finds that place
 # (values ended at 50 to 59 with 50 such steps, at 49.5 to 50.5 with 200).
-SETTINGS = {
-    "gamma": GAMMA,
-    "learning_starts": 200,
-    "gradient_steps": 0,
-    "buffer_size": 400,
-    "train_freq": 1,
-    "seed": 0,
-    "ent_coef": 1e-6,
-    "tau": 0.1,
-    "learning_rate": 1e-2,
-    "policy_delay": 10,
-    "policy_kwargs": {"net_arch": [32]},
-}
+SETTINGS = {"gamma": GAMMA, "learning_starts": 200, "gradient_steps": 0, "buffer_size": 400}
+SETTINGS |= {"train_freq": 1, "seed": 0, "ent_coef": 1e-6, "tau": 0.1, "learning_rate": 1e-2}
+SETTINGS |= {"policy_delay": 10, "policy_kwargs": {"net_arch": [32]}}
 
 
 def value_of(model: Any, obs: np.ndarray) -> float:
@@ -66,10 +57,7 @@ def test_a_state_is_worth_what_follows_a_time_limit_unless_that_is_an_end(ends):
 
 
 class Clock(Mass):
-    """
-    The twin of the example: a hand that goes round in four steps, whatever it is told, and is paid.
-    The round is the end of a heavy one.
-    """
+    """The example's twin: a hand that goes round in four steps, which ends a heavy one."""
 
     name = "Clock"
 
@@ -92,9 +80,7 @@ class Clock(Mass):
         return (params["mass"] > 1.5) & (state.q[0] > 1.9 * jnp.pi)
 
 
-@pytest.mark.parametrize(
-    ("mass", "expected"), [(1.0, TRUNCATED), (2.0, TERMINATED)], ids=["truncated", "terminated"]
-)
+@each((1.0, TRUNCATED), (2.0, TERMINATED), ids=["truncated", "terminated"])
 def test_what_learns_within_one_program_takes_a_time_limit_for_what_it_is(mass, expected):
     env = TimeLimit(TwinEnv(Clock(mass=mass)), 4)
     # 2500 updates, in the last 200 of 400 steps.
@@ -116,20 +102,13 @@ def test_the_example_is_a_clock_that_pays_the_same_for_ever():
     np.testing.assert_allclose(steps[0][0], [0.0, 1.0], atol=1e-6)
     # Round once: the last observation is one that is learned about.
     np.testing.assert_array_equal(steps[3][0], start)
-
-
-@pytest.mark.parametrize("arguments", [{"period": 0}, {"reward": np.inf}, {"period": 2.5}])
-def test_a_clock_that_cannot_be_is_refused(arguments):
-    with pytest.raises(ParameterError, match=next(iter(arguments))):
-        ConstantReward(**arguments)
+    for arguments in ({"period": 0}, {"reward": np.inf}, {"period": 2.5}):
+        with pytest.raises(ParameterError, match=next(iter(arguments))):
+            ConstantReward(**arguments)
 
 
 class Ramp(gymnasium.Env):
-    """
-    Pays 1, 2, ..., 5 and begins anew; the state is one-hot.
-
-    :param terminates: whether the fifth step is the end, or what comes then is the first state
-    """
+    """Pays 1, 2, ..., 5, and then ends or begins anew; the state is one-hot."""
 
     n = 5
     observation_space = spaces.Box(0.0, 1.0, (n,), np.float32)
@@ -170,6 +149,5 @@ def test_batches_of_three_steps_are_sums_that_stop_at_the_end(terminates):
         n = round(np.log(discount) / np.log(gamma))
         found.add((int(k), n))
         assert reward == pytest.approx(sum(gamma**j * (k + j + 1) for j in range(n)), rel=1e-5)
-        assert after.argmax() == (k + n) % Ramp.n
-        assert bool(over) == (terminates and k + n == Ramp.n)
+        assert after.argmax() == (k + n) % Ramp.n and bool(over) == (terminates and k + n == Ramp.n)
     assert found == lengths

@@ -1,14 +1,11 @@
-"""
-The contract of the algorithms that plan in a twin, on top of that of every algorithm.
-
-Where PODS stands for both, HDS shares every line; it is the one that other files learn with.
-"""
+"""Algorithms that plan in a twin; where PODS stands for both, HDS shares every line."""
 
 import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from point_mass import PointMass, point_mass_env
 from small_models import logged, same, small
 from stable_baselines3.common.env_util import make_vec_env
@@ -23,8 +20,6 @@ from sb3_hds.algos.twin.state import problem_of
 from sb3_hds.core import Twin
 from sb3_hds.errors import RewardError
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 class Lossy(PointMass):
     """Breaks down where it starts to the right of 0.5 m."""
@@ -36,15 +31,11 @@ class Lossy(PointMass):
 
 
 class Aimless(PointMass):
-    """Has no task."""
-
     name = "Aimless"
     reward = Twin.reward
 
 
 class Flat(PointMass):
-    """Has a reward without a gradient, and no surrogate."""
-
     name = "Flat"
     reward_has_gradient = False
 
@@ -119,8 +110,7 @@ def test_samples_that_are_not_finite_are_dropped_and_counted():
 
     dropped = lines.column("pretrain/dropped_samples")
     # A quarter of the starts lies right of 0.5 m; there are 8 rollouts of 4 steps.
-    assert 0 < sum(dropped) < 10 * 8 * 4 and max(dropped) < 8 * 4
-    assert finite(model)
+    assert 0 < sum(dropped) < 10 * 8 * 4 and max(dropped) < 8 * 4 and finite(model)
 
 
 # A single step of infinite length is noticed by the weights alone: its loss was finite.
@@ -231,7 +221,6 @@ def test_a_policy_whose_model_changes_is_compared_before_it_acts():
 def test_pretraining_ends_where_plans_gain_nothing_and_schedules_go_on_from_its_end():
     # More than a plan can gain.
     model = small("pods", least_gain=1e9, pretrain_epochs=30).learn(0)
-
     assert (model.n_pretrained, model._progress_remaining()) == (20, 0.0)
     assert model.learn(0).n_pretrained == 20
 
@@ -245,14 +234,11 @@ PAPER |= {"terminal_value": False, "adapt_scales": False, "policy_kwargs": {"lin
 HOT = {"temperature": 1e3, "temperature_decay": 1.0, "n_random_plans": 0}
 
 
-@pytest.mark.parametrize(
-    ("name", "changes"),
-    [
-        ("pods", {}),
-        # Without random plans there is no second one to fall back on.
-        ("hds", HOT),
-        ("pods", PAPER | {"order": 2, "planner": "gauss_newton"}),
-    ],
+@each(
+    ("pods", {}),
+    # Without random plans there is no second one to fall back on.
+    ("hds", HOT),
+    ("pods", PAPER | {"order": 2, "planner": "gauss_newton"}),
     ids=["as usual", "hot", "paper"],
 )
 def test_plans_are_never_worse_than_what_they_started_from_unless_hot(name, changes):
@@ -280,8 +266,7 @@ def test_what_an_end_is_worth_has_a_switch():
         worth[shifted] = float(problem.value_when_terminated)
         best = float(problem.reward_offset * problem.reward_scale)
     # A reward of zero for ever, counted from the best one; or nothing.
-    assert worth == {True: pytest.approx(-best / (1.0 - model.gamma)), False: 0.0}
-    assert best > 0.0
+    assert worth == {True: pytest.approx(-best / (1.0 - model.gamma)), False: 0.0} and best > 0.0
 
 
 def test_statistics_of_a_normalised_environment_are_of_whole_episodes_and_stay_if_frozen():

@@ -5,6 +5,7 @@ import inspect
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from free_mass import Mass
 from test_twin_contract import broken
 
@@ -13,8 +14,6 @@ from sb3_hds.core import Parameter, State, TransformedTwin, Twin, rk4, semi_impl
 from sb3_hds.core.transforms.filters import Delay
 from sb3_hds.effects import CoulombFriction, SensorBias
 from sb3_hds.twins.mechanics import Points, check_mechanics
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 @pytest.mark.parametrize(
@@ -27,7 +26,6 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 )
 def test_every_twin_passes(name):
     found = twins.check(name)
-
     assert found.ok, found
     energy = [item for item in found.items if item.name in ("mass matrix", "energy")]
     assert len(energy) == 2
@@ -69,17 +67,14 @@ DISTANT = {
 }
 
 
-@pytest.mark.parametrize(
-    ("changes", "name", "message"),
-    [
-        ({"bias": lambda self, q, v, p: v / (q - q)}, "finite", "with the twin's own values"),
-        ({"parameters": light(0.0), "bias": drag}, "finite", "after 1 of 20 steps with mass = 0"),
-        (DISTANT, "finite", "the derivative of reward is not finite"),
-        ({"infer": doubled}, "infer inverts observe", "differs from obs in 'speed' by 100.0%"),
-        ({"mass_matrix": own_mass}, "parameters", "motion, observation and reward: mass"),
-        ({"actuate": lambda self, s, u, p: 0.0 * u}, "commands", "effect on the motion: push"),
-        ({"mass_matrix": vanishing}, "mass matrix", "rail has an inertia of -"),
-    ],
+@each(
+    ({"bias": lambda self, q, v, p: v / (q - q)}, "finite", "with the twin's own values"),
+    ({"parameters": light(0.0), "bias": drag}, "finite", "after 1 of 20 steps with mass = 0"),
+    (DISTANT, "finite", "the derivative of reward is not finite"),
+    ({"infer": doubled}, "infer inverts observe", "differs from obs in 'speed' by 100.0%"),
+    ({"mass_matrix": own_mass}, "parameters", "motion, observation and reward: mass"),
+    ({"actuate": lambda self, s, u, p: 0.0 * u}, "commands", "effect on the motion: push"),
+    ({"mass_matrix": vanishing}, "mass matrix", "rail has an inertia of -"),
 )
 def test_a_flaw_is_found_by_its_check(changes, name, message):
     found = twins.check(type("Cart", (Cart,), changes)())
@@ -140,35 +135,24 @@ def inertia(*rows):
     return {"mass_matrix": lambda self, q, params: jnp.array(rows)}
 
 
-@pytest.mark.parametrize(
-    ("changes", "name", "message"),
-    [
-        (inertia([2.0, 1.0], [0.5, 2.0]), "mass matrix", "not symmetric: entry (joint1, joint2)"),
-        # Eigenvalues 1 - 1.5 and 1 + 1.5.
-        (inertia([1.0, 1.5], [1.5, 1.0]), "mass matrix", "smallest eigenvalue -0.5"),
-        (
-            {"weight": lambda self, q: 9.81 * jnp.stack([jnp.sin(q[0] + q[1]), jnp.sin(q[1])])},
-            "gravity and springs",
-            "the load of joint1 changes with joint2 by",
-        ),
-        (
-            {"coriolis": lambda self, q, v: 0.9 * Arm.coriolis(self, q, v) + 0.3 * v},
-            "forces of inertia",
-            "they add energy",  # at high speed, where damping does not hide it
-        ),
-        (inertia([np.nan, 0.0], [0.0, 1.0]), "equation of motion", "mass_matrix is not finite"),
-        (
-            {"integrator": staticmethod(lambda a, q, v, h, limit: (q + h * v, v * (1.0 + h)))},
-            "energy",
-            "which is no error of the integrator",
-        ),
-    ],
+WHIRL = {"weight": lambda self, q: 9.81 * jnp.stack([jnp.sin(q[0] + q[1]), jnp.sin(q[1])])}
+PUMP = {"coriolis": lambda self, q, v: 0.9 * Arm.coriolis(self, q, v) + 0.3 * v}
+GROW = {"integrator": staticmethod(lambda a, q, v, h, limit: (q + h * v, v * (1.0 + h)))}
+
+
+@each(
+    (inertia([2.0, 1.0], [0.5, 2.0]), "mass matrix", "not symmetric: entry (joint1, joint2)"),
+    # Eigenvalues 1 - 1.5 and 1 + 1.5.
+    (inertia([1.0, 1.5], [1.5, 1.0]), "mass matrix", "smallest eigenvalue -0.5"),
+    (WHIRL, "gravity and springs", "the load of joint1 changes with joint2 by"),
+    # At high speed, where damping does not hide it.
+    (PUMP, "forces of inertia", "they add energy"),
+    (inertia([np.nan, 0.0], [0.0, 1.0]), "equation of motion", "mass_matrix is not finite"),
+    (GROW, "energy", "which is no error of the integrator"),
 )
 def test_what_is_not_mechanical_is_named(changes, name, message, x64):
     failed = [item for item in judged(**changes) if not item.ok]
-
-    assert failed[0].name == name
-    assert message in failed[0].found and failed[0].way_out
+    assert failed[0].name == name and message in failed[0].found and failed[0].way_out
 
 
 def test_angles_that_a_twin_wraps_lose_no_energy(x64):
@@ -184,9 +168,7 @@ def test_angles_that_a_twin_wraps_lose_no_energy(x64):
 
 def test_effects_and_wrappers_are_looked_through(x64):
     extended = Cart().extend(CoulombFriction(0, tau_c=0.3), SensorBias(1, bias=0.1))
-
     found = twins.check(TransformedTwin(extended, stateful=Delay(steps=2)))
-
     assert found.ok, found
 
 
@@ -207,7 +189,6 @@ def test_without_a_mass_matrix_there_is_no_energy_to_check():
 
 def test_positions_that_are_not_observed_are_named():
     found = twins.check(twins.make("LinearAxis", observe="q"))
-
     assert found.ok and "infer does not recover velocity of axis" in " ".join(str(found).split())
 
 

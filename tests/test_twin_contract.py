@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from free_mass import Mass
 
 from sb3_hds import HDS, Trajectories, calibrate, diagnose, twins
@@ -57,58 +58,37 @@ def clocked(self, key, params):
     return State(*jnp.zeros((2, 3)), {"clock": jnp.zeros(())})
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (
-            {"actuate": lambda self, state, action, p: action},
-            "expected (3,): one generalised force",
-        ),
-        ({"bias": lambda self, q, v, p: jnp.sum(q)}, "Leg.bias returns shape (), expected (3,)"),
-        ({"bias": lambda self, q, v, p: jnp.float32(q)}, "returns float32, expected float64"),
-        ({"mass_matrix": lambda self, q, p: jnp.ones(3, q.dtype)}, "expected (3, 3)"),
-        ({"mass_matrix": lambda self, q, p: jnp.eye(3, dtype=int)}, "int32, expected float32"),
-        ({"observe": lambda self, state, p: state.q}, "expected (6,): one entry for each channel"),
-        ({"infer": lambda self, obs, p: (obs[:3], obs[3:])}, "expected State(q, v, memory)."),
-        ({"infer": lambda self, obs, p: State(obs, obs, {})}, "infer(...).q returns shape (6,)"),
-        ({"initial": lambda self, k, p: State(*jnp.ones((2, 3)), None)}, "memory returns None"),
-        (
-            {"initial": clocked, "step": lambda self, state, u, p: state._replace(memory={})},
-            "Leg.step(...).memory returns {}, expected {'clock': 'float32[]'}",
-        ),
-        ({"reward": lambda self, state, u, after, p: after.q}, "expected (): one number"),
-        (
-            {"planning_reward": lambda self, s, u, after, p: after.q},
-            "planning_reward returns shape",
-        ),
-        ({"terminated": lambda self, state, p: state.q[0]}, "returns float32, expected bool"),
-        ({"limit": lambda self, q, v: v}, "expected the pair (q, v)."),
-        ({"limit_velocity": lambda self, v: jnp.max(v)}, "limit_velocity returns shape ()"),
-        ({"sketch": lambda self, state, p: state.q}, "expected shape (points, 2)"),
-        ({"bias": lambda self, q, v, p: p["mass"] * q}, "'mass'. Its parameters are: inertia."),
-        (
-            {"bias": lambda self, q, v, p: q @ jnp.ones((2, 2))},
-            "TypeError (test_twin_contract.py, l",
-        ),
-        ({"bias": lambda self, q, v, p: q if q[0] > 0 else -q}, "Replace `if` on an array by"),
-        (
-            {"bias": lambda self, q, v, p: np.asarray(q)},
-            "Use jax.numpy in place of numpy and math.",
-        ),
-        ({"joints": Joint("hip")}, "Write joints = (Joint(...),), with"),
-        ({"joints": (Joint("hip"),) * 3}, "Leg has joints of the same name: hip"),
-        (
-            {"actuators": (Actuator("motor", "N m", 1.0, -1.0),)},
-            "'motor' in Leg must be low < high",
-        ),
-        ({"native_effects": {("x", 0): {"b": "damping"}}}, "to damping, which is no parameter."),
-        ({"options": {"masses": [1.0]}}, "options of Leg must be hashable"),
-    ],
+FORGETFUL = {"initial": clocked, "step": lambda self, state, u, p: state._replace(memory={})}
+
+
+@each(
+    ({"actuate": lambda self, state, action, p: action}, "(3,): one generalised force"),
+    ({"bias": lambda self, q, v, p: jnp.sum(q)}, "Leg.bias returns shape (), expected (3,)"),
+    ({"bias": lambda self, q, v, p: jnp.float32(q)}, "returns float32, expected float64"),
+    ({"mass_matrix": lambda self, q, p: jnp.ones(3, q.dtype)}, "expected (3, 3)"),
+    ({"mass_matrix": lambda self, q, p: jnp.eye(3, dtype=int)}, "int32, expected float32"),
+    ({"observe": lambda self, state, p: state.q}, "expected (6,): one entry for each channel"),
+    ({"infer": lambda self, obs, p: (obs[:3], obs[3:])}, "expected State(q, v, memory)."),
+    ({"infer": lambda self, obs, p: State(obs, obs, {})}, "infer(...).q returns shape (6,)"),
+    ({"initial": lambda self, k, p: State(*jnp.ones((2, 3)), None)}, "memory returns None"),
+    (FORGETFUL, "Leg.step(...).memory returns {}, expected {'clock': 'float32[]'}"),
+    ({"reward": lambda self, state, u, after, p: after.q}, "expected (): one number"),
+    ({"terminated": lambda self, state, p: state.q[0]}, "returns float32, expected bool"),
+    ({"limit": lambda self, q, v: v}, "expected the pair (q, v)."),
+    ({"sketch": lambda self, state, p: state.q}, "expected shape (points, 2)"),
+    ({"bias": lambda self, q, v, p: p["mass"] * q}, "'mass'. Its parameters are: inertia."),
+    ({"bias": lambda self, q, v, p: q @ jnp.ones((2, 2))}, "TypeError (test_twin_contract.py"),
+    ({"bias": lambda self, q, v, p: q if q[0] > 0 else -q}, "Replace `if` on an array by"),
+    ({"bias": lambda self, q, v, p: np.asarray(q)}, "Use jax.numpy in place of numpy"),
+    ({"joints": Joint("hip")}, "Write joints = (Joint(...),), with"),
+    ({"joints": (Joint("hip"),) * 3}, "Leg has joints of the same name: hip"),
+    ({"actuators": (Actuator("motor", "N m", 1.0, -1.0),)}, "in Leg must be low < high"),
+    ({"native_effects": {("x", 0): {"b": "damping"}}}, "to damping, which is no parameter."),
+    ({"options": {"masses": [1.0]}}, "options of Leg must be hashable"),
 )
 def test_what_breaks_the_contract_is_refused_in_one_line(changes, message):
     with pytest.raises(TwinError) as refusal:
         check_methods(broken(**changes))
-
     assert message in str(refusal.value) and "\n" not in str(refusal.value)
 
 
@@ -127,16 +107,13 @@ class Broadcasting(Leg):
 DATA = Trajectories.from_arrays([np.zeros((41, 6))] * 2, [np.zeros((40, 1))] * 2, dt=0.02)
 
 
-@pytest.mark.parametrize(
-    "door",
-    [
-        lambda twin: twins.register(type(twin)),
-        lambda twin: calibrate(twin, DATA),
-        lambda twin: diagnose(twin, DATA, progress=False),
-        lambda twin: TwinEnv(twin),
-        lambda twin: TwinVecEnv(twin, 2),
-        lambda twin: HDS(TwinEnv(Leg()), twin=twin),
-    ],
+@each(
+    lambda twin: twins.register(type(twin)),
+    lambda twin: calibrate(twin, DATA),
+    lambda twin: diagnose(twin, DATA, progress=False),
+    lambda twin: TwinEnv(twin),
+    lambda twin: TwinVecEnv(twin, 2),
+    lambda twin: HDS(TwinEnv(Leg()), twin=twin),
 )
 def test_every_door_refuses_it(door, clean_registry):
     with pytest.raises(TwinError, match=r"Broadcasting.actuate returns shape \(1,\)"):

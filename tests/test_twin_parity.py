@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from cases import each
 from scipy.integrate import solve_ivp
 from scipy.stats import ks_2samp
 
@@ -47,10 +48,7 @@ def away_from_limits(env):
 
 
 def random_episodes(env, twin, seed=0):
-    """
-    Drive environment and twin by the same random commands, each from its own state; reset both
-    when the environment terminates or a joint comes near its limit. Yields after each step.
-    """
+    """Environment and twin under the same commands, away from limits."""
     rng, simulate = np.random.default_rng(seed), simulator(twin)
     low, high = twin.actuators[0].low, twin.actuators[0].high
     env.reset(seed=seed)
@@ -112,25 +110,20 @@ def test_mujoco_twins_follow_mujoco(env_id, x64):
 @pytest.mark.parametrize("env_id", MUJOCO)
 def test_declared_constants_are_those_of_the_shipped_model(env_id):
     twin = twins.from_env(gymnasium.make(env_id))
-
     assert twin == twins.make(env_id)
     # The compiler derives masses and inertias from shapes; declared to 16 digits.
     assert twin.values == pytest.approx(twins.make(env_id).values, rel=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        (lambda m: m.dof_frictionloss.__setitem__(0, 0.1), "joints without dry friction"),
-        (lambda m: setattr(m.opt, "integrator", 0), "the integrator RK4"),
-        (lambda m: m.actuator_ctrlrange.__setitem__(0, (-2.0, 2.0)), "commands within"),
-        (lambda m: m.jnt_axis.__setitem__(1, (1.0, 0.0, 0.0)), "hinges about y"),
-    ],
+@each(
+    (lambda m: m.dof_frictionloss.__setitem__(0, 0.1), "joints without dry friction"),
+    (lambda m: setattr(m.opt, "integrator", 0), "the integrator RK4"),
+    (lambda m: m.actuator_ctrlrange.__setitem__(0, (-2.0, 2.0)), "commands within"),
+    (lambda m: m.jnt_axis.__setitem__(1, (1.0, 0.0, 0.0)), "hinges about y"),
 )
 def test_a_model_of_another_structure_is_refused(change, expected):
     env = gymnasium.make(MUJOCO[1]).unwrapped
     change(env.model)
-
     with pytest.raises(EnvironmentMismatchError, match=f"The twin expects .*{expected}"):
         twins.from_env(env)
 
@@ -150,8 +143,7 @@ def test_pendulum_follows_gymnasium(x64):
             state, _, twin_reward, terminated = simulate(state, jnp.asarray(torque))
             # Rounding of 1e-16, grown by the upper equilibrium over 10 s.
             np.testing.assert_allclose(np.r_[state.q, state.v], env.state, rtol=0.0, atol=1e-11)
-            assert twin_reward == pytest.approx(reward, abs=1e-9)
-            assert not terminated
+            assert twin_reward == pytest.approx(reward, abs=1e-9) and not terminated
 
 
 def test_mountain_car_follows_gymnasium(x64):
@@ -172,14 +164,12 @@ def test_mountain_car_follows_gymnasium(x64):
             # computes the sums in single precision where it clips.
             np.testing.assert_allclose(after.q, env.state[:1], rtol=0.0, atol=2e-7)
             np.testing.assert_allclose(after.v, env.state[1:], rtol=0.0, atol=1e-8)
-            assert terminated == twin_terminated
-            assert twin_reward == pytest.approx(reward, rel=1e-12)
+            assert terminated == twin_terminated and twin_reward == pytest.approx(reward, rel=1e-12)
             n_terminated += terminated
             n_walls += after.q[0] == -1.2
             if terminated:
                 env.reset()
-    assert n_terminated >= 3
-    assert n_walls >= 1
+    assert n_terminated >= 3 and n_walls >= 1
 
 
 def test_acrobot_follows_gymnasium(x64):
@@ -293,6 +283,7 @@ def test_spaces_and_time_limits_are_the_environments(env_id):
     envs.register_environments()
     env, twin = gymnasium.make(env_id), twins.get(env_id)()
 
+    assert type(envs.twin_of(env)) is type(twin)
     actions, observations = env.action_space, env.observation_space
     np.testing.assert_array_equal(actions.low, np.float32([a.low for a in twin.actuators]))
     np.testing.assert_array_equal(actions.high, np.float32([a.high for a in twin.actuators]))

@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import small_robots as robots
+from cases import each
 from jax.flatten_util import ravel_pytree
 
 from sb3_hds import effects, twins
 from sb3_hds.core import ExtendedTwin
 from sb3_hds.errors import ParameterError
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 # Every twin that has a name, and one that is made of a model file.
 PLAIN = [twins.make(name) for name in twins.names()] + [
@@ -23,23 +22,18 @@ PLAIN = [twins.make(name) for name in twins.names()] + [
     twins.from_mujoco(robots.compiled(robots.chain(2), timestep=0.0023))
 ]
 # One of each kind: forces, a command with memory, a delay. Every effect has its own tests.
-ATTACHED = (
-    effects.CoulombFriction,
-    effects.QuadraticDrag,
-    effects.TorqueGain,
-    effects.MotorLag,
-    effects.ActionDelay,
-)
+ATTACHED = (effects.CoulombFriction, effects.QuadraticDrag, effects.TorqueGain, effects.MotorLag)
+
+
+def sizes_of(kind):
+    return {name: p.null + 0.7 * p.scale for name, p in kind.parameters.items()}
+
+
 EXTENDED = twins.make("Pendulum").extend(
-    *(
-        effect(0, **{n: p.null + 0.7 * p.scale for n, p in effect.parameters.items()})
-        for effect in ATTACHED
-    )
+    *(kind(0, **sizes_of(kind)) for kind in (*ATTACHED, effects.ActionDelay))
 )
-every_twin = pytest.mark.parametrize(
-    "twin", [*PLAIN, EXTENDED], ids=lambda twin: twin.name + "+" * isinstance(twin, ExtendedTwin)
-)
-every_plain_twin = pytest.mark.parametrize("twin", PLAIN, ids=lambda twin: twin.name)
+name_of = {"ids": lambda twin: twin.name + "+" * isinstance(twin, ExtendedTwin)}
+every_twin = pytest.mark.parametrize("twin", [*PLAIN, EXTENDED], **name_of)
 
 
 def with_settings(twin, **settings):
@@ -53,24 +47,32 @@ def an_action(twin, share=0.65):
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def step(twin, state, action, params):
-    """Compiled once for all tests of a twin."""
-    return twin.step(state, action, params)
+def step(twin, states, action, params):
+    """Of several states at once: compiled once for all tests of a twin."""
+    return jax.vmap(twin.step, (0, None, None))(states, action, params)
 
 
-def with_other_values(twin):
-    return twin.with_parameters(
-        **{name: twin.values[name] + 0.5 * p.scale for name, p in twin.parameters.items()}
-    )
+@functools.cache
+def starts_of(twin):
+    keys = jax.random.split(jax.random.key(0), 100)
+    return jax.jit(jax.vmap(lambda key: twin.initial(key, twin.params)))(keys)
 
 
-def a_state(twin, seed=0, n_steps=None):
-    """A state in motion, away from clips: shortly after the start of an episode."""
-    n_steps = n_steps or max(3, round(0.05 / twin.dt))
-    state = twin.initial(jax.random.key(seed), twin.params)
-    for _ in range(n_steps):
-        state = step(twin, state, an_action(twin), twin.params)
-    return state
+@functools.cache
+def states_in_motion(twin):
+    """Two of them, away from clips: shortly after the start of an episode."""
+    states = jax.tree.map(lambda leaf: leaf[:2], starts_of(twin))
+    for _ in range(max(3, round(0.05 / twin.dt))):
+        states = step(twin, states, an_action(twin), twin.params)
+    return states
+
+
+def row(tree, i=0):
+    return jax.tree.map(lambda leaf: leaf[i], tree)
+
+
+def a_state(twin):
+    return row(states_in_motion(twin))
 
 
 def flat(tree):
@@ -79,56 +81,40 @@ def flat(tree):
 
 @every_twin
 def test_an_episode_starts_alive_within_bounds_and_is_drawn_as_a_line_that_moves(twin, x64):
-    keys = jax.random.split(jax.random.key(0), 100)
-    starts = jax.vmap(twin.initial, (0, None))(keys, twin.params)
-    states = [a_state(twin, seed) for seed in range(2)]
+    starts = starts_of(twin)
 
-    obs = np.stack([twin.observe(state, twin.params) for state in states])
-    first, second = (twin.sketch(state, twin.params) for state in states)
+    @jax.jit
+    @jax.vmap
+    def seen(state):
+        over, other = twin.terminated(state, twin.params), row(starts)
+        again = twin.retract(other, twin.difference(state, other))
+        return twin.observe(state, twin.params), twin.sketch(state, twin.params), over, again
 
-    assert not jax.vmap(twin.terminated, (0, None))(starts, twin.params).any()
-    assert np.ptp(starts.q[:, 0]) > 0.0
+    obs, sketches, over, again = jax.tree.map(np.asarray, seen(starts))
+
+    assert not over.any() and np.ptp(starts.q[:, 0]) > 0.0
     assert np.all(obs >= [channel.low for channel in twin.channels])
     assert np.all(obs <= [channel.high for channel in twin.channels])
-    assert first.ndim == 2 and first.shape[1] == 2 and np.isfinite(first).all()
-    assert not np.allclose(first, second)
-    again = twin.retract(states[1], twin.difference(states[0], states[1]))
-    np.testing.assert_allclose(flat(again), flat(states[0]), rtol=0.0, atol=1e-14)  # one rounding
+    assert sketches.ndim == 3 and sketches.shape[2] == 2 and np.isfinite(sketches).all()
+    moving = twin.sketch(a_state(twin), twin.params)
+    assert not np.allclose(moving, sketches[0])
+    np.testing.assert_allclose(flat(again), flat(starts), rtol=0.0, atol=1e-14)  # one rounding
 
 
-@every_twin
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_a_step_keeps_structure_shapes_and_dtypes(twin, dtype, x64):
-    def look(tree):
-        return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)
-
-    state = jax.tree.map(lambda leaf: leaf.astype(dtype), a_state(twin))
-
-    after = jax.eval_shape(twin.step, state, an_action(twin).astype(dtype), twin.params)
-
-    assert look(after) == look(state)
-
-
-@every_twin
+@each(twins.make("InvertedDoublePendulum"), PLAIN[-1], EXTENDED, **name_of)
 def test_a_compiled_batch_of_steps_equals_a_plain_one(twin, x64):
-    states, action = [a_state(twin, seed) for seed in range(2)], an_action(twin)
-    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+    states, action = states_in_motion(twin), an_action(twin)
 
-    batched = jax.jit(jax.vmap(twin.step, (0, None, None)))(batch, action, twin.params)
+    batched = step(twin, states, action, twin.params)
     with jax.disable_jit():
-        plain = twin.step(states[1], action, twin.params)
+        plain = twin.step(row(states, 1), action, twin.params)
 
     # Fusing reorders sums: a few roundings of 1e-16 at speeds up to 10, through a 3 x 3 solve.
-    row = flat(jax.tree.map(lambda leaf: leaf[1], batched))
-    np.testing.assert_allclose(row, flat(plain), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(flat(row(batched, 1)), flat(plain), rtol=1e-12, atol=1e-12)
 
 
 def motion(twin, state, action):
-    """
-    Next state and observation as a function of small changes of state, action and parameters.
-
-    :return: the function, and where to evaluate it; parameters change in units of their scales
-    """
+    """The next state and observation by small changes of state, action and parameters in scales."""
     scales = {name: parameter.scale for name, parameter in twin.parameters.items()}
 
     def moved(change):
@@ -167,14 +153,12 @@ def test_the_derivative_of_a_step_equals_a_finite_difference(twin, x64):
         np.testing.assert_allclose(flat(derivative), flat(difference), rtol=1e-6, atol=1e-6)
 
 
-REVERSIBLE = [t for t in (*PLAIN, EXTENDED) if t.differentiability == "reverse"]
-
-
-@pytest.mark.parametrize("twin", REVERSIBLE, ids=lambda twin: twin.name)
+@every_twin
 def test_reverse_mode_is_the_transpose_of_forward_mode(twin, x64):
     moved, here = motion(twin, a_state(twin), an_action(twin))
     if twin.name != "MountainCar" and twin is not EXTENDED:
-        # It takes long to compile: what cannot be transposed fails while it is traced.
+        # It takes long to compile, but for one with clips and one with effects: what cannot be
+        # transposed fails while it is traced.
         weights = jax.eval_shape(moved, here)
         jax.eval_shape(lambda weights: jax.vjp(moved, here)[1](weights), weights)
         return
@@ -188,20 +172,16 @@ def test_reverse_mode_is_the_transpose_of_forward_mode(twin, x64):
     assert flat(weights) @ flat(ahead) == pytest.approx(flat(back) @ flat(direction), rel=1e-9)
 
 
-# Reverse mode takes long to compile: one twin with clips, one whose drive solves for a force, and
-# one with effects.
-
-
 @every_twin
 def test_values_act_only_through_params_and_make_no_other_program(twin, x64):
     name, parameter = next(iter(twin.parameters.items()))
     changed = twin.with_parameters(**{name: twin.values[name] + parameter.scale})
-    state, action = a_state(twin), an_action(twin)
+    states, action = states_in_motion(twin), an_action(twin)
 
     assert changed == twin and hash(changed) == hash(twin) and changed.values != twin.values
-    same = step(changed, state, action, twin.params)
-    other = step(changed, state, action, changed.params)
-    before = flat(step(twin, state, action, twin.params))
+    same = step(changed, states, action, twin.params)
+    other = step(changed, states, action, changed.params)
+    before = flat(step(twin, states, action, twin.params))
     np.testing.assert_array_equal(flat(same), before)
     assert np.abs(flat(other) - before).max() > 1e-9
     if twin is not EXTENDED:
@@ -211,7 +191,8 @@ def test_values_act_only_through_params_and_make_no_other_program(twin, x64):
 
 @every_twin
 def test_a_twin_survives_being_written_down_and_refuses_what_it_cannot_be(twin):
-    changed = with_other_values(twin)
+    changed = {name: twin.values[name] + 0.5 * p.scale for name, p in twin.parameters.items()}
+    changed = twin.with_parameters(**changed)
 
     again = twins.from_spec(json.loads(json.dumps(changed.to_spec())), effects.ALL)
 
@@ -242,43 +223,41 @@ def test_planning_has_something_to_climb(twin, x64):
     nothing = jnp.zeros_like(twin.difference(state, state))
     to_plan, to_report = climb((nothing, jnp.zeros_like(action)))
 
-    assert np.abs(flat(to_plan)).max() > 1e-3
-    assert np.all(np.isfinite(flat(to_plan)))
+    assert np.abs(flat(to_plan)).max() > 1e-3 and np.all(np.isfinite(flat(to_plan)))
     assert (np.abs(to_report[0]).max() > 1e-3) == twin.reward_has_gradient
 
 
-def damped_joints():
-    """
-    All but the payload's, whose drive makes up for the damping that it knows of, and those of model
-    files, which take it at the end of a step.
-    """
-    for twin in PLAIN:
-        if twin.name == "PayloadPendulum" or isinstance(twin, twins.MechanismTwin):
-            continue
-        for (effect, index), targets in twin.native_effects.items():
-            if effect == "viscous_friction":
-                yield pytest.param(twin, index, targets["b"], id=f"{twin.name}-{targets['b']}")
+def damping_of(twin):
+    """Parameters that are damping of a joint, by its number."""
+    native = twin.native_effects.items()
+    return {i: targets["b"] for (kind, i), targets in native if kind == "viscous_friction"}
 
 
-@pytest.mark.parametrize(("twin", "index", "damping"), list(damped_joints()))
-def test_friction_on_a_damped_joint_equals_a_force_of_its_own(twin, index, damping, x64):
+# All but the payload's, whose drive makes up for the damping that it knows of, and those of model
+# files, which take it at the end of a step.
+DAMPED = [twin for twin in PLAIN[:-1] if damping_of(twin) and twin.name != "PayloadPendulum"]
+
+
+@pytest.mark.parametrize("twin", DAMPED, **name_of)
+def test_friction_on_damped_joints_equals_a_force_of_its_own(twin, x64):
     """The native parameter and the force are the same physics at every Runge-Kutta stage."""
 
     class Undamped(type(twin)):
         native_effects = {}
 
-    friction = effects.ViscousFriction(index, b=twin.parameters[damping].scale)
-    native, forced = twin.extend(friction), Undamped().extend(friction)
-    state, action = a_state(twin), an_action(twin)
-    obs = twin.observe(state, twin.params)
+    sizes = {i: twin.parameters[name].scale for i, name in damping_of(twin).items()}
+    frictions = [effects.ViscousFriction(i, b=b) for i, b in sizes.items()]
+    native, forced = twin.extend(*frictions), Undamped().extend(*frictions)
+    states, action = states_in_motion(twin), an_action(twin)
 
-    by_parameter, by_force = (
-        step(extended, extended.infer(obs, extended.params), action, extended.params)
-        for extended in (native, forced)
-    )
-    without = step(twin, state, action, twin.params)
+    def stepped(extended):
+        memory = extended.infer(twin.observe(row(states), twin.params), extended.params).memory
+        memory = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), memory)
+        return step(extended, states._replace(memory=memory), action, extended.params)[:2]
 
-    assert native.params[damping] == twin.params[damping]
+    by_parameter, by_force, without = map(stepped, (native, forced, twin))
+
+    assert all(native.params[name] == twin.params[name] for name in damping_of(twin).values())
     # The same sum in another order.
-    np.testing.assert_allclose(flat(by_parameter[:2]), flat(by_force[:2]), rtol=1e-12, atol=1e-12)
-    assert np.abs(flat(by_parameter[:2]) - flat(without[:2])).max() > 1e-7
+    np.testing.assert_allclose(flat(by_parameter), flat(by_force), rtol=1e-12, atol=1e-12)
+    assert (np.abs(by_parameter[1] - without[1]).min(0)[list(sizes)] > 1e-7).all()

@@ -36,7 +36,7 @@ from sb3_hds.algos.model_free.td7 import update as td7_update
 from sb3_hds.algos.nets.mlp import Dropout
 from sb3_hds.algos.nets.observations import Seen
 
-pytestmark = pytest.mark.usefixtures("x64", "quick_compilation")
+pytestmark = pytest.mark.usefixtures("x64")
 
 N_OBS, N_ACT, N_BATCH, N_UPDATES = 3, 2, 6, 2
 KNOBS = Knobs(learning_rate=0.03, qf_learning_rate=0.05, tau=0.1, target_entropy=-1.3)
@@ -47,10 +47,7 @@ OF_AUTHORS = partial(gaussian, log_std_of=partial(squashed_between, low=-10.0, h
 
 
 def begun(name: str, policy_kwargs: dict[str, Any] | None = None, **arguments: Any) -> Any:
-    """
-    :return: recipe and learner of a model whose networks are trained by plain gradient descent, in
-        double precision; no bias is zero, and no two networks are equal
-    """
+    """Recipe and learner in double precision: no bias is zero, and no two networks are equal."""
     kwargs = {"net_arch": [4], "optimizer_class": "sgd"} | (policy_kwargs or {})
     env = AnySpaces(action_space=spaces.Box(-1.0, 1.0, (N_ACT,)))
     model = algos.ALL[name](env=env, seed=0, buffer_size=10, policy_kwargs=kwargs, **arguments)
@@ -67,7 +64,6 @@ def begun(name: str, policy_kwargs: dict[str, Any] | None = None, **arguments: A
 
 
 def plain(tree: Any) -> Any:
-    """:return: writable arrays of NumPy"""
     return jax.tree.map(lambda leaf: np.array(leaf, np.float64), tree)
 
 
@@ -103,7 +99,6 @@ class Keys(NamedTuple):
 
 
 def keys_of(learner: Any) -> Iterator[Keys]:
-    """:return: of one update after the other"""
     key = learner.key
     while True:
         key, critic_key, actor_key = jax.random.split(key, 3)
@@ -118,11 +113,8 @@ class Soft:
     """
     Soft actor-critic (Haarnoja et al. 2018): equations 5 to 9 and 18 of arXiv 1812.05905.
 
-    :param target_of: next values of all critics, shape ``(critics, batch, values)``, to what
-        becomes a target, shape ``(batch, targets)``
-    :param error: of the values of one critic, given targets
-    :param worth: values of all critics to what the actor climbs, shape ``(batch,)``
-    :param b1: Adam's, of the entropy coefficient
+    :param target_of: next values ``(critics, batch, values)`` to targets ``(batch, targets)``
+    :param worth: values of all critics to what the actor climbs
     :param linear: whether the loss of the entropy coefficient has it itself, not its logarithm
     """
 
@@ -141,7 +133,6 @@ class Soft:
         self.keys, self.n, self.report = keys_of(learner), 0, {}
 
     def values(self, critic: Weights, obs: np.ndarray, action: np.ndarray, key: Any) -> np.ndarray:
-        """:param key: of dropout masks, where there are some"""
         both = np.concatenate([obs, action], -1)
         each = [member(critic, i) for i in range(len(critic["Dense_0"]["kernel"]))]
         return np.stack([dense(w["Dense_0"], self.body(w["body"], both)) for w in each])
@@ -190,13 +181,10 @@ class Soft:
         return self.report
 
     def follow(self) -> None:
-        share = KNOBS.tau
-        self.target = jax.tree.map(
-            lambda old, new: (1.0 - share) * old + share * new, self.target, self.critic
-        )
+        nearer = lambda old, new: (1.0 - KNOBS.tau) * old + KNOBS.tau * new  # noqa: E731
+        self.target = jax.tree.map(nearer, self.target, self.critic)
 
-    def explore(self, batch: Batch, key: Any) -> None:
-        """What follows the actor."""
+    def explore(self, batch: Batch, key: Any) -> None: ...
 
 
 def check(recipe, learner, expected, seen=lambda obs: obs, n=N_UPDATES, seed=0) -> Any:
@@ -233,7 +221,6 @@ def mean_worth(values: np.ndarray) -> np.ndarray:
 
 def test_soft_actor_critic_with_state_dependent_noise():
     recipe, learner = begun("gsde_sac", {"log_std_init": -1.0})
-
     check(recipe, learner, Soft(learner, mlp, least, half_square, least_worth))
 
 
@@ -280,19 +267,13 @@ def test_droq_drops_out_in_every_pass_of_its_critics_each_with_a_mask_of_its_own
 
     # Three passes of two critics in each update; masks of 24 entries agree by chance in none.
     kept = [mask for both in drawn.values() for mask in both]
-    assert len(kept) == 6 * N_UPDATES
-    assert len({mask.tobytes() for mask in kept}) == len(kept)
+    assert len(kept) == 6 * N_UPDATES and len({mask.tobytes() for mask in kept}) == len(kept)
 
 
 def _after_dropout(critic: Any, obs: Any, action: Any, w: Weights, key: Any) -> Any:
-    _, seen = critic.apply(
-        {"params": w},
-        obs,
-        action,
-        rngs={"dropout": key},
-        capture_intermediates=lambda module, _: isinstance(module, Dropout),
-        mutable=["intermediates"],
-    )
+    is_dropout = lambda module, _: isinstance(module, Dropout)  # noqa: E731
+    how = {"capture_intermediates": is_dropout, "mutable": ["intermediates"]}
+    _, seen = critic.apply({"params": w}, obs, action, rngs={"dropout": key}, **how)
     return seen["intermediates"]["body"]["Dropout_0"]["__call__"][0]
 
 
@@ -488,8 +469,7 @@ def test_crossq_normalises_both_pairs_together_and_has_no_target_networks():
 
 
 class Sale:
-    """Fujimoto et al., NeurIPS 2023, section 4 and appendix; LAP's loss is equation 10 of its own
-    paper (NeurIPS 2020)."""
+    """Fujimoto et al., NeurIPS 2023, section 4; LAP is equation 10 of NeurIPS 2020."""
 
     def __init__(self, recipe, learner) -> None:
         self.recipe, self.key = recipe, learner.key
@@ -568,9 +548,8 @@ class Sale:
 
 def test_td7_learns_embeddings_clips_targets_and_copies_them_late():
     recipe, learner = begun("td7", {"embedding_size": 5}, target_update_interval=2)
-    fixed = td7_update.Copies(
-        *(getattr(learner, n).weights for n in ("encoder", "actor", "critic", "encoder"))
-    )
+    encoder, actor, critic = (getattr(learner, n).weights for n in ("encoder", "actor", "critic"))
+    fixed = td7_update.Copies(encoder, actor, critic, encoder)
     learner = learner._replace(copies=fixed)
     expected = Sale(recipe, learner)
     report, given = before_any(td7_update.Report), batches(4)

@@ -77,8 +77,7 @@ def test_one_step_of_all_copies_is_one_call_of_one_program(monkeypatch):
             env.step(np.zeros((4, 1), np.float32))
 
     # 24 steps, restarts among them and two values of the mass: 24 calls, one compilation.
-    assert len(calls) == 24
-    assert compiled.step._cache_size() == 1
+    assert len(calls) == 24 and compiled.step._cache_size() == 1
 
 
 def test_each_copy_may_be_given_its_start():

@@ -1,8 +1,4 @@
-"""
-One contract for every Gymnasium wrapper.
-
-Whoever adds a wrapper adds one entry to ``CASES``.
-"""
+"""One contract for every Gymnasium wrapper: whoever adds one adds an entry to ``CASES``."""
 
 import contextlib
 import copy
@@ -27,14 +23,7 @@ from sb3_hds.wrappers.action_layer import ActionLayer
 
 
 class Case(NamedTuple):
-    """
-    :param wrapper: the class
-    :param arguments: of its constructor, besides the environment; a function of a folder where it
-        writes files
-    :param env_id: of an environment that it fits
-    :param pickles: False where it holds what no other process can have
-    :param remade: False where ``env.spec`` cannot tell how to wrap again
-    """
+    """What it is made with, and whether another process or ``env.spec`` can have it again."""
 
     wrapper: type[gymnasium.Wrapper]
     arguments: Mapping[str, Any] | Callable[[Path], Mapping[str, Any]] = {}
@@ -43,40 +32,36 @@ class Case(NamedTuple):
     remade: bool = True
 
 
+TWO_JOINTS = {"omega_swing": 4.0, "phase": [0.0, 1.5]}
+BARRIER = {"low": -2.0, "high": 2.0, "position": [[0, 1]], "on_breach": "ignore"}
+PHASE = {"name": "only", "mapping": [[2.0]], "constraints": [[[1.0]], [0.5]]}
 _numbers = itertools.count()
+
+
+def fresh_path(folder: Path) -> dict[str, Any]:
+    return {"path": str(folder / f"{next(_numbers)}.jsonl")}
+
+
 CASES = {
     "ActionDelay": Case(wrappers.ActionDelay, {"steps": 2}),
     "ActionRateLimit": Case(wrappers.ActionRateLimit, {"max_rate": 10.0}),
     "ActionScale": Case(wrappers.ActionScale, {"schedule": [[0, 0.2], [20, 1.0]]}),
     "ActionShield": Case(wrappers.ActionShield, {"constraints": [[[1.0]], [1.5]]}),
     "CPGPrior": Case(wrappers.CPGPrior, {"mode": "parameters", "omega_swing": 6.0}),
-    "CPGPrior, joints of MuJoCo": Case(
-        wrappers.CPGPrior, {"omega_swing": 4.0, "phase": [0.0, 1.5]}, "Swimmer-v5", pickles=False
-    ),
+    "CPGPrior, MuJoCo": Case(wrappers.CPGPrior, TWO_JOINTS, "Swimmer-v5", pickles=False),
     "ContinuityCost": Case(wrappers.ContinuityCost, {"weight": 0.1}),
     "HistoryObservation": Case(wrappers.HistoryObservation, {"n_observations": 2}),
     "InfiniteHorizon": Case(wrappers.InfiniteHorizon, {"max_episode_steps": 20}),
     # Pendulum-v1 is commanded by its torque, which the barrier would object to.
-    "JointLimitBarrier": Case(
-        wrappers.JointLimitBarrier,
-        {"low": -2.0, "high": 2.0, "position": [[0, 1]], "on_breach": "ignore"},
-    ),
+    "JointLimitBarrier": Case(wrappers.JointLimitBarrier, BARRIER),
     "LowPassAction": Case(wrappers.LowPassAction, {"cutoff": 4.0}),
     "ManualReset": Case(wrappers.ManualReset, {"wanted": "moving_joints.nobody"}),
     "Perturb": Case(wrappers.Perturb, {"noise": 0.1}),
     # Without a watchdog, which would act where the machine is busy.
     "RealTime": Case(wrappers.RealTime, {"period": 1e-4}),
     # An open file, which is never overwritten.
-    "Record": Case(
-        wrappers.Record,
-        lambda folder: {"path": str(folder / f"{next(_numbers)}.jsonl")},
-        pickles=False,
-        remade=False,
-    ),
-    "SharedControlTemplate": Case(
-        wrappers.SharedControlTemplate,
-        {"phases": [{"name": "only", "mapping": [[2.0]], "constraints": [[[1.0]], [0.5]]}]},
-    ),
+    "Record": Case(wrappers.Record, fresh_path, pickles=False, remade=False),
+    "SharedControlTemplate": Case(wrappers.SharedControlTemplate, {"phases": [PHASE]}),
     # Environments of MuJoCo begin anew where they are unpickled.
     "ShowJoints": Case(wrappers.ShowJoints, env_id="Swimmer-v5", pickles=False),
     "TerminateToTruncate": Case(wrappers.TerminateToTruncate, env_id="MountainCarContinuous-v0"),
@@ -132,7 +117,6 @@ def same(first: list[np.ndarray], second: list[np.ndarray]) -> bool:
 def test_every_wrapper_has_a_case():
     public = [getattr(wrappers, name) for name in wrappers.__all__]
     classes = {o for o in public if isinstance(o, type) and issubclass(o, gymnasium.Wrapper)}
-
     assert classes == {case.wrapper for case in CASES.values()}
 
 
@@ -155,9 +139,7 @@ def test_spaces_contain_what_comes_out_and_the_seed_decides_what_follows(name, t
 
 
 @every_wrapper
-def test_seeds_options_and_actions_reach_the_environment_and_layers_tell_what_they_did(
-    name, tmp_path
-):
+def test_seeds_options_and_actions_arrive_and_layers_tell_what_they_did(name, tmp_path):
     case, heard = CASES[name], []
 
     class Listening(gymnasium.Wrapper):

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from cases import each
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_hds import HDS
@@ -38,15 +39,9 @@ class Zoo:
         self.environ = {**os.environ, **own}
 
     def succeeds(self, *words: str, **environ: str) -> str:
-        done = subprocess.run(
-            words,
-            cwd=self.folder,
-            env={**self.environ, **environ},
-            text=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            timeout=500,
-        )
+        into = {"text": True, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        where = {"cwd": self.folder, "env": {**self.environ, **environ}}
+        done = subprocess.run(words, timeout=500, **into, **where)
         assert done.returncode == 0, done.stdout[-6000:]
         return done.stdout
 
@@ -157,14 +152,11 @@ def test_optuna_trials_are_stored_and_one_of_them_can_be_trained(zoo):
     assert "policy_kwargs.net_arch" in used
 
 
-@pytest.mark.parametrize(
-    ("algo", "params"),
-    [
-        ("openloop", ("population_size:3", "n_resets:1", "horizon:20", "n_elites:2", "n_envs:2")),
-        ("td7", (*FEW, "policy_kwargs:dict(net_arch=[8])")),
-    ],
+@each(
+    ("openloop", ("population_size:3", "n_resets:1", "horizon:20", "n_elites:2", "n_envs:2")),
+    ("td7", (*FEW, "policy_kwargs:dict(net_arch=[8])")),
 )
-def test_other_algorithms_are_trained_and_replayed(zoo, algo, params):
+def test_other_algorithms_are_trained_and_replayed(algo, params, zoo):
     agent = of(algo, "-f", "brief", "-n", "200")
 
     zoo.succeeds(*CONSOLE, "train", *agent, "--eval-freq", "-1", "-params", *params)

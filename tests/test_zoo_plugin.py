@@ -8,19 +8,12 @@ from types import SimpleNamespace
 import jax
 import pytest
 import yaml
+from cases import each
 from small_models import small
 
 import sb3_hds
-from rl_zoo_plugin import (
-    __main__,
-    compilation_cache,
-    hook,
-    lazy,
-    samplers,
-    tables,
-    trial_progress,
-    trials,
-)
+from rl_zoo_plugin import __main__, compilation_cache, hook, lazy, samplers, tables, trials
+from rl_zoo_plugin import trial_progress as progress_of_trials
 from rl_zoo_plugin.lazy import LazyAlgorithm
 from rl_zoo_plugin.samplers import SAMPLERS
 from sb3_hds.algos.registry import ALGORITHMS
@@ -66,8 +59,7 @@ def load_yml(algo: str) -> dict:
 
 
 def test_a_stand_in_is_called_loaded_and_read_like_the_class(walker):
-    assert walker.__name__ == "Walker"
-    assert walker("MlpPolicy", stride=0.7).stride == 0.7
+    assert walker.__name__ == "Walker" and walker("MlpPolicy", stride=0.7).stride == 0.7
     assert walker.load("agent.zip", custom_objects={}, stride=0.7).stride == 0.7
     # A single argument of the policy is not asked for when one is loaded.
     assert walker.load("agent.zip", **{"policy_kwargs.net_arch": [4]}).stride == 0.5
@@ -168,9 +160,9 @@ def test_a_trial_has_memory_for_its_own_steps_alone():
 
 
 def test_a_trial_says_now_and_then_how_far_it_is(capsys, monkeypatch):
-    monkeypatch.setattr(trial_progress, "_EVERY", 0.0)
+    monkeypatch.setattr(progress_of_trials, "_EVERY", 0.0)
     with trials.running(3, 20):
-        progress = trial_progress.TrialProgress()
+        progress = progress_of_trials.TrialProgress()
     small("droq", learning_starts=100).learn(25, callback=progress)
     progress.locals["pretraining"] = True
     progress.on_step()
@@ -195,12 +187,9 @@ class Manager:
         self.found = self.objective(SimpleNamespace(number=3))
 
 
-@pytest.mark.parametrize(
-    ("given", "shown"),
-    [
-        ({"show_progress": True}, "stable_baselines3.common.callbacks.ProgressBarCallback"),
-        ({"show_progress": True, "n_jobs": 2}, "rl_zoo_plugin.trial_progress.TrialProgress"),
-    ],
+@each(
+    ({"show_progress": True}, "stable_baselines3.common.callbacks.ProgressBarCallback"),
+    ({"show_progress": True, "n_jobs": 2}, "rl_zoo_plugin.trial_progress.TrialProgress"),
 )
 def test_trials_of_ours_know_their_steps_and_show_where_they_are(given, shown, monkeypatch):
     manager = type("Manager", (Manager,), dict(vars(Manager)))
@@ -282,20 +271,16 @@ def test_a_zoo_is_extended_before_and_after_it_is_imported(tmp_path, before):
 
     assert done.returncode == 0, done.stderr
     ours, users, stock, names = done.stdout.splitlines()
-    assert ours == str(tables.hyperparams_file("hds"))
-    assert users == "mine.yml" and stock == "None"
+    assert ours == str(tables.hyperparams_file("hds")) and users == "mine.yml" and stock == "None"
     # Known by name only: neither jax nor torch is imported before an algorithm is used.
     assert names == f"{['sac', *ALGORITHMS]} False False"
 
 
-@pytest.mark.parametrize(
-    ("environ", "expected"),
-    [
-        ({"SB3_HDS_CACHE": "/tmp/mine"}, "/tmp/mine"),
-        ({"SB3_HDS_CACHE": ""}, None),
-        ({"XDG_CACHE_HOME": "/tmp/xdg"}, "/tmp/xdg/sb3_hds/xla"),
-        ({"JAX_COMPILATION_CACHE_DIR": "/tmp/jax", "SB3_HDS_CACHE": "/tmp/mine"}, None),
-    ],
+@each(
+    ({"SB3_HDS_CACHE": "/tmp/mine"}, "/tmp/mine"),
+    ({"SB3_HDS_CACHE": ""}, None),
+    ({"XDG_CACHE_HOME": "/tmp/xdg"}, "/tmp/xdg/sb3_hds/xla"),
+    ({"JAX_COMPILATION_CACHE_DIR": "/tmp/jax", "SB3_HDS_CACHE": "/tmp/mine"}, None),
 )
 def test_programs_are_kept_where_the_user_wants_them(environ, expected, monkeypatch):
     for name in ("JAX_COMPILATION_CACHE_DIR", "SB3_HDS_CACHE", "XDG_CACHE_HOME"):

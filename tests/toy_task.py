@@ -9,22 +9,7 @@ LIMIT = 200
 
 
 class Toy(gymnasium.Env):
-    r"""
-    A mass on a spring with friction, driven by :math:`u \in [-1, 1]`; each step costs
-    :math:`0.3\,(x^2 + v^2)`, which is of order 1 under random actions.
-
-    :param units: of observations, as a factor
-    :param max_force: limit of the action, which acts relative to it
-    :param reward: ``"cost"``, ``"constant"``, ``"nothing"``, ``"effort"``, ``"rare"`` (1 where the
-        mass is far out), ``"late"`` (1 at the 190th step) or ``"jerk"`` (the cost and what changes
-        of the action cost)
-    :param scale: of rewards, as a factor
-    :param sees_velocity: whether observations contain it
-    :param sees_action: whether observations contain the action before
-    :param fails: whether an episode terminates far out
-    :param end: reward of such an end
-    :param success: what ``info["is_success"]`` says of it
-    """
+    """A mass on a spring; each step costs ``0.3 (x^2 + v^2)``, of order 1 under random actions."""
 
     def __init__(
         self,
