@@ -124,7 +124,7 @@ def _keys(twin: Twin) -> set[str]:
 
 def _left(hypotheses: Hypotheses, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     """:return: independent rows, and what is left in units of the noise, of each joint"""
-    made = equation(hypotheses, motion)
+    made = equation(hypotheses, motion, quick=True)
     p = problem(hypotheses, made, grams(made, weak_rows(made)))
     keys = list(range(len(p.items)))
     found = p.solve(keys)

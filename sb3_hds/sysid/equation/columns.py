@@ -2,7 +2,7 @@
 
 import copy
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -26,7 +26,7 @@ from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.effects import SensorDelay
 from sb3_hds.effects.joint import DryFriction
 from sb3_hds.sysid.equation.motion import Motion
-from sb3_hds.sysid.equation.terms import Terms, forces, portions, terms
+from sb3_hds.sysid.equation.terms import Terms, effective_inertia, forces, portions, terms
 from sb3_hds.sysid.hypotheses import PARAMETER, Candidate, Hypotheses, encoders
 
 # Finite differences by a parameter or a sensor, in shares of its scale.
@@ -37,6 +37,13 @@ _NOTHING = 1e-9
 _LATE = (0, 1, 2, 3, 4)
 # Places of a normal distribution, in standard deviations, and their weights (Gauss-Hermite).
 _PLACES, _WEIGHTS = np.array([0.0, -np.sqrt(3.0), np.sqrt(3.0)]), np.array([4.0, 1.0, 1.0]) / 6.0
+
+#: by effect, its parameter and the force per unit of it at a velocity
+CLOSED_FORMS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
+    "viscous_friction": ("b", np.negative),
+    "coulomb_friction": ("tau_c", lambda v: -np.sign(v)),
+    "constant_force": ("tau_0", np.ones_like),
+}
 
 Rule = Literal["linear", "chain", "blend", "switch"]
 
@@ -124,6 +131,7 @@ class Equation:
     :param load: force that the nominal model transmits: inertia, gravity, shape ``(n, dof)``
     :param actuator: force of the actuators, shape ``(n, dof)``
     :param mass: mass matrix, shape ``(n, dof, dof)``
+    :param effective: inertia that a constant force meets over an interval, likewise
     :param slopes: of the mass matrix by inertial parameters, by key of the candidate
     :param drives: by which share of the actuators' force that changes with a unit of a parameter,
         at each joint, likewise
@@ -139,6 +147,7 @@ class Equation:
     load: np.ndarray
     actuator: np.ndarray
     mass: np.ndarray
+    effective: np.ndarray
     slopes: dict[str, np.ndarray]
     drives: dict[str, np.ndarray]
     motion: Motion
@@ -158,16 +167,21 @@ class _Rows(NamedTuple):
     next_v: np.ndarray
 
 
-def equation(hypotheses: Hypotheses, motion: Motion) -> Equation:
+def equation(hypotheses: Hypotheses, motion: Motion, quick: bool = False) -> Equation:
     """
     :param hypotheses: candidates, and the twin as it is believed, at the interval of the motion
     :param motion: of the joints
+    :param quick: forces of ``CLOSED_FORMS`` only, which run no program, beside the bare mass matrix
     """
     twin, rows = hypotheses.believed, _rows(motion)
     params = twin.params
     found = _terms(twin, params, rows)
-    push = lambda t, change: np.einsum("nij,nj->ni", t.mass, change - t.change) / motion.dt  # noqa: E731
-    missing, smooth = push(found, rows.measured), push(found, rows.change)
+    given = (rows.q, rows.v, rows.actions)
+    effective = found.mass if quick else effective_inertia(twin, params, *given, found)
+    force = lambda change: (  # noqa: E731
+        np.einsum("nij,nj->ni", effective, change - found.change) / motion.dt
+    )
+    missing, smooth = force(rows.measured), force(rows.change)
     load = np.einsum("nij,nj->ni", found.mass, rows.a) + found.bias
     made = Equation(
         missing=missing,
@@ -179,12 +193,13 @@ def equation(hypotheses: Hypotheses, motion: Motion) -> Equation:
         load=load,
         actuator=found.actuator,
         mass=found.mass,
+        effective=effective,
         slopes={},
         drives={},
         motion=motion,
     )
     typical = np.sqrt(np.mean(np.concatenate([load, found.actuator]) ** 2)) + 1e-300
-    refuted = refuted_by_kinematics(twin, motion)
+    refuted = set() if quick else refuted_by_kinematics(twin, motion)
     inertia = 1.0 / np.diagonal(np.linalg.inv(found.mass), axis1=1, axis2=2)
     nodes = [_nodes(made, rows, found.bias, inertia, j) for j in range(inertia.shape[1])]
     for candidate in hypotheses.candidates:
@@ -193,6 +208,8 @@ def equation(hypotheses: Hypotheses, motion: Motion) -> Equation:
             continue
         if candidate.slot == PARAMETER:
             _add_parameter(made, hypotheses, candidate, rows, smooth, typical)
+        elif quick and candidate.name in CLOSED_FORMS:
+            _add_closed_form(made, candidate, nodes[candidate.index])
         elif isinstance(effect, JointEffect) and not jax.tree.leaves(effect.memory(twin)):
             _add_force(made, candidate, effect, nodes[candidate.index], rows)
         elif isinstance(effect, ActionEffect) and candidate.index >= 0:
@@ -265,7 +282,8 @@ def _add_parameter(
     step = _STEP * parameter.scale
     step = -step if value + step > parameter.upper else step
     there = _terms(twin, {**twin.params, name: value + step}, rows)
-    moved = np.einsum("nij,nj->ni", there.mass, rows.change - there.change) / made.motion.dt
+    effective = made.effective + there.mass - made.mass
+    moved = np.einsum("nij,nj->ni", effective, rows.change - there.change) / made.motion.dt
     column = -(moved - smooth) / step
     if not np.isfinite(column).all() or _rms(column) * parameter.scale < _NOTHING * typical:
         return
@@ -323,6 +341,13 @@ def _add_force(
                     tuple(names[i] for i in useful),
                 )
             )
+
+
+def _add_closed_form(made: Equation, candidate: Candidate, nodes: Mapping[str, np.ndarray]) -> None:
+    name, by_speed = CLOSED_FORMS[candidate.name]
+    values = np.sum(nodes["weights"] * by_speed(nodes["v"]), axis=(1, 2))
+    column = _put(made, candidate.index, values)
+    made.items.append(Item(candidate, (column,), (None,), "linear", (), (name,)))
 
 
 def _nodes(
@@ -567,7 +592,8 @@ def _add_sensor(
     q, v = read(rows.q, rows.v)
     _, next_v = read(rows.next_q, rows.next_v)
     there = _terms(twin, twin.params, rows._replace(q=q, v=v))
-    moved = np.einsum("nij,nj->ni", there.mass, next_v - v - there.change) / made.motion.dt
+    effective = made.effective + there.mass - made.mass
+    moved = np.einsum("nij,nj->ni", effective, next_v - v - there.change) / made.motion.dt
     column = -(moved - smooth) / step
     if np.isfinite(column).all() and np.abs(column).max() > 0.0:
         index = _put(made, None, column)

@@ -60,9 +60,24 @@ TABLE: dict[str, Plausibility] = {
     "sign_flip": Plausibility("sign", 3.0, reason="wiring, and conventions of others"),
 }
 _UNKNOWN = Plausibility("", 3.0)
+# A set point is a number that arrives as it is, or late: no amplifier changes it.
+_SET_POINT = 3.0
+_OF_AMPLIFIERS = ("torque_gain", "directional_gain", "dead_zone", "saturation")
+_UNITS_OF_SET_POINTS = ("rad", "rad/s", "m", "m/s", "deg", "deg/s")
 
 
 def plausibility(effect: str) -> Plausibility:
     """:param effect: name in the catalogue, or ``parameter.NAME``; others are taken to be rare"""
     name = effect.partition(".")[0]
     return TABLE.get(name, _UNKNOWN._replace(family=name))
+
+
+def rarity(effect: str, command: str = "") -> float:
+    """
+    :param effect: name in the catalogue
+    :param command: unit of the command of the actuator at which it is; empty elsewhere
+    :return: minus the logarithm of the prior odds
+    """
+    own = plausibility(effect).rarity
+    set_point = effect in _OF_AMPLIFIERS and command in _UNITS_OF_SET_POINTS
+    return own + _SET_POINT if set_point else own

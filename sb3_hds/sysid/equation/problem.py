@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from sb3_hds.core import ActionEffect
 from sb3_hds.sysid.equation.columns import Equation, Item
-from sb3_hds.sysid.equation.plausibility import plausibility
+from sb3_hds.sysid.equation.plausibility import plausibility, rarity
 from sb3_hds.sysid.equation.weak_form import Grams
 from sb3_hds.sysid.hypotheses import PARAMETER, Hypotheses
 
@@ -68,6 +68,7 @@ class Problem:
     :param drives: share of each joint's actuator force by parameters, by key
     :param rests: of springs, shares of their second column that are admissible
     :param always: items that belong to every set: what is refitted anyway
+    :param rarity: of each item, minus the logarithm of its prior odds
     """
 
     items: tuple[Item, ...]
@@ -83,6 +84,7 @@ class Problem:
     drives: dict[str, np.ndarray]
     rests: dict[int, tuple[float, float]]
     always: tuple[int, ...]
+    rarity: tuple[float, ...]
     total: np.ndarray
     cost: float
 
@@ -143,7 +145,7 @@ class Problem:
             return 0.0
         item = self.items[i]
         count = len(item.free) + _HIDDEN.get(item.candidate.name, 0)
-        return count * self.cost + 2.0 * plausibility(item.candidate.name).rarity
+        return count * self.cost + 2.0 * self.rarity[i]
 
     def solve(self, keys: Sequence[int], total: np.ndarray | None = None) -> Solution:
         """
@@ -235,31 +237,33 @@ class Problem:
             return False
         if found.free and self._inflation(found.free, found.inverse).max() > _MOST_INFLATION:
             return False
-        value = found.value
-        for i in keys:
-            item = self.items[i]
-            if i in self.always or not item.free:
-                continue
-            if item.rule == "chain":
-                (c,) = item.free
-                if not 0.0 <= value[c] <= 1.0:
-                    return False
-            elif item.rule == "blend":
-                one, two = (value[c] for c in item.free)
-                if item.candidate.name != "cogging" and one + two < 0.0:
-                    return False
-                low, high = self.rests.get(i, (-np.inf, np.inf))
-                if not low * (one + two) <= two <= high * (one + two):
-                    return False
-            elif all(c in found.held for c in item.free):
-                return False
-            elif item.candidate.ascending:
-                by_name = dict(zip(item.names, (value[c] for c in item.free), strict=True))
-                shorts = (name.rpartition(".")[2] for name in item.candidate.ascending)
-                sizes = [by_name.get(short, 0.0) for short in shorts]
-                if np.any(np.diff(sizes) < 0.0) or sizes[0] < _LEAST_SLIDING * sizes[-1]:
-                    return False
-        return True
+        return all(self._inside(i, found) for i in keys)
+
+    def beyond(self, keys: Sequence[int]) -> list[int]:
+        """:return: members that stand at their bounds alone, or have sizes that nothing has"""
+        found = self.solve(keys)
+        return [i for i in keys if not self._inside(i, found)]
+
+    def _inside(self, i: int, found: Solution) -> bool:
+        item, value = self.items[i], found.value
+        if i in self.always or not item.free or not value.keys() >= set(item.free):
+            return True
+        if item.rule == "chain":
+            (c,) = item.free
+            return 0.0 <= value[c] <= 1.0
+        if item.rule == "blend":
+            one, two = (value[c] for c in item.free)
+            low, high = self.rests.get(i, (-np.inf, np.inf))
+            pushes = item.candidate.name != "cogging" and one + two < 0.0
+            return not pushes and low * (one + two) <= two <= high * (one + two)
+        if all(c in found.held for c in item.free):
+            return False
+        if not item.candidate.ascending:
+            return True
+        by_name = dict(zip(item.names, (value[c] for c in item.free), strict=True))
+        shorts = (name.rpartition(".")[2] for name in item.candidate.ascending)
+        sizes = [by_name.get(short, 0.0) for short in shorts]
+        return bool(np.all(np.diff(sizes) >= 0.0) and sizes[0] >= _LEAST_SLIDING * sizes[-1])
 
     def score(self, keys: Sequence[int], priced: bool = True) -> float:
         """:return: Schwarz's criterion with prior odds; infinite for what cannot be"""
@@ -422,9 +426,16 @@ def problem(hypotheses: Hypotheses, equation: Equation, made: Grams) -> Problem:
         drives=equation.drives,
         rests=_rests(equation, items),
         always=tuple(always),
+        rarity=tuple(_rarity(hypotheses, item) for item in items),
         total=total,
         cost=float(np.log(made.effective.mean())),
     )
+
+
+def _rarity(h: Hypotheses, item: Item) -> float:
+    actuators = h.believed.actuators
+    command = actuators[item.candidate.index].unit if item.candidate.slot == "actuator" else ""
+    return rarity(item.candidate.name, command)
 
 
 def _bounds(h: Hypotheses, item: Item, name: str) -> tuple[float, float]:

@@ -7,7 +7,6 @@ import numpy as np
 from scipy import stats
 
 from sb3_hds.core import Effect
-from sb3_hds.sysid.equation.plausibility import plausibility
 from sb3_hds.sysid.equation.problem import Problem, Solution
 from sb3_hds.sysid.equation.weak_form import rich_columns
 
@@ -37,6 +36,10 @@ _NO_MATTER = 0.02
 _DOUBTFUL, _MOST_SHAKEN = 1.5, 4
 _VISCOUS, _DRY = "viscous_friction", "coulomb_friction"
 _LATE = ("action_delay", "motor_lag")
+# Joints at which the same effect may stand for something that all share.
+_MANY_JOINTS = 3
+# Place of what all actuators have in common.
+_SHARED = ("actuator", -1)
 
 
 class Member(NamedTuple):
@@ -96,6 +99,7 @@ def propose(problem: Problem) -> Proposal:
     starts = _starts(problem)
     results = [_climb(problem, keys) for keys in starts]
     _, keys = min(results, key=lambda r: r[0])
+    keys = _shared_instead(problem, keys)
     keys = _shaken(problem, keys)
     keys = _material(problem, keys)
     keys = _simplified(problem, keys)
@@ -214,8 +218,7 @@ def _at_all_joints(p: Problem, keys: list[int]) -> list[list[int]]:
             trials.append(
                 _inside_bounds(p, without, [i for i in single if p.family(i) not in taken])
             )
-        common = [i for i in every if p.place(i) == ("actuator", -1)]
-        trials += [[*without, i] for i in common]
+        trials += [[*without, i] for i in every if p.place(i) == _SHARED]
     return trials
 
 
@@ -230,6 +233,29 @@ def _inside_bounds(p: Problem, keys: list[int], new: list[int]) -> list[int]:
     return [*keys, *new]
 
 
+def _shared_instead(p: Problem, keys: list[int]) -> list[int]:
+    """
+    Climb again with what all actuators share, such as a late bus, in the place of something at many
+    joints: that is better only once the others have made room.
+    """
+    score = p.score(keys)
+    while True:
+        trials = []
+        for name in dict.fromkeys(p.items[i].candidate.name for i in keys):
+            rest = [i for i in keys if p.items[i].candidate.name != name]
+            if len(keys) - len(rest) < _MANY_JOINTS:
+                continue
+            shared = [i for i in range(len(p.items)) if p.place(i) == _SHARED and i not in keys]
+            trials += [[*rest, i] for i in p.ranking(rest, shared)]
+        trials = [t for t in trials if not p.clashes(t)]
+        if not trials:
+            return keys
+        new_score, new = _climb(p, min(trials, key=p.score))
+        if new_score >= score - 1e-6:
+            return keys
+        score, keys = new_score, new
+
+
 def _shaken(p: Problem, keys: list[int]) -> list[int]:
     """
     Climb again without one member at a time, the least plausible first: what was added early may
@@ -240,13 +266,11 @@ def _shaken(p: Problem, keys: list[int]) -> list[int]:
         doubtful = [
             i
             for i in keys
-            if i not in p.always
-            and p.items[i].key not in tried
-            and plausibility(p.items[i].candidate.name).rarity >= _DOUBTFUL
+            if i not in p.always and p.items[i].key not in tried and p.rarity[i] >= _DOUBTFUL
         ]
         if not doubtful:
             break
-        worst = max(doubtful, key=lambda i: plausibility(p.items[i].candidate.name).rarity)
+        worst = max(doubtful, key=lambda i: p.rarity[i])
         tried.add(p.items[worst].key)
         barred = {i for i, item in enumerate(p.items) if item.key == p.items[worst].key}
         new_score, new = _climb(p, [i for i in keys if i != worst], barred)
@@ -278,22 +302,51 @@ def _confirmed(p: Problem, keys: list[int]) -> list[int]:
         short = [x - _least_t(p, i) for i, x in zip(keys, t, strict=True)]
         if min(short) > 0.0:
             break
-        keys = [i for i, x in zip(keys, short, strict=True) if x > min(short)]
+        rest = [i for i, x in zip(keys, short, strict=True) if x > min(short)]
+        keys = _admitted(p, _retuned(p, rest))
     return keys
+
+
+def _retuned(p: Problem, keys: list[int]) -> list[int]:
+    """What is not linear in a member, at the values that suit the others as they are now."""
+    for place, i in enumerate(list(keys)):
+        if p.items[i].settings and i not in p.always:
+            same = [o for o, item in enumerate(p.items) if item.key == p.items[i].key]
+            trials = [[*keys[:place], o, *keys[place + 1 :]] for o in same]
+            keys = min(trials, key=lambda t: (t[place] in p.beyond(t), p.solve(t).rss))
+    return keys
+
+
+def _admitted(p: Problem, keys: list[int]) -> list[int]:
+    """Without a member, another may fall out of its bounds: a simpler one stands in, or none."""
+    while beyond := [i for i in p.beyond(keys) if i not in p.always]:
+        worst = max(beyond, key=lambda i: p.rarity[i])
+        rest = [m for m in keys if m != worst]
+        trials = [rest, *([*rest, o] for o in _simpler(p, worst))]
+        keys = min(trials, key=lambda t: (len(p.beyond(t)), p.score(t)))
+    return keys
+
+
+def _simpler(p: Problem, i: int) -> list[int]:
+    """:return: items of the same family and place with fewer parameters"""
+    name = _SIMPLER.get(p.items[i].candidate.name)
+    return [
+        o
+        for o, item in enumerate(p.items)
+        if item.candidate.name == name and p.family(o) == p.family(i)
+    ]
 
 
 def _simplified(p: Problem, keys: list[int]) -> list[int]:
     """A richer member of a family whose simpler one predicts held-out data as well is that one."""
     for i in list(keys):
-        name = p.items[i].candidate.name
-        if name not in _SIMPLER:
+        others = _simpler(p, i)
+        if not others:
             continue
         rest = [m for m in keys if m != i]
         held = p.held_out(keys)
-        for other in (
-            o for o in range(len(p.items)) if p.items[o].candidate.name == _SIMPLER[name]
-        ):
-            if p.family(other) != p.family(i) or not np.isfinite(p.score([*rest, other])):
+        for other in others:
+            if not np.isfinite(p.score([*rest, other])):
                 continue
             lost, t = worth(p, p.held_out([*rest, other]), held, i)
             if t < _WORSE or lost < _NO_MATTER:
@@ -306,18 +359,18 @@ def worth(p: Problem, without: np.ndarray, held: np.ndarray, i: int) -> tuple[fl
     :param without: held-out errors without a member
     :param held: with it
     :return: mean logarithm of their ratio, and its t over folds, at the member's own joint; where
-        it acts at several, at the one that gains most
+        it acts at several, at the one that gains most; of what all actuators share, over all
     """
     ratio = np.log((without + 1e-9) / (held + 1e-9))
     joints = p.joints(i)
     joint = joints[int(np.argmax(ratio.mean(0)[joints]))]
-    x = ratio[:, joint]
+    x = ratio[:, joints].ravel() if p.place(i) == _SHARED else ratio[:, joint]
     return float(x.mean()), float(x.mean() / (x.std(ddof=1) / np.sqrt(len(x)) + 1e-9))
 
 
 def _least_t(p: Problem, i: int) -> float:
     """The rarer a cause is, the surer it has to be."""
-    return _CONFIRMED + _RARE * plausibility(p.items[i].candidate.name).rarity
+    return _CONFIRMED + _RARE * p.rarity[i]
 
 
 def outstanding(p: Problem, keys: Sequence[int]) -> tuple[list[int], list[int]]:
@@ -346,8 +399,7 @@ def outstanding(p: Problem, keys: Sequence[int]) -> tuple[list[int], list[int]]:
 
 def _least_ratio(p: Problem, i: int) -> float:
     """Friction that every joint has stands out sooner than what is rare."""
-    rarity = plausibility(p.items[i].candidate.name).rarity
-    return _OUTSTANDING * (1.0 + min(rarity, _RAREST)) / (1.0 + _RAREST)
+    return _OUTSTANDING * (1.0 + min(p.rarity[i], _RAREST)) / (1.0 + _RAREST)
 
 
 def what_is_left(p: Problem, keys: Sequence[int]) -> list[Left]:

@@ -10,11 +10,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sb3_hds.core import AnalyticTwin, Params, State, Twin
+from sb3_hds.core.effect_chain import Attached, EffectChain
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.twin import plant_of
+from sb3_hds.effects import ConstantForce
 
 # Rows that are evaluated at a time: programs are compiled for one shape.
 _ROWS = 1024
+# A force that a machine hardly notices, in shares of what is typical at a joint.
+_PUSH = 1e-3
+# An interval's response to a force may be this many times weaker than the mass matrix alone has it.
+_STIFFEST = 1e6
 
 
 class Terms(NamedTuple):
@@ -40,6 +46,7 @@ def terms(
     v: Float[np.ndarray, "n dof"],
     actions: Float[np.ndarray, "n act"],
     recorded: bool = True,
+    push: Float[np.ndarray, " dof"] | None = None,
 ) -> Terms:
     """
     :param twin: whose interval is that of the rows; what it remembers is filled from the first row
@@ -48,18 +55,58 @@ def terms(
     :param v: velocities there
     :param actions: held over each interval
     :param recorded: whether rows follow one another, so that a twin may remember the ones before
+    :param push: constant force at each joint besides what the twin has [N m] or [N]; default: none
     """
     parts = []
     with jax.enable_x64(True):
         params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), dict(params))
+        pushed = jnp.asarray(np.zeros(q.shape[1]) if push is None else push, jnp.float64)
         if recorded and _remembers(twin):
             given = (jnp.asarray(x, jnp.float64) for x in (q, v, actions))
-            return Terms(*map(np.asarray, _one_after_the_other(twin, params, *given)))
+            return Terms(*map(np.asarray, _one_after_the_other(twin, params, pushed, *given)))
         for index, n in portions(len(q)):
             given = (jnp.asarray(x[index], jnp.float64) for x in (q, v, actions))
-            found = _side_by_side(twin, params, *given)
+            found = _side_by_side(twin, params, pushed, *given)
             parts.append([np.asarray(leaf)[:n] for leaf in found])
     return Terms(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def effective_inertia(
+    twin: Twin,
+    params: Params,
+    q: Float[np.ndarray, "n dof"],
+    v: Float[np.ndarray, "n dof"],
+    actions: Float[np.ndarray, "n act"],
+    found: Terms,
+) -> Float[np.ndarray, "n dof dof"]:
+    r"""
+    What a constant force meets over an interval,
+
+    .. math:: h \left(\frac{\partial\,\Delta v}{\partial f}\right)^{-1}
+
+    The mass matrix, and what damping adds within the interval: where a stiff servo brakes what a
+    force sets in motion, several times as much.
+
+    :param found: :func:`terms` of the same rows
+    :return: the mass matrix where the twin's step does not answer to forces
+    """
+    plant = plant_of(twin)
+    if not isinstance(plant, AnalyticTwin):
+        return found.mass
+    sizes = _PUSH * np.array([force or 1.0 for force in plant.typical_forces()])
+    response = np.stack(
+        [
+            (terms(twin, params, q, v, actions, push=size * unit).change - found.change) / size
+            for size, unit in zip(sizes, np.eye(len(sizes)), strict=True)
+        ],
+        -1,
+    )
+    well = np.isfinite(response).all((1, 2))
+    safe = np.where(well[:, None, None], response, np.eye(len(sizes)))
+    well &= np.linalg.cond(safe) < _STIFFEST * np.linalg.cond(found.mass)
+    inertia = found.mass.copy()
+    inertia[well] = twin.dt * np.linalg.inv(response[well])
+    return inertia
 
 
 def portions(n: int) -> Iterator[tuple[np.ndarray, int]]:
@@ -95,9 +142,20 @@ def _remembers(twin: Twin) -> bool:
     return bool(jax.tree.leaves(jax.eval_shape(lambda: twin.infer(obs, twin.params).memory)))
 
 
-def _one_step(twin: Twin, params: Params, state: State, action: Array) -> tuple[State, tuple]:
+def _one_step(
+    twin: Twin, params: Params, push: Array, state: State, action: Array
+) -> tuple[State, tuple]:
     plant = plant_of(twin)
-    after = twin.step(state, action, params)
+    if isinstance(plant, AnalyticTwin):
+        pushes = [Attached(f"push.{j}", ConstantForce().at(j), j) for j in range(len(push))]
+        sizes = {f"{a.key}.tau_0": push[a.index] for a in pushes}
+        memory = state.memory | {a.key: () for a in pushes}
+        after = twin.step(
+            state._replace(memory=memory), action, params, EffectChain(tuple(pushes), sizes)
+        )
+        after = after._replace(memory={key: after.memory[key] for key in state.memory})
+    else:
+        after = twin.step(state, action, params)
     if isinstance(plant, AnalyticTwin):
         found = (
             plant.mass_matrix(state.q, params),
@@ -111,19 +169,23 @@ def _one_step(twin: Twin, params: Params, state: State, action: Array) -> tuple[
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
-def _side_by_side(twin: Twin, params: Params, q: Array, v: Array, actions: Array) -> tuple:
+def _side_by_side(
+    twin: Twin, params: Params, push: Array, q: Array, v: Array, actions: Array
+) -> tuple:
     nothing = _memory_of(twin, params, q.dtype)
-    one = lambda q, v, u: _one_step(twin, params, State(q, v, nothing), u)[1]  # noqa: E731
+    one = lambda q, v, u: _one_step(twin, params, push, State(q, v, nothing), u)[1]  # noqa: E731
     return jax.vmap(one)(q, v, actions)
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
-def _one_after_the_other(twin: Twin, params: Params, q: Array, v: Array, actions: Array) -> tuple:
+def _one_after_the_other(
+    twin: Twin, params: Params, push: Array, q: Array, v: Array, actions: Array
+) -> tuple:
     obs = twin.observe(State(q[0], v[0], _memory_of(twin, params, q.dtype)), params)
     first = twin.infer(obs, params).memory
 
     def advance(memory: dict, row: tuple) -> tuple[dict, tuple]:
-        after, found = _one_step(twin, params, State(row[0], row[1], memory), row[2])
+        after, found = _one_step(twin, params, push, State(row[0], row[1], memory), row[2])
         return after.memory, found
 
     return jax.lax.scan(advance, first, (q, v, actions))[1]

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from numpy.lib.stride_tricks import sliding_window_view
 
 from sb3_hds.sysid.equation.columns import Equation, Item
 from sb3_hds.sysid.hypotheses import PARAMETER
@@ -94,7 +95,7 @@ def _joint(equation: Equation, j: int) -> Rows:
     widest = max(_WIDTH * period, _LEAST * motion.dt) / (2.0 * motion.dt)
     halves = [max(round(widest / 2**k), 2) for k in range(_NARROWEST)]
     halves = [n for n in halves if n >= _LEAST // 2] or halves[:1]
-    mass = float(np.median(equation.mass[:, j, j]))
+    mass = float(np.median(equation.effective[:, j, j]))
 
     def against(half: int, left_out: np.ndarray) -> Rows:
         projected, pieces = _against_bumps(table, equation.recording, left_out, half)
@@ -147,10 +148,12 @@ def _against_bumps(
         if end - begin < len(phi):
             continue
         first = np.arange(begin, end - len(phi) + 1, half)
-        for k in first:
-            rows.append(phi @ table[k : k + len(phi)])
-            middles.append(k + half)
-    return (np.array(rows) if rows else np.zeros((0, table.shape[1]))), np.array(middles, int)
+        stretches = sliding_window_view(table[begin:end], len(phi), axis=0)
+        rows.append(stretches[::half] @ phi)
+        middles.append(first + half)
+    if not rows:
+        return np.zeros((0, table.shape[1])), np.zeros(0, int)
+    return np.concatenate(rows), np.concatenate(middles)
 
 
 def _runs(recording: np.ndarray, left_out: np.ndarray) -> list[tuple[int, int]]:
