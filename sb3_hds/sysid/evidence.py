@@ -34,8 +34,9 @@ _ENOUGH = 1e-4
 _RIDGE = 1e-9
 # Most windows that are simulated at a time, and of what their number is a multiple.
 _PORTION, _ROUND = 64, 8
-# Steps of all windows beyond which a second program, for start states alone, is worth compiling.
-_MANY_STEPS = 10_000
+# Steps of all windows, or joints, beyond which a second program, for start states alone, is worth
+# compiling.
+_MANY_STEPS, _MANY_JOINTS = 10_000, 3
 
 # Held by programs that must not run beside another one.
 _LAPACK = threading.Lock()
@@ -260,7 +261,8 @@ class Evidence:
 
     def _width_for(self, index: np.ndarray) -> int:
         n, rows = self.shots.obs.shape[:2]
-        return 0 if not len(index) and n * rows > _MANY_STEPS else self.width
+        large = len(self.hypotheses.twin.joints) > _MANY_JOINTS
+        return 0 if not len(index) and (large or n * rows > _MANY_STEPS) else self.width
 
     def _lead_under(self, theta: np.ndarray, index: np.ndarray) -> int:
         """:return: steps before a window in which memory must be filled under these parameters"""

@@ -18,6 +18,8 @@ _LEVEL = 0.05
 # Members beyond which a set counts as large: their sizes are those in the equation of motion, and
 # each of them, confirmed there on held-out data, only must not make predictions worse.
 _MANY = 6
+# Steps of a fit of start states that begins where they were with one member more.
+_ROUGH_STEPS = 2
 # Folds of the data on which the equation's t is based.
 _FREEDOM = 7
 
@@ -48,16 +50,16 @@ def confirmed_set(
         return [], start
     verdicts, many = {}, len(members) > _MANY
     while members:
-        lost = {
-            key: _in_equation(search, screened, start, base, members.keys() - {key})
-            if many
-            else search.without(candidate, base, near=base)
-            for key, (candidate, _) in members.items()
-        }
-        verdicts = {
-            key: _at_own_joint(search.confirm, members[key][0], base.kept, rest.kept)
-            for key, rest in lost.items()
-        }
+        lost: dict[str, Base] = {}
+        verdicts = {}
+        for key, (candidate, _) in members.items():
+            if many:
+                theta = _sizes_without(search, screened, start, members.keys() - {key})
+                rest = search.confirm.evidence.fit(theta, (), base.kept.offsets, _ROUGH_STEPS)
+            else:
+                lost[key] = search.without(candidate, base, near=base)
+                rest = lost[key].kept
+            verdicts[key] = _at_own_joint(search.confirm, candidate, base.kept, rest)
         weakest = max(verdicts, key=lambda key: (verdicts[key].p_value, -verdicts[key].gain))
         weak = [
             k
@@ -68,7 +70,11 @@ def confirmed_set(
             break
         worst = weakest if weakest in weak else weak[0]
         members.pop(worst)
-        base = lost[worst]
+        if many:
+            theta = _sizes_without(search, screened, start, members.keys())
+            base = search.base(theta, base.free, near=base)
+        else:
+            base = lost[worst]
     if len(members) < len(screened.members):
         screened = screened.among(members)
         members = _members(search, screened)
@@ -88,12 +94,11 @@ def _members(search: Search, screened: Screened) -> dict[str, tuple[Candidate, M
     return {m.key: (known[m.key], m) for m in screened.members if m.key in known}
 
 
-def _in_equation(
-    search: Search, screened: Screened, start: Base, base: Base, keys: Collection[str]
-) -> Base:
+def _sizes_without(
+    search: Search, screened: Screened, start: Base, keys: Collection[str]
+) -> np.ndarray:
     """What is believed with these members only, with their sizes in the equation of motion."""
-    theta = _with_sizes(search, start.point.theta, screened.sizes_of(keys))
-    return search.base(theta, base.free, near=base)
+    return _with_sizes(search, start.point.theta, screened.sizes_of(keys))
 
 
 def _with_sizes(search: Search, theta: np.ndarray, sizes: Mapping[str, float]) -> np.ndarray:

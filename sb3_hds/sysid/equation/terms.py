@@ -101,7 +101,7 @@ def effective_inertia(
         ],
         -1,
     )
-    well = np.isfinite(response).all((1, 2))
+    well = np.asarray(np.isfinite(response).all((1, 2)))
     safe = np.where(well[:, None, None], response, np.eye(len(sizes)))
     well &= np.linalg.cond(safe) < _STIFFEST * np.linalg.cond(found.mass)
     inertia = found.mass.copy()
