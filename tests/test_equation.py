@@ -3,12 +3,14 @@
 import first_users
 import numpy as np
 import pytest
+import servo_leg
 
 from sb3_hds import Trajectories, effects, twins
 from sb3_hds.sysid.conventions import other_convention
 from sb3_hds.sysid.equation.columns import equation
-from sb3_hds.sysid.equation.motion import kinematics, motion
+from sb3_hds.sysid.equation.motion import differences, kinematics, motion
 from sb3_hds.sysid.equation.smoothing import smooth, white_noise
+from sb3_hds.sysid.equation.terms import effective_inertia, terms
 from sb3_hds.sysid.equation.weak_form import weak_rows
 from sb3_hds.sysid.hypotheses import Hypotheses
 from sb3_hds.sysid.leapfrog import in_step_with_the_log
@@ -130,6 +132,29 @@ def test_a_joint_whose_friction_carries_the_torque(believed, calibrate):
     assert found["coulomb_friction.axis"]["tau_c"] == pytest.approx(13.0, rel=0.05)
 
 
+def test_a_force_meets_what_a_servo_brakes_within_a_step():
+    twin = twins.from_mujoco(servo_leg.XML, dt=servo_leg.DT)
+    rng = np.random.default_rng(0)
+    q, v, u = (rng.uniform(-0.5, 0.5, (4, 3)) for _ in range(3))
+    found = terms(twin, twin.params, q, v, u)
+
+    inertia = effective_inertia(twin, twin.params, q, v, u, found)
+
+    # An implicit step takes the servo's damping at its end: h kv beside the mass matrix.
+    expected = found.mass + servo_leg.DT * 1.5 * np.eye(3)
+    np.testing.assert_allclose(inertia, expected, rtol=1e-6, atol=1e-9)
+
+
+def test_a_late_bus_and_dry_friction_are_told_of_a_servo_driven_leg_from_positions_alone():
+    found = proposed(servo_leg.leg(), servo_leg.recorded(delay=0.012, friction=0.2))
+
+    # A tenth of the interval at which commands are held.
+    assert found.pop("action_delay.all") == {"delay": pytest.approx(0.012, abs=5e-4)}
+    assert found.keys() == {f"coulomb_friction.{name}" for name in ("hip", "thigh", "calf")}
+    for sizes in found.values():
+        assert sizes["tau_c"] == pytest.approx(0.2, rel=0.1)
+
+
 def test_an_encoder_that_counts_too_much_scales_position_and_velocity():
     found = proposed(*first_users.scaled_angle(), ["inertia", "damping"])
 
@@ -176,6 +201,16 @@ def test_velocities_are_compared_with_differences_of_positions():
     assert found.zero == pytest.approx([0.02], rel=0.05)
     assert found.lag == pytest.approx([-0.5], abs=0.05)
     assert not found.agrees[0]
+
+
+@pytest.mark.parametrize("shift", [-0.5, 0.0, 0.2, 0.5])
+def test_differences_of_a_parabola_are_its_slope_when_the_velocity_is_true(shift):
+    t = 0.1 * np.arange(6.0)
+    found = differences(np.stack([3.0 * t**2, t], 1), 0.1, shift)
+
+    # At both ends there is one difference only.
+    np.testing.assert_allclose(found[1:-1, 0], 6.0 * (t + 0.1 * shift)[1:-1], atol=1e-12)
+    np.testing.assert_allclose(found[:, 1], 1.0)
 
 
 def test_smoothing_takes_noise_away_and_no_motion():

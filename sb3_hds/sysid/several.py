@@ -7,10 +7,11 @@ from scipy import stats
 
 from sb3_hds.sysid.comparison import Comparison, confirm
 from sb3_hds.sysid.equation.selection import Member
-from sb3_hds.sysid.evidence import Point
+from sb3_hds.sysid.evidence import Point, in_threads
 from sb3_hds.sysid.hypotheses import Candidate, encoders
 from sb3_hds.sysid.screening import Screened
 from sb3_hds.sysid.search import LEAST_GAIN, NOT_FINITE, Base, Half, Search, Tried, as_good, passes
+from sb3_hds.sysid.shooting import Shots, evenly
 from sb3_hds.sysid.telling import Accepted
 
 # Level at which each member has to be missed by held-out recordings when it is left out.
@@ -20,6 +21,8 @@ _LEVEL = 0.05
 _MANY = 6
 # Steps of a fit of start states that begins where they were with one member more.
 _ROUGH_STEPS = 2
+# Windows of a large machine on which each member of its set is left out once.
+_SOME_WINDOWS = 8
 # Folds of the data on which the equation's t is based.
 _FREEDOM = 7
 
@@ -48,33 +51,26 @@ def confirmed_set(
     members = _members(search, screened)
     if not members or not passes(search.better(base.kept, start.kept)):
         return [], start
-    verdicts, many = {}, len(members) > _MANY
-    while members:
-        lost: dict[str, Base] = {}
-        verdicts = {}
-        for key, (candidate, _) in members.items():
-            if many:
-                theta = _sizes_without(search, screened, start, members.keys() - {key})
-                rest = search.confirm.evidence.fit(theta, (), base.kept.offsets, _ROUGH_STEPS)
-            else:
-                lost[key] = search.without(candidate, base, near=base)
-                rest = lost[key].kept
-            verdicts[key] = _at_own_joint(search.confirm, candidate, base.kept, rest)
-        weakest = max(verdicts, key=lambda key: (verdicts[key].p_value, -verdicts[key].gain))
-        weak = [
-            k
-            for k, v in verdicts.items()
-            if (v.gain <= 0.0 if many else v.p_value >= _LEVEL or v.gain < LEAST_GAIN)
-        ]
+    many = len(members) > _MANY
+    verdicts: dict[str, Comparison] = {}
+    if many:
+        verdicts = _each_left_out(search, screened, start, base, members)
+        if any(v.gain <= 0.0 for v in verdicts.values()):
+            members = {key: m for key, m in members.items() if verdicts[key].gain > 0.0}
+            theta = _sizes_with(search, screened, start, members.keys())
+            base = search.base(theta, base.free, near=base)
+    while members and not many:
+        lost = {key: search.without(c, base, near=base) for key, (c, _) in members.items()}
+        verdicts = {
+            key: _at_own_joint(search.confirm, members[key][0], base.kept, rest.kept)
+            for key, rest in lost.items()
+        }
+        weak = [k for k, v in verdicts.items() if v.p_value >= _LEVEL or v.gain < LEAST_GAIN]
         if not weak:
             break
-        worst = weakest if weakest in weak else weak[0]
+        worst: str = max(weak, key=lambda key: (verdicts[key].p_value, -verdicts[key].gain))
         members.pop(worst)
-        if many:
-            theta = _sizes_without(search, screened, start, members.keys())
-            base = search.base(theta, base.free, near=base)
-        else:
-            base = lost[worst]
+        base = lost[worst]
     if len(members) < len(screened.members):
         screened = screened.among(members)
         members = _members(search, screened)
@@ -94,7 +90,30 @@ def _members(search: Search, screened: Screened) -> dict[str, tuple[Candidate, M
     return {m.key: (known[m.key], m) for m in screened.members if m.key in known}
 
 
-def _sizes_without(
+def _each_left_out(
+    search: Search,
+    screened: Screened,
+    start: Base,
+    base: Base,
+    members: Mapping[str, tuple[Candidate, Member]],
+) -> dict[str, Comparison]:
+    """:return: of each member of a large set, held-out errors with it beside those without it"""
+    half, some = search.confirm, evenly(search.confirm.evidence.shots.n, _SOME_WINDOWS)
+    shots = Shots(*(np.asarray(leaf)[some] for leaf in half.evidence.shots))
+    half = half._replace(evidence=half.evidence.on(shots), unit=half.unit[some])
+    kept = base.kept._replace(offsets=base.kept.offsets[some], raw=base.kept.raw[some])
+
+    def left_out(key: str) -> Comparison:
+        theta = _sizes_with(search, screened, start, members.keys() - {key})
+        rest = half.evidence.fit(theta, (), kept.offsets, _ROUGH_STEPS)
+        return _at_own_joint(half, members[key][0], kept, rest)
+
+    keys = list(members)
+    found: list[Comparison] = list(search.bar.over(in_threads(left_out, keys), len(keys)))
+    return dict(zip(keys, found, strict=True))
+
+
+def _sizes_with(
     search: Search, screened: Screened, start: Base, keys: Collection[str]
 ) -> np.ndarray:
     """What is believed with these members only, with their sizes in the equation of motion."""

@@ -3,7 +3,7 @@
 import copy
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -72,7 +72,7 @@ class Item:
     def key(self) -> str:
         return self.candidate.key
 
-    @property
+    @cached_property
     def free(self) -> tuple[int, ...]:
         """Columns whose coefficients are estimated."""
         return tuple(c for c, f in zip(self.columns, self.fixed, strict=True) if f is None)

@@ -33,7 +33,7 @@ class Moved(NamedTuple):
     :param q: smoothed positions [rad] or [m]
     :param v: smoothed velocities
     :param a: smoothed accelerations
-    :param raw: velocities as they were measured, or central differences of positions
+    :param raw: velocities as they were measured, or differences of positions
     :param actions: held from row to row, shape ``(rows - 1, n_act)``
     """
 
@@ -144,10 +144,10 @@ def motion(twin: Twin, data: Trajectories) -> Motion:
         raw = v.copy()
         still = ~measured
         if still.any():
-            raw[:, still] = np.gradient(q[:, still], data.dt, axis=0)
+            raw[:, still] = differences(q[:, still], data.dt, shift)
         recordings.append(_thinned(smoothed, raw, commands, every))
     noise_q, noise_v = mean("noise_q"), mean("noise_v")
-    noise_v = np.where(measured, noise_v, noise_q / (np.sqrt(2.0) * data.dt))
+    noise_v = np.where(measured, noise_v, np.sqrt(0.5 + 6.0 * shift**2) * noise_q / data.dt)
     return Motion(
         tuple(recordings),
         np.asarray(data.origin),
@@ -163,6 +163,19 @@ def motion(twin: Twin, data: Trajectories) -> Motion:
         np.array([2.0 * np.pi if joint.unit == "rad" else np.inf for joint in twin.joints]),
         measured & kinematics([(q, v) for q, v, _ in raws], data.dt, period).agrees,
     )
+
+
+def differences(
+    q: Float[np.ndarray, "rows dof"], dt: float, shift: float
+) -> Float[np.ndarray, "rows dof"]:
+    """
+    :param shift: when a velocity is true, between half an interval before its position and half an
+        interval after it
+    :return: from differences to the rows before and after
+    """
+    change = np.diff(q, axis=0) / dt
+    before, after = np.concatenate([change[:1], change]), np.concatenate([change, change[-1:]])
+    return (0.5 - shift) * before + (0.5 + shift) * after
 
 
 def joint_motion(twin: Twin, data: Trajectories) -> list[tuple[np.ndarray, np.ndarray]]:

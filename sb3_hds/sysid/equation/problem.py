@@ -332,25 +332,25 @@ class Problem:
         found = self.solve(keys)
         if not np.isfinite(found.rss):
             return []
+        pool = [i for i in range(len(self.items)) if i not in keys] if among is None else [*among]
+        own = sorted({c for i in pool for c in self.items[i].columns})
+        at = dict(zip(own, range(len(own)), strict=True))
         on = np.flatnonzero(found.weights)
-        r = self.total[:, on] @ found.weights[on]
-        cross = self.total[:, found.free]
-        diagonal = self.diagonal
-        left = np.maximum(diagonal - ((cross @ found.inverse) * cross).sum(1), 1e-9)
-        told = left > 1e-5 * diagonal
-        drop = np.where(told, r**2 / left, 0.0)
-        pool = (
-            [i for i in range(len(self.items)) if i not in keys] if among is None else list(among)
-        )
+        r = self.total[np.ix_(own, on)] @ found.weights[on]
+        cross = self.total[np.ix_(own, found.free)]
+        taken = cross @ found.inverse
+        diagonal = self.diagonal[own]
+        left = np.maximum(diagonal - (taken * cross).sum(1), 1e-9)
+        drop = np.where(left > 1e-5 * diagonal, r**2 / left, 0.0)
         gains = []
         for i in pool:
             item = self.items[i]
             if item.rule != "chain":
-                gains.append(float(drop[list(item.free)].sum()))
+                gains.append(float(sum(drop[at[c]] for c in item.free)))
                 continue
-            whole, part = item.columns
+            whole, part = (at[c] for c in item.columns)
             value = 2.0 * r[whole] - left[whole]
-            mixed = self.total[whole, part] - cross[whole] @ found.inverse @ cross[part]
+            mixed = self.total[own[whole], own[part]] - taken[whole] @ cross[part]
             if left[part] > 0.0:
                 share = np.clip((r[part] - mixed) / left[part], 0.0, 1.0)
                 value += 2.0 * share * (r[part] - mixed) - share**2 * left[part]

@@ -438,9 +438,12 @@ def _predictable(p: Problem, weights: np.ndarray, j: int, diagonal: np.ndarray) 
     columns = np.arange(len(weights) - 1)
     rich = columns[rich_columns(list(p.items), columns)]
     rich = rich[diagonal[rich] > 1e-12]
+    on = np.union1d(rich, np.flatnonzero(weights))
+    rich, weights = np.searchsorted(on, rich), weights[on]
+    every = p.grams.by_joint[j][np.ix_(on, on)]
     base = predicted = 0.0
-    for fold in p.grams.folds[:, j]:
-        train = p.grams.by_joint[j] - fold
+    for fold in (fold[np.ix_(on, on)] for fold in p.grams.folds[:, j]):
+        train = every - fold
         size = np.sqrt(np.abs(np.diag(train)[rich])) + 1e-300
         inner = train[np.ix_(rich, rich)] / np.outer(size, size)
         x = np.linalg.solve(inner + 0.02 * np.eye(len(rich)), (train[rich] @ weights) / size)
