@@ -527,7 +527,7 @@ class Inquiry:
                 *map(str, self.audit.findings),
                 *self.corrected,
                 *to_tell_apart(found, self.hypotheses),
-                *look_alike(found, select, base),
+                *look_alike([one for one in found if not one.sizes], select, base),
                 *out_of_reach(confirm, base.kept, self.origin[self.parts.confirm]),
                 *(errs_more(gain) if findings else ()),
             ),
