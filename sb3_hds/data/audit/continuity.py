@@ -1,4 +1,4 @@
-"""Values that no motion gives: repeated, stuck, cut off, put back."""
+"""Implausible values: repeated, stuck, saturated, or reset within a recording."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ class RepeatedSamples(Finding):
 
 @dataclasses.dataclass(frozen=True)
 class StuckChannel(Finding):
-    """:param value: at which the channel stays, in its unit"""
+    """:param value: the constant value, in the unit of the channel"""
 
     value: float
 
@@ -59,7 +59,7 @@ class StuckChannel(Finding):
 
 @dataclasses.dataclass(frozen=True)
 class DeadChannel(StuckChannel):
-    """In all recordings: whatever the twin has to predict of it, a wrong cause would do."""
+    """A channel that is stuck in all recordings, so that any cause could explain it."""
 
     blocks = True
     remedy = "Check cable and driver of this sensor, or leave the channel out."
@@ -68,8 +68,8 @@ class DeadChannel(StuckChannel):
 @dataclasses.dataclass(frozen=True)
 class SaturatedChannel(Finding):
     """
-    :param value: that the channel does not exceed, in its unit
-    :param share: of the samples that are there
+    :param value: the limit, in the unit of the channel
+    :param share: of the samples that are at the limit
     """
 
     value: float
@@ -116,11 +116,10 @@ def repeated_samples(
     stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
 ) -> list[RepeatedSamples]:
     """
-    Short runs of equal values while a channel moves.
+    Short runs of equal values in a moving channel.
 
-    A number that is not quantised repeats only where the system rests, at zero velocity, or where
-    it is cut off. One that is quantised repeats when it is slow, so only steady and fast motion
-    counts.
+    A channel without quantisation repeats a value only at rest or in saturation. A quantised
+    channel also does in slow motion, so there only fast and steady motion counts.
     """
     repeats = [_repeats(stretches, j, step) for j, step in enumerate(resolution)]
     found = [
@@ -157,10 +156,9 @@ def saturated(
     stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
 ) -> list[SaturatedChannel]:
     """
-    Channels that stay at exactly their largest or smallest value while others move.
+    Channels that stay exactly at their extreme value while others move.
 
-    They must get there with speed: a turning point looks flat too, most of all where values are
-    quantised.
+    They must reach it at speed: turning points are flat, too, in particular after quantisation.
     """
     found = []
     usual = _usual_steps(stretches)
@@ -187,8 +185,8 @@ def stuck(
     stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
 ) -> list[StuckChannel]:
     """
-    Channels that never change, in one recording or in all, or that stop anywhere with speed, or
-    jump when they are free again, while others move. A system that comes to rest does none of it.
+    Channels that are constant while others move, in one recording or in all, or that stop abruptly
+    or jump afterwards. A system that comes to rest does neither.
     """
     found = []
     usual = _usual_steps(stretches)
@@ -216,12 +214,12 @@ def reinitialised(
     stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
 ) -> list[ReinitialisedState]:
     """
-    Steps that are many times those before and after them, in several channels or back to where a
-    recording begins; and, however large other steps are, those that lead back there exactly and on
-    from there. Quantised values do so by chance, and one that is cut off stays there.
+    Resets of the state: steps many times larger than their neighbours, in several channels at once
+    or back to the start of a recording; and steps of any size that lead exactly to that start.
+    Quantised channels are exempt from the latter, because they return there by chance.
 
-    A single channel may jump for other reasons: a velocity at an impact, an outlier. Whole turns of
-    an angle are no jumps.
+    A jump of a single channel has other explanations (an impact, an outlier), and whole turns of an
+    angle are not jumps.
     """
     usual = _Usual.of(stretches)
     if usual is None:
@@ -258,10 +256,10 @@ def reinitialised(
 
 class _Usual(NamedTuple):
     """
-    What is usual in all recordings.
+    Typical motion over all recordings.
 
-    :param step: that nine in ten do not exceed while something moves, one per channel
-    :param bend: change of the step that nine in ten do not exceed, in units of ``spread``
+    :param step: 90 % quantile of the step from sample to sample, for each channel
+    :param bend: 90 % quantile of the change of the step, in units of ``spread``
     :param spread: standard deviation of each channel
     :param starts: first sample of each recording
     """

@@ -1,4 +1,4 @@
-"""Whether there is enough motion, and enough of it caused by the commands."""
+"""Whether motion and commands excite the system enough for identification."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -38,8 +38,8 @@ class StandingStill(Finding):
 @dataclasses.dataclass(frozen=True)
 class TooShort(Finding):
     """
-    :param n_steps: that there are
-    :param needed: at least so many
+    :param n_steps: number of steps
+    :param needed: smallest number for a verdict
     """
 
     blocks = True
@@ -55,7 +55,7 @@ class TooShort(Finding):
 
 @dataclasses.dataclass(frozen=True)
 class WeakMotion(Finding):
-    """:param ratio: spread of the channel by its noise"""
+    """:param ratio: standard deviation of the channel over that of its noise"""
 
     ratio: float
 
@@ -71,7 +71,7 @@ class WeakMotion(Finding):
 
 @dataclasses.dataclass(frozen=True)
 class WithinNoise(Finding):
-    """:param ratio: largest spread of a channel by its noise"""
+    """:param ratio: the largest ratio of a channel's standard deviation to that of its noise"""
 
     blocks = True
     ratio: float
@@ -105,9 +105,9 @@ class MostlyStill(Finding):
 @dataclasses.dataclass(frozen=True)
 class PoorExcitation(Finding):
     """
-    :param n_strokes: how often the channel moves one way or the other in all recordings, by a tenth
-        of its range at least; no other channel does so more often
-    :param n_conditions: under which was recorded
+    :param n_strokes: number of strokes in all recordings, of at least a tenth of the range of the
+        channel, which is the one with the most
+    :param n_conditions: number of conditions
     """
 
     n_strokes: int
@@ -132,7 +132,7 @@ class PoorExcitation(Finding):
 class ConstantCommand(Finding):
     """
     :param low: smallest value of the command, in its unit
-    :param high: largest one
+    :param high: largest value, in its unit
     """
 
     low: float
@@ -184,9 +184,9 @@ class Stillness(NamedTuple):
 
 def stillness_of(stretches: list[Stretch], resolution: Float64[np.ndarray, " n_obs"]) -> Stillness:
     """
-    A window of rows stands still if each channel either stays within two of its smallest steps, or
-    spreads little and jumps to and fro as noise does, without the smoothness of motion (von
-    Neumann's ratio, the mean squared step by the variance).
+    Detect rest in windows of 0.1 s: each channel either stays within two quantisation steps, or has
+    a small standard deviation and the von Neumann ratio (mean squared step over variance) of white
+    noise.
 
     :param stretches: at least one
     :param resolution: smallest step of each channel, 0 where it has none
@@ -221,16 +221,16 @@ def _median(values: np.ndarray) -> float:
     return float(np.median(values)) if len(values) else 0.0
 
 
-NEEDED = 100  # steps: with fewer, hardly any effect stands out from chance
+NEEDED = 100  # steps: with fewer, hardly any effect is significant
 _THROUGHOUT = 0.95  # share of the time
 _MOSTLY = 0.8  # share of the time
 _WEAK = 5.0  # noise
 _DEPENDENT = 0.999  # share of the variance
-_CONSTANT = 0.01  # of its largest value: a command that varies less tells nothing about its drive
+_CONSTANT = 0.01  # of its largest value: a command that varies less does not excite its drive
 _STROKE = 0.1  # of a channel's range, from one turning point to the next
 # Half of the strokes propose and half confirm. The logarithm of the mean square error of a stroke
 # scatters by about a half: of twenty, the mean has a standard error of 0.11, and a fifth less error
-# (0.22) is just beyond chance at 2.5 %.
+# (0.22) is just significant at 2.5 %.
 _STROKES = 40
 
 
@@ -278,7 +278,7 @@ def excitation(
 
 
 def _strokes(recordings: Sequence[np.ndarray]) -> int:
-    """How often a channel moves one way or the other, counted until there are enough."""
+    """Number of strokes (monotonic motions) of a channel, counted until there are enough."""
     least = _STROKE * (max(x.max() for x in recordings) - min(x.min() for x in recordings))
     n = 0
     for x in recordings:

@@ -30,7 +30,7 @@ Kind = Literal["regular", "rounded", "late", "jittered", "irregular"]
 
 class Clock(NamedTuple):
     """
-    What paced the rows between two gaps.
+    The clock that paced the rows between two gaps.
 
     :param kind: ``"regular"``: each stamp is on a tick; ``"rounded"``: but for the digits that the
         logger keeps; ``"late"``: but for a few; ``"jittered"``: but for errors that do not add up;

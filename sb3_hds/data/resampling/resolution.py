@@ -11,7 +11,7 @@ _FEWEST = 10  # steps that tell
 
 def resolutions(rows: Sequence[np.ndarray]) -> Float64[np.ndarray, " n_obs"]:
     """
-    Of values that were interpolated since, those that stayed equal still tell.
+    Works on interpolated values, too, as long as some of them stayed equal.
 
     :param rows: observations of each stretch, each of shape ``(rows, n_obs)``
     :return: smallest step of each channel whose values are multiples of one, otherwise 0
