@@ -1,5 +1,5 @@
 """
-``sb3-hds``: what is wrong with a simulation, and how robust a policy is, from the command line.
+``sb3-hds``: diagnosis of a simulation and robustness of a policy, from the command line.
 
     sb3-hds diagnose --twin PendulumReal --data 'logs/*.csv' --columns map.yml --report out.html
     sb3-hds diagnose --twin my_module:MyTwin --data 'logs/*.csv' --columns map.yml
@@ -28,9 +28,9 @@ _INTERRUPTED = "sb3-hds: interrupted"
 def main(arguments: Sequence[str] | None = None) -> int:
     """
     :param arguments: as on the command line; default: those of this process
-    :return: 0 on any verdict; 1 where the question makes no sense, with one line on why, or where
-        a twin fails its check; 130 where it is interrupted
-    :raises SystemExit: for words that are no command, with 2
+    :return: 0 on any verdict; 1 for invalid input, with one line on why, or where a twin fails its
+        check; 130 when interrupted
+    :raises SystemExit: with 2, for an unknown command or option
     """
     if arguments is None:
         signal.signal(signal.SIGINT, _stop)
@@ -95,13 +95,18 @@ def parser() -> argparse.ArgumentParser:
 
     every = Parser(
         prog="sb3-hds",
-        description="What a simulation gets wrong, and what a policy endures.",
+        description="Diagnose a simulation with measured data; test how robust a policy is.",
     )
     every.add_argument("--version", action=Version)
     commands = every.add_subparsers(dest="command", required=True, metavar="command")
     ask = commands.add_parser("diagnose", help="name the cause, from measured data")
     measured.add_arguments(ask)
-    ask.add_argument("--calibrate", nargs="*", default=[], help="parameters that are not believed")
+    ask.add_argument(
+        "--calibrate",
+        nargs="*",
+        default=[],
+        help="parameters of which the nominal value is not trusted",
+    )
     ask.add_argument("--effects", nargs="*", help="candidates; default: all, see 'sb3-hds effects'")
     ask.add_argument("--budget", choices=("full", "quick"), default="full")
     ask.add_argument("--seed", type=int, default=0)

@@ -1,4 +1,4 @@
-"""What commands on measured data share: their arguments, the data, the twin, what they write."""
+"""Arguments, data, twins and output files of the commands on measured data."""
 
 import argparse
 import json
@@ -64,12 +64,12 @@ def question(given: argparse.Namespace) -> "tuple[Twin, Trajectories]":
 
 
 def data_of(given: argparse.Namespace) -> "Trajectories":
-    """What ``--data`` names, under the map of ``--columns``."""
+    """The data of ``--data``, read with the map of ``--columns``."""
     return loaded(given, given.columns)
 
 
 def twin_of(given: argparse.Namespace) -> "Twin":
-    """What ``--twin`` and ``--set`` name."""
+    """The twin of ``--twin`` with the settings of ``--set``."""
     return twin_called(given.twin, settings("--set", given.set))
 
 
@@ -89,10 +89,10 @@ def twin_called(name: str, values: Mapping[str, Any]) -> "Twin":
     except NoTwinError as error:
         if ":" in name:
             raise
-        told = str(error).partition("\n")[0]
+        message = str(error).partition("\n")[0]
         raise NoTwinError(
-            f"{told} 'sb3-hds twins' lists what there is. One of your own is --twin module:Name, "
-            "where module.py in this folder registers Name."
+            f"{message} 'sb3-hds twins' lists what there is. One of your own is --twin "
+            "module:Name, where module.py in this folder registers Name."
         ) from None
     return kind(**values)
 
@@ -135,7 +135,7 @@ def check_write(given: argparse.Namespace) -> None:
 
 
 def write_twin(given: argparse.Namespace, twin: "Twin") -> None:
-    """What ``--write`` asks for, if anything."""
+    """Write the file of ``--write``, if there is one."""
     if not given.write:
         return
     if not given.write.endswith(model_files.SUFFIXES):

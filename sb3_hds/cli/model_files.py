@@ -1,4 +1,4 @@
-"""A twin made from the model file of a robot, and a log matched to it by the names of joints."""
+"""Twins from model files, and logs matched to them by the names of joints."""
 
 import argparse
 from collections.abc import Mapping

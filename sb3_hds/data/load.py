@@ -120,11 +120,11 @@ def _read(paths: Sequence[str], said: Columns | None) -> _Read:
     first: _First | None = None
     for path in paths:
         log = _log(path, said)
-        here, told = _understood((said or Columns()).over(log.columns), log)
+        here, remarks = _understood((said or Columns()).over(log.columns), log)
         first = first or _First(path, here, frozenset(log.tables[0]))
         _check_same(first, here, path)
         _check_columns(first, here, log.tables[0], path)
-        notes |= dict.fromkeys(told)
+        notes |= dict.fromkeys(remarks)
         for i, table in enumerate(log.tables):
             name = path if path.startswith(PREFIX) else Path(path).name
             source = name if len(log.tables) == 1 else f"{name}, episode {i}"
@@ -162,7 +162,7 @@ def _paths(files: Any) -> list[str]:
     times = Counter(path if path.startswith(PREFIX) else os.path.realpath(path) for path in found)
     (path, n), *_ = times.most_common(1)
     if n > 1:
-        raise TrajectoryError(f"files names '{path}' {n} times: load each recording once.")
+        raise TrajectoryError(f"files names '{path}' {n} times: a recording is evidence only once.")
     return found
 
 

@@ -27,7 +27,7 @@ _LIMITS = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)
 
 class TorqueGain(ActionEffect):
     r"""
-    The drive does more, or less, than it is told.
+    Scales the command: the drive is stronger or weaker than the model says.
 
     .. math:: u' = k\,u
 
@@ -64,7 +64,7 @@ class MotorLag(ActionEffect):
 
     name = "motor_lag"
     parameters = {"time_constant": Parameter(null=0.0, scale=0.02, unit="s", lower=0.0, upper=2.0)}
-    explanation = "The drive takes time to reach what it is told, as a motor with inductance does."
+    explanation = "The drive takes time to follow its command, as a motor with inductance does."
     source = "Åström and Murray 2021, section 3"
     chained = "time_constant"
     equivalents = {"action_delay": "where commands change slowly compared with either"}
@@ -169,7 +169,7 @@ class ActionDelay(ActionEffect):
 
 class DirectionalGain(ActionEffect):
     r"""
-    The drive does more, or less, than it is told, one way more than the other.
+    Scales the command, by another factor for each sign.
 
     .. math:: u' = \begin{cases} k_+ u & u > 0 \\ k_- u & u \le 0 \end{cases}
 

@@ -1,4 +1,4 @@
-"""What a diagnosis is worth for the policy: return on the real system."""
+"""The policy gain of a diagnosis: the return on the real system."""
 
 import dataclasses
 import inspect
@@ -37,8 +37,7 @@ _LEVEL = 0.9
 class Return:
     """
     :param mean: interquartile mean over runs and episodes
-    :param low: lower end of its 90 % interval, by bootstrap over runs; None with a single run,
-        which tells nothing of how others would differ
+    :param low: lower end of its 90 % interval, by bootstrap over runs; None for a single run
     :param high: upper end
     """
 
@@ -54,7 +53,7 @@ class PolicyGain:
 
     :param returns: by simulation (``"believed"``, ``"extended"``, and ``"true"`` where there is
         one): one row for each run, one column for each start state, shape ``(runs, episodes)``
-    :param gain: of the extended over the believed twin, paired by run and start state
+    :param gain: of the extended over the nominal twin, paired by run and start state
     """
 
     returns: Mapping[str, Float[np.ndarray, "runs episodes"]]
@@ -67,8 +66,8 @@ class PolicyGain:
     @property
     def share_of_ceiling(self) -> float | None:
         """
-        How much of the gap to policies from the true twin was closed; None where there is none, or
-        no gap.
+        Share of the gap to policies from the true twin that was closed; None without such a twin,
+        or without a gap.
         """
         if "true" not in self.returns:
             return None
@@ -97,11 +96,11 @@ class PolicyGain:
         return write_bytes(path, as_png(plot_policy_gain(self.to_dict())))
 
     def __str__(self) -> str:
-        told = policy_in_words(self.to_dict())
-        lines = textwrap.wrap(f"{told.measured}:", 80)
-        for name, value, *interval in (told.columns, *told.rows):
+        words = policy_in_words(self.to_dict())
+        lines = textwrap.wrap(f"{words.measured}:", 80)
+        for name, value, *interval in (words.columns, *words.rows):
             lines.append(f"  {name:<22} {value:>9}   {''.join(interval)}".rstrip())
-        for note in told.notes:
+        for note in words.notes:
             lines += textwrap.wrap(note, 80)
         return "\n".join(lines)
 
@@ -121,23 +120,23 @@ def measure_policy_gain(
     **arguments: Any,
 ) -> PolicyGain:
     """
-    Train with the same budget in the old and in the extended twin, and act on the real system.
+    Train with the same budget in the nominal and in the extended twin, and act on the real system.
 
     Runs with the same seed differ in the twin only, and all act from the same start states. Where
     ``env`` is one of our stand-ins for hardware, or made of a twin, policies from its true twin are
     the ceiling.
 
     :param diagnosis: whose ``believed`` and extended ``twin`` are compared
-    :param env: the real system, its id, or a function that makes it; one that has no limit of steps
-        gets the believed twin's
+    :param env: the real system, its id, or a function that makes it; without a step limit it gets
+        that of the nominal twin
     :param algorithm: trained in the simulations only
     :param budget: steps of the simulated environment; 0 is enough for PODS and HDS, which plan in
         their twin before they act
     :param seeds: runs in each simulation
     :param n_episodes: start states on the real system
-    :param ceiling: whether policies from the true twin are trained too, where there is one; or that
+    :param ceiling: whether policies are also trained in the true twin, where there is one; or that
         twin
-    :param progress: whether a bar shows how far it is
+    :param progress: whether to show a progress bar
     :param arguments: of the algorithm
     :return: returns by simulation, and the gain with its interval
     :raises TrajectoryError: for a twin without task, fewer than one run or episode, or an algorithm
@@ -175,9 +174,9 @@ def check_question(
     arguments: Mapping[str, Any],
 ) -> None:
     """
-    What :func:`measure_policy_gain` refuses, for whoever wants to know before there is a diagnosis.
+    The checks of :func:`measure_policy_gain`, which need no diagnosis.
 
-    :param believed: the twin as it is believed
+    :param believed: the nominal twin
     :param arguments: of the algorithm
     :raises TrajectoryError: as there
     :raises ParameterError: as there

@@ -109,8 +109,8 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
                 f"'{source}' was not written by Trajectories.save: it holds Python objects, which "
                 "would have to be unpickled, and no file is. Save arrays of numbers."
             ) from error
-        told = " ".join(str(error).split())[:200]
-        reason = "it holds no arrays of numbers" if "pickle" in told else told
+        message = " ".join(str(error).split())[:200]
+        reason = "it holds no arrays of numbers" if "pickle" in message else message
         raise TrajectoryError(
             f"'{source}' is damaged or was not written by Trajectories.save ({reason}). "
             "Restore it from a copy, or record it again."

@@ -214,8 +214,8 @@ class Reading:
             lines.append(_row(width, name, r.rows, interval, len(r.repeated), len(r.gaps)))
         if len(self.recordings) > _LISTED:
             lines.append(f"  and {len(self.recordings) - _LISTED} more")
-        told = [self.clocks(), self.summary(), *self.notes]
-        return "\n".join([*lines, *(line for text in told for line in _wrapped(text))])
+        paragraphs = [self.clocks(), self.summary(), *self.notes]
+        return "\n".join([*lines, *(line for text in paragraphs for line in _wrapped(text))])
 
 
 def _regular(some: list[Sampling], kept: bool) -> str:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-_NEAR = 50  # smallest steps: beyond, quantisation cannot be told from rounding
+_NEAR = 50  # smallest steps: beyond, quantisation cannot be distinguished from rounding
 _FEWEST = 10  # steps that tell
 
 

@@ -1,4 +1,4 @@
-"""What a reward depends on: the action alone, or something that the observation does not tell."""
+"""Regression tests of what a reward depends on beyond the observation."""
 
 import numpy as np
 
@@ -17,10 +17,10 @@ _BLOCKS = 10
 
 def explained_by(sample: Sample) -> tuple[float, float, float] | None:
     """
-    Regress rewards on observation and action, and see whether what was before says more.
+    Regress rewards on observation and action, then on earlier ones as well.
 
-    :return: the shares of the variance that observation and action leave open, that remain with the
-        last action known too, and with the last observation; None where there is nothing to regress
+    :return: unexplained shares of the variance given observation and action, given the last action
+        too, and given the last observation too; None where there is nothing to regress
     """
     later = np.flatnonzero(sample.age > 0)
     reward = sample.rewards[later]
@@ -41,26 +41,26 @@ def explained_by(sample: Sample) -> tuple[float, float, float] | None:
 
 
 def knows_last_action(sample: Sample) -> bool:
-    """:return: whether every entry of the last action can be read off the observation"""
+    """:return: whether the observation contains every entry of the last action"""
     later = np.flatnonzero(sample.age > 0)
     obs, last = _scaled(sample.obs)[later], sample.actions[later - 1]
     return all(_left_open(obs, column) < _KNOWN for column in last.T)
 
 
 def of_action_alone(sample: Sample) -> bool:
-    """:return: whether a quadratic function of the action is all that was paid"""
+    """:return: whether the reward is a quadratic function of the action alone"""
     if len(sample.rewards) < _FEWEST or not sample.actions.shape[1]:
         return False
     return _left_open(_quadratic(_scaled(sample.actions)), sample.rewards) < _NOTHING
 
 
 def is_missing(before: float, after: float) -> bool:
-    """:return: whether what was added explains most of what was open, and that was something"""
+    """:return: whether the added regressors explain most of a substantial residual"""
     return before > _MATERIAL and after < _RECOVERED * before
 
 
 def _left_open(features: np.ndarray, target: np.ndarray) -> float:
-    """Share of the variance that a ridge regression leaves open in blocks that it has not seen."""
+    """Unexplained share of the variance of a ridge regression, cross-validated in blocks."""
     block = np.arange(len(target)) * _BLOCKS // len(target)
     open_, total = 0.0, 0.0
     for seen, other in ((block % 2 == 0, block % 2 == 1), (block % 2 == 1, block % 2 == 0)):
@@ -76,7 +76,7 @@ def _left_open(features: np.ndarray, target: np.ndarray) -> float:
 
 
 def _quadratic(x: np.ndarray) -> np.ndarray:
-    """All products of two where there are few, squares otherwise."""
+    """All pairwise products where there are few regressors, squares otherwise."""
     n, width = x.shape
     if width * (width + 1) // 2 > n // 8:
         return np.hstack([x, x**2])

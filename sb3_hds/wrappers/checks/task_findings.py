@@ -1,4 +1,4 @@
-"""What makes a task hard to learn for no good reason, one function for each."""
+"""Properties that make a task needlessly hard to learn, one function for each."""
 
 import math
 
@@ -75,7 +75,7 @@ def action_space(space: spaces.Space) -> list[str]:
 
 
 def reward_variety(sample: Sample) -> list[str]:
-    """A reward that says something must not be the same everywhere."""
+    """An informative reward must vary."""
     inner = sample.rewards[~sample.terminated]
     if not len(inner):
         return []
@@ -125,7 +125,7 @@ def reward_scale(sample: Sample, gamma: float) -> list[str]:
 
 
 def missing_state(sample: Sample) -> list[str]:
-    """The reward depends on what the observation does not contain."""
+    """Rewards that depend on unobserved quantities."""
     found = explained_by(sample)
     if found is None or not np.isfinite(sample.obs).all():
         return []
@@ -149,7 +149,7 @@ def missing_state(sample: Sample) -> list[str]:
 
 
 def rewarded_end(sample: Sample, gamma: float) -> list[str]:
-    """Where living costs, the end is a relief."""
+    """Where each step costs, termination is rewarded."""
     ends = np.flatnonzero(sample.terminated)
     if len(ends) < _FEWEST_ENDS or sample.success[ends].mean() > _HALF:
         return []
@@ -169,7 +169,7 @@ def rewarded_end(sample: Sample, gamma: float) -> list[str]:
 
 
 def horizon(sample: Sample, gamma: float) -> list[str]:
-    """How far a discount looks, against how long an episode is."""
+    """The horizon of the discount against the length of episodes."""
     ahead = 1.0 / (1.0 - gamma)
     if not len(sample.lengths) and sample.limit is None:
         return [
@@ -201,7 +201,7 @@ def horizon(sample: Sample, gamma: float) -> list[str]:
 
 
 def _late(sample: Sample, gamma: float) -> list[str]:
-    """Where all that is paid is paid long after the start."""
+    """Where rewards come long after the start only."""
     values, counts = np.unique(sample.rewards, return_counts=True)
     special = sample.rewards != values[counts.argmax()]
     if not special.any() or special.mean() > 5 * _RARE:
