@@ -224,8 +224,8 @@ def _lost_observations(env: VecEnv, seen: Seen) -> list[str]:
     if strange:
         return [
             f"In {len(strange)} of {counted(len(reported), 'end')}, "
-            f"infos[i]['terminal_observation'] was {_shape(strange[0].last_obs)} instead of one observation of "
-            f"{env.observation_space}. Put the row of that copy there."
+            f"infos[i]['terminal_observation'] was {_shape(strange[0].last_obs)} instead of one "
+            f"observation of {env.observation_space}. Put the row of that copy there."
         ]
     # Where all episodes begin alike, an episode may as well end where it began.
     starts_differ = any(not is_same(end.first_obs, reported[0].first_obs) for end in reported)
@@ -234,8 +234,8 @@ def _lost_observations(env: VecEnv, seen: Seen) -> list[str]:
         return []
     return [
         f"In {n} of {counted(len(reported), 'end')}, infos[i]['terminal_observation'] was what "
-        "step() returned as well: it is either the first observation of the next episode, whose value "
-        "has nothing to do with the step before, or the copy was not reset. Keep the last "
+        "step() returned as well: it is either the first observation of the next episode, whose "
+        "value has nothing to do with the step before, or the copy was not reset. Keep the last "
         "observation before resetting, and return the first one of the next episode."
     ]
 
