@@ -114,14 +114,14 @@ def parser() -> argparse.ArgumentParser:
     ask.add_argument("--animate", help="MP4 film to write: measured and predicted motion")
     ask.add_argument("--json", help="JSON file to write")
     measured.add_write(ask)
-    worth = ask.add_argument_group("what it buys", "policies from both twins, on the real system")
-    worth.add_argument("--env", help="id of the real system")
-    worth.add_argument("--env-kwargs", nargs="*", default=[], metavar="NAME:VALUE", help="of it")
-    worth.add_argument("--algo", default="hds", help="id in the zoo; default: hds")
-    worth.add_argument("--policies", type=int, default=5, help="trained in each twin; default: 5")
-    worth.add_argument("--policy-budget", type=int, default=0, help="steps of training in a twin")
-    worth.add_argument("--episodes", type=int, default=20, help="for each policy; default: 20")
-    worth.add_argument(
+    gain = ask.add_argument_group("policy gain", "policies from both twins, on the real system")
+    gain.add_argument("--env", help="id of the real system")
+    gain.add_argument("--env-kwargs", nargs="*", default=[], metavar="NAME:VALUE", help="of it")
+    gain.add_argument("--algo", default="hds", help="id in the zoo; default: hds")
+    gain.add_argument("--policies", type=int, default=5, help="trained in each twin; default: 5")
+    gain.add_argument("--policy-budget", type=int, default=0, help="steps of training in a twin")
+    gain.add_argument("--episodes", type=int, default=20, help="for each policy; default: 20")
+    gain.add_argument(
         "--hyperparams", nargs="*", default=[], metavar="NAME:VALUE", help="of the algorithm"
     )
     audit.add_arguments(commands.add_parser("audit", help="find defects of measured data"))

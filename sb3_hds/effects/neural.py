@@ -130,8 +130,8 @@ class NeuralForce(ForceEffect):
         :return: standard deviation of the members, in units of the normalised output; the largest
             over the joints
         """
-        spread = jnp.std(self.forces(q, v, actuator, own), 0)
-        return jnp.max(spread / own["output_scale"])
+        std = jnp.std(self.forces(q, v, actuator, own), 0)
+        return jnp.max(std / own["output_scale"])
 
     def doubt(self, twin: "Twin", state: Any, action: Action, base: Params, own: Params) -> Scalar:
         if not self.caution:

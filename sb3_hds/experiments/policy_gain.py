@@ -71,8 +71,8 @@ class PolicyGain:
         """
         if "true" not in self.returns:
             return None
-        believed, extended, true = (self.of(s).mean for s in ("believed", "extended", "true"))
-        return (extended - believed) / (true - believed) if true > believed else None
+        nominal, extended, true = (self.of(s).mean for s in ("believed", "extended", "true"))
+        return (extended - nominal) / (true - nominal) if true > nominal else None
 
     def to_dict(self) -> dict[str, Any]:
         """:return: numbers as plain data for JSON"""
@@ -150,8 +150,8 @@ def measure_policy_gain(
     if step_limit_of(made) is None:
         real = TimeLimit(made, diagnosis.believed.max_episode_steps)  # type: ignore[arg-type]
     simulations = {"believed": diagnosis.believed, "extended": diagnosis.twin}
-    if (truth := _truth(real, ceiling)) is not None:
-        simulations["true"] = truth
+    if (true := _true_twin(real, ceiling)) is not None:
+        simulations["true"] = true
     runs = [(name, seed) for seed in range(seeds) for name in simulations]
     returns: dict[str, list[np.ndarray]] = {name: [] for name in simulations}
     for name, seed in track(runs, "training", transient=True, disable=not progress):
@@ -165,7 +165,7 @@ def measure_policy_gain(
 
 
 def check_question(
-    believed: Twin,
+    nominal: Twin,
     real: gymnasium.Env,
     algorithm: type[BaseAlgorithm],
     budget: int,
@@ -176,7 +176,7 @@ def check_question(
     """
     The checks of :func:`measure_policy_gain`, which need no diagnosis.
 
-    :param believed: the nominal twin
+    :param nominal: the nominal twin
     :param arguments: of the algorithm
     :raises TrajectoryError: as there
     :raises ParameterError: as there
@@ -198,12 +198,12 @@ def check_question(
             f"{algorithm.__name__} learns nothing in 0 steps: give it a budget, for example "
             "10,000 steps."
         )
-    if believed.max_episode_steps is None:
+    if nominal.max_episode_steps is None:
         raise TrajectoryError(
-            f"{believed.name} has no episode length, so no task to be good at. "
+            f"{nominal.name} has no episode length, so no task to be good at. "
             "Give its class max_episode_steps and a reward."
         )
-    _check_same_signals(real, believed)
+    _check_same_signals(real, nominal)
 
 
 def _made(env: gymnasium.Env | str | Callable[[], gymnasium.Env]) -> gymnasium.Env:
@@ -218,12 +218,12 @@ def _made(env: gymnasium.Env | str | Callable[[], gymnasium.Env]) -> gymnasium.E
     return made
 
 
-def _check_same_signals(real: gymnasium.Env, believed: Twin) -> None:
-    simulated = TwinEnv(believed)
+def _check_same_signals(real: gymnasium.Env, nominal: Twin) -> None:
+    simulated = TwinEnv(nominal)
     ours, theirs = simulated.observation_space.shape, real.observation_space.shape
     if ours != theirs:
         raise EnvironmentMismatchError(
-            f"The real system has observations of shape {theirs}, {believed.name} of shape {ours}. "
+            f"The real system has observations of shape {theirs}, {nominal.name} of shape {ours}. "
             "A policy from the one cannot act on the other: wrap the system, so that it reports "
             "what the twin does."
         )
@@ -235,7 +235,7 @@ def _check_same_signals(real: gymnasium.Env, believed: Twin) -> None:
     ):
         shown = "no Box" if not isinstance(theirs, gymnasium.spaces.Box) else _range(theirs)
         raise EnvironmentMismatchError(
-            f"The real system takes actions in {shown}, {believed.name} in {_range(ours)}. Wrap "
+            f"The real system takes actions in {shown}, {nominal.name} in {_range(ours)}. Wrap "
             "the system, so that the same number means the same."
         )
 
@@ -245,7 +245,7 @@ def _range(space: gymnasium.spaces.Box) -> str:
     return f"{low} to {high}"
 
 
-def _truth(real: gymnasium.Env, ceiling: bool | Twin) -> Twin | None:
+def _true_twin(real: gymnasium.Env, ceiling: bool | Twin) -> Twin | None:
     """The twin that is the real system; None where nobody knows it, or nobody asks."""
     if isinstance(ceiling, Twin):
         return ceiling

@@ -19,10 +19,10 @@ _STEADY = (0.5, 1.6)  # of the speed: steps around a repeated value, or it may b
 _STUCK = 20  # samples
 _PLATEAU = 5  # samples
 _MOVES, _CREEPS = 0.3, 0.05  # of the usual step of a channel
-_LARGE = 0.2  # of the spread of a channel: what a jump exceeds
+_LARGE = 0.2  # of the standard deviation of a channel: what a jump exceeds
 _ISOLATED = 6.0  # times the steps around it
-_NEAR_START = 0.05  # of the spread of a channel
-_AT_START = 1e-6  # of the spread of a channel
+_NEAR_START = 0.05  # of the standard deviation of a channel
+_AT_START = 1e-6  # of the standard deviation of a channel
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,19 +224,19 @@ def reinitialised(
     usual = _Usual.of(stretches)
     if usual is None:
         return []
-    at_start = _AT_START * usual.spread if (resolution == 0.0).any() else np.full(len(names), -1.0)
+    at_start = _AT_START * usual.std if (resolution == 0.0).any() else np.full(len(names), -1.0)
     places: dict[bool, list[Place]] = {True: [], False: []}
     sizes = {True: np.zeros(len(names)), False: np.zeros(len(names))}
     for stretch in stretches:
         jumps = np.diff(stretch.obs, axis=0)
-        large = np.abs(jumps) > np.maximum(_LARGE * usual.spread, 10.0 * resolution)
+        large = np.abs(jumps) > np.maximum(_LARGE * usual.std, 10.0 * resolution)
         large &= ~whole_turns(jumps, usual.step)
         isolated = large & _isolated(jumps, usual.step)
-        sharp = np.pad(_bends(stretch.obs, usual.spread) > usual.bend, (1, 0))
+        sharp = np.pad(_bends(stretch.obs, usual.std) > usual.bend, (1, 0))
         goes_on = np.append(jumps[1:].any(axis=1), True)
         for k in np.flatnonzero(large.any(axis=1)):
             away = np.abs(stretch.obs[k + 1] - usual.starts)
-            back = bool((away <= _NEAR_START * usual.spread + 2.0 * usual.step).all(1).any())
+            back = bool((away <= _NEAR_START * usual.std + 2.0 * usual.step).all(1).any())
             exactly = bool((away <= at_start).all(1).any() and sharp[k] and goes_on[k])
             if exactly or isolated[k].sum() > (not back and len(names) > 1):
                 to_start = back or exactly
@@ -259,31 +259,31 @@ class _Usual(NamedTuple):
     Typical motion over all recordings.
 
     :param step: 90 % quantile of the step from sample to sample, for each channel
-    :param bend: 90 % quantile of the change of the step, in units of ``spread``
-    :param spread: standard deviation of each channel
+    :param bend: 90 % quantile of the change of the step, in units of ``std``
+    :param std: standard deviation of each channel
     :param starts: first sample of each recording
     """
 
     step: np.ndarray
     bend: float
-    spread: np.ndarray
+    std: np.ndarray
     starts: np.ndarray
 
     @classmethod
     def of(cls, stretches: Sequence[Stretch]) -> "_Usual | None":
         steps = np.abs(np.concatenate([np.diff(stretch.obs, axis=0) for stretch in stretches]))
         moving = steps[steps.any(axis=1)]
-        spread = joined(stretches).std(axis=0)
-        bends = np.concatenate([_bends(stretch.obs, spread) for stretch in stretches])
+        std = joined(stretches).std(axis=0)
+        bends = np.concatenate([_bends(stretch.obs, std) for stretch in stretches])
         if not len(moving) or not len(bends):
             return None
         starts = np.array([stretch.obs[0] for stretch in stretches])
-        return cls(np.quantile(moving, 0.9, 0), float(np.quantile(bends, 0.9)), spread, starts)
+        return cls(np.quantile(moving, 0.9, 0), float(np.quantile(bends, 0.9)), std, starts)
 
 
-def _bends(x: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Largest change of the step at each inner row, in units of the spread."""
-    return np.max(np.abs(np.diff(x, 2, axis=0)) / np.where(spread > 0.0, spread, np.inf), axis=1)
+def _bends(x: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Largest change of the step at each inner row, in units of the standard deviation."""
+    return np.max(np.abs(np.diff(x, 2, axis=0)) / np.where(std > 0.0, std, np.inf), axis=1)
 
 
 def _moves_on(x: np.ndarray, a: int, b: int, fast: float) -> bool:

@@ -13,8 +13,8 @@ from sb3_hds.data.audit.stretches import Stretch, all_samples, joined
 
 _SECONDS, _FEWEST, _MOST = 0.1, 12, 100  # length of a window, and its limits in rows
 _WHITE = 0.5  # mean squared step by variance: 2 for white noise, 0 for smooth motion
-_SMALL = 0.3  # of the spread of a channel: what is larger is motion
-_ALL_NOISE = 3.0  # a channel that spreads no further than this times its noise does not move
+_SMALL = 0.3  # of the standard deviation of a channel: what is larger is motion
+_ALL_NOISE = 3.0  # times the noise: a channel with a smaller standard deviation does not move
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,16 +196,16 @@ def stillness_of(stretches: list[Stretch], resolution: Float64[np.ndarray, " n_o
         return Stillness(0.0, np.full(len(resolution), np.nan), 0)
     # Deviations, steps, ranges: one array per window and channel, whatever its number of rows.
     parts = [part for part in windows if len(part)]
-    spread = np.concatenate([part.std(axis=1, ddof=1) for part in parts])
+    std = np.concatenate([part.std(axis=1, ddof=1) for part in parts])
     step = np.concatenate([np.sqrt(np.mean(np.diff(p, axis=1) ** 2, axis=1)) for p in parts])
     width = np.concatenate([np.ptp(part, axis=1) for part in parts])
     overall = joined(stretches).std(axis=0)
-    jitters = step**2 >= _WHITE * spread**2
-    floor = np.array([_median(s[j]) for s, j in zip(spread.T, jitters.T, strict=True)])
-    small = (spread <= _SMALL * overall) | (overall <= _ALL_NOISE * floor)
+    jitters = step**2 >= _WHITE * std**2
+    floor = np.array([_median(s[j]) for s, j in zip(std.T, jitters.T, strict=True)])
+    small = (std <= _SMALL * overall) | (overall <= _ALL_NOISE * floor)
     still = ((width <= 2.01 * resolution) | (jitters & small)).all(axis=1)
     noise = (
-        np.sqrt(np.mean(spread[still] ** 2, axis=0)) if still.any() else np.full_like(floor, np.nan)
+        np.sqrt(np.mean(std[still] ** 2, axis=0)) if still.any() else np.full_like(floor, np.nan)
     )
     return Stillness(float(still.mean()), noise, len(still))
 
@@ -256,8 +256,8 @@ def excitation(
         return [*found, StandingStill("all channels", places, stillness.share if moves else 1.0)]
     if stillness.share >= _MOSTLY:
         found.append(MostlyStill("all channels", places, stillness.share))
-    spread = x.std(axis=0)
-    ratios = spread / np.maximum(stillness.noise, 1e-300)  # nan where the noise is not known
+    std = x.std(axis=0)
+    ratios = std / np.maximum(stillness.noise, 1e-300)  # nan where the noise is not known
     if (ratios < _WEAK).all():
         return [*found, WithinNoise("all channels", places, float(ratios.max()))]
     weak = zip(obs, ratios.tolist(), strict=True)
