@@ -93,30 +93,40 @@ class CPGPrior(TransformLayer):
         observe_state: bool = True,
         store: str = "raw",
     ) -> None:
-        given = {k: v for k, v in locals().items() if k not in ("self", "env", "__class__")}
+        passed_on = {
+            "mode": mode,
+            "amplitude": amplitude,
+            "offset": offset,
+            "phase": phase,
+            "kp": kp,
+            "kd": kd,
+            "action_range": action_range,
+            "amplitude_factor": amplitude_factor,
+            "frequency_factor": frequency_factor,
+            "amplitude_gain": amplitude_gain,
+            "position": position,
+            "velocity": velocity,
+        }
+        arguments = passed_on | {
+            "omega_swing": omega_swing,
+            "omega_stance": omega_stance,
+            "control": control,
+            "dt": dt,
+            "observe_state": observe_state,
+            "store": store,
+        }
         check_bounded(type(self), env.action_space)
         n = spaces.flatdim(env.action_space)
         self._joints = _tracked(env, control, n, bool(position))
         rhythm = Rhythm(
-            mode=mode,
             omega_swing=omega_swing,
             omega_stance=omega_swing if omega_stance is None else omega_stance,
-            amplitude=amplitude,
-            offset=offset,
-            phase=phase,
-            kp=kp,
-            kd=kd,
-            action_range=action_range,
-            amplitude_factor=amplitude_factor,
-            frequency_factor=frequency_factor,
-            amplitude_gain=amplitude_gain,
-            position=position,
-            velocity=velocity,
             dt=interval_of(env, EnvironmentMismatchError, drawn=True) if dt is None else float(dt),
             observed=observe_state,
+            **passed_on,
         )
         self.rhythm = rhythm.sized(n)
-        super().__init__(env, self.rhythm, store, given)
+        super().__init__(env, self.rhythm, store, arguments)
         self.action_space = spaces.Box(-1.0, 1.0, (self.rhythm.n_actions,), np.float32)
         self._target = self._command = np.zeros(n)
 

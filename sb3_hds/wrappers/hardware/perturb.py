@@ -43,7 +43,14 @@ class Perturb(gymnasium.Wrapper, RecordConstructorArgs):
         push: float = 0.0,
         push_probability: float = 0.05,
     ) -> None:
-        given = {k: v for k, v in locals().items() if k not in ("self", "env", "__class__")}
+        given = {
+            "noise": noise,
+            "failing": failing,
+            "sensor": sensor,
+            "constant": constant,
+            "push": push,
+            "push_probability": push_probability,
+        }
         RecordConstructorArgs.__init__(self, **given)
         gymnasium.Wrapper.__init__(self, env)
         space = env.observation_space
