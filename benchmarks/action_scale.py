@@ -1,5 +1,5 @@
 """
-Does a small range of actions learn faster, and a large one end better? A car on an oval.
+The range of actions against learning speed and final return: a car on an oval.
 
     python benchmarks/action_scale.py [--seeds 5] [--steps 6000] [--figure]
     python benchmarks/action_scale.py --steering        # and all of the speed's range

@@ -1,5 +1,5 @@
 """
-HDS with its default arguments on every other task: return in the environment itself, and wall time.
+HDS with default arguments on the other control tasks: return in the environment, and wall time.
 
     python benchmarks/control_tasks.py [--seeds 3]
 

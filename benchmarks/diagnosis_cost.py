@@ -1,5 +1,5 @@
 """
-What a diagnosis costs against the number of recordings.
+The cost of a diagnosis against the number of recordings.
 
     python benchmarks/diagnosis_cost.py
     python benchmarks/diagnosis_cost.py --systems pendulum --recordings 10 30 --budgets quick

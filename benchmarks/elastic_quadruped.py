@@ -1,5 +1,5 @@
 """
-A quadruped with springs: RL alone, an optimised rhythm, and both, in which order.
+A quadruped with series elasticity: RL alone, an optimised rhythm, and combinations of both.
 
     python benchmarks/elastic_quadruped.py              # 50,000 steps, three seeds
     python benchmarks/elastic_quadruped.py --figure     # draw the figure again from the table

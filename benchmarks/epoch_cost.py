@@ -1,6 +1,5 @@
 """
-What one planning epoch costs against the number of rollouts, and where a cold start spends its
-time.
+The cost of a planning epoch against the number of rollouts, and a profile of a cold start.
 
     python benchmarks/epoch_cost.py
 

@@ -1,5 +1,5 @@
 """
-What smooth exploration costs: return against continuity, unstructured noise and gSDE.
+The price of smooth exploration: return against continuity, for white noise and gSDE.
 
     python benchmarks/gsde_continuity.py                 # two environments, three seeds
     python benchmarks/gsde_continuity.py --figure        # draw the figure again from the table

@@ -1,4 +1,4 @@
-"""Stand-ins for hardware that its data sheet describes wrongly, and how policies do on them."""
+"""Stand-ins for hardware with wrong data sheets, and the returns of policies on them."""
 
 from pathlib import Path
 

@@ -1,5 +1,5 @@
 """
-What each part of HDS is worth: one changed at a time, on hardware that wore out.
+Ablations of HDS: one part changed at a time, on a stand-in for worn hardware.
 
     python benchmarks/hds_parts.py                        # beta, parts and weaknesses, five seeds
     python benchmarks/hds_parts.py --tables parts --seeds 2 --jobs 1

@@ -1,5 +1,5 @@
 """
-The cases of `hidden_effects.py`: what is planted where, how large, and what is recorded of it.
+The cases of `hidden_effects.py`: planted effects, their places and sizes, and the recordings.
 
 Everything about a case follows from its system and its number. Kinds of cases, effects, sizes,
 noises and numbers of recordings are dealt like cards: each comes up in its share, not by chance.

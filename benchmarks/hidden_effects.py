@@ -1,5 +1,5 @@
 """
-Does `diagnose` find what was hidden in data, and keep quiet where nothing was?
+Detection and false-alarm rates of `diagnose` on data with and without hidden effects.
 
     python benchmarks/hidden_effects.py --cases 1000 --jobs 2
     python benchmarks/hidden_effects.py --cases 100 --systems pendulum furuta --kinds null

@@ -1,4 +1,4 @@
-"""What came out of `hidden_effects.py`: rates beside the targets, tables, a picture."""
+"""The scores of `hidden_effects.py`: rates beside the targets, tables, a picture."""
 
 import json
 from collections.abc import Callable, Sequence

@@ -1,5 +1,5 @@
 """
-What importing the package costs beside its peers.
+The import time of the package beside its peers.
 
     python benchmarks/import_time.py
 

@@ -1,4 +1,4 @@
-"""What a few seeds say: intervals by the bootstrap over seeds, as rliable has them."""
+"""Bootstrap confidence intervals over seeds, as in rliable."""
 
 from collections.abc import Sequence
 
@@ -40,8 +40,8 @@ def of_iqm(groups: Sequence[np.ndarray]) -> tuple[float, float, float]:
     return float(trim_mean(np.concatenate(groups), 0.25)), *_limits(middles)
 
 
-def chance_of_more(ours: Sequence[float], theirs: Sequence[float]) -> float:
-    """:return: the chance that a run of ours earns more than one of theirs; ties count half"""
+def probability_of_improvement(ours: Sequence[float], theirs: Sequence[float]) -> float:
+    """:return: the probability that a run of ours earns more than one of theirs; ties count half"""
     above = np.subtract.outer(np.asarray(ours, float), np.asarray(theirs, float))
     return float(np.mean((above > 0.0) + 0.5 * (above == 0.0)))
 

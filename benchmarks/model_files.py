@@ -1,5 +1,5 @@
 """
-What a twin from a model file costs, against the number of its joints and of its rows.
+The cost of a twin from a model file, against the number of its joints and of its rows.
 
     python benchmarks/model_files.py
     python benchmarks/model_files.py --joints 1 7 30 --rows 64

@@ -1,5 +1,5 @@
 """
-How long the learners of ``model_free.py`` take for a step: all by turns, in one process.
+Time per step of the learners of ``model_free.py``, interleaved in one process.
 
     taskset -c 0 python benchmarks/model_free_pace.py                       # Pendulum-v1
     taskset -c 0 python benchmarks/model_free_pace.py --env HalfCheetah-v5 --methods sac td7

@@ -1,5 +1,5 @@
 """
-What the runs of ``model_free.py`` say: each method beside its peers and its paper.
+The tables and figures of ``model_free.py``: each method beside its peers and its paper.
 
 Intervals are those of means over seeds (see ``intervals.py``): of five seeds they are rough, of two
 little more than the spread.
@@ -131,7 +131,9 @@ def beside_peers(runs: pd.DataFrame) -> pd.DataFrame:
                 row = {"env": env, "method": method, "peer": peer, "mark": at}
                 row |= {"return": mine.mean(), "of_peer": their_mean, "low_of_peer": their_low}
                 row |= {"difference": difference, "low": low, "high": high}
-                row |= {"chance_of_more": intervals.chance_of_more(mine, theirs)}
+                row |= {
+                    "probability_of_improvement": intervals.probability_of_improvement(mine, theirs)
+                }
                 worse = "yes" if mine.mean() < their_low else "no"
                 row |= {"worse": "" if np.isnan(their_low) else worse}
                 rows.append(row | {"seeds": f"{len(mine)} and {len(theirs)}"})

@@ -1,5 +1,5 @@
 """
-A load is hung on in the middle: how many episodes until a learner is what it was?
+A payload added during training: the number of episodes until a learner has recovered.
 
     python benchmarks/payload_added.py [--seeds 5] [--jobs 2]
 

@@ -1,5 +1,5 @@
 """
-What a diagnosis buys: policies from the believed, the extended and the true twin, in reality.
+The policy gain of a diagnosis: policies from the nominal, the extended and the true twin.
 
     python benchmarks/policy_gain.py                # three hidden causes, five seeds
     python benchmarks/policy_gain.py --figure       # draw the figure again from the table

@@ -1,5 +1,5 @@
 """
-What noise, failed sensors and pushes leave of a return: open-loop gaits, and what learned a task.
+Returns under sensor noise, sensor failure and pushes: open-loop gaits and learned policies.
 
     python benchmarks/robustness.py                                 # published gaits
     python benchmarks/robustness.py --learners sac --steps 200000   # and what is learned there

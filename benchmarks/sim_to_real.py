@@ -1,5 +1,5 @@
 """
-The gap between simulation and reality, and who closes it with how many real steps.
+The gap between simulation and reality, and how much of it each method closes per real step.
 
     python benchmarks/sim_to_real.py                       # all cells and methods, five seeds
     python benchmarks/sim_to_real.py --cells heavy --seeds 2 --jobs 1

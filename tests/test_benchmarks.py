@@ -94,4 +94,4 @@ def test_intervals_are_those_of_rliable():
     apart = 3.0 * 2.0 * ours.std() / np.sqrt(5) * np.sqrt(0.025 * 0.975 / 10_000) / 0.0584
     np.testing.assert_allclose([low, high], limits["ours"][:, 0], atol=apart)
     chance = metrics.probability_of_improvement(ours[:, None], theirs[:, None])
-    assert intervals.chance_of_more(ours, theirs) == pytest.approx(chance)
+    assert intervals.probability_of_improvement(ours, theirs) == pytest.approx(chance)

@@ -1,5 +1,5 @@
 """
-``sb3-hds``: what is wrong with a simulation, and how robust a policy is, from the command line.
+``sb3-hds``: diagnosis of a simulation and robustness of a policy, from the command line.
 
     sb3-hds diagnose --twin PendulumReal --data 'logs/*.csv' --columns map.yml --report out.html
     sb3-hds diagnose --twin my_module:MyTwin --data 'logs/*.csv' --columns map.yml
@@ -28,9 +28,9 @@ _INTERRUPTED = "sb3-hds: interrupted"
 def main(arguments: Sequence[str] | None = None) -> int:
     """
     :param arguments: as on the command line; default: those of this process
-    :return: 0 on any verdict; 1 where the question makes no sense, with one line on why, or where
-        a twin fails its check; 130 where it is interrupted
-    :raises SystemExit: for words that are no command, with 2
+    :return: 0 on any verdict; 1 for invalid input, with one line on why, or where a twin fails its
+        check; 130 when interrupted
+    :raises SystemExit: with 2, for an unknown command or option
     """
     if arguments is None:
         signal.signal(signal.SIGINT, _stop)
@@ -95,13 +95,18 @@ def parser() -> argparse.ArgumentParser:
 
     every = Parser(
         prog="sb3-hds",
-        description="What a simulation gets wrong, and what a policy endures.",
+        description="Diagnose a simulation with measured data; test how robust a policy is.",
     )
     every.add_argument("--version", action=Version)
     commands = every.add_subparsers(dest="command", required=True, metavar="command")
     ask = commands.add_parser("diagnose", help="name the cause, from measured data")
     measured.add_arguments(ask)
-    ask.add_argument("--calibrate", nargs="*", default=[], help="parameters that are not believed")
+    ask.add_argument(
+        "--calibrate",
+        nargs="*",
+        default=[],
+        help="parameters of which the nominal value is not trusted",
+    )
     ask.add_argument("--effects", nargs="*", help="candidates; default: all, see 'sb3-hds effects'")
     ask.add_argument("--budget", choices=("full", "quick"), default="full")
     ask.add_argument("--seed", type=int, default=0)
@@ -109,14 +114,14 @@ def parser() -> argparse.ArgumentParser:
     ask.add_argument("--animate", help="MP4 film to write: measured and predicted motion")
     ask.add_argument("--json", help="JSON file to write")
     measured.add_write(ask)
-    worth = ask.add_argument_group("what it buys", "policies from both twins, on the real system")
-    worth.add_argument("--env", help="id of the real system")
-    worth.add_argument("--env-kwargs", nargs="*", default=[], metavar="NAME:VALUE", help="of it")
-    worth.add_argument("--algo", default="hds", help="id in the zoo; default: hds")
-    worth.add_argument("--policies", type=int, default=5, help="trained in each twin; default: 5")
-    worth.add_argument("--policy-budget", type=int, default=0, help="steps of training in a twin")
-    worth.add_argument("--episodes", type=int, default=20, help="for each policy; default: 20")
-    worth.add_argument(
+    gain = ask.add_argument_group("policy gain", "policies from both twins, on the real system")
+    gain.add_argument("--env", help="id of the real system")
+    gain.add_argument("--env-kwargs", nargs="*", default=[], metavar="NAME:VALUE", help="of it")
+    gain.add_argument("--algo", default="hds", help="id in the zoo; default: hds")
+    gain.add_argument("--policies", type=int, default=5, help="trained in each twin; default: 5")
+    gain.add_argument("--policy-budget", type=int, default=0, help="steps of training in a twin")
+    gain.add_argument("--episodes", type=int, default=20, help="for each policy; default: 20")
+    gain.add_argument(
         "--hyperparams", nargs="*", default=[], metavar="NAME:VALUE", help="of the algorithm"
     )
     audit.add_arguments(commands.add_parser("audit", help="find defects of measured data"))

@@ -13,7 +13,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(given: argparse.Namespace) -> None:
-    """Say what paced the rows and what is wrong with them, and once more after corrections."""
+    """Report the clock and the defects of the data, before and after corrections."""
     from sb3_hds.core.trajectories.storage import check_target
     from sb3_hds.data import audit
     from sb3_hds.errors import ParameterError

@@ -53,8 +53,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--prior",
         type=float,
         default=0.0,
-        help="how firmly to believe the twin's own values: they are taken to be right to within "
-        "1 / PRIOR of a usual deviation; default: 0, not at all",
+        help="weight of the prior at the twin's own values, with a standard deviation of "
+        "1 / PRIOR typical deviations; default: 0, no prior",
     )
     command.add_argument(
         "--level", type=float, default=0.95, help="of the confidence intervals; default: 0.95"
@@ -64,7 +64,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(given: argparse.Namespace) -> None:
-    """Audit, estimate, and tell: on the screen, as JSON, as a twin."""
+    """Audit, estimate, and report: on the screen, as JSON, as a twin."""
     from sb3_hds.core.trajectories.storage import check_target
     from sb3_hds.data import audit
     from sb3_hds.errors import TrajectoryError
@@ -109,7 +109,7 @@ def run(given: argparse.Namespace) -> None:
 
 
 def _extended(twin: "Twin", wanted: Sequence[str]) -> "Twin":
-    """With effects at the places that are named, or at all."""
+    """The twin with the named effects, at the named places or at all."""
     from sb3_hds.effects import ALL, effect_named
 
     places = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}
@@ -123,7 +123,7 @@ def _extended(twin: "Twin", wanted: Sequence[str]) -> "Twin":
 
 
 def _spelt_out(patterns: Sequence[str], twin: "Twin") -> list[str]:
-    """Patterns as the names that they mean; what means none stays, and is refused as a name."""
+    """Expand patterns into names; a pattern without a match is kept, and refused later."""
     found: dict[str, None] = {}
     for pattern in patterns:
         hits = [name for name in twin.parameters if fnmatchcase(name, pattern)]

@@ -33,7 +33,7 @@ def run(given: argparse.Namespace) -> None:
 
 
 def loaded(given: argparse.Namespace, columns: Any) -> "Trajectories":
-    """What ``--data`` names; what is wrong with the map of columns is said in yml."""
+    """The data of ``--data``; errors in the map of columns are explained in yml."""
     from sb3_hds.data import Trajectories
     from sb3_hds.data.columns import FORM
     from sb3_hds.data.load import WITHOUT_COLUMNS
@@ -43,8 +43,8 @@ def loaded(given: argparse.Namespace, columns: Any) -> "Trajectories":
     try:
         return Trajectories.load(files, columns=columns)
     except TrajectoryError as error:
-        told = str(error)
+        message = str(error)
         for python in (FORM, WITHOUT_COLUMNS):
-            if python in told:
-                told = told.replace(python, _COLUMNS)
-        raise TrajectoryError(told) from error
+            if python in message:
+                message = message.replace(python, _COLUMNS)
+        raise TrajectoryError(message) from error

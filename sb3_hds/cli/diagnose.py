@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def run(given: argparse.Namespace) -> None:
-    """Load, diagnose, and tell: on the screen, as a page, as JSON."""
+    """Load, diagnose, and report: on the screen, as a page, as JSON."""
     from sb3_hds.data import audit
     from sb3_hds.effects import ALL
     from sb3_hds.sysid import diagnose
@@ -59,7 +59,7 @@ def run(given: argparse.Namespace) -> None:
 
 
 def _check_targets(given: argparse.Namespace) -> None:
-    """What would fail after minutes fails now."""
+    """Fail early: check everything that would fail after the diagnosis."""
     from sb3_hds.core.trajectories.storage import check_target
 
     for target in filter(None, (given.json, given.write)):
@@ -79,7 +79,7 @@ def _check_targets(given: argparse.Namespace) -> None:
 def _policy_question(
     given: argparse.Namespace, twin: "Twin"
 ) -> "Callable[[Diagnosis], PolicyGain]":
-    """How policies are compared, once there is a diagnosis; what makes no sense is refused now."""
+    """The comparison of policies, to be run on a diagnosis; its arguments are checked now."""
     import gymnasium
 
     from sb3_hds.errors import ParameterError

@@ -1,4 +1,4 @@
-"""``sb3-hds effects`` and ``sb3-hds twins``: what exists."""
+"""``sb3-hds effects`` and ``sb3-hds twins``: the catalogues."""
 
 import argparse
 import inspect
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 _FURTHER = {"sign_flip": " So may all of a joint: the direction of position and velocity at once."}
 _OF_A_TWIN = (
-    "A parameter of the twin has another value than believed: each one of 'sb3-hds twins' that "
+    "A parameter of the twin differs from its nominal value: each one of 'sb3-hds twins' that "
     "--calibrate does not name. Always a candidate; --effects does not take it."
 )
 

@@ -1,23 +1,28 @@
-"""What commands on measured data share: their arguments, the data, the twin, what they write."""
+"""Arguments, data, twins and output files of the commands on measured data."""
 
 import argparse
 import json
 import sys
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from sb3_hds.cli import model_files
 from sb3_hds.cli.columns import loaded
-from sb3_hds.cli.settings import settings
+from sb3_hds.cli.settings import names, settings
 
 if TYPE_CHECKING:
     from sb3_hds.core import Trajectories, Twin
+    from sb3_hds.twins.mujoco import MechanismTwin
+
+_SUFFIXES = (".xml", ".mjcf", ".urdf")
+#: settings of ``--set`` that say how the twin is made; all others are parameters
+_OPTIONS = ("dt", "integrator", "observe", "payload", "masses")
 
 
 def add_arguments(command: argparse.ArgumentParser, *, twin_required: bool = True) -> None:
     """
     :param command: to which ``--twin`` or ``--model``, ``--data``, ``--columns``, ``--correct`` and
-        ``--set`` are added
+        ``--set`` are added, with ``--actuators`` and ``--ignore`` of a model
     :param twin_required: whether it makes no sense without a twin
     """
     either = command.add_mutually_exclusive_group(required=twin_required)
@@ -44,7 +49,20 @@ def add_arguments(command: argparse.ArgumentParser, *, twin_required: bool = Tru
         metavar="NAME:VALUE",
         help="parameters and options of the twin: mass:0.3 observe:q driven:true",
     )
-    model_files.add_arguments(command)
+    command.add_argument(
+        "--actuators",
+        nargs="+",
+        metavar="KIND|NAME:VALUE",
+        help="of a model that names none, as a URDF: torque (the default), or 'position kp:20 "
+        "kv:1.5', 'velocity kv:5', whose commands are targets",
+    )
+    command.add_argument(
+        "--ignore",
+        nargs="*",
+        default=[],
+        metavar="NAME",
+        help="what the twin of a model may do without: contacts, equality, fluid, limits, tendons",
+    )
 
 
 def question(given: argparse.Namespace) -> "tuple[Twin, Trajectories]":
@@ -56,7 +74,7 @@ def question(given: argparse.Namespace) -> "tuple[Twin, Trajectories]":
     from sb3_hds.errors import ParameterError
 
     if given.model is not None:
-        return model_files.question(given)
+        return _question_of_model(given)
     for option in ("actuators", "ignore"):
         if getattr(given, option):
             raise ParameterError(f"--{option} is about a model file: name one with --model.")
@@ -64,12 +82,12 @@ def question(given: argparse.Namespace) -> "tuple[Twin, Trajectories]":
 
 
 def data_of(given: argparse.Namespace) -> "Trajectories":
-    """What ``--data`` names, under the map of ``--columns``."""
+    """The data of ``--data``, read with the map of ``--columns``."""
     return loaded(given, given.columns)
 
 
 def twin_of(given: argparse.Namespace) -> "Twin":
-    """What ``--twin`` and ``--set`` name."""
+    """The twin of ``--twin`` with the settings of ``--set``."""
     return twin_called(given.twin, settings("--set", given.set))
 
 
@@ -78,8 +96,8 @@ def twin_called(name: str, values: Mapping[str, Any]) -> "Twin":
     from sb3_hds.errors import NoTwinError
     from sb3_hds.twins import get
 
-    if name.endswith(model_files.SUFFIXES):
-        return model_files.twin_of_model(name, values, {})
+    if name.endswith(_SUFFIXES):
+        return _twin_of_model(name, values, {})
     if name.endswith(".json"):
         return _twin_in(name).with_parameters(**values)
     if ":" in name and "" not in sys.path:
@@ -89,10 +107,10 @@ def twin_called(name: str, values: Mapping[str, Any]) -> "Twin":
     except NoTwinError as error:
         if ":" in name:
             raise
-        told = str(error).partition("\n")[0]
+        message = str(error).partition("\n")[0]
         raise NoTwinError(
-            f"{told} 'sb3-hds twins' lists what there is. One of your own is --twin module:Name, "
-            "where module.py in this folder registers Name."
+            f"{message} 'sb3-hds twins' lists what there is. One of your own is --twin "
+            "module:Name, where module.py in this folder registers Name."
         ) from None
     return kind(**values)
 
@@ -127,7 +145,7 @@ def check_write(given: argparse.Namespace) -> None:
     """:raises ParameterError: for a model file to write where none was read"""
     from sb3_hds.errors import ParameterError
 
-    if given.write and given.write.endswith(model_files.SUFFIXES) and given.model is None:
+    if given.write and given.write.endswith(_SUFFIXES) and given.model is None:
         raise ParameterError(
             f"{given.write} would be a corrected model file: name the file with --model. A twin "
             "without one is written as .json."
@@ -135,10 +153,10 @@ def check_write(given: argparse.Namespace) -> None:
 
 
 def write_twin(given: argparse.Namespace, twin: "Twin") -> None:
-    """What ``--write`` asks for, if anything."""
+    """Write the file of ``--write``, if there is one."""
     if not given.write:
         return
-    if not given.write.endswith(model_files.SUFFIXES):
+    if not given.write.endswith(_SUFFIXES):
         write_json(given.write, {"twin": twin.to_spec()})
         return
     from sb3_hds.twins import write_model
@@ -151,3 +169,89 @@ def write_json(path: str, plain: Mapping[str, Any]) -> None:
     from sb3_hds.core.trajectories.storage import write_bytes
 
     write_bytes(path, (json.dumps(plain, indent=1, allow_nan=False) + "\n").encode())
+
+
+if TYPE_CHECKING:
+    from sb3_hds.core import Trajectories
+    from sb3_hds.twins.mujoco import MechanismTwin
+
+
+def _twin_of_model(
+    path: str, given: Mapping[str, Any], words: Mapping[str, Any]
+) -> "MechanismTwin":
+    """
+    :param path: of an MJCF or URDF file
+    :param given: settings of ``--set``
+    :param words: ``actuators`` and ``ignore``
+    """
+    from sb3_hds.twins import from_mujoco
+
+    options = {name: given[name] for name in _OPTIONS if name in given}
+    values = {
+        name: float(value) if isinstance(value, int) else value
+        for name, value in given.items()
+        if name not in options
+    }
+    return from_mujoco(path, **options, **words).with_parameters(**values)
+
+
+def _question_of_model(given: argparse.Namespace) -> "tuple[MechanismTwin, Trajectories]":
+    """
+    The twin that ``--model`` names, at the interval of the data, and the data in its order.
+
+    :raises TrajectoryError: for signals of the twin that the log does not have by name
+    """
+    from sb3_hds.data.overview import names_in
+
+    own = settings("--set", given.set)
+    make = partial(_twin_of_model, given.model, words=_words(given))
+    files = given.data[0] if len(given.data) == 1 else given.data
+    named = names_in(files, given.columns)
+    if named is None:
+        data = loaded(given, given.columns)
+        return make({"dt": data.dt} | own), data
+    observed = [entry.name for entry in named.observed]
+    commanded = [entry.name for entry in named.commanded]
+    observe, found = _matched(make, own, observed, commanded)
+    suffix = " command" if commanded else ""
+    columns = named.chosen(
+        map(str, found.obs), (str(name).removesuffix(suffix) for name in found.actions)
+    )
+    data = loaded(given, columns)
+    for sentence in named.guessed:
+        print(sentence)
+    return make({"dt": data.dt} | observe | own), data
+
+
+def _matched(
+    make: Any, own: Mapping[str, Any], observed: list[str], commanded: list[str]
+) -> tuple[dict[str, Any], Any]:
+    """Velocities that a log does not have are not observed, unless ``--set`` says so."""
+    from sb3_hds.errors import TrajectoryError
+    from sb3_hds.twins.mujoco import match
+
+    columns = [*observed, *(f"{name} command" for name in commanded)]
+    twin = make(own)
+    found = match(twin, columns)
+    observe: dict[str, Any] = {}
+    lacking = [name for name, _ in found.missing]
+    if lacking and all(name.endswith("_velocity") for name in lacking) and "observe" not in own:
+        observe = {"observe": "q"}
+        found = match(make({**own, **observe}), columns)
+    try:
+        found.check()
+    except TrajectoryError as error:
+        raise TrajectoryError(
+            f"{error} In the map of columns, give each the name of its joint: obs: [{{column: "
+            f"NAME, name: {twin.channels[0].name}}}, ...], actions: [{{column: NAME, name: "
+            f"{twin.actuators[0].name if twin.actuators else 'NAME'}}}, ...]."
+        ) from None
+    return observe, found
+
+
+def _words(given: argparse.Namespace) -> dict[str, Any]:
+    found: dict[str, Any] = {"ignore": names(given.ignore)}
+    if given.actuators:
+        kind, *gains = given.actuators
+        found["actuators"] = {"kind": kind, **settings("--actuators", gains)}
+    return found

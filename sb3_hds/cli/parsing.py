@@ -1,4 +1,4 @@
-"""A parser that says in one line what it did not understand, and what was meant."""
+"""A parser whose errors are one line, with the nearest known name."""
 
 import argparse
 import re
@@ -49,8 +49,8 @@ class Version(argparse.Action):
         from importlib.metadata import PackageNotFoundError, version
 
         try:
-            told = version("sb3-hds")
+            found = version("sb3-hds")
         except PackageNotFoundError:  # a checkout that is on the path without being installed
-            told = "0+unknown"
-        print(f"{parser.prog} {told}")
+            found = "0+unknown"
+        print(f"{parser.prog} {found}")
         parser.exit()

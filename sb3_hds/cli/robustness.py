@@ -13,7 +13,7 @@ from sb3_hds.cli.settings import yml_setting
 
 
 def run(given: argparse.Namespace) -> None:
-    """Shake a policy and tell what it earned: on the screen, as a table."""
+    """Measure the return of a policy under disturbances: on the screen, as a table."""
     from sb3_hds.core.trajectories.storage import write_bytes
     from sb3_hds.experiments import PERTURBATIONS, measure_robustness
 

@@ -1,4 +1,4 @@
-"""What options of the command line hold: numbers, words, names."""
+"""Values of command-line options: numbers, words, names."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""``sb3-hds twins``: what exists, and whether a twin is sound."""
+"""``sb3-hds twins``: the catalogue of twins, and their checks."""
 
 import argparse
 

@@ -237,15 +237,15 @@ class _Caller:
         )
 
     def _failure(self, method: str, function: Callable[..., Any], error: Exception) -> str:
-        told = " ".join(str(error).split())
-        told = told if len(told) <= _LONGEST else f"{told[:_LONGEST]}..."
+        message = " ".join(str(error).split())
+        message = message if len(message) <= _LONGEST else f"{message[:_LONGEST]}..."
         names = [base.__name__ for base in type(error).__mro__]
         way_out = next((f" {_WAYS_OUT[name]}" for name in names if name in _WAYS_OUT), "")
         if isinstance(error, KeyError):
             way_out = f" Its parameters are: {', '.join(self.twin.params) or 'none'}."
         return (
             f"{type(self.twin).__name__}.{method} raises {type(error).__name__}"
-            f"{_line_of(function, error)}: {told}.{way_out}"
+            f"{_line_of(function, error)}: {message}.{way_out}"
         )
 
     def _cast(self, found: Any, like: Any) -> str:

@@ -134,6 +134,9 @@ class Effect(abc.ABC):
     blended: ClassVar[str] = ""
     #: time after which its memory has forgotten its initial value [periods of the motion]
     forgets: ClassVar[float] = 0.4
+    #: arguments of the constructor besides ``where`` and the parameters: attributes that are saved
+    #: and that tell programs apart
+    options: ClassVar[tuple[str, ...]] = ()
     #: learned arrays by name, pytrees that travel with the parameters; most effects have none
     tensors: Mapping[str, Any] = MappingProxyType({})
 
@@ -216,11 +219,14 @@ class Effect(abc.ABC):
 
     def to_spec(self) -> dict[str, Any]:
         """:return: plain data from which the same effect can be made"""
-        return {"effect": self.name, "where": self.where, "parameters": dict(self.values)}
+        own = {name: getattr(self, name) for name in self.options}
+        plain = {n: list(value) if isinstance(value, tuple) else value for n, value in own.items()}
+        spec = {"effect": self.name, "where": self.where, "parameters": dict(self.values)}
+        return spec | ({"options": plain} if plain else {})
 
     def structure(self) -> tuple[Any, ...]:
         """What makes two effects different programs: everything but the values of parameters."""
-        return (type(self), self.where)
+        return (type(self), self.where, *(getattr(self, name) for name in self.options))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Effect) and self.structure() == other.structure()

@@ -1,4 +1,4 @@
-"""What the columns of a log mean: said in a dict or a yml file."""
+"""The map of columns: what the columns of a log mean, as a dict or a yml file."""
 
 import dataclasses
 import math
@@ -56,7 +56,7 @@ class Entry(NamedTuple):
 
 class Label(NamedTuple):
     """
-    Where the label of a trajectory is from.
+    The source of a trajectory's label.
 
     :param column: in the log; None: the name of the file, without folder and suffix
     """
@@ -69,8 +69,8 @@ class Columns:
     """
     What the columns of a log mean.
 
-    :param obs: observation channels, in the order of the twin; None: as the file itself says
-    :param actions: action channels, in the order of the twin; None: as the file itself says
+    :param obs: observation channels, in the order of the twin; None: as declared in the file
+    :param actions: action channels, in the order of the twin; None: as declared in the file
     :param time: stamps, scaled to seconds, the sum of several columns where seconds and nanoseconds
         stand apart; None where rows are exactly ``dt`` apart
     :param condition: where the label is from; default: all trajectories have the same one
@@ -101,9 +101,9 @@ class Columns:
 
     def over(self, own: "Columns | None") -> "Columns":
         """
-        :param own: what a file says about itself
-        :return: that, where these columns leave something open
-        :raises TrajectoryError: if observations or actions are said by neither
+        :param own: columns that the file itself declares
+        :return: these columns, completed by those of the file
+        :raises TrajectoryError: if neither declares observations or actions
         """
         merged = self
         if own is not None:
@@ -123,7 +123,7 @@ class Columns:
     def in_units(self, units: Mapping[str, str]) -> "Columns":
         """
         :param units: of columns, as a file names them
-        :return: with these units where nothing else is said and they are understood
+        :return: with these units where the map has none and they are known
         """
 
         si = {name: unit_of(unit) for name, unit in units.items()}

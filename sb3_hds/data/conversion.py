@@ -1,4 +1,4 @@
-"""Units that logs are written in, and the factors that lead from them to SI units."""
+"""Units of logs, and their conversion to SI units."""
 
 import math
 import re
@@ -17,7 +17,7 @@ _DERIVED: dict[str, dict[str, int]] = {
     "Pa": {"kg": 1, "m": -1, "s": -2},
 }
 
-# Name in a log: factor to SI, and what it is there.
+# By name in a log: factor to SI, and powers of SI symbols.
 _PLAIN: dict[str, tuple[float, dict[str, int]]] = {
     "rad": (1.0, {"rad": 1}),
     "deg": (math.pi / 180.0, {"rad": 1}),
@@ -118,7 +118,7 @@ class Unit(NamedTuple):
 def unit_of(text: str) -> Unit | None:
     """
     :param text: as ``"deg"``, ``"rpm"``, ``"N mm"``, ``"[m/s^2]"``, ``"N·m"``, ``"counts"``
-    :return: None if it is not understood
+    :return: None if it is unknown
     """
     powers = _factors(text)
     if powers is None:
@@ -138,8 +138,8 @@ def same_quantity(one: str, other: str) -> bool | None:
     """
     :param one: a unit
     :param other: a unit
-    :return: whether they measure the same: N m and kg m2/s2 do, 1/s and rad/s do not; None if one
-        of them is not understood
+    :return: whether they are units of the same quantity: N m and kg m2/s2 are, 1/s and rad/s are
+        not; None if one of them is unknown
     """
     dimensions = []
     for text in (one, other):
@@ -168,7 +168,7 @@ def _factors(text: str) -> list[tuple[str, int]] | None:
     for i, product in enumerate(written.split("/")):
         factors = re.split(r"[\s.]+", product.strip())
         if i and len(factors) > 1:
-            return None  # W/m2 K: whether K divides or multiplies, nobody knows
+            return None  # W/m2 K is ambiguous
         for factor in factors:
             match = _FACTOR.fullmatch(factor)
             symbol = match and _symbol(match[1])

@@ -35,18 +35,18 @@ Files = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 
 class SamplingWarning(UserWarning):
-    """The rows of a log do not lie on one grid of time; says what was done about it."""
+    """The rows of a log do not lie on a regular time grid; says what was changed."""
 
 
 def load(files: Files, columns: Any = None) -> Trajectories:
     """
     Read logs; what ``Trajectories.load`` does.
 
-    Row k of a log is observation k, with the action that acts from then on: the action in the last
-    row of an episode is not used. Rows of a regular clock stay as they are, also where their stamps
-    are rounded, late or jitter; others are resampled. A row that was written twice is left out. A
-    gap ends the episode, and so does another label. What was changed is warned of; that, and what
-    paced the rows, stays in ``report``.
+    Row k of a log is observation k, with the action that acts from then on; the action in the last
+    row of an episode is not used. Rows of a regular clock are kept, even if their stamps are
+    rounded, late or jitter; others are resampled. Duplicated rows are dropped. A gap ends the
+    episode, and so does a change of label. Changes are warned of, and kept in ``report`` together
+    with the clock that was found.
 
     :param files: path, pattern with ``*``, ``minari:`` and the name of a data set, or several of
         them; a pattern gives its files in alphabetical order
@@ -89,8 +89,8 @@ def _loaded(files: Files, columns: Any) -> Trajectories:
 
 def first_log(files: Files, said: Columns | None) -> Log | None:
     """
-    :param said: what is known of the columns; None: nothing
-    :return: what the first file holds; None if ``Trajectories.save`` wrote it
+    :param said: the map of columns; None: there is none
+    :return: the first file as a log; None if ``Trajectories.save`` wrote it
     :raises TrajectoryError: if it cannot be read
     """
     path = _paths(files)[0]
@@ -103,7 +103,7 @@ def first_log(files: Files, said: Columns | None) -> Log | None:
 
 class _Read(NamedTuple):
     """
-    What all files hold.
+    The content of all files.
 
     :param columns: as the first file has them; the others agree
     :param notes: sentences, each once
@@ -115,16 +115,16 @@ class _Read(NamedTuple):
 
 
 def _read(paths: Sequence[str], said: Columns | None) -> _Read:
-    """One file after another: what is not used of a file is gone when the next one is read."""
+    """Read one file after another, and keep only the columns that are used."""
     episodes, notes = list[Rows](), dict[str, None]()
     first: _First | None = None
     for path in paths:
         log = _log(path, said)
-        here, told = _understood((said or Columns()).over(log.columns), log)
+        here, remarks = _understood((said or Columns()).over(log.columns), log)
         first = first or _First(path, here, frozenset(log.tables[0]))
         _check_same(first, here, path)
         _check_columns(first, here, log.tables[0], path)
-        notes |= dict.fromkeys(told)
+        notes |= dict.fromkeys(remarks)
         for i, table in enumerate(log.tables):
             name = path if path.startswith(PREFIX) else Path(path).name
             source = name if len(log.tables) == 1 else f"{name}, episode {i}"
@@ -133,7 +133,7 @@ def _read(paths: Sequence[str], said: Columns | None) -> _Read:
 
 
 class _First(NamedTuple):
-    """The file that others have to agree with."""
+    """The file that the others must agree with."""
 
     path: str
     columns: Columns
@@ -141,7 +141,7 @@ class _First(NamedTuple):
 
 
 def _paths(files: Any) -> list[str]:
-    """Every file that is meant, patterns expanded."""
+    """All files, with patterns expanded."""
     several = not isinstance(files, str | os.PathLike)
     if several and not isinstance(files, Iterable):
         raise TrajectoryError(f"files must be paths or patterns, got {files!r}.")
@@ -191,7 +191,7 @@ def _log(path: str, said: Columns | None) -> Log:
 
 
 def _understood(columns: Columns, log: Log) -> tuple[Columns, tuple[str, ...]]:
-    """With the units that the file itself names, and what was made of them, in sentences."""
+    """Columns with the units that the file declares, and notes on them."""
     columns = columns.in_units(log.units)
     notes = list(log.notes)
     used = [*(columns.obs or ()), *(columns.actions or ()), *(columns.time or ())]
@@ -233,7 +233,7 @@ def _check_columns(first: _First, columns: Columns, table: Table, path: str) -> 
 
 
 def _check_same(first: _First, here: Columns, path: str) -> None:
-    """Recordings say their own channels, and files their units; those of all must be the same."""
+    """Channels and units that files declare must agree."""
     for name in ("obs", "actions"):
         one, other = (getattr(c, name) or () for c in (first.columns, here))
         ours, theirs = ([e.name for e in entries] for entries in (one, other))

@@ -1,4 +1,4 @@
-"""What is in a log, and a map of columns to start from."""
+"""A listing of a log, and a first map of its columns."""
 
 import dataclasses
 import os
@@ -55,7 +55,7 @@ class _Column(NamedTuple):
 
     @property
     def varies(self) -> bool:
-        """Whether it is a signal at all."""
+        """Whether it changes at all."""
         return self.highest > self.lowest and self.rows > 1
 
 
@@ -156,7 +156,7 @@ def guessed_time(log: Log) -> Entry | None:
 
 
 def _guessed_time(columns: Sequence[_Column]) -> _Column | None:
-    """What increases and is called so; or else what increases steadily."""
+    """An increasing column with the name of a time, or else one that increases steadily."""
     rising = [c for c in columns if c.step > 0.0]
     called = [c for c in rising if _is(c, _TIME)]
     others = [c for c in rising if c.varies and not _is(c, f"{_INDEX} {_OBSERVED} {_ACTION}")]
@@ -180,7 +180,7 @@ def _time_lines(log: Log, time: _Column | None) -> list[str]:
 
 
 def _time_unit(table: Mapping[str, np.ndarray], time: _Column) -> str:
-    """By its size, its name, or its steps, in that order."""
+    """From the size, the name or the steps of the stamps, in that order."""
     named = [word for word in _words(time.name) if word in ("ms", "us", "ns", "millis", "micros")]
     words = {"millis": "ms", "micros": "us"}
     epoch = epoch_unit(table, Entry(time.name, time.name))
@@ -221,10 +221,10 @@ def _flow(entry: Mapping[str, str]) -> str:
 @dataclasses.dataclass(frozen=True)
 class Named:
     """
-    :param observed: what may be an observation, or anything
-    :param commanded: what is known to be a command
-    :param rest: the map of columns without these two: time, episodes, the label
-    :param guessed: sentences on what nobody said
+    :param observed: columns that may be observations, or anything
+    :param commanded: columns that are known to be commands
+    :param rest: the map without these two: time, episodes, label
+    :param guessed: one sentence for each guess
     """
 
     observed: tuple[Entry, ...]

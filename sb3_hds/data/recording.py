@@ -1,4 +1,4 @@
-"""A recording that survives its recorder: one line per step, whole or not at all."""
+"""Recordings that survive a crash of the process: one line for each step."""
 
 import json
 import os
@@ -19,7 +19,7 @@ _KEPT = "This is not recorded; what was before it is kept."
 
 class Recorder:
     """
-    Writes what a system does while it does it, for ``Trajectories.load(path)``.
+    Records a running system, for ``Trajectories.load(path)``.
 
     Each call appends one line of JSON to the file and hands it to the operating system: a process
     that is killed loses nothing that was recorded, at most the line that it was writing. Against a

@@ -1,20 +1,17 @@
 """What happens to a command on its way to the plant."""
 
-import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 
 from sb3_hds.core import ActionEffect, Memory, Parameter, Params, Ranges, Scalar
-from sb3_hds.effects.shapes import beyond, limited
+from sb3_hds.effects.shapes import Delayed, beyond
 
 if TYPE_CHECKING:
     from sb3_hds.core import Twin
 
 # A command that no drive has yet received.
 _AT_REST = 0.0
-# Longest delay that can be simulated where nobody says [s].
-_LONGEST_DELAY = 0.2
 # Time constants below this share of a sub-step leave nothing of the past: exp(-1000) is zero.
 _INSTANT = 1e-3
 # Between which equation errors interpolate: lags and delays in intervals and as shares of a period
@@ -27,7 +24,7 @@ _LIMITS = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)
 
 class TorqueGain(ActionEffect):
     r"""
-    The drive does more, or less, than it is told.
+    Scales the command: the drive is stronger or weaker than the model says.
 
     .. math:: u' = k\,u
 
@@ -64,7 +61,7 @@ class MotorLag(ActionEffect):
 
     name = "motor_lag"
     parameters = {"time_constant": Parameter(null=0.0, scale=0.02, unit="s", lower=0.0, upper=2.0)}
-    explanation = "The drive takes time to reach what it is told, as a motor with inductance does."
+    explanation = "The drive takes time to follow its command, as a motor with inductance does."
     source = "Åström and Murray 2021, section 3"
     chained = "time_constant"
     equivalents = {"action_delay": "where commands change slowly compared with either"}
@@ -87,7 +84,7 @@ class MotorLag(ActionEffect):
         return mean, after
 
 
-class ActionDelay(ActionEffect):
+class ActionDelay(Delayed, ActionEffect):
     r"""
     Commands arrive late.
 
@@ -106,9 +103,6 @@ class ActionDelay(ActionEffect):
     """
 
     name = "action_delay"
-    parameters = {
-        "delay": Parameter(null=0.0, scale=0.02, unit="s", lower=0.0, upper=_LONGEST_DELAY)
-    }
     explanation = "Commands reach the drive late, as over a bus or a radio link."
     source = "Åström and Murray 2021, section 10"
     chained = "delay"
@@ -116,19 +110,6 @@ class ActionDelay(ActionEffect):
         "motor_lag": "where commands change slowly compared with either",
         "sensor_delay": "where every channel is as late and nothing is fed back",
     }
-
-    def __init__(
-        self, where: int | str = 0, *, longest: float = _LONGEST_DELAY, **values: float
-    ) -> None:
-        self.longest, own = limited(self, "delay", longest)
-        self.parameters = own  # type: ignore[misc]  # with a limit of its own
-        super().__init__(where, **values)
-
-    def structure(self) -> tuple[Any, ...]:
-        return (*super().structure(), self.longest)
-
-    def to_spec(self) -> dict[str, Any]:
-        return super().to_spec() | {"options": {"longest": self.longest}}
 
     def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
         """Exact for what lies between: a held command that comes a part of an interval later."""
@@ -138,7 +119,7 @@ class ActionDelay(ActionEffect):
 
     def memory(self, twin: "Twin") -> Memory:
         """The commands of the last control intervals, the latest first, and a clock."""
-        intervals = math.ceil(self.longest / twin.dt - 1e-9) + 1
+        intervals = self.remembered(twin.dt)
         return {
             "commands": jnp.full(intervals, _AT_REST),
             "elapsed": jnp.asarray(twin.dt),
@@ -169,7 +150,7 @@ class ActionDelay(ActionEffect):
 
 class DirectionalGain(ActionEffect):
     r"""
-    The drive does more, or less, than it is told, one way more than the other.
+    Scales the command, by another factor for each sign.
 
     .. math:: u' = \begin{cases} k_+ u & u > 0 \\ k_- u & u \le 0 \end{cases}
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from typing import Any
 
 import jax.numpy as jnp
 
@@ -81,6 +80,8 @@ class DryFriction(JointEffect):
     :raises EffectError: unless that is positive
     """
 
+    options = ("standstill",)
+
     def __init__(
         self, where: int | str = 0, *, standstill: float = STANDSTILL, **values: float
     ) -> None:
@@ -92,12 +93,6 @@ class DryFriction(JointEffect):
     def against(self, joint: JointMoment, level: Scalar | float) -> Scalar:
         """:return: a force of this size against the motion"""
         return dry_friction(joint, level, self.standstill)
-
-    def structure(self) -> tuple[Any, ...]:
-        return (*super().structure(), self.standstill)
-
-    def to_spec(self) -> dict[str, Any]:
-        return super().to_spec() | {"options": {"standstill": self.standstill}}
 
 
 class CoulombFriction(DryFriction):

@@ -55,6 +55,7 @@ class NeuralForce(ForceEffect):
 
     name = "neural_force"
     held = True
+    options = ("n_members", "net_arch", "caution")
     parameters = {"share": Parameter(null=0.0, scale=1.0, unit="1", lower=0.0, upper=1.0)}
     explanation = "Something acts on the joints that has no name here, and was learned from data."
     source = "Chua et al. 2018; Heiden et al. 2021"
@@ -130,8 +131,8 @@ class NeuralForce(ForceEffect):
         :return: standard deviation of the members, in units of the normalised output; the largest
             over the joints
         """
-        spread = jnp.std(self.forces(q, v, actuator, own), 0)
-        return jnp.max(spread / own["output_scale"])
+        std = jnp.std(self.forces(q, v, actuator, own), 0)
+        return jnp.max(std / own["output_scale"])
 
     def doubt(self, twin: "Twin", state: Any, action: Action, base: Params, own: Params) -> Scalar:
         if not self.caution:
@@ -141,15 +142,7 @@ class NeuralForce(ForceEffect):
         return self.caution * own["share"] * self.disagreement(q, state.v, actuator, own)
 
     def structure(self) -> tuple[Any, ...]:
-        return (*super().structure(), self.n_members, self.net_arch, self.hinges, self.caution)
-
-    def to_spec(self) -> dict[str, Any]:
-        options = {
-            "n_members": self.n_members,
-            "net_arch": list(self.net_arch),
-            "caution": self.caution,
-        }
-        return super().to_spec() | {"options": options}
+        return (*super().structure(), self.hinges)
 
     def save(self, path: str | os.PathLike[str]) -> Any:
         """

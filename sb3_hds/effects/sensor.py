@@ -1,7 +1,6 @@
 """What happens to a measurement on its way out of the plant."""
 
-import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -9,14 +8,11 @@ import numpy as np
 
 from sb3_hds.core import Memory, Parameter, Params, Scalar, SensorEffect
 from sb3_hds.core.twin import plant_of
-from sb3_hds.effects.shapes import limited
+from sb3_hds.effects.shapes import Delayed
 from sb3_hds.errors import EffectError
 
 if TYPE_CHECKING:
     from sb3_hds.core import Twin
-
-# Longest delay that can be simulated where nobody says [s].
-_LONGEST_DELAY = 0.2
 
 
 class SensorBias(SensorEffect):
@@ -69,7 +65,7 @@ class SensorScale(SensorEffect):
         return reported / params["scale"]
 
 
-class SensorDelay(SensorEffect):
+class SensorDelay(Delayed, SensorEffect):
     r"""
     A sensor reports the past.
 
@@ -86,29 +82,13 @@ class SensorDelay(SensorEffect):
     """
 
     name = "sensor_delay"
-    parameters = {
-        "delay": Parameter(null=0.0, scale=0.02, unit="s", lower=0.0, upper=_LONGEST_DELAY)
-    }
     explanation = "Measurements arrive late, as from a camera or a filter."
     source = "Åström and Murray 2021, section 10"
     equivalents = {"action_delay": "where every channel is as late and nothing is fed back"}
 
-    def __init__(
-        self, where: int | str = 0, *, longest: float = _LONGEST_DELAY, **values: float
-    ) -> None:
-        self.longest, own = limited(self, "delay", longest)
-        self.parameters = own  # type: ignore[misc]  # with a limit of its own
-        super().__init__(where, **values)
-
-    def structure(self) -> tuple[Any, ...]:
-        return (*super().structure(), self.longest)
-
-    def to_spec(self) -> dict[str, Any]:
-        return super().to_spec() | {"options": {"longest": self.longest}}
-
     def memory(self, measured: Scalar, twin: "Twin") -> Memory:
         """The last measurements, the latest first."""
-        return jnp.full(math.ceil(self.longest / twin.dt - 1e-9) + 1, measured)
+        return jnp.full(self.remembered(twin.dt), measured)
 
     def sense(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Scalar:
         # Whoever moves a state without its memory sees the new one at once.

@@ -1,8 +1,7 @@
-"""Shapes that several effects share, with the derivatives that a search from null needs."""
+"""What several effects share: nonlinearities with the right derivative at null, and delays."""
 
 import dataclasses
 import math
-from collections.abc import Mapping
 
 import jax.numpy as jnp
 
@@ -11,6 +10,8 @@ from sb3_hds.errors import EffectError
 
 # Speed below which dry friction is smoothed where nobody says [rad/s] or [m/s].
 STANDSTILL = 0.01
+# Longest delay that can be simulated by default [s].
+_LONGEST_DELAY = 0.2
 
 
 def dry_friction(
@@ -44,15 +45,31 @@ def beyond(x: Scalar, limit: Scalar | float) -> Scalar:
     return jnp.maximum(x - limit, 0.0) + jnp.minimum(x + limit, 0.0)
 
 
-def limited(effect: Effect, name: str, longest: float) -> tuple[float, Mapping[str, Parameter]]:
+class Delayed(Effect):
     """
-    :param name: of the parameter that may not exceed ``longest``
-    :return: that limit, and the effect's parameters with it
+    Abstract: a signal arrives late.
+
+    :param longest: option; longest delay that can be simulated [s]
     :raises EffectError: unless it is positive
     """
-    if not (isinstance(longest, int | float) and 0.0 < longest < math.inf):
-        raise EffectError(f"longest is a positive time in seconds, got {longest!r}.")
-    own = dict(type(effect).parameters)
-    scale = min(own[name].scale, 0.5 * longest)
-    own[name] = dataclasses.replace(own[name], upper=float(longest), scale=scale)
-    return float(longest), own
+
+    options = ("longest",)
+    parameters = {
+        "delay": Parameter(null=0.0, scale=0.02, unit="s", lower=0.0, upper=_LONGEST_DELAY)
+    }
+
+    def __init__(
+        self, where: int | str = 0, *, longest: float = _LONGEST_DELAY, **values: float
+    ) -> None:
+        if not (isinstance(longest, int | float) and 0.0 < longest < math.inf):
+            raise EffectError(f"longest is a positive time in seconds, got {longest!r}.")
+        self.longest = float(longest)
+        delay = type(self).parameters["delay"]
+        scale = min(delay.scale, 0.5 * self.longest)
+        own = {"delay": dataclasses.replace(delay, upper=self.longest, scale=scale)}
+        self.parameters = own  # type: ignore[misc]  # with a limit of its own
+        super().__init__(where, **values)
+
+    def remembered(self, dt: float) -> int:
+        """:return: number of control intervals that a memory must hold, the present one included"""
+        return math.ceil(self.longest / dt - 1e-9) + 1

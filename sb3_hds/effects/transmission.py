@@ -1,7 +1,7 @@
 """What lies between a motor and its load: the joint's inertia is split into two."""
 
 import abc
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 
@@ -41,6 +41,7 @@ class Transmission(ForceEffect):
     """
 
     held = True
+    options = ("motor_share",)
 
     def __init__(
         self, where: int | str = 0, *, motor_share: float = _MATCHED, **values: float
@@ -78,12 +79,6 @@ class Transmission(ForceEffect):
         inertia, drive = self._apart(moment, index)
         share = self.motor_share
         return self.lead(memory, drive, share * (1.0 - share) * inertia, moment.h, params)
-
-    def structure(self) -> tuple[Any, ...]:
-        return (*super().structure(), self.motor_share)
-
-    def to_spec(self) -> dict[str, Any]:
-        return super().to_spec() | {"options": {"motor_share": self.motor_share}}
 
     def _apart(self, moment: Moment, index: int) -> tuple[Scalar, Scalar]:
         """The joint's effective inertia, and what drives the motor apart from the load."""

@@ -1,4 +1,4 @@
-"""The smallest task in which it matters whether a time limit ends it or only stops watching it."""
+"""The smallest task whose values depend on whether its time limit is a truncation."""
 
 import math
 from typing import Any
@@ -14,7 +14,8 @@ class ConstantReward(gymnasium.Env[np.ndarray, np.ndarray]):
     r"""
     Each step pays the same, for ever; actions change nothing; the observation is a clock.
 
-    With a time limit of ``period`` steps, and the discount :math:`\gamma`, the first state is worth
+    With a time limit of ``period`` steps, and the discount :math:`\gamma`, the value of the first
+    state is
 
     .. math::
 

@@ -1,4 +1,4 @@
-"""A small quadruped whose motors pull on springs: what walks well here stores energy in them."""
+"""A small quadruped with series-elastic joints, whose good gaits store energy in the springs."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What only whoever made a stand-in for hardware can know."""
+"""The true twins of the environments that stand in for hardware."""
 
 from typing import Any
 
@@ -18,8 +18,8 @@ from sb3_hds.twins import registry
 
 def true_twin(env: Any) -> Twin:
     """
-    The twin that knows everything about one of our stand-ins for hardware: the ceiling of what a
-    model can be. Noise of the sensors is no part of a twin.
+    The true twin of an environment that stands in for hardware, hidden effects included: the upper
+    bound for any model. Sensor noise is not part of a twin.
 
     :param env: ``sb3_hds/PendulumReal-v1`` or ``sb3_hds/InvertedPendulumFriction-v5``, wrapped or
         not

@@ -72,7 +72,7 @@ class InvertedPendulumFriction(InvertedPendulumEnv):
 
     @property
     def nominal(self) -> Any:
-        """What the XML says, in the form that twins read."""
+        """The nominal model of the XML, in the form that twins read."""
         return SimpleNamespace(
             unwrapped=SimpleNamespace(
                 model=self._shipped,

@@ -1,9 +1,9 @@
 """
-Which twin mirrors an environment, however that is vectorised and wrapped.
+The twin of an environment, whatever its vectorisation and wrappers.
 
-Wrappers known to leave observations, actions and rewards alone are looked through. Those that tell
-what they do, by a ``twin_transform``, are put around the twin. All others are refused by name:
-planning in a twin of what lies below them would be silently wrong.
+Neutral wrappers, which leave observations, actions and rewards alone, are skipped. Wrappers with a
+``twin_transform`` are put around the twin as well. All others are refused by name, because planning
+without them would be silently wrong.
 """
 
 import contextlib
@@ -61,7 +61,7 @@ def twin_of(env: gymnasium.Env | VecEnv) -> Twin:
     :param env: an environment or a vectorised one (in this process or in others), wrapped or not
     :return: its twin, with the parameters that the environment was made with
     :raises EnvironmentMismatchError: for a wrapper not known to leave observations, actions and
-        rewards alone, for copies with different parameters, or for spaces that no twin has
+        rewards alone, for copies with different parameters, or for spaces that twins do not support
     :raises NoTwinError: if no twin is registered for it
     """
     if isinstance(env, VecEnv):
@@ -82,7 +82,7 @@ def check_mirrors(env: gymnasium.Env | VecEnv, twin: Twin) -> None:
     Says nothing about what a step does: see :func:`~sb3_hds.envs.verify.verify_mirror`.
 
     :param env: as the learner gets it
-    :param twin: what is planned with
+    :param twin: for planning
     :raises EnvironmentMismatchError: if actions are no bounded Box, or if sizes or limits differ
     """
     low, high = _action_limits(env.action_space)
@@ -169,18 +169,18 @@ def _twins_of_copies(env: VecEnv) -> list[Twin]:
 
 def _layers_of(env: VecEnv) -> list[list[tuple[str, StatefulTransform]]]:
     """
-    The wrappers of each copy in another process that tell what they do, the outermost first.
+    The wrappers with a twin transform of each copy in another process, the outermost first.
 
     :raises EnvironmentMismatchError: for a wrapper neither neutral nor among them
-    :raises NoTwinError: if the copies do not tell how they are wrapped
+    :raises NoTwinError: if the wrappers of the copies are unknown
     """
     with _telling(env):
         named = [_wrappers_in(text) for text in env.env_method("__str__")]
         if not env.has_attr("twin_transforms"):
-            told: list[list[tuple[str, StatefulTransform]]] = [[] for _ in named]
+            layers_of_copies: list[list[tuple[str, StatefulTransform]]] = [[] for _ in named]
         else:
-            told = env.get_attr("twin_transforms")
-    for names, layers in zip(named, told, strict=True):
+            layers_of_copies = env.get_attr("twin_transforms")
+    for names, layers in zip(named, layers_of_copies, strict=True):
         left = iter([name for name, _ in layers] + [None])
         following = next(left)
         for name in names:
@@ -188,23 +188,23 @@ def _layers_of(env: VecEnv) -> list[list[tuple[str, StatefulTransform]]]:
                 following = next(left)
             else:
                 _refuse_unless_neutral(name)
-    return told
+    return layers_of_copies
 
 
-def _specs_of(env: VecEnv, told: set[str]) -> list[EnvSpec | None]:
+def _specs_of(env: VecEnv, transformed: set[str]) -> list[EnvSpec | None]:
     """
     How the copies in other processes were made. Ask for :func:`_layers_of` before: a spec holds the
     arguments of wrappers, and sending a lambda kills the process.
 
-    :param told: names of wrappers that tell what they do
+    :param transformed: names of wrappers with a twin transform
     :raises EnvironmentMismatchError: for another wrapper that is not neutral
-    :raises NoTwinError: if they do not tell
+    :raises NoTwinError: if the copies have no spec
     """
     with _telling(env):
         specs = env.get_attr("spec")
     for spec in specs:
         for wrapper in spec.additional_wrappers if spec is not None else ():
-            if wrapper.name not in told:
+            if wrapper.name not in transformed:
                 _refuse_unless_neutral(wrapper.name, wrapper.entry_point)
     return specs
 

@@ -1,4 +1,4 @@
-"""A pendulum to be wrong about: the task of ``Pendulum-v1``, stepped by MuJoCo's engine."""
+"""A stand-in for a real pendulum: the task of ``Pendulum-v1``, simulated by MuJoCo."""
 
 import math
 from collections.abc import Mapping
@@ -34,9 +34,8 @@ _LONGEST_DELAY = 0.2  # [s]
 
 class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
     """
-    The pendulum of ``Pendulum-v1`` as a system of its own: continuous time, friction, drag, and a
-    drive and sensors that are not ideal. It stands in for hardware: nothing of it is computed by a
-    twin.
+    The pendulum of ``Pendulum-v1`` in continuous time, with friction, drag, and a drive and sensors
+    that are not ideal. It stands in for hardware: no twin takes part in its simulation.
 
     The reward is that of ``Pendulum-v1``, from the true state and the command. Start states are
     those of ``Pendulum-v1``, or ``reset(options={"state": (angle, speed)})``.
@@ -177,7 +176,7 @@ class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
         return _engine.MjModel.from_xml_string(text)
 
     def _driven(self) -> float:
-        """What the drive does in the engine step that begins now [N m]."""
+        """Torque of the drive in the next engine step [N m]."""
         h = self.model.opt.timestep
         asked_at = self.data.time + 0.5 * h - self.delay
         command = next(torque for since, torque in reversed(self._commands) if since <= asked_at)

@@ -1,5 +1,5 @@
 """
-The compiled programs behind the environments.
+The compiled programs of the environments.
 
 Values of parameters are arguments, so all environments of equal twins share one compilation. States
 travel as numpy arrays: they pickle, they copy, and they belong to no device.
@@ -17,12 +17,12 @@ from sb3_hds.core import Params, State, Twin
 
 class Transition(NamedTuple):
     """
-    What one step of a twin gives; with a leading axis where several copies step at once.
+    The result of one step of a twin; with a leading axis for several copies.
 
-    :param state: where the twin is now
-    :param obs: what its sensors report
-    :param reward: for this step
-    :param terminated: whether the episode ends for a reason of the task
+    :param state: after the step
+    :param obs: observation of that state
+    :param reward: of this step
+    :param terminated: whether the task ends in that state
     """
 
     state: State
@@ -33,10 +33,10 @@ class Transition(NamedTuple):
 
 class BatchTransition(NamedTuple):
     """
-    What one step of many copies gives, those that ended already standing at a new start.
+    The result of one step of many copies; those that ended have restarted.
 
-    :param state: where the next step begins, leading axis ``n_envs``
-    :param obs: what the sensors report there, ``(n_envs, n_obs)``
+    :param state: at the start of the next step, leading axis ``n_envs``
+    :param obs: observation of that state, ``(n_envs, n_obs)``
     :param elapsed: steps since the start of each episode, ``(n_envs,)``
     :param ended: the step itself, before any restart
     :param truncated: whether the step limit was reached, ``(n_envs,)``

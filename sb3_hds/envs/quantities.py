@@ -1,4 +1,4 @@
-"""What environments that stand in for hardware accept as physical quantities."""
+"""Validation of the physical parameters of environments that stand in for hardware."""
 
 import math
 

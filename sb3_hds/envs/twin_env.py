@@ -21,7 +21,7 @@ _RENDER_MODES = ["rgb_array"]
 
 class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """
-    A twin to act in: its ``initial``, ``step``, ``observe``, ``reward`` and ``terminated``.
+    A twin as an environment: its ``initial``, ``step``, ``observe``, ``reward``, ``terminated``.
 
     Has no time limit of its own; ``gymnasium.make`` of a registered id adds it. Steps are computed
     on the host, where a single copy steps fastest. They are deterministic: all randomness is in
@@ -33,7 +33,7 @@ class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         name, also its options, ``dt`` [s] and ``substeps``
     :raises NoTwinError: for a name that is not registered
     :raises ParameterError: for a setting that the twin does not have, or a value out of bounds
-    :raises TwinError: for a twin whose methods do not return what they have to
+    :raises TwinError: for a twin whose methods return the wrong type, shape or dtype
     :raises ValueError: for another render mode
     """
 
@@ -55,7 +55,7 @@ class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     @property
     def state(self) -> State:
         """
-        Where the twin is now, memory included.
+        The current state, memory included.
 
         :raises gymnasium.error.ResetNeeded: before the first reset
         """
@@ -126,9 +126,9 @@ class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 def twin_from(twin: Twin | str, settings: Mapping[str, Any]) -> Twin:
     """
-    :return: the twin that is meant, with ``settings``
+    :return: the twin with ``settings``
     :raises TypeError: for neither a twin nor a name
-    :raises TwinError: for a twin whose methods do not return what they have to
+    :raises TwinError: for a twin whose methods return the wrong type, shape or dtype
     """
     if isinstance(twin, Twin):
         check_methods(twin)
@@ -152,7 +152,7 @@ def check_render_mode(mode: str | None) -> str | None:
 
 
 def metadata_of(twin: Twin) -> dict[str, Any]:
-    """:return: what Gymnasium and SB3's video recorders read"""
+    """:return: the metadata that Gymnasium and SB3's video recorders read"""
     return {"render_modes": list(_RENDER_MODES), "render_fps": max(1, round(1.0 / twin.dt))}
 
 
@@ -181,13 +181,13 @@ def _as_observation(obs: Any) -> np.ndarray:
 
 
 def _host() -> contextlib.AbstractContextManager[None]:
-    """Compute on the CPU even where JAX has an accelerator."""
+    """Compute on the CPU, even if JAX has an accelerator."""
     return jax.default_device(_cpu())
 
 
 @functools.cache
 def _cpu() -> Any:
-    """:return: None where JAX was told to know no CPU; then its default device serves"""
+    """:return: None where JAX was configured without a CPU; then the default device is used"""
     try:
         return jax.local_devices(backend="cpu")[0]
     except RuntimeError:

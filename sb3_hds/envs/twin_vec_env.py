@@ -31,8 +31,8 @@ class TwinVecEnv(VecEnv):
     """
     Copies of a twin that step together in one compiled call.
 
-    Gives what ``DummyVecEnv`` of as many ``TwinEnv`` under a ``TimeLimit`` gives: from the same
-    seeds the same start states, and steps that differ by rounding only. A copy that ends restarts
+    Equivalent to a ``DummyVecEnv`` of ``TwinEnv`` under a ``TimeLimit``: the same seeds give the
+    same start states, and steps differ by rounding only. A copy that ends restarts
     in the same call; its last observation is ``infos[i]["terminal_observation"]``.
 
     The copies share their parameters, and have no environments of their own: attributes are read
@@ -47,7 +47,7 @@ class TwinVecEnv(VecEnv):
         name, also its options, ``dt`` [s] and ``substeps``
     :raises NoTwinError: for a name that is not registered
     :raises ParameterError: for a setting that the twin does not have, or a value out of bounds
-    :raises TwinError: for a twin whose methods do not return what they have to
+    :raises TwinError: for a twin whose methods return the wrong type, shape or dtype
     :raises ValueError: for no copies, an impossible limit, or another render mode
     """
 
@@ -84,7 +84,7 @@ class TwinVecEnv(VecEnv):
     @property
     def states(self) -> State:
         """
-        Where the copies are now, memory included; leading axis ``n_envs``.
+        The current states, memory included; leading axis ``n_envs``.
 
         :raises gymnasium.error.ResetNeeded: before the first reset
         """

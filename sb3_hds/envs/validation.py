@@ -1,4 +1,4 @@
-"""What an environment made of a twin accepts: checked before any compiled program runs."""
+"""Validation of actions and reset options, before any compiled program runs."""
 
 from collections.abc import Mapping
 from typing import Any

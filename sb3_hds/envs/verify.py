@@ -1,4 +1,4 @@
-"""Stepping an environment and its twin side by side."""
+"""Step-by-step comparison of an environment and its twin."""
 
 import functools
 import math
@@ -29,13 +29,13 @@ def verify_mirror(
     ``1 + |value|``; a step that ends the episode in one and not in the other is an error of 1.
 
     :param env: the environment, wrapped or not; it is reset and stepped
-    :param twin: what should do the same
+    :param twin: of the environment
     :param steps: how many steps are compared
     :param tolerance: largest error that passes. Observations are single precision, which a step may
         magnify; hence the default.
     :param seed: of the environment's resets and the actions
-    :return: the largest error, or nan if one observation does not tell the state: then nothing can
-        be compared, and a warning says so
+    :return: the largest error, or nan if one observation does not determine the state; a warning
+        then says so
     :raises EnvironmentMismatchError: if spaces differ, or an error exceeds the tolerance
     """
     check_mirrors(env, twin)

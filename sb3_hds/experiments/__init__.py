@@ -1,4 +1,4 @@
-"""What a change is worth, measured: several seeds, the same start states, intervals."""
+"""Measured effects of a change: several seeds, paired start states, confidence intervals."""
 
 from sb3_hds.experiments.policy_gain import PolicyGain, measure_policy_gain
 from sb3_hds.experiments.returns import returns_of

@@ -1,4 +1,4 @@
-"""What a diagnosis is worth for the policy: return on the real system."""
+"""The policy gain of a diagnosis: the return on the real system."""
 
 import dataclasses
 import inspect
@@ -37,8 +37,7 @@ _LEVEL = 0.9
 class Return:
     """
     :param mean: interquartile mean over runs and episodes
-    :param low: lower end of its 90 % interval, by bootstrap over runs; None with a single run,
-        which tells nothing of how others would differ
+    :param low: lower end of its 90 % interval, by bootstrap over runs; None for a single run
     :param high: upper end
     """
 
@@ -54,7 +53,7 @@ class PolicyGain:
 
     :param returns: by simulation (``"believed"``, ``"extended"``, and ``"true"`` where there is
         one): one row for each run, one column for each start state, shape ``(runs, episodes)``
-    :param gain: of the extended over the believed twin, paired by run and start state
+    :param gain: of the extended over the nominal twin, paired by run and start state
     """
 
     returns: Mapping[str, Float[np.ndarray, "runs episodes"]]
@@ -67,13 +66,13 @@ class PolicyGain:
     @property
     def share_of_ceiling(self) -> float | None:
         """
-        How much of the gap to policies from the true twin was closed; None where there is none, or
-        no gap.
+        Share of the gap to policies from the true twin that was closed; None without such a twin,
+        or without a gap.
         """
         if "true" not in self.returns:
             return None
-        believed, extended, true = (self.of(s).mean for s in ("believed", "extended", "true"))
-        return (extended - believed) / (true - believed) if true > believed else None
+        nominal, extended, true = (self.of(s).mean for s in ("believed", "extended", "true"))
+        return (extended - nominal) / (true - nominal) if true > nominal else None
 
     def to_dict(self) -> dict[str, Any]:
         """:return: numbers as plain data for JSON"""
@@ -97,11 +96,11 @@ class PolicyGain:
         return write_bytes(path, as_png(plot_policy_gain(self.to_dict())))
 
     def __str__(self) -> str:
-        told = policy_in_words(self.to_dict())
-        lines = textwrap.wrap(f"{told.measured}:", 80)
-        for name, value, *interval in (told.columns, *told.rows):
+        words = policy_in_words(self.to_dict())
+        lines = textwrap.wrap(f"{words.measured}:", 80)
+        for name, value, *interval in (words.columns, *words.rows):
             lines.append(f"  {name:<22} {value:>9}   {''.join(interval)}".rstrip())
-        for note in told.notes:
+        for note in words.notes:
             lines += textwrap.wrap(note, 80)
         return "\n".join(lines)
 
@@ -121,23 +120,23 @@ def measure_policy_gain(
     **arguments: Any,
 ) -> PolicyGain:
     """
-    Train with the same budget in the old and in the extended twin, and act on the real system.
+    Train with the same budget in the nominal and in the extended twin, and act on the real system.
 
     Runs with the same seed differ in the twin only, and all act from the same start states. Where
     ``env`` is one of our stand-ins for hardware, or made of a twin, policies from its true twin are
     the ceiling.
 
     :param diagnosis: whose ``believed`` and extended ``twin`` are compared
-    :param env: the real system, its id, or a function that makes it; one that has no limit of steps
-        gets the believed twin's
+    :param env: the real system, its id, or a function that makes it; without a step limit it gets
+        that of the nominal twin
     :param algorithm: trained in the simulations only
     :param budget: steps of the simulated environment; 0 is enough for PODS and HDS, which plan in
         their twin before they act
     :param seeds: runs in each simulation
     :param n_episodes: start states on the real system
-    :param ceiling: whether policies from the true twin are trained too, where there is one; or that
+    :param ceiling: whether policies are also trained in the true twin, where there is one; or that
         twin
-    :param progress: whether a bar shows how far it is
+    :param progress: whether to show a progress bar
     :param arguments: of the algorithm
     :return: returns by simulation, and the gain with its interval
     :raises TrajectoryError: for a twin without task, fewer than one run or episode, or an algorithm
@@ -151,8 +150,8 @@ def measure_policy_gain(
     if step_limit_of(made) is None:
         real = TimeLimit(made, diagnosis.believed.max_episode_steps)  # type: ignore[arg-type]
     simulations = {"believed": diagnosis.believed, "extended": diagnosis.twin}
-    if (truth := _truth(real, ceiling)) is not None:
-        simulations["true"] = truth
+    if (true := _true_twin(real, ceiling)) is not None:
+        simulations["true"] = true
     runs = [(name, seed) for seed in range(seeds) for name in simulations]
     returns: dict[str, list[np.ndarray]] = {name: [] for name in simulations}
     for name, seed in track(runs, "training", transient=True, disable=not progress):
@@ -166,7 +165,7 @@ def measure_policy_gain(
 
 
 def check_question(
-    believed: Twin,
+    nominal: Twin,
     real: gymnasium.Env,
     algorithm: type[BaseAlgorithm],
     budget: int,
@@ -175,9 +174,9 @@ def check_question(
     arguments: Mapping[str, Any],
 ) -> None:
     """
-    What :func:`measure_policy_gain` refuses, for whoever wants to know before there is a diagnosis.
+    The checks of :func:`measure_policy_gain`, which need no diagnosis.
 
-    :param believed: the twin as it is believed
+    :param nominal: the nominal twin
     :param arguments: of the algorithm
     :raises TrajectoryError: as there
     :raises ParameterError: as there
@@ -199,12 +198,12 @@ def check_question(
             f"{algorithm.__name__} learns nothing in 0 steps: give it a budget, for example "
             "10,000 steps."
         )
-    if believed.max_episode_steps is None:
+    if nominal.max_episode_steps is None:
         raise TrajectoryError(
-            f"{believed.name} has no episode length, so no task to be good at. "
+            f"{nominal.name} has no episode length, so no task to be good at. "
             "Give its class max_episode_steps and a reward."
         )
-    _check_same_signals(real, believed)
+    _check_same_signals(real, nominal)
 
 
 def _made(env: gymnasium.Env | str | Callable[[], gymnasium.Env]) -> gymnasium.Env:
@@ -219,12 +218,12 @@ def _made(env: gymnasium.Env | str | Callable[[], gymnasium.Env]) -> gymnasium.E
     return made
 
 
-def _check_same_signals(real: gymnasium.Env, believed: Twin) -> None:
-    simulated = TwinEnv(believed)
+def _check_same_signals(real: gymnasium.Env, nominal: Twin) -> None:
+    simulated = TwinEnv(nominal)
     ours, theirs = simulated.observation_space.shape, real.observation_space.shape
     if ours != theirs:
         raise EnvironmentMismatchError(
-            f"The real system has observations of shape {theirs}, {believed.name} of shape {ours}. "
+            f"The real system has observations of shape {theirs}, {nominal.name} of shape {ours}. "
             "A policy from the one cannot act on the other: wrap the system, so that it reports "
             "what the twin does."
         )
@@ -236,7 +235,7 @@ def _check_same_signals(real: gymnasium.Env, believed: Twin) -> None:
     ):
         shown = "no Box" if not isinstance(theirs, gymnasium.spaces.Box) else _range(theirs)
         raise EnvironmentMismatchError(
-            f"The real system takes actions in {shown}, {believed.name} in {_range(ours)}. Wrap "
+            f"The real system takes actions in {shown}, {nominal.name} in {_range(ours)}. Wrap "
             "the system, so that the same number means the same."
         )
 
@@ -246,7 +245,7 @@ def _range(space: gymnasium.spaces.Box) -> str:
     return f"{low} to {high}"
 
 
-def _truth(real: gymnasium.Env, ceiling: bool | Twin) -> Twin | None:
+def _true_twin(real: gymnasium.Env, ceiling: bool | Twin) -> Twin | None:
     """The twin that is the real system; None where nobody knows it, or nobody asks."""
     if isinstance(ceiling, Twin):
         return ceiling

@@ -1,4 +1,4 @@
-"""One improver over many start states, compiled."""
+"""One planner over many start states, compiled."""
 
 from collections.abc import Callable, Mapping
 from functools import partial

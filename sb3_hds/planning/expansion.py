@@ -1,4 +1,4 @@
-"""Local models of a plan: what one step and one reward do to first and second order."""
+"""Local models of a plan: expansions of step and reward to first and second order."""
 
 from typing import NamedTuple
 
@@ -103,9 +103,9 @@ def _expand_end(problem: Problem, end: State, origin: Float[Array, " n"], second
 def _curvature_of_squares(problem: Problem, roots, end: State, origin: Float[Array, " n"]):
     r"""
     Gauss-Newton Hessian of :math:`-|\rho|^2`. Of :math:`(\partial\rho/\partial x)^\top
-    (\partial\rho/\partial x)`, what turns :math:`\rho` without making it longer is curvature only
-    near the goal, where :math:`\rho` is zero. Further off it is the freedom of the network, so that
-    its share fades.
+    (\partial\rho/\partial x)`, the part that rotates :math:`\rho` without lengthening it is
+    curvature only near the goal, where :math:`\rho` is zero. Elsewhere it is an arbitrary choice of
+    the network, so its share fades.
     """
     at = lambda dx: roots(problem.observe(problem.twin.retract(end, dx)))  # noqa: E731
     rho, jacobian = at(origin), jax.jacfwd(at)(origin)

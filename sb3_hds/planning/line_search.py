@@ -1,4 +1,4 @@
-"""Choosing among step sizes, "no change" always among them."""
+"""Line searches, with "no change" among the candidates."""
 
 import math
 from collections.abc import Callable
@@ -55,7 +55,7 @@ def climb(
     key: PRNGKeyArray | None,
 ) -> Plan:
     """
-    Move a whole control sequence along a direction, again and again; clipped to the limits.
+    Iterate line searches along a direction of the whole control sequence, clipped to the limits.
 
     :param direction: change of the controls for a unit step, zero where it is not finite
     :param n_step_sizes: candidates of each line search, "no change" and steps from 1 down to 5e-4

@@ -1,4 +1,4 @@
-"""What a planner maximises, and what it returns."""
+"""The planning problem, and the plan that solves it."""
 
 import dataclasses
 from collections.abc import Callable
@@ -17,7 +17,7 @@ TerminalValue: TypeAlias = Callable[[Obs], Scalar]
 
 class Plan(NamedTuple):
     """
-    A sequence of controls and what comes of it.
+    A sequence of controls with its states and rewards.
 
     :param controls: scaled actions in [-1, 1], shape ``(horizon, n_act)``
     :param states: leaves of shape ``(horizon + 1, ...)``, the start state first
@@ -40,10 +40,10 @@ class Problem:
 
     .. math:: \sum_{t<H} \gamma^t\, s\,(r_t - r_0) + \gamma^H V(o_H)
 
-    where :math:`r` is the twin's planning reward. An episode that has terminated is worth
-    :math:`-s\,r_0/(1-\gamma)` from there on: shifting every reward by the same :math:`r_0` then
-    changes the objective by a constant only, and does not make dying pay. There is no auto-reset.
-    Without ``shift_ends`` an end is worth zero, which is more than any reward below :math:`r_0`.
+    where :math:`r` is the twin's planning reward. A terminated episode has the value
+    :math:`-s\,r_0/(1-\gamma)` from there on, so that shifting every reward by :math:`r_0` changes
+    the objective by a constant only and does not reward termination. There is no auto-reset.
+    Without ``shift_ends`` a termination has the value zero, more than any reward below :math:`r_0`.
 
     :param twin: what is simulated
     :param params: its parameters
@@ -53,8 +53,8 @@ class Problem:
     :param terminal_value: :math:`V`, scaled like the rewards; None means zero
     :param terminal_curvature: whether second-order methods use the Hessian of :math:`V` too
     :param terminal_roots: observation to :math:`\rho`, shape ``(k,)``, with :math:`V \approx c -
-        |\rho|^2`. What their slopes say of the curvature stands in for the Hessian of :math:`V`:
-        never of the wrong sign, and as smooth as a gradient (Gauss-Newton).
+        |\rho|^2`. Their Gauss-Newton curvature replaces the Hessian of :math:`V`: it never has the
+        wrong sign, and is as smooth as a gradient.
     :param shift_ends: whether an episode that has terminated is shifted with the rewards
     """
 
@@ -99,7 +99,7 @@ class Problem:
 
     @property
     def value_when_terminated(self) -> Scalar:
-        """What an episode that has ended is worth, scaled and shifted."""
+        """The value of a terminated episode, scaled and shifted."""
         if self.discount == 1.0 or not self.shift_ends:
             return jnp.zeros(())
         return -jnp.asarray(self.reward_offset * self.reward_scale) / (1.0 - self.discount)
@@ -117,7 +117,7 @@ def simulate(problem: Problem, start: State, controls: Controls) -> Plan:
 
 
 def simulated(problem: Problem, start: State, first: Controls | Plan) -> Plan:
-    """:return: the plan that controls make from ``start``, or one that has been made already"""
+    """:return: the plan of the controls from ``start``; an existing plan is returned as it is"""
     return first if isinstance(first, Plan) else simulate(problem, start, first)
 
 

@@ -1,4 +1,4 @@
-"""The backward pass that Gauss-Newton and iLQR share."""
+"""The Riccati backward pass of Gauss-Newton and iLQR."""
 
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ class Gains(NamedTuple):
 
     :param feedforward: change of the controls, shape ``(horizon, m)``
     :param feedback: reaction to a change of the state, shape ``(horizon, m, n)``
-    :param sensitivity: what an error of this control costs, ``|Q_u| + tr(Q_uu) / 2``, shape
+    :param sensitivity: cost of an error in this control, ``|Q_u| + tr(Q_uu) / 2``, shape
         ``(horizon,)``
     """
 

@@ -1,4 +1,4 @@
-"""Where improvement starts: random smooth sequences, the best of many, and growing horizons."""
+"""Initial sequences: random smooth ones, the best of many, and growing horizons."""
 
 from collections.abc import Callable, Sequence
 
@@ -49,7 +49,7 @@ def multi_start(
     improve: Callable[[Problem, State, Controls], Plan],
 ) -> Plan:
     """
-    Improve several sequences and keep the best: the remedy against local optima.
+    Improve several sequences and keep the best, against local optima.
 
     :param initial: sequences of one length
     :param improve: an improver, for example ``gauss_newton``

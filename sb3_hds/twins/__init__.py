@@ -1,4 +1,4 @@
-"""The library of twins, one file per system, and the registry that finds them."""
+"""The library of twins, one file per system, and their registry."""
 
 from sb3_hds.twins.check import check
 from sb3_hds.twins.check_result import CheckItem, TwinCheck

@@ -1,4 +1,4 @@
-"""Whether a twin is the mechanical system that it is written down to be."""
+"""Consistency checks of a twin as a mechanical system."""
 
 from typing import Any, NamedTuple
 
@@ -39,12 +39,12 @@ def check(twin: Twin | type[Twin] | str, *, seed: int = 0) -> TwinCheck:
     - gravity and springs have a potential: :math:`\partial c(q, 0) / \partial q` is symmetric
     - the forces of inertia do no work, :math:`v^T (\tfrac12 \dot M v - c(q, v) + c(q, 0)) = 0`, or
       less than none, where the twin has damping of its own
-    - without actuators, what is left of the energy after :meth:`step` is what damping leaves, but
-      for an error that shrinks with the sub-step
+    - without actuators, the energy after :meth:`step` decreases by the work of damping, up to an
+      error that shrinks with the sub-step
 
     Everything is evaluated in double precision at random states, commands and values of parameters
-    within a ``scale`` of the twin's own. What a mass or a length *is*, no check can know:
-    ``verify_mirror`` compares with an environment, and ``calibrate`` with data.
+    within a ``scale`` of the twin's own. Values of masses and lengths cannot be
+    checked this way: ``verify_mirror`` compares with an environment, ``calibrate`` with data.
 
     Source of the third last and second last: Spong, Hutchinson and Vidyasagar, *Robot Modeling and
     Control*, 2006, section 7.5 (passivity).
@@ -210,19 +210,19 @@ def _finite(samples: _Samples) -> CheckItem:
     name = "finite"
     values = {"step": np.concatenate(samples.states[:2], -1)[:, :, 1:], **samples.seen}
     values = {method: values[method] for method in _METHODS}
-    for variant, told in enumerate(samples.names):
+    for variant, label in enumerate(samples.names):
         # At a bound, one step: a motion may be too fast there for the twin's sub-step.
-        n_steps = 1 if " = " in told else _N_STEPS
+        n_steps = 1 if " = " in label else _N_STEPS
         for method, found in values.items():
             bad = ~np.isfinite(found[variant, :, :n_steps]).reshape(_N_STARTS, n_steps, -1)
             if bad.any():
                 after = int(bad.any((0, 2)).argmax()) + 1
-                where = f"with {told}" if n_steps == 1 else f"with {_variant_in_words(told)}"
+                where = f"with {label}" if n_steps == 1 else f"with {_variant_in_words(label)}"
                 return CheckItem(
                     name,
                     False,
                     f"{method} is not finite after {after} of {_N_STEPS} steps {where}",
-                    f"Move the bound of {told.partition(' = ')[0]} to where the twin still works."
+                    f"Move the bound of {label.partition(' = ')[0]} to where the twin still works."
                     if n_steps == 1
                     else "Look for a division by zero or a root, or take more sub-steps.",
                 )
@@ -278,9 +278,9 @@ def _inverse(twin: Twin, samples: _Samples) -> CheckItem:
         for joint, b, a in zip(twin.joints, before.T, after.T, strict=True)
         if _apart(a - b, what == "position" and joint.unit == "rad") > ROUNDING * np.abs(b).max()
     ]
-    told = f"observe(infer(obs)) equals obs {precision(error.max())}"
+    found = f"observe(infer(obs)) equals obs {precision(error.max())}"
     return CheckItem(
-        name, True, f"{told}; infer does not recover {', '.join(lost)}" if lost else told
+        name, True, f"{found}; infer does not recover {', '.join(lost)}" if lost else found
     )
 
 

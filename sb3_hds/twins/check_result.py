@@ -1,4 +1,4 @@
-"""What checking a twin finds."""
+"""The result of checking a twin."""
 
 import dataclasses
 import textwrap
@@ -49,8 +49,8 @@ class TwinCheck:
 
     def __str__(self) -> str:
         n, failed = len(self.items), len(self.failed)
-        told = f"{failed} of {n} checks failed" if failed else f"all {n} checks passed"
-        lines = [f"{self.twin}: {told}", "=" * _WIDTH]
+        verdict = f"{failed} of {n} checks failed" if failed else f"all {n} checks passed"
+        lines = [f"{self.twin}: {verdict}", "=" * _WIDTH]
         for name, ok, found, way_out in self.items:
             lines += _wrapped(f"{'ok  ' if ok else 'FAIL'} {name}: {found}")
             lines += _wrapped(f"     -> {way_out}") if way_out else []

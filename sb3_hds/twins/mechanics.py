@@ -1,4 +1,4 @@
-"""Whether mass matrix, bias and step belong to one mechanical system: what energy says of them."""
+"""Energy checks of whether mass matrix, bias and step describe one mechanical system."""
 
 import copy
 from collections.abc import Callable
@@ -28,7 +28,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 class Points(NamedTuple):
     """
-    Where the terms of the equation of motion are compared.
+    Points at which the terms of the equation of motion are compared.
 
     :param params: values of the parameters, one of each for every point
     :param q: positions, shape ``(points, dof)``
@@ -41,7 +41,7 @@ class Points(NamedTuple):
 
 
 def precision(error: float) -> str:
-    """:return: how far something holds, in words"""
+    """:return: the precision to which something holds, in words"""
     return f"to {error:.0e}" if error else "exactly"
 
 
@@ -62,8 +62,8 @@ def check_mechanics(plant: AnalyticTwin, points: Points) -> list[CheckItem]:
     mass, slopes, shares = map(np.asarray, found)
     for method, values in (("mass_matrix", mass), ("bias", slopes), ("bias", shares)):
         if not np.isfinite(values).all():
-            told = f"{method} is not finite at every position and speed"
-            return [CheckItem("equation of motion", False, told, "Look for divisions by zero.")]
+            found = f"{method} is not finite at every position and speed"
+            return [CheckItem("equation of motion", False, found, "Look for divisions by zero.")]
     items = [_mass_item(plant, mass), _potential_item(plant, slopes), _power_item(shares)]
     return [*items, _energy_item(plant, points)] if all(item.ok for item in items) else items
 
@@ -112,8 +112,8 @@ def _mass_item(plant: AnalyticTwin, mass: Float[np.ndarray, "points dof dof"]) -
             f"not positive definite: smallest eigenvalue {least:.2g} where the diagonal is one",
             "What couples two joints must stay below the root of the product of their inertias.",
         )
-    told = f"at {len(mass)} points, smallest eigenvalue {least:.2g} where the diagonal is one"
-    return CheckItem(name, True, f"symmetric and positive definite ({told})")
+    found = f"at {len(mass)} points, smallest eigenvalue {least:.2g} where the diagonal is one"
+    return CheckItem(name, True, f"symmetric and positive definite ({found})")
 
 
 def _potential_item(plant: AnalyticTwin, slopes: Float[np.ndarray, "points dof dof"]) -> CheckItem:
@@ -132,8 +132,8 @@ def _potential_item(plant: AnalyticTwin, slopes: Float[np.ndarray, "points dof d
         )
     if len(plant.joints) == 1:
         return CheckItem(name, True, "bias(q, 0) has a potential, as with any single joint")
-    told = f"its Jacobian is symmetric {precision(apart.max())}"
-    return CheckItem(name, True, f"bias(q, 0) has a potential: {told}")
+    found = f"its Jacobian is symmetric {precision(apart.max())}"
+    return CheckItem(name, True, f"bias(q, 0) has a potential: {found}")
 
 
 def _power_item(shares: Float[np.ndarray, "points speeds"]) -> CheckItem:
@@ -173,23 +173,23 @@ def _energy_item(plant: AnalyticTwin, points: Points) -> CheckItem:
         least = _FALLS * abs(errors[-2]) if len(errors) > 1 else 0.0
         if falls := abs(errors[-1]) <= max(least, _NEGLIGIBLE):
             break
-    told = f"undriven for {n} sub-steps of {h:g} s, off by {errors[0]:+.0e} of the largest energy"
+    found = f"undriven for {n} sub-steps of {h:g} s, off by {errors[0]:+.0e} of the largest energy"
     if len(errors) == 1:
-        return CheckItem(name, True, told)
-    told += f", by {errors[-1]:+.0e} with sub-steps {_FINER[len(errors) - 1]} times as short"
+        return CheckItem(name, True, found)
+    found += f", by {errors[-1]:+.0e} with sub-steps {_FINER[len(errors) - 1]} times as short"
     if falls:
-        return CheckItem(name, True, f"{told}: the integrator's error")
+        return CheckItem(name, True, f"{found}: the integrator's error")
     clips = [
         method
         for method in ("limit", "limit_velocity")
         if getattr(type(plant), method) is not getattr(AnalyticTwin, method)
     ]
     if clips and errors[-1] < 0.0:
-        return CheckItem(name, True, f"{told}: {' and '.join(clips)} dissipates")
+        return CheckItem(name, True, f"{found}: {' and '.join(clips)} dissipates")
     return CheckItem(
         name,
         False,
-        f"{told}, which is no error of the integrator",
+        f"{found}, which is no error of the integrator",
         "Look at the integrator, and at step, limit and limit_velocity, if the twin has its own.",
     )
 
@@ -214,7 +214,9 @@ def _balance(plant: AnalyticTwin, h: float, n: int, finer: int) -> Callable[...,
         power = lambda state: _power(plant, params, state.q, state.v)[0]  # noqa: E731
 
         def lifted(q: Position, after: Position) -> Scalar:
-            """Work against gravity and springs, on the straight way: any other takes as much."""
+            """
+            Work against gravity and springs along a straight path; any other path takes as much.
+            """
             way = after - q
             # Where the twin wraps its angles, the way is not once around.
             way = jnp.where(rotary, way - 2.0 * jnp.pi * jnp.round(way / (2.0 * jnp.pi)), way)

@@ -1,4 +1,4 @@
-"""Gymnasium wrappers for what robots need, one file per concern."""
+"""Gymnasium wrappers for learning on robots, in rooms by what they act on."""
 
 from sb3_hds.wrappers.actions.continuity import ContinuityCost
 from sb3_hds.wrappers.actions.cpg_prior import CPGPrior

@@ -1,4 +1,4 @@
-"""What all layers between a policy and the commands of an environment have in common."""
+"""Base classes of the layers between a policy and the commands of an environment."""
 
 import abc
 import inspect
@@ -18,22 +18,23 @@ _STORES = ("raw", "executed")
 
 class ActionLayer(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs, abc.ABC):
     """
-    Abstract: turns the action that a policy chooses into the command that the environment gets.
+    Abstract: maps the action of a policy to the command of the environment.
 
     ``step`` adds to ``info``, where several layers are nested:
 
-    - ``raw_action``: what the policy chose, before the outermost layer
-    - ``safe_action``: what the environment was told, after the innermost layer
-    - ``correction``: the sum of what each layer changed, in command units
-    - ``constraint_cost``: the sum of what each layer found violated, 0 where nothing is
+    - ``raw_action``: the action of the policy, before the outermost layer
+    - ``safe_action``: the command of the environment, after the innermost layer
+    - ``correction``: the sum of the changes by all layers, in command units
+    - ``constraint_cost``: the sum of the constraint violations of all layers
     - ``executed_action``: the action that would have been executed unchanged, in the units of the
-      outermost layer's action space; what the policy chose, where a layer has no such action
-    - ``stored_action``: the same, where the outermost layer has ``store="executed"``: what a
-      learner should store instead of what it chose
+      outermost layer's action space; the raw action where a layer has no such action
+    - ``stored_action``: the same, where the outermost layer has ``store="executed"``: the
+      action that a learner should store instead of its own
 
     :param env: its actions are a bounded Box with one axis
     :param store: ``"raw"``, or ``"executed"``
-    :param arguments: of the constructor, so that ``env.spec`` can tell how to wrap again
+    :param arguments: of the constructor, recorded in ``env.spec`` so that the wrapper can be
+        rebuilt
     :raises ParameterError: for other actions, or another ``store``
     """
 
@@ -55,7 +56,7 @@ class ActionLayer(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs, abc.
 
     @property
     def commands(self) -> spaces.Box:
-        """What the environment below takes."""
+        """The command space of the environment below."""
         assert isinstance(self.env.action_space, spaces.Box)
         return self.env.action_space
 
@@ -71,15 +72,15 @@ class ActionLayer(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs, abc.
         return np.clip(action, self.commands.low, self.commands.high)
 
     def meant_by(self, command: np.ndarray) -> np.ndarray:
-        """:return: the action that stands for a command: the inverse of :meth:`nominal`"""
+        """:return: the action that corresponds to a command: the inverse of :meth:`nominal`"""
         return command
 
     def begin(self, obs: Any) -> None:
-        """An episode begins with ``obs``."""
+        """Called with the first observation of an episode."""
         self._obs = vector(self.env.observation_space, obs)
 
     def arrive(self, obs: Any, command: np.ndarray) -> None:
-        """``command`` led to ``obs``."""
+        """Called after a step with the command and the observation it led to."""
         self._obs = vector(self.env.observation_space, obs)
 
     def seen(self, obs: Any) -> Any:
@@ -87,14 +88,14 @@ class ActionLayer(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs, abc.
         return obs
 
     def cost(self) -> float:
-        """:return: by how much the latest observation violates what the layer guards"""
+        """:return: by how much the latest observation violates the constraints of the layer"""
         return 0.0
 
     def charged(self) -> float:
-        """:return: what the latest command costs; the reward is that much smaller"""
+        """:return: the penalty on the latest command, subtracted from the reward"""
         return 0.0
 
-    def told(self) -> dict[str, Any]:
+    def extra_info(self) -> dict[str, Any]:
         """:return: further entries of ``info``"""
         return {}
 
@@ -146,15 +147,14 @@ class ActionLayer(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs, abc.
         info["executed_action"] = executed.astype(self.action_space.dtype)
         if self.store == "executed":
             info["stored_action"] = info["executed_action"]
-        return info | self.told()
+        return info | self.extra_info()
 
 
 class TransformLayer(ActionLayer):
     """
-    Abstract: a layer that is a :class:`~sb3_hds.core.StatefulTransform`, so that a twin can be seen
-    through it.
+    Abstract: a layer around a :class:`~sb3_hds.core.StatefulTransform`, which can wrap a twin, too.
 
-    :param transform: what it does
+    :param transform: what the layer computes
     :raises ParameterError: if it does not fit the environment
     """
 
@@ -177,12 +177,12 @@ class TransformLayer(ActionLayer):
 
     @property
     def twin_transform(self) -> StatefulTransform | None:
-        """What a twin can be seen through; None where it would not be right."""
+        """The transform that also wraps the twin; None where there is no exact one."""
         return self._transform
 
     @property
     def twin_transforms(self) -> list[tuple[str, StatefulTransform]]:
-        """The layers from here to the environment that a twin can be seen through, by class."""
+        """The transforms from here to the environment, by class of the layer."""
         layers, env = [], self
         while isinstance(env, gymnasium.Wrapper):
             if isinstance(env, TransformLayer) and env.twin_transform is not None:
@@ -235,7 +235,7 @@ def check_action(env: gymnasium.Env, action: Any) -> np.ndarray:
 
 
 def vector(space: spaces.Space, obs: Any) -> np.ndarray:
-    """:return: the observation in double precision; of no entries where it is no vector"""
+    """:return: the observation in double precision, empty where it is no vector"""
     return np.asarray(obs, np.float64) if is_vector(space) else np.zeros(0)
 
 
@@ -253,7 +253,7 @@ def with_channels(
     env: gymnasium.Env, space: spaces.Space, added: tuple[Channel, ...]
 ) -> spaces.Box:
     """
-    :return: the observation space with ``added`` behind it
+    :return: the observation space with ``added`` appended
     :raises ParameterError: unless observations are a Box with one axis
     """
     if not isinstance(space, spaces.Box) or not is_vector(space):

@@ -1,4 +1,4 @@
-"""Which joint each actuator of a MuJoCo model drives, and where its state is."""
+"""The joint that each actuator of a MuJoCo model drives, and the place of its state."""
 
 from typing import Any, NamedTuple
 
@@ -83,13 +83,13 @@ def commands_positions(model: Any) -> bool:
     return bool(np.any(affine & (np.asarray(model.actuator_biasprm)[:, 1] != 0.0)))
 
 
-def refuse_servos(model: Any, told: Any) -> None:
+def refuse_servos(model: Any, declared: Any) -> None:
     """
     :param model: an ``MjModel``
-    :param told: what the environment says in its attribute ``commands_positions``
+    :param declared: the attribute ``commands_positions`` of the environment
     :raises EnvironmentMismatchError: if commands are positions, which are tracked already
     """
-    if told or commands_positions(model):
+    if declared or commands_positions(model):
         raise EnvironmentMismatchError(
             "The commands of this environment are positions: its own servos track them, and a "
             "second loop around those would not arrive. Let the oscillators be the commands: "

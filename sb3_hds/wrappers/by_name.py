@@ -1,4 +1,4 @@
-"""Functions that a yml file can only name."""
+"""Functions by their dotted name, as yml files hold them."""
 
 import importlib
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""How long a step of an environment is."""
+"""The control interval of an environment."""
 
 import numbers
 import warnings
@@ -10,15 +10,15 @@ import gymnasium
 
 def interval_of(env: gymnasium.Env, error: type[Exception], *, drawn: bool = False) -> float:
     """
-    :param error: raised where the environment does not tell
-    :param drawn: whether the rate at which it is drawn will do, with a warning
+    :param error: type of the exception where the interval is unknown
+    :param drawn: whether to fall back on the rendering rate, with a warning
     :return: the control interval [s]
     """
     inner = env.unwrapped
-    return interval_told(lambda name: getattr(inner, name, None), str(inner), error, drawn=drawn)
+    return interval_from(lambda name: getattr(inner, name, None), str(inner), error, drawn=drawn)
 
 
-def interval_told(
+def interval_from(
     attribute: Callable[[str], Any], env: str, error: type[Exception], *, drawn: bool
 ) -> float:
     """
@@ -28,8 +28,8 @@ def interval_told(
     :param env: what to call it
     """
     twin = attribute("twin")
-    for told in (*map(attribute, ("dt", "tau")), *(getattr(twin, n, None) for n in ("dt", "tau"))):
-        if isinstance(told, numbers.Real) and (seconds := float(told)) > 0.0:
+    for value in (*map(attribute, ("dt", "tau")), *(getattr(twin, n, None) for n in ("dt", "tau"))):
+        if isinstance(value, numbers.Real) and (seconds := float(value)) > 0.0:
             return seconds
     rate = (attribute("metadata") or {}).get("render_fps")
     if drawn and rate:

@@ -30,8 +30,8 @@ class GymnasiumVecEnv(VecEnv):
 
     - ``SAME_STEP``: the last observation is ``infos["final_obs"]``.
     - ``NEXT_STEP``: the step after an end ignores the action and returns a first observation. A
-      learner that stores it learns that the last state, under an action that nobody took, leads to
-      the first one. Here, copies that ended are reset at once, so that there is no such step.
+      learner that stored this step would learn a transition that does not exist. Here, copies that
+      ended are reset at once, so that there is no such step.
     - ``DISABLED``: likewise.
 
     The last two need an environment that resets some of its copies only: Gymnasium's own do, by
@@ -91,10 +91,10 @@ class GymnasiumVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """:raises RuntimeError: if the environment does not keep to its autoreset mode"""
-        obs, rewards, terminated, truncated, told = self.env.step(self._actions)
+        obs, rewards, terminated, truncated, raw_infos = self.env.step(self._actions)
         obs, rewards = copied(obs), np.asarray(rewards, np.float32)
         terminated, truncated = np.asarray(terminated, bool), np.asarray(truncated, bool)
-        infos, dones = infos_of(told, self.num_envs), terminated | truncated
+        infos, dones = infos_of(raw_infos, self.num_envs), terminated | truncated
         if dones.any() and self.autoreset_mode is AutoresetMode.SAME_STEP:
             last = [self._taken_apart(infos, i) if dones[i] else None for i in range(len(dones))]
         else:
@@ -111,7 +111,7 @@ class GymnasiumVecEnv(VecEnv):
         return obs, rewards, dones, infos
 
     def _taken_apart(self, infos: list[dict], i: int) -> Any:
-        """What a copy that ended in ``SAME_STEP`` says of its last and of its first moment."""
+        """Final and first observation and info of a copy that ended in ``SAME_STEP``."""
         both = infos[i]
         name = next((name for name in _FINAL_OBS if name in both), None)
         if name is None:
@@ -131,7 +131,7 @@ class GymnasiumVecEnv(VecEnv):
         :param which: of them shall begin anew
         :return: what all copies observe then
         """
-        obs, told = self._partial_reset(which.copy())
+        obs, raw_infos = self._partial_reset(which.copy())
         if not same_rows(before, obs, ~which):
             raise RuntimeError(
                 f"{self.env} was asked to reset the copies {np.flatnonzero(which).tolist()}, and "
@@ -139,7 +139,7 @@ class GymnasiumVecEnv(VecEnv):
                 "partial_reset does not keep to it. Use autoreset_mode=SAME_STEP, or pass "
                 "partial_reset=."
             )
-        infos = infos_of(told, self.num_envs)
+        infos = infos_of(raw_infos, self.num_envs)
         for i in np.flatnonzero(which):
             self.reset_infos[i] = infos[i]
         return copied(obs)
@@ -154,13 +154,13 @@ class GymnasiumVecEnv(VecEnv):
                 "otherwise use autoreset_mode=SAME_STEP, or pass partial_reset=."
             ) from error
 
-    def _episode(self, i: int, told: Any) -> dict[str, float]:
+    def _episode(self, i: int, statistics: Any) -> dict[str, float]:
         """
-        :param told: what the environment says of the episode; Gymnasium's vectorised
+        :param statistics: of the episode by the environment; Gymnasium's vectorised
             ``RecordEpisodeStatistics`` begins to count anew in all copies where one is reset
         """
-        if isinstance(told, dict) and told.get("l") == self._lengths[i]:
-            return told
+        if isinstance(statistics, dict) and statistics.get("l") == self._lengths[i]:
+            return statistics
         elapsed = round(time.time() - self._started, 6)
         return {"r": round(float(self._returns[i]), 6), "l": int(self._lengths[i]), "t": elapsed}
 

@@ -17,7 +17,7 @@ from sb3_hds.wrappers.actuated_joints import (
     actuated_joints,
     refuse_servos,
 )
-from sb3_hds.wrappers.interval import interval_told
+from sb3_hds.wrappers.interval import interval_from
 
 # Resets, which differ from each other, that must agree on where a joint is in the observation.
 _N_RESETS = 3
@@ -94,7 +94,7 @@ def body_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Body:
     """
     attribute, error = functools.partial(_attribute, env), EnvironmentMismatchError
     interval = (
-        interval_told(attribute, "The environment", error, drawn=True) if dt is None else float(dt)
+        interval_from(attribute, "The environment", error, drawn=True) if dt is None else float(dt)
     )
     driven = _driven(env, control)
     if driven is None:

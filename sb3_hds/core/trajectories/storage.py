@@ -109,9 +109,32 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
                 f"'{source}' was not written by Trajectories.save: it holds Python objects, which "
                 "would have to be unpickled, and no file is. Save arrays of numbers."
             ) from error
-        told = " ".join(str(error).split())[:200]
-        reason = "it holds no arrays of numbers" if "pickle" in told else told
+        message = " ".join(str(error).split())[:200]
+        reason = "it holds no arrays of numbers" if "pickle" in message else message
         raise TrajectoryError(
             f"'{source}' is damaged or was not written by Trajectories.save ({reason}). "
             "Restore it from a copy, or record it again."
         ) from error
+
+
+def read_marked(path: str | os.PathLike[str], kind: str, version: int) -> dict[str, np.ndarray]:
+    """
+    :param path: as given to :func:`write_npz`
+    :param kind: that the file must carry as ``format``
+    :param version: the latest that can be read
+    :return: all arrays, by name
+    :raises TrajectoryError: as :func:`read_npz`, and for another format or a later version
+    """
+    stored = read_npz(path)
+    if stored.get("format", np.array("")).tolist() != kind:
+        raise TrajectoryError(
+            f"'{path}' was not written by Trajectories.save; it holds: {', '.join(stored)}. "
+            "Say what that is, columns={'time': NAME, 'obs': [NAME, ...], 'actions': [NAME, "
+            "...]}, or build the data with Trajectories.from_arrays."
+        )
+    if stored.get("version", np.array(0)) > version:
+        raise TrajectoryError(
+            f"'{path}' is of version {stored['version']}, this sb3_hds reads up to "
+            f"{version}. Upgrade sb3_hds."
+        )
+    return stored

@@ -22,7 +22,7 @@ from sb3_hds.core.trajectories.episodes import (
     same_interval,
 )
 from sb3_hds.core.trajectories.replay_buffer import episodes_in
-from sb3_hds.core.trajectories.storage import read_npz, write_npz
+from sb3_hds.core.trajectories.storage import read_marked, write_npz
 from sb3_hds.errors import TrajectoryError
 
 _FORMAT, _VERSION = "sb3_hds.Trajectories", 1
@@ -191,18 +191,7 @@ class Trajectories:
     @classmethod
     def _load_npz(cls, path: str | os.PathLike[str]) -> "Trajectories":
         """One file that :meth:`save` wrote."""
-        stored = read_npz(path)
-        if stored.get("format", np.array("")).tolist() != _FORMAT:
-            raise TrajectoryError(
-                f"'{path}' was not written by Trajectories.save; it holds: {', '.join(stored)}. "
-                "Say what that is, columns={'time': NAME, 'obs': [NAME, ...], 'actions': [NAME, "
-                "...]}, or build the data with Trajectories.from_arrays."
-            )
-        if stored.get("version", np.array(0)) > _VERSION:
-            raise TrajectoryError(
-                f"'{path}' is of version {stored['version']}, this sb3_hds reads up to "
-                f"{_VERSION}. Upgrade sb3_hds."
-            )
+        stored = read_marked(path, _FORMAT, _VERSION)
         try:
             lengths = stored["lengths"].tolist()
             obs = [x[: n + 1] for x, n in zip(stored["obs"], lengths, strict=True)]
@@ -393,13 +382,10 @@ def _unzip(
     return [x for x, _ in episodes], [u for _, u in episodes]
 
 
-def _flatten(data: Trajectories) -> tuple[tuple[Any, ...], tuple[float, tuple[str, ...]]]:
-    return tuple(getattr(data, name) for name in _LEAVES), (data.dt, data.conditions)
-
-
-def _flatten_with_keys(data: Trajectories) -> tuple[Any, tuple[float, tuple[str, ...]]]:
-    leaves, static = _flatten(data)
-    return tuple(zip(map(jax.tree_util.GetAttrKey, _LEAVES), leaves, strict=True)), static
+def _flatten(data: Trajectories) -> tuple[Any, tuple[float, tuple[str, ...]]]:
+    """Leaves with their keys, and what is static."""
+    leaves = tuple((jax.tree_util.GetAttrKey(name), getattr(data, name)) for name in _LEAVES)
+    return leaves, (data.dt, data.conditions)
 
 
 def _unflatten(static: tuple[float, tuple[str, ...]], leaves: Iterable[Any]) -> Trajectories:
@@ -411,4 +397,4 @@ def _unflatten(static: tuple[float, tuple[str, ...]], leaves: Iterable[Any]) -> 
     return data
 
 
-jax.tree_util.register_pytree_with_keys(Trajectories, _flatten_with_keys, _unflatten, _flatten)
+jax.tree_util.register_pytree_with_keys(Trajectories, _flatten, _unflatten)

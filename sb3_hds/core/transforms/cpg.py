@@ -232,7 +232,7 @@ class Rhythm(StatefulTransform):
         """
         :param position: of the joints; None: the targets are the commands
         :param velocity: likewise
-        :return: what the actuators are told, not clipped
+        :return: the commands of the actuators, not clipped
         """
         command = target
         if position is not None:

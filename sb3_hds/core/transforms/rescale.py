@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,9 +13,56 @@ from sb3_hds.core.signals import Actuator, Channel
 from sb3_hds.core.transforms.base import ActionTransform, ObservationTransform
 from sb3_hds.errors import ParameterError
 
+_Signal = TypeVar("_Signal", Actuator, Channel)
+
 
 @dataclasses.dataclass(frozen=True)
-class RescaleAction(ActionTransform):
+class _Bounds:
+    """
+    :param low: lower bound, one number or one for each signal
+    :param high: upper bound, likewise
+    :raises ParameterError: unless both are finite and ``low < high``
+    """
+
+    low: float | Sequence[float] = -1.0
+    high: float | Sequence[float] = 1.0
+
+    def __post_init__(self) -> None:
+        low, high = np.asarray(self.low, float), np.asarray(self.high, float)
+        for name, value in (("low", low), ("high", high)):
+            plain = tuple(value.tolist()) if value.ndim else float(value)
+            object.__setattr__(self, name, plain)
+        if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high)) and np.all(low < high)):
+            raise ParameterError(
+                f"{type(self).__name__} needs finite bounds with low < high, "
+                f"got low={low}, high={high}."
+            )
+
+    def each(self, n: int, kind: str) -> tuple[np.ndarray, np.ndarray]:
+        """:return: the bounds of each of ``n`` signals"""
+        low, high = np.atleast_1d(self.low), np.atleast_1d(self.high)
+        if not {low.size, high.size} <= {1, n}:
+            raise ParameterError(
+                f"{type(self).__name__} has bounds for {max(low.size, high.size)} {kind}, "
+                f"but the twin has {n}."
+            )
+        return np.broadcast_to(low, (n,)), np.broadcast_to(high, (n,))
+
+    def rescaled(self, below: tuple[_Signal, ...], kind: str) -> tuple[_Signal, ...]:
+        """:return: the signals with these bounds, without a unit"""
+        lows, highs = self.each(len(below), kind)
+        unbounded = [s.name for s in below if not (math.isfinite(s.low) and math.isfinite(s.high))]
+        if unbounded:
+            raise ParameterError(
+                f"{type(self).__name__} needs limits to scale by, "
+                f"but these have none: {', '.join(unbounded)}."
+            )
+        pairs = zip(below, lows.tolist(), highs.tolist(), strict=True)
+        return tuple(s._replace(unit="1", low=low, high=high) for s, low, high in pairs)
+
+
+@dataclasses.dataclass(frozen=True)
+class RescaleAction(_Bounds, ActionTransform):
     """
     Gymnasium's ``RescaleAction``: ``[low, high]`` maps linearly onto the limits of each actuator.
 
@@ -28,27 +75,17 @@ class RescaleAction(ActionTransform):
 
     name: ClassVar[str] = "rescale_action"
 
-    low: float | Sequence[float] = -1.0
-    high: float | Sequence[float] = 1.0
-
-    def __post_init__(self) -> None:
-        _store_bounds(self, self.low, self.high)
-
     def actuators(self, below: tuple[Actuator, ...]) -> tuple[Actuator, ...]:
-        lows, highs = _spread(self, len(below), "actuators")
-        _refuse_unbounded(self, below)
-        pairs = zip(below, lows, highs, strict=True)
-        return tuple(a._replace(unit="1", low=float(lo), high=float(hi)) for a, lo, hi in pairs)
+        return self.rescaled(below, "actuators")
 
     def apply(
         self, action: Float[Array, " outer"], below: tuple[Actuator, ...]
     ) -> Float[Array, " inner"]:
-        low, high = _spread(self, len(below), "actuators")
-        return _affine(action, low, high, *_limits(below))
+        return _affine(action, *self.each(len(below), "actuators"), *_limits(below))
 
 
 @dataclasses.dataclass(frozen=True)
-class RescaleObservation(ObservationTransform):
+class RescaleObservation(_Bounds, ObservationTransform):
     """
     Gymnasium's ``RescaleObservation``: limits of each channel map linearly onto ``[low, high]``.
 
@@ -59,69 +96,22 @@ class RescaleObservation(ObservationTransform):
 
     name: ClassVar[str] = "rescale_observation"
 
-    low: float | Sequence[float] = -1.0
-    high: float | Sequence[float] = 1.0
-
-    def __post_init__(self) -> None:
-        _store_bounds(self, self.low, self.high)
-
     def channels(self, below: tuple[Channel, ...]) -> tuple[Channel, ...]:
-        lows, highs = _spread(self, len(below), "channels")
-        _refuse_unbounded(self, below)
-        pairs = zip(below, lows, highs, strict=True)
-        return tuple(c._replace(unit="1", low=float(lo), high=float(hi)) for c, lo, hi in pairs)
+        return self.rescaled(below, "channels")
 
     def observe(
         self, obs: Float[Array, " inner"], below: tuple[Channel, ...]
     ) -> Float[Array, " outer"]:
-        low, high = _spread(self, len(below), "channels")
-        return _affine(obs, *_limits(below), low, high)
+        return _affine(obs, *_limits(below), *self.each(len(below), "channels"))
 
     def invert(
         self, obs: Float[Array, " outer"], below: tuple[Channel, ...]
     ) -> Float[Array, " inner"]:
-        low, high = _spread(self, len(below), "channels")
-        return _affine(obs, low, high, *_limits(below))
+        return _affine(obs, *self.each(len(below), "channels"), *_limits(below))
 
 
-def _store_bounds(transform: RescaleAction | RescaleObservation, low: Any, high: Any) -> None:
-    """Keep bounds as hashable plain data: a float, or a tuple of floats."""
-    low, high = np.asarray(low, float), np.asarray(high, float)
-    for name, value in (("low", low), ("high", high)):
-        object.__setattr__(transform, name, tuple(value.tolist()) if value.ndim else float(value))
-    if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high)) and np.all(low < high)):
-        raise ParameterError(
-            f"{type(transform).__name__} needs finite bounds with low < high, "
-            f"got low={low}, high={high}."
-        )
-
-
-def _spread(
-    transform: RescaleAction | RescaleObservation, n: int, places: str
-) -> tuple[np.ndarray, np.ndarray]:
-    """One bound for each of ``n`` places."""
-    low, high = np.atleast_1d(transform.low), np.atleast_1d(transform.high)
-    if not {low.size, high.size} <= {1, n}:
-        raise ParameterError(
-            f"{type(transform).__name__} has bounds for {max(low.size, high.size)} {places}, "
-            f"but the twin has {n}."
-        )
-    return np.broadcast_to(low, (n,)), np.broadcast_to(high, (n,))
-
-
-def _refuse_unbounded(
-    transform: RescaleAction | RescaleObservation, below: Sequence[Actuator | Channel]
-) -> None:
-    unbounded = [p.name for p in below if not (math.isfinite(p.low) and math.isfinite(p.high))]
-    if unbounded:
-        raise ParameterError(
-            f"{type(transform).__name__} needs limits to scale by, "
-            f"but these have none: {', '.join(unbounded)}."
-        )
-
-
-def _limits(places: Sequence[Actuator | Channel]) -> tuple[np.ndarray, np.ndarray]:
-    return np.array([p.low for p in places]), np.array([p.high for p in places])
+def _limits(signals: Sequence[Actuator | Channel]) -> tuple[np.ndarray, np.ndarray]:
+    return np.array([s.low for s in signals]), np.array([s.high for s in signals])
 
 
 def _affine(

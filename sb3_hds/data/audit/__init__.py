@@ -1,4 +1,4 @@
-"""Are these data fit for a verdict? Asked before any physics: one file for each kind of check."""
+"""Data quality checks that need no physics: one file for each kind of defect."""
 
 from sb3_hds.data.audit.audit import audit
 from sb3_hds.data.audit.finding import Finding

@@ -1,4 +1,4 @@
-"""Are these data fit for a verdict? Asked before any physics."""
+"""The audit of measured data: defects are found before any physics is fitted."""
 
 import math
 from collections.abc import Sequence
@@ -33,25 +33,25 @@ def audit(
     twin: Twin | None = None,
 ) -> Audit:
     """
-    Look for defects of the recording, which physics would have to explain otherwise.
+    Find defects of the recording that a fit would otherwise attribute to physics.
 
-    Uneven, repeated and missing samples; channels that are stuck or cut off; joints at stops that
-    the twin does not have; a state that was put back inside a recording; values beyond all measure;
-    a velocity that comes late or early, or in other units than its position; the noise while
-    standing still; too little motion. Where the data were read from logs, rows are checked as they
-    were measured. Velocities are found by their correlation with the derivatives of others, none in
-    data that hardly move; where channels have units, these say which may be one, and positions and
-    velocities that are swapped are found. What is judged by its motion is not judged in data
-    without any, nor beside values beyond all measure.
+    The audit looks for uneven, repeated and missing samples; stuck and saturated channels; joints
+    at end stops that the twin lacks; resets of the state within a recording; outliers; velocities
+    that are shifted in time or in other units than their positions; and too little excitation. It
+    estimates the sensor noise at rest. Data that were read from logs are checked row by row, as
+    they were measured. Velocity channels are identified by their correlation with the derivatives
+    of other channels, and by their units where these are known; swapped positions and velocities
+    are then found, too. Checks that rely on motion are skipped where there is none, and where there
+    are outliers.
 
     :param data: of any kind
     :param channels: names of the observation channels, or a twin's ``channels``; default: those of
         the twin, those that were read, or ``obs[0]``, ``obs[1]``, ...
-    :param twin: of what was measured, as far as it is known: says what the channels are, whether
-        its own velocities are backward differences, and which positions it cannot follow unless
-        they are in another unit
-    :raises TrajectoryError: if the number of names is not that of the channels, or if the twin has
-        other channels or commands, or if one was read in a unit of something else
+    :param twin: a model of the measured system, if there is one: it names the channels, and tells
+        whether its own velocities are backward differences and which positions only fit in another
+        unit
+    :raises TrajectoryError: if the number of names is not that of the channels, or if the twin
+        has other channels or commands, or a channel of another physical quantity
     """
     report = data.report if isinstance(data.report, Reading) else None
     if twin is not None:
@@ -66,7 +66,7 @@ def audit(
     known = report and np.array(report.resolution)
     resolution = resolutions([stretch.obs for stretch in rows]) if known is None else known
     still = stillness_of(rows, resolution)
-    # Where values are beyond all measure, so are the spreads that everything else is compared with.
+    # Outliers inflate the standard deviations that the other checks are relative to.
     found: list[Finding] = _beyond(rows, names, resolution)
     if not found:
         found += excitation(data, still, names, actions)
@@ -110,7 +110,7 @@ def audit(
 
 
 def _fitting(twin: Twin, data: Trajectories) -> Twin:
-    """The twin at the interval of the data, if it is one of their system."""
+    """The twin at the sampling interval of the data; refused where channels do not match."""
     if (len(twin.channels), len(twin.actuators)) != (data.n_obs, data.n_act):
         raise TrajectoryError(
             f"{twin.name} has {len(twin.channels)} channels and {len(twin.actuators)} commands; "

@@ -1,4 +1,4 @@
-"""Values that no motion gives: repeated, stuck, cut off, put back."""
+"""Implausible values: repeated, stuck, saturated, or reset within a recording."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -19,10 +19,10 @@ _STEADY = (0.5, 1.6)  # of the speed: steps around a repeated value, or it may b
 _STUCK = 20  # samples
 _PLATEAU = 5  # samples
 _MOVES, _CREEPS = 0.3, 0.05  # of the usual step of a channel
-_LARGE = 0.2  # of the spread of a channel: what a jump exceeds
+_LARGE = 0.2  # of the standard deviation of a channel: what a jump exceeds
 _ISOLATED = 6.0  # times the steps around it
-_NEAR_START = 0.05  # of the spread of a channel
-_AT_START = 1e-6  # of the spread of a channel
+_NEAR_START = 0.05  # of the standard deviation of a channel
+_AT_START = 1e-6  # of the standard deviation of a channel
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +43,7 @@ class RepeatedSamples(Finding):
 
 @dataclasses.dataclass(frozen=True)
 class StuckChannel(Finding):
-    """:param value: at which the channel stays, in its unit"""
+    """:param value: the constant value, in the unit of the channel"""
 
     value: float
 
@@ -59,7 +59,7 @@ class StuckChannel(Finding):
 
 @dataclasses.dataclass(frozen=True)
 class DeadChannel(StuckChannel):
-    """In all recordings: whatever the twin has to predict of it, a wrong cause would do."""
+    """A channel that is stuck in all recordings, so that any cause could explain it."""
 
     blocks = True
     remedy = "Check cable and driver of this sensor, or leave the channel out."
@@ -68,8 +68,8 @@ class DeadChannel(StuckChannel):
 @dataclasses.dataclass(frozen=True)
 class SaturatedChannel(Finding):
     """
-    :param value: that the channel does not exceed, in its unit
-    :param share: of the samples that are there
+    :param value: the limit, in the unit of the channel
+    :param share: of the samples that are at the limit
     """
 
     value: float
@@ -116,11 +116,10 @@ def repeated_samples(
     stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
 ) -> list[RepeatedSamples]:
     """
-    Short runs of equal values while a channel moves.
+    Short runs of equal values in a moving channel.
 
-    A number that is not quantised repeats only where the system rests, at zero velocity, or where
-    it is cut off. One that is quantised repeats when it is slow, so only steady and fast motion
-    counts.
+    A channel without quantisation repeats a value only at rest or in saturation. A quantised
+    channel also does in slow motion, so there only fast and steady motion counts.
     """
     repeats = [_repeats(stretches, j, step) for j, step in enumerate(resolution)]
     found = [
@@ -157,10 +156,9 @@ def saturated(
     stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
 ) -> list[SaturatedChannel]:
     """
-    Channels that stay at exactly their largest or smallest value while others move.
+    Channels that stay exactly at their extreme value while others move.
 
-    They must get there with speed: a turning point looks flat too, most of all where values are
-    quantised.
+    They must reach it at speed: turning points are flat, too, in particular after quantisation.
     """
     found = []
     usual = _usual_steps(stretches)
@@ -187,8 +185,8 @@ def stuck(
     stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
 ) -> list[StuckChannel]:
     """
-    Channels that never change, in one recording or in all, or that stop anywhere with speed, or
-    jump when they are free again, while others move. A system that comes to rest does none of it.
+    Channels that are constant while others move, in one recording or in all, or that stop abruptly
+    or jump afterwards. A system that comes to rest does neither.
     """
     found = []
     usual = _usual_steps(stretches)
@@ -216,29 +214,29 @@ def reinitialised(
     stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
 ) -> list[ReinitialisedState]:
     """
-    Steps that are many times those before and after them, in several channels or back to where a
-    recording begins; and, however large other steps are, those that lead back there exactly and on
-    from there. Quantised values do so by chance, and one that is cut off stays there.
+    Resets of the state: steps many times larger than their neighbours, in several channels at once
+    or back to the start of a recording; and steps of any size that lead exactly to that start.
+    Quantised channels are exempt from the latter, because they return there by chance.
 
-    A single channel may jump for other reasons: a velocity at an impact, an outlier. Whole turns of
-    an angle are no jumps.
+    A jump of a single channel has other explanations (an impact, an outlier), and whole turns of an
+    angle are not jumps.
     """
     usual = _Usual.of(stretches)
     if usual is None:
         return []
-    at_start = _AT_START * usual.spread if (resolution == 0.0).any() else np.full(len(names), -1.0)
+    at_start = _AT_START * usual.std if (resolution == 0.0).any() else np.full(len(names), -1.0)
     places: dict[bool, list[Place]] = {True: [], False: []}
     sizes = {True: np.zeros(len(names)), False: np.zeros(len(names))}
     for stretch in stretches:
         jumps = np.diff(stretch.obs, axis=0)
-        large = np.abs(jumps) > np.maximum(_LARGE * usual.spread, 10.0 * resolution)
+        large = np.abs(jumps) > np.maximum(_LARGE * usual.std, 10.0 * resolution)
         large &= ~whole_turns(jumps, usual.step)
         isolated = large & _isolated(jumps, usual.step)
-        sharp = np.pad(_bends(stretch.obs, usual.spread) > usual.bend, (1, 0))
+        sharp = np.pad(_bends(stretch.obs, usual.std) > usual.bend, (1, 0))
         goes_on = np.append(jumps[1:].any(axis=1), True)
         for k in np.flatnonzero(large.any(axis=1)):
             away = np.abs(stretch.obs[k + 1] - usual.starts)
-            back = bool((away <= _NEAR_START * usual.spread + 2.0 * usual.step).all(1).any())
+            back = bool((away <= _NEAR_START * usual.std + 2.0 * usual.step).all(1).any())
             exactly = bool((away <= at_start).all(1).any() and sharp[k] and goes_on[k])
             if exactly or isolated[k].sum() > (not back and len(names) > 1):
                 to_start = back or exactly
@@ -258,34 +256,34 @@ def reinitialised(
 
 class _Usual(NamedTuple):
     """
-    What is usual in all recordings.
+    Typical motion over all recordings.
 
-    :param step: that nine in ten do not exceed while something moves, one per channel
-    :param bend: change of the step that nine in ten do not exceed, in units of ``spread``
-    :param spread: standard deviation of each channel
+    :param step: 90 % quantile of the step from sample to sample, for each channel
+    :param bend: 90 % quantile of the change of the step, in units of ``std``
+    :param std: standard deviation of each channel
     :param starts: first sample of each recording
     """
 
     step: np.ndarray
     bend: float
-    spread: np.ndarray
+    std: np.ndarray
     starts: np.ndarray
 
     @classmethod
     def of(cls, stretches: Sequence[Stretch]) -> "_Usual | None":
         steps = np.abs(np.concatenate([np.diff(stretch.obs, axis=0) for stretch in stretches]))
         moving = steps[steps.any(axis=1)]
-        spread = joined(stretches).std(axis=0)
-        bends = np.concatenate([_bends(stretch.obs, spread) for stretch in stretches])
+        std = joined(stretches).std(axis=0)
+        bends = np.concatenate([_bends(stretch.obs, std) for stretch in stretches])
         if not len(moving) or not len(bends):
             return None
         starts = np.array([stretch.obs[0] for stretch in stretches])
-        return cls(np.quantile(moving, 0.9, 0), float(np.quantile(bends, 0.9)), spread, starts)
+        return cls(np.quantile(moving, 0.9, 0), float(np.quantile(bends, 0.9)), std, starts)
 
 
-def _bends(x: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Largest change of the step at each inner row, in units of the spread."""
-    return np.max(np.abs(np.diff(x, 2, axis=0)) / np.where(spread > 0.0, spread, np.inf), axis=1)
+def _bends(x: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Largest change of the step at each inner row, in units of the standard deviation."""
+    return np.max(np.abs(np.diff(x, 2, axis=0)) / np.where(std > 0.0, std, np.inf), axis=1)
 
 
 def _moves_on(x: np.ndarray, a: int, b: int, fast: float) -> bool:

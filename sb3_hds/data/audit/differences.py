@@ -15,7 +15,7 @@ from sb3_hds.data.audit.velocity import Match, VelocityShift, difference_of
 
 @dataclasses.dataclass(frozen=True)
 class BackwardDifference(VelocityShift):
-    """A velocity that was computed as one, so that it belongs half a sample earlier."""
+    """A velocity that is the backward difference of its position, and so half a sample late."""
 
     @property
     def sentence(self) -> str:
@@ -37,9 +37,8 @@ def backward_differences(
     :param data: at one interval
     :param names: of the observation channels
     :param matches: of the data
-    :param twin: whose own velocities may be the same, as semi-implicit Euler steps make them; where
-        there is none, only differences in which the noise of the position shows are told, which no
-        simulation has
+    :param twin: if its own velocities are backward differences (semi-implicit Euler), they are not
+        reported; without a twin, only differences that carry the noise of the position are
     """
     found: dict[int, tuple[Match, bool]] = {}
     for match in matches:

@@ -1,4 +1,4 @@
-"""Whether there is enough motion, and enough of it caused by the commands."""
+"""Whether motion and commands excite the system enough for identification."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -13,8 +13,8 @@ from sb3_hds.data.audit.stretches import Stretch, all_samples, joined
 
 _SECONDS, _FEWEST, _MOST = 0.1, 12, 100  # length of a window, and its limits in rows
 _WHITE = 0.5  # mean squared step by variance: 2 for white noise, 0 for smooth motion
-_SMALL = 0.3  # of the spread of a channel: what is larger is motion
-_ALL_NOISE = 3.0  # a channel that spreads no further than this times its noise does not move
+_SMALL = 0.3  # of the standard deviation of a channel: what is larger is motion
+_ALL_NOISE = 3.0  # times the noise: a channel with a smaller standard deviation does not move
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,8 +38,8 @@ class StandingStill(Finding):
 @dataclasses.dataclass(frozen=True)
 class TooShort(Finding):
     """
-    :param n_steps: that there are
-    :param needed: at least so many
+    :param n_steps: number of steps
+    :param needed: smallest number for a verdict
     """
 
     blocks = True
@@ -55,7 +55,7 @@ class TooShort(Finding):
 
 @dataclasses.dataclass(frozen=True)
 class WeakMotion(Finding):
-    """:param ratio: spread of the channel by its noise"""
+    """:param ratio: standard deviation of the channel over that of its noise"""
 
     ratio: float
 
@@ -71,7 +71,7 @@ class WeakMotion(Finding):
 
 @dataclasses.dataclass(frozen=True)
 class WithinNoise(Finding):
-    """:param ratio: largest spread of a channel by its noise"""
+    """:param ratio: the largest ratio of a channel's standard deviation to that of its noise"""
 
     blocks = True
     ratio: float
@@ -105,9 +105,9 @@ class MostlyStill(Finding):
 @dataclasses.dataclass(frozen=True)
 class PoorExcitation(Finding):
     """
-    :param n_strokes: how often the channel moves one way or the other in all recordings, by a tenth
-        of its range at least; no other channel does so more often
-    :param n_conditions: under which was recorded
+    :param n_strokes: number of strokes in all recordings, of at least a tenth of the range of the
+        channel, which is the one with the most
+    :param n_conditions: number of conditions
     """
 
     n_strokes: int
@@ -132,7 +132,7 @@ class PoorExcitation(Finding):
 class ConstantCommand(Finding):
     """
     :param low: smallest value of the command, in its unit
-    :param high: largest one
+    :param high: largest value, in its unit
     """
 
     low: float
@@ -184,9 +184,9 @@ class Stillness(NamedTuple):
 
 def stillness_of(stretches: list[Stretch], resolution: Float64[np.ndarray, " n_obs"]) -> Stillness:
     """
-    A window of rows stands still if each channel either stays within two of its smallest steps, or
-    spreads little and jumps to and fro as noise does, without the smoothness of motion (von
-    Neumann's ratio, the mean squared step by the variance).
+    Detect rest in windows of 0.1 s: each channel either stays within two quantisation steps, or has
+    a small standard deviation and the von Neumann ratio (mean squared step over variance) of white
+    noise.
 
     :param stretches: at least one
     :param resolution: smallest step of each channel, 0 where it has none
@@ -196,16 +196,16 @@ def stillness_of(stretches: list[Stretch], resolution: Float64[np.ndarray, " n_o
         return Stillness(0.0, np.full(len(resolution), np.nan), 0)
     # Deviations, steps, ranges: one array per window and channel, whatever its number of rows.
     parts = [part for part in windows if len(part)]
-    spread = np.concatenate([part.std(axis=1, ddof=1) for part in parts])
+    std = np.concatenate([part.std(axis=1, ddof=1) for part in parts])
     step = np.concatenate([np.sqrt(np.mean(np.diff(p, axis=1) ** 2, axis=1)) for p in parts])
     width = np.concatenate([np.ptp(part, axis=1) for part in parts])
     overall = joined(stretches).std(axis=0)
-    jitters = step**2 >= _WHITE * spread**2
-    floor = np.array([_median(s[j]) for s, j in zip(spread.T, jitters.T, strict=True)])
-    small = (spread <= _SMALL * overall) | (overall <= _ALL_NOISE * floor)
+    jitters = step**2 >= _WHITE * std**2
+    floor = np.array([_median(s[j]) for s, j in zip(std.T, jitters.T, strict=True)])
+    small = (std <= _SMALL * overall) | (overall <= _ALL_NOISE * floor)
     still = ((width <= 2.01 * resolution) | (jitters & small)).all(axis=1)
     noise = (
-        np.sqrt(np.mean(spread[still] ** 2, axis=0)) if still.any() else np.full_like(floor, np.nan)
+        np.sqrt(np.mean(std[still] ** 2, axis=0)) if still.any() else np.full_like(floor, np.nan)
     )
     return Stillness(float(still.mean()), noise, len(still))
 
@@ -221,16 +221,16 @@ def _median(values: np.ndarray) -> float:
     return float(np.median(values)) if len(values) else 0.0
 
 
-NEEDED = 100  # steps: with fewer, hardly any effect stands out from chance
+NEEDED = 100  # steps: with fewer, hardly any effect is significant
 _THROUGHOUT = 0.95  # share of the time
 _MOSTLY = 0.8  # share of the time
 _WEAK = 5.0  # noise
 _DEPENDENT = 0.999  # share of the variance
-_CONSTANT = 0.01  # of its largest value: a command that varies less tells nothing about its drive
+_CONSTANT = 0.01  # of its largest value: a command that varies less does not excite its drive
 _STROKE = 0.1  # of a channel's range, from one turning point to the next
 # Half of the strokes propose and half confirm. The logarithm of the mean square error of a stroke
 # scatters by about a half: of twenty, the mean has a standard error of 0.11, and a fifth less error
-# (0.22) is just beyond chance at 2.5 %.
+# (0.22) is just significant at 2.5 %.
 _STROKES = 40
 
 
@@ -256,8 +256,8 @@ def excitation(
         return [*found, StandingStill("all channels", places, stillness.share if moves else 1.0)]
     if stillness.share >= _MOSTLY:
         found.append(MostlyStill("all channels", places, stillness.share))
-    spread = x.std(axis=0)
-    ratios = spread / np.maximum(stillness.noise, 1e-300)  # nan where the noise is not known
+    std = x.std(axis=0)
+    ratios = std / np.maximum(stillness.noise, 1e-300)  # nan where the noise is not known
     if (ratios < _WEAK).all():
         return [*found, WithinNoise("all channels", places, float(ratios.max()))]
     weak = zip(obs, ratios.tolist(), strict=True)
@@ -278,7 +278,7 @@ def excitation(
 
 
 def _strokes(recordings: Sequence[np.ndarray]) -> int:
-    """How often a channel moves one way or the other, counted until there are enough."""
+    """Number of strokes (monotonic motions) of a channel, counted until there are enough."""
     least = _STROKE * (max(x.max() for x in recordings) - min(x.min() for x in recordings))
     n = 0
     for x in recordings:

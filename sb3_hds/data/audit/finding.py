@@ -1,4 +1,4 @@
-"""What every finding of an audit is: a sentence with channel, samples, and what to do."""
+"""The findings of an audit: a sentence with the channel, the samples and the remedy."""
 
 import abc
 import dataclasses
@@ -37,14 +37,14 @@ class Place(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class Finding(abc.ABC):
     """
-    One defect.
+    One defect of the data.
 
     :param channel: name of the channel, or of what has the defect
     :param places: where it was seen
     """
 
     blocks: ClassVar[bool] = False
-    """Whether no verdict can be had from data with this defect."""
+    """Whether data with this defect cannot support a verdict."""
 
     remedy: ClassVar[str]
     """What to do about it."""
@@ -55,7 +55,7 @@ class Finding(abc.ABC):
     @property
     @abc.abstractmethod
     def sentence(self) -> str:
-        """What is the case."""
+        """The defect, in one sentence."""
 
     def __str__(self) -> str:
         return f"{self.sentence} {self.remedy}"
@@ -69,12 +69,12 @@ class Finding(abc.ABC):
 
 
 def percent(share: float) -> str:
-    """:return: a share, for people"""
+    """:return: a share in per cent, for people"""
     return f"{100.0 * share:.2g} %" if share < 0.995 else "100 %"
 
 
 def counted(n: int, noun: str) -> str:
-    """:return: a number of things, for people"""
+    """:return: a number with its noun, for people"""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
@@ -86,7 +86,7 @@ def listed(places: Sequence[Place]) -> str:
 
 
 def recordings(places: Sequence[Place]) -> str:
-    """:return: the first recordings that are concerned as a whole, and how many more there are"""
+    """:return: the first affected recordings, and how many more there are"""
     sources = list(dict.fromkeys(place.source for place in places))
     names = ", ".join(sources[:_PLACES])
     more = len(sources) - _PLACES

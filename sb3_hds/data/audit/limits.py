@@ -1,4 +1,4 @@
-"""Positions at the stops of a machine, which its twin does not have."""
+"""Positions at end stops that the twin does not simulate."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -22,9 +22,9 @@ _MARGIN = 0.002
 @dataclasses.dataclass(frozen=True)
 class ReachedLimit(Finding):
     """
-    :param value: end of the joint's range
-    :param unit: of that
-    :param share: of the samples that are there
+    :param value: end of the range of the joint
+    :param unit: of the value
+    :param share: of the samples that are at that end
     """
 
     value: float
@@ -45,7 +45,7 @@ class ReachedLimit(Finding):
 
 
 def reached_limits(stretches: Sequence[Stretch], twin: Twin) -> list[ReachedLimit]:
-    """:return: one for each joint that comes to an end of its range, as far as the twin says one"""
+    """:return: one for each joint that reaches an end of the range that the twin declares"""
     ends = np.array([(joint.low, joint.high) for joint in twin.joints]).reshape(-1, 2)
     limited = np.flatnonzero(np.isfinite(ends).all(1)).tolist()
     if not limited:

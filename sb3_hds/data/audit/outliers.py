@@ -1,4 +1,4 @@
-"""Values far beyond all others, which the physics of a system does not reach in one sample."""
+"""Outliers: values that a physical system cannot reach, and leave, within one sample."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -17,9 +17,9 @@ _AT_ONCE = 0.5  # of the way there, and of the way back, in one sample
 @dataclasses.dataclass(frozen=True)
 class Outliers(Finding):
     """
-    They outweigh all else in a mean square.
+    Excursions far beyond the usual range, which would dominate a mean squared error.
 
-    :param value: farthest one, in the unit of the channel
+    :param value: the most extreme outlier, in the unit of the channel
     :param low: lower end of the range that 98 % of the channel's samples fill
     :param high: upper end
     """
@@ -42,9 +42,9 @@ class Outliers(Finding):
 @dataclasses.dataclass(frozen=True)
 class Glitches(Outliers):
     """
-    Single samples, far from those around them.
+    Single samples far from their neighbours.
 
-    :param step: largest from one sample to the next elsewhere in these recordings
+    :param step: largest other step from sample to sample in these recordings
     """
 
     step: float
@@ -60,9 +60,9 @@ class Glitches(Outliers):
 
 def outliers(stretches: Sequence[Stretch], names: Sequence[str]) -> list[Outliers]:
     """
-    Samples that one step leads to and one step leads back from, far beyond the usual range.
+    Runs of samples far beyond the usual range that begin and end with a single step.
 
-    A blow ebbs away and an unstable system does not come back: neither is one.
+    The response to an impact decays, and an unstable system does not return: neither matches.
     """
     found = []
     tail = 0.5 * (1.0 - _USUAL)
@@ -108,11 +108,10 @@ def glitches(
     stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
 ) -> list[Glitches]:
     """
-    Single samples that one step leads to and the next leads back from, both many times as large
-    as any other step of the recording.
+    Single samples between two opposite steps, both many times larger than any other step.
 
-    An impact turns a velocity round and a blow ebbs away: neither comes back at once. An angle that
-    wraps to and fro is no glitch, nor is a tick of an encoder at rest.
+    Neither an impact nor a decaying response returns within one sample. A wrapping angle and the
+    tick of an encoder at rest are not glitches.
     """
     found = []
     everything = joined(stretches)
@@ -138,8 +137,8 @@ def glitches(
 
 def _spikes(x: np.ndarray, least: float) -> tuple[Int[np.ndarray, " rows"], float]:
     """
-    :param least: no step counts as smaller than this
-    :return: rows of single samples far beyond all other steps, and the largest of these
+    :param least: lower bound of the step that spikes are compared with
+    :return: rows of the spikes, and the largest other step
     """
     steps = np.diff(x)
     none = np.array([], dtype=int), 0.0

@@ -1,4 +1,4 @@
-"""Short stretches of measured motion, and what a twin makes of them from the same start."""
+"""Short stretches of measured motion, and their simulation by a twin from the same start."""
 
 from functools import partial
 from typing import NamedTuple
@@ -43,11 +43,13 @@ class Replay(NamedTuple):
     obs: Float[np.ndarray, "n rows n_obs"]
 
     def unexplained(self) -> Float[np.ndarray, " dof"]:
-        """:return: mean square error by that of a constant velocity, for each joint"""
+        """:return: mean squared error relative to that of a constant velocity, for each joint"""
         return self._by_acceleration(self.simulated - self.measured)
 
     def predicted(self) -> Float[np.ndarray, " dof"]:
-        """:return: how far the twin's acceleration leads, by how far the measured one does"""
+        """
+        :return: displacement due to the simulated acceleration over that due to the measured one
+        """
         return np.sqrt(self._by_acceleration(self.simulated - self.extrapolated))
 
     def _by_acceleration(self, part: Float[np.ndarray, "n rows dof"]) -> np.ndarray:
@@ -121,7 +123,7 @@ def _positions(twin: Twin, obs: Array, params: dict[str, Array]) -> Array:
 def _simulated(
     twin: Twin, obs: Array, q: Array, v: Array, actions: Array, params: dict[str, Array]
 ) -> tuple[Array, Array]:
-    """Without the end of an episode: only motion counts."""
+    """Simulate without termination."""
 
     def one(first: Array, position: Array, velocity: Array, commands: Array) -> tuple:
         start = twin.infer(first, params)._replace(q=position, v=velocity)

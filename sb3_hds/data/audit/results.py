@@ -41,7 +41,7 @@ class ChannelSummary:
 @dataclasses.dataclass(frozen=True)
 class Audit:
     """
-    What is wrong with data, before any physics; prints itself.
+    The result of an audit. Prints itself.
 
     :param findings: what was found, the most serious first
     :param channels: of the observation
@@ -49,7 +49,7 @@ class Audit:
     :param conditions: labels of the data
     :param lengths: number of steps of each trajectory
     :param dt: sampling interval [s]
-    :param stamps: whether the time stamps of the rows were there to be looked at
+    :param stamps: whether time stamps of rows were available
     """
 
     findings: tuple[Finding, ...]
@@ -62,17 +62,17 @@ class Audit:
 
     @property
     def usable(self) -> bool:
-        """Whether the data can support a verdict at all."""
+        """Whether the data can support a verdict."""
         return not any(finding.blocks for finding in self.findings)
 
     @property
     def reason(self) -> str:
-        """Why they cannot, and what to record instead; empty if they can."""
+        """Why they cannot, and what to record instead; empty if ``usable``."""
         return " ".join(str(finding) for finding in self.findings if finding.blocks)
 
     @property
     def velocity_shift(self) -> dict[str, float]:
-        """By how much each shifted velocity channel comes late [s]; negative: early."""
+        """Delay of each shifted velocity channel [s]; negative: early."""
         shifts = [f for f in self.findings if isinstance(f, VelocityShift)]
         return {shift.channel: shift.seconds for shift in shifts}
 
@@ -83,8 +83,8 @@ class Audit:
 
     def corrected(self, data: Trajectories) -> Trajectories:
         """
-        Cut where the state was put back, cut outliers out, and shift velocities to where they
-        belong. What outliers hid is found when the result is audited.
+        Cut at resets of the state, cut out outliers, and undo shifts of velocities. Audit the
+        result again: outliers may have hidden other defects.
 
         :param data: those that were audited
         :return: new trajectories; the same ones if there is nothing to correct
@@ -173,12 +173,11 @@ _ON_GRID = 0.02  # samples
 
 def shifted(data: Trajectories, shifts: Mapping[int, float]) -> Trajectories:
     """
-    Channels moved in time, interpolated linearly between samples.
-
-    The samples at the ends of each episode for which a channel was not measured are left out.
+    Shift channels in time, by linear interpolation; samples at the ends of an episode that then
+    lack a channel are left out.
 
     :param data: at one interval
-    :param shifts: of observation channels: by how many samples each comes late; negative: early
+    :param shifts: delay of each observation channel, by index [samples]; negative: early
     :raises TrajectoryError: if an episode is no longer than its shifts
     """
     before = max([0, *(math.ceil(-lag) for lag in shifts.values())])
@@ -203,8 +202,7 @@ def shifted(data: Trajectories, shifts: Mapping[int, float]) -> Trajectories:
 
 def cut(data: Trajectories, places: Sequence[tuple[int, float, float]]) -> Trajectories:
     """
-    Episodes cut where a new one begins inside them, or where samples have to go; pieces without a
-    step are left out.
+    Cut episodes at resets, and cut samples out; pieces without a step are dropped.
 
     :param data: at one interval
     :param places: trajectory, and the times of the last sample before and the first one after [s],
@@ -232,7 +230,7 @@ def _rebuilt(
     actions: Sequence[np.ndarray],
     sources: Sequence[int],
 ) -> Trajectories:
-    """Trajectories with the labels of those that they are made of, and no rows behind them."""
+    """New trajectories with the labels of their sources, without the rows of the log."""
     labels = [data.conditions[i] for i in sources]
     made = Trajectories.from_arrays(obs, actions, dt=data.dt, conditions=labels)
     report = data.report

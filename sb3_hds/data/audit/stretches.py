@@ -1,4 +1,4 @@
-"""Uninterrupted rows, as measured: what the checks of the audit look at."""
+"""Stretches of uninterrupted rows as they were measured, the input of all checks."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from sb3_hds.data.resampling.report import Part
 
 class Stretch(NamedTuple):
     """
-    Rows without a gap.
+    Consecutive rows without a gap.
 
     :param source: recording, for people
     :param trajectory: number of the trajectory that was made of them
@@ -34,7 +34,7 @@ class Stretch(NamedTuple):
         return float(np.median(np.diff(self.times)))
 
     def place(self, first: int, last: int) -> Place:
-        """:return: its rows ``first`` to ``last``, by their numbers in the recording"""
+        """:return: the place of its rows ``first`` to ``last``"""
         return Place(
             self.source,
             int(self.numbers[first]),
@@ -74,14 +74,16 @@ def joined(stretches: Sequence[Stretch]) -> Float64[np.ndarray, "rows n_obs"]:
 def runs(flags: Bool[np.ndarray, " steps"]) -> Iterator[tuple[int, int]]:
     """
     :param flags: of rows, or of the steps between rows
-    :return: where each run of set flags begins, and where the next flag is not set
+    :return: start (inclusive) and end (exclusive) of each run of set flags
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
 
 
 def _parts_of(data: Trajectories) -> list[Part]:
-    """What each trajectory was made of; nothing if they are not, one for one, what was read."""
+    """
+    The log rows of each trajectory; empty unless trajectories match the recordings one to one.
+    """
     if data.report is None:
         return []
     chosen = set(data.origin.tolist())

@@ -1,4 +1,4 @@
-"""Positions and velocities that cannot be what they are taken for: other units, or swapped."""
+"""Channels in other units than declared, and swapped positions and velocities."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -33,10 +33,10 @@ _NEAR = 0.15  # what a central difference and noise may change of the factor
 @dataclasses.dataclass(frozen=True)
 class OtherUnits(Finding):
     """
-    A velocity follows the derivative of a position, but for a factor that no sensor is off by.
+    A velocity that equals the derivative of a position times an implausibly large factor.
 
     :param position: name of the channel whose derivative it is
-    :param factor: by which that changes faster than the velocity says
+    :param factor: ratio of that derivative to the velocity
     """
 
     blocks = True
@@ -71,16 +71,16 @@ class OtherUnits(Finding):
 @dataclasses.dataclass(frozen=True)
 class MistakenUnits(Finding):
     """
-    A position that moves as the twin says only if it is in another unit.
+    A position that the twin can only follow in another unit.
 
     :param column: its name in the log
     :param span: of its measurements
-    :param unit: that the twin takes it for
-    :param other: the one that fits, in words
-    :param symbol: of that
-    :param factor: from that to the twin's
-    :param explained: share of its acceleration that the twin explains then
-    :param times: how often it accelerates as much as the twin says, if it is in the twin's unit
+    :param unit: unit of the twin's channel
+    :param other: unit that fits, in words
+    :param symbol: symbol of that unit
+    :param factor: from that unit to the twin's
+    :param explained: share of the acceleration that the twin then explains
+    :param times: ratio of the measured to the simulated acceleration in the twin's unit
     """
 
     blocks = True
@@ -113,7 +113,7 @@ class MistakenUnits(Finding):
 
 @dataclasses.dataclass(frozen=True)
 class LikelyUnits(MistakenUnits):
-    """In the other unit, it moves about as much as the twin says, but not when it says so."""
+    """The size of its acceleration fits another unit, but its course does not."""
 
     blocks = False
 
@@ -127,7 +127,7 @@ class LikelyUnits(MistakenUnits):
 
 @dataclasses.dataclass(frozen=True)
 class Swapped(Finding):
-    """:param derivative_of: name of the channel whose derivative this one is, and not vice versa"""
+    """:param derivative_of: name of the channel that this one is the derivative of"""
 
     blocks = True
     derivative_of: str
@@ -146,12 +146,11 @@ def other_units(
     data: Trajectories, channels: Sequence[Channel], matches: Sequence[Match]
 ) -> list[OtherUnits]:
     """
-    Velocities that are the derivative of a position but for a large factor, or that of revolutions
-    per minute.
+    Velocities that equal the derivative of a position times a large factor, or the factor of
+    revolutions per minute.
 
-    Only of channels that belong to no other one as position or velocity: in an oscillation,
-    everything is the derivative of something, but for a factor. Where units are known, they say
-    what may be a velocity of what.
+    Channels that already form a pair of position and velocity are excluded: in an oscillation,
+    every channel is proportional to the derivative of some other. Known units restrict the pairs.
 
     :param data: at one interval
     :param channels: of the observation
@@ -181,7 +180,7 @@ def swapped(
     data: Trajectories, channels: Sequence[Channel], matches: Sequence[Match]
 ) -> list[Swapped]:
     """
-    Channels that are a velocity by their unit, and of which a position is the derivative.
+    Pairs in which the channel with the unit of a position is the derivative of the other.
 
     :param data: at one interval
     :param channels: of the observation; nothing is found where they have no units
@@ -252,17 +251,16 @@ def mistaken_units(
     data: Trajectories, twin: Twin, channels: Sequence[Channel], columns: Sequence[str]
 ) -> list[MistakenUnits]:
     """
-    Positions that span more than a turn, or 5 m, and that accelerate as the twin says only if they
-    are in degrees, millimetres or centimetres.
+    Positions that span more than a turn, or 5 m, and whose acceleration the twin explains only in
+    degrees, millimetres or centimetres.
 
-    The twin is simulated for 0.3 s from measured states. In another unit than its own, it explains
-    nothing of the acceleration; in the right one, most of it, even if its parameters are off by a
-    third. Motion without forces, or under forces that are proportional to it, fits any unit: there
-    is no finding then.
+    The twin is simulated for 0.3 s from measured states. In the right unit it explains most of the
+    acceleration even if its parameters are off by a third, in a wrong one nothing. Linear systems
+    without other forces fit any unit and give no finding.
 
     :param data: at the twin's interval
     :param channels: of the observation, named as in reports
-    :param columns: their names in the log
+    :param columns: names of the channels in the log
     """
     units = [u for u in _UNITS if _spans(data, twin, u)]
     stretches = stretches_in(data) if units and not _has_quaternions(twin) else None

@@ -1,4 +1,4 @@
-"""Velocity channels that come late or early, as the derivative of a position tells."""
+"""Time shifts of velocity channels relative to the derivatives of their positions."""
 
 import dataclasses
 import itertools
@@ -41,8 +41,8 @@ Pairs = Sequence[tuple[np.ndarray, np.ndarray]]
 class VelocityShift(Finding):
     """
     :param position: name of the channel whose derivative it is
-    :param samples: by how many it comes late; negative: early
-    :param seconds: the same [s]
+    :param samples: delay of the velocity [samples]; negative: early
+    :param seconds: the same delay [s]
     :param stderr: standard error of ``samples``
     """
 
@@ -70,9 +70,9 @@ class Lag(NamedTuple):
     """
     :param velocity: channel
     :param position: name of the position whose derivative it is
-    :param samples: by how many the velocity comes late; negative: early
-    :param stderr: standard error of that, from blocks of the data
-    :param better: unexplained variance of the velocity without the shift by that with it
+    :param samples: delay of the velocity [samples]; negative: early
+    :param stderr: standard error of ``samples``, from blocks of the data
+    :param better: ratio of the unexplained variances without and with the shift
     :param backward: whether it is the backward difference of the position
     """
 
@@ -86,13 +86,13 @@ class Lag(NamedTuple):
 
 class Match(NamedTuple):
     """
-    A channel that follows the derivative of another one, whatever the factor.
+    A channel that is proportional to the derivative of another one.
 
     :param velocity: channel
-    :param position: name of what it follows the derivative of
-    :param parts: channels of that: one, or those of a cosine and a sine
-    :param pairs: both, per episode
-    :param scores: of these
+    :param position: name of the position
+    :param parts: channels of the position: one, or a cosine and a sine
+    :param pairs: position and velocity of each episode
+    :param scores: of the pairs
     :param width: of the moving average [samples]
     """
 
@@ -122,8 +122,8 @@ def velocity_shifts(
     :param data: at one interval
     :param names: of the observation channels
     :param matches: of the data
-    :return: the lags that are longer than a backward difference has, beyond doubt, and either long
-        or the cause of half of what the derivative leaves unexplained
+    :return: the significant lags beyond that of a backward difference that are either long or
+        explain half of the residual variance
     """
     whole = all_samples(data)
     return [
@@ -143,9 +143,9 @@ def velocity_shifts(
 
 class Difference(NamedTuple):
     """
-    :param backward: whether a velocity is the backward difference of its position: it has that
-        one's noise, or it is the same number
-    :param rough: whether the noise of the position shows in it
+    :param backward: whether a velocity is the backward difference of its position: it carries the
+        same noise, or is the same number
+    :param rough: whether it carries the noise of the position
     """
 
     backward: bool
@@ -154,7 +154,7 @@ class Difference(NamedTuple):
 
 def difference_of(pairs: Pairs, dt: float) -> Difference:
     """
-    Compare a velocity with the backward difference, and with a mean of four that is as late.
+    Compare a velocity with the backward difference, and with a smoother one of equal delay.
 
     :param pairs: position and velocity of each episode
     """
@@ -213,7 +213,7 @@ def matches_of(data: Trajectories, names: Sequence[str]) -> list[Match]:
 
 
 def _lags(matches: Sequence[Match], dt: float) -> list[Lag]:
-    """Of each velocity, that to the position that it fits best."""
+    """The lag of each velocity to its best matching position."""
     found = []
     for v in dict.fromkeys(match.velocity for match in matches if match.agrees):
         own = [match for match in matches if match.velocity == v and match.agrees]
@@ -228,7 +228,7 @@ def _lags(matches: Sequence[Match], dt: float) -> list[Lag]:
 def _positions(
     episodes: Sequence[np.ndarray], v: int
 ) -> list[tuple[tuple[int, ...], list[np.ndarray]]]:
-    """Everything that channel v may be the derivative of, per episode; turns are counted."""
+    """Candidate positions of channel v for each episode, unwrapped."""
     others = [j for j in range(episodes[0].shape[1]) if j != v]
     found: list[tuple[tuple[int, ...], list[np.ndarray]]]
     found = [((j,), [unwrapped(x[:, j]) for x in episodes]) for j in others]
@@ -265,7 +265,7 @@ def _blocks(pairs: Pairs, reach: int, width: int) -> Pairs:
 
 class _Scores(NamedTuple):
     """
-    How a velocity follows from the derivative, at shifts from -reach to reach samples.
+    Cross-correlation of a velocity and a derivative, at shifts from -reach to reach samples.
 
     :param correlation: at each shift
     :param slope: of the velocity on the derivative

@@ -1,4 +1,4 @@
-"""HDF5 files, as of robomimic, ACT, or a script of one's own."""
+"""HDF5 files, such as those of robomimic and ACT."""
 
 import contextlib
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What a reader makes of a file, and what all readers share."""
+"""The result of a reader, and what all readers share."""
 
 import contextlib
 import errno
@@ -35,7 +35,7 @@ _CONTENTS = {
 
 class Log(NamedTuple):
     """
-    What one file holds.
+    The content of one file.
 
     :param tables: one or more, with rows in order of time. Columns that are not wanted may be left
         out; where one that is wanted does not exist, all names are there, for the message
@@ -55,9 +55,9 @@ def foreign(
     path: Path, remedy: str = "Restore it from a copy, or record it again."
 ) -> Iterator[None]:
     """
-    What other libraries raise while they read a file becomes one sentence on that file.
+    Turn exceptions of other libraries into one sentence about the file.
 
-    :raises TrajectoryError: for whatever is raised inside
+    :raises TrajectoryError: for any exception raised inside
     """
     try:
         with warnings.catch_warnings():
@@ -78,7 +78,7 @@ def foreign(
 
 
 def _other_kind(path: Path) -> str:
-    """A sentence where the content is of another kind than the name says, otherwise nothing."""
+    """A sentence if the content does not match the suffix, otherwise empty."""
     try:
         with path.open("rb") as file:
             begin = file.read(16)

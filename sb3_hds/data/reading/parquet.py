@@ -16,7 +16,7 @@ def read_parquet(path: Path, columns: Columns) -> Log:
     """
     Lists of one length are columns ``x[0]``, ``x[1]``, structs are columns ``x.a``.
 
-    A column ``episode_index``, as LeRobot writes it, tells episodes apart.
+    A column ``episode_index``, as LeRobot writes it, separates episodes.
 
     :param path: of the file
     :param columns: for what is wanted

@@ -1,4 +1,4 @@
-"""Which reader reads which file."""
+"""The reader for each file suffix."""
 
 from collections.abc import Callable
 from pathlib import Path

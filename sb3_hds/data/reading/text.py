@@ -13,7 +13,7 @@ from sb3_hds.data.conversion import unit_of
 from sb3_hds.data.reading.log import Log, aliases, foreign
 from sb3_hds.errors import TrajectoryError
 
-_PEEKED = 1 << 18  # characters from which the layout is told
+_PEEKED = 1 << 18  # characters that the layout is inferred from
 _SAMPLED = 50  # lines
 _ROWS = 200_000  # that are read at once
 _EXACT = 50_000_000  # bytes: larger files are read three times as fast, to 15 digits instead of 17
@@ -146,7 +146,7 @@ def _frame(
 
 
 def _has_decimal_commas(frame: Any) -> bool:
-    """Whether they come after the lines from which the layout was told."""
+    """Whether decimal commas occur after the lines that the layout was inferred from."""
     texts = (frame[name].dropna() for name in frame.columns if frame[name].dtype == object)
     return any(text.astype(str).str.fullmatch(r"-?\d+,\d+").any() for text in texts)
 

@@ -1,4 +1,4 @@
-"""Files that nest: objects of JSON, groups of HDF5, structs and cells of MATLAB, as tables."""
+"""Nested files as tables: objects of JSON, groups of HDF5, structs and cells of MATLAB."""
 
 import itertools
 import re

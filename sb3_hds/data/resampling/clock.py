@@ -30,7 +30,7 @@ Kind = Literal["regular", "rounded", "late", "jittered", "irregular"]
 
 class Clock(NamedTuple):
     """
-    What paced the rows between two gaps.
+    The clock that paced the rows between two gaps.
 
     :param kind: ``"regular"``: each stamp is on a tick; ``"rounded"``: but for the digits that the
         logger keeps; ``"late"``: but for a few; ``"jittered"``: but for errors that do not add up;
@@ -157,7 +157,7 @@ def common_interval(clocks: Sequence[Clock]) -> float | None:
     order = np.argsort(own)
     middle = own[order][np.searchsorted(rows[order].cumsum(), 0.5 * rows.sum())]
     alike = np.abs(own - middle) <= SAME_RATE * middle
-    # What is as long as this one is told by all of them together.
+    # The accuracy of their common interval comes from all of them together.
     sure = np.array([c.stderr if np.isfinite(c.stderr) else SAME_RATE * c.dt for c in ticking])
     weights = 1.0 / np.maximum(sure[alike], 1e-9 * middle) ** 2
     mean = float(weights @ own[alike] / weights.sum())

@@ -1,4 +1,4 @@
-"""What reading a log changed."""
+"""The report of what reading a log changed."""
 
 import dataclasses
 import math
@@ -13,17 +13,17 @@ from sb3_hds.data.resampling.clock import Kind
 from sb3_hds.data.resampling.rows import Rows
 
 _LISTED = 20
-_DRIFT = 1e-4  # relative change of a rate that is worth a word
+_DRIFT = 1e-4  # relative change of a rate that is reported
 
 
 @dataclasses.dataclass(frozen=True)
 class Sampling:
     """
-    The time stamps of one recording, and what became of its rows.
+    The time stamps of one recording, and what was done to its rows.
 
     :param source: file, and episode where it holds several
     :param rows: number of rows
-    :param intervals: shortest, median and longest time between two rows, gaps apart [s]
+    :param intervals: shortest, median and longest time between two rows, without gaps [s]
     :param uneven: number of intervals that differ from the median by more than 10 %
     :param repeated: rows left out because they have the stamp of the row before
     :param gaps: row before which a gap lies, and its length [s]; the recording is cut there
@@ -32,9 +32,9 @@ class Sampling:
     :param moved: longest time from a sample to the row closest to it [s]
     :param error: of the rows, when they are interpolated back from the samples: root mean square,
         one per observation channel, in its unit
-    :param clock: what paced the rows: ``"regular"``; ``"rounded"``, regular with stamps of few
-        digits; ``"late"``, regular but for a few stamps; ``"jittered"``, regular with stamps whose
-        errors do not add up; or ``"irregular"``
+    :param clock: the kind of clock that paced the rows: ``"regular"``; ``"rounded"``, regular with
+        stamps of few digits; ``"late"``, regular but for a few stamps; ``"jittered"``, regular with
+        stamps whose errors do not add up; or ``"irregular"``
     :param interval: of that clock, or the median one [s]
     :param rounding: what all stamps are multiples of, otherwise 0 [s]
     :param off: largest distance of a stamp from its tick [s]
@@ -66,13 +66,13 @@ class Sampling:
 
     @property
     def altered(self) -> bool:
-        """Whether the samples are anything other than the rows."""
+        """Whether the samples differ from the rows."""
         return self.resampled or bool(self.repeated or self.gaps or self.missing)
 
 
 class Part(NamedTuple):
     """
-    What one trajectory was made of.
+    The rows that one trajectory was made of.
 
     :param recording: number of the recording
     :param rows: without gaps and repeated stamps
@@ -98,7 +98,7 @@ class Reading:
         otherwise 0
     :param recordings: one for each that was read, in order; ``Trajectories.origin`` counts them
     :param parts: the rows as measured that each trajectory was made of, in order
-    :param units: of the observation channels, as they are now; empty where nobody named one
+    :param units: of the observation channels, as they are now; empty where unknown
     :param action_units: of the action channels, likewise
     :param notes: sentences on what was understood of the files themselves
     """
@@ -115,11 +115,11 @@ class Reading:
 
     @property
     def altered(self) -> bool:
-        """Whether anything is not as it stands in the files."""
+        """Whether any sample differs from the files."""
         return any(recording.altered for recording in self.recordings)
 
     def clocks(self) -> str:
-        """:return: what paced the rows, in one sentence for each kind of clock that was found"""
+        """:return: the clocks that paced the rows, one sentence for each kind"""
         said = []
         for kind, say in _CLOCKS.items():
             for kept in (True, False):
@@ -214,8 +214,8 @@ class Reading:
             lines.append(_row(width, name, r.rows, interval, len(r.repeated), len(r.gaps)))
         if len(self.recordings) > _LISTED:
             lines.append(f"  and {len(self.recordings) - _LISTED} more")
-        told = [self.clocks(), self.summary(), *self.notes]
-        return "\n".join([*lines, *(line for text in told for line in _wrapped(text))])
+        paragraphs = [self.clocks(), self.summary(), *self.notes]
+        return "\n".join([*lines, *(line for text in paragraphs for line in _wrapped(text))])
 
 
 def _regular(some: list[Sampling], kept: bool) -> str:

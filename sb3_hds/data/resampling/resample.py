@@ -1,4 +1,4 @@
-"""From rows with time stamps to steps of one length, and what that changed."""
+"""Resampling of rows with time stamps to one constant interval, with a report of the changes."""
 
 import itertools
 import math
@@ -28,11 +28,11 @@ from sb3_hds.errors import TrajectoryError
 
 _UNEVEN = 0.1  # of the median interval
 _GAP = 5.0  # intervals
-_LARGEST = 0.2  # usual step from which a whole turn is told [rad]
+_LARGEST = 0.2  # largest typical step at which whole turns are recognised [rad]
 _ENDS = 6.0  # usual steps: how near to its ends an angle wraps
 _AS_GOOD = 1.05  # ratio of mean deviations up to which two clocks fit stamps equally well
 _SIGMAS = 3.0  # standard errors by which an interval may differ from the common one
-_FAR = 10.0  # intervals between two measurements that nobody can fill in
+_FAR = 10.0  # intervals between two measurements that cannot be interpolated
 
 
 class Steps(NamedTuple):
@@ -50,13 +50,13 @@ class Steps(NamedTuple):
 
 def at_one_interval(episodes: Sequence[Rows], columns: Columns) -> tuple[Steps, Reading]:
     """
-    Find the clock of each episode, leave out rows that were written twice, cut at gaps, and
-    resample rows that no regular clock paced, or one of another rate.
+    Identify the clock of each episode, drop duplicated rows, cut at gaps, and resample rows of
+    irregular clocks or of clocks with another rate.
 
-    Rows of a regular clock stay as they are, whatever their stamps: these are rounded, late, or
-    jitter. If the values agree with such stamps rather than with the ticks, those rows alone are
-    interpolated. Of the commands, each held until the next row, a step gets the mean over its
-    duration, so that it gives the same impulse.
+    Rows of a regular clock are kept, even if their stamps are rounded, late or jitter. Where the
+    values agree with such stamps rather than with the ticks, only those rows are interpolated.
+    Commands are held until the next row; a step gets their mean over its duration, which preserves
+    the impulse.
 
     :param episodes: at least one
     :param columns: for ``dt``, ``gap``, names, and which channels are angles
@@ -156,8 +156,8 @@ def _cut(rows: Rows, gap: float | None) -> _Cut:
 
 def _gaps(times: np.ndarray, interval: float, rounding: float, gap: float | None) -> list[int]:
     """
-    Rows before which a part ends. Rows that come late in a burst, and catch up with the clock, were
-    held up on their way: nothing is missing there.
+    Rows before which a part ends. Rows that arrive late in a burst and catch up with the clock were
+    buffered: there is no gap.
     """
     waits = np.diff(times)
     ends = np.flatnonzero(waits > (gap or _GAP * interval + rounding)) + 1
@@ -173,7 +173,7 @@ def _catches_up(x: np.ndarray) -> bool:
 
 
 def _interval(clocks: Sequence[Clock]) -> float:
-    """The one of the clocks; without any, a round number near the median interval."""
+    """The common interval of the clocks, or else a round number near the median interval."""
     several = [clock for clock in clocks if len(clock.slots) > 1]
     if not several:
         raise TrajectoryError("Each episode of the log has a single row: nothing follows from it.")

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-_NEAR = 50  # smallest steps: beyond, quantisation cannot be told from rounding
+_NEAR = 50  # smallest steps: beyond, quantisation cannot be distinguished from rounding
 _FEWEST = 10  # steps that tell
 
 
 def resolutions(rows: Sequence[np.ndarray]) -> Float64[np.ndarray, " n_obs"]:
     """
-    Of values that were interpolated since, those that stayed equal still tell.
+    Works on interpolated values, too, as long as some of them stayed equal.
 
     :param rows: observations of each stretch, each of shape ``(rows, n_obs)``
     :return: smallest step of each channel whose values are multiples of one, otherwise 0

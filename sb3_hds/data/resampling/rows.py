@@ -1,4 +1,4 @@
-"""The rows of a table, in the channels of the result, checked at the door."""
+"""The rows of a table as validated channels."""
 
 import itertools
 import re

@@ -1,4 +1,4 @@
-"""What rows say of their time stamps: written twice, too coarse, or right where a clock is not."""
+"""Checks of time stamps against the values of their rows: duplicates, coarse or true stamps."""
 
 import numpy as np
 from jaxtyping import Bool
@@ -45,11 +45,11 @@ def check_resolved(rows: Rows) -> None:
 
 def written_twice(rows: Rows, interval: float) -> Bool[np.ndarray, " rows"]:
     """
-    Rows that have the stamp of the row before because they are that row once more.
+    Duplicated rows, which repeat the stamp of the row before.
 
-    Where only a few stamps are repeated, those after which the clock is a row behind. Where many
-    are, either all of them, if measurements are repeated as well, or none: the logger's ticks are
-    coarser than its rows are apart.
+    Where few stamps repeat, these are the rows after which the clock is one row behind. Where many
+    do, all of them are duplicates if their values repeat as well; otherwise none is, and the ticks
+    of the logger are coarser than the interval.
 
     :param rows: of one episode
     :param interval: typical one [s]
@@ -75,12 +75,12 @@ def written_twice(rows: Rows, interval: float) -> Bool[np.ndarray, " rows"]:
 
 def values_follow_stamps(rows: Rows, clock: Clock) -> bool:
     """
-    Whether rows were measured when their stamps say, rather than at the ticks of their clock.
+    Whether rows were measured at their stamps rather than at the ticks of their clock.
 
     If row k was measured late by a time d, its value differs by v d from what it would be at its
     tick, which spoils the smoothness of the motion. So fourth differences of the values are
-    regressed on those of v d: the slope is 1 if stamps are right, and 0 if ticks are. What noise
-    hides makes no difference; then the answer is no.
+    regressed on those of v d: the slope is 1 if the stamps are right, and 0 if the ticks are. If
+    noise hides the difference, it does not matter, and the answer is no.
 
     :param rows: of which some stamps are off their ticks
     :param clock: of these

@@ -11,7 +11,7 @@ from sb3_hds.core.types import Action, Force, MassMatrix, Obs, Params, Position,
 from sb3_hds.errors import ParameterError
 
 _MAX_SPEED = 2.0  # [m/s]
-_SERVO_TIME = 0.05  # [s] time constant with which the handle takes up the speed it is told
+_SERVO_TIME = 0.05  # [s] time constant with which the handle follows its commanded speed
 _HANDLE_MASS = 10.0  # [kg] shows only when an effect pushes the handle: the drive knows its load
 
 # Weights of the cost on payload position, handle position, payload velocity and command.

@@ -33,7 +33,7 @@ def from_mujoco(
     ignore: Collection[str] = (),
 ) -> MechanismTwin:
     """
-    A twin of whatever MuJoCo can load, as long as nothing touches.
+    A twin of a model that MuJoCo can load, without contacts.
 
     Its parameters carry the names and words of the file: ``elbow_damping``, ``elbow_frictionloss``,
     ``elbow_armature``, ``elbow_servo_kp``.
@@ -50,8 +50,8 @@ def from_mujoco(
         ``"implicitfast"`` for a URDF
     :param observe: ``"qv"`` for positions and velocities, ``"q"`` for positions only
     :param payload: name of a site or body: an unknown mass may be there, or near it
-    :param masses: whether mass, centre and inertia of each body are parameters, too; a warning says
-        which of them no motion can tell
+    :param masses: whether mass, centre and inertia of each body are parameters, too; a warning
+        lists those that no motion can identify
     :param reward: of a task: ``reward(state, action, next_state, params)``
     :param terminated: when a task ends: ``terminated(state, params)``
     :param ignore: what the model has and the twin may do without: ``"contacts"`` where nothing

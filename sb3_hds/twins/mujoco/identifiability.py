@@ -1,4 +1,4 @@
-"""Which inertial parameters the motion of a mechanism can tell, whatever it does."""
+"""Structural identifiability of the inertial parameters of a mechanism."""
 
 from typing import TYPE_CHECKING
 
@@ -21,8 +21,8 @@ _FEW = 6
 
 def unidentifiable(twin: "MechanismTwin") -> str:
     """
-    :return: in a sentence, which masses, centres, inertias and armatures no data can tell, or only
-        together with others; empty if there are none
+    :return: a sentence on the masses, centres, inertias and armatures that no data can identify, or
+        only in combination; empty if there are none
 
     Source: Khalil and Dombre, *Modeling, Identification and Control of Robots*, Kogan Page 2002,
     section 9.4.

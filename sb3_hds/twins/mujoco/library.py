@@ -1,4 +1,4 @@
-"""MuJoCo itself, which only those pay for who read a model."""
+"""The MuJoCo library, imported on first use."""
 
 from typing import Any
 

@@ -75,13 +75,13 @@ def match(twin: MechanismTwin, names: Iterable[str]) -> Matching:
         ``"dq_elbow"``; where no word says what of a joint it is, its position
     """
     columns = list(dict.fromkeys(names))
-    told = {name: _Told.by(name) for name in columns}
+    parsed = {name: _Parsed.by(name) for name in columns}
     taken: set[str] = set()
 
     def found(joint: str, kinds: Sequence[frozenset[str]]) -> str | None:
         for kind in kinds:
-            alike = [name for name in columns if name not in taken and told[name].kinds == kind]
-            scores = {name: told[name].fits(joint) for name in alike}
+            alike = [name for name in columns if name not in taken and parsed[name].kinds == kind]
+            scores = {name: parsed[name].fits(joint) for name in alike}
             best = max(scores.values(), default=0.0)
             first = [name for name, score in scores.items() if score == best > 0.0]
             if len(first) == 1:
@@ -97,7 +97,7 @@ def match(twin: MechanismTwin, names: Iterable[str]) -> Matching:
         _, joint, kinds = signals[i]
         hits[i] = found(joint, kinds)
     # What else a name says must be a prefix of all, as of a namespace: right_elbow is no elbow.
-    beside = {i: told[name].beside(signals[i][1]) for i, name in hits.items() if name is not None}
+    beside = {i: parsed[name].beside(signals[i][1]) for i, name in hits.items() if name is not None}
     if len(set(beside.values())) > 1:
         hits |= {i: None for i, more in beside.items() if more}
         taken = {name for name in hits.values() if name is not None}
@@ -139,14 +139,14 @@ def arranged(twin: MechanismTwin, data: Trajectories) -> Trajectories:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Told:
-    """What the name of a column says."""
+class _Parsed:
+    """The parsed name of a column."""
 
     joint: tuple[str, ...]
     kinds: frozenset[str]
 
     @classmethod
-    def by(cls, name: str) -> "_Told":
+    def by(cls, name: str) -> "_Parsed":
         words = _tokens(name)
         kinds = frozenset(_KIND_OF[word] for word in words if word in _KIND_OF)
         joint = tuple(word for word in words if word not in _KIND_OF and word not in _IDLE)
@@ -154,12 +154,12 @@ class _Told:
 
     def beside(self, joint: str) -> tuple[str, ...]:
         """:return: words that are not those of the joint"""
-        own = _Told.by(joint).joint
+        own = _Parsed.by(joint).joint
         return tuple(word for word in self.joint if word not in own)
 
     def fits(self, joint: str) -> float:
         """:return: 0 if it is of another joint; more, the less else is said"""
-        wanted = _Told.by(joint).joint
+        wanted = _Parsed.by(joint).joint
         n = len(wanted)
         if not n or not self.joint:
             return float(self.joint == wanted)
@@ -190,7 +190,7 @@ def _signals(twin: MechanismTwin) -> list[tuple[str, str, list[frozenset[str]]]]
 
 
 def _measured(kind: str) -> list[frozenset[str]]:
-    """A measured effort stands for its command; a measured position is no target."""
+    """A measured effort can replace its command; a measured position is no target."""
     return [frozenset([_EFFORT])] if kind == _EFFORT else []
 
 

@@ -1,4 +1,4 @@
-"""What a twin knows of a model: the numbers of its links and drives, as plain data."""
+"""The links and drives of a model, as plain data."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ SUFFIXES = {
 @dataclasses.dataclass(frozen=True)
 class Body:
     """
-    What is rigidly carried by one link.
+    The rigid body that one link carries.
 
     :param name: of the body in the model
     :param mass: [kg]
@@ -175,7 +175,7 @@ class Shape:
 @dataclasses.dataclass(frozen=True)
 class Mechanism:
     """
-    All that the equation of motion of a model needs.
+    All data of the equation of motion of a model.
 
     :param name: of the model
     :param gravity: [m/s2], in the world's frame

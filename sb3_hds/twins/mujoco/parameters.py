@@ -54,7 +54,7 @@ def of_plant(
     """
     :param payload: where an unknown mass may be
     :param masses: whether mass, centre and inertia of each body are parameters
-    :return: all that the equation of motion has
+    :return: the parameters of the equation of motion
     """
     forces = usual.weight + _OF_DRIVE * usual.drive
     found = {name: Parameter(0.0, _TILT, "rad", -1.0, 1.0) for name in tilts(mechanism)}
@@ -73,7 +73,7 @@ def of_plant(
 
 
 def of_drives(mechanism: Mechanism) -> dict[str, Parameter]:
-    """:return: all that turns commands into forces"""
+    """:return: the parameters of the actuators"""
     found = {}
     for drive in mechanism.drives:
         found |= _of_drive(drive, mechanism.links[drive.link])

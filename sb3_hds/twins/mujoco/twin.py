@@ -102,7 +102,7 @@ class MechanismTwin(AnalyticTwin):
         self.actuation = Actuation(mechanism)
         self.parameters = self.equation.parameters | of_drives(mechanism)
         self.native_effects = native_effects(mechanism)
-        # What a drive is told to damp it knows; viscous friction would do just the same.
+        # The damping gain of a drive is known; viscous friction would be aliased with it.
         servos = ("position", "velocity")
         self.known_parameters = frozenset(
             f"{drive.name}_kv" for drive in mechanism.drives if drive.role in servos

@@ -1,4 +1,4 @@
-"""Rewards for actions that do not jump."""
+"""A penalty on jumps of the action."""
 
 from typing import Any, ClassVar
 
@@ -10,11 +10,10 @@ from sb3_hds.wrappers.action_layer import TransformLayer
 
 class ContinuityCost(TransformLayer):
     """
-    The reward less ``weight`` times the sum of squared differences of actions. Actions pass
-    unchanged; the last one is appended to observations, so that the reward stays a function of what
-    is seen.
+    Subtracts ``weight`` times the squared change of the action from the reward. Actions pass
+    unchanged; the last one is appended to observations, so that the task stays Markov.
 
-    ``info["continuity_cost"]`` is what the reward lost.
+    ``info["continuity_cost"]`` is the penalty.
 
     :param env: its actions are a bounded Box with one axis
     :param weight: [reward / command unit squared], at least 0
@@ -37,5 +36,5 @@ class ContinuityCost(TransformLayer):
         transform = Continuity(weight=float(weight), observed=observe_state)
         super().__init__(env, transform, store, arguments)
 
-    def told(self) -> dict[str, Any]:
+    def extra_info(self) -> dict[str, Any]:
         return {"continuity_cost": self.charged()}

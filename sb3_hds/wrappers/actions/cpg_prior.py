@@ -1,4 +1,4 @@
-"""A rhythm that a policy adjusts instead of having to find it."""
+"""A central pattern generator as a prior that a policy modulates."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -26,18 +26,17 @@ class CPGPrior(TransformLayer):
     :class:`~sb3_hds.core.Rhythm` for the equations.
 
     Sine and cosine of the clock that all joints share are appended to the observation, and in the
-    third mode the amplitudes and their rates: whatever acts is seen, so the task stays Markov.
+    third mode the amplitudes and their rates, so the task stays Markov.
 
     Actuators track their joints where these are known: from the entries of the observation that
     ``position`` and ``velocity`` name, or else, in environments of MuJoCo, from the environment
     itself. Elsewhere, with ``control="direct"``, and where commands are positions (MuJoCo's
     position servos, or an environment whose attribute ``commands_positions`` is true), targets are
-    the commands. Commands are clipped
-    to the action space below. A twin is seen through the rhythm unless joints are read from MuJoCo,
-    whose state it does not have: name their entries.
+    the commands. Commands are clipped to the action space below. The wrapper has a twin counterpart
+    unless joints are read from MuJoCo, whose state a twin does not have: name their entries.
 
-    ``info["command"]`` is what the environment below was told, ``info["target"]`` the aim. Learners
-    store what they chose: a command has no unique action.
+    ``info["command"]`` is the command of the environment below, ``info["target"]`` the target of
+    the joints. Learners store the raw action, because a command has no unique action.
 
     In a file of the zoo: ``env_wrapper: [{sb3_hds.wrappers.CPGPrior: {omega_swing: 3.9, ...}}]``.
     :meth:`sb3_hds.OpenLoop.constants` has the gait of a search as these arguments.
@@ -94,30 +93,40 @@ class CPGPrior(TransformLayer):
         observe_state: bool = True,
         store: str = "raw",
     ) -> None:
-        given = {k: v for k, v in locals().items() if k not in ("self", "env", "__class__")}
+        passed_on = {
+            "mode": mode,
+            "amplitude": amplitude,
+            "offset": offset,
+            "phase": phase,
+            "kp": kp,
+            "kd": kd,
+            "action_range": action_range,
+            "amplitude_factor": amplitude_factor,
+            "frequency_factor": frequency_factor,
+            "amplitude_gain": amplitude_gain,
+            "position": position,
+            "velocity": velocity,
+        }
+        arguments = passed_on | {
+            "omega_swing": omega_swing,
+            "omega_stance": omega_stance,
+            "control": control,
+            "dt": dt,
+            "observe_state": observe_state,
+            "store": store,
+        }
         check_bounded(type(self), env.action_space)
         n = spaces.flatdim(env.action_space)
         self._joints = _tracked(env, control, n, bool(position))
         rhythm = Rhythm(
-            mode=mode,
             omega_swing=omega_swing,
             omega_stance=omega_swing if omega_stance is None else omega_stance,
-            amplitude=amplitude,
-            offset=offset,
-            phase=phase,
-            kp=kp,
-            kd=kd,
-            action_range=action_range,
-            amplitude_factor=amplitude_factor,
-            frequency_factor=frequency_factor,
-            amplitude_gain=amplitude_gain,
-            position=position,
-            velocity=velocity,
             dt=interval_of(env, EnvironmentMismatchError, drawn=True) if dt is None else float(dt),
             observed=observe_state,
+            **passed_on,
         )
         self.rhythm = rhythm.sized(n)
-        super().__init__(env, self.rhythm, store, given)
+        super().__init__(env, self.rhythm, store, arguments)
         self.action_space = spaces.Box(-1.0, 1.0, (self.rhythm.n_actions,), np.float32)
         self._target = self._command = np.zeros(n)
 
@@ -135,7 +144,7 @@ class CPGPrior(TransformLayer):
     def nominal(self, action: np.ndarray) -> np.ndarray:
         return self._rounded(self._command)
 
-    def told(self) -> dict[str, Any]:
+    def extra_info(self) -> dict[str, Any]:
         return {"command": self._rounded(self._command), "target": self._target}
 
     def _readings(self) -> tuple[np.ndarray | None, np.ndarray | None]:

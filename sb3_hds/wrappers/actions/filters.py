@@ -1,4 +1,4 @@
-"""Commands without high frequencies."""
+"""Filters of commands: low-pass, delay, rate limit."""
 
 import math
 from collections.abc import Sequence
@@ -74,13 +74,13 @@ class LowPassAction(TransformLayer):
 
 class ActionDelay(TransformLayer):
     """
-    Commands arrive whole steps late. Those on their way are appended to observations.
+    Delays commands by whole steps. Commands in transit are appended to observations.
 
-    Learners always store what they chose: what is executed in a step was chosen in an earlier one.
+    Learners store the raw action: the executed one was chosen in an earlier step.
 
     :param env: its actions are a bounded Box with one axis
-    :param steps: how late [control intervals]
-    :param observe_state: whether the commands on their way are appended, the oldest first; without
+    :param steps: length of the delay [control intervals]
+    :param observe_state: whether the commands in transit are appended, the oldest first; without
         them, the task is not Markov
     :param store: ``"raw"``
     :raises ParameterError: unless ``steps`` is a whole number of at least 1
@@ -97,7 +97,7 @@ class ActionDelay(TransformLayer):
 
 class ActionRateLimit(TransformLayer):
     """
-    Commands change by at most so much per second. The last command is appended to observations.
+    Limits the rate of change of commands. The last command is appended to observations.
 
     :param env: its actions are a bounded Box with one axis
     :param max_rate: [command unit / s], one number or one per action

@@ -1,4 +1,4 @@
-"""Commands that are small, at first or always."""
+"""A reduced range of commands, constant or on a schedule."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,8 +13,8 @@ from sb3_hds.wrappers.action_layer import TransformLayer
 
 class ActionScale(TransformLayer):
     """
-    Actions reach a share of the range of commands, around its middle: always the same share, or one
-    that follows a schedule over the steps of this copy of the environment.
+    Scales actions to a share of the command range, around its middle: a constant share, or one that
+    follows a schedule over the steps of this copy of the environment.
 
     The action space stays as it is. With a schedule, its progress from 0 to 1 is appended to
     observations, and goes on over resets; a reset with a seed begins anew. An environment for
@@ -25,11 +25,10 @@ class ActionScale(TransformLayer):
     :param scale: the share, above 0 and at most 1
     :param schedule: ``[[0, 0.3], [10_000, 1.0]]``: shares at step 0 and from step 10,000 on, linear
         between; instead of ``scale``
-    :param axes: numbers of the actions concerned, from 0, such as ``[0]`` for steering alone; None:
-        all
-    :param progress: where in the schedule it begins, from 0 to 1: 1 to act with what was trained
+    :param axes: indices of the scaled actions, such as ``[0]`` for steering alone; None: all
+    :param progress: initial progress of the schedule, from 0 to 1; 1 to evaluate a trained policy
     :param observe_state: whether the progress is appended
-    :param store: ``"executed"``: learners store the action that stands for what was executed below
+    :param store: ``"executed"``: learners store the action that corresponds to the executed command
     :raises ParameterError: for a share or a schedule out of range, or both, or for axes that the
         actions do not have
     """
@@ -78,7 +77,7 @@ class ActionScale(TransformLayer):
 
     def set_progress(self, progress: float) -> None:
         """
-        Go to another place of the schedule, for example to where training is, also at later resets
+        Set the progress of the schedule, for example to that of training, also for later resets
         with a seed; reachable through ``VecEnv.env_method``. Without a schedule, nothing happens.
 
         :param progress: from 0 to 1

@@ -1,1 +1,1 @@
-"""Checks of a task before anything is learned on it."""
+"""Checks of a task before training."""

@@ -1,4 +1,4 @@
-"""How episodes end under random actions, seen from where a learner stands."""
+"""Ends of episodes under random actions, as a learner sees them."""
 
 import copy
 from typing import Any, NamedTuple
@@ -15,15 +15,15 @@ ENOUGH = 20
 class End(NamedTuple):
     """
     :param length: steps of the episode
-    :param terminated: what a learner takes the end for
-    :param told: what ``info`` says about it
-    :param last_obs: where it ended, as far as is told
-    :param first_obs: where the next episode begins
+    :param terminated: whether a learner takes the end for a termination
+    :param info: of the last step
+    :param last_obs: last observation of the episode, if it is reported
+    :param first_obs: first observation of the next episode
     """
 
     length: int
     terminated: bool
-    told: dict[str, Any]
+    info: dict[str, Any]
     last_obs: Any
     first_obs: Any
 
@@ -32,7 +32,7 @@ class Seen(NamedTuple):
     """
     :param ends: in the order in which they came
     :param n_steps: of all copies together
-    :param clock: whether observations tell how far an episode has gone
+    :param clock: whether observations contain the time since the start of the episode
     """
 
     ends: list[End]
@@ -74,9 +74,9 @@ def ends_of_vec_env(env: VecEnv, n_steps: int, seed: int) -> Seen:
         obs, _, dones, infos = env.step(actions)
         lengths += 1
         for i in np.flatnonzero(dones).tolist():
-            told = dict(infos[i])
-            cut, last = bool(told.get("TimeLimit.truncated")), told.get("terminal_observation")
-            ends.append(End(int(lengths[i]), not cut, told, last, _row(obs, i)))
+            info = dict(infos[i])
+            cut, last = bool(info.get("TimeLimit.truncated")), info.get("terminal_observation")
+            ends.append(End(int(lengths[i]), not cut, info, last, _row(obs, i)))
             lengths[i] = 0
             traces[i].append([])
     return Seen(ends, taken, _is_clock([one for trace in traces for one in trace]))

@@ -1,4 +1,4 @@
-"""Reports of checks: they say what was looked at, and print themselves in 80 columns."""
+"""Reports of checks, printed in 80 columns."""
 
 import dataclasses
 import textwrap
@@ -10,11 +10,11 @@ _WIDTH = 80
 @dataclasses.dataclass(frozen=True, repr=False)
 class Report:
     """
-    What a check found.
+    The result of a check.
 
-    :param subject: what was checked, and how much of it was seen
+    :param subject: what was checked, and on how much data
     :param problems: one paragraph each: what was measured, why it matters, what to do
-    :param notes: what could not be seen, or is right and still worth knowing
+    :param notes: what could not be checked, and other remarks
     """
 
     subject: str

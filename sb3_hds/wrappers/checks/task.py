@@ -1,4 +1,4 @@
-"""Is a task made so that it can be learned?"""
+"""A check of whether a task can be learned."""
 
 import gymnasium
 from stable_baselines3.common.vec_env import VecEnv
@@ -19,15 +19,15 @@ def check_task(
     env: gymnasium.Env, *, gamma: float = 0.99, n_steps: int = 2_000, seed: int = 0
 ) -> TaskReport:
     """
-    Look for what makes a task hard to learn for no good reason.
+    Look for properties that make a task needlessly hard to learn.
 
     Steps the environment with random actions and looks at the scale of observations and rewards,
-    the action space, constant or sparse rewards, rewards that depend on what the observation does
-    not tell (the last action, velocities), ends that pay, and the length of episodes against the
-    discount. What good policies will see is not known: numbers are those of random actions. The
-    environment is reset and stepped, and not closed.
+    the action space, constant or sparse rewards, rewards that depend on unobserved quantities
+    (the last action, velocities), rewarded terminations, and the length of episodes against the
+    discount. All numbers are those of random actions; good policies may see others. The environment
+    is reset and stepped, and not closed.
 
-    :param env: wrapped as the learner gets it; what ``VecNormalize`` would do is not seen
+    :param env: wrapped as for the learner, but without ``VecNormalize``
     :param gamma: discount per step that it will be learned with
     :param n_steps: at least 100
     :param seed: of starts and actions

@@ -1,4 +1,4 @@
-"""What makes a task hard to learn for no good reason, one function for each."""
+"""Properties that make a task needlessly hard to learn, one function for each."""
 
 import math
 
@@ -6,12 +6,6 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from sb3_hds.wrappers.checks.missing_state import (
-    explained_by,
-    is_missing,
-    knows_last_action,
-    of_action_alone,
-)
 from sb3_hds.wrappers.checks.report import counted
 from sb3_hds.wrappers.checks.task_sample import Sample
 
@@ -24,6 +18,16 @@ _FORGOTTEN = 0.05
 _FAR = 100
 # Ends from which something can be concluded.
 _FEWEST_ENDS = 3
+
+# Shares of the variance of rewards.
+_MATERIAL = 0.02
+_RECOVERED = 0.5
+# Of the variance of the last action, that an observation leaves open where it contains it.
+_KNOWN = 0.02
+# Of the variance of rewards: rounding, and the ridge of the regression.
+_NOTHING = 1e-4
+_FEWEST = 200
+_BLOCKS = 10
 
 
 def observation_scale(sample: Sample) -> list[str]:
@@ -75,7 +79,7 @@ def action_space(space: spaces.Space) -> list[str]:
 
 
 def reward_variety(sample: Sample) -> list[str]:
-    """A reward that says something must not be the same everywhere."""
+    """An informative reward must vary."""
     inner = sample.rewards[~sample.terminated]
     if not len(inner):
         return []
@@ -125,7 +129,7 @@ def reward_scale(sample: Sample, gamma: float) -> list[str]:
 
 
 def missing_state(sample: Sample) -> list[str]:
-    """The reward depends on what the observation does not contain."""
+    """Rewards that depend on unobserved quantities."""
     found = explained_by(sample)
     if found is None or not np.isfinite(sample.obs).all():
         return []
@@ -149,7 +153,7 @@ def missing_state(sample: Sample) -> list[str]:
 
 
 def rewarded_end(sample: Sample, gamma: float) -> list[str]:
-    """Where living costs, the end is a relief."""
+    """Where each step costs, termination is rewarded."""
     ends = np.flatnonzero(sample.terminated)
     if len(ends) < _FEWEST_ENDS or sample.success[ends].mean() > _HALF:
         return []
@@ -169,7 +173,7 @@ def rewarded_end(sample: Sample, gamma: float) -> list[str]:
 
 
 def horizon(sample: Sample, gamma: float) -> list[str]:
-    """How far a discount looks, against how long an episode is."""
+    """The horizon of the discount against the length of episodes."""
     ahead = 1.0 / (1.0 - gamma)
     if not len(sample.lengths) and sample.limit is None:
         return [
@@ -201,7 +205,7 @@ def horizon(sample: Sample, gamma: float) -> list[str]:
 
 
 def _late(sample: Sample, gamma: float) -> list[str]:
-    """Where all that is paid is paid long after the start."""
+    """Where rewards come long after the start only."""
     values, counts = np.unique(sample.rewards, return_counts=True)
     special = sample.rewards != values[counts.argmax()]
     if not special.any() or special.mean() > 5 * _RARE:
@@ -253,3 +257,77 @@ def _bounds(space: spaces.Box) -> str:
     if len(low) == len(high) == 1:
         return f"limits are [{low[0]:g}, {high[0]:g}]"
     return f"limits are from {low[0]:g} to {high[-1]:g}, and differ between actions"
+
+
+def explained_by(sample: Sample) -> tuple[float, float, float] | None:
+    """
+    Regress rewards on observation and action, then on earlier ones as well.
+
+    :return: unexplained shares of the variance given observation and action, given the last action
+        too, and given the last observation too; None where there is nothing to regress
+    """
+    later = np.flatnonzero(sample.age > 0)
+    reward = sample.rewards[later]
+    sizes = (sample.obs.shape[1], sample.actions.shape[1])
+    if len(later) < _FEWEST or not all(sizes) or np.ptp(sample.rewards) < 1e-9:
+        return None
+    obs, before = _scaled(sample.obs)[later], _scaled(sample.obs)[later - 1]
+    action, last = _scaled(sample.actions)[later], _scaled(sample.actions)[later - 1]
+    base = _quadratic(np.hstack([obs, action]))
+    # As far as the observation contains it, the last action is no news.
+    news = np.hstack([last, last**2, last * action])
+    moved = obs - before
+    return (
+        _left_open(base, reward),
+        _left_open(np.hstack([base, news]), reward),
+        _left_open(np.hstack([base, moved, moved**2]), reward),
+    )
+
+
+def knows_last_action(sample: Sample) -> bool:
+    """:return: whether the observation contains every entry of the last action"""
+    later = np.flatnonzero(sample.age > 0)
+    obs, last = _scaled(sample.obs)[later], sample.actions[later - 1]
+    return all(_left_open(obs, column) < _KNOWN for column in last.T)
+
+
+def of_action_alone(sample: Sample) -> bool:
+    """:return: whether the reward is a quadratic function of the action alone"""
+    if len(sample.rewards) < _FEWEST or not sample.actions.shape[1]:
+        return False
+    return _left_open(_quadratic(_scaled(sample.actions)), sample.rewards) < _NOTHING
+
+
+def is_missing(before: float, after: float) -> bool:
+    """:return: whether the added regressors explain most of a substantial residual"""
+    return before > _MATERIAL and after < _RECOVERED * before
+
+
+def _left_open(features: np.ndarray, target: np.ndarray) -> float:
+    """Unexplained share of the variance of a ridge regression, cross-validated in blocks."""
+    block = np.arange(len(target)) * _BLOCKS // len(target)
+    open_, total = 0.0, 0.0
+    for seen, other in ((block % 2 == 0, block % 2 == 1), (block % 2 == 1, block % 2 == 0)):
+        mean, std = features[seen].mean(0), features[seen].std(0)
+        used = std > 1e-9
+        x = np.clip((features[:, used] - mean[used]) / std[used], -10.0, 10.0)
+        y = target - target[seen].mean()
+        gram = x[seen].T @ x[seen] + 1e-3 * seen.sum() * np.eye(x.shape[1])
+        weights = np.linalg.solve(gram, x[seen].T @ y[seen])
+        open_ += np.sum((y[other] - x[other] @ weights) ** 2)
+        total += np.sum(y[other] ** 2)
+    return float(open_ / max(total, 1e-300))
+
+
+def _quadratic(x: np.ndarray) -> np.ndarray:
+    """All pairwise products where there are few regressors, squares otherwise."""
+    n, width = x.shape
+    if width * (width + 1) // 2 > n // 8:
+        return np.hstack([x, x**2])
+    first, second = np.triu_indices(width)
+    return np.hstack([x, x[:, first] * x[:, second]])
+
+
+def _scaled(x: np.ndarray) -> np.ndarray:
+    std = x.std(0)
+    return (x - x.mean(0)) / np.where(std > 1e-9, std, 1.0)

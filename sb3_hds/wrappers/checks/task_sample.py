@@ -1,4 +1,4 @@
-"""What a task looks like under random actions, as arrays."""
+"""A sample of a task under random actions, as arrays."""
 
 import copy
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""Does a time-out reach the learner as what it is?"""
+"""A check of whether time-outs reach the learner as truncations."""
 
 import math
 from collections import Counter
@@ -41,11 +41,11 @@ def check_truncation(
     termination. A time limit that arrives as a termination makes values wrong, silently: those of a
     constant reward of 1 by a factor of :math:`1 / (1 - \gamma^n)` for a limit of ``n`` steps.
 
-    Episodes are made with random actions. What an end *means* cannot be seen from outside; but
-    ends that come after the same number of steps time and again are a limit, unless observations
-    tell the time. A limit around a shorter one, which never acts, is found in the whole stack of
-    wrappers; in copies in processes of their own, by where episodes end. The environment is reset
-    and stepped, and not closed.
+    Episodes are sampled with random actions. The meaning of an end cannot be observed, but ends
+    that recur after the same number of steps are a time limit, unless observations contain the
+    time. A limit outside a shorter one, which never acts, is found in the stack of wrappers, or for
+    copies in other processes from the lengths of episodes. The environment is reset and stepped,
+    and not closed.
 
     :param env: an environment, an SB3 ``VecEnv`` of anybody's, or a Gymnasium ``VectorEnv`` in any
         autoreset mode, wrapped as the learner gets it
@@ -115,7 +115,7 @@ def _of_vector_env(env: VectorEnv, n_steps: int | None, seed: int) -> Truncation
 
 
 def _only_in_info(seen: Seen) -> list[str]:
-    n = sum(end.terminated and bool(end.told.get("TimeLimit.truncated")) for end in seen.ends)
+    n = sum(end.terminated and bool(end.info.get("TimeLimit.truncated")) for end in seen.ends)
     if not n:
         return []
     return [
@@ -193,14 +193,14 @@ def _stands_out(lengths: Counter, longest: int) -> bool:
 
 
 def _tells_time_outs(seen: Seen) -> bool:
-    """Whether each end, or at least each time-out, is told; SB3 reads nothing as False."""
-    told = [end.told.get("TimeLimit.truncated") for end in seen.ends]
-    return any(told) or None not in told
+    """Whether each end, or at least each time-out, is marked; SB3 reads a missing key as False."""
+    flags = [end.info.get("TimeLimit.truncated") for end in seen.ends]
+    return any(flags) or None not in flags
 
 
 def _missing_keys(seen: Seen) -> list[str]:
     problems = []
-    n = sum("TimeLimit.truncated" not in end.told for end in seen.ends)
+    n = sum("TimeLimit.truncated" not in end.info for end in seen.ends)
     if n and not _tells_time_outs(seen):
         problems.append(
             f"In {n} of {counted(len(seen.ends), 'end')}, infos[i] had no 'TimeLimit.truncated'. "
@@ -219,23 +219,23 @@ def _missing_keys(seen: Seen) -> list[str]:
 
 def _lost_observations(env: VecEnv, seen: Seen) -> list[str]:
     """Last observations that cannot be what they should be."""
-    told = [end for end in seen.ends if end.last_obs is not None]
-    strange = [end for end in told if not _fits(env, end.last_obs)]
+    reported = [end for end in seen.ends if end.last_obs is not None]
+    strange = [end for end in reported if not _fits(env, end.last_obs)]
     if strange:
         return [
-            f"In {len(strange)} of {counted(len(told), 'end')}, infos[i]['terminal_observation'] "
-            f"was {_shape(strange[0].last_obs)} instead of one observation of "
-            f"{env.observation_space}. Put the row of that copy there."
+            f"In {len(strange)} of {counted(len(reported), 'end')}, "
+            f"infos[i]['terminal_observation'] was {_shape(strange[0].last_obs)} instead of one "
+            f"observation of {env.observation_space}. Put the row of that copy there."
         ]
     # Where all episodes begin alike, an episode may as well end where it began.
-    starts_differ = any(not is_same(end.first_obs, told[0].first_obs) for end in told)
-    n = sum(is_same(end.last_obs, end.first_obs) for end in told)
-    if not starts_differ or n < len(told):
+    starts_differ = any(not is_same(end.first_obs, reported[0].first_obs) for end in reported)
+    n = sum(is_same(end.last_obs, end.first_obs) for end in reported)
+    if not starts_differ or n < len(reported):
         return []
     return [
-        f"In {n} of {counted(len(told), 'end')}, infos[i]['terminal_observation'] was what step() "
-        "returned as well: it is either the first observation of the next episode, whose value "
-        "has nothing to do with the step before, or the copy was not reset. Keep the last "
+        f"In {n} of {counted(len(reported), 'end')}, infos[i]['terminal_observation'] was what "
+        "step() returned as well: it is either the first observation of the next episode, whose "
+        "value has nothing to do with the step before, or the copy was not reset. Keep the last "
         "observation before resetting, and return the first one of the next episode."
     ]
 

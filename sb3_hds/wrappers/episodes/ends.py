@@ -1,4 +1,4 @@
-"""What the end of an episode means: the task is over, or somebody stopped looking."""
+"""Terminations and truncations, converted into each other."""
 
 from typing import Any
 
@@ -11,11 +11,11 @@ Step = tuple[Any, Any, bool, bool, dict[str, Any]]
 
 class TerminateToTruncate(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     """
-    Every end is a truncation: what would have come after still counts.
+    Turns every end into a truncation, so that learners bootstrap the value of the last state.
 
     For environments that end for a reason that is not part of the task: an operator, a workspace
     that was left, a limit that is signalled as termination. Rewards are left alone, so where an end
-    means failure, it must cost something on its own, or the learner sees nothing wrong with it.
+    means failure, the reward must say so, or the learner sees nothing wrong with it.
 
     :param env: of any kind
     """
@@ -34,12 +34,12 @@ class TerminateToTruncate(gymnasium.Wrapper, gymnasium.utils.RecordConstructorAr
 
 class TruncateToTerminate(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     r"""
-    Every end is a termination: nothing comes after, the value of the last state is 0.
+    Turns every end into a termination: the value of the last state is 0.
 
-    For a task that really is over after its time, such as "as far as possible in ten seconds". A
-    policy can only learn that where it sees the time: put
-    :class:`~sb3_hds.wrappers.TimeAware` around as well. Without it, states that look the same are
-    worth :math:`\sum_{k<n} \gamma^k r`, with as many ``n`` as there are moments in an episode.
+    For a task that really is over after its time, such as "as far as possible in ten seconds".
+    Values are then functions of time, so add :class:`~sb3_hds.wrappers.TimeAware` outside. Without
+    it, one observation has as many values :math:`\sum_{k<n} \gamma^k r` as there are steps
+    :math:`n` left.
 
     Source: Pardo et al., *Time Limits in Reinforcement Learning*, ICML 2018, section 3
     ("time-awareness").
@@ -61,12 +61,13 @@ class TruncateToTerminate(gymnasium.Wrapper, gymnasium.utils.RecordConstructorAr
 
 class InfiniteHorizon(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     """
-    A task without an end in time: after ``max_episode_steps`` an episode is cut, never terminated.
+    A task without a time limit: after ``max_episode_steps`` an episode is truncated, not
+    terminated.
 
     Ends before the limit, such as a fall, stay what they are. For environments that count their
     steps themselves and call the last one a termination, and for those that have no limit: a robot
     that walks for ever still has to be put back sometimes. A failure in the very step of the limit
-    cannot be told from the limit, and counts as the limit.
+    cannot be distinguished from the limit, and counts as the limit.
 
     Source: Pardo et al., *Time Limits in Reinforcement Learning*, ICML 2018, section 4
     ("partial-episode bootstrapping").
@@ -107,7 +108,7 @@ class InfiniteHorizon(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
 
 def _told(info: dict[str, Any], name: str, truncated: bool) -> dict[str, Any]:
     """:return: with the old flag of rl_zoo3's ``TimeLimit``, where it is there, set right"""
-    told = info | {name: True}
-    if "TimeLimit.truncated" in told:
-        told["TimeLimit.truncated"] = truncated
-    return told
+    marked = info | {name: True}
+    if "TimeLimit.truncated" in marked:
+        marked["TimeLimit.truncated"] = truncated
+    return marked

@@ -1,4 +1,4 @@
-"""An episode that ends because somebody wants to put the robot back."""
+"""Ends of episodes at the request of an operator."""
 
 import threading
 from collections.abc import Callable
@@ -13,8 +13,8 @@ class ManualReset(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     """
     Ends an episode when asked to: with a key, a foot switch, or from another thread.
 
-    The step during which the request comes is truncated, not terminated: nothing about the task
-    made it end, so what would have come after still counts. Observations, actions and rewards are
+    The step during which the request comes is truncated, not terminated, because the task is not
+    over. Observations, actions and rewards are
     left alone.
 
     :param env: of any kind

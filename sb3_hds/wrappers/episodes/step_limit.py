@@ -1,4 +1,4 @@
-"""After how many steps an environment cuts its episodes."""
+"""The step limits in a stack of wrappers."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""What goes wrong with sensors, and what pushes a robot."""
+"""Disturbances: sensor noise, sensor failure, pushes."""
 
 from typing import Any
 
@@ -16,16 +16,16 @@ _TORSO = 1
 
 class Perturb(gymnasium.Wrapper, RecordConstructorArgs):
     """
-    Noise on observations, a sensor that fails, a force that pushes. Rewards and the environment's
-    own state are what they are; random numbers are those of the environment, seeded with it.
+    Adds noise to observations, a failed sensor, and random pushes. Rewards and the state of the
+    environment are not affected by the sensors; random numbers come from the generator of the
+    environment.
 
     :param env: whose observations are a Box with one axis
-    :param noise: standard deviation of what is added to each entry, drawn afresh at every step, in
-        the unit of the entry
-    :param failing: one entry of the observation shows ``"zero"`` throughout, or a ``"constant"``;
-        None: none fails
-    :param sensor: which entry; None: another one in each episode
-    :param constant: what a sensor shows that fails so
+    :param noise: standard deviation of the white noise on each entry, in the unit of the entry
+    :param failing: the reading of a failed sensor: ``"zero"``, or a ``"constant"``; None: none
+        fails
+    :param sensor: index of the failed entry; None: a random one in each episode
+    :param constant: reading of a sensor that fails with ``"constant"``
     :param push: force on the torso [N], in a random direction of space
     :param push_probability: of a push in a step
     :raises ParameterError: for arguments out of range
@@ -43,7 +43,14 @@ class Perturb(gymnasium.Wrapper, RecordConstructorArgs):
         push: float = 0.0,
         push_probability: float = 0.05,
     ) -> None:
-        given = {k: v for k, v in locals().items() if k not in ("self", "env", "__class__")}
+        given = {
+            "noise": noise,
+            "failing": failing,
+            "sensor": sensor,
+            "constant": constant,
+            "push": push,
+            "push_probability": push_probability,
+        }
         RecordConstructorArgs.__init__(self, **given)
         gymnasium.Wrapper.__init__(self, env)
         space = env.observation_space

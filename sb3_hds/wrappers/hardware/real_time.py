@@ -1,4 +1,4 @@
-"""A control period against a clock, and a watchdog for learners that are late."""
+"""A control loop in real time, with a watchdog for late commands."""
 
 import math
 import threading
@@ -19,7 +19,7 @@ _LEAST_PAUSE = 0.1
 
 class Timing(NamedTuple):
     """
-    What happened since the environment was wrapped.
+    Counters since the environment was wrapped.
 
     :param steps: commands of the learner that were executed
     :param overruns: of them, those that came after their deadline
@@ -43,7 +43,7 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
 
     A command that comes after its tick is an overrun: it is executed at once. With a
     ``safe_action``, a watchdog executes that one if no command has come ``grace`` after a tick, and
-    again at each tick until one comes. Then the reward of ``step`` includes what was missed, and
+    again at each tick until one comes. Then the reward of ``step`` includes the missed steps, and
     ``info["missed_steps"]`` is how many safe actions were executed since the last observation that
     the learner saw. An episode that ends meanwhile is reported by the next ``step``, whose command
     is dropped (``info["command_dropped"]``).
@@ -53,8 +53,8 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     first), or beside the loop with :class:`sb3_hds.algos.TrainBeside`. Where ``step`` is
     interrupted or raises, the watchdog goes on with the safe action until ``reset`` or ``close``.
 
-    A general-purpose operating system wakes a process a little late, on a busy machine by
-    milliseconds: this is no hard real time, and no substitute for a watchdog in the drive.
+    A general-purpose operating system wakes a process late, on a busy machine by milliseconds: this
+    is not hard real time, and no substitute for a watchdog in the drive.
 
     Times are no part of ``info``, which is a function of seed and actions: they are attributes,
     ``timing``, ``latency`` (of the latest command, from observation to command [s]; 0 for the first

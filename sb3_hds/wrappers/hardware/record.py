@@ -1,4 +1,4 @@
-"""Recording whatever an environment does, a robot's included."""
+"""Recordings of an environment or a robot."""
 
 import os
 from collections.abc import Callable, Sequence

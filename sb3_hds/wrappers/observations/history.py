@@ -1,4 +1,4 @@
-"""Observations with a memory."""
+"""A history of observations and actions in the observation."""
 
 from typing import ClassVar
 

@@ -1,4 +1,4 @@
-"""Joints that the observation does not show."""
+"""Joint states that the observation lacks."""
 
 from typing import Any
 

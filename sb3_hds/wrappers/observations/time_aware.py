@@ -1,4 +1,4 @@
-"""Observations that tell how much time is left."""
+"""The remaining time in the observation."""
 
 from typing import Any
 
@@ -16,9 +16,9 @@ class TimeAware(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     r"""
     Adds the remaining time to the observation: :math:`1 - k / n` after ``k`` of ``n`` steps.
 
-    A Box gets one more entry, a Dict the key ``"remaining_time"``. For tasks that are over after
-    their time: the value of a state then depends on it. That the end is a termination is not said
-    here but by :class:`~sb3_hds.wrappers.TruncateToTerminate`. The spaces of the wrapped
+    A Box gets one more entry, a Dict the key ``"remaining_time"``. For tasks with a
+    true time limit, where values depend on the remaining time. To make its end a termination, add
+    :class:`~sb3_hds.wrappers.TruncateToTerminate`. The spaces of the wrapped
     environment are left alone.
 
     Source: Pardo et al., *Time Limits in Reinforcement Learning*, ICML 2018, section 3.

@@ -1,4 +1,4 @@
-"""Joints that stay within their limits, whatever a policy asks for."""
+"""Joint limits, enforced by a control barrier function."""
 
 import math
 import warnings
@@ -31,7 +31,7 @@ class JointLimitBarrier(TransformLayer):
     to be next to the environment: any layer below would change what it decided.
 
     ``info["constraint_cost"]`` is how far joints are beyond their limits, and
-    ``info["tracking_error"]`` by how much they missed what they were told.
+    ``info["tracking_error"]`` by how much they missed their commands.
 
     :param env: observes the positions in a Box with one axis
     :param low: lower limit [rad] or [m], one number or one per guarded joint
@@ -40,7 +40,7 @@ class JointLimitBarrier(TransformLayer):
         two indices of its cosine and sine
     :param action: index of the command that is each joint's speed; default: 0, 1, ...
     :param gain: speed per unit of the command [rad/s] or [m/s]
-    :param share: :math:`\gamma`, above 0 and at most 1: how much of the distance one step may take
+    :param share: :math:`\gamma`, above 0 and at most 1: the largest share of the distance per step
     :param tolerance: :math:`\varepsilon`, by how much a step may miss [rad] or [m]; default: what
         single precision needs
     :param dt: control interval [s]; default: the environment's own ``dt`` or ``tau``
@@ -124,7 +124,7 @@ class JointLimitBarrier(TransformLayer):
     def cost(self) -> float:
         return float(self._barrier.violation(self._obs))
 
-    def told(self) -> dict[str, Any]:
+    def extra_info(self) -> dict[str, Any]:
         return {"tracking_error": self._missed}
 
     def _breach(self, message: str) -> None:

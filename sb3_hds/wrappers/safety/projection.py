@@ -1,4 +1,4 @@
-"""The nearest command that linear constraints allow."""
+"""Projection of commands onto linear constraints."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -74,7 +74,7 @@ class ConstraintSet:
     """
     Linear constraints on commands, constant or a function of the observation.
 
-    :param layer: whose they are, for messages
+    :param layer: name of the layer, for messages
     :param given: see :data:`Constraints`
     :param n: size of a command
     :raises ParameterError: for anything else, or a constant pair of the wrong shape

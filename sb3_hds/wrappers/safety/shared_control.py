@@ -1,4 +1,4 @@
-"""A task in phases, each with few inputs and its own constraints."""
+"""Shared control templates: a task in phases, each with few inputs and its own constraints."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -42,11 +42,12 @@ class SharedControlTemplate(ActionLayer):
     r"""
     A finite-state description of a task. In each phase, a few inputs in [-1, 1] are mapped to
     commands, :math:`u = M(o)\,a + c`, and projected onto the constraints of the phase; conditions
-    on observations lead from phase to phase. So a policy learns only what is left to learn, and
-    constraints are kept instead of rewarded.
+    on observations lead from phase to phase. The policy learns only the remaining inputs,
+    and constraints are enforced rather than rewarded.
 
     The phase is appended to observations, one entry for each, 1 for the present one.
-    ``info["phase"]`` is its name. Learners store what they chose: a command has no unique input.
+    ``info["phase"]`` is its name. Learners store the raw action, because a command has no unique
+    input.
 
     Assumes that some command is allowed at every observation of a phase. It has to be next to the
     environment: any layer below would change what it decided.
@@ -140,7 +141,7 @@ class SharedControlTemplate(ActionLayer):
     def cost(self) -> float:
         return self._violated
 
-    def told(self) -> dict[str, Any]:
+    def extra_info(self) -> dict[str, Any]:
         return {"phase": self.phase}
 
     def _move_on(self, obs: Any) -> None:

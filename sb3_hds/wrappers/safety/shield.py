@@ -1,4 +1,4 @@
-"""Commands that coupled constraints allow."""
+"""A shield: commands are projected onto coupled linear constraints."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -18,7 +18,7 @@ _ROUNDING = 1e-5
 
 class ActionShield(ActionLayer):
     r"""
-    The command is the one nearest to the action among those that linear constraints allow:
+    Projects the action onto the commands that satisfy linear constraints:
 
     .. math:: \min_u |u - a|^2 \quad \text{s.t.}\quad G(o)\,u \le h(o),\ u \in \text{Box}
 
@@ -27,9 +27,9 @@ class ActionShield(ActionLayer):
     limits, walls and joint combinations at once. For limits of single joints,
     :class:`JointLimitBarrier` is the closed form.
 
-    Assumes that some command is allowed at every observation, and that what is allowed is safe. The
+    Assumes that the constraints are feasible at every observation and sufficient for safety. The
     first is checked at construction where constraints are constant, and at every step; the second
-    at every reset and step, where a ``guard`` says what safe means. It has to be next to the
+    at every reset and step, if a ``guard`` defines safety. It has to be next to the
     environment: any layer below would change what it decided.
 
     ``info["constraint_cost"]`` is how far guards are below zero, summed, or without one, by how
@@ -108,7 +108,7 @@ class ActionShield(ActionLayer):
     def cost(self) -> float:
         return float(-self._margins.clip(None, 0.0).sum()) if self._guard else self._violated
 
-    def told(self) -> dict[str, Any]:
+    def extra_info(self) -> dict[str, Any]:
         return {"infeasible": self._infeasible}
 
     def _look(self, obs: Any) -> None:

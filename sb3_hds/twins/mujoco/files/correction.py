@@ -1,4 +1,4 @@
-"""What a model file has to say of a corrected twin."""
+"""The differences between a corrected twin and its model file."""
 
 import dataclasses
 
@@ -21,13 +21,13 @@ _SAME = 1e-12
 @dataclasses.dataclass
 class Correction:
     """
-    The changes that a file has to carry, and what became of them.
+    The changes that a file has to carry, and the record of what was written.
 
     :param plant: the twin of the file, without effects
     :param values: of the plant, with what effects add to them
     :param effects: others: name, index and place of each, with its values
     :param changed: what was written, a line each
-    :param left_out: what such a file cannot say, a line each
+    :param left_out: what the format cannot express, a line each
     """
 
     plant: MechanismTwin
@@ -77,7 +77,7 @@ class Correction:
 
 
 def changed_bodies(correction: Correction) -> dict[int, spatial.Body]:
-    """:return: by link, what is not as the file has it"""
+    """:return: the bodies that differ from the file, by link"""
     mechanism, plant = correction.mechanism, correction.plant
     null = {name: parameter.null for name, parameter in plant.parameters.items()}
     with_body = [i for i, link in enumerate(mechanism.links) if link.body is not None]

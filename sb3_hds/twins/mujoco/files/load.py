@@ -1,4 +1,4 @@
-"""From whatever describes a robot to a compiled model of MuJoCo."""
+"""Loading of model files and environments as compiled MuJoCo models."""
 
 import os
 from collections.abc import Callable

@@ -61,8 +61,8 @@ def mjcf_of(correction: Correction, source: Any, target: Path) -> str:
     try:
         spec.compile()
     except ValueError as error:
-        told = str(error).strip().splitlines()[0]
-        raise ModelFileError(f"MuJoCo refuses the corrected model: {told}") from None
+        message = str(error).strip().splitlines()[0]
+        raise ModelFileError(f"MuJoCo refuses the corrected model: {message}") from None
     return spec.to_xml()
 
 

@@ -1,4 +1,4 @@
-"""What a model asks for and its twin does not simulate: refused in a line, with the way out."""
+"""Features of a model that its twin does not simulate, refused with the remedy."""
 
 from collections.abc import Collection
 from typing import Any
@@ -20,7 +20,7 @@ def refuse(model: Any, integrator: str, ignore: Collection[str]) -> None:
     :param model: compiled
     :param integrator: that the twin will have
     :param ignore: of :data:`IGNORABLE`
-    :raises ModelFileError: for all that stands against a twin, a line each
+    :raises ModelFileError: for all unsupported features, a line each
     """
     unknown = [name for name in ignore if name not in IGNORABLE]
     if unknown:

@@ -1,4 +1,4 @@
-"""What a robot looks like: the meshes of its model, as far as their files are there."""
+"""The visual meshes of a model, where their files exist."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -91,7 +91,7 @@ def _body_of(spec: Any, name: str) -> Any:
 
 
 def _found(name: str, folder: Path) -> Path | None:
-    """A mesh by the end of its path: packages lie where nobody says."""
+    """A mesh by the end of its path: the root of its package is unknown."""
     parts = Path(name.partition("://")[2] or name).parts
     for first in range(len(parts)):
         path = folder.joinpath(*parts[first:])

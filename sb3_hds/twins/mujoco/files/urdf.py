@@ -79,8 +79,8 @@ def _write_urdf_inertial(correction: Correction, link: Any, body: Any, new: spat
     """Only where nothing else is rigidly carried: then the link is the twin's body."""
     own = None if link is None else link.find("inertial")
     mass = None if own is None else own.find("mass")
-    told = math.nan if mass is None else float(mass.get("value", "nan"))
-    if own is None or mass is None or not math.isclose(told, body.mass, rel_tol=1e-9):
+    held = math.nan if mass is None else float(mass.get("value", "nan"))
+    if own is None or mass is None or not math.isclose(held, body.mass, rel_tol=1e-9):
         correction.left_out.append(
             f"mass and inertia of {body.name}, which carries other links rigidly"
         )

@@ -1,4 +1,4 @@
-"""A corrected twin back into the model file of its robot: as MJCF, or as URDF where that can."""
+"""Export of a corrected twin to a model file, MJCF or URDF."""
 
 import dataclasses
 import os
@@ -19,8 +19,8 @@ from sb3_hds.twins.mujoco.twin import MechanismTwin
 class Written:
     """
     :param path: of the file
-    :param changed: what is in it that the source did not say, a line each
-    :param left_out: what the twin has and such a file cannot say, a line each
+    :param changed: changes relative to the source, a line each
+    :param left_out: properties of the twin that the format cannot express, a line each
     """
 
     path: Path
@@ -37,14 +37,14 @@ class Written:
 
 def write_model(twin: Twin, path: str | os.PathLike[str], source: Any) -> Written:
     """
-    Write a calibrated or extended twin of a model file as such a file: its source, corrected.
+    Write a calibrated or extended twin of a model file as a corrected copy of that file.
 
     An MJCF file carries friction loss, damping, armature, stiffness, gains, gravity, masses with
     centres and inertias, a payload, and delays, time constants and limits of actuators; besides,
     the step and the integrator of the twin, so that ``mj_step``, ``substeps`` times a control
-    interval, does what the twin does. Dry friction is MuJoCo's then, at which a joint sticks. A
-    URDF carries damping, friction and inertials; what a file cannot say is listed. Meshes that are
-    missing are left out of MJCF.
+    interval, does what the twin does. Dry friction then is MuJoCo's, which sticks. A URDF carries
+    damping, friction and inertials; what a format cannot express is listed. Missing meshes are left
+    out of MJCF.
 
     :param twin: made by ``twins.from_mujoco``, with other parameters, or with effects
     :param path: ``.xml`` or ``.mjcf`` for MJCF, ``.urdf`` for a URDF, which needs one as its source
