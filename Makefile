@@ -33,7 +33,7 @@ $(VENV)/.installed-%: pyproject.toml constraints.txt $(VENV)/.torch
 	@touch $@
 
 $(VENV)/.installed-demo: EXTRAS := zoo,report
-$(VENV)/.installed-dev: EXTRAS := zoo,report,dev
+$(VENV)/.installed-dev: EXTRAS := zoo,report,onnx,dev
 
 format: install
 	$(BIN)/ruff check --select I --fix .
@@ -71,7 +71,7 @@ test-lowest test-newest: test-%:
 		--retries 1 --constraint constraints.txt --extra-index-url $(TORCH_INDEX) torch
 	$(VENV)-$*/bin/python -m pip --disable-pip-version-check install --quiet uv
 	$(VENV)-$*/bin/uv pip install --python $(VENV)-$*/bin/python --resolution $(RESOLUTION) \
-		--editable ".[zoo,report,dev]"
+		--editable ".[zoo,report,onnx,dev]"
 	$(VENV)-$*/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not expensive" $(TESTS)
 
 docs: install

@@ -53,6 +53,14 @@ class SafetyError(SB3HDSError, RuntimeError):
     """A safety layer cannot keep what it promises: what it assumes does not hold."""
 
 
+class ExportError(SB3HDSError, ValueError):
+    """A policy cannot be exported, or a file that was exported cannot be run."""
+
+
+class StudyError(SB3HDSError, ValueError):
+    """A study asks for what does not exist, or for a folder that is taken."""
+
+
 class DivergedError(SB3HDSError, FloatingPointError, ValueError):
     """
     Learning diverged.

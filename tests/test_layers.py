@@ -9,13 +9,14 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 
 ORDER = (
-    {"errors"},
+    {"errors", "lazy"},
     {"core"},
     {"data", "twins", "effects"},
     {"planning", "sysid"},
     {"envs", "wrappers"},
+    {"deploy"},
     {"algos"},
-    {"deploy", "experiments"},
+    {"experiments"},
     {"rl_zoo_plugin", "cli"},
 )
 ALL = set().union(*ORDER)
@@ -28,6 +29,7 @@ TABLES = {"pandas", "rich", "yaml"}
 
 LIBRARIES = {
     "errors": set(),
+    "lazy": set(),
     "core": ARRAYS,
     "data": ARRAYS | TABLES | {"scipy", "minari"},
     "data/reading/hdf5.py": {"h5py"},
@@ -46,11 +48,12 @@ LIBRARIES = {
     "wrappers/safety/projection.py": {"daqp"},
     "wrappers/vec_env.py": {"stable_baselines3.common.monitor"},
     "algos": LEARNING,
-    "deploy": LEARNING | {"onnx", "onnxruntime"},
-    "experiments": LEARNING | TABLES | {"scipy"},
+    "deploy": LEARNING | {"jax2onnx", "onnx", "onnxruntime"},
+    "experiments": LEARNING | TABLES | {"scipy", "jinja2", "rliable"},
     "cli": LEARNING | TABLES,
     "rl_zoo_plugin": {"rl_zoo3", "optuna"},
     "rl_zoo_plugin/compilation_cache.py": {"jax"},
+    "rl_zoo_plugin/study_worker.py": {"stable_baselines3"},
     "rl_zoo_plugin/trial_progress.py": {"stable_baselines3"},
 }
 """What a layer, or one file of it, imports from outside; the standard library is free."""

@@ -9,6 +9,9 @@
     sb3-hds audit --data 'logs/*.csv' --columns map.yml
     sb3-hds calibrate --twin LinearAxis --data log.mat --columns map.yml --write axis.json
     sb3-hds robustness --algo openloop --model model.zip --env Swimmer-v5
+    sb3-hds export model.zip policy.onnx --c policy.h
+    sb3-hds run policy.onnx --env Pendulum-v1 --rate 20
+    sb3-hds study run study.yml
     sb3-hds effects friction
     sb3-hds twins
     sb3-hds twins check my_module:MyTwin
@@ -51,7 +54,18 @@ def _stop(*_: Any) -> None:
 
 
 def _run(given: argparse.Namespace) -> int:
-    from sb3_hds.cli import audit, calibrate, columns, diagnose, listing, robustness, twins
+    from sb3_hds.cli import (
+        audit,
+        calibrate,
+        columns,
+        diagnose,
+        export,
+        listing,
+        robustness,
+        study,
+        twins,
+    )
+    from sb3_hds.cli import run as run_file
     from sb3_hds.errors import SB3HDSError
 
     try:
@@ -64,7 +78,10 @@ def _run(given: argparse.Namespace) -> int:
                 "audit": audit.run,
                 "calibrate": calibrate.run,
                 "diagnose": diagnose.run,
+                "export": export.run,
                 "robustness": robustness.run,
+                "run": run_file.run,
+                "study": study.run,
                 "effects": listing.run_effects,
                 "twins": twins.run,
             }[given.command](given)
@@ -90,7 +107,8 @@ def _warn(
 
 def parser() -> argparse.ArgumentParser:
     """:return: what the command understands"""
-    from sb3_hds.cli import audit, calibrate, columns, measured, twins
+    from sb3_hds.cli import audit, calibrate, columns, export, measured, study, twins
+    from sb3_hds.cli import run as run_file
     from sb3_hds.cli.parsing import Parser, Version
 
     every = Parser(
@@ -150,6 +168,15 @@ def parser() -> argparse.ArgumentParser:
     shake.add_argument("--csv", help="table to write")
     columns.add_arguments(
         commands.add_parser("columns", help="list what is in a log, with a map to start from")
+    )
+    export.add_arguments(
+        commands.add_parser("export", help="write a policy as ONNX, or as a header of C")
+    )
+    run_file.add_arguments(
+        commands.add_parser("run", help="act by an exported policy, in real time, and record it")
+    )
+    study.add_arguments(
+        commands.add_parser("study", help="run algorithms on environments, with seeds, and report")
     )
     known = commands.add_parser("effects", help="list the candidates, with units and explanations")
     known.add_argument(

@@ -2,15 +2,23 @@
 Measured data in and out: readers, recordings, and an audit before any physics.
 
 Importing it teaches ``Trajectories.load`` to read logs.
+
+Names are imported on first use: a loop on a robot needs few of them, and neither JAX nor PyTorch.
 """
 
-from sb3_hds.core.trajectories import Trajectories, read_logs_by
-from sb3_hds.data.audit import Audit, audit
-from sb3_hds.data.audit.finding import Finding
-from sb3_hds.data.columns import Columns, Entry, Label, columns_from
-from sb3_hds.data.load import SamplingWarning, load
-from sb3_hds.data.recording import Recorder
-from sb3_hds.data.resampling.report import Reading, Sampling
+from typing import TYPE_CHECKING, Any
+
+from sb3_hds.core.trajectories.log_reader import read_logs_by
+from sb3_hds.lazy import lazily
+
+if TYPE_CHECKING:
+    from sb3_hds.core.trajectories import Trajectories
+    from sb3_hds.data.audit import Audit, audit
+    from sb3_hds.data.audit.finding import Finding
+    from sb3_hds.data.columns import Columns, Entry, Label, columns_from
+    from sb3_hds.data.load import SamplingWarning, load
+    from sb3_hds.data.recording import Recorder
+    from sb3_hds.data.resampling.report import Reading, Sampling
 
 __all__ = [
     "Audit",
@@ -28,4 +36,29 @@ __all__ = [
     "load",
 ]
 
-read_logs_by(load)
+
+def _load(files: Any, columns: Any) -> "Trajectories":
+    from sb3_hds.data.load import load
+
+    return load(files, columns)
+
+
+read_logs_by(_load)
+lazily(
+    __name__,
+    {
+        "Audit": "sb3_hds.data.audit",
+        "Columns": "sb3_hds.data.columns",
+        "Entry": "sb3_hds.data.columns",
+        "Finding": "sb3_hds.data.audit.finding",
+        "Label": "sb3_hds.data.columns",
+        "Reading": "sb3_hds.data.resampling.report",
+        "Recorder": "sb3_hds.data.recording",
+        "Sampling": "sb3_hds.data.resampling.report",
+        "SamplingWarning": "sb3_hds.data.load",
+        "Trajectories": "sb3_hds.core.trajectories",
+        "audit": "sb3_hds.data.audit",
+        "columns_from": "sb3_hds.data.columns",
+        "load": "sb3_hds.data.load",
+    },
+)

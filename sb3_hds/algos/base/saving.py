@@ -2,9 +2,10 @@
 
 import contextlib
 import io
+import os
 import pathlib
 from collections.abc import Iterable, Iterator
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -24,6 +25,9 @@ from sb3_hds.algos.base.construct import device_or_cpu
 from sb3_hds.algos.base.description import described
 from sb3_hds.algos.base.files import by_names, damage_reported, name_of, refuse_damaged, write_whole
 from sb3_hds.errors import EnvironmentMismatchError
+
+if TYPE_CHECKING:
+    from sb3_hds.deploy import Exported
 
 
 @contextlib.contextmanager
@@ -84,6 +88,20 @@ class SavesTensors(BaseAlgorithm):
         self.policy_description = described(self.policy)  # type: ignore[arg-type]
         write = super().save
         write_whole(path, "zip", lambda file: write(file, exclude, include))
+
+    def export_onnx(self, path: str | os.PathLike[str], **options: Any) -> "Exported":
+        """
+        Write what the policy computes where nothing is explored as an ONNX file, which
+        :class:`~sb3_hds.deploy.OnnxPolicy` and every other runtime of ONNX runs.
+
+        :param path: a file of that name is replaced
+        :param options: see :func:`~sb3_hds.deploy.export_onnx`
+        :return: what was written
+        :raises ExportError: where the file would compute something else
+        """
+        from sb3_hds.deploy import export_onnx
+
+        return export_onnx(self, path, **options)
 
     @classmethod
     def load(

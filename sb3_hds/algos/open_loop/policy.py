@@ -16,7 +16,8 @@ from sb3_hds.algos.base.policy import TensorPolicy, TrainingTensors, refuse_odd
 from sb3_hds.algos.open_loop.cma_es import SearchState
 from sb3_hds.algos.open_loop.gait import Constants
 from sb3_hds.algos.open_loop.robot import Body
-from sb3_hds.core.transforms.oscillators import Gait, target_at
+from sb3_hds.core.transforms.oscillators import Gait, advance_phase, target_at
+from sb3_hds.deploy.policy_function import Joints, Memory, PolicyFunction
 from sb3_hds.errors import EnvironmentMismatchError
 from sb3_hds.wrappers.actuated_joints import track
 
@@ -146,6 +147,26 @@ class OscillatorPolicy(TensorPolicy):
         box = self.action_space
         assert isinstance(box, spaces.Box)
         return np.clip(targets.reshape(-1, *box.shape), box.low, box.high).astype(box.dtype)
+
+    def policy_function(self) -> PolicyFunction:
+        """:return: what the policy computes, with the phases of its oscillators as memory"""
+        body, gait = self.body, self.constants
+        omega = float(gait.omega_swing), float(gait.omega_stance)
+        dt = body.dt if body else 1.0
+        tracks = body is not None and body.control == "track"
+        seen = tracks and bool(body.seen_position)  # type: ignore[union-attr]
+
+        def act(obs: Any, joints: tuple[Any, ...], memory: tuple[Any, ...]) -> tuple[Any, Any]:
+            (phase,) = memory
+            targets = gait.amplitude * jnp.sin(phase) + gait.offset
+            if tracks:
+                position, velocity = body.in_observations(obs) if seen else joints  # type: ignore[union-attr]
+                targets = track(targets, position, velocity, gait.kp, gait.kd)
+            return targets, (advance_phase(phase, dt, *omega),)
+
+        first = Memory("phase", advance_phase(gait.phase, 0.5 * dt, *omega))
+        machine = Joints(body.position, body.velocity) if tracks and not seen else None  # type: ignore[union-attr]
+        return PolicyFunction(act, squashed=False, memory=(first,), joints=machine)
 
     def _joints(self, observations: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
         body = self.body

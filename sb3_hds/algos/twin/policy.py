@@ -15,6 +15,7 @@ from sb3_hds.algos.nets.activations import Activation, activation, finite_leaves
 from sb3_hds.algos.twin.networks import Actor, Value
 from sb3_hds.algos.twin.state import Networks, Progress, fresh_networks
 from sb3_hds.core.numerics.compilation import GENERATOR
+from sb3_hds.deploy.policy_function import PolicyFunction
 
 _POLICY_WIDTHS, _VALUE_WIDTHS = (96, 96), (64, 64)
 
@@ -106,6 +107,15 @@ class TwinPolicy(TensorPolicy):
     def _predict(self, observation: np.ndarray, deterministic: bool = True) -> np.ndarray:  # type: ignore[override]
         flat = observation.reshape(observation.shape[0], -1)
         return np.asarray(_act(self.actor_network, self.networks, flat))
+
+    def policy_function(self) -> PolicyFunction:
+        """:return: what the policy computes, to be exported"""
+        inside = self.networks.acting_inside
+        return PolicyFunction.without_memory(
+            partial(_act, self.actor_network, self.networks),
+            squashed=True,
+            scales=(np.asarray(inside.mean), np.asarray(inside.scale)),
+        )
 
     def reset_noise(self, batch_size: int = 1) -> None:
         """Nothing to reset: the policy is deterministic."""

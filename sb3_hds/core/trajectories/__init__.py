@@ -1,5 +1,26 @@
-"""Measured data: the type, its files, and where it comes from."""
+"""
+Measured data: the type, its files, and where it comes from.
 
-from sb3_hds.core.trajectories.trajectories import Trajectories, read_logs_by
+Names are imported on first use: a loop on a robot needs few of them, and neither JAX nor PyTorch.
+"""
 
-__all__ = ["Trajectories", "read_logs_by"]
+from typing import TYPE_CHECKING
+
+from sb3_hds.lazy import lazily
+
+if TYPE_CHECKING:
+    from sb3_hds.core.trajectories.log_reader import read_logs_by
+    from sb3_hds.core.trajectories.trajectories import Trajectories
+
+__all__ = [
+    "Trajectories",
+    "read_logs_by",
+]
+
+lazily(
+    __name__,
+    {
+        "Trajectories": "sb3_hds.core.trajectories.trajectories",
+        "read_logs_by": "sb3_hds.core.trajectories.log_reader",
+    },
+)

@@ -5,7 +5,7 @@ import glob
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +21,7 @@ from sb3_hds.core.trajectories.episodes import (
     resample,
     same_interval,
 )
+from sb3_hds.core.trajectories.log_reader import log_reader
 from sb3_hds.core.trajectories.replay_buffer import episodes_in
 from sb3_hds.core.trajectories.storage import read_marked, write_npz
 from sb3_hds.errors import TrajectoryError
@@ -177,16 +178,17 @@ class Trajectories:
         :raises TrajectoryError: if there is no such file, if it is damaged or of another kind, if
             a column is missing, holds no finite numbers, or if time decreases
         """
+        reader = log_reader()
         if columns is None and isinstance(files, str | os.PathLike):
             path = Path(files)
-            if _log_reader is None or _is_npz(path):
+            if reader is None or _is_npz(path):
                 return cls._load_npz(path)
-        if _log_reader is None:
+        if reader is None:
             raise TrajectoryError(
                 "Logs are read by sb3_hds.data, which is not imported. Import it, or use "
                 "'from sb3_hds import Trajectories'."
             )
-        return _log_reader(files, columns)
+        return reader(files, columns)
 
     @classmethod
     def _load_npz(cls, path: str | os.PathLike[str]) -> "Trajectories":
@@ -354,20 +356,6 @@ class Trajectories:
             f"  channels: {self.n_obs} observed, {self.n_act} commanded\n"
             f"  conditions: {', '.join(counts[:4])}{more}"
         )
-
-
-_LogReader = Callable[[Any, Any], Trajectories]
-_log_reader: _LogReader | None = None
-
-
-def read_logs_by(reader: _LogReader) -> None:
-    """
-    Register the reader of logs, which lives in a layer above ``core``.
-
-    :param reader: takes files and columns, as :meth:`Trajectories.load` does
-    """
-    global _log_reader
-    _log_reader = reader
 
 
 def _is_npz(path: Path) -> bool:

@@ -33,6 +33,7 @@ from sb3_hds.algos.nets.mlp import ORTHOGONAL, ORTHONORMAL, Mlp, SimbaBody
 from sb3_hds.algos.nets.observations import Seen, flattener, seen, size_of
 from sb3_hds.algos.nets.optimizers import Weights, optimizer_of
 from sb3_hds.core.numerics.compilation import GENERATOR
+from sb3_hds.deploy.policy_function import PolicyFunction
 
 _OF_GSDE = ("log_std_init", "full_std", "use_expln", "clip_mean")
 # Of the policy's constructor: what is no argument.
@@ -303,6 +304,15 @@ class GaussianPolicy(LearningPolicy):
         if not self.use_sde:
             return np.zeros(1)
         return np.asarray(noise_std(self.actor_network, self.learner.actor.weights))  # type: ignore[arg-type]
+
+    def policy_function(self) -> PolicyFunction:
+        """:return: what the policy computes where nothing is explored, to be exported"""
+        learner, scales = self.learner, None
+        if self.normalize_observations:
+            variance = np.asarray(learner.seen.variance)
+            scales = np.asarray(learner.seen.mean), np.sqrt(variance)
+        act = partial(_mean, self.actor_network, learner.actor.weights, learner.seen)
+        return PolicyFunction.without_memory(act, squashed=True, scales=scales)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
         obs, actor = self.flatten(observation), self.learner.actor.weights

@@ -29,6 +29,7 @@ from sb3_hds.algos.nets.activations import Activation, activation
 from sb3_hds.algos.nets.observations import flattener, size_of
 from sb3_hds.algos.nets.optimizers import optimizer_of
 from sb3_hds.core.numerics.compilation import GENERATOR
+from sb3_hds.deploy.policy_function import PolicyFunction
 
 # Of the policy's constructor: what is no argument.
 _NO_ARGUMENTS = ("self", "observation_space", "action_space", "__class__", "use_sde")
@@ -123,12 +124,21 @@ class TD7Policy(LearningPolicy):
         checkpoint = self.learner.checkpoint._replace(kept=jnp.zeros(()))
         self.learner = self.learner._replace(checkpoint=checkpoint)
 
+    def policy_function(self) -> PolicyFunction:
+        """:return: what the policy computes where nothing is explored, to be exported"""
+        act = partial(_act, self.recipe, *self._acting(deterministic=True))
+        return PolicyFunction.without_memory(act, squashed=True)
+
     def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
-        learner = self.learner
-        weights = learner.copies.encoder, learner.actor.weights
-        if deterministic and self.has_checkpoint:
-            weights = learner.checkpoint.encoder, learner.checkpoint.actor
+        weights = self._acting(deterministic)
         return np.asarray(_act(self.recipe, *weights, self.flatten(observation)))
+
+    def _acting(self, deterministic: bool) -> tuple[Any, Any]:
+        """Weights of the encoder and of the actor."""
+        learner = self.learner
+        if deterministic and self.has_checkpoint:
+            return learner.checkpoint.encoder, learner.checkpoint.actor
+        return learner.copies.encoder, learner.actor.weights
 
     def critic(self, obs: Any, actions: Any) -> tuple[np.ndarray, ...]:
         learner, flat = self.learner, self.flatten(obs)

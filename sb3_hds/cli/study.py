@@ -1,0 +1,83 @@
+"""``sb3-hds study``."""
+
+import argparse
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sb3_hds.experiments.study import Study
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """:param command: that is to understand them"""
+    parts = command.add_subparsers(dest="part", required=True, metavar="part")
+    for name, told in (
+        ("run", "run what is not complete; once more after an interruption"),
+        ("status", "a table of its runs, and the time to go"),
+        ("report", "one page of HTML, with figures"),
+    ):
+        part = parts.add_parser(name, help=told)
+        part.add_argument("study", metavar="STUDY.yml", help="algorithms, envs, seeds, budget")
+        part.add_argument(
+            "--folder", help="the zoo's folder of logs; default: logs/ and the name of the study"
+        )
+        if name != "report":
+            part.add_argument("--jobs", type=int, help="runs at a time; default: one for each core")
+        if name == "run":
+            part.add_argument(
+                "--memory", type=float, default=2.0, help="that a run may need [GiB]; default: 2"
+            )
+        if name == "report":
+            part.add_argument("--html", help="page to write; default: report.html in the folder")
+
+
+def run(given: argparse.Namespace) -> int:
+    """:return: 1 where a run failed"""
+    from sb3_hds.experiments.study import Study
+
+    study = Study.load(given.study)
+    folder = Path(given.folder or Path("logs") / study.name)
+    return {"run": _run, "status": _status, "report": _report}[given.part](study, folder, given)
+
+
+def _run(study: "Study", folder: Path, given: argparse.Namespace) -> int:
+    from sb3_hds.experiments.study import run_study
+
+    done = run_study(study, folder, jobs=given.jobs, memory=given.memory)
+    print(f"{len(done.complete)} of {len(study.runs)} runs are complete in {folder}")
+    return 1 if done.failed else 0
+
+
+def _status(study: "Study", folder: Path, given: argparse.Namespace) -> int:
+    from rich.console import Console
+    from rich.table import Table
+
+    from sb3_hds.experiments.study import progress_of, seconds_to_go
+
+    progress = progress_of(study, folder)
+    table = Table("algorithm", "environment", "seed", "state", "steps", "wall time", box=None)
+    for one in progress:
+        share = f"{one.steps:,}" + (f" of {study.steps:,}" if study.steps else "")
+        run = one.run
+        table.add_row(run.label, run.env, str(run.seed), one.state, share, _time(one.seconds))
+    Console().print(table)
+    complete = sum(one.state == "complete" for one in progress)
+    left = seconds_to_go(study, progress, given.jobs or os.cpu_count() or 1)
+    to_go = "" if left is None else f", about {_time(left)} to go"
+    print(f"{complete} of {len(progress)} runs are complete{to_go}")
+    return 0
+
+
+def _report(study: "Study", folder: Path, given: argparse.Namespace) -> int:
+    from sb3_hds.experiments.study import write_report
+
+    written = write_report(study, folder, given.html or folder / "report.html")
+    print(f"{written.page}: {written.n_runs} runs, and {len(written.figures)} files of figures")
+    return 0
+
+
+def _time(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}"

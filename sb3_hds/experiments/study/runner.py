@@ -1,0 +1,408 @@
+"""
+Studies: algorithms, environments and seeds, each run by RL Zoo in a process of its own.
+
+A run is written in a folder of its own and moved, when it is complete, to where the zoo would have
+put it. What is there is complete; what is not is run, however often a study is killed.
+"""
+
+import contextlib
+import dataclasses
+import json
+import os
+import platform
+import secrets
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from sb3_hds.core.trajectories.storage import write_bytes
+from sb3_hds.errors import StudyError, did_you_mean
+
+#: file that marks a complete run, and says what it was
+MARK = "study.json"
+#: table of steps and seconds in the folder of a run
+CLOCK = "clock.csv"
+_RUNNING, _FAILED, _LOCK = ".running", ".failed", ".lock"
+_KEYS = ("name", "algorithms", "envs", "seeds", "budget", "evaluation")
+_ALGORITHM = ("label", "algo", "hyperparams")
+_ENV = ("id", "kwargs")
+# Characters of an error that are shown.
+_SHOWN = 600
+
+
+class Run(NamedTuple):
+    """
+    :param label: of the algorithm with its hyperparameters, in lower case: the zoo's folder
+    :param algo: id in the zoo
+    :param hyperparams: that replace those of its file
+    """
+
+    label: str
+    algo: str
+    hyperparams: Mapping[str, Any]
+    env: str
+    env_kwargs: Mapping[str, Any]
+    seed: int
+
+    @property
+    def place(self) -> Path:
+        """Where the zoo would put it, below its folder of logs."""
+        return Path(self.label) / f"{self.env_name}_{self.seed + 1}"
+
+    @property
+    def env_name(self) -> str:
+        """Of the environment, in names of files."""
+        return self.env.replace("/", "-")
+
+    def __str__(self) -> str:
+        return f"{self.label} on {self.env}, seed {self.seed}"
+
+
+Command = Callable[[Run, Path, Path], Sequence[str]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """
+    :param name: of the study
+    :param runs: all of them
+    :param steps: of each, at most; None: as many as its time allows
+    :param minutes: of each, at most; None: as long as its steps take
+    :param every: steps from one evaluation to the next
+    :param episodes: of an evaluation
+    """
+
+    name: str
+    runs: tuple[Run, ...]
+    steps: int | None
+    minutes: float | None
+    every: int
+    episodes: int
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "Study":
+        """
+        :param path: of a yml file
+        :raises StudyError: for something in it that is unknown, missing or no number
+        """
+        file = Path(path)
+        try:
+            told = yaml.safe_load(file.read_text())
+        except yaml.YAMLError as error:
+            raise StudyError(f"'{path}' is no yml: {error}.") from error
+        except FileNotFoundError as error:
+            raise StudyError(f"There is no study '{path}' (in {Path.cwd()}).") from error
+        _check_keys(f"'{path}'", told, _KEYS, ("algorithms", "envs", "budget"))
+        budget, evaluation = told["budget"], told.get("evaluation") or {}
+        _check_keys("budget", budget, ("steps", "minutes"), ())
+        _check_keys("evaluation", evaluation, ("every", "episodes"), ())
+        steps, minutes = budget.get("steps"), budget.get("minutes")
+        if steps is None and minutes is None:
+            raise StudyError("budget needs steps, minutes, or both: {steps: 10000}.")
+        usual = max(1, steps // 20) if isinstance(steps, int) else 1_000
+        numbers = {"steps": steps, "minutes": minutes, "every": evaluation.get("every", usual)}
+        numbers["episodes"] = evaluation.get("episodes", 10)
+        for key, value in numbers.items():
+            whole = key == "minutes" or isinstance(value, int)
+            if value is not None and not (isinstance(value, int | float) and value > 0 and whole):
+                raise StudyError(f"{key} must be a number above 0, got {value!r}.")
+        return cls(name=str(told.get("name", file.stem)), runs=_runs(told), **numbers)
+
+    def settings(self, run: Run) -> dict[str, Any]:
+        """:return: what a run is made of, as it is written beside it"""
+        told = run._asdict() | {"steps": self.steps, "minutes": self.minutes}
+        told |= {"every": self.every, "episodes": self.episodes}
+        return json.loads(json.dumps(told))
+
+
+class Done(NamedTuple):
+    """
+    :param complete: runs that were there before, or are now
+    :param failed: runs that ended with an error, and its last lines
+    """
+
+    complete: tuple[Run, ...]
+    failed: tuple[tuple[Run, str], ...]
+
+
+class Progress(NamedTuple):
+    """
+    :param state: ``"complete"``, ``"running"``, ``"failed"`` or ``"waiting"``
+    :param steps: made so far
+    :param seconds: since it began
+    """
+
+    run: Run
+    state: str
+    steps: int
+    seconds: float
+
+
+def zoo_command(study: Study) -> Command:
+    """:return: what starts a run, by the zoo's ``train``"""
+
+    def command(run: Run, logs: Path, clock: Path) -> list[str]:
+        steps = study.steps or 2**31 - 1
+        found = [sys.executable, "-m", "rl_zoo_plugin.study_worker", str(clock)]
+        found += [repr(float(study.minutes or 0.0)), "--algo", run.algo, "--env", run.env]
+        found += ["--seed", str(run.seed), "-n", str(steps), "-f", str(logs), "--verbose", "0"]
+        found += ["--eval-freq", str(study.every), "--eval-episodes", str(study.episodes)]
+        for option, given in (("-params", run.hyperparams), ("--env-kwargs", run.env_kwargs)):
+            if given:
+                found += [option, *(f"{name}:{value!r}" for name, value in given.items())]
+        return found
+
+    return command
+
+
+def run_study(
+    study: Study,
+    folder: str | os.PathLike[str],
+    *,
+    jobs: int | None = None,
+    memory: float = 2.0,
+    command: Command | None = None,
+    tell: Callable[[str], None] = print,
+) -> Done:
+    """
+    Run what is not complete. Called again after it was killed, it goes on.
+
+    :param folder: the zoo's folder of logs, made where there is none
+    :param jobs: runs at a time; default: as many as there are cores
+    :param memory: that a run may need [GiB]: no more run at a time than fit into what is free
+    :param command: starts a run; default: :func:`zoo_command`
+    :param tell: is called with a line for each run that ends
+    :raises StudyError: if another study is at work in that folder, or if it has a run of the same
+        name with other settings
+    """
+    root = Path(folder)
+    root.mkdir(parents=True, exist_ok=True)
+    make = command or zoo_command(study)
+    with _alone(root):
+        waiting = [run for run in study.runs if not is_complete(study, run, root)]
+        shutil.rmtree(root / _RUNNING, ignore_errors=True)
+        complete = [run for run in study.runs if run not in waiting]
+        failed: list[tuple[Run, str]] = []
+        lock, left = threading.Lock(), len(waiting)
+
+        def one(run: Run) -> None:
+            nonlocal left
+            error = _executed(study, run, root, make)
+            with lock:
+                left -= 1
+                if error is None:
+                    complete.append(run)
+                else:
+                    failed.append((run, error))
+                what = "complete" if error is None else f"failed: {error[-_SHOWN:]}"
+                tell(f"{time.strftime('%H:%M:%S')} {run}: {what} ({left} to go)")
+
+        with ThreadPoolExecutor(_at_a_time(jobs, memory)) as pool:
+            list(pool.map(one, waiting))
+    return Done(tuple(run for run in study.runs if run in complete), tuple(failed))
+
+
+def is_complete(study: Study, run: Run, folder: Path) -> bool:
+    """
+    :return: whether a run is there
+    :raises StudyError: if there is one of the same name with other settings
+    """
+    mark = folder / run.place / MARK
+    if not mark.exists():
+        if (folder / run.place).exists():
+            raise StudyError(
+                f"'{folder / run.place}' is not of a study. Choose another folder for this one."
+            )
+        return False
+    told, wanted = json.loads(mark.read_text())["settings"], study.settings(run)
+    if told != wanted:
+        differing = ", ".join(key for key in wanted if told.get(key) != wanted[key])
+        raise StudyError(
+            f"'{folder / run.place}' was run with another {differing}. Choose another folder, or "
+            "remove that one."
+        )
+    return True
+
+
+def progress_of(study: Study, folder: str | os.PathLike[str]) -> list[Progress]:
+    """:return: of each run, in their order"""
+    root, found = Path(folder), []
+    for run in study.runs:
+        if is_complete(study, run, root):
+            found.append(Progress(run, "complete", *_last_of(root / run.place / CLOCK)))
+        elif begun := sorted(_scratch(root, run).parent.glob(f"{_scratch(root, run).name}.*")):
+            found.append(Progress(run, "running", *_last_of(begun[-1] / CLOCK)))
+        else:
+            state = "failed" if _error_file(root, run).exists() else "waiting"
+            found.append(Progress(run, state, 0, 0.0))
+    return found
+
+
+def seconds_to_go(study: Study, progress: Sequence[Progress], jobs: int) -> float | None:
+    """
+    By the mean of what complete runs of the same algorithm in the same environment took, or of all.
+
+    :param jobs: runs at a time
+    :return: [s]; None before a run is complete
+    """
+    took: dict[tuple[str, str], list[float]] = {}
+    for one in progress:
+        if one.state == "complete":
+            took.setdefault((one.run.label, one.run.env), []).append(one.seconds)
+    if not took:
+        return None
+    everything = [seconds for some in took.values() for seconds in some]
+    left = 0.0
+    for one in progress:
+        if one.state != "complete":
+            known = took.get((one.run.label, one.run.env), everything)
+            left += max(0.0, sum(known) / len(known) - one.seconds)
+    return left / jobs
+
+
+def _check_keys(what: str, given: Any, known: Sequence[str], needed: Sequence[str]) -> None:
+    if not isinstance(given, Mapping):
+        raise StudyError(f"{what} must be a table with {', '.join(known)}, got {given!r}.")
+    for key in given:
+        if key not in known:
+            hint = did_you_mean(str(key), known)
+            raise StudyError(f"{what} has '{key}', and takes {', '.join(known)}.{hint}")
+    for key in needed:
+        if not given.get(key):
+            raise StudyError(f"{what} lacks '{key}'.")
+
+
+def _runs(told: Mapping[str, Any]) -> tuple[Run, ...]:
+    seeds = told.get("seeds", 5)
+    seeds = range(seeds) if isinstance(seeds, int) else seeds
+    runs = []
+    for given in told["algorithms"]:
+        entry: dict[str, Any] = {"algo": given} if isinstance(given, str) else given
+        _check_keys("an entry of algorithms", entry, _ALGORITHM, ("algo",))
+        label = str(entry.get("label", entry["algo"]))
+        if label != label.lower() or "/" in label:
+            raise StudyError(f"A label is a folder of the zoo, in lower case, got '{label}'.")
+        for place in told["envs"]:
+            env: dict[str, Any] = {"id": place} if isinstance(place, str) else place
+            _check_keys("an entry of envs", env, _ENV, ("id",))
+            for seed in seeds:
+                hyperparams, kwargs = entry.get("hyperparams") or {}, env.get("kwargs") or {}
+                runs.append(Run(label, entry["algo"], hyperparams, env["id"], kwargs, int(seed)))
+    places = [run.place for run in runs]
+    if len(set(places)) < len(places):
+        raise StudyError("Two runs would have one folder: give each algorithm a label of its own.")
+    return tuple(runs)
+
+
+def _at_a_time(jobs: int | None, memory: float) -> int:
+    cores = os.cpu_count() or 1
+    wanted = cores if jobs is None else jobs
+    free = _free_memory()
+    return max(1, wanted if free is None else min(wanted, int(free / memory)))
+
+
+def _free_memory() -> float | None:
+    """[GiB]; None where the system does not say it."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) / 2**20
+    return None
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """A lock that the system gives back when this process ends, however it does."""
+    with (folder / _LOCK).open("w") as file:
+        try:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except ImportError:  # Windows: whoever starts two has been asked not to
+            pass
+        except OSError as error:
+            raise StudyError(f"Another study is at work in '{folder}'. Wait for it.") from error
+        yield
+
+
+def _executed(study: Study, run: Run, root: Path, command: Command) -> str | None:
+    """:return: None, or the last lines of an error"""
+    # A name of its own: the process of a study that was killed may take a moment to end.
+    scratch = _scratch(root, run).with_name(f"{_scratch(root, run).name}.{secrets.token_hex(4)}")
+    logs, clock = scratch / "logs", scratch / CLOCK
+    logs.mkdir(parents=True)
+    words = list(command(run, logs, clock))
+    begun = time.time()
+    # It ends when this process does: its standard input is a pipe from here.
+    pipe, said = subprocess.PIPE, subprocess.STDOUT
+    with (
+        (scratch / "output.txt").open("wb") as output,
+        subprocess.Popen(words, stdin=pipe, stdout=output, stderr=said) as process,
+    ):
+        code = process.wait()
+    found = sorted((logs / run.algo).glob(f"{run.env_name}_*"))
+    if code or not found:
+        error = (scratch / "output.txt").read_text(errors="replace")
+        _error_file(root, run).parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(_error_file(root, run), error.encode())
+        return error.strip() or f"it ended with {code} and wrote nothing"
+    if clock.exists():
+        clock.replace(found[0] / CLOCK)
+    told = {
+        "settings": study.settings(run),
+        "command": words,
+        "begun": begun,
+        "seconds": time.time() - begun,
+        "machine": {"cpu": _processor(), "cores": os.cpu_count(), "system": platform.platform()},
+        "versions": _versions(),
+    }
+    write_bytes(found[0] / MARK, json.dumps(told, indent=1).encode())
+    target = root / run.place
+    target.parent.mkdir(parents=True, exist_ok=True)
+    found[0].rename(target)
+    shutil.rmtree(scratch, ignore_errors=True)
+    _error_file(root, run).unlink(missing_ok=True)
+    return None
+
+
+def _scratch(root: Path, run: Run) -> Path:
+    return root / _RUNNING / f"{run.label}-{run.env_name}_{run.seed + 1}"
+
+
+def _error_file(root: Path, run: Run) -> Path:
+    return root / _FAILED / f"{run.label}-{run.env_name}_{run.seed + 1}.txt"
+
+
+def _last_of(clock: Path) -> tuple[int, float]:
+    """Steps and seconds of the last whole line."""
+    rows = (
+        [line.split(",") for line in clock.read_text().splitlines()[1:]] if clock.exists() else []
+    )
+    whole = [row for row in rows if len(row) == 2 and all(row)]
+    return (int(whole[-1][0]), float(whole[-1][1])) if whole else (0, 0.0)
+
+
+def _processor() -> str:
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _versions() -> dict[str, str]:
+    from importlib.metadata import PackageNotFoundError, version
+
+    found = {"python": platform.python_version()}
+    for name in ("sb3-hds", "rl_zoo3", "stable-baselines3", "sbx-rl", "jax", "gymnasium", "mujoco"):
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
