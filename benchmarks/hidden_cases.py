@@ -17,6 +17,7 @@ import numpy as np
 from independent_rigs import (
     COMMANDS,
     EULER,
+    EVERYWHERE,
     FORCES,
     FROM_FILES,
     OUTSIDE,
@@ -24,6 +25,7 @@ from independent_rigs import (
     SYSTEMS,
     TRANSMISSIONS,
     DivergedError,
+    Loop,
     Moment,
     Planted,
     System,
@@ -37,9 +39,10 @@ N_STEPS = 200
 #: rounds every channel to its tick, the square root of 12 times that: two hundred ticks or so to a
 #: turn. A rig's own electronics computes the velocities, so their ticks are no finer or coarser.
 NOISES = {"tick": 2e-3, "1 %": 0.01, "5 %": 0.05}
-#: kinds of cases, and how many of a hundred
+#: kinds of cases, and how many of a hundred; one cause and several take turns
 SHARES = {
-    "effect": 40,
+    "effect": 20,
+    "several": 20,
     "outside": 15,
     "null": 12,
     "null, disturbed": 12,
@@ -104,6 +107,10 @@ class Case:
     :param base_change: by how much it is off, or its planted deviation
     :param disturbance: coloured torque, in units of the typical command
     :param asked: whether other rules are asked, too
+    :param loop: ``"open"`` where commands are torques as they come; a ``"position"`` or
+        ``"velocity"`` loop makes them of what is measured
+    :param seen: what is recorded: ``"qv"`` for positions and velocities, ``"q"`` for positions
+    :param n_steps: of each recording
     """
 
     system: str
@@ -117,6 +124,9 @@ class Case:
     base_change: float
     disturbance: float
     asked: bool
+    loop: str = "open"
+    seen: str = "qv"
+    n_steps: int = N_STEPS
 
     @property
     def truths(self) -> tuple[str, ...]:
@@ -136,20 +146,27 @@ def kinds(system: str) -> tuple[str, ...]:
     if RIGS[system] is EULER:
         return (EULERS,) * 100
     shares, dealt = dict(SHARES), list[str]()
+    shares["effect"] += shares.pop("several")
     if RIGS[system].base is None:
         shares["null"] += shares.pop("null, wrong base")
     for n in range(1, 101):
         behind = {kind: share * n / 100 - dealt.count(kind) for kind, share in shares.items()}
         dealt.append(max(behind, key=lambda kind: behind[kind]))
+    for place in [i for i, kind in enumerate(dealt) if kind == "effect"][1::2]:
+        dealt[place] = "several"
     return tuple(dealt)
 
 
 def kind_of(system: str, number: int) -> tuple[str, int]:
-    """:return: kind of a case, and how many of this kind come before it"""
+    """
+    :return: kind of a case, and how many of this kind come before it; of single effects, twice as
+        many, as they have every second card of their packs
+    """
     hundreds, place = divmod(number, 100)
     dealt = kinds(system)
     kind = dealt[place]
-    return kind, hundreds * dealt.count(kind) + dealt[:place].count(kind)
+    turn = hundreds * dealt.count(kind) + dealt[:place].count(kind)
+    return kind, 2 * turn if kind == "effect" else turn
 
 
 def draw(
@@ -164,7 +181,7 @@ def draw(
     turn = number
     if not kind:
         kind, turn = kind_of(system, number)
-    deal = functools.partial(_dealt, turn, system, kind)
+    deal = functools.partial(dealt, turn, system, kind)
     factors = {"effect": (2.0, 4.0, 8.0), "pair": (2.0, 4.0, 8.0), "outside": (4.0, 8.0)}
     noise = noise or deal("noise", ("tick", "tick", "1 %", "1 %", "5 %"))
     wrong, disturbance = deal("condition", _CONDITIONS) if kind == "effect" else (False, 0.0)
@@ -195,7 +212,7 @@ def draw(
     raise RuntimeError(f"{system}, case {number}: nothing could be planted in {_TRIES} tries.")
 
 
-def _dealt(turn: int, system: str, kind: str, what: str, cards: Sequence[_Card]) -> _Card:
+def dealt(turn: int, system: str, kind: str, what: str, cards: Sequence[_Card]) -> _Card:
     """A card of a pack that is shuffled anew when it has been dealt."""
     pack, place = divmod(turn, len(cards))
     label = zlib.crc32(f"{system}, {kind}, {what}".encode())
@@ -257,6 +274,8 @@ def name_of(planted: Planted, system: str) -> str:
     if planted.effect.startswith(PARAMETER):
         return planted.effect
     effect = "sign_flip" if planted.effect == "reversed_joint" else planted.effect
+    if planted.index == EVERYWHERE:
+        return f"{effect}.all"
     return f"{effect}.{places_of(planted.effect, system)[planted.index].name}"
 
 
@@ -371,16 +390,20 @@ def _positions(system: str) -> np.ndarray:
 
 
 @functools.cache
-def believed(system: str) -> Any:
-    """:return: the twin under diagnosis"""
+def believed(system: str, seen: str = "qv") -> Any:
+    """
+    :param seen: ``"q"`` if positions are observed only
+    :return: the twin under diagnosis
+    """
     from sb3_hds import twins
 
     name, values = RIGS[system].twin
     if system in FROM_FILES:
         # Runge and Kutta's steps of 4 ms follow those of 1 ms, and cost a quarter.
-        made = twins.from_mujoco(RIGS[system].xml)
-        return twins.MechanismTwin(made.mechanism, dt=RIGS[system].dt, substeps=_SUBSTEPS)
-    return twins.make(name, dt=RIGS[system].dt, **values)
+        made, dt = twins.from_mujoco(RIGS[system].xml), RIGS[system].dt
+        return twins.MechanismTwin(made.mechanism, dt=dt, substeps=_SUBSTEPS, observe=seen)
+    observe = {"observe": "q"} if seen == "q" else {}
+    return twins.make(name, dt=RIGS[system].dt, **values | observe)
 
 
 def base_value(system: str) -> float:
@@ -396,32 +419,51 @@ def spread(system: str) -> np.ndarray:
     return np.concatenate(obs).std(0)
 
 
-def sensed(true: np.ndarray, system: str, noise: str, rng: np.random.Generator) -> np.ndarray:
-    """:return: what sensors report, shape ``(n, channels)``"""
+def sensed(true: np.ndarray, system: str, noise: str, chance: np.ndarray) -> np.ndarray:
+    """
+    :param true: shape ``(..., channels)``
+    :param chance: standard normal numbers, likewise
+    :return: what sensors report
+    """
     error = NOISES[noise] * spread(system)
     if noise == "tick":
         tick = np.sqrt(12.0) * error
         return tick * np.round(true / tick)
-    return true + error * rng.standard_normal(true.shape)
+    return true + error * chance
 
 
-def recorded(case: Case, seed: int) -> tuple[Any, np.ndarray]:
-    """:return: data of a case, and positions and velocities as the sensors would best show them"""
+def recorded(
+    case: Case, seed: int, loop: Loop | None = None, harder: np.ndarray | float = 1.0
+) -> tuple[Any, np.ndarray]:
+    """
+    :param loop: that computes commands from what sensors report; default: none
+    :param harder: by how much commands without a loop are larger than this rig's usual ones
+    :return: data of a case, and positions and velocities as the sensors would best show them
+    """
     from sb3_hds import Trajectories
 
+    rng, shape = np.random.default_rng([seed, 1]), (case.n_steps + 1, len(spread(case.system)))
+    chances = [rng.standard_normal(shape) for _ in range(case.recordings)]
+    sense = lambda recording, rows, true: sensed(  # noqa: E731
+        true, case.system, case.noise, chances[recording][rows]
+    )
+    rig = RIGS[case.system]
+    torque = tuple(map(float, harder * np.array(rig.torque)))
     obs, actions = simulate(
-        RIGS[case.system],
+        dataclasses.replace(rig, torque=torque),
         list(case.planted),
         n_recordings=case.recordings,
-        n_steps=N_STEPS,
+        n_steps=case.n_steps,
         seed=seed,
         base_change=case.base_change,
         disturbance=case.disturbance,
         excited=case.kind != "still",
+        loop=loop and loop._replace(sense=sense),
     )
-    rng = np.random.default_rng([seed, 1])
-    noisy = [sensed(o, case.system, case.noise, rng) for o in obs]
-    data = Trajectories.from_arrays(noisy, actions, dt=RIGS[case.system].dt)
+    noisy = [sense(recording, slice(None), o) for recording, o in enumerate(obs)]
+    if case.seen == "q":
+        noisy = [o[:, : rig.dof] for o in noisy]
+    data = Trajectories.from_arrays(noisy, actions, dt=rig.dt)
     return data, np.concatenate([o[:-1] for o in obs])
 
 
@@ -444,11 +486,11 @@ def smallest(case: Case) -> dict[str, dict[str, float]]:
         found = diagnose(
             believed(case.system), data, calibrate=case.nuisances, budget="quick", progress=False
         )
-        _write(path, json.dumps(found.to_dict()["detectable"]))
+        write(path, json.dumps(found.to_dict()["detectable"]))
     return json.loads(path.read_text())
 
 
-def _write(path: Path, text: str) -> None:
+def write(path: Path, text: str) -> None:
     """All of it or nothing, whoever else writes the same."""
     import os
 

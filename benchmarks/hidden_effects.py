@@ -18,6 +18,10 @@ tried on every fourth case of a kind. Beside the cases, one in fifty more asks a
 Euler twin, which differs from the engine by half a step and by no friction, and one in a hundred
 about each of a six-joint arm and a three-joint leg whose twins come from their MJCFs, driven by
 torques and, as many, in closed loop by servos.
+
+Half of the cases with effects have two to nine at once (`several_cases.py`), and of these the arm
+and the leg have more than of all others. They are judged cause by cause (`several_scores.py`),
+beside others on the same data (`several_rules.py`).
 """
 
 import argparse
@@ -35,6 +39,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import several_cases
+import several_rules
 from hidden_cases import (
     EULERS,
     NOISES,
@@ -42,7 +48,6 @@ from hidden_cases import (
     RIGS,
     SHARES,
     Case,
-    base_value,
     believed,
     draw,
     kind_of,
@@ -53,6 +58,8 @@ from independent_rigs import FROM_FILES, SYSTEMS, Planted, simulate
 from other_rules import asked
 from runs import CACHE, RESULTS
 from same_cause import equals
+from several_scores import RULE as RULE_OF_SEVERAL
+from several_scores import SEVERAL
 
 # Cases of one system that one process works through, so that it compiles once.
 BLOCK = 40
@@ -61,6 +68,8 @@ _EULER = 50
 # And one is of each rig whose twin comes from a model file, torques and servos apart: a diagnosis
 # of six joints takes minutes.
 _OF_FILES = 100
+# But of several causes, so many times as many: few joints are no measure of many.
+_MORE_OF_SEVERAL = 10
 # Share of the sensors' noise by which twin and engine may differ after a second.
 _LEAST_MISMATCH = 0.1
 # Compiled programs take memory maps, of which Linux gives a process 65,530.
@@ -100,10 +109,13 @@ def numbers(cases: int, systems: Sequence[str], only: Sequence[str] | None) -> d
     counts = {system: -(-cases // len(SYSTEMS)) if system in SYSTEMS else 0 for system in systems}
     counts |= {system: -(-cases // _EULER) for system in systems if system not in SYSTEMS}
     counts |= {system: -(-cases // _OF_FILES) for system in systems if system in FROM_FILES}
-    return {
-        system: [n for n in range(count) if not only or kind_of(system, n)[0] in only]
-        for system, count in counts.items()
-    }
+    found = {}
+    for system, count in counts.items():
+        more = _MORE_OF_SEVERAL if system in FROM_FILES else 1
+        kinds = [(n, kind_of(system, n)[0]) for n in range(more * count)]
+        kinds = [(n, kind) for n, kind in kinds if n < count or kind == SEVERAL]
+        found[system] = [n for n, kind in kinds if not only or kind in only]
+    return found
 
 
 def go(table: str, wanted: dict[str, list[int]], budget: str, jobs: int) -> int:
@@ -246,20 +258,29 @@ def run(
     from sb3_hds import effects
     from sb3_hds.sysid.inquiry import Inquiry
 
-    case, data, motion = draw(system, number, kind=kind, noise=noise, most=most)
-    started = time.time()
-    inquiry = Inquiry(believed(system), data, effects.ALL, case.nuisances, number, budget, False)
+    if (kind or kind_of(system, number)[0]) == SEVERAL:
+        case, data, motion = several_cases.draw(system, number, noise=noise, most=most)
+    else:
+        case, data, motion = draw(system, number, kind=kind, noise=noise, most=most)
+    twin, started = believed(system, case.seen), time.time()
+    inquiry = Inquiry(twin, data, effects.ALL, case.nuisances, number, budget, False)
     reason = inquiry.poor()
     found = inquiry.refused(reason) if reason else inquiry.run()
     seconds = time.time() - started
     names = [key(finding) for finding in found.findings]
     first = found.findings[0] if names else None
     turned = _turned(found.convention)
-    values = {n: e.estimate for n, e in first.parameters.items()} if first else {}
+    values = {key(f): {n: e.estimate for n, e in f.parameters.items()} for f in found.findings}
     commands = np.concatenate([data.episode(i)[1] for i in range(len(data))])
-    more = {}
+    said = {}
+    if case.kind == SEVERAL:
+        said = of_several(case, inquiry.screened, found)
     if rules and case.asked and not reason:
-        more = others(inquiry, case)
+        said |= (
+            others_of_several(case, inquiry, data, motion, commands, budget)
+            if case.kind == SEVERAL
+            else others(inquiry, case)
+        )
     return {
         "system": system,
         "case": number,
@@ -278,13 +299,45 @@ def run(
         "more": ";".join(names[1:]),
         "gain": first.gain if first else 0.0,
         "explained": found.explained,
-        "asked": bool(more),
+        "asked": rules and case.asked and not reason,
         "at_the_end": reached(found),
         "unexplained": bool(found.unexplained),
         "moved": " ".join(getattr(inquiry, "moved", ())),
         "estimate": json.dumps(estimates(case, found)),
         "seconds": seconds,
-        **more,
+        **said,
+    }
+
+
+def of_several(case: Case, screened: Any, found: Any) -> dict[str, Any]:
+    """How the data came about, which causes show in them, and every set that was named."""
+    visible = (
+        several_cases.visible(screened, case.truths) if screened else [True] * len(case.truths)
+    )
+    return {
+        "joints": RIGS[case.system].dof,
+        "causes": len(case.planted),
+        "loop": case.loop,
+        "seen": case.seen,
+        "visible": json.dumps(visible),
+        "sets": json.dumps([[key(f), *f.alternatives] for f in found.findings]),
+    }
+
+
+def others_of_several(
+    case: Case, inquiry: Any, data: Any, motion: np.ndarray, commands: np.ndarray, budget: str
+) -> dict[str, str]:
+    """What other rules say, and what that means in these data."""
+    found = several_rules.asked(inquiry, believed(case.system, case.seen), data, budget)
+    return {
+        f"{RULE_OF_SEVERAL}{rule}": json.dumps(
+            {
+                "names": answer.names,
+                "same": equals(case, motion, commands, answer.names, {}),
+                "seconds": answer.seconds,
+            }
+        )
+        for rule, answer in found.items()
     }
 
 
@@ -328,8 +381,10 @@ def _turns(planted: Planted, name: str, estimate: float, true: float) -> float:
 
 
 def true_value(planted: Planted, name: str, system: str) -> float | None:
-    added = base_value(system) if planted.effect.startswith(PARAMETER) else 0.0
-    return added + planted.values[name] if name in planted.values else None
+    if name not in planted.values:
+        return None
+    own = believed(system).values if planted.effect.startswith(PARAMETER) else {}
+    return own.get(name, 0.0) + planted.values[name]
 
 
 def reached(found: Any) -> float:

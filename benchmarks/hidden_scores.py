@@ -3,13 +3,16 @@
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from hidden_cases import EULERS, NULLS, SHARES
+from rates import Score, as_table, middle, share, sizes_of, told_share, wilson
 from runs import RESULTS
 from same_cause import right
+from several_scores import PARTS as PARTS_OF_SEVERAL
+from several_scores import RULE as RULE_OF_SEVERAL
+from several_scores import SEVERAL
 
 #: what Euler's twin may be told: that something is late by half a step, or that something is wrong
 LATE = ("sensor_delay", "action_delay")
@@ -20,64 +23,6 @@ _RULE, _GAIN = "rule: ", "gain: "
 _TEXTS = ("truth", "same", "verdict", "named", "set", "more", "moved", "estimate")
 
 
-class Score(NamedTuple):
-    """
-    :param label: what is counted
-    :param value: share or median
-    :param low: end of its 95 % Wilson interval; not a number where there is none
-    :param high: likewise
-    :param n: of how many
-    :param least: what has to be reached
-    :param most: what must not be exceeded
-    """
-
-    label: str
-    value: float
-    low: float
-    high: float
-    n: int
-    least: float | None = None
-    most: float | None = None
-
-    @property
-    def target(self) -> str:
-        ends = [f"at least {self.least:g}"] if self.least is not None else []
-        ends += [f"at most {self.most:g}"] if self.most is not None else []
-        return ", ".join(ends)
-
-    @property
-    def reached(self) -> str:
-        if not self.target or not np.isfinite(self.value):
-            return ""
-        enough = self.least is None or self.value >= self.least
-        return "yes" if enough and (self.most is None or self.value <= self.most) else "no"
-
-
-def wilson(hits: int, n: int) -> tuple[float, float]:
-    """:return: 95 % interval of a share"""
-    from scipy.stats import binomtest
-
-    if not n:
-        return np.nan, np.nan
-    found = binomtest(hits, n).proportion_ci(method="wilson")
-    return float(found.low), float(found.high)
-
-
-def share(label: str, hits: Any, **target: float) -> Score:
-    """:param hits: of each case, whether it counts"""
-    hits = np.asarray(hits, bool)
-    n = len(hits)
-    return Score(label, hits.mean() if n else np.nan, *wilson(int(hits.sum()), n), n, **target)
-
-
-def middle(label: str, values: Any, at: float = 0.5, **target: float) -> Score:
-    """:return: a quantile"""
-    values = np.asarray(values, float)
-    values = values[np.isfinite(values)]
-    value = float(np.quantile(values, at)) if len(values) else np.nan
-    return Score(label, value, np.nan, np.nan, len(values), **target)
-
-
 def loaded(path: Path) -> pd.DataFrame:
     """:return: a table in which "null" is a word"""
     return pd.read_csv(path, keep_default_na=False, na_values=[""])
@@ -86,7 +31,7 @@ def loaded(path: Path) -> pd.DataFrame:
 def prepared(table: pd.DataFrame) -> pd.DataFrame:
     """With what follows from each row: whether a name was given, whether it and all are right."""
     # A column without any word looks like one of numbers.
-    texts = [name for name in table if name in _TEXTS or name.startswith(_RULE)]
+    texts = [name for name in table if name in _TEXTS or name.startswith((_RULE, RULE_OF_SEVERAL))]
     table = table.assign(**{name: table[name].astype(object).fillna("") for name in texts})
     judged = lambda column: [_right(row, row[column]) for _, row in table.iterrows()]  # noqa: E731
     later = [
@@ -108,7 +53,8 @@ def _right(row: pd.Series, names: str) -> bool:
 
 
 def scores(table: pd.DataFrame, budget: str) -> list[Score]:
-    """:param table: as ``prepared``"""
+    """:param table: as ``prepared``; cases with several causes have scores of their own"""
+    table = table[table["kind"] != SEVERAL]
     nulls, effects = table[table["kind"].isin(NULLS)], table[table["kind"] == "effect"]
     outside, pairs = table[table["kind"] == "outside"], table[table["kind"] == "pair"]
     cases = table[table["kind"] != EULERS]
@@ -174,18 +120,6 @@ def _eulers(rows: pd.DataFrame) -> list[Score]:
     ]
 
 
-def sizes_of(rows: pd.DataFrame) -> tuple[list[bool], list[float]]:
-    """:return: of each parameter of a right name, whether its interval covers, and its error"""
-    covered, errors = [], []
-    for text in rows["estimate"]:
-        for value, low, high, true in json.loads(text or "{}").values():
-            # Zero is where a parameter ends: an interval that ends there, too, says little.
-            if true:
-                covered.append(low <= true <= high)
-                errors.append(abs(value - true) / abs(true))
-    return covered, errors
-
-
 def by_difficulty(table: pd.DataFrame) -> pd.DataFrame:
     """Right names of single effects by what disturbs them and by their size."""
     effects, rows = table[table["kind"] == "effect"], []
@@ -211,14 +145,14 @@ def by_cause(table: pd.DataFrame) -> pd.DataFrame:
 
 def by_system(table: pd.DataFrame) -> pd.DataFrame:
     rows = []
-    for name, own in table.groupby("system", sort=False):
+    for name, own in table[table["kind"] != SEVERAL].groupby("system", sort=False):
         nulls, outside = own[own["kind"].isin(NULLS)], own[own["kind"] == "outside"]
         rows.append(
             {"system": name}
             | _told(own[own["kind"] == "effect"])
             | {
-                "false alarms": _of(nulls["spoke"]),
-                "refused outside": _of(~outside["spoke"]),
+                "false alarms": told_share(nulls["spoke"]),
+                "refused outside": told_share(~outside["spoke"]),
                 "seconds": f"{own['seconds'].median():.0f}",
             }
         )
@@ -244,8 +178,8 @@ def by_outside(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(
         {
             "cause": name.replace("_", " "),
-            "refused": _of(~own["spoke"]),
-            "as unknown": _of(own["verdict"] == "unknown"),
+            "refused": told_share(~own["spoke"]),
+            "as unknown": told_share(own["verdict"] == "unknown"),
         }
         for name, own in outside.groupby("truth")
     )
@@ -253,7 +187,7 @@ def by_outside(table: pd.DataFrame) -> pd.DataFrame:
 
 def by_rule(table: pd.DataFrame) -> pd.DataFrame:
     """Peers, and `diagnose` itself, on the cases that all were asked about."""
-    asked = table[table["asked"].astype(bool)]
+    asked = table[table["asked"].astype(bool) & (table["kind"] != SEVERAL)]
     rules = [name.removeprefix(_RULE) for name in table if name.startswith(_RULE)]
     rows = [_of_rule("diagnose", asked, asked["named"], asked["at_the_end"])]
     for rule in rules:
@@ -271,17 +205,17 @@ def _of_rule(rule: str, asked: pd.DataFrame, names: pd.Series, gains: pd.Series)
     ratio = (gains / asked["oracle"])[effect & spoke]
     return {
         "rule": rule,
-        "false alarms": _of(spoke[asked["kind"].isin(NULLS)]),
-        "named outside": _of(spoke[asked["kind"] == "outside"]),
-        "right": _of(good[effect]),
-        "wrong": _of((spoke & ~good)[effect]),
+        "false alarms": told_share(spoke[asked["kind"].isin(NULLS)]),
+        "named outside": told_share(spoke[asked["kind"] == "outside"]),
+        "right": told_share(good[effect]),
+        "wrong": told_share((spoke & ~good)[effect]),
         "gain over the oracle's": f"{np.nanmedian(ratio):.2f}" if ratio.notna().any() else "-",
     }
 
 
 def _told(rows: pd.DataFrame) -> dict[str, str]:
     return {
-        "right": _of(rows["right"]),
+        "right": told_share(rows["right"]),
         "to the letter": _share(rows["truth"] == rows["named"]),
         "within the set": _share(rows["within"][rows["spoke"]]),
         "wrong": _share(rows["spoke"] & ~rows["right"]),
@@ -292,28 +226,6 @@ def _told(rows: pd.DataFrame) -> dict[str, str]:
 
 def _share(hits: pd.Series) -> str:
     return f"{hits.mean():.2f}" if len(hits) else "-"
-
-
-def _of(hits: Any) -> str:
-    hits = np.asarray(hits, bool)
-    if not len(hits):
-        return "-"
-    low, high = wilson(int(hits.sum()), len(hits))
-    return f"{hits.mean():.2f} [{low:.2f}, {high:.2f}] of {len(hits)}"
-
-
-def as_table(found: Sequence[Score]) -> pd.DataFrame:
-    return pd.DataFrame(
-        {
-            "what": s.label,
-            "measured": f"{s.value:.3g}" if np.isfinite(s.value) else "-",
-            "95 % interval": "" if np.isnan(s.low) else f"{s.low:.3f} to {s.high:.3f}",
-            "of": s.n,
-            "target": s.target,
-            "reached": s.reached,
-        }
-        for s in found
-    )
 
 
 PARTS: dict[str, Callable[[pd.DataFrame], pd.DataFrame]] = {
@@ -338,8 +250,11 @@ def report(name: str) -> None:
     _write(as_table(found), f"{name}_targets")
     for part, condensed in PARTS.items():
         _write(condensed(table), f"{name}_{part}")
+    if len(several := table[table["kind"] == SEVERAL]):
+        for part, condensed in PARTS_OF_SEVERAL.items():
+            _write(condensed(several), f"{name}_{part}")
     figure(found, table, name)
-    wrong = table[table["spoke"] & ~table["within"] & (table["kind"] != EULERS)]
+    wrong = table[table["spoke"] & ~table["within"] & ~table["kind"].isin((EULERS, SEVERAL))]
     columns = ["system", "case", "kind", "truth", "factor", "noise", "disturbance", "set"]
     if len(wrong):
         print(f"Wrong:\n{wrong[columns].to_string(index=False)}")

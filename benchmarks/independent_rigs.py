@@ -11,12 +11,18 @@ import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 _STEP = 0.001  # [s]
+#: how the names of parameters end that are the inertia of a joint's rotor
+ARMATURE = "_armature"
+#: index of what all motors share, such as a late bus
+EVERYWHERE = -1
+# Sines of which a set point is made, and between which frequencies they are [Hz].
+_SINES, _SLOWEST, _FASTEST = 3, 0.2, 1.2
 # The engine's dry friction is a damper up to where it brakes at this time constant [s] and ratio.
 # Its default of 20 ms would let rigs creep: these are the hardest that its step bears.
 _DRY = (2.0 * _STEP, 1.0)
@@ -289,7 +295,7 @@ class Planted:
     """
     :param effect: name as in the catalogue, or of something that is not in it; ``reversed_joint``
         is a sign flip of all that measures a joint
-    :param index: of the joint, the motor or the channel
+    :param index: of the joint, the motor or the channel; of all motors: ``EVERYWHERE``
     :param values: in its units
     """
 
@@ -381,7 +387,7 @@ class Commands:
 
     def __call__(self, index: int, u: float) -> float:
         for p in self.planted:
-            if p.index != index:
+            if p.index not in (index, EVERYWHERE):
                 continue
             v = p.values
             if p.effect == "torque_gain":
@@ -403,6 +409,40 @@ class Commands:
                 queue.append(u)
                 u = queue.pop(0)
         return u
+
+
+class Loop(NamedTuple):
+    """
+    A controller that turns measurements into torques, held over each interval.
+
+    :param stiffness: torque per error of position of each motor's joint; zero where velocities are
+        controlled
+    :param damping: torque per error of velocity
+    :param amplitude: of the set points of positions; those of velocities are their derivatives
+    :param sense: from the number of a recording, that of an interval, and what sensors without
+        noise would show, to what they report
+    """
+
+    stiffness: np.ndarray
+    damping: np.ndarray
+    amplitude: np.ndarray
+    sense: Callable[[int, Any, np.ndarray], np.ndarray] = lambda _, __, true: true
+
+    def set_points(self, rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
+        """:return: of positions and velocities, shape ``(2, n, motors)``"""
+        shape = (_SINES, 1, len(self.amplitude))
+        rate = 2.0 * math.pi * np.exp(rng.uniform(math.log(_SLOWEST), math.log(_FASTEST), shape))
+        phase = rate * times[:, None] + rng.uniform(0.0, 2.0 * math.pi, shape)
+        size = self.amplitude / math.sqrt(_SINES)
+        return size * np.stack([np.sin(phase).sum(0), (rate * np.cos(phase)).sum(0)])
+
+    def command(self, wanted: np.ndarray, reported: np.ndarray) -> np.ndarray:
+        """
+        :param wanted: position and velocity of each motor's joint, shape ``(2, motors)``
+        :param reported: positions and velocities of all joints, one after the other
+        """
+        q, v = (x[: len(self.damping)] for x in np.split(reported, 2))
+        return self.stiffness * (wanted[0] - q) + self.damping * (wanted[1] - v)
 
 
 TRANSMISSIONS: dict[str, Callable[..., str]] = {
@@ -433,19 +473,31 @@ def simulate(
     base_change: float = 0.0,
     disturbance: float = 0.0,
     excited: bool = True,
+    loop: Loop | None = None,
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """
     :param base_change: by how much the parameter that ``base`` names is not what the twin believes
     :param disturbance: standard deviation of a coloured torque (correlated over 0.1 s), in units of
         the typical command
+    :param loop: that closes itself over what is measured, noise included; no sensor may be late
+        then. Default: commands are what nobody computes from measurements
     :return: noiseless observations and commands of each recording
     :raises DivergedError: if what was planted throws the rig out of the world
     """
     model = modelled(system, planted, base_change)
     rng = np.random.default_rng(seed)
     found = [
-        _recording(model, system, planted, rng, n_steps, disturbance, excited)
-        for _ in range(n_recordings)
+        _recording(
+            model,
+            system,
+            planted,
+            rng,
+            n_steps,
+            disturbance,
+            excited,
+            loop and loop._replace(sense=functools.partial(loop.sense, recording)),
+        )
+        for recording in range(n_recordings)
     ]
     return [system.seen(obs) for obs, _ in found], [actions for _, actions in found]
 
@@ -460,8 +512,6 @@ def modelled(system: System, planted: list[Planted], base_change: float = 0.0) -
     if system.base is not None:
         _, body, what = system.base
         getattr(model, f"body_{what}")[body] += base_change
-        # The engine keeps inertias of simple joints from when it read the file.
-        mujoco.mj_setConst(model, mujoco.MjData(model))
     model.dof_solref[:] = _DRY
     for p in planted:
         if p.effect == "viscous_friction":
@@ -471,6 +521,11 @@ def modelled(system: System, planted: list[Planted], base_change: float = 0.0) -
         elif p.effect == "stiffness":
             model.jnt_stiffness[p.index] = p.values["k"]
             model.qpos_spring[p.index] = p.values["q0"]
+        elif p.effect.endswith(ARMATURE):
+            (change,) = p.values.values()
+            model.dof_armature[p.index] += change
+    # The engine keeps inertias of simple joints from when it read the file.
+    mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 
 
@@ -482,7 +537,9 @@ def _recording(
     n_steps: int,
     disturbance: float,
     excited: bool,
+    loop: Loop | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
+    """:param loop: of this recording: ``sense`` needs no number of it any more"""
     data = mujoco.MjData(model)
     data.qpos[:] = system.around
     if excited:
@@ -497,7 +554,11 @@ def _recording(
     fine, push = [_state(data, system)], np.zeros(system.dof)
     size = disturbance * np.array([*system.torque, *system.torque])[: system.dof]
     keep, per_step = math.exp(-_STEP / 0.1), round(system.dt / _STEP)
-    for action in actions:
+    wanted = loop and loop.set_points(rng, system.dt * np.arange(n_steps))
+    for k, action in enumerate(actions):
+        if loop is not None:
+            shown = _measured(np.array(fine[-1:]), planted, system, 1)[0]
+            action[:] = loop.command(wanted[:, k], loop.sense(k, shown))
         for _ in range(per_step):
             data.ctrl[:] = [commands(i, u) for i, u in enumerate(action)]
             push = keep * push + math.sqrt(1.0 - keep**2) * size * rng.standard_normal(system.dof)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from hidden_cases import RIGS, Case, believed, places_of, slot_of, spread
+from independent_rigs import EVERYWHERE
 
 # Share of the samples that have to agree where something is said of all.
 _ALL = 0.99
@@ -136,13 +137,13 @@ def equals(
     motion: np.ndarray,
     commands: np.ndarray,
     named: Sequence[str],
-    values: Values,
+    values: Mapping[str, Values],
 ) -> dict[str, list[str]]:
     """
     :param motion: positions and velocities of all joints, shape ``(n, 2 dof)``
     :param commands: shape ``(n, actuators)``
     :param named: all names that a diagnosis gave one after the other, each with its place
-    :param values: parameters of the first
+    :param values: their parameters, by name
     :return: of each cause that was planted, the other names that mean the same here
     """
     found: dict[str, list[str]] = {}
@@ -154,11 +155,16 @@ def equals(
             if planted.effect in pair:
                 (other,) = pair - {planted.effect}
                 name = _named_at(other, joint, case.system)
-                told = values if named and name == named[0] else {}
+                if planted.index == EVERYWHERE and slot_of(other) == "actuator":
+                    name = f"{other}.all"
+                told = values.get(name, {})
                 if name and holds(here, {**planted.values, **told}):
                     same.append(name)
         if moves(here):
             same += _together(planted.effect, joint, case, named)
+        if planted.index == EVERYWHERE:
+            # What all motors share may be told of each of them.
+            same += [name for name in named if name.startswith(f"{planted.effect}.")]
         found[truth] = same
     return found
 

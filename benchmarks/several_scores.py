@@ -1,0 +1,167 @@
+"""What came out of the cases with several causes at once: rates beside the targets, tables."""
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from rates import Score, as_table, middle, share, sizes_of, told_share
+
+SEVERAL = "several"
+RULE = "several: "
+# What a verdict may take by number of joints [s], programs compiled or not.
+_SECONDS = {1: 10.0, 2: None, 3: None, 6: 60.0}
+
+
+class Judged(NamedTuple):
+    """
+    What was said of one case.
+
+    :param named: of each planted cause that shows, whether one of the names means it
+    :param within: the same of names and what is said to be as likely
+    :param right: of each name that was given, whether it means something that was planted
+    :param among: of each, whether that or what is said to be as likely does
+    """
+
+    named: list[bool]
+    within: list[bool]
+    right: list[bool]
+    among: list[bool]
+
+    @property
+    def flawless(self) -> bool:
+        """All names are right, and none is missing."""
+        return all(self.right) and all(self.named)
+
+    @property
+    def flawless_with_sets(self) -> bool:
+        return all(self.among) and all(self.within)
+
+
+def judged(
+    truths: Sequence[str],
+    visible: Sequence[bool],
+    same: Mapping[str, Sequence[str]],
+    sets: Sequence[Sequence[str]],
+) -> Judged:
+    """
+    :param truths: names of all planted causes, with their places
+    :param visible: whether each is above twice the detection limit
+    :param same: other names that mean the same in these data, by truth
+    :param sets: of each finding, its name and what is as likely
+    """
+    meant = [{truth, *same.get(truth, ())} for truth in truths]
+    shown = [own for own, visible_ in zip(meant, visible, strict=True) if visible_]
+    names, every = {s[0] for s in sets}, {name for s in sets for name in s}
+    right = lambda names: any(own & {*names} for own in meant)  # noqa: E731
+    return Judged(
+        named=[bool(own & names) for own in shown],
+        within=[bool(own & every) for own in shown],
+        right=[right(s[:1]) for s in sets],
+        among=[right(s) for s in sets],
+    )
+
+
+def of_diagnose(rows: pd.DataFrame) -> list[Judged]:
+    return [
+        judged(
+            row["truth"].split(";"),
+            json.loads(row["visible"]),
+            json.loads(row["same"]),
+            json.loads(row["sets"]),
+        )
+        for _, row in rows.iterrows()
+    ]
+
+
+def of_rule(rows: pd.DataFrame, rule: str) -> list[Judged]:
+    found = []
+    for _, row in rows.iterrows():
+        said = json.loads(row[f"{RULE}{rule}"])
+        sets = [[name] for name in said["names"]]
+        visible = json.loads(row["visible"])
+        found.append(judged(row["truth"].split(";"), visible, said["same"], sets))
+    return found
+
+
+def _every(found: Sequence[Judged], field: str) -> list[bool]:
+    return [hit for one in found for hit in getattr(one, field)]
+
+
+def scores(rows: pd.DataFrame) -> list[Score]:
+    """:param rows: cases with several causes"""
+    found = of_diagnose(rows)
+    covered, errors = sizes_of(rows)
+    visible = [shown for text in rows["visible"] for shown in json.loads(text)]
+    return [
+        share("planted causes that show: named or in a set", _every(found, "within"), least=0.95),
+        share("planted causes that show: named", _every(found, "named")),
+        share("names that are right", _every(found, "right"), least=0.97),
+        share("cases: all right, none missing", [one.flawless for one in found], least=0.85),
+        share("the same, sets included", [one.flawless_with_sets for one in found]),
+        share("90 % intervals that cover", covered, least=0.85, most=0.95),
+        middle("error of a parameter, median", errors),
+        share("planted causes that show, of all", visible),
+        *(
+            middle(
+                f"seconds, {joints} joint{'s' if joints > 1 else ''}, median",
+                rows["seconds"][rows["joints"] == joints],
+                **({"most": most} if most else {}),
+            )
+            for joints, most in _SECONDS.items()
+        ),
+    ]
+
+
+def targets(rows: pd.DataFrame) -> pd.DataFrame:
+    return as_table(scores(rows))
+
+
+def by_condition(rows: pd.DataFrame) -> pd.DataFrame:
+    """By number of joints, and by how the rig was driven and recorded."""
+    servos = rows["system"].str.endswith("servos")
+    conditions = {
+        **{f"{n} joint{'s' if n > 1 else ''}": rows["joints"] == n for n in _SECONDS},
+        "open loop": (rows["loop"] == "open") & ~servos,
+        "position loop": rows["loop"] == "position",
+        "velocity loop": rows["loop"] == "velocity",
+        "loop in the model": servos,
+        "positions and velocities": rows["seen"] == "qv",
+        "positions only": rows["seen"] == "q",
+        "several recordings": rows["recordings"] > 1,
+        "one long recording": rows["recordings"] == 1,
+        "two or three causes": rows["causes"] <= 3,
+        "four to six": rows["causes"].between(4, 6),
+        "seven to nine": rows["causes"] >= 7,
+    }
+    return pd.DataFrame(
+        {"condition": name} | _row(of_diagnose(own := rows[chosen]), own, own["seconds"])
+        for name, chosen in conditions.items()
+    )
+
+
+def by_rule(rows: pd.DataFrame) -> pd.DataFrame:
+    """Others, and `diagnose` on the cases that each of them was asked about."""
+    found = []
+    for rule in (name.removeprefix(RULE) for name in rows if name.startswith(RULE)):
+        own = rows[rows[f"{RULE}{rule}"] != ""]
+        seconds = pd.Series([json.loads(x)["seconds"] for x in own[f"{RULE}{rule}"]], dtype=float)
+        found.append({"rule": rule} | _row(of_rule(own, rule), own, seconds))
+        found.append({"rule": "diagnose, same cases"} | _row(of_diagnose(own), own, own["seconds"]))
+    return pd.DataFrame(found)
+
+
+def _row(found: Sequence[Judged], rows: pd.DataFrame, seconds: pd.Series) -> dict[str, Any]:
+    names = sum(len(one.right) for one in found)
+    return {
+        "cases": len(rows),
+        "causes named or in a set": told_share(_every(found, "within")),
+        "names right": told_share(_every(found, "right")),
+        "names a case": f"{names / len(rows):.1f}" if len(rows) else "-",
+        "all right, none missing": told_share([one.flawless for one in found]),
+        "seconds": f"{np.median(seconds):.1f}" if len(rows) else "-",
+    }
+
+
+PARTS = {"several": targets, "several_conditions": by_condition, "several_rules": by_rule}
