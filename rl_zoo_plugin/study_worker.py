@@ -63,9 +63,9 @@ def main() -> None:
 
     create: Any = ExperimentManager.create_callbacks
 
-    def with_clock(manager: Any) -> None:
-        create(manager)
-        manager.callbacks.append(Clock(path, minutes))
+    def with_clock(self: Any) -> None:
+        create(self)
+        self.callbacks.append(Clock(path, minutes))
 
     ExperimentManager.create_callbacks = with_clock
     train()

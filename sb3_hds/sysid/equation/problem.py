@@ -336,8 +336,8 @@ class Problem:
         own = sorted({c for i in pool for c in self.items[i].columns})
         at = dict(zip(own, range(len(own)), strict=True))
         on = np.flatnonzero(found.weights)
-        r = self.total[np.ix_(own, on)] @ found.weights[on]
-        cross = self.total[np.ix_(own, found.free)]
+        rows = self.total[own]
+        r, cross = rows[:, on] @ found.weights[on], rows[:, found.free]
         taken = cross @ found.inverse
         diagonal = self.diagonal[own]
         left = np.maximum(diagonal - (taken * cross).sum(1), 1e-9)
