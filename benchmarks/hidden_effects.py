@@ -275,7 +275,9 @@ def run(
     said = {}
     if case.kind == SEVERAL:
         said = of_several(case, inquiry.screened, found)
-    if rules and case.asked and not reason:
+    # A log in other conventions is told before anything is simulated.
+    wanted = rules and case.asked and not reason and inquiry.convention is None
+    if wanted:
         said |= (
             others_of_several(case, inquiry, data, motion, commands, budget)
             if case.kind == SEVERAL
@@ -299,7 +301,7 @@ def run(
         "more": ";".join(names[1:]),
         "gain": first.gain if first else 0.0,
         "explained": found.explained,
-        "asked": rules and case.asked and not reason,
+        "asked": wanted,
         "at_the_end": reached(found),
         "unexplained": bool(found.unexplained),
         "moved": " ".join(getattr(inquiry, "moved", ())),

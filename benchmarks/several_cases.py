@@ -179,27 +179,33 @@ def _with(case: Case, planted: tuple[Planted, ...]) -> Case | None:
 def _planted(
     case: Case, count: int, scale: bool, rng: np.random.Generator
 ) -> tuple[Planted, ...] | None:
-    """:return: as many causes; None if one of them could not be large enough to show"""
-    found: list[Planted] = []
-    if scale:
-        found.append(_size(case, *_scale(case, rng), rng))
-    taken = set()
-    for _ in range(count - len(found)):
-        free = [place for place in _places(case) if _family(*place) not in taken]
+    """:return: as many causes; None if no more of them could be large enough to show"""
+    found = [_size(case, *_scale(case, rng), rng)] if scale else []
+    if not all(map(_finite, found)):
+        return None
+    free = _places(case)
+    while len(found) < count:
         friction = [place for place in free if place[0] in (_VISCOUS, _DRY)]
         others = [place for place in free if place not in friction]
+        if not free:
+            return None
         chosen = friction if (rng.random() < _FRICTION and friction) or not others else others
         if chosen is others:
             # Kinds come up alike, however many places they have.
             kind = str(rng.choice(sorted({kind for kind, _ in others})))
             chosen = [place for place in others if place[0] == kind]
-        if not chosen:
-            return None
-        place = chosen[int(rng.integers(len(chosen)))]
-        taken.add(_family(*place))
-        found.append(_size(case, *place, rng))
-    sizes = [value for p in found for value in p.values.values()]
-    return tuple(found) if np.all(np.isfinite(sizes)) else None
+        kind, index = chosen[int(rng.integers(len(chosen)))]
+        planted = _size(case, kind, index, rng)
+        if _finite(planted):
+            found.append(planted)
+            free = [p for p in free if (_FAMILIES[p[0]], p[1]) != (_FAMILIES[kind], index)]
+        else:
+            free.remove((kind, index))
+    return tuple(found)
+
+
+def _finite(planted: Planted) -> bool:
+    return bool(np.all(np.isfinite([*planted.values.values()])))
 
 
 def _scale(case: Case, rng: np.random.Generator) -> tuple[str, int]:
@@ -226,10 +232,6 @@ def _places(case: Case) -> list[tuple[str, int]]:
             # Of channels, those of positions.
             found += [(kind, i) for i in range(rig.dof)]
     return found
-
-
-def _family(kind: str, index: int) -> tuple[str, int]:
-    return _FAMILIES[kind], index
 
 
 def _size(case: Case, kind: str, index: int, rng: np.random.Generator) -> Planted:

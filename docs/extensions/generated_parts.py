@@ -84,7 +84,10 @@ PARTS: dict[str, Callable[[], str]] = {
     ),
     **{
         f"hidden_effects_{part}": summaries.whole(f"hidden_effects_{part}")
-        for part in ("targets", "kinds", "difficulty", "causes", "systems", "outside", "rules")
+        for part in (
+            *("targets", "kinds", "difficulty", "causes", "systems", "outside", "rules"),
+            *("several", "several_conditions", "several_rules"),
+        )
     },
     "hidden_effects_picture": summaries.picture(
         "hidden_effects", "rates with intervals beside their targets, right names against size"

@@ -1,0 +1,139 @@
+"""Several causes hidden at once: how they are dealt, driven and judged, and what others say."""
+
+import dataclasses
+
+import first_users
+import hidden_cases
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import several_rules
+from cases import each
+from hidden_cases import RIGS, believed, kind_of, nothing
+from independent_rigs import EVERYWHERE, Loop, Planted, modelled
+from several_cases import SEVERAL, share_of_friction, visible
+from several_scores import judged
+
+from sb3_hds import effects
+from sb3_hds.sysid.equation.motion import motion
+from sb3_hds.sysid.leapfrog import in_step_with_the_log
+from sb3_hds.sysid.screening import screen
+
+VISCOUS, DRY = "viscous_friction.axis", "coulomb_friction.axis"
+
+
+def test_one_cause_and_several_take_turns_and_other_kinds_keep_their_numbers():
+    dealt = [kind_of("pendulum", number) for number in range(200)]
+    alone = [turn for kind, turn in dealt if kind == "effect"]
+    several = [turn for kind, turn in dealt if kind == SEVERAL]
+
+    assert len(alone) == len(several) == 40
+    assert several == list(range(40))
+    assert alone == list(range(0, 80, 2))
+    assert [turn for kind, turn in dealt if kind == "null"] == list(range(24))
+
+
+def test_a_rotor_of_the_engine_is_that_of_the_twin():
+    rig, name = RIGS["leg"], "joint1_armature"
+    model = modelled(rig, [Planted(f"parameter.{name}", 1, {name: 0.02})])
+    data = mujoco.MjData(model)
+    data.qpos[:] = [0.3, -0.5, 0.8]
+    mujoco.mj_forward(model, data)
+    engine = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, engine)
+    twin = believed("leg")
+    twin = twin.with_parameters(**{name: twin.values[name] + 0.02})
+    with jax.enable_x64(True):
+        matrix = twin.mass_matrix(jnp.asarray(data.qpos), twin.params)
+
+    np.testing.assert_allclose(matrix, engine, rtol=1e-6)
+
+
+@each(("1 %", "qv"), ("tick", "q"))
+def test_a_loop_computes_what_is_logged_from_what_is_reported_and_holds_it(noise, seen):
+    case = dataclasses.replace(nothing("pendulum", noise, recordings=2), n_steps=50)
+    still = Loop(np.array([2.0]), np.array([0.3]), np.zeros(1))
+    data, _ = hidden_cases.recorded(case, seed=4, loop=still)
+    positions, _ = hidden_cases.recorded(dataclasses.replace(case, seen=seen), seed=4, loop=still)
+
+    for recording in range(2):
+        reported, commands = data.episode(recording)[:2]
+        expected = -2.0 * reported[:-1, 0] - 0.3 * reported[:-1, 1]
+        np.testing.assert_allclose(commands[:, 0], expected, atol=1e-5)  # float32 in the log
+        # What is not recorded is reported all the same.
+        np.testing.assert_array_equal(positions.episode(recording)[1], commands)
+    assert positions.obs.shape[-1] == len(seen)
+
+
+def test_set_points_are_positions_and_their_derivatives():
+    loop = Loop(np.ones(2), np.ones(2), np.array([0.5, 1.0]))
+    times = np.linspace(0.0, 4.0, 4001)
+    q, v = loop.set_points(np.random.default_rng(0), times)
+
+    np.testing.assert_allclose(np.gradient(q, times, axis=0)[1:-1], v[1:-1], atol=1e-3)
+    assert (np.abs(q).max(0) <= np.sqrt(3.0) * loop.amplitude).all()
+
+
+def test_a_late_bus_delays_every_motor_and_friction_has_its_share():
+    late = Planted("action_delay", EVERYWHERE, {"delay": 0.02})
+    case = dataclasses.replace(
+        nothing("double_pendulum", "tick", recordings=1), kind=SEVERAL, planted=(late,), n_steps=20
+    )
+    assert case.truths == ("action_delay.all",)
+    data, motion_ = hidden_cases.recorded(case, seed=1)
+    rubbing = dataclasses.replace(case, planted=(Planted("viscous_friction", 0, {"b": 0.1}),))
+    commands = data.episode(0)[1]
+
+    share = share_of_friction(rubbing, data, motion_)
+    expected = np.sqrt(np.mean((0.1 * motion_[:, 2]) ** 2) / np.mean(commands[:, 0] ** 2))
+    assert share == pytest.approx([expected, 0.0], rel=1e-5)
+
+
+@each(
+    # Both are named; one of them is, and the other is as likely; one is missing, or hidden.
+    (dict(sets=[[VISCOUS], [DRY]]), [True, True], [True, True], True, True),
+    (dict(sets=[[VISCOUS], ["dead_zone.force", DRY]]), [True, False], [True, False], False, True),
+    (dict(sets=[[VISCOUS]]), [True, False], [True], False, False),
+    (dict(sets=[[VISCOUS]], visible=[True, False]), [True], [True], True, True),
+    # Another name means the same here; a name too many; nothing is said.
+    (dict(sets=[[VISCOUS], ["a.b"]], same={DRY: ["a.b"]}), [True, True], [True, True], True, True),
+    (dict(sets=[[VISCOUS], [DRY], ["a.b"]]), [True, True], [True, True, False], False, False),
+    (dict(sets=[]), [False, False], [], False, False),
+)
+def test_sets_are_judged_cause_by_cause_and_name_by_name(said, named, right, flawless, with_sets):
+    found = judged(
+        [VISCOUS, DRY], said.get("visible", [True, True]), said.get("same", {}), said["sets"]
+    )
+
+    assert (found.named, found.right) == (named, right)
+    assert (found.flawless, found.flawless_with_sets) == (flawless, with_sets)
+
+
+@pytest.fixture(scope="module")
+def screened():
+    twin, data, _ = in_step_with_the_log(*first_users.joint_with_friction())
+    return screen(twin, motion(twin, data), effects.ALL, ())
+
+
+def test_what_is_there_shows_and_what_is_not_does_not(screened):
+    shown = visible(screened, [VISCOUS, DRY, "quadratic_drag.axis", "backlash.axis"])
+
+    # Play has no column: no equation says whether it shows.
+    assert shown == [True, True, False, True]
+
+
+def test_regressions_name_both_frictions_and_more(screened):
+    given = several_rules.regression_of(screened)
+    names = {
+        rule.__name__: rule(given)
+        for rule in (several_rules.by_elimination, several_rules.by_forward_bic)
+    }
+
+    for found in names.values():
+        assert {VISCOUS, DRY} <= {*found}
+    assert len(names["by_elimination"]) > 2
+    # Without noise and without anything missing, there is nothing to name.
+    nothing_missing = given._replace(missing=np.zeros_like(given.missing))
+    assert several_rules.by_forward_bic(nothing_missing) == []
