@@ -27,7 +27,7 @@ _WIDEST_OFFSET = np.pi
 
 
 @dataclasses.dataclass(frozen=True)
-class Body:
+class Robot:
     """
     Plain data, saved with a model.
 
@@ -62,7 +62,7 @@ class Body:
                 object.__setattr__(self, field.name, tuple(value))
 
     def to_dict(self) -> dict[str, Any]:
-        """:return: plain data for JSON, from which ``Body(**data)`` makes it again"""
+        """:return: plain data for JSON, from which ``Robot(**data)`` makes it again"""
         return {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in dataclasses.asdict(self).items()
@@ -83,7 +83,7 @@ class Body:
         return observations[:, list(self.seen_position)], observations[:, list(self.seen_velocity)]
 
 
-def body_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Body:
+def robot_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Robot:
     """
     Resets the environment a few times to find out where in its observations the joints are.
 
@@ -99,7 +99,7 @@ def body_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Body:
     driven = _driven(env, control)
     if driven is None:
         low, high = _commands(env)
-        return Body(
+        return Robot(
             dt=interval,
             control="direct",
             names=tuple(f"action[{i}]" for i in range(low.size)),
@@ -119,7 +119,7 @@ def body_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Body:
             "let them be read from the environment itself: joints='env'."
         )
     seen_position, seen_velocity = found or ((), ())
-    return Body(
+    return Robot(
         dt=interval,
         control="track",
         names=driven.names,
@@ -133,8 +133,8 @@ def body_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Body:
     )
 
 
-def space_of(
-    body: Body,
+def gait_space_of(
+    robot: Robot,
     *,
     amplitude: float,
     offset: float,
@@ -151,8 +151,8 @@ def space_of(
         half their range
     :param offset: largest one, up and down from where the joint rests, within its range; likewise
     """
-    lower, upper, rest = (np.array(ends) for ends in (body.lower, body.upper, body.rest))
-    half = 0.5 * (upper - lower) if body.control == "direct" else np.ones(len(rest))
+    lower, upper, rest = (np.array(ends) for ends in (robot.lower, robot.upper, robot.rest))
+    half = 0.5 * (upper - lower) if robot.control == "direct" else np.ones(len(rest))
     centre = np.clip(rest, lower, upper)
     return GaitSpace(
         amplitude=amplitude * half,
@@ -160,7 +160,7 @@ def space_of(
         frequency=frequency,
         kp=kp,
         kd=kd,
-        gain_factor=gain_factor if body.control == "track" else 1.0,
+        gain_factor=gain_factor if robot.control == "track" else 1.0,
         same_frequency=same_frequency,
         phases=phases,
         leads=leads,

@@ -16,7 +16,7 @@ from sb3_hds.algos.model_free.sac.update import Loss, Targets, Values
 
 
 @dataclasses.dataclass(frozen=True)
-class Truncated:
+class TruncatedQuantiles:
     """
     The quantiles of all critics in one pool, without its ``n_dropped * n_critics`` largest (TQC).
     Which critic these come from does not matter.

@@ -58,9 +58,8 @@ class Wishes:
 
     :param names: parameters that are estimated; empty: none
     :param nominal: values that are believed before any data, by name
-    :param residual: whether a force is learned
     :param residual_kwargs: further arguments of ``sysid.fit_residual``
-    :param beta: share of rollouts in the learned model, or ``"auto"``
+    :param beta: share of rollouts in the learned model, or ``"auto"``; 0: no force is learned
     :param seed: of whatever is drawn
     :param suspected: effects that are estimated with the rest once the twin proves inexact, and
         stay attached where they explain something
@@ -68,7 +67,6 @@ class Wishes:
 
     names: tuple[str, ...]
     nominal: Mapping[str, float]
-    residual: bool
     residual_kwargs: Mapping[str, Any]
     beta: float | str
     seed: int
@@ -105,10 +103,29 @@ class Correction:
     error_calibrated: float = np.nan
     error_hybrid: float = np.nan
 
-    @property
-    def forgotten(self) -> bool:
-        """Whether data from before a change of the system were left out."""
-        return self.since is not None
+    def log(self) -> tuple[dict[str, float], dict[str, float]]:
+        """
+        :return: by key, errors that there are and parameters as the twin has them now; and for
+            those that it took over from the fit the ends of their intervals
+        """
+        values: dict[str, float] = {"beta": self.beta, "forgotten": int(self.since is not None)}
+        for name in ("error_twin", "error_calibrated", "error_hybrid"):
+            error = getattr(self, name)
+            if not (np.isnan(error) or (name == "error_calibrated" and self.fit is None)):
+                values[name] = error
+        if self.residual is not None:
+            values["disagreement"] = self.residual.disagreement
+        intervals: dict[str, float] = {}
+        for estimate in self.fit.estimates if self.fit is not None else ():
+            value = self.twin.values.get(estimate.name)
+            if value is None:
+                continue
+            values[estimate.name] = value
+            if value == estimate.estimate:
+                intervals[f"{estimate.name}_low"] = estimate.low
+                intervals[f"{estimate.name}_high"] = estimate.high
+        with_prefix = lambda found: {f"model/{name}": x for name, x in found.items()}  # noqa: E731
+        return with_prefix(values), with_prefix(intervals)
 
 
 def correct(
@@ -302,7 +319,7 @@ def _with_residual(
 ) -> tuple[Correction, np.ndarray]:
     """:return: the correction, and the errors of the model that is planned in"""
     twin, residual, held = found.twin, None, windows.held
-    wanted = wishes.residual and wishes.beta != 0.0 and mean_error(errors[held]) > EXACT
+    wanted = wishes.beta != 0.0 and mean_error(errors[held]) > EXACT
     if wanted and learn_force:
         scale = 0.05 * windows.spread if found.fit is None else found.fit.noise
         scale = np.maximum(scale, 1e-3 * windows.spread)
