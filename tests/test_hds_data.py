@@ -15,7 +15,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_hds import HDS, PODS, effects, twins
 from sb3_hds.algos.twin.hds.algorithm import _effects_of, _native_of
-from sb3_hds.algos.twin.hds.correction import Correction, Wishes, correct
+from sb3_hds.algos.twin.hds.correction import Correction, CorrectionConfig, correct
 from sb3_hds.algos.twin.hds.windows import Since
 from sb3_hds.core import Trajectories
 from sb3_hds.effects import force_of
@@ -30,7 +30,7 @@ def wishes(twin, **changes):
     plain = {"names": tuple(twin.parameters), "residual_kwargs": {}, "seed": 0, "beta": 0.0}
     # Of the model itself: what is estimated alike is one program.
     plain |= {"suspected": ("coulomb_friction", "action_delay")}
-    return Wishes(nominal=dict(twin.values), **(plain | changes))
+    return CorrectionConfig(nominal=dict(twin.values), **(plain | changes))
 
 
 def corrected(twin, data, n_new=10_000, **changes):

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from small_models import small
 
 from sb3_hds.algos.model_free.sac import update as off_policy
-from sb3_hds.algos.model_free.sac.quantiles import (
+from sb3_hds.algos.model_free.sac.objectives import (
     all_targets,
     sorted_by_columns,
     sorted_by_rows,

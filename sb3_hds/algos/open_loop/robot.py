@@ -9,7 +9,6 @@ from gymnasium import spaces
 from jaxtyping import Float
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_hds.algos.open_loop.gait import GaitSpace
 from sb3_hds.errors import EnvironmentMismatchError
 from sb3_hds.wrappers.actuated_joints import (
     COMMANDS_POSITIONS,
@@ -130,40 +129,6 @@ def robot_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Robot:
         lower=tuple(driven.lower.tolist()),
         upper=tuple(driven.upper.tolist()),
         rest=tuple(driven.rest.tolist()),
-    )
-
-
-def gait_space_of(
-    robot: Robot,
-    *,
-    amplitude: float,
-    offset: float,
-    frequency: tuple[float, float],
-    kp: float,
-    kd: float,
-    gain_factor: float,
-    same_frequency: bool,
-    phases: bool,
-    leads: tuple[float, ...],
-) -> GaitSpace:
-    """
-    :param amplitude: largest one: of a joint [rad] or [m]; where commands are direct, in shares of
-        half their range
-    :param offset: largest one, up and down from where the joint rests, within its range; likewise
-    """
-    lower, upper, rest = (np.array(ends) for ends in (robot.lower, robot.upper, robot.rest))
-    half = 0.5 * (upper - lower) if robot.control == "direct" else np.ones(len(rest))
-    centre = np.clip(rest, lower, upper)
-    return GaitSpace(
-        amplitude=amplitude * half,
-        offset=np.stack([centre - offset * half, centre + offset * half], axis=1),
-        frequency=frequency,
-        kp=kp,
-        kd=kd,
-        gain_factor=gain_factor if robot.control == "track" else 1.0,
-        same_frequency=same_frequency,
-        phases=phases,
-        leads=leads,
     )
 
 

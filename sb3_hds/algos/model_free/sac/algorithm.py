@@ -18,13 +18,13 @@ from sb3_hds.algos.base.config import between, takes
 from sb3_hds.algos.base.construct import jax_device
 from sb3_hds.algos.model_free.algorithm import ModelFreeAlgorithm, ModelFreeConfig
 from sb3_hds.algos.model_free.replay import batches_of
+from sb3_hds.algos.model_free.sac.objectives import squared_error
 from sb3_hds.algos.model_free.sac.policy import GaussianPolicy, SimbaPolicy
 from sb3_hds.algos.model_free.sac.update import (
     Hyperparams,
     UpdateConfig,
     UpdateMetrics,
     log_of,
-    squared_error,
     update,
 )
 from sb3_hds.algos.model_free.update import zero_metrics

@@ -15,15 +15,13 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_hds.algos.base.config import takes
 from sb3_hds.algos.model_free.sac.algorithm import SACConfig, SoftActorCritic
+from sb3_hds.algos.model_free.sac.objectives import mean_q, mean_values, quantile_huber
 from sb3_hds.algos.model_free.sac.policy import GaussianPolicy, GaussianPolicyConfig
-from sb3_hds.algos.model_free.sac.quantiles import quantile_huber
 from sb3_hds.algos.model_free.sac.update import (
     Hyperparams,
     SACState,
     UpdateConfig,
     actor_distribution,
-    mean_q,
-    mean_values,
     q_values,
 )
 from sb3_hds.algos.model_free.update import Batch

@@ -15,16 +15,14 @@ import numpy as np
 from sb3_hds.algos.base.config import between, check_count, takes
 from sb3_hds.algos.base.policy import PolicyConfig
 from sb3_hds.algos.model_free.policy import LearningPolicy
+from sb3_hds.algos.model_free.sac.objectives import min_q, min_values, squared_error
 from sb3_hds.algos.model_free.sac.update import (
     SACState,
     UpdateConfig,
     actor_distribution,
     explore,
     init_state,
-    min_q,
-    min_values,
     q_values,
-    squared_error,
 )
 from sb3_hds.algos.nets.activations import Activation, activation, widths
 from sb3_hds.algos.nets.heads import USUAL, Critic, ExploringActor, GaussianActor, noise_std

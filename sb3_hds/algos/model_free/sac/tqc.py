@@ -6,8 +6,8 @@ from typing import Any
 
 from sb3_hds.algos.base.config import check_count, takes
 from sb3_hds.algos.model_free.sac.algorithm import SACConfig, SoftActorCritic
-from sb3_hds.algos.model_free.sac.quantiles import TruncatedQuantiles, quantile_huber
-from sb3_hds.algos.model_free.sac.update import UpdateConfig, mean_q
+from sb3_hds.algos.model_free.sac.objectives import TruncatedQuantiles, mean_q, quantile_huber
+from sb3_hds.algos.model_free.sac.update import UpdateConfig
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -18,15 +18,12 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from sb3_hds.algos.model_free.sac.objectives import Loss, Targets, Values
 from sb3_hds.algos.model_free.update import Batch, UpdateStep, apply_schedule
 from sb3_hds.algos.nets.heads import Gaussian, log_probability
 from sb3_hds.algos.nets.observations import RunningStats, normalize
 from sb3_hds.algos.nets.optimizers import Optimizer, TrainState, Weights
 from sb3_hds.core.numerics.compilation import QUICK_COMPILATION
-
-Values = Float[Array, "critics batch values"]
-Targets = Float[Array, "batch targets"]
-Loss = Float[Array, ""]
 
 
 class SACState(NamedTuple):
@@ -388,34 +385,6 @@ def explore(
 def log_of(ent_coef: Array | float) -> Array:
     """:return: its logarithm; of 0, that of the least positive number, with no infinity in it"""
     return jnp.log(jnp.maximum(jnp.asarray(ent_coef, jnp.float32), jnp.finfo(jnp.float32).tiny))
-
-
-# --- what algorithms choose from
-
-
-def min_values(values: Values) -> Targets:
-    """Of the critics, value by value: clipped double Q-learning (Fujimoto et al. 2018)."""
-    return jnp.min(values, 0)
-
-
-def mean_values(values: Values) -> Targets:
-    """Of the critics, value by value (BRO)."""
-    return jnp.mean(values, 0)
-
-
-def squared_error(values: Values, targets: Targets) -> Loss:
-    """Half the mean squared error, summed over critics."""
-    return 0.5 * jnp.sum(jnp.mean((values - targets[None]) ** 2, (1, 2)))
-
-
-def min_q(values: Values) -> Float[Array, " batch"]:
-    """Minimum over critics (SAC)."""
-    return jnp.min(jnp.mean(values, -1), 0)
-
-
-def mean_q(values: Values) -> Float[Array, " batch"]:
-    """Mean over critics and quantiles (DroQ, TQC, BRO)."""
-    return jnp.mean(values, (0, 2))
 
 
 _ADAM = Optimizer(optax.adam)

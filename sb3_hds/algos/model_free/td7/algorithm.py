@@ -20,11 +20,7 @@ from sb3_hds.algos.model_free.algorithm import ModelFreeAlgorithm, ModelFreeConf
 from sb3_hds.algos.model_free.replay import batches_of, transitions
 from sb3_hds.algos.model_free.td7.policy import TD7Policy
 from sb3_hds.algos.model_free.td7.prioritized_replay import LapReplayBuffer
-from sb3_hds.algos.model_free.td7.update import (
-    UpdateConfig,
-    UpdateMetrics,
-    update,
-)
+from sb3_hds.algos.model_free.td7.update import UpdateConfig, UpdateMetrics, update
 from sb3_hds.algos.model_free.update import Batch, zero_metrics
 
 

@@ -12,11 +12,9 @@ import numpy as np
 from sb3_hds.algos.base.config import check_count, takes
 from sb3_hds.algos.base.policy import PolicyConfig
 from sb3_hds.algos.model_free.policy import LearningPolicy
+from sb3_hds.algos.model_free.td7.networks import Actor, Critic, Encoder
 from sb3_hds.algos.model_free.td7.update import (
-    Actor,
     Checkpoint,
-    Critic,
-    Encoder,
     TD7State,
     UpdateConfig,
     act,

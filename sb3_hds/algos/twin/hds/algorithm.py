@@ -15,7 +15,13 @@ from sb3_hds.algos.base.config import between, takes
 from sb3_hds.algos.base.construct import as_list
 from sb3_hds.algos.twin.algorithm import TwinAlgorithm
 from sb3_hds.algos.twin.config import TwinConfig
-from sb3_hds.algos.twin.hds.correction import Correction, Since, Wishes, correct, names_to_estimate
+from sb3_hds.algos.twin.hds.correction import (
+    Correction,
+    CorrectionConfig,
+    Since,
+    correct,
+    names_to_estimate,
+)
 from sb3_hds.algos.twin.hds.recorded_steps import RecordedSteps, Source, data_from
 from sb3_hds.algos.twin.model import check_known, missing_effects, nulls_of, required
 from sb3_hds.algos.twin.pretraining import meanwhile, nothing
@@ -173,7 +179,7 @@ class HDS(TwinAlgorithm):
             correct,
             self.twin,
             data,
-            self._wishes(self.twin),
+            self._correction_config(self.twin),
             self.model_beta,
             learn_force=n_steps >= _GROWTH * self._steps_at_force,
             n_new=self.real_timesteps - self._refitted_at,
@@ -276,9 +282,9 @@ class HDS(TwinAlgorithm):
             drawn[f"{force[0]}.share"] = jnp.asarray(chosen, jnp.float32)
         return drawn
 
-    def _wishes(self, twin: Twin) -> Wishes:
+    def _correction_config(self, twin: Twin) -> CorrectionConfig:
         config = self.config
-        return Wishes(
+        return CorrectionConfig(
             names=names_to_estimate(twin, config.calibrated),
             nominal=self.nominal,
             residual_kwargs=config.residual_kwargs or {},

@@ -61,7 +61,7 @@ class RecordedSteps:
             except TrajectoryError:  # none of the steps is finite
                 pass
         data = Trajectories.concatenate(parts) if parts else None
-        return data if data is None or latest is None else latest_steps(data, latest)
+        return data if data is None or latest is None else last_steps(data, latest)
 
     def recordings(self) -> Trajectories | None:
         """
@@ -166,7 +166,7 @@ def data_from(source: Any) -> Trajectories | None:
     )
 
 
-def latest_steps(data: Trajectories, n_steps: int) -> Trajectories:
+def last_steps(data: Trajectories, n_steps: int) -> Trajectories:
     """The end of the data; the recording in which it begins is cut."""
     obs, actions, left = [], [], max(n_steps, 1)
     for i in reversed(range(len(data))):
@@ -185,7 +185,7 @@ def _whole(data: Trajectories, n_steps: int) -> Trajectories:
     """The latest recordings that have together no more steps than so many."""
     after = np.cumsum(data.lengths[::-1])[::-1]
     fit = np.flatnonzero(after <= n_steps)
-    return data[fit] if len(fit) else latest_steps(data, n_steps)
+    return data[fit] if len(fit) else last_steps(data, n_steps)
 
 
 def _counted(data: Trajectories) -> Trajectories:
