@@ -42,14 +42,13 @@ PARTS = {
     "noise does not decay": {"exploration_decay": 1.0},
     "best step always": {"temperature": 0.0},
     "no terminal value": {"terminal_value": False},
-    "relabelling": {"relabel_share": 0.25},
     "no calibration": {"calibrated": None},
     "nothing suspected": {"suspected": ()},
-    "no learned force": {"residual": False},
+    "no learned force": {"beta": 0.0},
     "beta 0.05": {"beta": 0.05},
     "no data": {"refit_freq": 0},
 }
-PRETRAINED_WITH = ("exploration_decay", "temperature", "terminal_value", "relabel_share")
+PRETRAINED_WITH = ("exploration_decay", "temperature", "terminal_value")
 TABLES = ("beta", "parts", "weaknesses")
 
 

@@ -129,12 +129,12 @@ def backpropagation(model):
 
     import jax
 
-    from sb3_hds.algos.twin.state import optimiser, resets
+    from sb3_hds.algos.twin.state import clipped_adam, resets
     from sb3_hds.planning import Problem, follow
 
     twin, actor = model.twin, model.policy.actor_network
     problem = Problem(twin, twin.params)
-    adam = optimiser(model.policy.max_grad_norm)
+    adam = clipped_adam(model.policy.max_grad_norm)
     rate = model.lr_schedule(1.0)
 
     @jax.jit
@@ -153,7 +153,7 @@ def backpropagation(model):
 
         return jax.lax.scan(update, (weights, state), None, length=GRADIENT_STEPS)[0]
 
-    model._learner()
+    model._epoch_state()
     keys = iter(jax.random.split(jax.random.key(model.seed), 10_000))
     state = [adam.init(model.policy.networks.actor)]
 

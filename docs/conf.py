@@ -24,6 +24,7 @@ exclude_patterns = ["_build", "modules/_*.md"]
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 
+autoclass_content = "both"  # arguments are documented where they are declared, by the constructor
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 autodoc_typehints = "description"

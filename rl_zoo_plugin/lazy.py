@@ -86,21 +86,12 @@ def _parameters(function: Any) -> dict[str, inspect.Parameter]:
 
 
 def parameters_of(algorithm: Any) -> dict[str, inspect.Parameter]:
-    """:return: of its constructor, and of those to which that passes on what it does not know"""
-    found: dict[str, inspect.Parameter] = {}
-    for base in algorithm.__mro__:
-        if "__init__" not in vars(base):
-            continue
-        own = _parameters(base.__init__)
-        found = {**own, **found}
-        if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in own.values()):
-            break
-    passed_on = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
-    return {name: p for name, p in found.items() if p.kind not in passed_on}
+    """:return: of its constructor"""
+    return _parameters(algorithm)
 
 
 def _refuse_unknown(algorithm: Any, hyperparams: dict[str, Any], also: Iterable[str] = ()) -> None:
-    known = [name for name in parameters_of(algorithm) if name != "self"]
+    known = list(parameters_of(algorithm))
     unknown = sorted(set(hyperparams) - set(known) - set(also))
     if not unknown:
         return

@@ -55,7 +55,7 @@ def _suggest_planner(trial: Any, _: int) -> None:
     trial.suggest_float("learning_rate", 1e-4, 1e-2, log=True)
     trial.suggest_int("batch_size_pow", 6, 10)
     trial.suggest_int("n_rollouts_pow", 4, 8)
-    trial.suggest_categorical("order", [1, 2])
+    trial.suggest_categorical("planner", ["ilqr", "first_order"])
     trial.suggest_categorical("net_arch", list(_NET_ARCHS))
     trial.suggest_categorical("activation_fn", ["tanh", "relu", "elu"])
 

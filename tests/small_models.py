@@ -18,8 +18,7 @@ from sb3_hds.algos.twin.algorithm import TwinAlgorithm
 # One set for all that plan in a twin: equal settings are one compiled program.
 _LEARNING = {"batch_size": 16, "buffer_size": 500, "policy_kwargs": {"net_arch": [8]}}
 _PLANNING = _LEARNING | {"pretrain_epochs": 1, "n_rollouts": 8, "horizon": 4, "lookahead": 2}
-_PLANNING |= {"n_iterations": 1, "n_step_sizes": 3, "n_random_plans": 2, "plan_memory": 2}
-_PLANNING |= {"gradient_steps": 4, "train_freq": 25}
+_PLANNING |= {"n_random_plans": 2, "gradient_steps": 4, "train_freq": 25}
 _MODEL_FREE = _LEARNING | {"learning_starts": 10, "train_freq": 5, "gradient_steps": 2}
 # What an algorithm has besides.
 _OWN = {

@@ -8,7 +8,7 @@ from gymnasium.utils.env_checker import check_env as check_gymnasium
 from stable_baselines3.common.env_checker import check_env as check_sb3
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_hds.algos.open_loop.robot import body_of
+from sb3_hds.algos.open_loop.robot import robot_of
 from sb3_hds.envs import ElasticQuadruped
 from sb3_hds.wrappers import CPGPrior
 
@@ -88,10 +88,10 @@ def test_a_fall_ends_the_episode():
 
 def test_rhythms_find_its_motors():
     env = gymnasium.make(ID, control="torque")
-    body = body_of(DummyVecEnv([lambda: env]), "auto", "auto", None)
-    assert body.control == "track" and body.dt == pytest.approx(0.02)
-    assert body.names[:3] == ("FL_hip_motor", "FL_knee_motor", "FR_hip_motor")
-    assert body.rest == (0.0,) * 8
+    robot = robot_of(DummyVecEnv([lambda: env]), "auto", "auto", None)
+    assert robot.control == "track" and robot.dt == pytest.approx(0.02)
+    assert robot.names[:3] == ("FL_hip_motor", "FL_knee_motor", "FR_hip_motor")
+    assert robot.rest == (0.0,) * 8
 
     walking = CPGPrior(env, omega_swing=25.0, amplitude=0.3, kp=6.0, kd=0.14)
     obs, _ = walking.reset(seed=0)

@@ -34,7 +34,7 @@ def test_an_update_that_diverges_is_an_error_and_leaves_the_last_good_weights():
 
     after = model.get_parameters()["policy"]
     assert finite(model) and before.keys() == after.keys()
-    assert model._n_updates == int(model.policy.learner.n_updates)
+    assert model._n_updates == int(model.policy.agent_state.n_updates)
 
 
 @pytest.mark.parametrize("name", ["droq", "td7"])
@@ -70,7 +70,7 @@ def test_updates_are_counted_where_they_are_interrupted(monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         model.train(gradient_steps=200, batch_size=16)
 
-    assert model._n_updates == int(model.policy.learner.n_updates) > before
+    assert model._n_updates == int(model.policy.agent_state.n_updates) > before
 
 
 @pytest.mark.parametrize(("of_reward", "value"), [(True, np.inf), (False, np.nan)])

@@ -12,8 +12,8 @@ from stable_baselines3.common.distributions import StateDependentNoiseDistributi
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_hds.algos import learn_compiled
-from sb3_hds.algos.model_free.sac.update import act
-from sb3_hds.algos.nets.squashed import Gaussian, exploration_std, log_probability, marginal_std
+from sb3_hds.algos.model_free.sac.update import actor_distribution
+from sb3_hds.algos.nets.heads import Gaussian, exploration_std, log_probability, marginal_std
 
 
 def both_noises(full_std: bool, use_expln: bool) -> tuple[Gaussian, np.ndarray, Any]:
@@ -55,7 +55,7 @@ def test_each_environment_has_its_noise_matrix_and_the_deviation_is_logged():
     model.learn(45, log_interval=1)
 
     policy, obs = model.policy, np.ones((3, 3), np.float32)
-    gaussian, _ = act(policy.actor_network, policy.learner.actor.weights, obs)
+    gaussian, _ = actor_distribution(policy.actor_network, policy.agent_state.actor.weights, obs)
     noise = np.stack([gaussian.latent[0] @ matrix for matrix in policy.matrices])
     wanted = 2.0 * np.tanh(gaussian.mean + noise)
     np.testing.assert_allclose(model.predict(obs)[0], wanted, rtol=1e-4, atol=1e-6)
@@ -71,8 +71,8 @@ def test_a_noise_matrix_lasts_over_as_many_collections_as_it_takes(compiled):
     model = learn_compiled(model, 40)[0][0] if compiled else model.learn(40)
 
     buffer, policy = model.replay_buffer, model.policy
-    weights, seen = policy.learner.actor.weights, buffer.observations[:40, 0]
-    gaussian, _ = act(policy.actor_network, weights, seen)
+    weights, seen = policy.agent_state.actor.weights, buffer.observations[:40, 0]
+    gaussian, _ = actor_distribution(policy.actor_network, weights, seen)
     apart = np.arctanh(buffer.actions[:40, 0]) - gaussian.mean
 
     def misfit(steps: slice) -> float:
@@ -87,12 +87,12 @@ def test_a_noise_matrix_lasts_over_as_many_collections_as_it_takes(compiled):
 
 def test_the_optimistic_actor_of_bro_explores_by_gsde_too():
     model = small("bro", use_sde=True, std_multiplier=0.5)
-    policy, recipe = model.policy, model.policy.recipe
-    actor, extra = policy.learner.actor.weights, policy.learner.extra
+    policy, recipe = model.policy, model.policy.update_config
+    actor, extra = policy.agent_state.actor.weights, policy.agent_state.extra
     moved = jax.tree.map(lambda weight: weight + 0.1, extra["actor"].weights)
     extra = extra | {"actor": extra["actor"]._replace(weights=moved)}
-    policy.learner = policy.learner._replace(extra=extra)
-    gaussian, _ = act(recipe.actor, actor, STATES)
+    policy.agent_state = policy.agent_state._replace(extra=extra)
+    gaussian, _ = actor_distribution(recipe.actor, actor, STATES)
     shift = recipe.extra.network.apply(moved, STATES, gaussian.mean)
     policy.reset_noise()
 

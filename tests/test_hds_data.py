@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from cases import each
 from measuring import measured
-from small_models import logged, reloaded, same, small
+from small_models import reloaded, same, small
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_hds import HDS, PODS, effects, twins
 from sb3_hds.algos.twin.hds.algorithm import _effects_of, _native_of
-from sb3_hds.algos.twin.hds.correction import Correction, Wishes, correct
+from sb3_hds.algos.twin.hds.correction import Correction, CorrectionConfig, correct
 from sb3_hds.algos.twin.hds.windows import Since
-from sb3_hds.algos.twin.log import record_correction
 from sb3_hds.core import Trajectories
 from sb3_hds.effects import force_of
 from sb3_hds.errors import TrajectoryError
@@ -28,14 +27,14 @@ REAL = "sb3_hds/PendulumReal-v1"
 
 
 def wishes(twin, **changes):
-    plain = {"names": tuple(twin.parameters), "residual": False, "residual_kwargs": {}, "seed": 0}
+    plain = {"names": tuple(twin.parameters), "residual_kwargs": {}, "seed": 0, "beta": 0.0}
     # Of the model itself: what is estimated alike is one program.
-    plain |= {"beta": "auto", "suspected": ("coulomb_friction", "action_delay")}
-    return Wishes(nominal=dict(twin.values), **(plain | changes))
+    plain |= {"suspected": ("coulomb_friction", "action_delay")}
+    return CorrectionConfig(nominal=dict(twin.values), **(plain | changes))
 
 
-def corrected(twin, data, n_new=10_000, beta=0.0, **changes):
-    return correct(twin, data, wishes(twin, **changes), beta, learn_force=True, n_new=n_new)
+def corrected(twin, data, n_new=10_000, **changes):
+    return correct(twin, data, wishes(twin, **changes), 0.0, learn_force=True, n_new=n_new)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +54,7 @@ def inertia(twin) -> float:
 
 def real(env=REAL, **settings) -> HDS:
     """:return: a model in the twin of the real system, without pretraining and learned force"""
-    own = {"twin": "PendulumReal", "residual": False, "pretrain_epochs": 0}
+    own = {"twin": "PendulumReal", "beta": 0.0, "pretrain_epochs": 0}
     return small("hds", env, **(own | settings))
 
 
@@ -67,12 +66,9 @@ def no_planning(monkeypatch):
 
 def recorded(found):
     """:return: what is logged of a correction"""
-    model = small("hds", REAL)
-    lines = logged(model)
-    record_correction(model, found)
-    model.logger.dump()
-    (line,) = lines.lines
-    return {key: value for key, value in line.items() if key.startswith("model/")}
+    values, intervals = found.log()
+    assert not values.keys() & intervals.keys()
+    return values | intervals
 
 
 def test_a_twin_that_is_exact_is_left_alone():
@@ -146,7 +142,7 @@ def test_what_has_no_parameter_is_left_to_the_learned_force():
     twin = twins.make("PendulumReal")
     data = measured(twin.extend(effects.CoulombFriction(0, tau_c=0.4)), noise=0.005, n=10)
 
-    found = corrected(twin, data, residual=True, suspected=())
+    found = corrected(twin, data, beta="auto", suspected=())
 
     assert found.beta > 0.0 and force_of(found.twin) is not None
     assert found.error_hybrid < 0.9 * found.error_calibrated < 0.9 * found.error_twin
@@ -157,7 +153,7 @@ def test_an_attached_force_that_no_longer_helps_is_switched_off(heavier):
     plain = twins.make("PendulumReal", mass=1.3, damping=0.1)
     twin = plain.extend(effects.NeuralForce(n_members=2, net_arch=(4,), share=1.0))
     tiny = {"n_members": 2, "net_arch": [4]}
-    own = wishes(plain, names=(), suspected=(), residual=True, residual_kwargs=tiny)
+    own = wishes(plain, names=(), suspected=(), beta="auto", residual_kwargs=tiny)
 
     found = correct(twin, heavier, own, 1.0, learn_force=False, n_new=1000)
 
@@ -174,7 +170,7 @@ def test_data_from_before_a_change_are_forgotten():
     found = corrected(twins.make("PendulumReal"), both, n_new=after.n_steps)
     mixed = corrected(twins.make("PendulumReal"), both, n_new=both.n_steps)
 
-    assert found.forgotten and not mixed.forgotten
+    assert found.since is not None and mixed.since is None
     assert found.error_calibrated < 1e-3 < mixed.error_calibrated
 
 
@@ -361,7 +357,8 @@ def test_what_counts_since_a_change_is_remembered_in_real_steps(monkeypatch, no_
         return dataclasses.replace(found, since=Since(15, 0) if len(counted) == 2 else None)
 
     monkeypatch.setattr("sb3_hds.algos.twin.hds.algorithm.correct", changed_once)
-    model = real(train_freq=10, replan_epochs=2, gradient_steps=3).learn(10).learn(20)
+    monkeypatch.setattr("sb3_hds.algos.twin.hds.algorithm._REPLAN_EPOCHS", 2)
+    model = real(train_freq=10, gradient_steps=3).learn(10).learn(20)
 
     assert (model.num_timesteps, model.real_timesteps) == (20, 30)
     # Fifteen of the first twenty steps, and the ten that came after.
@@ -376,7 +373,7 @@ def test_what_counts_since_a_change_is_remembered_in_real_steps(monkeypatch, no_
     ({"max_saved_steps": 200}, 60, 120),
     ({"max_saved_steps": 90}, 60, 30),
     ({"max_saved_steps": 40}, 40, 0),
-    ({"save_data": False}, 0, 0),
+    ({"max_saved_steps": 0}, 0, 0),
 )
 def test_early_data_share_the_limit_and_the_latest_stay(settings, n_real, n_early, no_planning):
     """Recordings of 60 steps: as many whole ones as there is room for, or the end of the last."""

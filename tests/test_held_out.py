@@ -49,7 +49,7 @@ def real(steps, **changes):
 
 
 def model_in(env, **changes):
-    settings = {"twin": "PendulumReal", "residual": False, "train_freq": 50, "pretrain_epochs": 0}
+    settings = {"twin": "PendulumReal", "beta": 0.0, "train_freq": 50, "pretrain_epochs": 0}
     return small("hds", env, **settings | changes)
 
 

@@ -22,10 +22,10 @@ from sb3_hds import DroQ
 from sb3_hds.algos.model_free.replay import batches_of
 from sb3_hds.algos.model_free.sac import algorithm as soft_actor_critic
 from sb3_hds.algos.model_free.sac import update as off_policy
-from sb3_hds.algos.model_free.sac.update import Trained
 from sb3_hds.algos.model_free.td7 import update as td7_update
 from sb3_hds.algos.model_free.td7.prioritized_replay import LapReplayBuffer
-from sb3_hds.algos.nets.mlp import SimbaBody
+from sb3_hds.algos.nets.mlp import SimbaNet
+from sb3_hds.algos.nets.optimizers import TrainState
 from sb3_hds.errors import EnvironmentMismatchError
 
 CHOICES = spaces.Dict(
@@ -50,8 +50,8 @@ def test_observations_and_actions_of_any_shape_are_learned_from(name, space):
 
 def test_after_the_same_seed_a_model_explores_and_learns_alike():
     models = [small("gsde_sac", seed=np.uint32(seed)) for seed in (1, 2)]
-    actor = models[0].policy.learner.actor
-    models[1].policy.learner = models[1].policy.learner._replace(actor=actor)
+    actor = models[0].policy.agent_state.actor
+    models[1].policy.agent_state = models[1].policy.agent_state._replace(actor=actor)
     assert not np.array_equal(*(model.predict(STATES)[0] for model in models))
 
     for model in models:
@@ -59,7 +59,7 @@ def test_after_the_same_seed_a_model_explores_and_learns_alike():
         model.set_random_seed(None)
 
     np.testing.assert_array_equal(*(model.predict(STATES)[0] for model in models))
-    keys = [jax.random.key_data(model.policy.learner.key) for model in models]
+    keys = [jax.random.key_data(model.policy.agent_state.key) for model in models]
     np.testing.assert_array_equal(*keys)
 
 
@@ -140,9 +140,12 @@ def test_returns_of_several_steps_and_compressed_buffers_are_learned_from():
     compressed = small("td7", optimize_memory_usage=True, replay_buffer_kwargs=buffer).learn(30)
 
     assert longer._n_updates > 0 and compressed._n_updates > 0
-    discounts = batches_of(longer, 4, 16, 4).discount
+    discounts = batches_of(longer.replay_source, 4, 16, 4).discount
     assert discounts.min() == pytest.approx(0.9**3)
-    batch, env = batches_of(compressed, 1, 16, 1), gymnasium.make("Pendulum-v1").unwrapped
+    batch, env = (
+        batches_of(compressed.replay_source, 1, 16, 1),
+        gymnasium.make("Pendulum-v1").unwrapped,
+    )
     env.reset()
     for obs, action, next_obs in zip(batch.obs[0], batch.action[0], batch.next_obs[0], strict=True):
         env.state = np.array([np.arctan2(obs[1], obs[0]), obs[2]], np.float64)
@@ -155,7 +158,9 @@ def test_the_replay_buffer_is_that_of_the_arguments_that_a_model_is_loaded_with(
     longer = reloaded(plain, n_steps=3, gamma=0.9).learn(20)
     again = reloaded(longer, n_steps=1).learn(20)
 
-    discounts = [batches_of(model, 1, 16, 1).discount.min() for model in (longer, again)]
+    discounts = [
+        batches_of(model.replay_source, 1, 16, 1).discount.min() for model in (longer, again)
+    ]
     assert discounts == pytest.approx([0.9**3, 0.9])
     assert type(again.replay_buffer) is type(plain.replay_buffer)
     changed = reloaded(plain, replay_buffer_class=ReplayBuffer)
@@ -164,13 +169,15 @@ def test_the_replay_buffer_is_that_of_the_arguments_that_a_model_is_loaded_with(
 
 def test_an_entropy_coefficient_that_a_model_is_loaded_with_is_the_one_that_acts():
     learned = small("droq")
-    entropy = learned.policy.learner.log_ent_coef._replace(weights={"params": jnp.float32(-2.0)})
-    learned.policy.learner = learned.policy.learner._replace(log_ent_coef=entropy)
+    entropy = learned.policy.agent_state.log_ent_coef._replace(
+        weights={"params": jnp.float32(-2.0)}
+    )
+    learned.policy.agent_state = learned.policy.agent_state._replace(log_ent_coef=entropy)
 
     fixed = reloaded(learned, ent_coef=0.3)
 
-    kept = np.exp(fixed.policy.learner.log_ent_coef.weights["params"])
-    assert kept == pytest.approx(0.3) and not fixed.policy.recipe.learns_ent_coef
+    kept = np.exp(fixed.policy.agent_state.log_ent_coef.weights["params"])
+    assert kept == pytest.approx(0.3) and not fixed.policy.update_config.learns_ent_coef
     assert same(reloaded(learned).get_parameters(), learned.get_parameters())
     with pytest.raises(ValueError, match="use_sde must be False"):
         reloaded(learned, use_sde=True)
@@ -181,7 +188,7 @@ def test_hindsight_replay_is_learned_from():
     model = small("droq", env, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer)
 
     assert model.learn(40)._n_updates > 0
-    batch = batches_of(model, 1, 500, 1)
+    batch = batches_of(model.replay_source, 1, 500, 1)
     achieved, goal = batch.next_obs[0, :, :3], batch.obs[0, :, 3:6]
     reached = (achieved == goal).all(1)
     np.testing.assert_array_equal(batch.reward[0], np.where(reached, 0.0, -1.0))
@@ -193,7 +200,7 @@ def test_batches_are_normalised_as_the_environment_is_and_time_limits_are_no_end
     env = VecNormalize(DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")]))
     model = small("droq", env, gradient_steps=0).learn(450)
 
-    batch = batches_of(model, 3, 100, 4)
+    batch = batches_of(model.replay_source, 3, 100, 4)
 
     assert batch.obs.shape == (4, 100, 3) and (batch.obs[3] == 0.0).all()
     assert np.abs(batch.obs[:3].reshape(-1, 3).mean(0)).max() < 0.5
@@ -219,13 +226,13 @@ def test_networks_start_afresh_when_told_to():
 def test_bro_starts_afresh_with_its_temperature_and_others_keep_theirs(name, afresh):
     model = small(name)
     assert len(model.param_resets or ()) == afresh
-    begun = model.policy.learner.log_ent_coef
+    begun = model.policy.agent_state.log_ent_coef
     later = jax.tree.map(lambda x: x + 1, begun)
-    model.policy.learner = model.policy.learner._replace(log_ent_coef=later)
+    model.policy.agent_state = model.policy.agent_state._replace(log_ent_coef=later)
 
     model._restart(seed=1)
 
-    after = model.policy.learner.log_ent_coef
+    after = model.policy.agent_state.log_ent_coef
     assert jax.tree.leaves(after) == jax.tree.leaves(begun if afresh else later)
 
 
@@ -247,8 +254,10 @@ def test_schedules_act_on_all_that_learns(name):
     def trained(left: float) -> list[np.ndarray]:
         model._current_progress_remaining = left
         model.train(2, 16)
-        parts = jax.tree.leaves(model.policy.learner, is_leaf=lambda x: isinstance(x, Trained))
-        parts = [part.weights["params"] for part in parts if isinstance(part, Trained)]
+        parts = jax.tree.leaves(
+            model.policy.agent_state, is_leaf=lambda x: isinstance(x, TrainState)
+        )
+        parts = [part.weights["params"] for part in parts if isinstance(part, TrainState)]
         return [np.array(leaf) for leaf in jax.tree.leaves(parts)]
 
     begun, ended, again = trained(1.0), trained(0.0), trained(1.0)
@@ -302,17 +311,17 @@ def test_networks_of_simba_serve_other_algorithms():
     model = small("droq", policy="SimbaPolicy", learning_starts=50).learn(30)
 
     policy, speeds = model.policy, model.replay_buffer.next_observations[:30, 0, 2]
-    assert isinstance(policy.actor_network.body, SimbaBody)
+    assert isinstance(policy.actor_network.body, SimbaNet)
     assert policy.optimizers[0].make is optax.adamw
     assert policy.critic_network.body.dropout_rate == 0.01
-    assert float(policy.learner.seen.count) == 30.0
-    assert float(policy.learner.seen.mean[2]) == pytest.approx(speeds.mean(), rel=1e-3)
+    assert float(policy.agent_state.obs_stats.count) == 30.0
+    assert float(policy.agent_state.obs_stats.mean[2]) == pytest.approx(speeds.mean(), rel=1e-3)
 
 
 @pytest.mark.parametrize(("name", "last"), [("tqc_jax", True), ("crossq_jax", False)])
 def test_layers_start_orthogonal_where_that_is_asked_for(name, last):
     told = {"net_arch": [16, 16], "ortho_init": True if last else "hidden"}
-    learner = small(name, policy_kwargs=told).policy.learner
+    learner = small(name, policy_kwargs=told).policy.agent_state
 
     actor, critics = (getattr(learner, of).weights["params"] for of in ("actor", "critic"))
     for weights in (actor, critics):
@@ -327,7 +336,7 @@ def test_layers_start_orthogonal_where_that_is_asked_for(name, last):
 
 @pytest.mark.parametrize(("name", "gain"), [("simba", 1.0), ("bro", np.sqrt(2.0))])
 def test_last_layers_start_as_in_the_code_of_the_authors(name, gain):
-    learner = small(name).policy.learner
+    learner = small(name).policy.agent_state
 
     actor, critic = (getattr(learner, of).weights["params"] for of in ("actor", "critic"))
     for layer, expected in ((actor["Dense_0"], gain), (actor["Dense_1"], 1.0)):

@@ -13,16 +13,15 @@ from gymnasium import spaces
 from small_models import small
 
 from sb3_hds.algos.model_free.sac import update as off_policy
-from sb3_hds.algos.model_free.sac.quantiles import (
+from sb3_hds.algos.model_free.sac.objectives import (
     all_targets,
     sorted_by_columns,
     sorted_by_rows,
     target_by_target,
 )
-from sb3_hds.algos.model_free.sac.update import Trained
 from sb3_hds.algos.nets.mlp import Dropout
 from sb3_hds.algos.nets.observations import flattener
-from sb3_hds.algos.nets.optimizers import optimizer_of
+from sb3_hds.algos.nets.optimizers import TrainState, optimizer_of
 
 
 def test_every_processor_sorts_and_compares_quantiles_alike():
@@ -86,7 +85,7 @@ def test_a_torch_class_means_what_it_does_in_torch(make, arguments):
     ours = optimizer_of(make, arguments)
 
     with jax.enable_x64(True):
-        trained = Trained({"params": jnp.asarray(w)}, ours.init(jnp.asarray(w)))
+        trained = TrainState({"params": jnp.asarray(w)}, ours.init(jnp.asarray(w)))
         for slope in slopes:
             trained = ours.apply(jnp.asarray(slope), trained, 0.03)
             theirs.grad = th.tensor(slope)
@@ -110,9 +109,11 @@ def test_an_optimiser_of_ones_own_may_have_a_known_name():
 def test_no_batch_is_decomposed_at_once():
     """With two in one program, both threads of two could wait for the other one for ever."""
     model = small("bro")
-    recipe, n_obs, n_act = (getattr(model.policy, each) for each in ("recipe", "n_obs", "n_act"))
+    recipe, n_obs, n_act = (
+        getattr(model.policy, each) for each in ("update_config", "n_obs", "n_act")
+    )
 
-    program = off_policy.begin.lower(recipe, n_obs, n_act, 1.0, jax.random.key(0)).as_text()
+    program = off_policy.init_state.lower(recipe, n_obs, n_act, 1.0, jax.random.key(0)).as_text()
 
     shapes = re.findall(r"@lapack_\w+qr\w*\(.*: \(tensor<(\w+)xf32>", program)
     assert shapes and all(shape.count("x") == 1 for shape in shapes)

@@ -16,7 +16,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
 from sb3_hds import OpenLoop
-from sb3_hds.algos.open_loop.algorithm import cma_es as gait_search
+from sb3_hds.algos.open_loop import cma_es
 from sb3_hds.algos.open_loop.gait import Constants
 from sb3_hds.core.transforms.oscillators import Gait, target_at
 from sb3_hds.envs import TwinVecEnv
@@ -93,7 +93,7 @@ def test_a_model_that_has_no_joints_to_read_says_where_it_could_get_them():
     with pytest.raises(EnvironmentMismatchError, match="do not show position and velocity"):
         OpenLoop("MlpPolicy", hidden(), joints="observation")
     shown = OpenLoop("MlpPolicy", ShowJoints(hidden()), joints="observation")
-    assert shown.policy.body.seen_position == (1, 2) and shown.policy.body.seen_velocity == (3, 4)
+    assert shown.policy.robot.seen_position == (1, 2) and shown.policy.robot.seen_velocity == (3, 4)
 
 
 def test_the_state_that_predict_returns_carries_the_phase():
@@ -179,14 +179,14 @@ def test_a_restored_search_asks_for_what_cmaes_itself_would_ask_for():
     """A sphere, with the library keeping its own state."""
     from cmaes import CMA
 
-    state = gait_search.begin(np.array([2.0, -1.0, 0.5]), 0.7, 0, 6, 1, 2)
+    state = cma_es.init_search(np.array([2.0, -1.0, 0.5]), 0.7, 0, 6, 1, 2)
     own = CMA(mean=state.mean.copy(), sigma=0.7, population_size=6)
 
     for _ in range(20):
-        points = gait_search.candidates(state)
+        points = cma_es.candidates(state)
         values = -(points**2).sum(axis=1)
         own.tell([(point, -value) for point, value in zip(points, values, strict=True)])
-        state = gait_search.tell(state._replace(returns=values[:, None]))
+        state = cma_es.tell(state._replace(returns=values[:, None]))
 
         np.testing.assert_allclose(state.mean, own.mean, rtol=1e-9)
         np.testing.assert_allclose(state.sigma, own._sigma, rtol=1e-9)

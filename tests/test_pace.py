@@ -6,8 +6,8 @@ import pytest
 from cases import each
 from small_models import small
 
-from sb3_hds.algos.base import pace
-from sb3_hds.algos.base.pace import Pace
+from sb3_hds.algos.base import algorithm
+from sb3_hds.algos.base.algorithm import Pace
 
 
 class Learner:
@@ -23,7 +23,7 @@ class Learner:
 def said(monkeypatch, seconds: list[float], n_updates: int = 1, n_steps: int = 1) -> list[str]:
     """By a learner whose calls of ``train`` take these times."""
     now, learner, looking = 0.0, Learner(), Pace()
-    monkeypatch.setattr(pace.time, "perf_counter", lambda: now)
+    monkeypatch.setattr(algorithm.time, "perf_counter", lambda: now)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for each in seconds:

@@ -79,13 +79,13 @@ def test_arguments_and_networks_are_those_of_the_paper(name):
         assert (kept["activation_fn"], kept["qf_activation_fn"]) == ("relu", "elu")
         assert model.learning_rates() == pytest.approx((3e-4, 3e-4))
         return
-    knobs = model.knobs()
-    assert (knobs.learning_rate, knobs.target_entropy) == pytest.approx(RATES[name])
-    assert knobs.qf_learning_rate == knobs.learning_rate
+    hyper = model.hyper()
+    assert (hyper.learning_rate, hyper.target_entropy) == pytest.approx(RATES[name])
+    assert hyper.qf_learning_rate == hyper.learning_rate
     actor, critics, n_values, optimizer, arguments = NETWORKS[name]
     assert policy.widths == (actor, critics) and policy.n_critics == 2
     assert policy.critic_network.n_values == n_values
-    assert name != "bro" or model.multiplier_rate * knobs.learning_rate == pytest.approx(3e-5)
+    assert name != "bro" or model.multiplier_rate * hyper.learning_rate == pytest.approx(3e-5)
     for used in policy.optimizers:
         assert (used.make.__name__, dict(used.arguments)) == (optimizer, arguments)
     assert having(policy.critic_network.body, BODIES.get(name, {})) == BODIES.get(name, {})

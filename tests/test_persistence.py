@@ -30,7 +30,7 @@ from small_models import (
 )
 
 from sb3_hds import algos, effects, twins
-from sb3_hds.algos.base import files as persistence
+from sb3_hds.algos.base import files
 from sb3_hds.errors import NoTwinError
 
 every_algorithm = pytest.mark.parametrize("name", EVERY_NAME)
@@ -187,7 +187,7 @@ def test_a_file_appears_whole_and_a_failed_save_leaves_the_older_one(tmp_path, m
 
 def test_a_file_gets_the_suffix_that_stable_baselines_would_give_it(tmp_path):
     for given, expected in (("model.best", "model.best"), ("a/b/model", "a/b/model.zip")):
-        persistence.write_whole(str(tmp_path / given), "zip", lambda file: file.write(b"content"))
+        files.write_whole(str(tmp_path / given), "zip", lambda file: file.write(b"content"))
         assert (tmp_path / expected).read_bytes() == b"content"
 
 

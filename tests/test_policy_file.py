@@ -36,10 +36,10 @@ def test_a_policy_alone_acts_as_its_model_and_nothing_is_unpickled(name, no_pick
 def test_checkpoints_of_td7_act_in_the_policy_alone(no_pickle, tmp_path):
     model = small("td7", use_checkpoints=True, train_freq=None)
     model.policy.keep_checkpoint()
-    learner = model.policy.learner
+    learner = model.policy.agent_state
     actor = jax.tree.map(lambda weight: weight + 0.1, learner.checkpoint.actor)
     other = learner.checkpoint._replace(actor=actor)
-    model.policy.learner = learner._replace(checkpoint=other)
+    model.policy.agent_state = learner._replace(checkpoint=other)
 
     model.policy.save(tmp_path / "policy.pth")
     alone = type(model.policy).load(tmp_path / "policy.pth")

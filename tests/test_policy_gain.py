@@ -17,7 +17,7 @@ from sb3_hds.experiments.policy_gain import _summarised
 from sb3_hds.sysid import Diagnosis
 
 ROBOT = "sb3_hds/PendulumReal-v1"
-SMALL = {"pretrain_epochs": 2, "n_rollouts": 4, "n_random_plans": 0, "compare_every": 0}
+SMALL = {"pretrain_epochs": 2, "n_rollouts": 4, "n_random_plans": 0}
 
 
 def a_diagnosis(believed="PendulumReal"):

@@ -8,14 +8,14 @@ from flax import linen as nn
 
 from sb3_hds.algos.twin.networks import Actor, Value
 from sb3_hds.algos.twin.regression import rescale
-from sb3_hds.algos.twin.state import Learner, Samples, fresh_networks
+from sb3_hds.algos.twin.state import EpochState, Samples, fresh_networks
 
 
 def learner_after(n_epochs):
     key = jax.random.key(0, impl="unsafe_rbg")
     actor, value = Actor(1, (4,), nn.tanh), Value((4,), nn.tanh)
     networks, progress = fresh_networks(actor, value, 2, 1.0, key)
-    return Learner(networks, progress._replace(n_epochs=jnp.asarray(n_epochs)), None)
+    return EpochState(networks, progress._replace(n_epochs=jnp.asarray(n_epochs)), None)
 
 
 def samples(alive):

@@ -76,7 +76,7 @@ def test_layers_of_td7_start_as_those_of_torch():
     n = 30  # of each last layer, too: its biases are as many
     env = AnySpaces(spaces.Box(-1, 1, (n,)), spaces.Box(-1, 1, (n,)))
     kwargs = {"net_arch": [n, n], "embedding_size": n, "n_critics": n}
-    learner = small("td7", env, policy_kwargs=kwargs).policy.learner
+    learner = small("td7", env, policy_kwargs=kwargs).policy.agent_state
     # The ensemble's axis comes first.
     n_inputs = lambda layer: layer["kernel"].shape[-2]  # noqa: E731
     layers = []
@@ -188,7 +188,7 @@ def test_what_td7_is_loaded_with_counts():
 
 def test_uniform_draws_give_td7_the_gradient_of_prioritised_ones():
     model = small("td7")
-    prioritised = model.recipe()
+    prioritised = model.update_config()
     errors = jnp.array([[0.2, 3.0, 5.0, 0.7], [0.9, 1.5, 8.0, 0.1]])
     share = td7_update.priorities_of(prioritised, errors)
     uniform = dataclasses.replace(prioritised, uniform=True)
@@ -202,11 +202,13 @@ def test_uniform_draws_give_td7_the_gradient_of_prioritised_ones():
 def test_a_policy_of_td7_is_kept_only_if_it_did_no_worse():
     model = assessing()
     model.best_worst_return = -300.0
-    begun = model.policy.learner.checkpoint
+    begun = model.policy.agent_state.checkpoint
 
     for earned, kept, best in ((-500.0, False, -300.0), (-100.0, True, -100.0)):
         model._finished = [(earned, 200)]
-        assert model._assessed() == 200 and (model.policy.learner.checkpoint is not begun) == kept
+        assert (
+            model._assessed() == 200 and (model.policy.agent_state.checkpoint is not begun) == kept
+        )
         assert model.best_worst_return == best
 
 

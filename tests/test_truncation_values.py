@@ -16,7 +16,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer
 from sb3_hds import algos
 from sb3_hds.algos import learn_compiled
 from sb3_hds.algos.model_free.replay import batches_of
-from sb3_hds.algos.model_free.sac.update import judge
+from sb3_hds.algos.model_free.sac.update import q_values
 from sb3_hds.core import State
 from sb3_hds.envs import ConstantReward, TwinEnv
 from sb3_hds.errors import ParameterError
@@ -39,8 +39,10 @@ def value_of(model: Any, obs: np.ndarray) -> float:
     """:return: what the critics think of a state and the middle action, in the mean"""
     policy = model.policy
     flat = np.asarray(policy.flatten(np.asarray(obs)[None]))
-    weights, action = policy.learner.critic.weights, np.zeros((1, policy.n_act), np.float32)
-    return float(np.mean(judge(policy.recipe, weights, flat, action, jax.random.key(0))[0]))
+    weights, action = policy.agent_state.critic.weights, np.zeros((1, policy.n_act), np.float32)
+    return float(
+        np.mean(q_values(policy.update_config, weights, flat, action, jax.random.key(0))[0])
+    )
 
 
 @pytest.mark.parametrize("ends", [False, True], ids=["truncated", "terminated"])
@@ -137,7 +139,7 @@ def test_batches_of_three_steps_are_sums_that_stop_at_the_end(terminates):
     model = algos.GSDESAC(env=env, **(SETTINGS | {"n_steps": 3, "gamma": gamma})).learn(53)
     assert isinstance(model.replay_buffer, NStepReplayBuffer)
 
-    batch = jax.tree.map(lambda x: np.asarray(x[0]), batches_of(model, 1, 500, 1))
+    batch = jax.tree.map(lambda x: np.asarray(x[0]), batches_of(model.replay_source, 1, 500, 1))
 
     first = batch.obs.argmax(-1)
     # The 53rd step is the third of an episode: what began one or two before it is cut short there.

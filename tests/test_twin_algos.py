@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_hds import twins
 from sb3_hds.algos.twin import algorithm as twin_algorithm
-from sb3_hds.algos.twin.config import knobs_of, visited_states
+from sb3_hds.algos.twin.config import hyperparams
 from sb3_hds.algos.twin.policy import all_finite
 from sb3_hds.algos.twin.regression import regress
 from sb3_hds.algos.twin.state import problem_of
@@ -30,6 +30,15 @@ class Lossy(PointMass):
         return jnp.where(state.q > 0.5, jnp.nan, super().actuate(state, action, params))
 
 
+class Broken(PointMass):
+    """Breaks down at once."""
+
+    name = "Broken"
+
+    def actuate(self, state, action, params):
+        return super().actuate(state, action, params) + jnp.nan
+
+
 class Aimless(PointMass):
     name = "Aimless"
     reward = Twin.reward
@@ -42,6 +51,11 @@ class Flat(PointMass):
 
 def finite(model) -> bool:
     return all_finite(model.policy.networks)
+
+
+def hyper_of(model, gradient_steps):
+    twin = model.twin
+    return hyperparams(model.config, 0, 1e-3, gradient_steps, twin.params, {}, model._view(twin))
 
 
 def close(first, second) -> bool:
@@ -68,36 +82,30 @@ def test_pretraining_is_done_once_without_a_step_of_the_environment():
     assert model.num_timesteps == 30 and model._n_updates == 60
 
 
-def test_rates_of_policy_and_value_follow_their_own_schedules(monkeypatch):
-    model = small("pods", pretrain_epochs=4, learning_rate=1e-3, value_learning_rate="lin_1e-2")
+def test_the_rate_follows_its_schedule_over_the_epochs(monkeypatch):
+    model = small("pods", pretrain_epochs=4, learning_rate="lin_1e-2")
     seen = []
 
     def recorded(*arguments):
-        seen.append(knobs_of(*arguments))
+        seen.append(hyperparams(*arguments))
         return seen[-1]
 
-    monkeypatch.setattr(twin_algorithm, "knobs_of", recorded)
+    monkeypatch.setattr(twin_algorithm, "hyperparams", recorded)
     model.learn(0)
 
-    assert [float(k.learning_rate) for k in seen] == [1e-3] * 4
     # A straight line from 0.01 to 0 over four epochs.
-    rates = [float(k.value_learning_rate) for k in seen]
+    rates = [float(hyper.learning_rate) for hyper in seen]
     np.testing.assert_allclose(rates, [1e-2, 0.75e-2, 0.5e-2, 0.25e-2])
 
 
-def test_relabelling_plans_from_visited_states_and_moves_no_scale_where_none_is_finite():
-    model = small("hds", relabel_share=1.0).learn(50)
-    inside = model.policy.networks.inside
+def test_where_no_sample_is_finite_no_scale_moves():
+    model = small("pods", point_mass_env(), twin=Broken(), pretrain_epochs=1)
+    inside = model._epoch_state().networks.inside
 
-    visited, relabel = visited_states(model, 3)
-
-    stored = model.replay_buffer.observations[:50].reshape(50, 3)
-    assert relabel.all() and finite(model)
-    assert all((np.asarray(obs) == stored).all(1).any() for obs in visited)
-    model.replay_buffer.observations[:] = np.nan
     model.run_epoch(gradient_steps=4)
+
     # Eight rollouts of four steps.
-    assert model.logger.name_to_value["train/dropped_samples"] == 8 * 4
+    assert model.logger.name_to_value["train/dropped_samples"] == 8 * 4 and finite(model)
     np.testing.assert_array_equal(model.policy.networks.inside.mean, inside.mean)
     np.testing.assert_array_equal(model.policy.networks.inside.scale, inside.scale)
 
@@ -156,32 +164,34 @@ def test_some_rollouts_go_on_for_long_while_others_start_afresh():
     assert len(seen) == 60 and ages[:2].mean() > 6.0 > 2.0 > ages[6:].mean()
 
 
-def test_random_plans_are_tried_for_a_share_of_the_rollouts():
+def test_random_plans_are_tried_for_half_of_the_rollouts():
     # Of so many, some surely win against the policy's own plan.
-    none, half = (
-        small("pods", n_random_plans=32, pretrain_epochs=2, random_share=share).learn(0)
-        for share in (0.0, 0.5)
-    )
+    none, some = (small("pods", n_random_plans=n, pretrain_epochs=1).learn(0) for n in (0, 32))
 
-    assert none.twin_timesteps < half.twin_timesteps
-    assert not same(none.get_parameters(), half.get_parameters())
+    program = some._program
+    # Four of eight: each draws so many plans, and improves and follows the best of them.
+    columns = 2 * 1 + 1
+    improving = program.n_iterations * program.horizon * (1 + columns + program.n_step_sizes)
+    more = 4 * (32 * program.horizon + improving + program.lookahead)
+    assert some.twin_timesteps - none.twin_timesteps == more
+    assert not same(none.get_parameters(), some.get_parameters())
 
 
 def test_the_policy_learns_from_the_first_half_of_plans_and_the_value_from_all():
     model = small("pods", pretrain_epochs=1, learned_share=0.5).learn(0)
-    learner, settings = model._learner(), model._settings
-    knobs = knobs_of(model, settings.twin, 1.0, 4)
+    state, program = model._epoch_state(), model._program
+    hyper = hyper_of(model, 4)
     # Four steps of eight rollouts, first steps first.
     late = jnp.arange(4 * 8) >= 2 * 8
 
     def learned_with(field, where):
-        samples = learner.workspace.samples
+        samples = state.workspace.samples
         rows = getattr(samples, field)
         mask = where.reshape(1, -1, *[1] * (rows.ndim - 2))
         changed = samples._replace(**{field: jnp.where(mask, rows + 1.0, rows)})
-        workspace = learner.workspace._replace(samples=changed)
+        workspace = state.workspace._replace(samples=changed)
         key = jax.random.key(0, impl="unsafe_rbg")
-        return regress(settings, learner._replace(workspace=workspace), knobs, key)[0].networks
+        return regress(program, state._replace(workspace=workspace), hyper, key)[0].networks
 
     before = learned_with("control", jnp.zeros_like(late))
     assert close(learned_with("control", late).actor, before.actor)
@@ -211,8 +221,8 @@ def test_the_better_of_two_policies_acts():
 
 def test_a_policy_whose_model_changes_is_compared_before_it_acts():
     changing, fixed = (
-        small(name, train_freq=20, compare_every=100).learn(40).logger.name_to_value
-        for name in ("hds", "pods")
+        small(name, train_freq=20, **own).learn(40).logger.name_to_value
+        for name, own in (("hds", {}), ("pods", {"compare_every": 100}))
     )
 
     assert "train/return_of_best" in changing and "train/return_of_best" not in fixed
@@ -231,14 +241,14 @@ PAPER |= {"n_random_plans": 0, "lookahead": 0, "compare_every": 0, "plan_memory"
 PAPER |= {"terminal_value": False, "adapt_scales": False, "policy_kwargs": {"linear_path": False}}
 
 
-HOT = {"temperature": 1e3, "temperature_decay": 1.0, "n_random_plans": 0}
+HOT = {"temperature": 1e3, "n_random_plans": 0}
 
 
 @each(
     ("pods", {}),
     # Without random plans there is no second one to fall back on.
     ("hds", HOT),
-    ("pods", PAPER | {"order": 2, "planner": "gauss_newton"}),
+    ("pods", PAPER | {"planner": "gauss_newton"}),
     ids=["as usual", "hot", "paper"],
 )
 def test_plans_are_never_worse_than_what_they_started_from_unless_hot(name, changes):
@@ -250,19 +260,18 @@ def test_plans_are_never_worse_than_what_they_started_from_unless_hot(name, chan
     worsened, hot = sum(lines.column("pretrain/worsened_plans")), changes is HOT
     assert finite(model) and (worsened > 0) == hot
     assert hot or ((np.subtract(after, before) >= 0.0).all() and after != before)
-    if "order" in changes:
+    if "planner" in changes:
         assert set(lines.column("pretrain/value_loss")) == {0.0}
     if hot:
-        assert lines.column("pretrain/temperature") == [1e3] * 10
+        expected = [1e3 * 0.9**n for n in range(10)]
+        assert lines.column("pretrain/temperature") == pytest.approx(expected)
 
 
 def test_what_an_end_is_worth_has_a_switch():
     worth = {}
     for shifted in (True, False):
         model = small("pods", "InvertedPendulum-v5", shift_ends=shifted)
-        learner, settings = model._learner(), model._settings
-        knobs = knobs_of(model, settings.twin, 1.0, 4)
-        problem = problem_of(settings, learner, knobs)
+        problem = problem_of(model._program, model._epoch_state(), hyper_of(model, 4))
         worth[shifted] = float(problem.value_when_terminated)
         best = float(problem.reward_offset * problem.reward_scale)
     # A reward of zero for ever, counted from the best one; or nothing.
@@ -273,7 +282,7 @@ def test_statistics_of_a_normalised_environment_are_of_whole_episodes_and_stay_i
     env, frozen = (VecNormalize(DummyVecEnv([point_mass_env]), training=on) for on in (True, False))
 
     for one in (env, frozen):
-        small("pods", one)._learner()
+        small("pods", one)._epoch_state()
 
     # Random episodes of PointMass, 20 steps with forces uniform in [-1, 3] N, spread by 1.8 m and
     # 0.7 m/s around 1.9 m and 1.1 m/s; plans drawn at random are smoother, so they spread more.

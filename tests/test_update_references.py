@@ -31,15 +31,17 @@ from numpy_networks import (
 from odd_envs import AnySpaces
 
 from sb3_hds import algos
-from sb3_hds.algos.model_free.sac.update import Batch, Knobs, Report, average, before_any, update
+from sb3_hds.algos.model_free.sac.objectives import mean_values
+from sb3_hds.algos.model_free.sac.update import Hyperparams, UpdateMetrics, update
 from sb3_hds.algos.model_free.td7 import update as td7_update
+from sb3_hds.algos.model_free.update import Batch
 from sb3_hds.algos.nets.mlp import Dropout
-from sb3_hds.algos.nets.observations import Seen
+from sb3_hds.algos.nets.observations import RunningStats
 
 pytestmark = pytest.mark.usefixtures("x64")
 
 N_OBS, N_ACT, N_BATCH, N_UPDATES = 3, 2, 6, 2
-KNOBS = Knobs(learning_rate=0.03, qf_learning_rate=0.05, tau=0.1, target_entropy=-1.3)
+HYPER = Hyperparams(learning_rate=0.03, qf_learning_rate=0.05, tau=0.1, target_entropy=-1.3)
 # Double precision, and slopes whose error is that of a central difference.
 CLOSE: dict[str, Any] = {"rtol": 1e-6, "atol": 1e-8}
 # NormalTanhPolicy of the authors of SimBa and of BRO.
@@ -47,7 +49,7 @@ OF_AUTHORS = partial(gaussian, log_std_of=partial(squashed_between, low=-10.0, h
 
 
 def begun(name: str, policy_kwargs: dict[str, Any] | None = None, **arguments: Any) -> Any:
-    """Recipe and learner in double precision: no bias is zero, and no two networks are equal."""
+    """Config and state in double precision: no bias is zero, and no two networks are equal."""
     kwargs = {"net_arch": [4], "optimizer_class": "sgd"} | (policy_kwargs or {})
     env = AnySpaces(action_space=spaces.Box(-1.0, 1.0, (N_ACT,)))
     model = algos.ALL[name](env=env, seed=0, buffer_size=10, policy_kwargs=kwargs, **arguments)
@@ -60,7 +62,9 @@ def begun(name: str, policy_kwargs: dict[str, Any] | None = None, **arguments: A
         moved = 0.2 * rng.normal(size=leaf.shape) if weight else 0.0
         return jnp.asarray(np.asarray(leaf, np.float64) + moved)
 
-    return model.policy.recipe, jax.tree_util.tree_map_with_path(doubled, model.policy.learner)
+    return model.policy.update_config, jax.tree_util.tree_map_with_path(
+        doubled, model.policy.agent_state
+    )
 
 
 def plain(tree: Any) -> Any:
@@ -98,8 +102,8 @@ class Keys(NamedTuple):
     extra: Any
 
 
-def keys_of(learner: Any) -> Iterator[Keys]:
-    key = learner.key
+def keys_of(state: Any) -> Iterator[Keys]:
+    key = state.key
     while True:
         key, critic_key, actor_key = jax.random.split(key, 3)
         yield Keys(*jax.random.split(critic_key, 3), *jax.random.split(actor_key, 3))
@@ -122,15 +126,15 @@ class Soft:
 
     policy_delay = target_every = 1  # updates of the critics for each of the actor and of targets
 
-    def __init__(self, learner, body, target_of, error, worth, b1=0.9, linear=False) -> None:
+    def __init__(self, state, body, target_of, error, worth, b1=0.9, linear=False) -> None:
         self.linear = linear
         self.body, self.target_of, self.error, self.worth = body, target_of, error, worth
-        self.actor = plain(learner.actor.weights["params"])
-        self.critic = plain(learner.critic.weights["params"])
-        self.target = plain(learner.target["params"])
-        self.log_ent_coef = float(learner.log_ent_coef.weights["params"])
-        self.adam = Adam(KNOBS.learning_rate, b1)
-        self.keys, self.n, self.report = keys_of(learner), 0, {}
+        self.actor = plain(state.actor.weights["params"])
+        self.critic = plain(state.critic.weights["params"])
+        self.target = plain(state.target["params"])
+        self.log_ent_coef = float(state.log_ent_coef.weights["params"])
+        self.adam = Adam(HYPER.learning_rate, b1)
+        self.keys, self.n, self.report = keys_of(state), 0, {}
 
     def values(self, critic: Weights, obs: np.ndarray, action: np.ndarray, key: Any) -> np.ndarray:
         both = np.concatenate([obs, action], -1)
@@ -165,42 +169,42 @@ class Soft:
             return np.mean(ent_coef * log_prob - worth)
 
         self.report["critic_loss"] = critic_loss(self.critic)
-        self.critic = descend(critic_loss, self.critic, KNOBS.qf_learning_rate)
+        self.critic = descend(critic_loss, self.critic, HYPER.qf_learning_rate)
         if self.n % self.target_every == 0:
             self.follow()
         if self.n % self.policy_delay:
             return self.report
         self.report |= {"actor_loss": actor_loss(self.actor), "ent_coef": ent_coef}
-        excess = -self.acts(self.actor, batch.obs, noise)[1].mean() - KNOBS.target_entropy
+        excess = -self.acts(self.actor, batch.obs, noise)[1].mean() - HYPER.target_entropy
         # Of the loss, by the logarithm.
         rise = ent_coef * excess if self.linear else excess
         self.report["ent_coef_loss"] = rise if self.linear else self.log_ent_coef * excess
-        self.actor = descend(actor_loss, self.actor, KNOBS.learning_rate)
+        self.actor = descend(actor_loss, self.actor, HYPER.learning_rate)
         self.log_ent_coef = self.adam.step(self.log_ent_coef, rise)
         self.explore(batch, keys.extra)
         return self.report
 
     def follow(self) -> None:
-        nearer = lambda old, new: (1.0 - KNOBS.tau) * old + KNOBS.tau * new  # noqa: E731
+        nearer = lambda old, new: (1.0 - HYPER.tau) * old + HYPER.tau * new  # noqa: E731
         self.target = jax.tree.map(nearer, self.target, self.critic)
 
     def explore(self, batch: Batch, key: Any) -> None: ...
 
 
-def check(recipe, learner, expected, seen=lambda obs: obs, n=N_UPDATES, seed=0) -> Any:
-    """:return: the learner after as many updates as the reference makes, which agree with it"""
+def check(config, state, expected, seen=lambda obs: obs, n=N_UPDATES, seed=0) -> Any:
+    """:return: the state after as many updates as the reference makes, which agree with it"""
     given = batches(n, seed)
-    learner, report = update(recipe, learner, given, n, KNOBS, before_any(Report))
+    state, report = update(config, state, given, n, HYPER, zero_metrics(UpdateMetrics))
     for i in range(n):
         batch = jax.tree.map(lambda x, i=i: np.array(x[i]), given)
         said = expected.update(batch._replace(obs=seen(batch.obs), next_obs=seen(batch.next_obs)))
     assert_same(report._asdict(), said)
-    assert_same(learner.critic.weights["params"], expected.critic)
-    assert_same(learner.actor.weights["params"], expected.actor)
-    assert_same(learner.log_ent_coef.weights["params"], expected.log_ent_coef)
-    if not recipe.joint_pass:
-        assert_same(learner.target["params"], expected.target)
-    return learner
+    assert_same(state.critic.weights["params"], expected.critic)
+    assert_same(state.actor.weights["params"], expected.actor)
+    assert_same(state.log_ent_coef.weights["params"], expected.log_ent_coef)
+    if not config.joint_pass:
+        assert_same(state.target["params"], expected.target)
+    return state
 
 
 def half_square(values: np.ndarray, y: np.ndarray) -> float:
@@ -220,17 +224,17 @@ def mean_worth(values: np.ndarray) -> np.ndarray:
 
 
 def test_soft_actor_critic_with_state_dependent_noise():
-    recipe, learner = begun("gsde_sac", {"log_std_init": -1.0})
-    check(recipe, learner, Soft(learner, mlp, least, half_square, least_worth))
+    config, state = begun("gsde_sac", {"log_std_init": -1.0})
+    check(config, state, Soft(state, mlp, least, half_square, least_worth))
 
 
 def test_actors_and_target_networks_may_be_updated_less_often():
     delays = {"policy_delay": 2, "target_update_interval": 3}
-    recipe, learner = begun("droq", {"dropout_rate": 0.0}, ent_coef="auto_0.3", **delays)
-    expected = Soft(learner, mlp, least, half_square, mean_worth)
+    config, state = begun("droq", {"dropout_rate": 0.0}, ent_coef="auto_0.3", **delays)
+    expected = Soft(state, mlp, least, half_square, mean_worth)
     expected.policy_delay, expected.target_every = 2, 3
 
-    check(recipe, learner, expected, n=3)
+    check(config, state, expected, n=3)
 
 
 class Dropped(Soft):
@@ -238,8 +242,8 @@ class Dropped(Soft):
 
     rate = 0.3
 
-    def __init__(self, learner, masks) -> None:
-        super().__init__(learner, mlp, least, half_square, mean_worth)
+    def __init__(self, state, masks) -> None:
+        super().__init__(state, mlp, least, half_square, mean_worth)
         self.masks = masks
 
     def values(self, critic: Weights, obs: np.ndarray, action: np.ndarray, key: Any) -> np.ndarray:
@@ -252,18 +256,18 @@ class Dropped(Soft):
 
 
 def test_droq_drops_out_in_every_pass_of_its_critics_each_with_a_mask_of_its_own():
-    recipe, learner = begun("droq", {"dropout_rate": Dropped.rate}, policy_delay=1)
+    config, state = begun("droq", {"dropout_rate": Dropped.rate}, policy_delay=1)
     drawn = {}
 
     def masks(critic: Weights, obs: np.ndarray, action: np.ndarray, key: Any) -> np.ndarray:
         """What is not zero after dropout, seen once: it is the same for all weights."""
         name = np.asarray(jax.random.key_data(key)).tobytes()
         if name not in drawn:
-            seen = partial(_after_dropout, recipe.critic, obs, action)
+            seen = partial(_after_dropout, config.critic, obs, action)
             drawn[name] = np.asarray(jax.vmap(seen)(critic, jax.random.split(key, 2))) != 0.0
         return drawn[name]
 
-    check(recipe, learner, Dropped(learner, masks))
+    check(config, state, Dropped(state, masks))
 
     # Three passes of two critics in each update; masks of 24 entries agree by chance in none.
     kept = [mask for both in drawn.values() for mask in both]
@@ -280,42 +284,44 @@ def _after_dropout(critic: Any, obs: Any, action: Any, w: Weights, key: Any) -> 
 def test_tqc_drops_the_largest_of_all_quantiles():
     kwargs = {"n_quantiles": 5, "n_critics": 3, "log_std_init": -1.0}
     drop = {"top_quantiles_to_drop_per_net": 2}
-    recipe, learner = begun("tqc_jax", kwargs, use_sde=True, train_freq=8, **drop)
+    config, state = begun("tqc_jax", kwargs, use_sde=True, train_freq=8, **drop)
 
     def kept(values: np.ndarray) -> np.ndarray:
         return np.sort(np.concatenate([*values], -1))[:, : 3 * 3]
 
-    check(recipe, learner, Soft(learner, mlp, kept, quantile_huber, mean_worth))
+    check(config, state, Soft(state, mlp, kept, quantile_huber, mean_worth))
 
 
 def test_simba_normalises_by_all_it_saw():
-    recipe, learner = begun("simba", {"n_critics": 1}, clipped_double_q=False)
-    assert recipe.target_of is average
+    config, state = begun("simba", {"n_critics": 1}, clipped_double_q=False)
+    assert config.target_values is mean_values
     rows = np.random.default_rng(2).normal([3.0, -1.0, 0.0], [2.0, 0.1, 5.0], (40, N_OBS))
-    learner = learner._replace(seen=Seen.nothing(N_OBS).with_more(rows[:7]).with_more(rows[7:]))
-    learner = learner._replace(seen=jax.tree.map(lambda x: jnp.asarray(x, float), learner.seen))
+    state = state._replace(
+        obs_stats=RunningStats.empty(N_OBS).with_more(rows[:7]).with_more(rows[7:])
+    )
+    state = state._replace(obs_stats=jax.tree.map(lambda x: jnp.asarray(x, float), state.obs_stats))
     # Statistics are kept in single precision.
-    np.testing.assert_allclose(learner.seen.variance, rows.var(0), rtol=1e-6)
-    mean, variance = plain(learner.seen.mean), plain(learner.seen.variance)
-    expected = Soft(learner, simba, lambda v: v.mean(0), half_square, mean_worth, linear=True)
+    np.testing.assert_allclose(state.obs_stats.variance, rows.var(0), rtol=1e-6)
+    mean, variance = plain(state.obs_stats.mean), plain(state.obs_stats.variance)
+    expected = Soft(state, simba, lambda v: v.mean(0), half_square, mean_worth, linear=True)
     expected.gaussian = OF_AUTHORS
 
-    check(recipe, learner, expected, lambda obs: (obs - mean) / np.sqrt(variance + 1e-8))
+    check(config, state, expected, lambda obs: (obs - mean) / np.sqrt(variance + 1e-8))
 
 
 class Optimistic(Soft):
     """Nauman et al., NeurIPS 2024, section 3: the actor that explores, and its two multipliers."""
 
-    def __init__(self, learner) -> None:
+    def __init__(self, state) -> None:
         target_of = lambda values: values.mean(0)  # noqa: E731
-        super().__init__(learner, bro, target_of, quantile_huber, mean_worth, b1=0.5, linear=True)
-        self.shift = plain(learner.extra["actor"].weights["params"])
+        super().__init__(state, bro, target_of, quantile_huber, mean_worth, b1=0.5, linear=True)
+        self.shift = plain(state.extra["actor"].weights["params"])
         self.gaussian = OF_AUTHORS
         # As Adjustment of the authors has them.
         self.raw_optimism, self.raw_regularizer = (
             np.arctanh((np.log(start) + 10.0) / 8.75 - 1.0) for start in (1.0, 0.25)
         )
-        self.adams = tuple(Adam(0.1 * KNOBS.learning_rate, 0.5) for _ in range(2))
+        self.adams = tuple(Adam(0.1 * HYPER.learning_rate, 0.5) for _ in range(2))
 
     @staticmethod
     def multiplier(raw: Any) -> Any:
@@ -342,7 +348,7 @@ class Optimistic(Soft):
             return regularizer * divergence(w) - upper.mean()
 
         excess = divergence(self.shift) / N_ACT - 0.05
-        self.shift = descend(loss, self.shift, KNOBS.learning_rate)
+        self.shift = descend(loss, self.shift, HYPER.learning_rate)
         of_optimism, of_regularizer = self.adams
         rise = lambda raw: slope(self.multiplier, raw)  # noqa: E731
         self.raw_optimism = of_optimism.step(self.raw_optimism, excess * rise(self.raw_optimism))
@@ -351,18 +357,18 @@ class Optimistic(Soft):
 
 
 def test_bro_regresses_and_climbs_means_and_explores_by_another_actor():
-    recipe, learner = begun("bro", {"n_quantiles": 5})
+    config, state = begun("bro", {"n_quantiles": 5})
     # Deviations near e^-1: the divergence goes by their square, and this is plain gradient descent.
-    of_std = learner.actor.weights["params"]["Dense_1"]
+    of_std = state.actor.weights["params"]["Dense_1"]
     of_std |= {"kernel": 0.1 * of_std["kernel"], "bias": of_std["bias"] + 0.6}
-    expected = Optimistic(learner)
+    expected = Optimistic(state)
 
     # With the batches of seed 0, a unit of a critic is so near its kink that differences cross it.
-    learner = check(recipe, learner, expected, seed=1)
+    state = check(config, state, expected, seed=1)
 
-    assert_same(learner.extra["actor"].weights["params"], expected.shift)
-    assert_same(learner.extra["optimism"].weights["params"], expected.raw_optimism)
-    assert_same(learner.extra["regularizer"].weights["params"], expected.raw_regularizer)
+    assert_same(state.extra["actor"].weights["params"], expected.shift)
+    assert_same(state.extra["optimism"].weights["params"], expected.raw_optimism)
+    assert_same(state.extra["regularizer"].weights["params"], expected.raw_regularizer)
 
 
 class Renormed:
@@ -414,12 +420,12 @@ class Joint(Soft):
 
     momentum = 0.9
 
-    def __init__(self, learner) -> None:
-        alone = learner._replace(target={"params": {}})
+    def __init__(self, state) -> None:
+        alone = state._replace(target={"params": {}})
         super().__init__(alone, None, least, half_square, least_worth, linear=True)
-        statistics = plain(learner.critic.weights["statistics"]["body"])
+        statistics = plain(state.critic.weights["statistics"]["body"])
         self.of_critics = [Renormed(member(statistics, i)) for i in range(2)]
-        self.of_actor = Renormed(plain(learner.actor.weights["statistics"]["body"]))
+        self.of_actor = Renormed(plain(state.actor.weights["statistics"]["body"]))
 
     def judged(self, critic: Weights, obs: Any, action: Any, how: str) -> np.ndarray:
         both, values = np.concatenate([obs, action], -1), []
@@ -455,27 +461,27 @@ class Joint(Soft):
 
 def test_crossq_normalises_both_pairs_together_and_has_no_target_networks():
     kwargs = {"renorm_warmup_steps": 1, "batch_norm_momentum": Joint.momentum}
-    recipe, learner = begun("crossq_jax", kwargs, policy_delay=1)
-    assert recipe.joint_pass and learner.target == {}
-    expected = Joint(learner)
+    config, state = begun("crossq_jax", kwargs, policy_delay=1)
+    assert config.joint_pass and state.target == {}
+    expected = Joint(state)
 
-    learner = check(recipe, learner, expected)
+    state = check(config, state, expected)
 
     for i, layer in enumerate(expected.of_critics):
-        found = member(learner.critic.weights["statistics"]["body"], i)
+        found = member(state.critic.weights["statistics"]["body"], i)
         for name, held in layer.statistics.items():
             assert_same(found[name], held | {"steps": float(N_UPDATES)})
-    assert float(learner.actor.weights["statistics"]["body"]["BatchRenorm_0"]["steps"]) == N_UPDATES
+    assert float(state.actor.weights["statistics"]["body"]["BatchRenorm_0"]["steps"]) == N_UPDATES
 
 
 class Sale:
     """Fujimoto et al., NeurIPS 2023, section 4; LAP is equation 10 of NeurIPS 2020."""
 
-    def __init__(self, recipe, learner) -> None:
-        self.recipe, self.key = recipe, learner.key
-        parts = {n: plain(getattr(learner, n).weights["params"]) for n in ("encoder", "actor")}
+    def __init__(self, config, state) -> None:
+        self.update_config, self.key = config, state.key
+        parts = {n: plain(getattr(state, n).weights["params"]) for n in ("encoder", "actor")}
         self.encoder, self.actor = parts["encoder"], parts["actor"]
-        self.critic = plain(learner.critic.weights["params"])
+        self.critic = plain(state.critic.weights["params"])
         self.fixed = self.target_encoder = self.encoder
         self.target_actor, self.target_critic = self.actor, self.critic
         self.clip, self.range, self.n = (0.0, 0.0), [np.inf, -np.inf], 0
@@ -488,7 +494,7 @@ class Sale:
         own = average_l1(dense(w["Dense_0"], obs))
         return np.tanh(self._two(w["_Dense_0"], np.concatenate([own, state], -1), relu))
 
-    def judge(self, critic: Weights, obs: Any, action: Any, state: Any, both: Any) -> np.ndarray:
+    def q_values(self, critic: Weights, obs: Any, action: Any, state: Any, both: Any) -> np.ndarray:
         values = []
         for i in range(2):
             w = member(critic, i)
@@ -509,18 +515,18 @@ class Sale:
         def encoder_loss(w: Weights) -> float:
             return np.mean((self.embed(w, batch.obs, batch.action)[1] - wanted) ** 2)
 
-        noise = np.clip(self.recipe.target_noise * normal(noise_key), -0.5, 0.5)
+        noise = np.clip(self.update_config.target_noise * normal(noise_key), -0.5, 0.5)
         state, _ = self.embed(self.target_encoder, batch.next_obs, batch.action)
         action = np.clip(self.act(self.target_actor, batch.next_obs, state) + noise, -1.0, 1.0)
         embedded = self.embed(self.target_encoder, batch.next_obs, action)
-        value = self.judge(self.target_critic, batch.next_obs, action, *embedded).min(0)
+        value = self.q_values(self.target_critic, batch.next_obs, action, *embedded).min(0)
         alive = batch.discount * (1.0 - batch.terminated)
         y = batch.reward + alive * np.clip(value, *self.clip)
         self.range = [min(self.range[0], y.min()), max(self.range[1], y.max())]
         embedded = self.embed(self.fixed, batch.obs, batch.action)
 
         def errors(w: Weights) -> np.ndarray:
-            return np.abs(self.judge(w, batch.obs, batch.action, *embedded) - y)
+            return np.abs(self.q_values(w, batch.obs, batch.action, *embedded) - y)
 
         def critic_loss(w: Weights) -> float:
             e = errors(w)
@@ -529,17 +535,17 @@ class Sale:
         def actor_loss(w: Weights) -> float:
             action = self.act(w, batch.obs, embedded[0])
             both = self.embed(self.fixed, batch.obs, action)[1]
-            return -self.judge(self.critic, batch.obs, action, embedded[0], both).mean()
+            return -self.q_values(self.critic, batch.obs, action, embedded[0], both).mean()
 
         report = {"critic_loss": critic_loss(self.critic)}
         report["encoder_loss"] = encoder_loss(self.encoder)
         priorities = np.maximum(errors(self.critic).max(0), 1.0) ** 0.4
-        self.encoder = descend(encoder_loss, self.encoder, KNOBS.qf_learning_rate)
-        self.critic = descend(critic_loss, self.critic, KNOBS.qf_learning_rate)
-        if self.n % self.recipe.policy_delay == 0:
+        self.encoder = descend(encoder_loss, self.encoder, HYPER.qf_learning_rate)
+        self.critic = descend(critic_loss, self.critic, HYPER.qf_learning_rate)
+        if self.n % self.update_config.policy_delay == 0:
             report["actor_loss"] = actor_loss(self.actor)
-            self.actor = descend(actor_loss, self.actor, KNOBS.learning_rate)
-        if self.n % self.recipe.target_every == 0:
+            self.actor = descend(actor_loss, self.actor, HYPER.learning_rate)
+        if self.n % self.update_config.target_every == 0:
             self.target_actor, self.target_critic = self.actor, self.critic
             self.target_encoder, self.fixed = self.fixed, self.encoder
             self.clip = tuple(self.range)
@@ -547,25 +553,25 @@ class Sale:
 
 
 def test_td7_learns_embeddings_clips_targets_and_copies_them_late():
-    recipe, learner = begun("td7", {"embedding_size": 5}, target_update_interval=2)
-    encoder, actor, critic = (getattr(learner, n).weights for n in ("encoder", "actor", "critic"))
+    config, state = begun("td7", {"embedding_size": 5}, target_update_interval=2)
+    encoder, actor, critic = (getattr(state, n).weights for n in ("encoder", "actor", "critic"))
     fixed = td7_update.Copies(encoder, actor, critic, encoder)
-    learner = learner._replace(copies=fixed)
-    expected = Sale(recipe, learner)
-    report, given = before_any(td7_update.Report), batches(4)
-    rates = KNOBS.learning_rate, KNOBS.qf_learning_rate
+    state = state._replace(copies=fixed)
+    expected = Sale(config, state)
+    report, given = zero_metrics(td7_update.UpdateMetrics), batches(4)
+    rates = HYPER.learning_rate, HYPER.qf_learning_rate
 
     # The third update is the first one by copied networks, within the range of targets.
     for i in range(3):
         batch = jax.tree.map(lambda x, i=i: jnp.asarray(x[i]), given)
-        learner, report, priorities = td7_update.update(recipe, learner, batch, *rates, report)
+        state, report, priorities = td7_update.update(config, state, batch, *rates, report)
         said, wanted = expected.update(jax.tree.map(np.array, batch))
         assert_same({name: report._asdict()[name] for name in said}, said)
         assert_same(priorities, wanted)
 
     for name in ("encoder", "actor", "critic"):
-        assert_same(getattr(learner, name).weights["params"], getattr(expected, name))
-    assert_same(learner.copies.encoder["params"], expected.fixed)
-    assert_same(learner.copies.target_encoder["params"], expected.target_encoder)
-    assert_same(tuple(learner.clip), expected.clip)
-    assert tuple(learner.clip) != (0.0, 0.0)
+        assert_same(getattr(state, name).weights["params"], getattr(expected, name))
+    assert_same(state.copies.encoder["params"], expected.fixed)
+    assert_same(state.copies.target_encoder["params"], expected.target_encoder)
+    assert_same(tuple(state.clip), expected.clip)
+    assert tuple(state.clip) != (0.0, 0.0)

@@ -25,7 +25,7 @@ CONSOLE = (str(Path(sys.executable).with_name("rl_zoo3")),)
 MODULE = (sys.executable, "-m")
 # Small plans: these tests ask whether a command works, not how well the algorithm learns.
 QUICK = ("n_rollouts:8", "pretrain_epochs:1", "horizon:8", "gradient_steps:4", "n_random_plans:1")
-QUICK += ("n_iterations:1", "refit_freq:0")
+QUICK += ("refit_freq:0",)
 FEW = ("learning_starts:50", "train_freq:50", "gradient_steps:2", "batch_size:16")
 
 

@@ -145,7 +145,7 @@ def test_what_is_sampled_goes_with_what_the_file_says_of_the_policy(algo, study,
 
     assert model.policy_kwargs["net_arch"] == (narrow if algo == "bro" else [8, 8])
     if algo == "tqc_jax":
-        assert model.policy.recipe.n_critics == entry["policy_kwargs"]["n_critics"] == 5
+        assert model.policy.update_config.n_critics == entry["policy_kwargs"]["n_critics"] == 5
 
 
 def test_a_trial_has_memory_for_its_own_steps_alone():

@@ -38,10 +38,12 @@ ALGORITHMS: dict[str, Entry] = {
     "gsde_sac": Entry("GSDESAC", "model_free.sac.gsde_sac", _GAUSSIAN, "gsde"),
     "droq": Entry("DroQ", "model_free.sac.droq", _GAUSSIAN, "sac"),
     "crossq_jax": Entry(
-        "CrossQ", "model_free.sac.crossq", {"CrossQPolicy": _SAC_POLICY}, "model_free"
+        "CrossQ", "model_free.sac.crossq", {"CrossQPolicy": "model_free.sac.crossq"}, "model_free"
     ),
     "tqc_jax": Entry("TQC", "model_free.sac.tqc", _GAUSSIAN, "tqc"),
-    "simba": Entry("SimbaSAC", "model_free.sac.simba", {"SimbaSACPolicy": _SAC_POLICY}, "blocks"),
+    "simba": Entry(
+        "SimbaSAC", "model_free.sac.simba", {"SimbaSACPolicy": "model_free.sac.simba"}, "blocks"
+    ),
     "td7": Entry("TD7", "model_free.td7.algorithm", {"TD7Policy": "model_free.td7.policy"}, "td7"),
     "bro": Entry("BRO", "model_free.sac.bro", {"BroPolicy": "model_free.sac.bro"}, "blocks"),
     "openloop": Entry(

@@ -195,7 +195,7 @@ def _impossible(
 def _returns(
     model: BaseAlgorithm, env: VecEnv, n_episodes: int, encoders: str
 ) -> Float[np.ndarray, " episodes"]:
-    tracks = isinstance(model, OpenLoop) and (model.body or {}).get("control") == "track"
+    tracks = isinstance(model, OpenLoop) and (model.robot or {}).get("control") == "track"
     own = tracks and encoders == "own"
     before = model.policy.read_states if isinstance(model, OpenLoop) else None
     try:

@@ -3,7 +3,10 @@ and no measurement that is not finite."""
 
 import copy
 import io
+import numbers
 import pathlib
+import time
+import warnings
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -12,15 +15,25 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback, RolloutReturn
 
-from sb3_hds.algos.base.checks import check_buffer, check_buffer_class, check_log_interval
-from sb3_hds.algos.base.construct import check_origin, check_policy_kwargs
+from sb3_hds.algos.base.config import OffPolicyConfig, schedule_of
+from sb3_hds.algos.base.construct import (
+    check_buffer,
+    check_buffer_class,
+    check_log_interval,
+    check_origin,
+    check_policy_kwargs,
+)
 from sb3_hds.algos.base.executed_actions import executed
 from sb3_hds.algos.base.files import by_names, damaged, write_whole
-from sb3_hds.algos.base.pace import Pace
 from sb3_hds.algos.base.policy import TensorPolicy
 from sb3_hds.algos.base.saving import SavesTensors
 from sb3_hds.errors import EnvironmentMismatchError
 
+# Steps per second below which a learner says what would make it faster.
+_SLOW = 5.0
+# Of the first calls of ``train``, which compile, nothing is seen; then, so many updates are enough,
+# or so much time. [s]
+_COMPILING, _UPDATES, _SECONDS = 2, 100, 10.0
 _STATISTICS = ("obs_rms", "ret_rms", "returns")
 
 
@@ -33,28 +46,12 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
     #: what a policy class must extend
     policy_family: ClassVar[type[TensorPolicy]] = TensorPolicy
     policy: TensorPolicy
-    saved_by: str
     #: of ``VecNormalize``, as they were after the last step that was stored
     _statistics: dict[str, Any] | None = None
 
-    def _constructed(self, device: Any, set_up: bool) -> None:
-        """
-        The end of every constructor.
-
-        :param device: as it was passed
-        :param set_up: whether networks are made now; ``load`` has them made later
-        :raises ValueError: if there is no environment to make them for
-        """
-        self.saved_by, self._device_name = type(self).__name__, str(device)
+    def construct(self, config: OffPolicyConfig, **more: Any) -> None:
+        super().construct(config, **more)
         self._pace = Pace()
-        if not set_up:
-            return
-        if self.env is None:
-            raise ValueError(
-                f"{type(self).__name__} needs an environment, for example "
-                f"{type(self).__name__}('Pendulum-v1')."
-            )
-        self._setup_model()
 
     @property
     def network_seed(self) -> int:
@@ -110,6 +107,13 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         collected = super().collect_rollouts(*args, **kwargs)
         self._pace.collected(self, self.num_timesteps - before)
         return collected
+
+    def check_environment(self, config: Any) -> None:
+        """
+        :param config: the arguments, checked
+        :raises ValueError: for an argument that does not go with the environment
+        :raises EnvironmentMismatchError: for an environment that does not go with the arguments
+        """
 
     def remedies(self, updates_per_step: float) -> list[str]:
         """:return: what would make a slow learner faster, as arguments"""
@@ -199,7 +203,11 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         check_origin(type(self), self.saved_by)
         check_policy_kwargs(self.policy_class, self.policy_kwargs)
         self.policy_kwargs = by_names(self.policy_kwargs)
-        self.check_arguments()
+        if isinstance(self.learning_rate, str):
+            self.learning_rate = schedule_of(self.learning_rate)
+        elif isinstance(self.learning_rate, numbers.Real):
+            self.learning_rate = float(self.learning_rate)
+        self.check_environment(self.config)
         check_buffer_class(type(self), self.replay_buffer_class, self.observation_space)
         try:
             super()._setup_model()
@@ -212,12 +220,55 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_statistics", "_pace"]
 
-    def check_arguments(self) -> None:
-        """
-        :raises ValueError: for an argument that would otherwise fail later, or not at all
-        """
-
 
 def _is_finite(measured: Any) -> bool:
     parts = measured.values() if isinstance(measured, dict) else [measured]
     return all(np.isfinite(part).all() for part in parts)
+
+
+class Pace:
+    """
+    Looks at a learner's first hundred updates, once their programs are compiled. The environment,
+    and callbacks, may be as slow as they like.
+    """
+
+    def __init__(self) -> None:
+        self._calls, self._seconds, self._steps, self._updates = 0, 0.0, 0, 0
+        self._done = False
+        self.pause()
+
+    def pause(self) -> None:
+        """What comes next are no updates."""
+        self._since: float | None = None
+
+    def collected(self, model: "TensorAlgorithm", n_steps: int) -> None:
+        """
+        Updates may begin.
+
+        :param n_steps: of the environment, for which they are
+        """
+        if not self._done:
+            self._since = time.perf_counter()
+            self._new_steps, self._updates_before = n_steps, model._n_updates
+
+    def updated(self, model: "TensorAlgorithm") -> None:
+        """Updates, if there were some, have been made."""
+        if self._since is None or model._n_updates == self._updates_before:
+            return
+        seconds, self._since = time.perf_counter() - self._since, None
+        self._calls += 1
+        if self._calls <= _COMPILING:
+            return
+        self._seconds += seconds
+        self._steps += self._new_steps
+        self._updates += model._n_updates - self._updates_before
+        if self._updates < _UPDATES and self._seconds < _SECONDS:
+            return
+        self._done = True
+        rate = self._steps / max(self._seconds, 1e-9)
+        if rate < _SLOW:
+            remedies = model.remedies(self._updates / max(self._steps, 1))
+            warnings.warn(
+                f"{type(model).__name__} makes {rate:.2g} steps/s, since the updates for each of "
+                f"them take {1.0 / rate:.2g} s. What would make it faster: {'; '.join(remedies)}."
+            )

@@ -1,62 +1,32 @@
-"""The ways in which an algorithm may be called."""
+"""
+The ways in which an algorithm may be called; for each mistake, one line that says what to do.
+"""
 
 import inspect
 import math
 import numbers
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import jax
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.her import HerReplayBuffer
 
 from sb3_hds.algos import registry
-from sb3_hds.algos.base.checks import check_action_space, checked_env
-from sb3_hds.algos.twin.epoch import PLANNERS
+from sb3_hds.algos.base.config import is_whole
 from sb3_hds.errors import EnvironmentMismatchError, did_you_mean
 
-if TYPE_CHECKING:
-    from sb3_hds.algos.twin.algorithm import TwinAlgorithm
-
-# Counts, with the least that makes sense. Where None is the default, it means: derived.
-_AT_LEAST = {
-    "n_rollouts": 1,
-    "horizon": 1,
-    "lookahead": 0,
-    "n_iterations": 1,
-    "n_step_sizes": 2,
-    "n_random_plans": 0,
-    "plan_memory": 1,
-    "compare_every": 0,
-    "pretrain_epochs": 0,
-    "batch_size": 1,
-    "gradient_steps": -1,
-    "refit_freq": 0,
-    "replan_epochs": 0,
-    "diagnose_freq": 0,
-    "max_saved_steps": 1,
-}
-_DERIVED = ("horizon", "lookahead")
-_SHARES = (
-    "reset_share",
-    "relabel_share",
-    "random_share",
-    "learned_share",
-    "gain_weight",
-    "sensitivity_weight",
-    "averaging",
-    "exploration_decay",
-    "temperature_decay",
-)
-_OF_RESIDUAL = ("n_members", "net_arch", "caution")
+_LONGEST = 200
+_GOALS = {"observation", "achieved_goal", "desired_goal"}
 # What the constructors of policies are given by their algorithm, and what only SB3's have.
 _OF_ALGORITHMS = ("observation_space", "action_space", "lr_schedule", "use_sde")
 _OF_TORCH = (
@@ -65,11 +35,6 @@ _OF_TORCH = (
     "share_features_extractor",
     "normalize_images",
 )
-_CHOICES = {
-    "order": (1, 2),
-    "planner": (None, *PLANNERS),
-    "loss": ("smooth_absolute", "squared"),
-}
 
 
 def policy_and_env(
@@ -107,17 +72,6 @@ def policy_and_env(
 
 def _itself(env: gym.Env) -> gym.Env:
     return env
-
-
-def check_twin_observes(space: spaces.Space) -> None:
-    """
-    :raises EnvironmentMismatchError: for dictionaries, images and whatever else no twin has
-    """
-    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-        raise EnvironmentMismatchError(
-            f"A twin observes a Box with one axis, and this environment observes {space}. Use one "
-            "that has a twin (sb3_hds.twins.all_ids() lists them), or make your own of its state."
-        )
 
 
 def check_policy_kwargs(policy: type, policy_kwargs: Iterable[str]) -> None:
@@ -171,88 +125,164 @@ def check_origin(algorithm: type, saved_by: str) -> None:
         )
 
 
-def check_arguments(model: "TwinAlgorithm") -> None:
-    """
-    Everything that would otherwise fail inside a compiled program, or in the middle of training.
+def in_one_line(what: Any) -> str:
+    """:return: as it prints itself, shortened"""
+    text = " ".join(str(what).split())
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
-    :raises ValueError: naming the argument, what it may be and what it is
+
+def checked_env(algorithm: type, env: Any) -> Any:
     """
-    for name, allowed in _broken_rules(model):
-        raise ValueError(
-            f"{type(model).__name__}({name}={getattr(model, name)!r}): {name} must be {allowed}."
+    :param env: an environment, or its id
+    :return: the environment
+    :raises EnvironmentMismatchError: for anything else
+    """
+    name = algorithm.__name__
+    aliases = getattr(algorithm, "policy_aliases", {})
+    if isinstance(env, str) and env in aliases:
+        raise EnvironmentMismatchError(
+            f"{name}(env={env!r}): that is a policy. The policy comes first, as in "
+            f"{name}({env!r}, 'Pendulum-v1')."
         )
-    if model.value_learning_rate is not None:
-        schedule_of(model.value_learning_rate)
-
-
-def _broken_rules(model: "TwinAlgorithm") -> Iterator[tuple[str, str]]:
-    for name, least in _AT_LEAST.items():
-        if hasattr(model, name) and not is_count(
-            getattr(model, name), least, may_be_none=name in _DERIVED
-        ):
-            yield name, f"a whole number of at least {least}" + " or None" * (name in _DERIVED)
-    for name in _SHARES:
-        if not between(getattr(model, name), 0.0, 1.0):
-            yield name, "a number from 0 to 1"
-    for name in ("temperature", "exploration_noise", "least_gain", "randomisation"):
-        if not between(getattr(model, name), 0.0, math.inf):
-            yield name, "a finite number of at least 0"
-    if not (between(model.gamma, 0.0, 1.0) and model.gamma > 0.0):
-        yield "gamma", "a number above 0 and at most 1"
-    for name in ("learning_rate", "value_learning_rate"):
-        rate = getattr(model, name)
-        if isinstance(rate, numbers.Real) and not between(rate, 0.0, math.inf):
-            yield name, "a finite number of at least 0, or a schedule"
-    beta, kwargs = getattr(model, "beta", "auto"), getattr(model, "residual_kwargs", None)
-    if beta != "auto" and not between(beta, 0.0, 1.0):
-        yield "beta", "'auto' or a number from 0 to 1"
-    if not set(kwargs or ()) <= set(_OF_RESIDUAL):
-        yield "residual_kwargs", f"a dictionary with some of {', '.join(_OF_RESIDUAL)}"
-    for name, choices in _CHOICES.items():
-        if getattr(model, name) not in choices:
-            yield name, f"one of {', '.join(map(repr, choices))}"
-
-
-def is_count(value: Any, least: int, may_be_none: bool = False) -> bool:
-    """:return: whether it is a whole number of at least ``least``"""
-    if value is None:
-        return may_be_none
-    return isinstance(value, int | np.integer) and int(value) >= least
-
-
-def check_count(name: str, value: Any, least: int = 1) -> None:
-    """
-    :raises ValueError: unless it is a whole number of at least ``least``
-    """
-    if not is_count(value, least):
-        raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}.")
-
-
-def between(value: Any, low: float, high: float) -> bool:
-    """:return: whether it is a finite number from ``low`` to ``high``"""
-    if not isinstance(value, numbers.Real):
-        return False
-    return low <= float(value) <= high and math.isfinite(value)
-
-
-def schedule_of(rate: float | str | Schedule) -> Schedule:
-    """
-    :param rate: a number, a function of the remaining progress (from 1 to 0), or ``"lin_3e-3"`` as
-        in the zoo
-    :raises ValueError: for any other string, and for a negative number in one
-    """
-    if not isinstance(rate, str):
-        return FloatSchedule(float(rate) if isinstance(rate, numbers.Real) else rate)
-    kind, _, after = rate.partition("_")
-    try:
-        start = float(after if kind == "lin" else rate)
-    except ValueError:
-        start = math.nan
-    if not between(start, 0.0, math.inf):
-        raise ValueError(
-            f"A learning rate is a number of at least 0, a schedule or 'lin_NUMBER', got {rate!r}."
+    made = maybe_make_env(env, 0)
+    if isinstance(made, VectorEnv):
+        raise EnvironmentMismatchError(
+            f"{name} takes no vectorised environment of Gymnasium: wrap it in "
+            "sb3_hds.wrappers.GymnasiumVecEnv(env)."
         )
-    return FloatSchedule(LinearSchedule(start, 0.0, 1.0) if kind == "lin" else start)
+    needed = ("observation_space", "action_space", "reset", "step")
+    if isinstance(made, type) or not all(hasattr(made, each) for each in needed):
+        what = "a class or function: call it first" if callable(made) else "no environment"
+        raise EnvironmentMismatchError(
+            f"{name}(env={in_one_line(made)}): that is {what}. Pass an environment, as from "
+            "gymnasium.make('Pendulum-v1'), its id, or a VecEnv of SB3."
+        )
+    return made
+
+
+def check_action_space(algorithm: type, space: spaces.Space) -> None:
+    """
+    :raises EnvironmentMismatchError: unless actions are a Box with finite limits
+    """
+    name = algorithm.__name__
+    if not isinstance(space, spaces.Box):
+        raise EnvironmentMismatchError(
+            f"{name} acts by real numbers: it only supports a Box as action space, and this "
+            f"environment has {in_one_line(space)}. For choices, use DQN or PPO of "
+            "stable_baselines3."
+        )
+    with np.errstate(over="ignore"):
+        width = np.asarray(space.high, np.float32) - np.asarray(space.low, np.float32)
+    if not np.isfinite(width).all():
+        raise EnvironmentMismatchError(
+            f"{name} needs a finite lower and upper bound of each action, which it scales to [-1, "
+            f"1], and this environment has {in_one_line(space)}. Say what is sensible: "
+            "gymnasium.wrappers.TransformAction(env, lambda action: action, gymnasium.spaces.Box("
+            "low, high))."
+        )
+
+
+def check_buffer_class(algorithm: type, kind: Any, space: spaces.Space) -> None:
+    """
+    :param kind: of replay buffers; None: the usual one
+    :raises EnvironmentMismatchError: for hindsight where there are no goals
+    """
+    relabels = isinstance(kind, type) and issubclass(kind, HerReplayBuffer)
+    names = set(space.spaces) if isinstance(space, spaces.Dict) else set()
+    if relabels and not names >= _GOALS:
+        raise EnvironmentMismatchError(
+            f"{algorithm.__name__}(replay_buffer_class=HerReplayBuffer) relabels goals: it needs "
+            "observations that are a Dict with observation, achieved_goal and desired_goal, and "
+            f"this environment observes {in_one_line(space)}. Leave replay_buffer_class out, or "
+            "use an environment with goals (gymnasium_robotics)."
+        )
+
+
+def check_buffer(model: Any, buffer: Any, path: Any) -> None:
+    """
+    :param buffer: that was read
+    :raises EnvironmentMismatchError: if it is of another environment, or none
+    """
+    if not isinstance(buffer, ReplayBuffer):
+        raise EnvironmentMismatchError(
+            f"'{path}' holds a {type(buffer).__name__}, no replay buffer: pass the file that "
+            "save_replay_buffer wrote."
+        )
+    for name in ("observation_space", "action_space", "n_envs"):
+        own, its = getattr(model, name), getattr(buffer, name, None)
+        if its is not None and its != own:
+            raise EnvironmentMismatchError(
+                f"The replay buffer in '{path}' is of another environment: its {name} is "
+                f"{in_one_line(its)}, this model's {in_one_line(own)}. Load it into a model with "
+                "the environment that it was filled in."
+            )
+
+
+def check_has_env(model: Any) -> None:
+    """
+    :raises EnvironmentMismatchError: if there is nothing to learn in
+    """
+    if model.env is None:
+        name = type(model).__name__
+        raise EnvironmentMismatchError(
+            f"{name} has no environment to learn in: call set_env(env), or load it with one, as "
+            f"{name}.load(path, env=env)."
+        )
+
+
+def whole_steps(total_timesteps: Any) -> int:
+    """
+    :param total_timesteps: also as 1e5
+    :raises ValueError: unless it is a whole number of at least 0
+    """
+    number = float(total_timesteps) if isinstance(total_timesteps, numbers.Real) else math.nan
+    if not (number.is_integer() and number >= 0.0):
+        raise ValueError(
+            f"learn(total_timesteps={total_timesteps!r}): total_timesteps must be a whole number "
+            "of steps of at least 0."
+        )
+    return int(number)
+
+
+def check_log_interval(log_interval: Any) -> None:
+    """
+    :raises ValueError: unless it is None or a whole number of at least 1
+    """
+    if log_interval is not None and not (is_whole(log_interval) and log_interval >= 1):
+        raise ValueError(
+            f"learn(log_interval={log_interval!r}): log_interval must be None, for no log, or a "
+            "whole number of at least 1."
+        )
+
+
+def callbacks_of(given: Any) -> list[BaseCallback]:
+    """
+    :param given: a callback, a function of ``locals`` and ``globals``, a list of these, or None
+    :raises TypeError: for anything else
+    """
+    several = list(given) if isinstance(given, list | tuple) else [given]
+    found = [each for each in several if each is not None]
+    if not all(callable(each) or isinstance(each, BaseCallback) for each in found):
+        raise TypeError(
+            f"learn(callback={in_one_line(given)}): callback must be a BaseCallback of SB3, a "
+            "function of locals and globals, or a list of these."
+        )
+    return [each if isinstance(each, BaseCallback) else ConvertCallback(each) for each in found]
+
+
+def as_list(name: str, given: Any, kind: type) -> list[Any]:
+    """
+    :param name: of the argument
+    :param given: names or objects of a kind, or a single one
+    :raises TypeError: for anything else
+    """
+    several = [given] if isinstance(given, str | kind) else given
+    if not isinstance(several, Iterable) or not all(isinstance(x, str | kind) for x in several):
+        raise TypeError(
+            f"{name}={in_one_line(given)}: {name} must be a list of names, or of objects of "
+            f"{kind.__name__}."
+        )
+    return list(several)
 
 
 def device_or_cpu(device: Any) -> Any:

@@ -1,10 +1,13 @@
 """Policies whose networks are pytrees, saved as tensors."""
 
+import dataclasses
 from typing import Any, Self
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from sbx.common.policies import BaseJaxPolicy
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import get_device
 
 from sb3_hds.algos.base.files import (
@@ -40,6 +43,26 @@ def refuse_odd(observation: Any) -> None:
         )
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class PolicyConfig:
+    """
+    What SB3 passes to every policy.
+
+    :param observation_space: of the environment
+    :param action_space: a bounded Box
+    :param lr_schedule: learning rate by remaining progress
+    """
+
+    observation_space: spaces.Space
+    action_space: spaces.Box
+    lr_schedule: Schedule
+
+    def arguments(self) -> dict[str, Any]:
+        """:return: all but the spaces"""
+        names = [f.name for f in dataclasses.fields(self) if not f.name.endswith("_space")]
+        return {name: getattr(self, name) for name in names}
+
+
 class TensorPolicy(BaseJaxPolicy):
     """
     A policy whose networks are pytrees, saved as tensors.
@@ -71,6 +94,9 @@ class TensorPolicy(BaseJaxPolicy):
         """Rounding may lead out of the bounds, by one unit in the last place."""
         low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
         return np.clip(super().unscale_action(scaled_action), low, high)
+
+    def set_up(self) -> None:
+        """The end of every constructor: networks are drawn when they are first asked for."""
 
     def move_to(self, device: Any) -> None:
         """

@@ -1,27 +1,30 @@
 """Saving and loading of every algorithm: tensors, in files that are whole or not there."""
 
 import contextlib
+import inspect
 import io
 import os
 import pathlib
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_hds.algos import registry
-from sb3_hds.algos.base.checks import (
+from sb3_hds.algos.base.config import Config, arguments_of, check_known
+from sb3_hds.algos.base.construct import (
     callbacks_of,
-    check_given,
     check_has_env,
     checked_env,
+    device_or_cpu,
     in_one_line,
+    policy_and_env,
     whole_steps,
 )
-from sb3_hds.algos.base.construct import device_or_cpu
 from sb3_hds.algos.base.description import described
 from sb3_hds.algos.base.files import by_names, damage_reported, name_of, refuse_damaged, write_whole
 from sb3_hds.errors import EnvironmentMismatchError
@@ -65,9 +68,56 @@ class SavesTensors(BaseAlgorithm):
     policy_class = _ByName()  # type: ignore[assignment]  # SB3 annotates what it returns
     policy_description: dict[str, Any] | None
 
-    def __new__(cls, *args: Any, **given: Any) -> Self:
-        check_given(cls, given)
-        return super().__new__(cls)
+    #: the dataclass whose fields are the arguments of the constructor
+    config_class: ClassVar[type[Config]] = Config
+    saved_by: str
+    _device_name: str
+
+    def construct(self, config: Config, **more: Any) -> None:
+        """
+        Call SB3's constructor with what it takes of the arguments, and keep the others as
+        attributes.
+
+        :param more: arguments of SB3's constructor that are not the user's to choose
+        """
+        policy, env = policy_and_env(
+            type(self), config.policy, config.env, self.check_observations, config.monitor_wrapper
+        )
+        # Python's own generator, which SB3 seeds as well, takes no number of NumPy.
+        seed = None if config.seed is None else int(config.seed)
+        own: dict[str, Any] = {name: getattr(config, name) for name in arguments_of(config)}
+        # SB3 and SBX write into dictionaries: two models that were given the same are still two.
+        own = {name: dict(x) if isinstance(x, dict) else x for name, x in own.items()}
+        own |= {"policy": policy, "env": env, "seed": seed}
+        del own["device"]  # of torch, where SB3 has one
+        fixed = {"supported_action_spaces": (spaces.Box,), "support_multi_env": True, **more}
+        of_sb3 = inspect.signature(super().__init__).parameters
+        super().__init__(**{n: x for n, x in (own | fixed).items() if n in of_sb3})
+        for name in own.keys() - of_sb3.keys():
+            setattr(self, name, own[name])
+        self.saved_by, self._device_name = type(self).__name__, str(config.device)
+
+    def set_up(self) -> None:
+        """
+        The end of every constructor; ``load`` sets the model up later.
+
+        :raises ValueError: if there is no environment to make networks for
+        """
+        if self.env is None:
+            name = type(self).__name__
+            raise ValueError(f"{name} needs an environment, for example {name}('Pendulum-v1').")
+        self._setup_model()
+
+    @property
+    def config(self) -> Any:
+        """The arguments as the model's attributes have them now."""
+        return self.config_class.of(self)
+
+    @staticmethod
+    def check_observations(space: spaces.Space) -> None:
+        """
+        :raises EnvironmentMismatchError: for observations that the algorithm cannot use
+        """
 
     def save(
         self,
@@ -121,7 +171,7 @@ class SavesTensors(BaseAlgorithm):
         :raises ValueError: for a damaged file, or one that another algorithm saved
         :raises TypeError: for an argument that neither this nor the constructor has
         """
-        check_given(cls, kwargs, loading=True)
+        check_known(cls, cls.config_class, kwargs, loading=True)
         env = None if env is None else checked_env(cls, env)
         if kwargs.get("policy_kwargs"):
             kwargs["policy_kwargs"] = by_names(kwargs["policy_kwargs"])

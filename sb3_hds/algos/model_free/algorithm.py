@@ -1,12 +1,11 @@
 """What model-free algorithms share: SB3 collects steps and calls ``train``, which updates."""
 
-import inspect
+import dataclasses
 import itertools
 import math
-import numbers
 import warnings
 from abc import abstractmethod
-from collections import ChainMap
+from dataclasses import KW_ONLY
 from typing import Any, ClassVar, NoReturn
 
 import jax
@@ -15,9 +14,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import (
-    GymEnv,
     MaybeCallback,
     Schedule,
     TrainFreq,
@@ -26,11 +23,12 @@ from stable_baselines3.common.type_aliases import (
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_hds.algos.base.algorithm import TensorAlgorithm
-from sb3_hds.algos.base.construct import between, is_count, policy_and_env, schedule_of
+from sb3_hds.algos.base.config import Config, OffPolicyConfig, Rate, between, is_count, schedule_of
 from sb3_hds.algos.model_free.policy import LearningPolicy
+from sb3_hds.algos.model_free.replay import Source
 from sb3_hds.algos.nets.activations import finite_leaves
 from sb3_hds.algos.nets.observations import check_actions, check_observations
-from sb3_hds.algos.nets.optimizers import Trained
+from sb3_hds.algos.nets.optimizers import TrainState
 from sb3_hds.errors import DivergedError, EnvironmentMismatchError
 
 # What is logged of updates of the actor, which not every call of ``train`` makes.
@@ -40,27 +38,23 @@ _USUAL_BATCH = 256
 _LARGEST = float(np.finfo(np.float32).max)
 
 
-class ModelFreeAlgorithm(TensorAlgorithm):
+@dataclasses.dataclass(frozen=True, eq=False)
+class ModelFreeConfig(OffPolicyConfig):
     """
-    Abstract: off-policy learning from transitions.
+    Arguments of every model-free algorithm.
 
     :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` for Dict observations, ``"SimbaPolicy"``
         (not CrossQ, TD7 and BRO), a policy class, or the environment itself
-    :param env: an environment, its id, or a vectorised environment
-    :param learning_rate: of the actor and the entropy coefficient; number, schedule or
+    :param learning_rate: of the actor, the entropy coefficient and the critics; number, schedule or
         ``"lin_3e-4"``
-    :param qf_learning_rate: of the critics, likewise; None: as ``learning_rate``
-    :param buffer_size: transitions that are kept
+    :param qf_learning_rate: of the critics, where it differs
     :param learning_starts: steps with random actions before learning starts; where a paper has
         more (DroQ, CrossQ and SimBa 5,000, BRO 2,500), the files in ``hyperparams/`` have as many
         on the tasks of that paper
     :param batch_size: transitions per update
-    :param tau: how far the target networks follow in each update
-    :param gamma: discount per step
-    :param train_freq: steps between two calls of ``train``, or ``(n, "episode")``
-    :param gradient_steps: updates in each of them; -1: as many as steps were made
+    :param tau: weight of the online critics in the Polyak average of the target critics
+    :param gradient_steps: updates per call of ``train``; -1: as many as steps were made
     :param policy_delay: updates of the critics for each of the actor
-    :param action_noise: added to the actions
     :param replay_buffer_class: as in SB3
     :param replay_buffer_kwargs: as in SB3
     :param optimize_memory_usage: as in SB3; needs
@@ -69,110 +63,87 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         observations nor with ``optimize_memory_usage``
     :param use_sde: explore by gSDE instead of independent noise at each step; not with TD7, which
         adds noise to its actions
-    :param sde_sample_freq: steps after which its noise matrix is drawn again, in how many
-        collections (``train_freq``) they are made, where SB3 draws in each; -1: at the start of
-        each collection. Where collections are episodes, each begins with a new one
+    :param sde_sample_freq: steps between two draws of its noise matrix, however many collections
+        (``train_freq``) they take, where SB3 draws in each; -1: at the start of each collection.
+        Where collections are episodes, each starts with a new one
     :param use_sde_at_warmup: whether it also acts before ``learning_starts``
-    :param stats_window_size: episodes in the averages that are logged
-    :param tensorboard_log: folder for TensorBoard
-    :param policy_kwargs: see :class:`~sb3_hds.algos.model_free.sac.policy.GaussianPolicy`
-    :param param_resets: steps of the environment at which networks and their optimisers start
-        afresh; the entropy coefficient stays, but with BRO, and so does TD7's checkpoint
-    :param verbose: 0 nothing, 1 information, 2 debugging
-    :param seed: of all random numbers
-    :param device: ``"auto"``, ``"cpu"`` or ``"cuda"``, as JAX has it
-    :param monitor_wrapper: as in SB3
-    :param _init_setup_model: as in SB3
+    :param policy_kwargs: see :class:`~sb3_hds.algos.GaussianPolicy`
+    :param param_resets: steps of the environment at which networks and their optimisers are reset;
+        the entropy coefficient stays, except with BRO, and so does TD7's checkpoint
     """
+
+    _: KW_ONLY
+    qf_learning_rate: Rate | None = None
+    tau: float = 0.005
+    policy_delay: int = 1
+    replay_buffer_class: type[ReplayBuffer] | None = None
+    replay_buffer_kwargs: dict[str, Any] | None = None
+    optimize_memory_usage: bool = False
+    n_steps: int = 1
+    use_sde: bool = False
+    sde_sample_freq: int = -1
+    use_sde_at_warmup: bool = False
+    param_resets: list[int] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require_mapping("replay_buffer_kwargs")
+        self.require_counts({"policy_delay": 1, "n_steps": 1, "sde_sample_freq": -1})
+        self.require_range(0.0, 1.0, "from 0 to 1", "tau", "gamma")
+        if self.qf_learning_rate is not None:
+            self.require_rate("qf_learning_rate")
+        self.require(
+            self.param_resets is None or _are_rising_steps(self.param_resets),
+            "param_resets",
+            "None or a rising list of steps, such as [15_000, 50_000]",
+        )
+        made_with = (self.policy_kwargs or {}).get("use_sde", self.use_sde)
+        allowed = f"{made_with}, as when the networks were made"
+        self.require(self.use_sde == made_with, "use_sde", allowed)
+        given: Any = self.replay_buffer_class
+        fine = given is None or (isinstance(given, type) and issubclass(given, ReplayBuffer))
+        self.require(fine, "replay_buffer_class", "None or a class of replay buffers")
+        if given is None and self.n_steps > 1:
+            shares = self.optimize_memory_usage
+            self.require(not shares, "optimize_memory_usage", "False where n_steps > 1")
+        ends = (self.replay_buffer_kwargs or {}).get("handle_timeout_termination", True)
+        self.require(
+            not (self.optimize_memory_usage and ends),
+            "optimize_memory_usage",
+            "False, unless time limits may count as ends: "
+            "replay_buffer_kwargs={'handle_timeout_termination': False}",
+        )
+
+
+class ModelFreeAlgorithm(TensorAlgorithm):
+    """Abstract: off-policy learning from transitions."""
 
     #: steps of ``learn()`` without a number
     default_timesteps: ClassVar[int] = 20_000
     policy: LearningPolicy
     qf_learning_rate: Any
+    policy_delay: int
     #: the replay buffer that arguments led to, where none was passed
     _derived_buffer: type[ReplayBuffer] | None = None
-    #: the learner before the last update
+    #: the state before the last update
     _before: Any = None
     #: the ``param_resets`` that ``reset_idx`` counts in
     _counted_resets: list[int] | None = None
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: float | str | Schedule = 3e-4,
-        *,
-        qf_learning_rate: float | str | Schedule | None = None,
-        buffer_size: int = 1_000_000,
-        learning_starts: int = 100,
-        batch_size: int = 256,
-        tau: float = 0.005,
-        gamma: float = 0.99,
-        train_freq: int | tuple[int, str] = 1,
-        gradient_steps: int = 1,
-        policy_delay: int = 1,
-        action_noise: ActionNoise | None = None,
-        replay_buffer_class: type[ReplayBuffer] | None = None,
-        replay_buffer_kwargs: dict[str, Any] | None = None,
-        optimize_memory_usage: bool = False,
-        n_steps: int = 1,
-        use_sde: bool = False,
-        sde_sample_freq: int = -1,
-        use_sde_at_warmup: bool = False,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        param_resets: list[int] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: str = "auto",
-        monitor_wrapper: bool = True,
-        _init_setup_model: bool = True,
-    ) -> None:
-        policy_class, made_env = policy_and_env(
-            type(self), policy, env, check_observations, monitor_wrapper
-        )
-        super().__init__(
-            policy=policy_class,
-            env=made_env,
-            learning_rate=learning_rate,  # type: ignore[arg-type]  # a name until it is set up
-            qf_learning_rate=None,
-            buffer_size=buffer_size,
-            learning_starts=learning_starts,
-            batch_size=batch_size,
-            tau=tau,
-            gamma=gamma,
-            train_freq=train_freq,
-            gradient_steps=gradient_steps,
-            action_noise=action_noise,
-            replay_buffer_class=replay_buffer_class,
-            # SB3 and SBX write into both: two models that were given the same are still two.
-            replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),
-            optimize_memory_usage=optimize_memory_usage,
-            n_steps=n_steps,
-            policy_kwargs=dict(policy_kwargs or {}),
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            # Python's own generator, which SB3 seeds as well, takes no number of NumPy.
-            seed=None if seed is None else int(seed),
-            use_sde=use_sde,
-            sde_sample_freq=sde_sample_freq,
-            use_sde_at_warmup=use_sde_at_warmup,
-            param_resets=param_resets,
-            monitor_wrapper=monitor_wrapper,
-            supported_action_spaces=(spaces.Box,),
-            support_multi_env=True,
-        )
-        if n_steps > 1 and replay_buffer_class is not None:
+    def construct(self, config: ModelFreeConfig, **more: Any) -> None:  # type: ignore[override]
+        kind = config.replay_buffer_class
+        if config.n_steps > 1 and kind is not None:
             warnings.warn(
-                f"n_steps={n_steps} is ignored with replay_buffer_class="
-                f"{replay_buffer_class.__name__}: use SB3's NStepReplayBuffer with "
-                f"replay_buffer_kwargs={{'n_steps': {n_steps}, 'gamma': {gamma}}}."
+                f"n_steps={config.n_steps} is ignored with replay_buffer_class={kind.__name__}: "
+                "use SB3's NStepReplayBuffer with replay_buffer_kwargs="
+                f"{{'n_steps': {config.n_steps}, 'gamma': {config.gamma}}}."
             )
-        self.qf_learning_rate = qf_learning_rate
-        self.policy_delay = policy_delay
-        self._constructed(device, _init_setup_model)
+        buffer_kwargs = config.replay_buffer_kwargs or {}
+        more = {"qf_learning_rate": None, "replay_buffer_kwargs": dict(buffer_kwargs), **more}
+        super().construct(config, **more)
+        self.qf_learning_rate = config.qf_learning_rate
+
+    check_observations = staticmethod(check_observations)
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
@@ -215,12 +186,12 @@ class ModelFreeAlgorithm(TensorAlgorithm):
                 f"{type(self).__name__} has nothing to learn from: its replay buffer is empty. "
                 "Call learn(), or load_replay_buffer(path) first."
             )
-        before = int(self.policy.learner.n_updates)
+        before = int(self.policy.agent_state.n_updates)
         try:
             report = self._updates(gradient_steps, batch_size)
         finally:
             # Interrupted, some of them were made.
-            now = int(self.policy.learner.n_updates)
+            now = int(self.policy.agent_state.n_updates)
             self._n_updates += now - before
         improved = now // self.policy_delay > before // self.policy_delay
         silent = () if improved else _OF_ACTOR
@@ -232,7 +203,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             if name not in silent:
                 self.logger.record(f"train/{name}", value)
 
-    def _take(self, learner: Any, report: dict[str, float]) -> None:
+    def _take(self, state: Any, report: dict[str, float]) -> None:
         """
         Go on with what an update made of the networks.
 
@@ -241,7 +212,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         """
         if not all(map(math.isfinite, report.values())):
             self._give_up(f"an update diverged ({report})")
-        self._before, self.policy.learner = self.policy.learner, learner
+        self._before, self.policy.agent_state = self.policy.agent_state, state
 
     def remedies(self, updates_per_step: float) -> list[str]:
         (pi, qf), narrow, freq = self.policy.widths, self.policy.narrow, self.train_freq
@@ -259,12 +230,12 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         return [*found, "a GPU"]
 
     def check_weights(self) -> None:
-        if not finite_leaves(_trained(self.policy.learner)):
+        if not finite_leaves(_trained(self.policy.agent_state)):
             self._give_up("an update made weights that are not finite")
 
     def _give_up(self, what: str) -> NoReturn:
-        if self._before is not None and not finite_leaves(_trained(self.policy.learner)):
-            self.policy.learner = self._before
+        if self._before is not None and not finite_leaves(_trained(self.policy.agent_state)):
+            self.policy.agent_state = self._before
             self.policy.forget_noise()
         raise DivergedError(
             f"{type(self).__name__}: {what}. The model keeps its last good state; lower "
@@ -312,6 +283,12 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         if buffer.handle_timeout_termination:
             buffer.timeouts[buffer.pos - 1, goes_on] = 1.0
 
+    @property
+    def replay_source(self) -> Source:
+        """What batches are drawn from."""
+        normalizer = self.get_vec_normalize_env()
+        return Source(self.replay_buffer, normalizer, self.policy.flatten, self.gamma)
+
     def learning_rates(self) -> tuple[float, float]:
         """:return: of the actor and of the critics, at this point of the training"""
         rate = self._rate("learning_rate", self.lr_schedule)
@@ -334,96 +311,25 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             )
         return rate
 
-    def check_arguments(self) -> None:
+    def check_environment(self, config: Any) -> None:
         check_actions(self.action_space)  # type: ignore[arg-type]  # SB3 has refused all but Box
-        counts = {
-            "buffer_size": 1,
-            "learning_starts": 0,
-            "batch_size": 1,
-            "policy_delay": 1,
-            "gradient_steps": -1,
-            "n_steps": 1,
-            "sde_sample_freq": -1,
-        }
-        for name, fewest in counts.items():
-            fine = is_count(getattr(self, name), fewest)
-            self.refuse_unless(fine, name, f"a whole number of at least {fewest}")
-        self._check_collection()
-        for name in ("tau", "gamma"):
-            self.refuse_unless(between(getattr(self, name), 0.0, 1.0), name, "from 0 to 1")
-        for name in ("learning_rate", "qf_learning_rate"):
-            rate = getattr(self, name)
-            fine = not isinstance(rate, numbers.Real) or between(rate, 0.0, math.inf)
-            self.refuse_unless(fine, name, "a number of at least 0, or a schedule")
-        if self.qf_learning_rate is not None:
-            schedule_of(self.qf_learning_rate)
-        self.refuse_unless(
-            self.param_resets is None or _are_rising_steps(self.param_resets),
-            "param_resets",
-            "None or a rising list of steps, such as [15_000, 50_000]",
-        )
-        made_with = self.policy_kwargs.get("use_sde", self.use_sde)
-        self.refuse_unless(
-            self.use_sde == made_with, "use_sde", f"{made_with}, as when the networks were made"
-        )
-        usual_buffer = self.replay_buffer_class is None
-        if usual_buffer and self.n_steps > 1:
-            self._check_n_step_buffer()
-        ends = self.replay_buffer_kwargs.get("handle_timeout_termination", True)
-        self.refuse_unless(
-            not (self.optimize_memory_usage and ends),
-            "optimize_memory_usage",
-            "False, unless time limits may count as ends: "
-            "replay_buffer_kwargs={'handle_timeout_termination': False}",
-        )
-
-    def _check_n_step_buffer(self) -> None:
-        if isinstance(self.observation_space, spaces.Dict):
+        derived = config.replay_buffer_class is None
+        if derived and config.n_steps > 1 and isinstance(self.observation_space, spaces.Dict):
             raise EnvironmentMismatchError(
                 "n_steps > 1 needs SB3's NStepReplayBuffer, which has no Dict observation spaces: "
                 "use n_steps=1, or gymnasium.wrappers.FlattenObservation."
             )
-        self.refuse_unless(
-            not self.optimize_memory_usage, "optimize_memory_usage", "False where n_steps > 1"
-        )
 
-    def _check_collection(self) -> None:
-        freq: Any = self.train_freq
-        fewest, unit = freq if isinstance(freq, tuple) and len(freq) == 2 else (freq, "step")
-        units = [each.value for each in TrainFrequencyUnit]
-        fine = is_count(fewest, 1) and getattr(unit, "value", unit) in units
-        self.refuse_unless(fine, "train_freq", "a number of at least 1, or (n, 'episode')")
-        fine = self.action_noise is None or isinstance(self.action_noise, ActionNoise)
-        self.refuse_unless(fine, "action_noise", "None or an ActionNoise of SB3")
-        given: Any = self.replay_buffer_class
-        fine = given is None or (isinstance(given, type) and issubclass(given, ReplayBuffer))
-        self.refuse_unless(fine, "replay_buffer_class", "None or a class of replay buffers")
-
-    def refuse_unless(self, fine: bool, name: str, allowed: str) -> None:
+    def warn_of_unused(self, config: Config, *names: str, why: str) -> None:
         """
-        :raises ValueError: unless it is fine
-        """
-        if not fine:
-            got = getattr(self, name)
-            raise ValueError(f"{type(self).__name__}({name}={got!r}): {name} must be {allowed}.")
-
-    def warn_unless_usual(self, *names: str, why: str) -> None:
-        """
-        :param names: of arguments that do nothing here
+        :param names: of arguments that have no effect here
         :param why: not
         """
-        usual = ChainMap(
-            *({**inspect.signature(kind.__init__).parameters} for kind in type(self).__mro__)
-        )
-        idle = [name for name in names if getattr(self, name) != usual[name].default]
-        if idle:
-            warnings.warn(f"{type(self).__name__} does not look at {', '.join(idle)}: {why}.")
+        unused = [name for name in names if not config.is_default(name)]
+        if unused:
+            warnings.warn(f"{type(self).__name__} does not look at {', '.join(unused)}: {why}.")
 
     def _setup_model(self) -> None:
-        if isinstance(self.learning_rate, str):
-            self.learning_rate = schedule_of(self.learning_rate)
-        elif isinstance(self.learning_rate, numbers.Real):
-            self.learning_rate = float(self.learning_rate)
         # Of None, SBX makes the first number of ``learning_rate``.
         given, self._before = self.qf_learning_rate, None
         derived = self.replay_buffer_class in (None, self._derived_buffer)
@@ -468,7 +374,7 @@ def _are_rising_steps(given: Any) -> bool:
     return all(before < after for before, after in itertools.pairwise(given))
 
 
-def _trained(learner: Any) -> list[Any]:
+def _trained(state: Any) -> list[Any]:
     """:return: all that optimisers change, with their own state"""
-    parts = jax.tree.leaves(learner, is_leaf=lambda part: isinstance(part, Trained))
-    return [part for part in parts if isinstance(part, Trained)]
+    parts = jax.tree.leaves(state, is_leaf=lambda part: isinstance(part, TrainState))
+    return [part for part in parts if isinstance(part, TrainState)]

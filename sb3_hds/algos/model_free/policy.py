@@ -11,17 +11,17 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import is_vectorized_observation
 
 from sb3_hds.algos.base.policy import TensorPolicy, TrainingTensors
-from sb3_hds.algos.nets.optimizers import Trained
+from sb3_hds.algos.nets.optimizers import TrainState
 from sb3_hds.core.numerics.compilation import GENERATOR
 
 
 class LearningPolicy(TensorPolicy):
     """
-    Abstract: a policy that holds a learner, a named tuple of networks with their optimisers
-    (:class:`~sb3_hds.algos.nets.optimizers.Trained`), a random ``key``, and more.
+    Abstract: a policy that holds a state, a named tuple of networks with their optimisers
+    (:class:`~sb3_hds.algos.nets.optimizers.TrainState`), a random ``key``, and more.
     """
 
-    #: fields of the learner that are saved with the networks, not with their optimisers
+    #: fields of the state that are saved with the networks, not with their optimisers
     held: ClassVar[tuple[str, ...]]
     #: hidden widths of the actor and of the critics
     widths: tuple[tuple[int, ...], tuple[int, ...]]
@@ -32,7 +32,7 @@ class LearningPolicy(TensorPolicy):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._learner: Any = None
+        self._agent_state: Any = None
         self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
 
     @abstractmethod
@@ -53,8 +53,8 @@ class LearningPolicy(TensorPolicy):
         """Updates, and actions by which the policy explores, draw from here on by this seed."""
         # Networks of this seed were drawn by the key that is folded here.
         key = jax.random.fold_in(jax.random.key(seed, impl=GENERATOR), 1)
-        placed = jax.device_put(key, self.learner.key.sharding)
-        self.learner = self.learner._replace(key=placed)
+        placed = jax.device_put(key, self.agent_state.key.sharding)
+        self.agent_state = self.agent_state._replace(key=placed)
 
     def forget_noise(self) -> None:
         """What was drawn for several steps is drawn anew, where a policy explores so."""
@@ -65,18 +65,18 @@ class LearningPolicy(TensorPolicy):
         return self
 
     @property
-    def learner(self) -> Any:
+    def state(self) -> Any:
         """What updates change."""
-        if self._learner is None:
+        if self._agent_state is None:
             self.build_plain()
-        return self._learner
+        return self._agent_state
 
-    @learner.setter
-    def learner(self, learner: Any) -> None:
-        self._learner = learner
+    @state.setter
+    def state(self, state: Any) -> None:
+        self._agent_state = state
 
     def move_to(self, device: Any) -> None:
-        self.learner = jax.device_put(self.learner, device)
+        self.agent_state = jax.device_put(self.agent_state, device)
 
     def prepare_obs(self, observation: Any) -> tuple[Any, bool]:
         space = self.observation_space
@@ -100,8 +100,8 @@ class LearningPolicy(TensorPolicy):
 
     @property
     def weights(self) -> Any:
-        fields = self.learner._asdict()
-        networks = {n: part.weights for n, part in fields.items() if isinstance(part, Trained)}
+        fields = self.agent_state._asdict()
+        networks = {n: part.weights for n, part in fields.items() if isinstance(part, TrainState)}
         return networks | {name: fields[name] for name in self.held}
 
     @weights.setter
@@ -111,9 +111,9 @@ class LearningPolicy(TensorPolicy):
     @property
     def training_state(self) -> Any:
         """Random keys are stored as 64-bit integers, which torch can hold."""
-        fields = self.learner._asdict()
+        fields = self.agent_state._asdict()
         state = {
-            name: part.optimizer if isinstance(part, Trained) else part
+            name: part.optimizer if isinstance(part, TrainState) else part
             for name, part in fields.items()
             if name not in self.held
         }
@@ -123,15 +123,15 @@ class LearningPolicy(TensorPolicy):
     def training_state(self, tree: Any) -> None:
         data = jnp.asarray(np.asarray(tree["key"]).astype(np.uint32))
         key = jax.random.wrap_key_data(data, impl=GENERATOR)
-        placed = jax.device_put(key, self.learner.key.sharding)
+        placed = jax.device_put(key, self.agent_state.key.sharding)
         self._take("optimizer", tree | {"key": placed})
 
     def _take(self, of_networks: str, tree: Any) -> None:
-        before = self.learner._asdict()
+        before = self.agent_state._asdict()
         after = {
             name: before[name]._replace(**{of_networks: part})
-            if isinstance(before[name], Trained)
+            if isinstance(before[name], TrainState)
             else part
             for name, part in tree.items()
         }
-        self.learner = self.learner._replace(**after)
+        self.agent_state = self.agent_state._replace(**after)

@@ -1,6 +1,6 @@
 """Activation functions by name, of JAX or of torch, and small questions about networks."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -130,6 +130,24 @@ def widths_of(given: Any) -> tuple[int, ...] | None:
     if not all(isinstance(width, int | np.integer) and width > 0 for width in given):
         return None
     return tuple(map(int, given))
+
+
+def widths(
+    net_arch: Sequence[int] | Mapping[str, Sequence[int]], critic: str
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """
+    :param critic: the key of the critics' widths, where those of the actor differ
+    :return: hidden widths of the actor and of the critics
+    :raises ValueError: for other keys than ``pi`` and that one, or widths that are no counts
+    """
+    given = net_arch if isinstance(net_arch, Mapping) else {"pi": net_arch, critic: net_arch}
+    pi, qf = (widths_of(given.get(name)) for name in ("pi", critic))
+    if given.keys() != {"pi", critic} or pi is None or qf is None:
+        raise ValueError(
+            f"net_arch must be a list of widths such as [256, 256], or {{'pi': [256], '{critic}': "
+            f"[256, 256]}}, got {net_arch!r}."
+        )
+    return pi, qf
 
 
 def finite_leaves(tree: Any) -> bool:

@@ -75,7 +75,7 @@ class Mlp(nn.Module):
         return x
 
 
-class SimbaBody(nn.Module):
+class SimbaNet(nn.Module):
     """
     Residual blocks on a linear path: layer norm, a layer four times as wide, and back.
 
@@ -103,7 +103,7 @@ class SimbaBody(nn.Module):
         return nn.LayerNorm()(x) if self.net_arch else x
 
 
-class BroBody(nn.Module):
+class BroNet(nn.Module):
     """
     Residual blocks with layer norm after each dense layer.
 

@@ -16,7 +16,7 @@ from sb3_hds.errors import EnvironmentMismatchError
 _EPSILON = 1e-8
 
 
-class Seen(NamedTuple):
+class RunningStats(NamedTuple):
     """
     Running mean and variance of the observations of the environment.
 
@@ -28,10 +28,10 @@ class Seen(NamedTuple):
     count: Float[Array, ""]
 
     @classmethod
-    def nothing(cls, n_obs: int) -> "Seen":
+    def empty(cls, n_obs: int) -> "RunningStats":
         return cls(jnp.zeros(n_obs), jnp.ones(n_obs), jnp.zeros(()))
 
-    def with_more(self, obs: np.ndarray) -> "Seen":
+    def with_more(self, obs: np.ndarray) -> "RunningStats":
         """
         :param obs: shape ``(n, obs)``
         :return: as if they had been there from the start (Chan et al. 1983), on the host
@@ -42,14 +42,14 @@ class Seen(NamedTuple):
         away = more - mean
         squares = n * variance + obs.var(0, np.float64) * n_more + away**2 * n * n_more / total
         parts = (mean + away * n_more / total, squares / total, np.asarray(total))
-        return Seen(*(part.astype(np.float32) for part in parts))  # type: ignore[arg-type]
+        return RunningStats(*(part.astype(np.float32) for part in parts))  # type: ignore[arg-type]
 
 
-def seen(scales: Seen, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch obs"]:
+def normalize(stats: RunningStats, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch obs"]:
     """:return: observations in units of what was seen so far; before anything was, as they are"""
-    known = scales.count > 1.0
-    std = jnp.sqrt(jnp.where(known, scales.variance, 1.0) + _EPSILON)
-    return (obs - jnp.where(known, scales.mean, 0.0)) / std
+    known = stats.count > 1.0
+    std = jnp.sqrt(jnp.where(known, stats.variance, 1.0) + _EPSILON)
+    return (obs - jnp.where(known, stats.mean, 0.0)) / std
 
 
 def check_observations(space: spaces.Space) -> None:

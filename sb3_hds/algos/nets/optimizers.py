@@ -38,7 +38,7 @@ _TORCH: dict[str, dict[str, Any]] = {
 }
 
 
-class Trained(NamedTuple):
+class TrainState(NamedTuple):
     """
     :param weights: flax variables, ``"params"`` and, where there are some, ``"statistics"``
     :param optimizer: state of the optimiser of the params
@@ -63,12 +63,12 @@ class Optimizer:
     def init(self, params: Any) -> Any:
         return self._transformation.init(params)
 
-    def apply(self, gradient: Any, trained: Trained, rate: Any) -> Trained:
+    def apply(self, gradient: Any, trained: TrainState, rate: Any) -> TrainState:
         params = trained.weights["params"]
         step, state = self._transformation.update(gradient, trained.optimizer, params)
         step = jax.tree.map(lambda s: rate * s, step)
         weights = {**trained.weights, "params": optax.apply_updates(params, step)}
-        return Trained(weights, state)
+        return TrainState(weights, state)
 
     @property
     def _transformation(self) -> optax.GradientTransformation:

@@ -1,6 +1,6 @@
 """Open loop: a few oscillators move the joints, and CMA-ES finds their constants."""
 
-import math
+import dataclasses
 import secrets
 import sys
 import time
@@ -9,29 +9,32 @@ from functools import partial
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_hds.algos.base.checks import check_log_interval, whole_steps
-from sb3_hds.algos.base.construct import between, check_origin, is_count, jax_device, policy_and_env
+from sb3_hds.algos.base.config import takes
+from sb3_hds.algos.base.construct import (
+    check_log_interval,
+    check_origin,
+    jax_device,
+    whole_steps,
+)
 from sb3_hds.algos.base.policy import TensorPolicy
 from sb3_hds.algos.base.saving import SavesTensors
 from sb3_hds.algos.open_loop import cma_es
+from sb3_hds.algos.open_loop.config import OpenLoopConfig
 from sb3_hds.algos.open_loop.gait import Constants, GaitSpace
 from sb3_hds.algos.open_loop.policy import OscillatorPolicy
 from sb3_hds.algos.open_loop.robot import (
-    Body,
-    body_of,
+    Robot,
     refuse_without_state,
-    space_of,
+    robot_of,
     state_vectors,
 )
 from sb3_hds.algos.open_loop.rollouts import Trial, Trials
-from sb3_hds.core.transforms.oscillators import LEADS
 from sb3_hds.errors import EnvironmentMismatchError, ParameterError
 
 
@@ -67,37 +70,6 @@ class OpenLoop(SavesTensors):
     Resets between the ends of episodes have to be allowed (``Monitor(allow_early_resets=True)``,
     the default). A ``VecEnv`` that cannot reset one of its copies runs whole episodes from whatever
     starts it draws.
-
-    :param policy: ``"MlpPolicy"`` (there is no other, and no network in it), or the environment
-    :param env: an environment, its id, or a vectorised environment: candidates run in parallel
-    :param population_size: candidates in a generation; None: ``4 + 3 log(dim)``
-    :param n_resets: episodes of each candidate in a generation
-    :param horizon: steps of such an episode; None: until it ends
-    :param initial_sigma: standard deviation of the first generation, before squashing
-    :param n_elites: best candidates so far that are ranked in the end
-    :param ranking_share: of the steps of ``learn``, for the ranking
-    :param kp: command per rad of error
-    :param kd: command per rad/s
-    :param gain_factor: gains are searched up and down by it; 1: not
-    :param amplitude: largest one [rad]; where there are no joints, in half ranges of the command
-    :param offset: largest one [rad] up and down from where the model rests, likewise
-    :param frequency: smallest and largest [Hz]
-    :param same_frequency: one for swing and stance
-    :param phases: False: all joints move together
-    :param gait: all legs do the same, each with a lead of its own: ``"trot"``, ``"pace"``,
-        ``"bound"`` or ``"walk"`` of the legs front left, front right, hind left, hind right, or a
-        lead for each leg [rad]. Joints come leg by leg, of the same sense. None: each for itself
-    :param control: ``"track"`` joints, ``"direct"`` commands, or ``"auto"``
-    :param joints: read from the ``"observation"``, from the ``"env"``, or ``"auto"``
-    :param dt: how long a step takes [s]; None: as the environment says
-    :param stats_window_size: episodes in the averages that are logged
-    :param tensorboard_log: folder for TensorBoard
-    :param policy_kwargs: the policy has none
-    :param verbose: 0 nothing, 1 information, 2 debugging
-    :param seed: of all random numbers
-    :param device: ``"auto"``, ``"cpu"`` or ``"cuda"``, as JAX has it
-    :param monitor_wrapper: as in SB3
-    :param _init_setup_model: as in SB3
     """
 
     default_timesteps: ClassVar[int] = 200_000
@@ -109,162 +81,45 @@ class OpenLoop(SavesTensors):
     policy_family: ClassVar[type[TensorPolicy]] = OscillatorPolicy
     policy: OscillatorPolicy
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
-        env: GymEnv | str | None = None,
-        *,
-        population_size: int | None = None,
-        n_resets: int = 2,
-        horizon: int | None = None,
-        initial_sigma: float = 1.0,
-        n_elites: int = 5,
-        ranking_share: float = 0.15,
-        kp: float = 3.0,
-        kd: float = 0.2,
-        gain_factor: float = 4.5,
-        amplitude: float = 1.0,
-        offset: float = 0.5,
-        frequency: Sequence[float] = (0.4, 4.0),
-        same_frequency: bool = False,
-        phases: bool = True,
-        gait: str | Sequence[float] | None = None,
-        control: str = "auto",
-        joints: str = "auto",
-        dt: float | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: str = "auto",
-        monitor_wrapper: bool = True,
-        _init_setup_model: bool = True,
-    ) -> None:
-        policy_class, made_env = policy_and_env(
-            type(self), policy, env, lambda space: None, monitor_wrapper
-        )
-        self.population_size = population_size
-        self.n_resets = n_resets
-        self.horizon = horizon
-        self.initial_sigma = initial_sigma
-        self.n_elites = n_elites
-        self.ranking_share = ranking_share
-        self.kp, self.kd, self.gain_factor = kp, kd, gain_factor
-        self.amplitude, self.offset = amplitude, offset
-        self.frequency = np.atleast_1d(np.asarray(frequency, float)).tolist()
-        self.same_frequency, self.phases = same_frequency, phases
-        self.gait: Any = gait
-        if isinstance(gait, Sequence) and not isinstance(gait, str):
-            self.gait = list(gait)
-        self.control, self.joints, self.dt = control, joints, dt
-        self.body: dict[str, Any] | None = None
-        super().__init__(
-            policy=policy_class,
-            env=made_env,
-            learning_rate=0.0,  # SB3 wants one; nothing here has it
-            policy_kwargs=dict(policy_kwargs or {}),
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            monitor_wrapper=monitor_wrapper,
-            seed=seed,
-            supported_action_spaces=(spaces.Box,),
-            support_multi_env=True,
-        )
-        self.saved_by = type(self).__name__
-        self._device_name = str(device)
-        if _init_setup_model:
-            if self.env is None:
-                raise ValueError(
-                    f"{type(self).__name__} needs an environment, for example "
-                    f"{type(self).__name__}('Swimmer-v5')."
-                )
-            self._setup_model()
+    config_class = OpenLoopConfig
+
+    @takes(OpenLoopConfig)
+    def __init__(self, config: OpenLoopConfig) -> None:
+        self.construct(config)
+
+    def construct(self, config: OpenLoopConfig, **more: Any) -> None:  # type: ignore[override]
+        frequency: Any = np.atleast_1d(np.asarray(config.frequency, float)).tolist()
+        gait = config.gait if isinstance(config.gait, str | None) else list(config.gait)
+        config = dataclasses.replace(config, frequency=frequency, gait=gait)
+        # SB3 wants a learning rate; nothing here has one.
+        super().construct(config, learning_rate=0.0, **more)
+        self.robot: dict[str, Any] | None = None
 
     def _setup_model(self) -> None:
         check_origin(type(self), self.saved_by)
-        self.check_arguments()
+        _ = self.config  # checks the arguments, after loading, too
         jax_device(self._device_name)
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         if self.env is not None:
             self._meet(self.env)
-        assert self.body is not None
+        assert self.robot is not None
         self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space,
             self.action_space,
             self.lr_schedule,
-            body=self.body,
+            robot=self.robot,
             **self.policy_kwargs,
         )
         self._bind()
         self._restart(np.zeros(self.gait_space.dim))
         self.policy.constants = self.gait_space.decode(self.policy.search.mean)
 
-    def check_arguments(self) -> None:
-        """
-        :raises ValueError: for an argument that would otherwise fail later, or not at all
-        """
-        counts = {"population_size": 2, "n_resets": 1, "horizon": 1, "n_elites": 1}
-        derived = ("population_size", "horizon")
-        for name, fewest in counts.items():
-            fine = is_count(getattr(self, name), fewest, may_be_none=name in derived)
-            allowed = f"a whole number of at least {fewest}" + " or None" * (name in derived)
-            self._refuse_unless(fine, name, allowed)
-        for name in ("initial_sigma", "amplitude", "offset"):
-            fine = between(value := getattr(self, name), 0.0, math.inf) and value > 0.0
-            self._refuse_unless(fine, name, "a finite number above 0")
-        for name in ("kp", "kd"):
-            fine = between(getattr(self, name), 0.0, math.inf)
-            self._refuse_unless(fine, name, "a finite number of at least 0")
-        self._refuse_unless(between(self.ranking_share, 0.0, 1.0), "ranking_share", "from 0 to 1")
-        self._refuse_unless(
-            between(self.gain_factor, 1.0, math.inf), "gain_factor", "a finite number of at least 1"
-        )
-        fine = len(self.frequency) == 2 and 0.0 < self.frequency[0] < self.frequency[1] < math.inf
-        self._refuse_unless(fine, "frequency", "two numbers, 0 < lowest < highest")
-        if self.dt is not None:
-            fine = between(self.dt, 0.0, math.inf) and self.dt > 0.0
-            self._refuse_unless(fine, "dt", "a finite number above 0, or None")
-        if isinstance(self.gait, list):
-            fine = bool(self.gait) and all(between(x, -math.inf, math.inf) for x in self.gait)
-        else:
-            fine = self.gait is None or self.gait in LEADS
-        named = ", ".join(map(repr, LEADS))
-        self._refuse_unless(fine, "gait", f"one of {named}, a lead [rad] for each leg, or None")
-        choices = {"control": ("auto", "track", "direct"), "joints": ("auto", "observation", "env")}
-        for name, allowed in choices.items():
-            fine = getattr(self, name) in allowed
-            self._refuse_unless(fine, name, f"one of {', '.join(map(repr, allowed))}")
-
-    def _refuse_unless(self, fine: bool, name: str, allowed: str) -> None:
-        if not fine:
-            got = getattr(self, name)
-            raise ValueError(f"{type(self).__name__}({name}={got!r}): {name} must be {allowed}.")
-
     @property
     def gait_space(self) -> GaitSpace:
         """The gaits that are searched."""
-        assert self.body is not None
-        return space_of(
-            Body(**self.body),
-            amplitude=self.amplitude,
-            offset=self.offset,
-            frequency=(self.frequency[0], self.frequency[1]),
-            kp=self.kp,
-            kd=self.kd,
-            gain_factor=self.gain_factor,
-            same_frequency=self.same_frequency,
-            phases=self.phases,
-            leads=self._leads,
-        )
-
-    @property
-    def _leads(self) -> tuple[float, ...]:
-        if self.gait is None:
-            return (0.0,)
-        return LEADS[self.gait] if isinstance(self.gait, str) else tuple(self.gait)
+        assert self.robot is not None
+        return self.config.gait_space(Robot(**self.robot))
 
     @property
     def constants(self) -> dict[str, Any]:
@@ -298,17 +153,18 @@ class OpenLoop(SavesTensors):
         :raises ParameterError: for another number of joints than there are, and for values that
             are not finite or frequencies that are not above 0
         """
+        config = self.config
         given = {
             "amplitude": amplitude,
             "offset": offset,
             "phase": phase,
             "omega_swing": omega_swing,
             "omega_stance": omega_stance,
-            "kp": self.kp if kp is None else kp,
-            "kd": self.kd if kd is None else kd,
+            "kp": config.kp if kp is None else kp,
+            "kd": config.kd if kd is None else kd,
         }
-        assert self.body is not None
-        names = self.body["names"]
+        assert self.robot is not None
+        names = self.robot["names"]
         constants = Constants(**{name: _sized(name, v, names) for name, v in given.items()})
         self.policy.constants = constants
         self._restart(self.gait_space.encode(constants))
@@ -333,19 +189,19 @@ class OpenLoop(SavesTensors):
 
         :raises EnvironmentMismatchError: if it has other joints
         """
-        before, body = self.env, self.body
+        before, robot = self.env, self.robot
         super().set_env(env, force_reset)
         if self.env is before:
             return
         assert self.env is not None
         self._meet(self.env)
-        assert body is not None and self.body is not None
-        if self.body["names"] != body["names"]:
+        assert robot is not None and self.robot is not None
+        if self.robot["names"] != robot["names"]:
             raise EnvironmentMismatchError(
-                f"The gait is one of the joints {', '.join(body['names'])}; this environment has "
-                f"{', '.join(self.body['names'])}."
+                f"The gait is one of the joints {', '.join(robot['names'])}; this environment has "
+                f"{', '.join(self.robot['names'])}."
             )
-        self.policy.body = Body(**self.body)
+        self.policy.robot = Robot(**self.robot)
         self.policy.constants = self.policy.constants
         self._bind()
 
@@ -375,8 +231,8 @@ class OpenLoop(SavesTensors):
             total, callback, reset_num_timesteps, name, progress_bar
         )
         callback.on_training_start(locals(), globals())
-        search_until = total_timesteps - self.ranking_share * total
-        trials = Trials(self, callback, total_timesteps)
+        search_until = total_timesteps - self.config.ranking_share * total
+        trials = Trials(self, self.policy, callback, total_timesteps)
         going, latest = True, 0
         # A generation more must not take the steps of the ranking.
         while going and self.num_timesteps + max(latest, 1) <= search_until:
@@ -402,7 +258,7 @@ class OpenLoop(SavesTensors):
 
         callback.on_rollout_start()
         wanted = [Trial(int(row), int(seeds[reset]), (row, reset)) for row, reset in due]
-        done = trials.run(gaits, wanted, keep, self.horizon)
+        done = trials.run(gaits, wanted, keep, self.config.horizon)
         callback.on_rollout_end()
         if not done:
             return False
@@ -483,14 +339,14 @@ class OpenLoop(SavesTensors):
         """SB3 sets it to zero at first; the search counts itself."""
 
     def _restart(self, start: np.ndarray) -> None:
-        dim = len(start)
-        self.policy.search = cma_es.begin(
+        dim, config = len(start), self.config
+        self.policy.search = cma_es.init_search(
             start,
-            self.initial_sigma,
+            config.initial_sigma,
             secrets.randbelow(2**31) if self.seed is None else int(self.seed),
-            self.population_size or cma_es.default_population(dim),
-            self.n_resets,
-            self.n_elites,
+            config.population_size or cma_es.default_population(dim),
+            config.n_resets,
+            config.n_elites,
         )
 
     def _meet(self, env: VecEnv) -> None:
@@ -499,26 +355,27 @@ class OpenLoop(SavesTensors):
 
         :raises EnvironmentMismatchError: if its joints do not come in as many legs as the gait has
         """
-        body = body_of(env, self.control, self.joints, self.dt)
+        config = self.config
+        robot = robot_of(env, config.control, config.joints, config.dt)
         normalises = getattr(self.get_vec_normalize_env(), "norm_obs", False)
-        if body.control == "track" and self.joints != "env" and normalises:
+        if robot.control == "track" and config.joints != "env" and normalises:
             raise ValueError(
                 "OpenLoop reads joints from observations, which VecNormalize scales: use "
                 "VecNormalize(norm_obs=False), or joints='env'."
             )
-        n_legs = len(self._leads)
-        if len(body.names) % n_legs:
+        n_legs = len(config.leads)
+        if len(robot.names) % n_legs:
             raise EnvironmentMismatchError(
                 f"A gait of {n_legs} legs needs as many joints in each, leg by leg; there are "
-                f"{len(body.names)}: {', '.join(body.names)}."
+                f"{len(robot.names)}: {', '.join(robot.names)}."
             )
-        self.body = body.to_dict()
+        self.robot = robot.to_dict()
 
     def _bind(self) -> None:
         """Where the observation does not show the joints, they are read from the environment."""
-        body = self.policy.body
-        assert body is not None
-        unseen = body.control == "track" and not body.seen_position
+        robot = self.policy.robot
+        assert robot is not None
+        unseen = robot.control == "track" and not robot.seen_position
         self.read_joints_from(self.env if unseen else None)
 
 

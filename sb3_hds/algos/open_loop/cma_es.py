@@ -42,7 +42,7 @@ class SearchState(NamedTuple):
     n_rounds: np.ndarray
 
 
-def begin(
+def init_search(
     start: Float[np.ndarray, " dim"],
     sigma: float,
     seed: int,

@@ -15,7 +15,7 @@ from stable_baselines3.common.utils import is_vectorized_observation
 from sb3_hds.algos.base.policy import TensorPolicy, TrainingTensors, refuse_odd
 from sb3_hds.algos.open_loop.cma_es import SearchState
 from sb3_hds.algos.open_loop.gait import Constants
-from sb3_hds.algos.open_loop.robot import Body
+from sb3_hds.algos.open_loop.robot import Robot
 from sb3_hds.core.transforms.oscillators import Gait, advance_phase, target_at
 from sb3_hds.deploy.policy_function import Joints, Memory, PolicyFunction
 from sb3_hds.errors import EnvironmentMismatchError
@@ -62,7 +62,7 @@ class OscillatorPolicy(TensorPolicy):
     :param observation_space: of any kind; a Box with one axis where joints are read from it
     :param action_space: a bounded Box of any shape
     :param lr_schedule: as SB3 passes it; not looked at
-    :param body: what is known of the system, see :class:`~sb3_hds.algos.open_loop.robot.Body`
+    :param robot: what is known of the system, see :class:`~sb3_hds.algos.open_loop.robot.Robot`
     :param use_sde: accepted for SB3's sake
     """
 
@@ -71,15 +71,15 @@ class OscillatorPolicy(TensorPolicy):
         observation_space: spaces.Space,
         action_space: spaces.Box,
         lr_schedule: Schedule,
-        body: Body | Mapping[str, Any] | None = None,
+        robot: Robot | Mapping[str, Any] | None = None,
         use_sde: bool = False,
     ) -> None:
         super().__init__(observation_space, action_space, squash_output=False)
         n = int(np.prod(action_space.shape))
-        self.body = body if isinstance(body, Body) or body is None else Body(**body)
+        self.robot = robot if isinstance(robot, Robot) or robot is None else Robot(**robot)
         self.arguments = {
             "lr_schedule": lr_schedule,
-            "body": None if self.body is None else self.body.to_dict(),
+            "robot": None if self.robot is None else self.robot.to_dict(),
         }
         zero, one = np.zeros(n), np.asarray(1.0)
         self.constants = Constants(zero, zero, zero, one, one, zero, zero)
@@ -98,7 +98,7 @@ class OscillatorPolicy(TensorPolicy):
     def constants(self, constants: Constants) -> None:
         self._constants = Constants(*(np.asarray(part, float) for part in constants))
         rows = Constants(*(part[None] for part in self._constants))
-        self._timetable = Timetable(rows, self.body.dt if self.body else 1.0)
+        self._timetable = Timetable(rows, self.robot.dt if self.robot else 1.0)
 
     def predict(
         self,
@@ -140,8 +140,8 @@ class OscillatorPolicy(TensorPolicy):
         :param kd: likewise
         :return: actions, within their bounds
         """
-        body = self.body
-        if body is not None and body.control == "track":
+        robot = self.robot
+        if robot is not None and robot.control == "track":
             positions, velocities = self._joints(observations, len(targets))
             targets = track(targets, positions, velocities, kp, kd)
         box = self.action_space
@@ -150,30 +150,30 @@ class OscillatorPolicy(TensorPolicy):
 
     def policy_function(self) -> PolicyFunction:
         """:return: what the policy computes, with the phases of its oscillators as memory"""
-        body, gait = self.body, self.constants
+        robot, gait = self.robot, self.constants
         omega = float(gait.omega_swing), float(gait.omega_stance)
-        dt = body.dt if body else 1.0
-        tracks = body is not None and body.control == "track"
-        seen = tracks and bool(body.seen_position)  # type: ignore[union-attr]
+        dt = robot.dt if robot else 1.0
+        tracks = robot is not None and robot.control == "track"
+        seen = tracks and bool(robot.seen_position)  # type: ignore[union-attr]
 
         def act(obs: Any, joints: tuple[Any, ...], memory: tuple[Any, ...]) -> tuple[Any, Any]:
             (phase,) = memory
             targets = gait.amplitude * jnp.sin(phase) + gait.offset
             if tracks:
-                position, velocity = body.in_observations(obs) if seen else joints  # type: ignore[union-attr]
+                position, velocity = robot.in_observations(obs) if seen else joints  # type: ignore[union-attr]
                 targets = track(targets, position, velocity, gait.kp, gait.kd)
             return targets, (advance_phase(phase, dt, *omega),)
 
         first = Memory("phase", advance_phase(gait.phase, 0.5 * dt, *omega))
-        machine = Joints(body.position, body.velocity) if tracks and not seen else None  # type: ignore[union-attr]
+        machine = Joints(robot.position, robot.velocity) if tracks and not seen else None  # type: ignore[union-attr]
         return PolicyFunction(act, squashed=False, memory=(first,), joints=machine)
 
     def _joints(self, observations: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
-        body = self.body
-        assert body is not None
+        robot = self.robot
+        assert robot is not None
         if self.read_states is None:
-            if body.seen_position:
-                return body.in_observations(observations)
+            if robot.seen_position:
+                return robot.in_observations(observations)
             raise EnvironmentMismatchError(
                 "The joints are not in the observation, and this policy has no environment to read "
                 "them from: model.read_joints_from(env), with the VecEnv that it acts in. Or train "
@@ -185,7 +185,7 @@ class OscillatorPolicy(TensorPolicy):
                 f"Joints are read from {len(states)} copies of the environment, and there are {n} "
                 "observations: model.read_joints_from(env), with the VecEnv that it acts in."
             )
-        return body.in_states(states)
+        return robot.in_states(states)
 
     def _as_rows(self, observation: Any) -> tuple[Any, bool]:
         """Observations with one row for each copy, and whether there were rows."""

@@ -9,7 +9,6 @@ from gymnasium import spaces
 from jaxtyping import Float
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_hds.algos.open_loop.gait import GaitSpace
 from sb3_hds.errors import EnvironmentMismatchError
 from sb3_hds.wrappers.actuated_joints import (
     COMMANDS_POSITIONS,
@@ -27,7 +26,7 @@ _WIDEST_OFFSET = np.pi
 
 
 @dataclasses.dataclass(frozen=True)
-class Body:
+class Robot:
     """
     Plain data, saved with a model.
 
@@ -62,7 +61,7 @@ class Body:
                 object.__setattr__(self, field.name, tuple(value))
 
     def to_dict(self) -> dict[str, Any]:
-        """:return: plain data for JSON, from which ``Body(**data)`` makes it again"""
+        """:return: plain data for JSON, from which ``Robot(**data)`` makes it again"""
         return {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in dataclasses.asdict(self).items()
@@ -83,7 +82,7 @@ class Body:
         return observations[:, list(self.seen_position)], observations[:, list(self.seen_velocity)]
 
 
-def body_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Body:
+def robot_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Robot:
     """
     Resets the environment a few times to find out where in its observations the joints are.
 
@@ -99,7 +98,7 @@ def body_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Body:
     driven = _driven(env, control)
     if driven is None:
         low, high = _commands(env)
-        return Body(
+        return Robot(
             dt=interval,
             control="direct",
             names=tuple(f"action[{i}]" for i in range(low.size)),
@@ -119,7 +118,7 @@ def body_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Body:
             "let them be read from the environment itself: joints='env'."
         )
     seen_position, seen_velocity = found or ((), ())
-    return Body(
+    return Robot(
         dt=interval,
         control="track",
         names=driven.names,
@@ -130,40 +129,6 @@ def body_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Body:
         lower=tuple(driven.lower.tolist()),
         upper=tuple(driven.upper.tolist()),
         rest=tuple(driven.rest.tolist()),
-    )
-
-
-def space_of(
-    body: Body,
-    *,
-    amplitude: float,
-    offset: float,
-    frequency: tuple[float, float],
-    kp: float,
-    kd: float,
-    gain_factor: float,
-    same_frequency: bool,
-    phases: bool,
-    leads: tuple[float, ...],
-) -> GaitSpace:
-    """
-    :param amplitude: largest one: of a joint [rad] or [m]; where commands are direct, in shares of
-        half their range
-    :param offset: largest one, up and down from where the joint rests, within its range; likewise
-    """
-    lower, upper, rest = (np.array(ends) for ends in (body.lower, body.upper, body.rest))
-    half = 0.5 * (upper - lower) if body.control == "direct" else np.ones(len(rest))
-    centre = np.clip(rest, lower, upper)
-    return GaitSpace(
-        amplitude=amplitude * half,
-        offset=np.stack([centre - offset * half, centre + offset * half], axis=1),
-        frequency=frequency,
-        kp=kp,
-        kd=kd,
-        gain_factor=gain_factor if body.control == "track" else 1.0,
-        same_frequency=same_frequency,
-        phases=phases,
-        leads=leads,
     )
 
 

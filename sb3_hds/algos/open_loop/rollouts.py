@@ -2,9 +2,10 @@
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
@@ -18,10 +19,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_hds.algos.open_loop.gait import Constants
-from sb3_hds.algos.open_loop.policy import Timetable
-
-if TYPE_CHECKING:
-    from sb3_hds.algos.open_loop.algorithm import OpenLoop
+from sb3_hds.algos.open_loop.policy import OscillatorPolicy, Timetable
 
 
 class Trial(NamedTuple):
@@ -43,14 +41,22 @@ class Trials:
     Runs episodes, as many at a time as the environment has copies. A copy that has nothing left to
     try goes on moving until the others are done, and its steps count as all do.
 
-    :param model: whose environment, counters and policy these are
+    :param model: whose environment and counters these are
+    :param policy: that tracks the targets of a gait
     :param callback: called at every step
     :param total_timesteps: at which to stop
     """
 
-    def __init__(self, model: "OpenLoop", callback: BaseCallback, total_timesteps: int) -> None:
+    def __init__(
+        self,
+        model: BaseAlgorithm,
+        policy: OscillatorPolicy,
+        callback: BaseCallback,
+        total_timesteps: int,
+    ) -> None:
         assert model.env is not None
-        self._model, self._callback, self._total = model, callback, total_timesteps
+        self._model, self._policy = model, policy
+        self._callback, self._total = callback, total_timesteps
         self._env = model.env
         self._one_by_one = can_reset_one(model.env)
         self._steps = np.zeros(model.n_envs, np.int64)
@@ -70,8 +76,8 @@ class Trials:
         :param horizon: steps after which an episode is cut off, where single copies can be reset
         :return: whether all are over; otherwise the steps were used up, or the callback said stop
         """
-        assert self._model.policy.body is not None
-        timetable, waiting = Timetable(gaits, self._model.policy.body.dt), deque(trials)
+        assert self._policy.robot is not None
+        timetable, waiting = Timetable(gaits, self._policy.robot.dt), deque(trials)
         running: list[Trial | None] = [None] * self._env.num_envs
         if not self._one_by_one:
             self._model._last_obs = self._env.reset()  # type: ignore[assignment]
@@ -110,7 +116,7 @@ class Trials:
         model, callback = self._model, self._callback
         if model.num_timesteps >= self._total:
             return False
-        actions = model.policy.command(targets, model._last_obs, kp, kd)
+        actions = self._policy.command(targets, model._last_obs, kp, kd)
         new_obs, rewards, dones, infos = self._env.step(actions)
         normaliser = model.get_vec_normalize_env()
         earned = rewards if normaliser is None else normaliser.get_original_reward()

@@ -1,11 +1,12 @@
 """
-The shell of every algorithm that learns through a twin.
+The shell of every algorithm that plans in a twin.
 
 SB3 collects real steps and calls ``train``; a call of ``train`` is one planning epoch in the twin
-(the pure function in ``epoch.py``). A timestep is a step of the environment that the user passed
+(the pure functions in ``epoch.py``). A timestep is a step of the environment that the user passed
 in, nothing else; simulated steps are counted apart.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
@@ -14,36 +15,39 @@ from typing import Any, ClassVar, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import (
     GymEnv,
     MaybeCallback,
     RolloutReturn,
-    Schedule,
     TrainFreq,
 )
 
 from sb3_hds.algos.base.algorithm import TensorAlgorithm
-from sb3_hds.algos.base.checks import callbacks_of
-from sb3_hds.algos.base.construct import (
-    check_arguments,
+from sb3_hds.algos.base.construct import callbacks_of, jax_device
+from sb3_hds.algos.twin.config import TwinConfig, epoch_config, hyperparams
+from sb3_hds.algos.twin.epoch import EpochMetrics, epoch, epoch_log, twin_steps_per_epoch
+from sb3_hds.algos.twin.model import (
+    Tensors,
+    check_reward,
     check_twin_observes,
-    jax_device,
-    policy_and_env,
+    required,
+    twin_from_spec,
+    twin_given,
 )
-from sb3_hds.algos.twin.config import knobs_of, settings_of
-from sb3_hds.algos.twin.epoch import Report, epoch, twin_steps_per_epoch
-from sb3_hds.algos.twin.log import record_epoch
-from sb3_hds.algos.twin.model import Tensors, check_reward, required, twin_from_spec, twin_given
 from sb3_hds.algos.twin.normalization import prepare_statistics, view_of
 from sb3_hds.algos.twin.policy import TwinPolicy, all_finite
 from sb3_hds.algos.twin.pretraining import Pretraining, meanwhile, nothing
 from sb3_hds.algos.twin.selection import choose_policy, programs, twin_steps_per_comparison
-from sb3_hds.algos.twin.state import Learner, Settings, Workspace, begin, longest_episode
+from sb3_hds.algos.twin.state import (
+    EpochConfig,
+    EpochState,
+    Workspace,
+    init_workspace,
+    longest_episode,
+)
 from sb3_hds.core import Params, Twin
 from sb3_hds.core.contract import check_methods
 from sb3_hds.core.numerics.compilation import GENERATOR
@@ -56,129 +60,21 @@ _FEWEST_EPOCHS = 20
 
 
 class TwinAlgorithm(TensorAlgorithm):
-    """
-    Abstract: what PODS and HDS share. Arguments are documented there.
-    """
+    """Abstract: what PODS and HDS share."""
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": TwinPolicy}
     policy_family = TwinPolicy
+    config_class = TwinConfig
     policy: TwinPolicy
+    twin: Twin | None
     #: the twin contains the layers: it has to be told what they were told
     stores_executed: ClassVar[bool] = False
+    check_observations = staticmethod(check_twin_observes)
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] | GymEnv,
-        env: GymEnv | str | None,
-        *,
-        learning_rate: float | Schedule,
-        value_learning_rate: float | str | Schedule | None,
-        buffer_size: int,
-        learning_starts: int,
-        batch_size: int,
-        gamma: float,
-        train_freq: int | tuple[int, str],
-        gradient_steps: int,
-        action_noise: ActionNoise | None,
-        replay_buffer_class: type[ReplayBuffer] | None,
-        replay_buffer_kwargs: dict[str, Any] | None,
-        optimize_memory_usage: bool,
-        twin: Twin | str | None,
-        pretrain_epochs: int,
-        n_rollouts: int,
-        horizon: int | None,
-        order: int,
-        planner: str | None,
-        n_iterations: int,
-        n_step_sizes: int,
-        n_random_plans: int,
-        random_share: float,
-        lookahead: int | None,
-        terminal_value: bool,
-        shift_ends: bool,
-        reset_share: float,
-        exploration_noise: float,
-        exploration_decay: float,
-        temperature: float,
-        temperature_decay: float,
-        relabel_share: float,
-        plan_memory: int,
-        learned_share: float,
-        loss: str,
-        gain_weight: float,
-        sensitivity_weight: float,
-        averaging: float,
-        adapt_scales: bool,
-        compare_every: int,
-        least_gain: float,
-        randomisation: float,
-        policy_kwargs: dict[str, Any] | None,
-        stats_window_size: int,
-        tensorboard_log: str | None,
-        verbose: int,
-        device: str,
-        seed: int | None,
-        monitor_wrapper: bool,
-        _init_setup_model: bool,
-    ) -> None:
-        policy_class, made_env = policy_and_env(
-            type(self), policy, env, check_twin_observes, monitor_wrapper
-        )
-        super().__init__(
-            policy=policy_class,
-            env=made_env,
-            learning_rate=learning_rate,
-            buffer_size=buffer_size,
-            learning_starts=learning_starts,
-            batch_size=batch_size,
-            gamma=gamma,
-            train_freq=train_freq,
-            gradient_steps=gradient_steps,
-            action_noise=action_noise,
-            replay_buffer_class=replay_buffer_class,
-            replay_buffer_kwargs=replay_buffer_kwargs,
-            optimize_memory_usage=optimize_memory_usage,
-            policy_kwargs=dict(policy_kwargs or {}),
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            seed=seed,
-            monitor_wrapper=monitor_wrapper,
-            sde_support=False,
-            supported_action_spaces=(spaces.Box,),
-            support_multi_env=True,
-        )
-        self.value_learning_rate = value_learning_rate
-        self.twin: Twin | None = twin_given(twin)
+    def construct(self, config: TwinConfig, **more: Any) -> None:  # type: ignore[override]
+        config = dataclasses.replace(config, twin=twin_given(config.twin))
+        super().construct(config, sde_support=False, **more)
         self.twin_spec: dict[str, Any] | None = None
-        self.pretrain_epochs = pretrain_epochs
-        self.n_rollouts = n_rollouts
-        self.horizon = horizon
-        self.order = order
-        self.planner = planner
-        self.n_iterations = n_iterations
-        self.n_step_sizes = n_step_sizes
-        self.n_random_plans = n_random_plans
-        self.random_share = random_share
-        self.lookahead = lookahead
-        self.terminal_value = terminal_value
-        self.shift_ends = shift_ends
-        self.reset_share = reset_share
-        self.exploration_noise = exploration_noise
-        self.exploration_decay = exploration_decay
-        self.temperature = temperature
-        self.temperature_decay = temperature_decay
-        self.relabel_share = relabel_share
-        self.plan_memory = plan_memory
-        self.learned_share = learned_share
-        self.loss = loss
-        self.gain_weight = gain_weight
-        self.sensitivity_weight = sensitivity_weight
-        self.averaging = averaging
-        self.adapt_scales = adapt_scales
-        self.compare_every = compare_every
-        self.least_gain = least_gain
-        self.randomisation = randomisation
         self.recent_gain, self.recent_return = 0.0, 0.0
         self.unstored_step: dict[str, Any] | None = None
         self.real_timesteps = 0
@@ -188,10 +84,9 @@ class TwinAlgorithm(TensorAlgorithm):
         self._n_updates = 0
         self._epochs_planned, self._epochs_done = 0, 0
         self._workspace: Workspace | None = None
-        self._compiled: Settings | None = None
+        self._compiled: EpochConfig | None = None
         self.stopped = False
         self.poll: Callable[[], None] = nothing
-        self._constructed(device, _init_setup_model)
 
     def learn(  # type: ignore[override]
         self,
@@ -242,7 +137,7 @@ class TwinAlgorithm(TensorAlgorithm):
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self.real_timesteps += self.n_envs
 
-    def run_epoch(self, gradient_steps: int) -> Report:
+    def run_epoch(self, gradient_steps: int) -> EpochMetrics:
         """
         Improve plans in the twin and regress the policy on them, once.
 
@@ -251,32 +146,38 @@ class TwinAlgorithm(TensorAlgorithm):
         :raises NoTwinError: if the model was loaded without environment and without twin
         :raises DivergedError: if the regression diverged; the model keeps its last good state
         """
-        learner, settings = self._learner(), self._settings
-        knobs = knobs_of(self, settings.twin, self._progress_remaining(), gradient_steps)
-        if settings != self._compiled:
-            compares = self.compare_every > 0 and (
-                self.comparison_due or self.compare_every <= self._epochs_planned
-            )
-            meanwhile(programs(settings, learner, knobs, compares), self.poll)
-            self._compiled = settings
-        learner, report = epoch(settings, learner, knobs)
-        learner, returns = choose_policy(
-            settings, learner, knobs, self.compare_every, self.comparison_due
+        state, program, config = self._epoch_state(), self._program, self.config
+        every, view = config.refinements.compare_every, self._view(program.twin)
+        rate = self.lr_schedule(self._progress_remaining())
+        n_epochs = int(self.policy.progress.n_epochs)
+        varied = self.varied(program.twin)
+        hyper = hyperparams(
+            config, n_epochs, rate, gradient_steps, program.twin.params, varied, view
         )
-        losses = float(report.policy_loss), float(report.value_loss)
-        if not (all(map(math.isfinite, losses)) and all_finite(learner.networks)):
+        if program != self._compiled:
+            compares = every > 0 and (self.comparison_due or every <= self._epochs_planned)
+            meanwhile(programs(program, state, hyper, compares), self.poll)
+            self._compiled = program
+        state, metrics = epoch(program, state, hyper)
+        state, returns = choose_policy(program, state, hyper, every, self.comparison_due)
+        losses = float(metrics.policy_loss), float(metrics.value_loss)
+        if not (all(map(math.isfinite, losses)) and all_finite(state.networks)):
             raise DivergedError(
                 f"The regression diverged (losses {losses}); the model keeps the state before this "
                 "epoch. Lower learning_rate."
             )
-        self.policy.networks, self.policy.progress = learner.networks, learner.progress
-        self._workspace = learner.workspace
+        self.policy.networks, self.policy.progress = state.networks, state.progress
+        self._workspace = state.workspace
         self._epochs_done += 1
-        self.twin_timesteps += twin_steps_per_epoch(settings)
+        self.twin_timesteps += twin_steps_per_epoch(program)
         if returns is not None:
-            self.twin_timesteps += twin_steps_per_comparison(settings)
-        record_epoch(self, report, knobs, returns)
-        return report
+            self.twin_timesteps += twin_steps_per_comparison(program)
+        for name, value in epoch_log(metrics, hyper, returns).items():
+            self.logger.record(name, value)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("time/epochs", int(self.policy.progress.n_epochs))
+        self.logger.record("time/twin_timesteps", self.twin_timesteps)
+        return metrics
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
@@ -302,12 +203,10 @@ class TwinAlgorithm(TensorAlgorithm):
         self._workspace = None
         self._setup_twin()
 
-    def check_arguments(self) -> None:
-        check_arguments(self)
-
     def remedies(self, updates_per_step: float) -> list[str]:
+        n = self.config.n_rollouts
         return [
-            f"n_rollouts={max(1, self.n_rollouts // 4)}, {self.n_rollouts} now",
+            f"n_rollouts={max(1, n // 4)}, {n} now",
             "a larger train_freq",
             f"fewer gradient_steps, {updates_per_step:.3g} for each step now",
             "a GPU",
@@ -354,11 +253,12 @@ class TwinAlgorithm(TensorAlgorithm):
         :return: parameters that differ between the rollouts of an epoch, each of shape
             ``(n_rollouts,)``
         """
-        if not self.randomisation:
+        config = self.config
+        if not config.randomisation:
             return {}
         drawn = {}
         for name, parameter in twin.parameters.items():
-            deviation = self.randomisation * parameter.scale * np.random.randn(self.n_rollouts)
+            deviation = config.randomisation * parameter.scale * np.random.randn(config.n_rollouts)
             values = np.clip(twin.values[name] + deviation, parameter.lower, parameter.upper)
             drawn[name] = jnp.asarray(values, jnp.float32)
         return drawn
@@ -367,20 +267,24 @@ class TwinAlgorithm(TensorAlgorithm):
         """Called when a training starts, before the first planning epoch."""
 
     @property
-    def _settings(self) -> Settings:
-        return settings_of(self, required(self.twin, self.twin_spec))
+    def _program(self) -> EpochConfig:
+        """What an epoch is compiled for."""
+        return epoch_config(self.config, self.policy, required(self.twin, self.twin_spec))
 
-    def _learner(self) -> Learner:
+    def _view(self, twin: Twin) -> Any:
+        return view_of(self.get_vec_normalize_env(), len(twin.channels))
+
+    def _epoch_state(self) -> EpochState:
         """What an epoch changes. Before the first one, the scales of the task are found."""
-        settings, policy = self._settings, self.policy
+        program, policy = self._program, self.policy
         workspace = self._workspace
         if workspace is None:
             fresh = int(policy.progress.n_epochs) == 0
             if fresh:
                 seed = int(np.asarray(policy.progress.key)[0])
-                prepare_statistics(self._vec_normalize_env, settings.twin, jax.random.key(seed))
-            view = view_of(self._vec_normalize_env, len(settings.twin.channels))
-            started = partial(begin, settings, settings.twin.params, view, policy.progress)
+                prepare_statistics(self._vec_normalize_env, program.twin, jax.random.key(seed))
+            view, params = self._view(program.twin), program.twin.params
+            started = partial(init_workspace, program, params, view, policy.progress)
             [(workspace, scales, progress)] = meanwhile([started], self.poll)
             if fresh:
                 policy.networks = policy.networks._replace(inside=scales.inside)
@@ -388,7 +292,7 @@ class TwinAlgorithm(TensorAlgorithm):
                     reward_scale=scales.reward_scale, reward_offset=scales.reward_offset
                 )
             self._workspace, policy.progress = workspace, progress
-        return Learner(policy.networks, policy.progress, workspace)
+        return EpochState(policy.networks, policy.progress, workspace)
 
     def _progress_remaining(self) -> float:
         """From 1 to 0 over the planning epochs of this call of ``learn``, pretraining included."""
@@ -409,15 +313,16 @@ class TwinAlgorithm(TensorAlgorithm):
         assert isinstance(self.train_freq, TrainFreq)
         if self.train_freq.unit.value == "step":
             return self.train_freq.frequency * self.n_envs
-        return self.train_freq.frequency * longest_episode(self._settings.twin)
+        return self.train_freq.frequency * longest_episode(self._program.twin)
 
     @property
     def pretraining_due(self) -> int:
         """Planning epochs that are left to do before the next real step."""
-        enough = self.least_gain * self.recent_return
+        config = self.config
+        enough = config.refinements.least_gain * self.recent_return
         if self.n_pretrained >= _FEWEST_EPOCHS and self.recent_gain < enough:
             return 0
-        return max(0, self.pretrain_epochs - self.n_pretrained)
+        return max(0, config.pretrain_epochs - self.n_pretrained)
 
     def pretrain_epoch(self) -> None:
         """
@@ -426,8 +331,8 @@ class TwinAlgorithm(TensorAlgorithm):
         """
         planned = self.pretraining_due
         steps = self.gradient_steps if self.gradient_steps >= 0 else self._steps_per_epoch
-        report = self.run_epoch(steps)
-        before, after = float(report.before), float(report.after)
+        metrics = self.run_epoch(steps)
+        before, after = float(metrics.before), float(metrics.after)
         self.recent_gain = _RECENT * self.recent_gain + max(0.0, after - before)
         self.recent_return = _RECENT * self.recent_return + abs(before)
         self.n_pretrained += 1

@@ -1,100 +1,243 @@
-"""From the arguments of a constructor to what an epoch reads."""
+"""Arguments of the algorithms that plan in a twin, and what an epoch reads of them."""
 
-from typing import TYPE_CHECKING
+import dataclasses
+import math
+from dataclasses import KW_ONLY, field
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_hds.algos.base.construct import schedule_of
-from sb3_hds.algos.twin.normalization import view_of
-from sb3_hds.algos.twin.state import Knobs, Settings
-from sb3_hds.core import Twin
+from sb3_hds.algos.base.config import OffPolicyConfig, Rate, between
+from sb3_hds.algos.twin.policy import TwinPolicy
+from sb3_hds.algos.twin.state import EpochConfig, Hyperparams, View
+from sb3_hds.core import Params, Twin
 
-if TYPE_CHECKING:
-    from sb3_hds.algos.twin.algorithm import TwinAlgorithm
+PLANNERS = ("first_order", "gauss_newton", "ilqr")
+LOSSES = ("smooth_absolute", "squared")
 
 # A plan looks this far ahead where the horizon is derived [s], within these numbers of steps.
 _HORIZON = 0.6
 _SHORTEST, _LONGEST = 12, 32
 # How many horizons the policy is followed beyond the end of a plan, where that is derived.
 _LOOKAHEAD = 5
+# Share of start states for which random plans are tried: they are as expensive as the policy's own,
+# and a local optimum that half of the rollouts avoid is no longer what the policy learns.
+_RANDOM_SHARE = 0.5
+# Factor on the temperature of the annealed acceptance after each epoch: after the first fifty, it
+# is below 1 % of what it was.
+_TEMPERATURE_DECAY = 0.9
 
 
-def settings_of(model: "TwinAlgorithm", twin: Twin) -> Settings:
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class Refinements:
+    """
+    How plans are improved and learned from. PODS has these as arguments, so that the setting of its
+    paper can be reached; HDS goes by the defaults, which ``benchmarks/payload.py`` compares with
+    the paper's.
+
+    :param n_iterations: improvements of each plan in an epoch (the paper: 1)
+    :param n_step_sizes: candidates of each line search, "no change" included
+    :param plan_memory: epochs whose plans are learned from (the paper: 1)
+    :param learned_share: share of each plan, from its start, that the policy learns from: what a
+        plan does at its end depends most on the learned value (the paper: 1)
+    :param loss: ``"smooth_absolute"``, in units of the typical control, or ``"squared"`` (the
+        paper); see :func:`~sb3_hds.algos.twin.regression.regress`
+    :param gain_weight: 0..1, how much a sample counts in proportion to what its plan gained over
+        the policy (the paper: 0)
+    :param sensitivity_weight: 0..1, how much it counts in proportion to what an error of its
+        control costs; only with ``"ilqr"`` (the paper: 0)
+    :param averaging: decay per epoch of the average of policies (the paper: 0)
+    :param adapt_scales: whether the scales of the networks' inputs and of the regression's errors
+        follow the plans (near a balance both are far smaller than in random rollouts); False keeps
+        those of the first rollouts
+    :param compare_every: epochs after which the average policy and the one that acts go through
+        whole episodes of the twin, and the better one acts from then on; 0: the average acts (the
+        paper)
+    :param least_gain: the pretraining ends when plans have gained less than this share of the
+        policy's return, on the average of about ten epochs; 0: never
+    """
+
+    n_iterations: int = 3
+    n_step_sizes: int = 6
+    plan_memory: int = 8
+    learned_share: float = 0.5
+    loss: str = "smooth_absolute"
+    gain_weight: float = 0.7
+    sensitivity_weight: float = 0.7
+    averaging: float = 0.9
+    adapt_scales: bool = True
+    compare_every: int = 10
+    least_gain: float = 1e-3
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TwinConfig(OffPolicyConfig):
+    """
+    Arguments of PODS and HDS.
+
+    :param env: an environment with a twin, its id, or a vectorised environment
+    :param learning_rate: of policy and value, per Adam step; a schedule runs over all planning
+        epochs, pretraining included. Own choice, measured.
+    :param buffer_size: real transitions that are kept
+    :param learning_starts: real steps with random actions before the policy acts
+    :param batch_size: states per regression step
+    :param train_freq: real steps between two planning epochs, or ``(n, "episode")``
+    :param gradient_steps: regression steps per planning epoch; -1: as many as real steps were made
+        (the paper: 50)
+    :param action_noise: added to the actions in the real environment
+    :param twin: the simulation to plan in, or its name; None: the one that mirrors the environment.
+        Pass a different one to learn in a model that is wrong on purpose.
+    :param pretrain_epochs: planning epochs before the first real step
+    :param n_rollouts: start states planned from in each epoch (the paper: 4000)
+    :param horizon: steps of a plan; None: 0.6 s, between 12 and 32 steps (the paper: the whole
+        episode of 100)
+    :param planner: ``"ilqr"``: second-order steps with feedback and limits on the controls;
+        ``"gauss_newton"``: the paper's open-loop second-order step; ``"first_order"``: gradient of
+        the action sequence
+    :param n_random_plans: random sequences of which the best is improved too, for half of the start
+        states: the remedy against local optima; 0 switches it off (the paper)
+    :param lookahead: steps for which the policy is followed beyond the end of a plan when plans are
+        compared; None: five horizons; 0 switches it off (the paper)
+    :param terminal_value: whether a value network rates the end of a plan (the paper: no)
+    :param shift_ends: whether an episode that has terminated counts as one that earns the reward
+        zero for ever. Rewards are counted from the best one that was seen; without it, an end is
+        worth zero on that scale, and dying pays.
+    :param reset_share: share of start states drawn from the reset distribution in each epoch, the
+        others go on from where the policy went; 1 is the paper's choice
+    :param exploration_noise: standard deviation of a constant offset of the controls while start
+        states go on, in units of the typical size of the plans' controls
+    :param randomisation: domain randomisation: standard deviation of the twin's parameters between
+        rollouts, in units of each parameter's ``scale``; 0: none
+    :param policy_kwargs: ``net_arch``, ``activation_fn``, ``linear_path``, ``max_grad_norm``; see
+        :class:`~sb3_hds.algos.TwinPolicy`
+    """
+
+    learning_rate: Rate = LinearSchedule(5e-3, 1e-4, 1.0)  # noqa: RUF009  never changed
+    _: KW_ONLY
+    buffer_size: int = 100_000
+    learning_starts: int = 0
+    train_freq: int | tuple[int, str] | None = 100
+    gradient_steps: int = 96
+    twin: Twin | str | None = None
+    pretrain_epochs: int = 160
+    n_rollouts: int = 128
+    horizon: int | None = None
+    planner: str = "ilqr"
+    n_random_plans: int = 7
+    lookahead: int | None = None
+    terminal_value: bool = True
+    shift_ends: bool = True
+    reset_share: float = 0.5
+    exploration_noise: float = 0.0
+    randomisation: float = 0.0
+    exploration_decay: float = field(default=1.0, init=False)
+    temperature: float = field(default=0.0, init=False)
+    derived = ("horizon", "lookahead")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require_counts(
+            {
+                "n_rollouts": 1,
+                "horizon": 1,
+                "lookahead": 0,
+                "n_random_plans": 0,
+                "pretrain_epochs": 0,
+            }
+        )
+        self.require_range(0.0, 1.0, "a number from 0 to 1", "reset_share", "exploration_decay")
+        non_negative = ("temperature", "exploration_noise", "randomisation")
+        self.require_range(0.0, math.inf, "a finite number of at least 0", *non_negative)
+        fine = between(self.gamma, 0.0, 1.0) and self.gamma > 0.0
+        self.require(fine, "gamma", "a number above 0 and at most 1")
+        self.require_choice("planner", PLANNERS)
+
+    @property
+    def refinements(self) -> Refinements:
+        """How plans are improved and learned from."""
+        return Refinements()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PODSConfig(Refinements, TwinConfig):
+    """Arguments of PODS."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require_counts(
+            {"n_iterations": 1, "n_step_sizes": 2, "plan_memory": 1, "compare_every": 0}
+        )
+        shares = ("learned_share", "gain_weight", "sensitivity_weight", "averaging")
+        self.require_range(0.0, 1.0, "a number from 0 to 1", *shares)
+        self.require_range(0.0, math.inf, "a finite number of at least 0", "least_gain")
+        self.require_choice("loss", LOSSES)
+
+    @property
+    def refinements(self) -> Refinements:
+        return self
+
+
+def epoch_config(config: TwinConfig, policy: TwinPolicy, twin: Twin) -> EpochConfig:
     """
     :param twin: to plan in; the horizon is derived from its time step, unless one was passed
     :return: what an epoch is compiled for
     """
-    horizon = model.horizon or int(np.clip(round(_HORIZON / twin.dt), _SHORTEST, _LONGEST))
-    return Settings(
+    horizon = config.horizon or int(np.clip(round(_HORIZON / twin.dt), _SHORTEST, _LONGEST))
+    how = config.refinements
+    return EpochConfig(
         twin=twin,
-        actor=model.policy.actor_network,
-        value=model.policy.value_network,
-        n_rollouts=model.n_rollouts,
+        actor=policy.actor_network,
+        value=policy.value_network,
+        n_rollouts=config.n_rollouts,
         horizon=horizon,
-        lookahead=_LOOKAHEAD * horizon if model.lookahead is None else model.lookahead,
-        advance=(horizon + 1) // 2 if model.reset_share < 1.0 else 0,
-        planner=model.planner or ("first_order" if model.order == 1 else "ilqr"),
-        n_iterations=model.n_iterations,
-        n_step_sizes=model.n_step_sizes,
-        n_candidates=model.n_random_plans,
-        random_share=model.random_share,
-        discount=model.gamma,
-        terminal_value=model.terminal_value,
-        shift_ends=model.shift_ends,
-        plan_memory=model.plan_memory,
-        n_learned=max(1, round(model.learned_share * horizon)),
-        batch_size=model.batch_size,
-        squared_error=model.loss == "squared",
-        max_grad_norm=model.policy.max_grad_norm,
-        annealed=model.temperature > 0.0,
-        adapt_scales=model.adapt_scales,
+        lookahead=_LOOKAHEAD * horizon if config.lookahead is None else config.lookahead,
+        advance=(horizon + 1) // 2 if config.reset_share < 1.0 else 0,
+        planner=config.planner,
+        n_iterations=how.n_iterations,
+        n_step_sizes=how.n_step_sizes,
+        n_candidates=config.n_random_plans,
+        random_share=_RANDOM_SHARE,
+        discount=config.gamma,
+        terminal_value=config.terminal_value,
+        shift_ends=config.shift_ends,
+        plan_memory=how.plan_memory,
+        n_learned=max(1, round(how.learned_share * horizon)),
+        batch_size=config.batch_size,
+        squared_error=how.loss == "squared",
+        max_grad_norm=policy.max_grad_norm,
+        annealed=config.temperature > 0.0,
+        adapt_scales=how.adapt_scales,
     )
 
 
-def knobs_of(model: "TwinAlgorithm", twin: Twin, remaining: float, gradient_steps: int) -> Knobs:
+def hyperparams(
+    config: TwinConfig,
+    n_epochs: int,
+    learning_rate: float,
+    gradient_steps: int,
+    params: Params,
+    varied: Params,
+    view: View,
+) -> Hyperparams:
     """
-    :param remaining: from 1 to 0 over the epochs of a training, for the schedules
+    :param n_epochs: that were done
+    :param learning_rate: of this epoch
+    :param params: the twin's parameters
+    :param varied: those of them that differ between rollouts, each of shape ``(n_rollouts,)``
+    :param view: what the environment's own normalisation does to an observation
     :return: what this epoch works with, without compiling again
     """
-    n_epochs = int(model.policy.progress.n_epochs)
-    rate = value_rate = model.lr_schedule(remaining)
-    if model.value_learning_rate is not None:
-        value_rate = schedule_of(model.value_learning_rate)(remaining)
-    visited, relabel = visited_states(model, len(twin.channels))
-    return Knobs(
-        params=twin.params,
-        varied=model.varied(twin),
-        learning_rate=rate,
-        value_learning_rate=value_rate,
-        noise=model.exploration_noise * model.exploration_decay**n_epochs,
-        temperature=model.temperature * model.temperature_decay**n_epochs,
-        reset_share=model.reset_share,
-        gain_weight=model.gain_weight,
-        sensitivity_weight=model.sensitivity_weight,
-        averaging=model.averaging,
+    how = config.refinements
+    return Hyperparams(
+        params=params,
+        varied=varied,
+        learning_rate=learning_rate,
+        noise=config.exploration_noise * config.exploration_decay**n_epochs,
+        temperature=config.temperature * _TEMPERATURE_DECAY**n_epochs,
+        reset_share=config.reset_share,
+        gain_weight=how.gain_weight,
+        sensitivity_weight=how.sensitivity_weight,
+        averaging=how.averaging,
         gradient_steps=gradient_steps,
-        visited=visited,
-        relabel=relabel,
-        view=view_of(model.get_vec_normalize_env(), len(twin.channels)),
+        view=view,
     )
-
-
-def visited_states(model: "TwinAlgorithm", n_obs: int) -> tuple[jax.Array, jax.Array]:
-    """
-    Observations of the real environment to plan from, drawn from the replay buffer.
-
-    :return: them, shape ``(n_rollouts, n_obs)``, and which rollouts start there, shape
-        ``(n_rollouts,)``
-    """
-    buffer, n = model.replay_buffer, model.n_rollouts
-    count = round(model.relabel_share * n)
-    visited = np.zeros((n, n_obs), np.float32)
-    if buffer is None or buffer.size() == 0:
-        count = 0
-    elif count:
-        steps = np.random.randint(buffer.size(), size=count)
-        copies = np.random.randint(buffer.n_envs, size=count)
-        visited[:count] = buffer.observations[steps, copies].reshape(count, n_obs)
-    return jnp.asarray(visited), jnp.arange(n) < count

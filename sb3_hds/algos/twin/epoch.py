@@ -16,9 +16,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from sb3_hds.algos.twin.networks import output
 from sb3_hds.algos.twin.regression import regress, remember, rescale, samples_of
 from sb3_hds.algos.twin.state import (
-    Knobs,
-    Learner,
-    Settings,
+    EpochConfig,
+    EpochState,
+    Hyperparams,
     for_each,
     longest_episode,
     problem_of,
@@ -38,7 +38,6 @@ from sb3_hds.planning import (
 )
 from sb3_hds.planning.problem import Control
 
-PLANNERS = ("first_order", "gauss_newton", "ilqr")
 # By this much, in units of the objective, the plan that began as the policy's own is preferred.
 _TIE = 1e-3
 
@@ -59,7 +58,7 @@ class Outcome(NamedTuple):
     dropped: jax.Array
 
 
-class Report(NamedTuple):
+class EpochMetrics(NamedTuple):
     """
     What an epoch tells: its :class:`Outcome`, and
 
@@ -93,68 +92,95 @@ class Choice(NamedTuple):
     sensitivity: Float[Array, "rollouts horizon"]
 
 
-def epoch(settings: Settings, learner: Learner, knobs: Knobs) -> tuple[Learner, Report]:
+def epoch(
+    config: EpochConfig, state: EpochState, hyper: Hyperparams
+) -> tuple[EpochState, EpochMetrics]:
     """
     Plan from every start state, keep what is better than the policy, regress on it, move on.
 
-    :return: the learner after the epoch, and what happened
+    :return: the state after the epoch, and what happened
     """
-    learner, outcome = plan_ahead(settings, learner, knobs)
-    learner, losses = learn_from_plans(settings, learner, knobs)
-    return learner, Report(*outcome, *losses)
+    state, outcome = plan_ahead(config, state, hyper)
+    state, losses = learn_from_plans(config, state, hyper)
+    return state, EpochMetrics(*outcome, *losses)
+
+
+def epoch_log(
+    metrics: EpochMetrics, hyper: Hyperparams, returns: Float[Array, " 2"] | None
+) -> dict[str, float]:
+    """
+    :param returns: of the average policy and of the one that acted so far, if they were compared
+    :return: what an epoch logs, by key
+    """
+    compared = {}
+    if returns is not None:
+        compared["train/return_of_average"] = float(returns[0])
+        compared["train/return_of_best"] = float(max(returns))
+    return compared | {
+        "train/learning_rate": hyper.learning_rate,
+        "train/plan_return_before": float(metrics.before),
+        "train/plan_return_after": float(metrics.after),
+        "train/policy_loss": float(metrics.policy_loss),
+        "train/value_loss": float(metrics.value_loss),
+        "train/gradient_norm": float(metrics.gradient_norm),
+        "train/worsened_plans": int(metrics.worsened),
+        "train/dropped_samples": int(metrics.dropped),
+        "train/exploration_noise": hyper.noise,
+        "train/temperature": hyper.temperature,
+    }
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK_COMPILATION)
-def plan_ahead(settings: Settings, learner: Learner, knobs: Knobs) -> tuple[Learner, Outcome]:
+def plan_ahead(
+    config: EpochConfig, state: EpochState, hyper: Hyperparams
+) -> tuple[EpochState, Outcome]:
     """The first half of an epoch: everything that happens in the twin."""
-    key = jax.random.wrap_key_data(learner.progress.key, impl=GENERATOR)
+    key = jax.random.wrap_key_data(state.progress.key, impl=GENERATOR)
     key, k_noise, k_plan, k_move = jax.random.split(key, 4)
-    problem = problem_of(settings, learner, knobs)
-    seen = jax.vmap(lambda obs: settings.twin.infer(obs, knobs.params))(knobs.visited)
-    starts = _where(knobs.relabel, seen, learner.workspace.starts)
-
-    own, wandering = _act(settings, learner, knobs, problem, starts, k_noise)
-    choice = _plan(settings, learner, knobs, problem, own, k_plan)
+    problem = problem_of(config, state, hyper)
+    starts = state.workspace.starts
+    own, wandering = _act(config, state, hyper, problem, starts, k_noise)
+    choice = _plan(config, state, hyper, problem, own, k_plan)
     gain = jnp.maximum(choice.kept.value - choice.own.value, 0.0)
     samples, finite = samples_of(
-        knobs, problem, choice.kept, choice.tails, gain, choice.sensitivity
+        hyper, problem, choice.kept, choice.tails, gain, choice.sensitivity
     )
-    moved, ages = _move_on(settings, learner, knobs, wandering, k_move)
-    outcome = _outcome(settings, learner, choice, finite)
-    learner = remember(settings, learner, samples)
-    if settings.adapt_scales:
-        learner = rescale(learner, samples)
-    progress = learner.progress._replace(gain=_mean(gain, finite), key=jax.random.key_data(key))
-    workspace = learner.workspace._replace(starts=moved, ages=ages)
-    return learner._replace(progress=progress, workspace=workspace), outcome
+    moved, ages = _move_on(config, state, hyper, wandering, k_move)
+    outcome = _outcome(config, state, choice, finite)
+    state = remember(config, state, samples)
+    if config.adapt_scales:
+        state = rescale(state, samples)
+    progress = state.progress._replace(gain=_mean(gain, finite), key=jax.random.key_data(key))
+    workspace = state.workspace._replace(starts=moved, ages=ages)
+    return state._replace(progress=progress, workspace=workspace), outcome
 
 
 @partial(jax.jit, static_argnums=0)
 def learn_from_plans(
-    settings: Settings, learner: Learner, knobs: Knobs
-) -> tuple[Learner, Float[Array, " 3"]]:
+    config: EpochConfig, state: EpochState, hyper: Hyperparams
+) -> tuple[EpochState, Float[Array, " 3"]]:
     """The second half of an epoch: the regression."""
-    key = jax.random.wrap_key_data(learner.progress.key, impl=GENERATOR)
+    key = jax.random.wrap_key_data(state.progress.key, impl=GENERATOR)
     key, k_regress = jax.random.split(key)
-    learner, losses = regress(settings, learner, knobs, k_regress)
-    progress = learner.progress._replace(
-        n_epochs=learner.progress.n_epochs + 1, key=jax.random.key_data(key)
+    state, losses = regress(config, state, hyper, k_regress)
+    progress = state.progress._replace(
+        n_epochs=state.progress.n_epochs + 1, key=jax.random.key_data(key)
     )
-    return learner._replace(progress=progress), losses
+    return state._replace(progress=progress), losses
 
 
-def control_of(settings: Settings, learner: Learner, knobs: Knobs, obs: Obs) -> Control:
+def control_of(config: EpochConfig, state: EpochState, hyper: Hyperparams, obs: Obs) -> Control:
     """:return: what the policy in training does for an observation of the twin"""
-    seen = learner.networks.inside(knobs.view(obs))
-    return output(settings.actor, learner.networks.actor, seen)
+    seen = state.networks.inside(hyper.view(obs))
+    return output(config.actor, state.networks.actor, seen)
 
 
-def twin_steps_per_epoch(settings: Settings) -> int:
+def twin_steps_per_epoch(config: EpochConfig) -> int:
     """
     :return: simulated steps of one epoch, line searches included; a Jacobian counts one step for
         each of its columns besides the step itself, as many as finite differences would take
     """
-    s = settings
+    s = config
     columns = 2 * len(s.twin.joints) + len(s.twin.actuators)
     improving = s.n_iterations * s.horizon * (1 + columns + s.n_step_sizes)
     n, n_random = s.n_rollouts, _random_slots(s).size
@@ -164,45 +190,45 @@ def twin_steps_per_epoch(settings: Settings) -> int:
 
 
 def _act(
-    settings: Settings,
-    learner: Learner,
-    knobs: Knobs,
+    config: EpochConfig,
+    state: EpochState,
+    hyper: Hyperparams,
     problem: Problem,
     starts: State,
     key: PRNGKeyArray,
 ) -> tuple[Plan, Plan]:
     """What the policy does from each start state, and what it does with exploration noise."""
-    policy = partial(control_of, settings, learner, knobs)
+    policy = partial(control_of, config, state, hyper)
 
     def act(start: State, offset: Control, varied: Params) -> Plan:
         here = problem.with_params(varied)
-        return follow(here, start, lambda obs: policy(obs) + offset, settings.horizon)
+        return follow(here, start, lambda obs: policy(obs) + offset, config.horizon)
 
-    n = settings.n_rollouts
-    noise = knobs.noise * learner.progress.control_scale
+    n = config.n_rollouts
+    noise = hyper.noise * state.progress.control_scale
     offsets = noise * jax.random.normal(key, (n, problem.n_controls))
-    if not settings.advance:
-        own = for_each(act, starts, jnp.zeros_like(offsets), knobs.varied)
+    if not config.advance:
+        own = for_each(act, starts, jnp.zeros_like(offsets), hyper.varied)
         return own, own
-    rows, varied = _joined(starts, starts), _joined(knobs.varied, knobs.varied)
+    rows, varied = _joined(starts, starts), _joined(hyper.varied, hyper.varied)
     paths = for_each(act, rows, jnp.concatenate([jnp.zeros_like(offsets), offsets]), varied)
     return _pick(paths, slice(n)), _pick(paths, slice(n, None))
 
 
 def _plan(
-    settings: Settings,
-    learner: Learner,
-    knobs: Knobs,
+    config: EpochConfig,
+    state: EpochState,
+    hyper: Hyperparams,
     problem: Problem,
     own: Plan,
     key: PRNGKeyArray,
 ) -> Choice:
     """For each of the policy's own plans, the plan that is kept."""
     k_random, k_improve, k_keep = jax.random.split(key, 3)
-    n, fresh = settings.n_rollouts, _random_slots(settings)
-    policy = partial(control_of, settings, learner, knobs)
-    first, tried = own, _pick(knobs.varied, fresh)
-    varied = knobs.varied
+    n, fresh = config.n_rollouts, _random_slots(config)
+    policy = partial(control_of, config, state, hyper)
+    first, tried = own, _pick(hyper.varied, fresh)
+    varied = hyper.varied
     if fresh.size:
         # Without the barrier, XLA gathers again in every step of the loops.
         starts = jax.tree.map(lambda leaf: leaf[fresh, 0], own.states)
@@ -210,15 +236,15 @@ def _plan(
 
         def search(start: State, key: PRNGKeyArray, varied: Params) -> Plan:
             here = problem.with_params(varied)
-            return best_of_random(here, start, key, settings.horizon, settings.n_candidates)
+            return best_of_random(here, start, key, config.horizon, config.n_candidates)
 
         found = jax.vmap(search)(starts, jax.random.split(k_random, fresh.size), tried)
         first, varied = _joined(own, found), _joined(varied, tried)
-    improved, sensitivity = _improve(settings, learner, knobs, problem, first, varied, k_improve)
+    improved, sensitivity = _improve(config, state, hyper, problem, first, varied, k_improve)
 
-    plans, varied = _joined(improved, own), _joined(varied, knobs.varied)
+    plans, varied = _joined(improved, own), _joined(varied, hyper.varied)
     ends = jax.tree.map(lambda leaf: leaf[:, -1], plans.states)
-    value_of_end = lambda end, own: _tail(settings, problem.with_params(own), policy, end)  # noqa: E731
+    value_of_end = lambda end, own: _tail(config, problem.with_params(own), policy, end)  # noqa: E731
     tails = for_each(value_of_end, ends, varied)
     values = jax.vmap(lambda p, tail: score(problem, p.rewards, p.alive, tail))(plans, tails)
     plans = plans._replace(value=values)
@@ -228,8 +254,8 @@ def _plan(
     best = jnp.arange(n).at[fresh].set(jnp.where(better, others, fresh))
     unchanged = n + fresh.size + jnp.arange(n)
     advantage = values[best] - values[unchanged]
-    if settings.annealed:
-        temperature = knobs.temperature * learner.progress.gain
+    if config.annealed:
+        temperature = hyper.temperature * state.progress.gain
         advantage += temperature * jax.random.logistic(k_keep, (n,))
     kept = jnp.where(advantage > 0.0, best, unchanged)
     return Choice(
@@ -237,66 +263,66 @@ def _plan(
     )
 
 
-def _random_slots(settings: Settings) -> np.ndarray:
+def _random_slots(config: EpochConfig) -> np.ndarray:
     """:return: the rollouts for which random plans are tried too"""
-    count = round(settings.n_rollouts * settings.random_share) if settings.n_candidates else 0
-    return np.linspace(0, settings.n_rollouts, count, endpoint=False).astype(int)
+    count = round(config.n_rollouts * config.random_share) if config.n_candidates else 0
+    return np.linspace(0, config.n_rollouts, count, endpoint=False).astype(int)
 
 
 def _improve(
-    settings: Settings,
-    learner: Learner,
-    knobs: Knobs,
+    config: EpochConfig,
+    state: EpochState,
+    hyper: Hyperparams,
     problem: Problem,
     first: Plan,
     varied: Params,
     key: PRNGKeyArray,
 ) -> tuple[Plan, Float[Array, "plans horizon"]]:
     """:return: the improved plans, and what an error of each of their controls costs"""
-    discounts = settings.discount ** jnp.arange(settings.horizon)
-    temperature = knobs.temperature * learner.progress.gain
+    discounts = config.discount ** jnp.arange(config.horizon)
+    temperature = hyper.temperature * state.progress.gain
 
     def one(first: Plan, own: Params, key: PRNGKeyArray | None):
         here = problem.with_params(own)
         start = jax.tree.map(lambda leaf: leaf[0], first.states)
         options = {
-            "n_iterations": settings.n_iterations,
-            "n_step_sizes": settings.n_step_sizes,
+            "n_iterations": config.n_iterations,
+            "n_step_sizes": config.n_step_sizes,
             "temperature": temperature,
             "key": key,
         }
-        if settings.planner == "ilqr":
+        if config.planner == "ilqr":
             plan, gains = ilqr(here, start, first, **options)
             return plan, jnp.sqrt(gains.sensitivity / discounts)
-        improver = gradient_ascent if settings.planner == "first_order" else gauss_newton
-        return improver(here, start, first, **options), jnp.ones(settings.horizon)
+        improver = gradient_ascent if config.planner == "first_order" else gauss_newton
+        return improver(here, start, first, **options), jnp.ones(config.horizon)
 
-    keys = jax.random.split(key, first.value.shape[0]) if settings.annealed else None
+    keys = jax.random.split(key, first.value.shape[0]) if config.annealed else None
     return jax.vmap(one, (0, 0, None if keys is None else 0))(first, varied, keys)
 
 
-def _tail(settings: Settings, problem: Problem, policy, end: State) -> jax.Array:
+def _tail(config: EpochConfig, problem: Problem, policy, end: State) -> jax.Array:
     """Value of a plan's end by what the policy makes of it: errors of V are not exploited."""
-    if not settings.lookahead:
+    if not config.lookahead:
         return problem.value_at_end(end)
-    return follow(problem, end, policy, settings.lookahead).value
+    return follow(problem, end, policy, config.lookahead).value
 
 
 def _move_on(
-    settings: Settings, learner: Learner, knobs: Knobs, wandering: Plan, key: PRNGKeyArray
+    config: EpochConfig, state: EpochState, hyper: Hyperparams, wandering: Plan, key: PRNGKeyArray
 ) -> tuple[State, Float[Array, " rollouts"]]:
     """The next start states: where the policy went with exploration noise, or a reset."""
-    n = settings.n_rollouts
+    n = config.n_rollouts
     k_reset, k_draw = jax.random.split(key)
-    fresh = resets(settings.twin, knobs.params, k_draw, n)
-    if not settings.advance:
+    fresh = resets(config.twin, hyper.params, k_draw, n)
+    if not config.advance:
         return fresh, jnp.zeros(n)
-    moved = jax.tree.map(lambda leaf: leaf[:, settings.advance], wandering.states)
-    ages = learner.workspace.ages + settings.advance
+    moved = jax.tree.map(lambda leaf: leaf[:, config.advance], wandering.states)
+    ages = state.workspace.ages + config.advance
     finite = jnp.isfinite(moved.q).all(1) & jnp.isfinite(moved.v).all(1)
-    too_old = ages >= longest_episode(settings.twin)
-    drawn = jax.random.uniform(k_reset, (n,)) < _reset_rates(knobs.reset_share, n)
-    again = too_old | drawn | ~wandering.alive[:, settings.advance] | ~finite
+    too_old = ages >= longest_episode(config.twin)
+    drawn = jax.random.uniform(k_reset, (n,)) < _reset_rates(hyper.reset_share, n)
+    again = too_old | drawn | ~wandering.alive[:, config.advance] | ~finite
     return _where(again, fresh, moved), jnp.where(again, 0.0, ages)
 
 
@@ -309,16 +335,16 @@ def _reset_rates(share: float, n: int) -> Float[Array, " rollouts"]:
     return position ** (1.0 / share - 1.0)
 
 
-def _outcome(settings: Settings, learner: Learner, choice: Choice, finite: jax.Array) -> Outcome:
-    forever = 1.0 / (1.0 - settings.discount) if settings.discount < 1.0 else settings.horizon
-    progress = learner.progress
+def _outcome(config: EpochConfig, state: EpochState, choice: Choice, finite: jax.Array) -> Outcome:
+    forever = 1.0 / (1.0 - config.discount) if config.discount < 1.0 else config.horizon
+    progress = state.progress
     unit = lambda value: value / progress.reward_scale + progress.reward_offset * forever  # noqa: E731
     both = finite & jnp.isfinite(choice.own.value)
     return Outcome(
         unit(_mean(choice.own.value, both)),
         unit(_mean(choice.kept.value, both)),
         jnp.sum(choice.kept.value < choice.own.value),
-        jnp.sum(~finite) * settings.horizon,
+        jnp.sum(~finite) * config.horizon,
     )
 
 

@@ -5,13 +5,25 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch as th
+from gymnasium import spaces
 
 from sb3_hds import effects, twins
-from sb3_hds.algos.base.checks import in_one_line
+from sb3_hds.algos.base.construct import in_one_line
 from sb3_hds.algos.base.files import from_state_dict, to_state_dict
 from sb3_hds.core import Effect, Twin
 from sb3_hds.core.twin import plant_of
-from sb3_hds.errors import NoTwinError, RewardError
+from sb3_hds.errors import EnvironmentMismatchError, NoTwinError, RewardError
+
+
+def check_twin_observes(space: spaces.Space) -> None:
+    """
+    :raises EnvironmentMismatchError: for dictionaries, images and whatever else no twin has
+    """
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise EnvironmentMismatchError(
+            f"A twin observes a Box with one axis, and this environment observes {space}. Use one "
+            "that has a twin (sb3_hds.twins.all_ids() lists them), or make your own of its state."
+        )
 
 
 def check_reward(twin: Twin) -> None:

@@ -1,5 +1,6 @@
 """The deterministic policy of PODS and HDS, as SB3 sees it."""
 
+import dataclasses
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -8,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_hds.algos.base.policy import TensorPolicy, TrainingTensors
+from sb3_hds.algos.base.config import takes
+from sb3_hds.algos.base.policy import PolicyConfig, TensorPolicy, TrainingTensors
 from sb3_hds.algos.nets.activations import Activation, activation, finite_leaves, widths_of
 from sb3_hds.algos.twin.networks import Actor, Value
 from sb3_hds.algos.twin.state import Networks, Progress, fresh_networks
@@ -20,13 +21,13 @@ from sb3_hds.deploy.policy_function import PolicyFunction
 _POLICY_WIDTHS, _VALUE_WIDTHS = (96, 96), (64, 64)
 
 
-class TwinPolicy(TensorPolicy):
+@dataclasses.dataclass(frozen=True, eq=False)
+class TwinPolicyConfig(PolicyConfig):
     """
-    A policy network with a value network beside it, both with their own input normalisation.
+    Arguments of the policy of PODS and HDS.
 
     :param observation_space: a Box of one dimension
     :param action_space: a bounded Box of one dimension
-    :param lr_schedule: learning rate of the policy by remaining progress
     :param net_arch: hidden widths of both networks, or ``{"pi": [...], "vf": [...]}``; default
         96, 96 for the policy and 64, 64 for the value
     :param activation_fn: name, JAX function or torch module class
@@ -36,32 +37,35 @@ class TwinPolicy(TensorPolicy):
     :param use_sde: accepted for SB3's sake; the policy is deterministic
     """
 
-    def __init__(
-        self,
-        observation_space: spaces.Box,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        net_arch: Sequence[int] | dict[str, Sequence[int]] | None = None,
-        activation_fn: str | Activation | type = "tanh",
-        linear_path: bool = True,
-        max_grad_norm: float = 1.0,
-        use_sde: bool = False,
-    ) -> None:
-        super().__init__(observation_space, action_space, squash_output=True)
-        pi, vf = _widths(net_arch)
-        function = activation(activation_fn)
-        if not max_grad_norm > 0.0:
-            raise ValueError(f"max_grad_norm must be above 0, got {max_grad_norm!r}.")
-        self.arguments = {
-            "lr_schedule": lr_schedule,
-            "net_arch": net_arch,
-            "activation_fn": activation_fn,
-            "linear_path": linear_path,
-            "max_grad_norm": max_grad_norm,
-        }
-        self.actor_network = Actor(int(np.prod(action_space.shape)), pi, function, linear_path)
+    net_arch: Sequence[int] | dict[str, Sequence[int]] | None = None
+    activation_fn: str | Activation | type = "tanh"
+    linear_path: bool = True
+    max_grad_norm: float = 1.0
+    use_sde: bool = False
+
+    def __post_init__(self) -> None:
+        """
+        :raises ValueError: for arguments out of range
+        """
+        if not self.max_grad_norm > 0.0:
+            raise ValueError(f"max_grad_norm must be above 0, got {self.max_grad_norm!r}.")
+
+
+class TwinPolicy(TensorPolicy):
+    """
+    A policy network with a value network beside it, both with their own input normalisation.
+    """
+
+    @takes(TwinPolicyConfig)
+    def __init__(self, config: TwinPolicyConfig) -> None:
+        super().__init__(config.observation_space, config.action_space, squash_output=True)
+        self.arguments = config.arguments()
+        del self.arguments["use_sde"]
+        pi, vf = _widths(config.net_arch)
+        function, n_act = activation(config.activation_fn), int(np.prod(config.action_space.shape))
+        self.actor_network = Actor(n_act, pi, function, config.linear_path)
         self.value_network = Value(vf, function)
-        self.max_grad_norm = max_grad_norm
+        self.max_grad_norm = config.max_grad_norm
         self.networks: Networks
         self.progress: Progress
         self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves

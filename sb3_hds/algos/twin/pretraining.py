@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import (
@@ -14,9 +14,6 @@ from stable_baselines3.common.callbacks import (
     ProgressBarCallback,
 )
 from stable_baselines3.common.logger import Logger
-
-if TYPE_CHECKING:
-    from sb3_hds.algos.twin.algorithm import TwinAlgorithm
 
 # Log lines written during pretraining.
 _N_LOGS = 10
@@ -46,7 +43,7 @@ class Pretraining(CallbackList):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        model: TwinAlgorithm = self.model  # type: ignore[assignment]
+        model: Any = self.model
         self.update_locals(_no_step(model))
         model.poll = self._poll
         try:
@@ -58,7 +55,7 @@ class Pretraining(CallbackList):
             model.poll = nothing
             self.update_locals({"pretraining": False})
 
-    def _run(self, model: "TwinAlgorithm") -> None:
+    def _run(self, model: Any) -> None:
         model.before_planning()
         due = model.pretraining_due
         every = max(1, due // _N_LOGS)
@@ -83,7 +80,7 @@ class Pretraining(CallbackList):
 
     def _on_step(self) -> bool:
         """SB3 stores a step after the callbacks have seen it, checkpoints among them."""
-        model: TwinAlgorithm = self.model  # type: ignore[assignment]
+        model: Any = self.model
         names = ("buffer_actions", "new_obs", "rewards", "dones", "infos")
         model.unstored_step = {name: self.locals[name] for name in names}
         return super()._on_step()
@@ -150,7 +147,7 @@ def meanwhile(works: Sequence[Callable[[], Any]], poll: Callable[[], None]) -> l
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _no_step(model: "TwinAlgorithm") -> dict[str, Any]:
+def _no_step(model: Any) -> dict[str, Any]:
     """:return: what callbacks find in ``locals`` after a step, of one that was not made"""
     space: Any = model.action_space
     n_envs = model.n_envs
@@ -205,7 +202,7 @@ def _counts_restored(callbacks: Iterable[BaseCallback]) -> Iterator[None]:
 
 
 @contextmanager
-def _own_series(model: "TwinAlgorithm") -> Iterator[None]:
+def _own_series(model: Any) -> Iterator[None]:
     usual = model.logger
     own = OwnSeries(usual, lambda: int(model.policy.progress.n_epochs))
     model._logger = own

@@ -6,7 +6,7 @@ import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sb3_hds.algos.twin.networks import output, squash, value_of, with_input_scales
-from sb3_hds.algos.twin.state import Knobs, Learner, Samples, Settings, optimiser
+from sb3_hds.algos.twin.state import EpochConfig, EpochState, Hyperparams, Samples, clipped_adam
 from sb3_hds.planning import Plan, Problem
 
 # Where the absolute error of the regression turns into a squared one, in units of the control
@@ -21,7 +21,7 @@ _LARGEST_WEIGHT = 20.0
 
 
 def samples_of(
-    knobs: Knobs,
+    hyper: Hyperparams,
     problem: Problem,
     kept: Plan,
     tails: Float[Array, " rollouts"],
@@ -44,12 +44,12 @@ def samples_of(
         the others weigh nothing
     """
     before = jax.tree.map(lambda leaf: leaf[:, :-1], kept.states)
-    obs = jax.vmap(jax.vmap(lambda state: knobs.view(problem.observe(state))))(before)
+    obs = jax.vmap(jax.vmap(lambda state: hyper.view(problem.observe(state))))(before)
     targets = jax.vmap(lambda plan, tail: _to_go(problem, plan, tail))(kept, tails)
     finite = jnp.isfinite(obs).all((1, 2)) & jnp.isfinite(targets).all(1) & jnp.isfinite(kept.value)
     alive = finite[:, None] & kept.alive[:, :-1]
-    weight = _weight(gain, knobs.gain_weight)[:, None] * _weight(
-        sensitivity, knobs.sensitivity_weight
+    weight = _weight(gain, hyper.gain_weight)[:, None] * _weight(
+        sensitivity, hyper.sensitivity_weight
     )
 
     def flat(x: jax.Array) -> jax.Array:
@@ -66,22 +66,22 @@ def samples_of(
     return samples, finite
 
 
-def remember(settings: Settings, learner: Learner, samples: Samples) -> Learner:
+def remember(config: EpochConfig, state: EpochState, samples: Samples) -> EpochState:
     """Write an epoch's samples over the oldest row."""
-    work = learner.workspace
-    row = work.n_filled % settings.plan_memory
+    work = state.workspace
+    row = work.n_filled % config.plan_memory
     write = lambda rows, new: jax.lax.dynamic_update_index_in_dim(rows, new, row, 0)  # noqa: E731
     rows = jax.tree.map(write, work.samples, samples)
-    return learner._replace(workspace=work._replace(samples=rows, n_filled=work.n_filled + 1))
+    return state._replace(workspace=work._replace(samples=rows, n_filled=work.n_filled + 1))
 
 
-def rescale(learner: Learner, samples: Samples) -> Learner:
+def rescale(state: EpochState, samples: Samples) -> EpochState:
     """
     Let the scales of inputs and controls follow the plans: near a balance both are far smaller than
     in the random rollouts from which they were first taken. Old epochs are forgotten at a rate of
     3/n. The networks' first layers change with their inputs, so that what they compute does not.
     """
-    nets, progress = learner.networks, learner.progress
+    nets, progress = state.networks, state.progress
     counted = samples.alive[:, None]
     rate = _FORGETTING / (progress.n_epochs + _FORGETTING) * jnp.any(counted > 0.0)
     total = jnp.maximum(jnp.sum(counted), 1.0)
@@ -100,15 +100,15 @@ def rescale(learner: Learner, samples: Samples) -> Learner:
         for weights in (nets.actor, nets.average, nets.value)
     )
     nets = nets._replace(actor=actor, average=average, value=value, inside=inside)
-    return learner._replace(
+    return state._replace(
         networks=nets,
         progress=progress._replace(control_scale=effort),
     )
 
 
 def regress(
-    settings: Settings, learner: Learner, knobs: Knobs, key: PRNGKeyArray
-) -> tuple[Learner, Float[Array, " 3"]]:
+    config: EpochConfig, state: EpochState, hyper: Hyperparams, key: PRNGKeyArray
+) -> tuple[EpochState, Float[Array, " 3"]]:
     r"""
     Adam on minibatches of the remembered samples.
 
@@ -119,28 +119,28 @@ def regress(
     control scale: a squared error averages between turning left and turning right, and blurs the
     moments of switching. The paper's :math:`w\,e^2/2`, in units of the control, is a setting.
 
-    :return: the learner; the mean losses of policy and value, and the mean norm of the policy's
+    :return: the state; the mean losses of policy and value, and the mean norm of the policy's
         gradient before it is clipped
     """
-    adam, work = optimiser(settings.max_grad_norm), learner.workspace
-    filled = jnp.minimum(work.n_filled, settings.plan_memory)
-    inside, unit = learner.networks.inside, learner.progress.control_scale
+    adam, work = clipped_adam(config.max_grad_norm), state.workspace
+    filled = jnp.minimum(work.n_filled, config.plan_memory)
+    inside, unit = state.networks.inside, state.progress.control_scale
 
-    n_columns = settings.horizon * settings.n_rollouts
-    n_early = settings.n_learned * settings.n_rollouts
+    n_columns = config.horizon * config.n_rollouts
+    n_early = config.n_learned * config.n_rollouts
 
     def draw(key: PRNGKeyArray, n: int) -> Samples:
-        drawn = jax.random.randint(key, (settings.batch_size,), 0, filled * n)
+        drawn = jax.random.randint(key, (config.batch_size,), 0, filled * n)
         return jax.tree.map(lambda leaf: leaf[drawn // n, drawn % n], work.samples)
 
     def policy_loss(actor, batch: Samples) -> jax.Array:
-        error = output(settings.actor, actor, inside(batch.obs)) - batch.control
-        if settings.squared_error:
+        error = output(config.actor, actor, inside(batch.obs)) - batch.control
+        if config.squared_error:
             return jnp.mean(batch.weight[:, None] * 0.5 * error**2)
         return jnp.mean(batch.weight[:, None] * jnp.sqrt((error / unit) ** 2 + _SMOOTH_ERROR**2))
 
     def value_loss(value, batch: Samples) -> jax.Array:
-        found = value_of(output(settings.value, value, inside(batch.obs)))
+        found = value_of(output(config.value, value, inside(batch.obs)))
         error = squash(found) - squash(batch.value)
         return jnp.mean(batch.alive * error**2)
 
@@ -149,28 +149,26 @@ def regress(
         k_policy, k_value = jax.random.split(jax.random.fold_in(key, i))
         loss_p, slope = jax.value_and_grad(policy_loss)(actor, draw(k_policy, n_early))
         norm = optax.tree.norm(slope)
-        actor, actor_state = _descend(adam, slope, actor, actor_state, knobs.learning_rate)
+        actor, actor_state = _descend(adam, slope, actor, actor_state, hyper.learning_rate)
         loss_v = jnp.zeros(())
-        if settings.terminal_value:
+        if config.terminal_value:
             loss_v, slope = jax.value_and_grad(value_loss)(value, draw(k_value, n_columns))
-            value, value_state = _descend(
-                adam, slope, value, value_state, knobs.value_learning_rate
-            )
+            value, value_state = _descend(adam, slope, value, value_state, hyper.learning_rate)
         return actor, value, actor_state, value_state, losses + jnp.stack([loss_p, loss_v, norm])
 
-    nets, progress = learner.networks, learner.progress
-    optimisers = (progress.actor_optimiser, progress.value_optimiser)
+    nets, progress = state.networks, state.progress
+    optimisers = (progress.actor_optimizer, progress.value_optimizer)
     first = (nets.actor, nets.value, *optimisers, jnp.zeros(3))
     actor, value, actor_state, value_state, losses = jax.lax.fori_loop(
-        0, knobs.gradient_steps, update, first
+        0, hyper.gradient_steps, update, first
     )
-    decay = jnp.where(progress.n_epochs > 0, knobs.averaging, 0.0)
+    decay = jnp.where(progress.n_epochs > 0, hyper.averaging, 0.0)
     average = jax.tree.map(lambda a, new: decay * a + (1.0 - decay) * new, nets.average, actor)
-    learner = learner._replace(
+    state = state._replace(
         networks=nets._replace(actor=actor, value=value, average=average),
-        progress=progress._replace(actor_optimiser=actor_state, value_optimiser=value_state),
+        progress=progress._replace(actor_optimizer=actor_state, value_optimizer=value_state),
     )
-    return learner, losses / jnp.maximum(knobs.gradient_steps, 1)
+    return state, losses / jnp.maximum(hyper.gradient_steps, 1)
 
 
 def _to_go(problem: Problem, plan: Plan, tail: jax.Array) -> Float[Array, " horizon"]:

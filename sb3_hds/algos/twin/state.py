@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.algos.twin.networks import Actor, Value, output, value_of
 from sb3_hds.core import Obs, Params, State, Twin
@@ -27,7 +27,7 @@ _LONG_EPISODE = 1000
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class EpochConfig:
     """
     What makes two epochs different programs: a change compiles again. The fields are documented as
     arguments of ``PODS`` and ``HDS``.
@@ -74,14 +74,13 @@ class View(NamedTuple):
         return jnp.clip((obs - self.mean) / self.scale, -self.clip, self.clip)
 
 
-class Knobs(NamedTuple):
+class Hyperparams(NamedTuple):
     """
     What may change from epoch to epoch without compiling again.
 
     :param params: the twin's parameters
     :param varied: those of them that differ between rollouts, each of shape ``(n_rollouts,)``
-    :param learning_rate: of the policy
-    :param value_learning_rate: of the value network
+    :param learning_rate: of policy and value
     :param noise: standard deviation of the exploration noise, in units of the control scale
     :param temperature: of the annealed acceptance, in units of the mean gain of the last epoch
     :param reset_share: share of start states drawn afresh in each epoch
@@ -89,15 +88,12 @@ class Knobs(NamedTuple):
     :param sensitivity_weight: 0..1, how much a sample counts by what an error of it costs
     :param averaging: decay of the average of policies, per epoch
     :param gradient_steps: regression steps
-    :param visited: observations of the real environment, shape ``(n_rollouts, n_obs)``
-    :param relabel: which start states are taken from ``visited``, shape ``(n_rollouts,)``
     :param view: what the environment's own normalisation does to an observation
     """
 
     params: Params
     varied: Params
     learning_rate: float
-    value_learning_rate: float
     noise: float
     temperature: float
     reset_share: float
@@ -105,8 +101,6 @@ class Knobs(NamedTuple):
     sensitivity_weight: float
     averaging: float
     gradient_steps: int
-    visited: Float[Array, "rollouts obs"]
-    relabel: Bool[Array, " rollouts"]
     view: View
 
 
@@ -134,8 +128,8 @@ class Progress(NamedTuple):
     """
     What training needs to go on after a break, and is saved with a model.
 
-    :param actor_optimiser: state of Adam
-    :param value_optimiser: state of Adam
+    :param actor_optimizer: state of Adam
+    :param value_optimizer: state of Adam
     :param reward_scale: scale of the objective
     :param reward_offset: reward that counts as zero
     :param control_scale: geometric mean of the size of the plans' controls, shape ``(n_act,)``
@@ -144,8 +138,8 @@ class Progress(NamedTuple):
     :param key: for random numbers, as integers
     """
 
-    actor_optimiser: Any
-    value_optimiser: Any
+    actor_optimizer: Any
+    value_optimizer: Any
     reward_scale: jax.Array
     reward_offset: jax.Array
     control_scale: jax.Array
@@ -160,7 +154,7 @@ class Samples(NamedTuple):
     ``(plan_memory, horizon * n_rollouts, ...)``, first steps first: one row for each of the last
     epochs.
 
-    :param obs: as the learner sees them
+    :param obs: as the state sees them
     :param control: scaled to [-1, 1]
     :param value: objective from here on
     :param weight: in the policy's loss; zero where there is nothing to learn
@@ -202,7 +196,7 @@ class Scales(NamedTuple):
     reward_offset: jax.Array
 
 
-class Learner(NamedTuple):
+class EpochState(NamedTuple):
     """Everything that an epoch reads and changes."""
 
     networks: Networks
@@ -219,7 +213,7 @@ def fresh_networks(
     obs = jnp.zeros(n_obs)
     weights, value_weights = actor.init(k_actor, obs), value.init(k_value, obs)
     inside = View(jnp.zeros(n_obs), jnp.ones(n_obs), jnp.full((), jnp.inf))
-    adam = optimiser(max_grad_norm)
+    adam = clipped_adam(max_grad_norm)
     zero = jnp.zeros(())
     progress = Progress(
         adam.init(weights),
@@ -235,8 +229,8 @@ def fresh_networks(
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK_COMPILATION)
-def begin(
-    settings: Settings, params: Params, view: View, progress: Progress
+def init_workspace(
+    config: EpochConfig, params: Params, view: View, progress: Progress
 ) -> tuple[Workspace, Scales, Progress]:
     """
     Start states from the twin's reset, no samples, and the scales of observations and rewards, read
@@ -246,25 +240,25 @@ def begin(
     """
     key = jax.random.wrap_key_data(progress.key, impl=GENERATOR)
     key, k_starts, k_plans = jax.random.split(key, 3)
-    n, n_obs, n_act = settings.n_rollouts, view.mean.shape[0], len(settings.twin.actuators)
-    rows = (settings.plan_memory, settings.horizon * n)
+    n, n_obs, n_act = config.n_rollouts, view.mean.shape[0], len(config.twin.actuators)
+    rows = (config.plan_memory, config.horizon * n)
     empty = jnp.zeros(rows)
     samples = Samples(jnp.zeros((*rows, n_obs)), jnp.zeros((*rows, n_act)), empty, empty, empty)
-    starts = resets(settings.twin, params, k_starts, n)
+    starts = resets(config.twin, params, k_starts, n)
     workspace = Workspace(starts, jnp.zeros(n), samples, jnp.zeros((), jnp.int32))
 
-    problem = Problem(settings.twin, params, settings.discount)
-    search = lambda start, k: best_of_random(problem, start, k, settings.horizon, 1)  # noqa: E731
+    problem = Problem(config.twin, params, config.discount)
+    search = lambda start, k: best_of_random(problem, start, k, config.horizon, 1)  # noqa: E731
     plans = jax.vmap(search)(starts, jax.random.split(k_plans, n))
     seen = jax.vmap(jax.vmap(lambda state: view(problem.observe(state))))(plans.states)
-    offset = _best_reward(plans) if settings.discount < 1.0 else jnp.zeros(())
-    shortfall = _typical_shortfall(plans, offset, settings.discount)
+    offset = _best_reward(plans) if config.discount < 1.0 else jnp.zeros(())
+    shortfall = _typical_shortfall(plans, offset, config.discount)
     scale = _TYPICAL_SHORTFALL / jnp.maximum(shortfall, 1e-6)
     scales = Scales(_input_scales(seen, plans), scale, offset)
     return workspace, scales, progress._replace(key=jax.random.key_data(key))
 
 
-def optimiser(max_grad_norm: float) -> optax.GradientTransformation:
+def clipped_adam(max_grad_norm: float) -> optax.GradientTransformation:
     """Adam without its learning rate, which is a knob."""
     return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.scale_by_adam(0.9, 0.99))
 
@@ -295,26 +289,26 @@ def longest_episode(twin: Twin) -> int:
     return twin.max_episode_steps or _LONG_EPISODE
 
 
-def problem_of(settings: Settings, learner: Learner, knobs: Knobs) -> Problem:
+def problem_of(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> Problem:
     """:return: what the planner maximises with the networks as they are now"""
 
     def roots(obs: Obs) -> jax.Array:
-        seen = learner.networks.inside(knobs.view(obs))
-        return output(settings.value, learner.networks.value, seen)
+        seen = state.networks.inside(hyper.view(obs))
+        return output(config.value, state.networks.value, seen)
 
     def of_shortfall(obs: Obs) -> jax.Array:
         found = roots(obs)
         return jnp.concatenate([jnp.minimum(found[:1], 0.0), found[1:]])
 
     return Problem(
-        settings.twin,
-        knobs.params,
-        settings.discount,
-        learner.progress.reward_scale,
-        learner.progress.reward_offset,
-        (lambda obs: value_of(roots(obs))) if settings.terminal_value else None,
-        terminal_roots=of_shortfall if settings.terminal_value else None,
-        shift_ends=settings.shift_ends,
+        config.twin,
+        hyper.params,
+        config.discount,
+        state.progress.reward_scale,
+        state.progress.reward_offset,
+        (lambda obs: value_of(roots(obs))) if config.terminal_value else None,
+        terminal_roots=of_shortfall if config.terminal_value else None,
+        shift_ends=config.shift_ends,
     )
 
 

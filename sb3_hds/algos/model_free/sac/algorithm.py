@@ -3,6 +3,8 @@
 import dataclasses
 import math
 import warnings
+from collections.abc import Mapping
+from dataclasses import KW_ONLY
 from typing import Any, ClassVar
 
 import jax
@@ -10,43 +12,62 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
-from sb3_hds.algos.base.construct import between, is_count, jax_device
-from sb3_hds.algos.model_free.algorithm import ModelFreeAlgorithm
+from sb3_hds.algos.base.config import between, takes
+from sb3_hds.algos.base.construct import jax_device
+from sb3_hds.algos.model_free.algorithm import ModelFreeAlgorithm, ModelFreeConfig
 from sb3_hds.algos.model_free.replay import batches_of
+from sb3_hds.algos.model_free.sac.objectives import squared_error
 from sb3_hds.algos.model_free.sac.policy import GaussianPolicy, SimbaPolicy
 from sb3_hds.algos.model_free.sac.update import (
-    Knobs,
-    Recipe,
-    Report,
-    before_any,
+    Hyperparams,
+    UpdateConfig,
+    UpdateMetrics,
     log_of,
-    squared,
     update,
 )
+from sb3_hds.algos.model_free.update import zero_metrics
 
 # Updates of one compiled call; more are made in several.
 _MOST_UPDATES = 64
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class SACConfig(ModelFreeConfig):
+    """
+    Arguments of the SAC family.
+
+    :param ent_coef: a number, ``"auto"``, or ``"auto_0.1"`` to start there
+    :param target_entropy: a number, or ``"auto"``: minus the number of controls; of SimBa and BRO,
+        half of that
+    :param linear_ent_coef: whether the loss of the entropy coefficient is linear in the coefficient
+        itself, as equation 18 of the paper, not in its logarithm, as in SB3, SBX and the authors'
+        code of DroQ and TQC
+    :param target_update_interval: updates of the critics between two updates of the target critics,
+        counted from the first; SB3 counts anew in each call of ``train``
+    """
+
+    _: KW_ONLY
+    ent_coef: float | str = "auto"
+    target_entropy: float | str = "auto"
+    linear_ent_coef: bool = False
+    target_update_interval: int = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        entropy = self.target_entropy
+        fine = entropy == "auto" or between(entropy, -math.inf, math.inf)
+        self.require(fine, "target_entropy", "'auto' or a number")
+        self.require_flag("linear_ent_coef")
+        self.require_counts({"target_update_interval": 1})
+        initial_ent_coef(self.ent_coef)
+
+
 class SoftActorCritic(ModelFreeAlgorithm):
     """
-    Abstract: soft actor-critic (Haarnoja et al. 2018), on which the algorithms of this family
-    differ by their :class:`~sb3_hds.algos.model_free.sac.update.Recipe`.
-
-    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` for Dict observations, ``"SimbaPolicy"``
-        (not CrossQ and BRO), a policy class, or the environment itself
-    :param env: an environment, its id, or a vectorised environment
-    :param learning_rate: of actor, entropy coefficient and critics; number, schedule or
-        ``"lin_3e-4"``
-    :param ent_coef: a number, ``"auto"``, or ``"auto_0.1"`` to start there
-    :param target_entropy: a number, or ``"auto"``: minus the number of controls
-    :param linear_ent_coef: whether the loss of the entropy coefficient has it itself, as equation
-        18 of the paper, not its logarithm, as SB3, SBX and the authors' code of DroQ and TQC
-    :param target_update_interval: updates of the critics for each of the target networks, counted
-        from the first; SB3 counts anew in each call of ``train``
-    :param arguments: those of :class:`~sb3_hds.algos.model_free.algorithm.ModelFreeAlgorithm`
+    Abstract: soft actor-critic (Haarnoja et al. 2018). Algorithms of this family differ by their
+    :class:`~sb3_hds.algos.model_free.sac.update.UpdateConfig`.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -55,52 +76,43 @@ class SoftActorCritic(ModelFreeAlgorithm):
         "SimbaPolicy": SimbaPolicy,
     }
     policy_family = GaussianPolicy
-    #: fields of the learner that ``param_resets`` leaves as they are
-    kept_by_restarts: ClassVar[tuple[str, ...]] = ("log_ent_coef", "seen", "n_updates")
+    #: fields of the state that ``param_resets`` leaves as they are
+    kept_by_restarts: ClassVar[tuple[str, ...]] = ("log_ent_coef", "obs_stats", "n_updates")
     policy: GaussianPolicy
+    ent_coef: float | str
+    target_entropy: float | str
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: float | str | Schedule = 3e-4,
-        *,
-        ent_coef: float | str = "auto",
-        target_entropy: float | str = "auto",
-        linear_ent_coef: bool = False,
-        target_update_interval: int = 1,
-        **arguments: Any,
-    ) -> None:
-        self.ent_coef, self.target_entropy = ent_coef, target_entropy
-        self.linear_ent_coef = linear_ent_coef
-        self.target_update_interval = target_update_interval
-        super().__init__(policy, env, learning_rate=learning_rate, **arguments)
+    config_class = SACConfig
+    #: arguments of the policy unless they are given
+    usual_policy_kwargs: ClassVar[Mapping[str, Any]] = {}
 
-    def recipe(self) -> Recipe:
+    @takes(SACConfig)
+    def __init__(self, config: SACConfig) -> None:
+        self.construct(config)
+
+    def construct(self, config: SACConfig, **more: Any) -> None:  # type: ignore[override]
+        policy_kwargs = {**self.usual_policy_kwargs, **(config.policy_kwargs or {})}
+        super().construct(dataclasses.replace(config, policy_kwargs=policy_kwargs), **more)
+
+    def update_config(self) -> UpdateConfig:
         """:return: what an update is made of"""
+        config = self.config
         return dataclasses.replace(
-            self.policy.plain_recipe(),
-            policy_delay=self.policy_delay,
-            target_every=self.target_update_interval,
-            learns_ent_coef=isinstance(self.ent_coef, str),
-            linear_ent_coef=bool(self.linear_ent_coef),
+            self.policy.plain_update_config(),
+            policy_delay=config.policy_delay,
+            target_update_interval=config.target_update_interval,
+            learns_ent_coef=isinstance(config.ent_coef, str),
+            linear_ent_coef=bool(config.linear_ent_coef),
         )
 
     def auto_target_entropy(self) -> float:
         """:return: what ``target_entropy="auto"`` means here"""
         return -float(self.policy.n_act)
 
-    def check_arguments(self) -> None:
-        super().check_arguments()
-        entropy = self.target_entropy
-        fine = entropy == "auto" or between(entropy, -math.inf, math.inf)
-        self.refuse_unless(fine, "target_entropy", "'auto' or a number")
-        fine = isinstance(self.linear_ent_coef, bool | np.bool_)
-        self.refuse_unless(fine, "linear_ent_coef", "True or False")
-        fine = is_count(self.target_update_interval, 1)
-        self.refuse_unless(fine, "target_update_interval", "a whole number of at least 1")
-        _initial_ent_coef(self.ent_coef)
-        if self.use_sde and self.sde_sample_freq < 1 and self.train_freq in (1, (1, "step")):
+    def check_environment(self, config: Any) -> None:
+        super().check_environment(config)
+        each_step = config.train_freq in (1, (1, "step"))
+        if config.use_sde and config.sde_sample_freq < 1 and each_step:
             warnings.warn(
                 f"{type(self).__name__}(use_sde=True, train_freq=1) draws a new noise matrix at "
                 "each step, which is not smooth: pass sde_sample_freq=8, or train_freq=8 and "
@@ -109,9 +121,9 @@ class SoftActorCritic(ModelFreeAlgorithm):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        if self.policy.recipe.joint_pass:
+        if self.policy.update_config.joint_pass:
             why = "there are no target networks with batch normalisation"
-            self.warn_unless_usual("tau", "target_update_interval", why=why)
+            self.warn_of_unused(self.config, "tau", "target_update_interval", why=why)
 
     def set_parameters(
         self,
@@ -122,44 +134,46 @@ class SoftActorCritic(ModelFreeAlgorithm):
         super().set_parameters(load_path_or_dict, exact_match, device)
         if not isinstance(self.ent_coef, str):
             # What is no parameter of this model is not another one's to set; ``load`` passes here.
-            before = self.policy.learner.log_ent_coef
+            before = self.policy.agent_state.log_ent_coef
             fixed = {"params": log_of(self.ent_coef)}
             now = before._replace(weights=fixed)
-            self.policy.learner = self.policy.learner._replace(log_ent_coef=now)
+            self.policy.agent_state = self.policy.agent_state._replace(log_ent_coef=now)
 
     def _build(self, seed: int) -> None:
-        start, device = _initial_ent_coef(self.ent_coef), jax_device(self._device_name)
-        recipe, n_quantiles = self.recipe(), self.policy.n_quantiles
-        if recipe.error is squared and n_quantiles > 1:
+        start, device = initial_ent_coef(self.ent_coef), jax_device(self._device_name)
+        config, n_quantiles = self.update_config(), self.policy.n_quantiles
+        if config.critic_loss is squared_error and n_quantiles > 1:
             raise ValueError(
                 f"{type(self).__name__}(policy_kwargs={{'n_quantiles': {n_quantiles}}}): its "
                 "critics have one value each: leave it out, or use TQC."
             )
-        self.policy.build(recipe, start, seed, device)
+        self.policy.build(config, start, seed, device)
 
     def _restart(self, seed: int) -> None:
         """The entropy coefficient stays with its optimiser, as in SBX, but for BRO."""
-        before = self.policy.learner
+        before = self.policy.agent_state
         self._build(seed)
         kept = {name: getattr(before, name) for name in self.kept_by_restarts}
-        self.policy.learner = self.policy.learner._replace(**kept)
+        self.policy.agent_state = self.policy.agent_state._replace(**kept)
 
     def _updates(self, n: int, batch_size: int) -> dict[str, float]:
-        policy, knobs, report, found = self.policy, self.knobs(), {}, before_any(Report)
+        policy, hyper, report, found = self.policy, self.hyper(), {}, zero_metrics(UpdateMetrics)
         for done in range(0, n, _MOST_UPDATES):
             now = min(_MOST_UPDATES, n - done)
-            batches = batches_of(self, now, batch_size, _capacity(now))
-            learner, found = update(policy.recipe, policy.learner, batches, now, knobs, found)
+            batches = batches_of(self.replay_source, now, batch_size, _capacity(now))
+            state, found = update(
+                policy.update_config, policy.agent_state, batches, now, hyper, found
+            )
             report = _plain(found)
-            self._take(learner, report)
+            self._take(state, report)
         return report
 
-    def knobs(self) -> Knobs:
+    def hyper(self) -> Hyperparams:
         """:return: what schedules make of the arguments, at this point of the training"""
         rate, qf_rate = self.learning_rates()
         entropy = self.target_entropy
         wanted = self.auto_target_entropy() if entropy == "auto" else float(entropy)
-        return Knobs(rate, qf_rate, self.tau, wanted)
+        return Hyperparams(rate, qf_rate, self.tau, wanted)
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -186,7 +200,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
         self.policy.observed(new_obs)
 
 
-def _initial_ent_coef(ent_coef: float | str) -> float:
+def initial_ent_coef(ent_coef: float | str) -> float:
     """
     :raises ValueError: for anything but a number of at least 0, ``"auto"`` or ``"auto_NUMBER"``,
         which is above 0
@@ -213,5 +227,5 @@ def _capacity(n: int) -> int:
     return 1 << (n - 1).bit_length()
 
 
-def _plain(report: Report) -> dict[str, float]:
+def _plain(report: UpdateMetrics) -> dict[str, float]:
     return {name: float(value) for name, value in jax.device_get(report)._asdict().items()}

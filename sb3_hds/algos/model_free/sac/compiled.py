@@ -13,18 +13,18 @@ from rich.progress import track
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
-from sb3_hds.algos.base.construct import is_count
+from sb3_hds.algos.base.config import is_count
 from sb3_hds.algos.model_free.sac.algorithm import SoftActorCritic
 from sb3_hds.algos.model_free.sac.compiled_run import (
     Loop,
     Round,
     Run,
     Step,
-    begin_run,
+    init_run,
     run_rounds,
     runs_axes,
 )
-from sb3_hds.algos.model_free.sac.update import Knobs
+from sb3_hds.algos.model_free.sac.update import Hyperparams
 from sb3_hds.core import Twin
 from sb3_hds.core.numerics.compilation import GENERATOR
 from sb3_hds.envs.mirror import check_mirrors, twin_of
@@ -196,7 +196,7 @@ def _loop_of(model: SoftActorCritic, total_timesteps: int, twin: Twin) -> Loop:
     frequency = model.train_freq.frequency  # type: ignore[union-attr]
     return Loop(
         twin=twin,
-        recipe=model.policy.recipe,
+        update_config=model.policy.update_config,
         limit=_limit_of(env),
         capacity=min(model.buffer_size, _capacity(_rounded_up(total_timesteps, frequency))),
         learning_starts=model.learning_starts,
@@ -224,13 +224,13 @@ def _begun(loop: Loop, models: Sequence[SoftActorCritic], seeds: Sequence[int]) 
     singles = []
     for model, seed in zip(models, seeds, strict=True):
         network_key, key = jax.random.split(jax.random.key(seed, impl="threefry2x32"))
-        learner = model.policy.learner._replace(key=network_key)
-        singles.append(begin_run(loop, loop.twin.params, learner, key))
+        state = model.policy.agent_state._replace(key=network_key)
+        singles.append(init_run(loop, loop.twin.params, state, key))
     stacked = jax.tree.map(lambda *parts: jnp.stack(parts), *singles)
-    learner = stacked.learner._replace(n_updates=singles[0].learner.n_updates)
+    state = stacked.agent._replace(n_updates=singles[0].agent.n_updates)
     # What a program returns has a device of its own: arrays without would be compiled for apart.
-    (device,) = models[0].policy.learner.key.devices()
-    return jax.device_put(stacked._replace(learner=learner), device)
+    (device,) = models[0].policy.agent_state.key.devices()
+    return jax.device_put(stacked._replace(agent=state), device)
 
 
 def _calls(
@@ -248,11 +248,11 @@ def _calls(
     return track(calls, "learning", disable=not progress_bar)
 
 
-def _knobs_at(model: SoftActorCritic, remaining: float) -> Knobs:
+def _knobs_at(model: SoftActorCritic, remaining: float) -> Hyperparams:
     now, model._current_progress_remaining = model._current_progress_remaining, remaining
-    knobs = model.knobs()
+    hyper = model.hyper()
     model._current_progress_remaining = now
-    return knobs
+    return hyper
 
 
 def _filled_up(begins: np.ndarray, table: np.ndarray, n: int) -> Round:
@@ -260,16 +260,16 @@ def _filled_up(begins: np.ndarray, table: np.ndarray, n: int) -> Round:
     happens = np.arange(n) < len(begins)
     begins, table = np.pad(begins, (0, more)), np.pad(table, ((0, more), (0, 0)))
     columns: Any = jnp.asarray(table).T
-    return Round(jnp.asarray(begins, jnp.int32), jnp.asarray(happens), Knobs(*columns))
+    return Round(jnp.asarray(begins, jnp.int32), jnp.asarray(happens), Hyperparams(*columns))
 
 
 def _take_over(model: SoftActorCritic, run: Run, on_host: Run, n_steps: int) -> None:
     """The model goes on from where the run is."""
     key = jax.random.key(int(on_host.key[-1]), impl=GENERATOR)
-    device = next(iter(model.policy.learner.key.devices()))
-    model.policy.learner = jax.device_put(run.learner._replace(key=key), device)
+    device = next(iter(model.policy.agent_state.key.devices()))
+    model.policy.agent_state = jax.device_put(run.agent._replace(key=key), device)
     model.num_timesteps = n_steps
-    model._n_updates = int(run.learner.n_updates)
+    model._n_updates = int(run.agent.n_updates)
     buffer: Any = model.replay_buffer
     memory, held = on_host.memory, min(n_steps, buffer.buffer_size)
     shape = buffer.observations.shape[2:]
@@ -287,14 +287,11 @@ def _take_over(model: SoftActorCritic, run: Run, on_host: Run, n_steps: int) -> 
 def _of_seed(runs: Run, i: int) -> Run:
     pick = lambda axis: lambda x: x if axis is None else x[i]  # noqa: E731
     axes = runs_axes()
-    learner = type(runs.learner)(
-        *(
-            jax.tree.map(pick(axis), part)
-            for axis, part in zip(axes.learner, runs.learner, strict=True)
-        )
+    state = type(runs.agent)(
+        *(jax.tree.map(pick(axis), part) for axis, part in zip(axes.agent, runs.agent, strict=True))
     )
-    rest = runs._replace(learner=None)  # type: ignore[arg-type]
-    return jax.tree.map(pick(0), rest)._replace(learner=learner)
+    rest = runs._replace(agent=None)  # type: ignore[arg-type]
+    return jax.tree.map(pick(0), rest)._replace(agent=state)
 
 
 def _episodes(steps: Sequence[Step], i: int) -> Episodes:

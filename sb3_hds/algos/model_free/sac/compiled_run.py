@@ -15,17 +15,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sb3_hds.algos.model_free.sac.update import (
-    Batch,
-    Knobs,
-    Learner,
-    Recipe,
-    Report,
-    before_any,
-    explored,
+    Hyperparams,
+    SACState,
+    UpdateConfig,
+    UpdateMetrics,
+    explore,
     update_once,
 )
+from sb3_hds.algos.model_free.update import Batch, zero_metrics
 from sb3_hds.algos.nets.heads import ExploringActor, noise_std
-from sb3_hds.algos.nets.observations import Seen, seen
+from sb3_hds.algos.nets.observations import RunningStats, normalize
 from sb3_hds.core import Params, State, Twin
 
 
@@ -44,7 +43,7 @@ class Loop:
     """
 
     twin: Twin
-    recipe: Recipe
+    update_config: UpdateConfig
     limit: int
     capacity: int
     learning_starts: int
@@ -57,7 +56,7 @@ class Loop:
 
     @property
     def use_sde(self) -> bool:
-        return isinstance(self.recipe.actor, ExploringActor)
+        return isinstance(self.update_config.actor, ExploringActor)
 
 
 class Run(NamedTuple):
@@ -70,7 +69,7 @@ class Run(NamedTuple):
     :param total: return of the episode so far
     """
 
-    learner: Learner
+    agent: SACState
     state: State
     obs: Float[Array, " obs"]
     elapsed: Int[Array, ""]
@@ -94,17 +93,17 @@ class Round(NamedTuple):
     """
     :param steps: steps of the environment before it
     :param happens: False fills up a call of the program, so that all calls are of one length
-    :param knobs: in it
+    :param hyper: in it
     """
 
     steps: Int[Array, ""]
     happens: Bool[Array, ""]
-    knobs: Knobs
+    hyper: Hyperparams
 
 
-def begin_run(loop: Loop, params: Params, learner: Learner, key: PRNGKeyArray) -> Run:
+def init_run(loop: Loop, params: Params, agent: SACState, key: PRNGKeyArray) -> Run:
     """
-    :param learner: fresh networks
+    :param agent: fresh networks
     :return: a run that stands at the start of its first episode, with nothing remembered
     """
     key, start_key = jax.random.split(key)
@@ -120,25 +119,27 @@ def begin_run(loop: Loop, params: Params, learner: Learner, key: PRNGKeyArray) -
         discount=jnp.full(many, loop.gamma),
     )
     empty = jnp.zeros((0, n_act))
-    matrix = _std_of(loop, learner) if loop.use_sde else empty
+    matrix = _std_of(loop, agent) if loop.use_sde else empty
     count, total = jnp.zeros((), jnp.int32), jnp.zeros(())
-    return Run(learner, state, obs, count, memory, matrix, total, key)
+    return Run(agent, state, obs, count, memory, matrix, total, key)
 
 
 @partial(jax.jit, static_argnums=0, donate_argnums=2)
-def run_rounds(loop: Loop, params: Params, runs: Run, rounds: Round) -> tuple[Run, Step, Report]:
+def run_rounds(
+    loop: Loop, params: Params, runs: Run, rounds: Round
+) -> tuple[Run, Step, UpdateMetrics]:
     """
     :param runs: leading axis: seeds, everywhere but in the number of updates, which they share
     :param rounds: leading axis: one after the other
-    :return: the runs after them; what each step was, axes seeds, rounds, ``train_freq``; the report
-        of the last update of each
+    :return: the runs after them; what each step was, axes seeds, rounds, ``train_freq``; the
+        metrics of the last update of each
     """
     axes = runs_axes()
 
-    def one(run: Run) -> tuple[Run, Step, Report]:
-        before = run, before_any(Report)
-        (run, report), steps = jax.lax.scan(partial(_round, loop, params), before, rounds)
-        return run, steps, report
+    def one(run: Run) -> tuple[Run, Step, UpdateMetrics]:
+        before = run, zero_metrics(UpdateMetrics)
+        (run, metrics), steps = jax.lax.scan(partial(_round, loop, params), before, rounds)
+        return run, steps, metrics
 
     return jax.vmap(one, in_axes=(axes,), out_axes=(axes, 0, 0))(runs)
 
@@ -149,17 +150,17 @@ def runs_axes() -> Run:
         seed, the actor would be updated every time, for those seeds whose turn it might be.
     """
     fields: Any = dict.fromkeys(Run._fields, 0)
-    learner: Any = dict.fromkeys(Learner._fields, 0) | {"n_updates": None}
-    return Run(**fields | {"learner": Learner(**learner)})
+    agent: Any = dict.fromkeys(SACState._fields, 0) | {"n_updates": None}
+    return Run(**fields | {"agent": SACState(**agent)})
 
 
 def _round(
-    loop: Loop, params: Params, carry: tuple[Run, Report], now: Round
-) -> tuple[tuple[Run, Report], Step]:
-    def happen() -> tuple[tuple[Run, Report], Step]:
+    loop: Loop, params: Params, carry: tuple[Run, UpdateMetrics], now: Round
+) -> tuple[tuple[Run, UpdateMetrics], Step]:
+    def happen() -> tuple[tuple[Run, UpdateMetrics], Step]:
         run, steps = jax.lax.scan(partial(_step, loop, params, now.steps), carry[0], counts)
         after = now.steps + loop.train_freq
-        learn = lambda: _learn(loop, run, now.knobs, carry[1], after)  # noqa: E731
+        learn = lambda: _learn(loop, run, now.hyper, carry[1], after)  # noqa: E731
         return jax.lax.cond(after > loop.learning_starts, learn, lambda: (run, carry[1])), steps
 
     counts = jnp.arange(loop.train_freq)
@@ -184,14 +185,14 @@ def _step(loop: Loop, params: Params, before: Array, run: Run, count: Array) -> 
     row = Batch(run.obs, action, obs, reward, terminated.astype(jnp.float32), gamma)
     at = t % loop.capacity
     memory = jax.tree.map(lambda rows, new: rows.at[at].set(new), run.memory, row)
-    learner = run.learner
-    if loop.recipe.normalize:
-        learner = learner._replace(seen=_with_one_more(learner.seen, obs))
+    agent = run.agent
+    if loop.update_config.normalize_observations:
+        agent = agent._replace(obs_stats=_with_one_more(agent.obs_stats, obs))
     fresh = twin.initial(start_key, params)
     start = fresh, twin.observe(fresh, params)
     state, obs = jax.tree.map(partial(jnp.where, ended), start, (state, obs))
     after = Run(
-        learner,
+        agent,
         state,
         obs,
         jnp.where(ended, 0, elapsed),
@@ -204,34 +205,36 @@ def _step(loop: Loop, params: Params, before: Array, run: Run, count: Array) -> 
 
 
 def _learn(
-    loop: Loop, run: Run, knobs: Knobs, report: Report, n_steps: Array
-) -> tuple[Run, Report]:
+    loop: Loop, run: Run, hyper: Hyperparams, metrics: UpdateMetrics, n_steps: Array
+) -> tuple[Run, UpdateMetrics]:
     held = jnp.minimum(n_steps, loop.capacity)
 
-    def one(_: Array, carry: tuple[Learner, Report, Any]) -> tuple[Learner, Report, Any]:
-        learner, report, key = carry
+    def one(
+        _: Array, carry: tuple[SACState, UpdateMetrics, Any]
+    ) -> tuple[SACState, UpdateMetrics, Any]:
+        agent, metrics, key = carry
         key, drawn = jax.random.split(key)
         rows = jax.random.randint(drawn, (loop.batch_size,), 0, held)
         batch = jax.tree.map(lambda x: x[rows], run.memory)
-        return *update_once(loop.recipe, learner, batch, knobs, report), key
+        return *update_once(loop.update_config, agent, batch, hyper, metrics), key
 
-    learner, report, key = jax.lax.fori_loop(
-        0, loop.gradient_steps, one, (run.learner, report, run.key)
+    agent, metrics, key = jax.lax.fori_loop(
+        0, loop.gradient_steps, one, (run.agent, metrics, run.key)
     )
-    return run._replace(learner=learner, key=key), report
+    return run._replace(agent=agent, key=key), metrics
 
 
 def _action(
     loop: Loop, run: Run, matrix: Array, t: Array, key: PRNGKeyArray
 ) -> Float[Array, " act"]:
     """From -1 to 1: random before learning starts, then as the algorithm explores."""
-    recipe, learner = loop.recipe, run.learner
+    config, agent = loop.update_config, run.agent
     random_key, noise_key = jax.random.split(key)
     n_act = len(loop.twin.actuators)
-    obs = seen(learner.seen, run.obs[None])
+    obs = normalize(agent.obs_stats, run.obs[None])
     drawn = jax.random.normal(noise_key, (1, n_act))
     noise = lambda g: g.latent @ matrix if loop.use_sde else g.std * drawn  # noqa: E731
-    action = explored(recipe, learner.actor.weights, learner.extra, obs, noise)
+    action = explore(config, agent.actor.weights, agent.extra, obs, noise)
     if loop.use_sde and loop.warm:
         return action[0]
     random = jax.random.uniform(random_key, (n_act,), minval=-1.0, maxval=1.0)
@@ -241,20 +244,20 @@ def _action(
 def _noise_matrix(loop: Loop, run: Run, count: Array, t: Array, key: PRNGKeyArray) -> Array:
     if not loop.use_sde:
         return run.matrix
-    std, every = _std_of(loop, run.learner), loop.sde_sample_freq
+    std, every = _std_of(loop, run.agent), loop.sde_sample_freq
     due = count == 0 if every <= 0 else t % every == 0
     return jnp.where(due, std * jax.random.normal(key, std.shape), run.matrix)
 
 
-def _std_of(loop: Loop, learner: Learner) -> Array:
-    actor: Any = loop.recipe.actor
-    return noise_std(actor, dict(learner.actor.weights))
+def _std_of(loop: Loop, agent: SACState) -> Array:
+    actor: Any = loop.update_config.actor
+    return noise_std(actor, dict(agent.actor.weights))
 
 
-def _with_one_more(scales: Seen, obs: Array) -> Seen:
+def _with_one_more(stats: RunningStats, obs: Array) -> RunningStats:
     """Welford's update, in single precision."""
-    count = scales.count + 1.0
-    away = obs - scales.mean
-    mean = scales.mean + away / count
-    variance = (scales.variance * scales.count + away * (obs - mean)) / count
-    return Seen(mean, variance, count)
+    count = stats.count + 1.0
+    away = obs - stats.mean
+    mean = stats.mean + away / count
+    variance = (stats.variance * stats.count + away * (obs - mean)) / count
+    return RunningStats(mean, variance, count)

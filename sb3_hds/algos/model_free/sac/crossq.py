@@ -1,12 +1,56 @@
 """CrossQ: batch normalisation in the place of target networks."""
 
-from typing import Any, ClassVar
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY
+from typing import ClassVar
 
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from sb3_hds.algos.model_free.sac.algorithm import SoftActorCritic
-from sb3_hds.algos.model_free.sac.policy import CrossQPolicy
+from sb3_hds.algos.base.config import Rate, takes
+from sb3_hds.algos.model_free.sac.algorithm import SACConfig, SoftActorCritic
+from sb3_hds.algos.model_free.sac.policy import GaussianPolicy, GaussianPolicyConfig
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CrossQPolicyConfig(GaussianPolicyConfig):
+    """
+    Arguments of ``CrossQPolicy``; the optimiser is Adam with a ``b1`` of 0.5.
+
+    :param net_arch: ``{"pi": [256, 256], "qf": [512, 512]}`` by default
+    :param renorm_warmup_steps: batch normalisation in actor and critics, which becomes batch
+        renormalisation after so many updates; None: neither of them
+    """
+
+    net_arch: Sequence[int] | Mapping[str, Sequence[int]] = dataclasses.field(
+        default_factory=lambda: {"pi": (256, 256), "qf": (512, 512)}
+    )
+    renorm_warmup_steps: int | None = 100_000
+    usual_optimizer = ("adam", {"b1": 0.5})
+
+
+class CrossQPolicy(GaussianPolicy):
+    """
+    Batch normalisation in actor and critics, and Adam's ``b1`` of 0.5 (Bhatt et al., ICLR 2024).
+    Their critics have 2048 units, which two cores do not bear: ``net_arch={"pi": [256, 256], "qf":
+    [2048, 2048]}``; the default has a quarter of them.
+    """
+
+    @takes(CrossQPolicyConfig)
+    def __init__(self, config: CrossQPolicyConfig) -> None:
+        self.construct(config)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CrossQConfig(SACConfig):
+    """
+    Arguments of CrossQ; ``tau`` and ``target_update_interval`` have no effect.
+    """
+
+    learning_rate: Rate = 1e-3
+    _: KW_ONLY
+    policy_delay: int = 3
+    linear_ent_coef: bool = True
 
 
 class CrossQ(SoftActorCritic):
@@ -25,14 +69,6 @@ class CrossQ(SoftActorCritic):
     learning rate never changes; here, schedules act. The loss of the entropy coefficient has the
     coefficient itself, as in the authors' code, where SBX has its logarithm
     (``linear_ent_coef=False``).
-
-    :param policy: see :class:`~sb3_hds.algos.model_free.sac.algorithm.SoftActorCritic`
-    :param env: likewise
-    :param learning_rate: of actor, entropy coefficient and critics
-    :param policy_delay: updates of the critics for each of the actor
-    :param linear_ent_coef: whether the loss of the entropy coefficient has it itself
-    :param arguments: those of ``SoftActorCritic``; ``tau`` and ``target_update_interval`` have
-        no meaning here
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -41,21 +77,8 @@ class CrossQ(SoftActorCritic):
     }
     policy_family = CrossQPolicy
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: float | str | Schedule = 1e-3,
-        *,
-        policy_delay: int = 3,
-        linear_ent_coef: bool = True,
-        **arguments: Any,
-    ) -> None:
-        super().__init__(
-            policy,
-            env,
-            learning_rate=learning_rate,
-            policy_delay=policy_delay,
-            linear_ent_coef=linear_ent_coef,
-            **arguments,
-        )
+    config_class = CrossQConfig
+
+    @takes(CrossQConfig)
+    def __init__(self, config: CrossQConfig) -> None:
+        self.construct(config)

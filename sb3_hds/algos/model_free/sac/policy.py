@@ -1,6 +1,6 @@
 """The policies of the SAC family, as SB3 sees them: a Gaussian actor and an ensemble of critics."""
 
-import inspect
+import dataclasses
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -11,44 +11,38 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnasium import spaces
-from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_hds.algos.base.construct import between, check_count
+from sb3_hds.algos.base.config import between, check_count, takes
+from sb3_hds.algos.base.policy import PolicyConfig
 from sb3_hds.algos.model_free.policy import LearningPolicy
+from sb3_hds.algos.model_free.sac.objectives import min_q, min_values, squared_error
 from sb3_hds.algos.model_free.sac.update import (
-    Learner,
-    Recipe,
-    act,
-    begin,
-    explored,
-    judge,
-    least,
-    pessimistic,
-    squared,
+    SACState,
+    UpdateConfig,
+    actor_distribution,
+    explore,
+    init_state,
+    q_values,
 )
-from sb3_hds.algos.nets.activations import Activation, activation, widths_of
+from sb3_hds.algos.nets.activations import Activation, activation, widths
 from sb3_hds.algos.nets.heads import USUAL, Critic, ExploringActor, GaussianActor, noise_std
-from sb3_hds.algos.nets.mlp import ORTHOGONAL, ORTHONORMAL, Mlp, SimbaBody
-from sb3_hds.algos.nets.observations import Seen, flattener, seen, size_of
-from sb3_hds.algos.nets.optimizers import Weights, optimizer_of
+from sb3_hds.algos.nets.mlp import ORTHOGONAL, ORTHONORMAL, Mlp, SimbaNet
+from sb3_hds.algos.nets.observations import RunningStats, flattener, normalize, size_of
+from sb3_hds.algos.nets.optimizers import Optimizer, Weights, optimizer_of
 from sb3_hds.core.numerics.compilation import GENERATOR
 from sb3_hds.deploy.policy_function import PolicyFunction
 
 _OF_GSDE = ("log_std_init", "full_std", "use_expln", "clip_mean")
-# Of the policy's constructor: what is no argument.
-_NO_ARGUMENTS = ("self", "observation_space", "action_space", "__class__")
 
 
-class GaussianPolicy(LearningPolicy):
+@dataclasses.dataclass(frozen=True, eq=False)
+class GaussianPolicyConfig(PolicyConfig):
     """
-    ``"MlpPolicy"`` and ``"MultiInputPolicy"``: dense layers; without target entropy or rules of its
-    own, so that every algorithm of the family can use it.
+    Arguments of the policies of the SAC family.
 
     :param observation_space: Box, Discrete, MultiDiscrete, MultiBinary, or a Dict of these, which
         are flattened, choices one-hot
     :param action_space: a bounded Box of any shape
-    :param lr_schedule: learning rate by remaining progress
     :param net_arch: hidden widths of both, or ``{"pi": [...], "qf": [...]}``
     :param activation_fn: name, JAX function or torch module class
     :param n_critics: members of the ensemble
@@ -57,7 +51,7 @@ class GaussianPolicy(LearningPolicy):
     :param layer_norm: in the critics; the networks of SimBa and BRO have it in any case
     :param renorm_warmup_steps: batch normalisation in actor and critics, which becomes batch
         renormalisation after so many updates, and CrossQ's update, without target networks; None:
-        neither, but 100,000 with ``CrossQPolicy``
+        neither
     :param batch_norm_momentum: the share of its running statistics that stays at an update, as in
         SBX; SB3-contrib's ``batch_norm_momentum=0.01`` is 0.99 here
     :param ortho_init: whether layers start orthogonal, as in JAXRL's SAC, rather than as flax and
@@ -77,191 +71,188 @@ class GaussianPolicy(LearningPolicy):
     :param optimizer_kwargs: besides the learning rate; torch's ``betas`` and ``alpha`` are
         understood
     :param qf_optimizer_kwargs: of the critics, where they differ
-    :raises ValueError: for arguments out of range, and those that these networks do not use
     """
 
-    held = ("target", "seen")
-    learner: Learner
-    defaults: ClassVar[Mapping[str, Any]] = {
-        "net_arch": (256, 256),
-        "optimizer_class": "adam",
-        "normalize_observations": False,
-        "squash_log_std": False,
-        "renorm_warmup_steps": None,
-    }
+    net_arch: Sequence[int] | Mapping[str, Sequence[int]] = (256, 256)
+    activation_fn: str | Activation | type = "relu"
+    n_critics: int = 2
+    n_quantiles: int = 1
+    dropout_rate: float = 0.0
+    layer_norm: bool = False
+    renorm_warmup_steps: int | None = None
+    batch_norm_momentum: float = 0.99
+    ortho_init: bool | str = False
+    use_sde: bool = False
+    log_std_init: float = -3.0
+    full_std: bool = True
+    use_expln: bool = False
+    clip_mean: float = 2.0
+    normalize_observations: bool = False
+    squash_log_std: bool | None = None
+    optimizer_class: str | Callable[..., Any] | None = None
+    optimizer_kwargs: Mapping[str, Any] | None = None
+    qf_optimizer_kwargs: Mapping[str, Any] | None = None
+    #: the optimiser unless one is given, and its arguments
+    usual_optimizer: ClassVar[tuple[str, Mapping[str, Any]]] = ("adam", {})
+    #: whether the deviation is squashed unless it is said
+    squashes: ClassVar[bool] = False
     #: arguments that these networks do not use
     unused: ClassVar[tuple[str, ...]] = ()
 
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        net_arch: Sequence[int] | Mapping[str, Sequence[int]] | None = None,
-        activation_fn: str | Activation | type = "relu",
-        n_critics: int = 2,
-        n_quantiles: int = 1,
-        dropout_rate: float = 0.0,
-        layer_norm: bool = False,
-        renorm_warmup_steps: int | None = None,
-        batch_norm_momentum: float = 0.99,
-        ortho_init: bool | str = False,
-        use_sde: bool = False,
-        log_std_init: float = -3.0,
-        full_std: bool = True,
-        use_expln: bool = False,
-        clip_mean: float = 2.0,
-        normalize_observations: bool | None = None,
-        squash_log_std: bool | None = None,
-        optimizer_class: str | Callable[..., Any] | None = None,
-        optimizer_kwargs: Mapping[str, Any] | None = None,
-        qf_optimizer_kwargs: Mapping[str, Any] | None = None,
-    ) -> None:
-        self.arguments = {
-            name: value for name, value in locals().items() if name not in _NO_ARGUMENTS
-        }
-        super().__init__(observation_space, action_space, squash_output=True)
-        chosen = {
-            name: self.defaults.get(name) if value is None else value
-            for name, value in self.arguments.items()
-        }
-        check_count("n_critics", n_critics)
-        check_count("n_quantiles", n_quantiles)
-        if chosen["renorm_warmup_steps"] is not None:
-            check_count("renorm_warmup_steps", chosen["renorm_warmup_steps"], 0)
-        _check_settings(self.arguments)
-        self._refuse_unused(has_batch_norm=chosen["renorm_warmup_steps"] is not None)
-        self._warn_of_unused()
-        if use_sde and squash_log_std:
-            raise ValueError(
-                f"policy_kwargs={{'squash_log_std': {squash_log_std!r}}}: with use_sde=True, the "
-                "deviation of actions is that of a noise matrix, which nothing squashes. Leave out "
-                "one of them."
-            )
-        net: Any = chosen["net_arch"]
-        # Files say it, so that they do not depend on the default.
-        self.arguments["net_arch"] = dict(net) if isinstance(net, Mapping) else net
-        self.widths = widths(net, "qf")
-        self.activation_fn = activation(activation_fn)
-        self.dropout_rate, self.layer_norm = float(dropout_rate), layer_norm
-        self.renorm_warmup_steps, self.batch_norm_momentum = (
-            chosen["renorm_warmup_steps"],
-            batch_norm_momentum,
-        )
-        self.ortho_init = ortho_init
-        self.normalize_observations = bool(chosen["normalize_observations"])
-        self.squash_log_std = bool(chosen["squash_log_std"]) and not use_sde
-        self.n_critics, self.n_quantiles, self.use_sde = n_critics, n_quantiles, use_sde
-        n_act = int(np.prod(action_space.shape))
-        pi, qf = self.widths
-        body = self.actor_body(pi)
-        of_mean, of_std = self.last_layers()
-        self.actor_network = GaussianActor(body, n_act, self.squash_log_std, of_mean, of_std)
-        if use_sde:
-            gsde = (log_std_init, full_std, use_expln, clip_mean, of_mean)
-            self.actor_network = ExploringActor(body, n_act, *gsde)
-        self.critic_network = Critic(self.critic_body(qf), n_quantiles, of_mean)
-        own = dict(optimizer_kwargs or {})
-        make: Any = chosen["optimizer_class"]
-        usual = self.defaults.get("optimizer_kwargs", {}) if optimizer_class is None else {}
-        self.optimizers = (
-            optimizer_of(make, {**usual, **own}),
-            optimizer_of(make, {**usual, **own, **dict(qf_optimizer_kwargs or {})}),
-        )
-        self.n_obs, self.n_act = size_of(observation_space), n_act
-        self.flatten = flattener(observation_space)
-        self.forget_noise()
-        self._noise = np.random.default_rng(0)
-
-    def _refuse_unused(self, has_batch_norm: bool) -> None:
-        unused = self.unused if has_batch_norm else (*self.unused, "batch_norm_momentum")
-        usual = inspect.signature(GaussianPolicy).parameters
-        for name in unused:
-            if self.arguments[name] != usual[name].default:
+    def __post_init__(self) -> None:
+        """
+        :raises ValueError: for arguments out of range, and those that these networks do not use
+        """
+        check_count("n_critics", self.n_critics)
+        check_count("n_quantiles", self.n_quantiles)
+        if self.renorm_warmup_steps is not None:
+            check_count("renorm_warmup_steps", self.renorm_warmup_steps, 0)
+        _check_ranges(self)
+        defaults = {field.name: field.default for field in dataclasses.fields(self)}
+        given = {name for name, usual in defaults.items() if getattr(self, name) != usual}
+        has_batch_norm = self.renorm_warmup_steps is not None
+        for name in (*self.unused, *(() if has_batch_norm else ("batch_norm_momentum",))):
+            if name in given:
                 raise ValueError(
-                    f"policy_kwargs={{'{name}': {self.arguments[name]!r}}}: the networks of "
-                    f"{type(self).__name__} do not use {name} here; leave it out."
+                    f"policy_kwargs={{'{name}': {getattr(self, name)!r}}}: the networks of "
+                    f"{type(self).__name__.removesuffix('Config')} do not use {name} here; leave "
+                    "it out."
                 )
-
-    def _warn_of_unused(self) -> None:
-        usual = inspect.signature(GaussianPolicy).parameters
-        idle = [name for name in _OF_GSDE if self.arguments[name] != usual[name].default]
-        if idle and not self.arguments["use_sde"]:
+        idle = [name for name in _OF_GSDE if name in given]
+        if idle and not self.use_sde:
             warnings.warn(f"{', '.join(idle)} in policy_kwargs say nothing without use_sde=True.")
-        momentum = self.arguments["batch_norm_momentum"]
+        momentum = self.batch_norm_momentum
         if momentum < 0.5:
             warnings.warn(
                 f"batch_norm_momentum={momentum} is the share of the running statistics that "
                 "stays at an update, as in SBX. SB3-contrib's is the share of the new: pass "
                 f"{1.0 - momentum:g} for its {momentum}."
             )
+        if self.use_sde and self.squash_log_std:
+            raise ValueError(
+                "policy_kwargs={'squash_log_std': True}: with use_sde=True, the deviation of "
+                "actions is that of a noise matrix, which nothing squashes. Leave out one of them."
+            )
+
+    def optimizers(self) -> tuple[Optimizer, Optimizer]:
+        """:return: of the actor and of the critics"""
+        make, usual = self.usual_optimizer
+        if self.optimizer_class is not None:
+            make, usual = self.optimizer_class, {}
+        own = {**usual, **(self.optimizer_kwargs or {})}
+        return optimizer_of(make, own), optimizer_of(
+            make, own | dict(self.qf_optimizer_kwargs or {})
+        )
+
+
+class GaussianPolicy(LearningPolicy):
+    """
+    ``"MlpPolicy"`` and ``"MultiInputPolicy"``: dense layers; without target entropy or rules of its
+    own, so that every algorithm of the family can use it.
+    """
+
+    held = ("target", "obs_stats")
+    state: SACState
+
+    @takes(GaussianPolicyConfig)
+    def __init__(self, config: GaussianPolicyConfig) -> None:
+        self.construct(config)
+
+    def construct(self, config: GaussianPolicyConfig) -> None:
+        """Describe networks and optimisers, which are drawn later."""
+        super().__init__(config.observation_space, config.action_space, squash_output=True)
+        self.config, self.arguments = config, config.arguments()
+        net = config.net_arch
+        self.arguments["net_arch"] = dict(net) if isinstance(net, Mapping) else net
+        self.widths = pi, qf = widths(net, "qf")
+        self.activation_fn = activation(config.activation_fn)
+        self.normalize_observations = bool(config.normalize_observations)
+        self.n_critics, self.n_quantiles = config.n_critics, config.n_quantiles
+        self.use_sde = config.use_sde
+        self.n_obs = size_of(config.observation_space)
+        self.n_act = int(np.prod(config.action_space.shape))
+        self.flatten = flattener(config.observation_space)
+        body, (of_mean, of_std) = self.actor_body(pi), self.last_layers()
+        if config.use_sde:
+            gsde = (config.log_std_init, config.full_std, config.use_expln, config.clip_mean)
+            self.actor_network = ExploringActor(body, self.n_act, *gsde, of_mean)
+        else:
+            squash = config.squash_log_std
+            squash = config.squashes if squash is None else bool(squash)
+            self.actor_network = GaussianActor(body, self.n_act, squash, of_mean, of_std)
+        self.critic_network = Critic(self.critic_body(qf), config.n_quantiles, of_mean)
+        self.optimizers = config.optimizers()
+        self.forget_noise()
+        self._noise = np.random.default_rng(0)
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
         return Mlp(
             net_arch,
             self.activation_fn,
-            renorm_warmup_steps=self.renorm_warmup_steps,
-            momentum=self.batch_norm_momentum,
-            ortho_init=bool(self.ortho_init),
+            renorm_warmup_steps=self.config.renorm_warmup_steps,
+            momentum=self.config.batch_norm_momentum,
+            ortho_init=bool(self.config.ortho_init),
         )
 
     def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
         return Mlp(
             net_arch,
             self.activation_fn,
-            self.dropout_rate,
-            self.layer_norm,
-            self.renorm_warmup_steps,
-            self.batch_norm_momentum,
-            bool(self.ortho_init),
+            float(self.config.dropout_rate),
+            self.config.layer_norm,
+            self.config.renorm_warmup_steps,
+            self.config.batch_norm_momentum,
+            bool(self.config.ortho_init),
         )
 
     def last_layers(self) -> tuple[nn.initializers.Initializer, nn.initializers.Initializer]:
         """:return: where they start: those of means and values, and those of deviations"""
-        usual = self.ortho_init in (False, "hidden")
+        usual = self.config.ortho_init in (False, "hidden")
         return (USUAL, USUAL) if usual else (ORTHOGONAL, ORTHONORMAL)
 
     def build_plain(self) -> None:
         """That of SAC; with batch normalisation, that of CrossQ."""
-        self.build(self.plain_recipe(), 1.0, 0, jax.devices()[0])
+        self.build(self.plain_update_config(), 1.0, 0, jax.devices()[0])
 
-    def plain_recipe(self) -> Recipe:
+    def plain_update_config(self) -> UpdateConfig:
         """:return: that of SAC with these networks; with batch normalisation, that of CrossQ"""
-        return Recipe(
+        return UpdateConfig(
             actor=self.actor_network,
             critic=self.critic_network,
             n_critics=self.n_critics,
-            target_of=least,
-            error=squared,
-            worth=pessimistic,
+            target_values=min_values,
+            critic_loss=squared_error,
+            actor_objective=min_q,
             optimizer=self.optimizers[0],
             qf_optimizer=self.optimizers[1],
-            joint_pass=self.renorm_warmup_steps is not None,
-            normalize=self.normalize_observations,
+            joint_pass=self.config.renorm_warmup_steps is not None,
+            normalize_observations=self.normalize_observations,
         )
 
-    def build(self, recipe: Recipe, ent_coef: float, seed: int, device: Any) -> None:
+    def build(self, config: UpdateConfig, ent_coef: float, seed: int, device: Any) -> None:
         """
         Draw fresh networks.
 
-        :param recipe: of the algorithm
+        :param config: of the algorithm
         :param ent_coef: where the entropy coefficient starts
         """
-        self.recipe = recipe
+        self.update_config = config
         key = jax.random.key(seed, impl=GENERATOR)
-        self.learner = jax.device_put(begin(recipe, self.n_obs, self.n_act, ent_coef, key), device)
+        self.agent_state = jax.device_put(
+            init_state(config, self.n_obs, self.n_act, ent_coef, key), device
+        )
         self._draw_noise_by(seed)
 
     def observed(self, obs: np.ndarray | dict[str, np.ndarray]) -> None:
         """Count observations, of one step of every environment, among those seen."""
         if self.normalize_observations:
-            scales = self.learner.seen.with_more(self.flatten(obs))
-            self.learner = self.learner._replace(seen=scales)
+            stats = self.agent_state.obs_stats.with_more(self.flatten(obs))
+            self.agent_state = self.agent_state._replace(obs_stats=stats)
 
     def critic(self, obs: Any, actions: Any) -> tuple[np.ndarray, ...]:
-        learner, flat = self.learner, self.flatten(obs)
+        state, flat = self.agent_state, self.flatten(obs)
         taken = np.asarray(actions, np.float32).reshape(len(flat), -1)
-        values = _judged(self.recipe, learner.critic.weights, learner.seen, flat, taken)
+        values = _judged(self.update_config, state.critic.weights, state.obs_stats, flat, taken)
         return tuple(np.asarray(values))
 
     def reset_noise(self, batch_size: int = 1) -> None:
@@ -271,7 +262,7 @@ class GaussianPolicy(LearningPolicy):
         :param batch_size: number of environments
         """
         if self.use_sde:
-            std = np.asarray(noise_std(self.actor_network, self.learner.actor.weights))  # type: ignore[arg-type]
+            std = np.asarray(noise_std(self.actor_network, self.agent_state.actor.weights))  # type: ignore[arg-type]
             drawn = self._noise.standard_normal((batch_size, *std.shape), np.float32)
             self.matrices = drawn * std
 
@@ -303,31 +294,47 @@ class GaussianPolicy(LearningPolicy):
         """:return: standard deviation of the noise matrix's entries; 0 without gSDE"""
         if not self.use_sde:
             return np.zeros(1)
-        return np.asarray(noise_std(self.actor_network, self.learner.actor.weights))  # type: ignore[arg-type]
+        return np.asarray(noise_std(self.actor_network, self.agent_state.actor.weights))  # type: ignore[arg-type]
 
     def policy_function(self) -> PolicyFunction:
         """:return: what the policy computes where nothing is explored, to be exported"""
-        learner, scales = self.learner, None
+        state, scales = self.agent_state, None
         if self.normalize_observations:
-            variance = np.asarray(learner.seen.variance)
-            scales = np.asarray(learner.seen.mean), np.sqrt(variance)
-        act = partial(_mean, self.actor_network, learner.actor.weights, learner.seen)
+            variance = np.asarray(state.obs_stats.variance)
+            scales = np.asarray(state.obs_stats.mean), np.sqrt(variance)
+        act = partial(_mean, self.actor_network, state.actor.weights, state.obs_stats)
         return PolicyFunction.without_memory(act, squashed=True, scales=scales)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
-        obs, actor = self.flatten(observation), self.learner.actor.weights
+        obs, actor = self.flatten(observation), self.agent_state.actor.weights
         if deterministic:
-            return np.asarray(_mean(self.actor_network, actor, self.learner.seen, obs))
-        scales, extra = self.learner.seen, self.learner.extra
+            return np.asarray(_mean(self.actor_network, actor, self.agent_state.obs_stats, obs))
+        stats, extra = self.agent_state.obs_stats, self.agent_state.extra
         if not self.use_sde:
             noise = self._noise.standard_normal((len(obs), self.n_act), np.float32)
-            return np.asarray(_scattered(self.recipe, actor, extra, scales, obs, noise))
+            return np.asarray(_scattered(self.update_config, actor, extra, stats, obs, noise))
         if self.matrices is None:
             self.reset_noise()
         matrices: Any = self.matrices
         if len(matrices) != len(obs):
             matrices = matrices[:1]
-        return np.asarray(_moved(self.recipe, actor, extra, scales, obs, matrices))
+        return np.asarray(_moved(self.update_config, actor, extra, stats, obs, matrices))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SimbaPolicyConfig(GaussianPolicyConfig):
+    """
+    Arguments of ``SimbaPolicy``; the optimiser is AdamW with the weight decay of the paper.
+
+    :param net_arch: a quarter of the paper's width, ``{"pi": [128], "qf": [128, 128]}`` by default
+    """
+
+    net_arch: Sequence[int] | Mapping[str, Sequence[int]] = dataclasses.field(
+        default_factory=lambda: {"pi": (128,), "qf": (128, 128)}
+    )
+    normalize_observations: bool = True
+    usual_optimizer = ("adamw", {"weight_decay": 1e-2})
+    unused = ("renorm_warmup_steps", "ortho_init")
 
 
 class SimbaPolicy(GaussianPolicy):
@@ -342,110 +349,62 @@ class SimbaPolicy(GaussianPolicy):
     of SimBa's authors.
     """
 
-    defaults: ClassVar[Mapping[str, Any]] = {
-        "net_arch": {"pi": (128,), "qf": (128, 128)},
-        "optimizer_class": "adamw",
-        "optimizer_kwargs": {"weight_decay": 1e-2},
-        "normalize_observations": True,
-    }
-    unused = ("renorm_warmup_steps", "ortho_init")
     narrow = 128
 
+    @takes(SimbaPolicyConfig)
+    def __init__(self, config: SimbaPolicyConfig) -> None:
+        self.construct(config)
+
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
-        return SimbaBody(net_arch, self.activation_fn)
+        return SimbaNet(net_arch, self.activation_fn)
 
     def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
-        return SimbaBody(net_arch, self.activation_fn, self.dropout_rate)
+        return SimbaNet(net_arch, self.activation_fn, float(self.config.dropout_rate))
 
 
-class SimbaSACPolicy(SimbaPolicy):
-    """
-    The policy of SimbaSAC: also what actions are drawn from is that of SimBa's authors, with
-    ``squash_log_std=True`` where there is no gSDE, and so is where last layers start.
-    """
-
-    defaults = {**SimbaPolicy.defaults, "squash_log_std": True}
-
-    def last_layers(self) -> tuple[nn.initializers.Initializer, nn.initializers.Initializer]:
-        return ORTHONORMAL, ORTHONORMAL
-
-
-class CrossQPolicy(GaussianPolicy):
-    """
-    Batch normalisation in actor and critics, and Adam's ``b1`` of 0.5 (Bhatt et al., ICLR 2024).
-    Their critics have 2048 units, which two cores do not bear: ``net_arch={"pi": [256, 256], "qf":
-    [2048, 2048]}``; the default has a quarter of them.
-    """
-
-    defaults = {
-        "net_arch": {"pi": (256, 256), "qf": (512, 512)},
-        "optimizer_class": "adam",
-        "optimizer_kwargs": {"b1": 0.5},
-        "normalize_observations": False,
-        "renorm_warmup_steps": 100_000,
-    }
-
-
-def widths(
-    net_arch: Sequence[int] | Mapping[str, Sequence[int]], critic: str
-) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """
-    :param critic: the key of the critics' widths, where those of the actor differ
-    :return: hidden widths of the actor and of the critics
-    :raises ValueError: for other keys than ``pi`` and that one, or widths that are no counts
-    """
-    given = net_arch if isinstance(net_arch, Mapping) else {"pi": net_arch, critic: net_arch}
-    pi, qf = (widths_of(given.get(name)) for name in ("pi", critic))
-    if given.keys() != {"pi", critic} or pi is None or qf is None:
-        raise ValueError(
-            f"net_arch must be a list of widths such as [256, 256], or {{'pi': [256], '{critic}': "
-            f"[256, 256]}}, got {net_arch!r}."
-        )
-    return pi, qf
-
-
-def _check_settings(arguments: Mapping[str, Any]) -> None:
+def _check_ranges(config: GaussianPolicyConfig) -> None:
     ranges = {
         "batch_norm_momentum": (0.0, 1.0, "from 0 to 1: the share that stays at an update"),
         "log_std_init": (-math.inf, math.inf, "a finite number"),
         "clip_mean": (0.0, math.inf, "a number of at least 0; 0 does not clip"),
     }
     for name, (low, high, allowed) in ranges.items():
-        if not between(arguments[name], low, high):
-            raise ValueError(f"{name} must be {allowed}, got {arguments[name]!r}.")
-    rate = arguments["dropout_rate"]
+        if not between(value := getattr(config, name), low, high):
+            raise ValueError(f"{name} must be {allowed}, got {value!r}.")
+    rate = config.dropout_rate
     if not (between(rate, 0.0, 1.0) and rate < 1.0):
         raise ValueError(f"dropout_rate must be at least 0 and below 1, got {rate!r}.")
-    start = arguments["ortho_init"]
-    if start not in (True, False, "hidden"):
-        raise ValueError(f"ortho_init must be True, False or 'hidden', got {start!r}.")
+    if config.ortho_init not in (True, False, "hidden"):
+        raise ValueError(f"ortho_init must be True, False or 'hidden', got {config.ortho_init!r}.")
 
 
 @partial(jax.jit, static_argnums=0)
-def _judged(recipe: Recipe, weights: Weights, scales: Seen, obs: Any, actions: Any) -> jax.Array:
+def _judged(
+    config: UpdateConfig, weights: Weights, stats: RunningStats, obs: Any, actions: Any
+) -> jax.Array:
     """Dropout, where there is some, is the same in each call."""
-    inside = seen(scales, obs) if recipe.normalize else obs
-    values, _ = judge(recipe, weights, inside, actions, jax.random.key(0))
+    inside = normalize(stats, obs) if config.normalize_observations else obs
+    values, _ = q_values(config, weights, inside, actions, jax.random.key(0))
     return jnp.mean(values, -1, keepdims=True)
 
 
 @partial(jax.jit, static_argnums=0)
-def _mean(actor: nn.Module, weights: Weights, scales: Seen, obs: Any) -> jax.Array:
-    return jnp.tanh(act(actor, weights, seen(scales, obs))[0].mean)
+def _mean(actor: nn.Module, weights: Weights, stats: RunningStats, obs: Any) -> jax.Array:
+    return jnp.tanh(actor_distribution(actor, weights, normalize(stats, obs))[0].mean)
 
 
 @partial(jax.jit, static_argnums=0)
 def _scattered(
-    recipe: Recipe, weights: Weights, extra: Any, scales: Seen, obs: Any, noise: Any
+    config: UpdateConfig, weights: Weights, extra: Any, stats: RunningStats, obs: Any, noise: Any
 ) -> jax.Array:
-    return explored(recipe, weights, extra, seen(scales, obs), lambda g: g.std * noise)
+    return explore(config, weights, extra, normalize(stats, obs), lambda g: g.std * noise)
 
 
 @partial(jax.jit, static_argnums=0)
 def _moved(
-    recipe: Recipe, weights: Weights, extra: Any, scales: Seen, obs: Any, matrices: Any
+    config: UpdateConfig, weights: Weights, extra: Any, stats: RunningStats, obs: Any, matrices: Any
 ) -> jax.Array:
     """Every environment has its matrix; with one matrix, it is everybody's."""
     each = jnp.broadcast_to(matrices, (obs.shape[0], *matrices.shape[1:]))
     noise = lambda g: jnp.einsum("bl,bla->ba", g.latent, each)  # noqa: E731
-    return explored(recipe, weights, extra, seen(scales, obs), noise)
+    return explore(config, weights, extra, normalize(stats, obs), noise)

@@ -1,15 +1,59 @@
 """SimBa: SAC with residual networks on normalised observations."""
 
 import dataclasses
-from typing import Any, ClassVar
+from dataclasses import KW_ONLY
+from typing import ClassVar
 
-import numpy as np
+import flax.linen as nn
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from sb3_hds.algos.model_free.sac.algorithm import SoftActorCritic
-from sb3_hds.algos.model_free.sac.policy import SimbaSACPolicy
-from sb3_hds.algos.model_free.sac.update import Recipe, average, mean
+from sb3_hds.algos.base.config import Rate, takes
+from sb3_hds.algos.model_free.sac.algorithm import SACConfig, SoftActorCritic
+from sb3_hds.algos.model_free.sac.objectives import mean_q, mean_values
+from sb3_hds.algos.model_free.sac.policy import SimbaPolicy, SimbaPolicyConfig
+from sb3_hds.algos.model_free.sac.update import UpdateConfig
+from sb3_hds.algos.nets.mlp import ORTHONORMAL
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SimbaSACPolicyConfig(SimbaPolicyConfig):
+    """Arguments of ``SimbaSACPolicy``, which squashes the deviation unless it explores by gSDE."""
+
+    squashes = True
+
+
+class SimbaSACPolicy(SimbaPolicy):
+    """
+    The policy of SimbaSAC: also what actions are drawn from is that of SimBa's authors, with
+    ``squash_log_std=True`` where there is no gSDE, and so is where last layers start.
+    """
+
+    @takes(SimbaSACPolicyConfig)
+    def __init__(self, config: SimbaSACPolicyConfig) -> None:
+        self.construct(config)
+
+    def last_layers(self) -> tuple[nn.initializers.Initializer, nn.initializers.Initializer]:
+        return ORTHONORMAL, ORTHONORMAL
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SimbaSACConfig(SACConfig):
+    """
+    Arguments of SimbaSAC.
+
+    :param clipped_double_q: whether the minimum of the critics counts, not their mean
+    """
+
+    learning_rate: Rate = 4e-4
+    _: KW_ONLY
+    gradient_steps: int = 2
+    ent_coef: float | str = "auto_0.01"
+    linear_ent_coef: bool = True
+    clipped_double_q: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require_flag("clipped_double_q")
 
 
 class SimbaSAC(SoftActorCritic):
@@ -39,15 +83,6 @@ class SimbaSAC(SoftActorCritic):
     linear_ent_coef=False, gradient_steps=1`` with ``policy_kwargs={"net_arch": [256, 256],
     "normalize_observations": False, "squash_log_std": False, "optimizer_kwargs": {"weight_decay":
     1e-4}}``.
-
-    :param policy: see :class:`~sb3_hds.algos.model_free.sac.algorithm.SoftActorCritic`
-    :param env: likewise
-    :param learning_rate: of actor, entropy coefficient and critics
-    :param gradient_steps: updates per call of ``train``
-    :param ent_coef: a number, ``"auto"``, or ``"auto_0.1"`` to start there
-    :param linear_ent_coef: whether the loss of the entropy coefficient has it itself
-    :param clipped_double_q: whether the least of the critics counts, not their mean
-    :param arguments: those of ``SoftActorCritic``
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -56,39 +91,17 @@ class SimbaSAC(SoftActorCritic):
         "SimbaPolicy": SimbaSACPolicy,
     }
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: float | str | Schedule = 4e-4,
-        *,
-        gradient_steps: int = 2,
-        ent_coef: float | str = "auto_0.01",
-        linear_ent_coef: bool = True,
-        clipped_double_q: bool = True,
-        **arguments: Any,
-    ) -> None:
-        self.clipped_double_q = clipped_double_q
-        super().__init__(
-            policy,
-            env,
-            learning_rate=learning_rate,
-            gradient_steps=gradient_steps,
-            ent_coef=ent_coef,
-            linear_ent_coef=linear_ent_coef,
-            **arguments,
-        )
+    config_class = SimbaSACConfig
 
-    def check_arguments(self) -> None:
-        super().check_arguments()
-        fine = isinstance(self.clipped_double_q, bool | np.bool_)
-        self.refuse_unless(fine, "clipped_double_q", "True or False")
+    @takes(SimbaSACConfig)
+    def __init__(self, config: SimbaSACConfig) -> None:
+        self.construct(config)
 
     def auto_target_entropy(self) -> float:
         return -0.5 * self.policy.n_act
 
-    def recipe(self) -> Recipe:
-        recipe = super().recipe()
-        if self.clipped_double_q:
-            return recipe
-        return dataclasses.replace(recipe, target_of=average, worth=mean)
+    def update_config(self) -> UpdateConfig:
+        config = super().update_config()
+        if self.config.clipped_double_q:
+            return config
+        return dataclasses.replace(config, target_values=mean_values, actor_objective=mean_q)

@@ -1,20 +1,37 @@
 """TQC: quantile critics, of which the largest quantiles are left out."""
 
 import dataclasses
+from dataclasses import KW_ONLY
 from typing import Any
 
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from sb3_hds.algos.base.config import check_count, takes
+from sb3_hds.algos.model_free.sac.algorithm import SACConfig, SoftActorCritic
+from sb3_hds.algos.model_free.sac.objectives import TruncatedQuantiles, mean_q, quantile_huber
+from sb3_hds.algos.model_free.sac.update import UpdateConfig
 
-from sb3_hds.algos.base.construct import check_count, is_count
-from sb3_hds.algos.model_free.sac.algorithm import SoftActorCritic
-from sb3_hds.algos.model_free.sac.quantiles import Truncated, quantile_huber
-from sb3_hds.algos.model_free.sac.update import Recipe, mean
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TQCConfig(SACConfig):
+    """
+    Arguments of TQC.
+
+    :param top_quantiles_to_drop_per_net: times the number of critics, so many of the largest of all
+        critics' next values are left out of the targets
+    :param policy_kwargs: ``n_quantiles`` is 25 unless given; see
+        :class:`~sb3_hds.algos.GaussianPolicy`
+    """
+
+    _: KW_ONLY
+    top_quantiles_to_drop_per_net: int = 2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require_counts({"top_quantiles_to_drop_per_net": 0})
 
 
 class TQC(SoftActorCritic):
     """
-    Truncated quantile critics.
+    TruncatedQuantiles quantile critics.
 
     Source: Kuznetsov et al., *Controlling Overestimation Bias with Truncated Mixture of Continuous
     Distributional Quantile Critics*, ICML 2020: 25 quantiles, five networks of three layers of 512
@@ -22,49 +39,28 @@ class TQC(SoftActorCritic):
     which 2 quantiles are dropped for each network, none on HalfCheetah, 5 on Hopper; learning
     starts with the first full batch (``learning_starts=256``). SB3-contrib and SBX use two
     networks; so does the default here.
-
-    :param policy: see :class:`~sb3_hds.algos.model_free.sac.algorithm.SoftActorCritic`
-    :param env: likewise
-    :param learning_rate: of actor, entropy coefficient and critics; number, schedule or
-        ``"lin_3e-4"``
-    :param top_quantiles_to_drop_per_net: as many times the number of critics are left out of the
-        pool of all critics' next values, the largest of the pool
-    :param policy_kwargs: ``n_quantiles`` is 25 unless given
-    :param arguments: those of ``SoftActorCritic``
     """
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: float | str | Schedule = 3e-4,
-        *,
-        top_quantiles_to_drop_per_net: int = 2,
-        policy_kwargs: dict[str, Any] | None = None,
-        **arguments: Any,
-    ) -> None:
-        self.top_quantiles_to_drop_per_net = top_quantiles_to_drop_per_net
-        super().__init__(
-            policy,
-            env,
-            learning_rate=learning_rate,
-            policy_kwargs={"n_quantiles": 25, **(policy_kwargs or {})},
-            **arguments,
-        )
+    config_class = TQCConfig
+    usual_policy_kwargs = {"n_quantiles": 25}
 
-    def recipe(self) -> Recipe:
+    @takes(TQCConfig)
+    def __init__(self, config: TQCConfig) -> None:
+        self.construct(config)
+
+    def update_config(self) -> UpdateConfig:
         return dataclasses.replace(
-            super().recipe(),
-            target_of=Truncated(self.top_quantiles_to_drop_per_net),
-            error=quantile_huber,
-            worth=mean,
+            super().update_config(),
+            target_values=TruncatedQuantiles(self.config.top_quantiles_to_drop_per_net),
+            critic_loss=quantile_huber,
+            actor_objective=mean_q,
         )
 
-    def check_arguments(self) -> None:
-        super().check_arguments()
-        n, n_quantiles = self.top_quantiles_to_drop_per_net, self.policy_kwargs["n_quantiles"]
+    def check_environment(self, config: Any) -> None:
+        super().check_environment(config)
+        n, n_quantiles = config.top_quantiles_to_drop_per_net, config.policy_kwargs["n_quantiles"]
         check_count("n_quantiles", n_quantiles)
-        if not (is_count(n, 0) and n < n_quantiles):
+        if n >= n_quantiles:
             raise ValueError(
                 "top_quantiles_to_drop_per_net must be a whole number of at least 0 and below the "
                 f"{n_quantiles} quantiles of a critic (policy_kwargs={{'n_quantiles': ...}}), got "

@@ -1,7 +1,9 @@
 """TD7: learned embeddings, prioritised replay, and policies that are kept once they proved good."""
 
+import dataclasses
 import io
 import pathlib
+from dataclasses import KW_ONLY
 from typing import Any, ClassVar
 
 import jax
@@ -10,19 +12,72 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule, TrainFreq
+from stable_baselines3.common.type_aliases import TrainFreq
 
-from sb3_hds.algos.base.construct import between, is_count, jax_device
-from sb3_hds.algos.model_free.algorithm import ModelFreeAlgorithm
+from sb3_hds.algos.base.config import takes
+from sb3_hds.algos.base.construct import jax_device
+from sb3_hds.algos.model_free.algorithm import ModelFreeAlgorithm, ModelFreeConfig
 from sb3_hds.algos.model_free.replay import batches_of, transitions
-from sb3_hds.algos.model_free.sac.update import Batch, before_any
 from sb3_hds.algos.model_free.td7.policy import TD7Policy
 from sb3_hds.algos.model_free.td7.prioritized_replay import LapReplayBuffer
-from sb3_hds.algos.model_free.td7.update import (
-    Recipe,
-    Report,
-    update,
-)
+from sb3_hds.algos.model_free.td7.update import UpdateConfig, UpdateMetrics, update
+from sb3_hds.algos.model_free.update import Batch, zero_metrics
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TD7Config(ModelFreeConfig):
+    """
+    Arguments of TD7.
+
+    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` for Dict observations, a policy class, or
+        the environment itself
+    :param learning_rate: of encoder, actor and critics; number, schedule or ``"lin_3e-4"``
+    :param tau: no effect: target networks are copied
+    :param train_freq: steps between two calls of ``train``, or ``(n, "episode")``; None: one
+        episode where policies are assessed, one step where not
+    :param gradient_steps: updates per call of ``train``; no effect where policies are assessed
+    :param target_update_interval: updates between two copies into the target networks
+    :param target_policy_noise: standard deviation of the noise on the target policy's actions,
+        which lie in [-1, 1]
+    :param target_noise_clip: its limit
+    :param exploration_noise: standard deviation of the noise on actions, unless ``action_noise`` is
+        passed
+    :param priority_exponent: how much priorities depend on errors; 0: not at all
+    :param use_checkpoints: whether policies are assessed; None: where there is one environment
+    :param max_episodes_per_checkpoint: episodes that assess a policy, after
+        ``updates_before_checkpointing``
+    :param updates_before_checkpointing: up to this number of updates, one episode does
+    :param reset_weight: factor on the best assessment at that moment
+    :param policy_kwargs: see :class:`~sb3_hds.algos.TD7Policy`
+    """
+
+    _: KW_ONLY
+    learning_starts: int = 25_000
+    train_freq: int | tuple[int, str] | None = None
+    policy_delay: int = 2
+    target_update_interval: int = 250
+    target_policy_noise: float = 0.2
+    target_noise_clip: float = 0.5
+    exploration_noise: float = 0.1
+    priority_exponent: float = 0.4
+    use_checkpoints: bool | None = None
+    max_episodes_per_checkpoint: int = 20
+    updates_before_checkpointing: int = 750_000
+    reset_weight: float = 0.9
+    derived = ("train_freq",)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require_counts({"target_update_interval": 1, "max_episodes_per_checkpoint": 1})
+        noises = ("target_policy_noise", "target_noise_clip", "exploration_noise")
+        self.require_range(0.0, np.inf, "a number of at least 0", *noises)
+        self.require_range(0.0, 1.0, "from 0 to 1", "priority_exponent", "reset_weight")
+        self.require(not self.use_sde, "use_sde", "False: noise is added to the actions")
+        kind = self.replay_buffer_class
+        if isinstance(kind, type) and issubclass(kind, LapReplayBuffer):
+            self.require(self.n_steps == 1, "n_steps", "1 with LapReplayBuffer")
+            compressed, allowed = self.optimize_memory_usage, "False with LapReplayBuffer"
+            self.require(not compressed, "optimize_memory_usage", allowed)
 
 
 class TD7(ModelFreeAlgorithm):
@@ -51,28 +106,6 @@ class TD7(ModelFreeAlgorithm):
     ``optimize_memory_usage`` or a buffer of one's own (``HerReplayBuffer``), transitions are drawn
     uniformly, and weights in the loss make its expected gradient the same (Fujimoto, Meger and
     Precup, NeurIPS 2020).
-
-    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` for Dict observations, a policy class, or
-        the environment itself
-    :param env: an environment, its id, or a vectorised environment
-    :param learning_rate: of encoder, actor and critics; number, schedule or ``"lin_3e-4"``
-    :param learning_starts: steps with random actions before learning starts
-    :param train_freq: steps between two calls of ``train``, or ``(n, "episode")``; None: one
-        episode where policies are assessed, one step where not
-    :param policy_delay: updates of the critics for each of the actor
-    :param target_update_interval: updates between two copies into the target networks
-    :param target_policy_noise: standard deviation of the noise on the target policy's actions,
-        which lie in [-1, 1]
-    :param target_noise_clip: its limit
-    :param exploration_noise: standard deviation of the noise on actions, unless ``action_noise`` is
-        passed
-    :param priority_exponent: how much priorities depend on errors; 0: not at all
-    :param use_checkpoints: whether policies are assessed; None: where there is one environment
-    :param max_episodes_per_checkpoint: episodes that assess a policy, after
-        ``updates_before_checkpointing``
-    :param updates_before_checkpointing: after as many or fewer, one episode does
-    :param reset_weight: factor on the best assessment at that moment
-    :param arguments: those of :class:`~sb3_hds.algos.model_free.algorithm.ModelFreeAlgorithm`
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -83,65 +116,35 @@ class TD7(ModelFreeAlgorithm):
     #: steps of ``learn()`` without a number: twice as many as are random
     default_timesteps: ClassVar[int] = 50_000
     policy: TD7Policy
+    use_checkpoints: bool | None
+    exploration_noise: float
+    target_update_interval: int
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] | GymEnv = "MlpPolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: float | str | Schedule = 3e-4,
-        *,
-        learning_starts: int = 25_000,
-        train_freq: int | tuple[int, str] | None = None,
-        policy_delay: int = 2,
-        target_update_interval: int = 250,
-        target_policy_noise: float = 0.2,
-        target_noise_clip: float = 0.5,
-        exploration_noise: float = 0.1,
-        action_noise: ActionNoise | None = None,
-        replay_buffer_class: type[ReplayBuffer] | None = None,
-        priority_exponent: float = 0.4,
-        use_checkpoints: bool | None = None,
-        max_episodes_per_checkpoint: int = 20,
-        updates_before_checkpointing: int = 750_000,
-        reset_weight: float = 0.9,
-        **arguments: Any,
-    ) -> None:
-        self.target_update_interval = target_update_interval
-        self.target_policy_noise = target_policy_noise
-        self.target_noise_clip = target_noise_clip
-        self.exploration_noise = exploration_noise
-        self.priority_exponent = priority_exponent
-        self.use_checkpoints = use_checkpoints
-        self.max_episodes_per_checkpoint = max_episodes_per_checkpoint
-        self.updates_before_checkpointing = updates_before_checkpointing
-        self.reset_weight = reset_weight
+    config_class = TD7Config
+
+    @takes(TD7Config)
+    def __init__(self, config: TD7Config) -> None:
+        self.construct(config)
+
+    def construct(self, config: TD7Config, **more: Any) -> None:  # type: ignore[override]
         self.assessed_episodes, self.assessed_steps = 0, 0
         self.worst_return, self.best_worst_return = np.inf, -np.inf
         self._finished: list[tuple[float, int]] = []
         self._begin_episode()
-        self._chosen_freq = train_freq
+        self._chosen_freq = config.train_freq
         self._derived_noise: ActionNoise | None = None
-        super().__init__(
-            policy,
-            env,
-            learning_rate=learning_rate,
-            learning_starts=learning_starts,
-            train_freq=train_freq,  # type: ignore[arg-type]  # None until it is derived
-            policy_delay=policy_delay,
-            action_noise=action_noise,
-            replay_buffer_class=replay_buffer_class,
-            **arguments,
-        )
+        super().construct(config, **more)
 
-    def recipe(self) -> Recipe:
+    def update_config(self) -> UpdateConfig:
         """:return: what an update is made of"""
-        return Recipe(
+        config = self.config
+        return UpdateConfig(
             **self.policy.parts,
-            target_every=self.target_update_interval,
-            policy_delay=self.policy_delay,
-            target_noise=self.target_policy_noise,
-            noise_clip=self.target_noise_clip,
-            alpha=self.priority_exponent,
+            target_update_interval=config.target_update_interval,
+            policy_delay=config.policy_delay,
+            target_noise=config.target_policy_noise,
+            noise_clip=config.target_noise_clip,
+            alpha=config.priority_exponent,
             uniform=not self.prioritised,
         )
 
@@ -157,30 +160,14 @@ class TD7(ModelFreeAlgorithm):
             self.replay_buffer_class, LapReplayBuffer
         )
 
-    def check_arguments(self) -> None:
-        super().check_arguments()
-        for name in ("target_update_interval", "max_episodes_per_checkpoint"):
-            self.refuse_unless(
-                is_count(getattr(self, name), 1), name, "a whole number of at least 1"
-            )
-        for name in ("target_policy_noise", "target_noise_clip", "exploration_noise"):
-            fine = between(getattr(self, name), 0.0, np.inf)
-            self.refuse_unless(fine, name, "a number of at least 0")
-        for name in ("priority_exponent", "reset_weight"):
-            self.refuse_unless(between(getattr(self, name), 0.0, 1.0), name, "from 0 to 1")
-        several = self.n_envs > 1 and self.use_checkpoints
-        self.refuse_unless(not several, "use_checkpoints", "False with several environments")
-        self.refuse_unless(not self.use_sde, "use_sde", "False: noise is added to the actions")
-        self.warn_unless_usual("tau", why="target networks are copied whole")
+    def check_environment(self, config: Any) -> None:
+        super().check_environment(config)
+        several = self.n_envs > 1 and config.use_checkpoints
+        config.require(not several, "use_checkpoints", "False with several environments")
+        self.warn_of_unused(config, "tau", why="target networks are copied whole")
         if self.assesses:
             why = "with checkpoints, there are as many updates as steps (use_checkpoints=False)"
-            self.warn_unless_usual("gradient_steps", why=why)
-        if self.prioritised:
-            self.refuse_unless(self.n_steps == 1, "n_steps", "1 with LapReplayBuffer")
-            compressed = self.optimize_memory_usage
-            self.refuse_unless(
-                not compressed, "optimize_memory_usage", "False with LapReplayBuffer"
-            )
+            self.warn_of_unused(config, "gradient_steps", why=why)
 
     def _usual_buffer(self) -> type[ReplayBuffer] | None:
         is_dict = isinstance(self.observation_space, spaces.Dict)
@@ -235,16 +222,16 @@ class TD7(ModelFreeAlgorithm):
             )
 
     def _build(self, seed: int) -> None:
-        self.policy.build(self.recipe(), seed, jax_device(self._device_name))
+        self.policy.build(self.update_config(), seed, jax_device(self._device_name))
 
     def _restart(self, seed: int) -> None:
         """The policy of the last checkpoint goes on acting until a new one does no worse."""
-        before = self.policy.learner
+        before = self.policy.agent_state
         self._build(seed)
         kept: dict[str, Any] = {"n_updates": before.n_updates}
         if before.checkpoint.kept > 0.0:
             kept["checkpoint"] = before.checkpoint
-        self.policy.learner = self.policy.learner._replace(**kept)
+        self.policy.agent_state = self.policy.agent_state._replace(**kept)
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """
@@ -283,8 +270,9 @@ class TD7(ModelFreeAlgorithm):
             self.assessed_steps += length
             self.worst_return = min(self.worst_return, reward)
         self._finished = []
-        late = self._n_updates > self.updates_before_checkpointing
-        enough = self.max_episodes_per_checkpoint if late else 1
+        config = self.config
+        late = self._n_updates > config.updates_before_checkpointing
+        enough = config.max_episodes_per_checkpoint if late else 1
         good = self.worst_return >= self.best_worst_return
         if good and self.assessed_episodes < enough:
             return 0
@@ -292,8 +280,8 @@ class TD7(ModelFreeAlgorithm):
             self.best_worst_return = self.worst_return
             self.policy.keep_checkpoint()
         due = self.assessed_steps
-        if not late and self._n_updates + due > self.updates_before_checkpointing:
-            self.best_worst_return *= self.reset_weight
+        if not late and self._n_updates + due > config.updates_before_checkpointing:
+            self.best_worst_return *= config.reset_weight
         self._begin_assessment()
         return due
 
@@ -301,27 +289,31 @@ class TD7(ModelFreeAlgorithm):
         """One after the other: what is drawn depends on the errors of the update before."""
         buffer: Any = self.replay_buffer
         rates, policy = self.learning_rates(), self.policy
-        report, found = {}, before_any(Report)
+        metrics, found = {}, zero_metrics(UpdateMetrics)
         for _ in range(n):
             batch, drawn = self._drawn(batch_size)
-            learner, found, priorities = update(policy.recipe, policy.learner, batch, *rates, found)
+            state, found, priorities = update(
+                policy.update_config, policy.agent_state, batch, *rates, found
+            )
             found = jax.device_get(found)  # as before the first update, or it is compiled twice
-            report = {name: float(value) for name, value in found._asdict().items()}
-            self._take(learner, report)
+            metrics = {name: float(value) for name, value in found._asdict().items()}
+            self._take(state, metrics)
             if drawn is None:
                 continue
             buffer.set_priorities(*drawn, np.asarray(priorities))
-            if int(learner.n_updates) % self.target_update_interval == 0:
+            if int(state.n_updates) % self.target_update_interval == 0:
                 buffer.forget_highest()
-        return report
+        return metrics
 
     def _drawn(self, batch_size: int) -> tuple[Batch, tuple[np.ndarray, np.ndarray] | None]:
         """:return: a batch, and which transitions it is made of, where these have priorities"""
         if not self.prioritised:
-            return Batch(*(rows[0] for rows in batches_of(self, 1, batch_size, 1))), None
+            return Batch(
+                *(rows[0] for rows in batches_of(self.replay_source, 1, batch_size, 1))
+            ), None
         buffer: Any = self.replay_buffer
         drawn = buffer.draw(batch_size)
-        return Batch(**transitions(self, buffer, *drawn)), drawn  # type: ignore[arg-type]
+        return Batch(**transitions(self.replay_source, *drawn)), drawn  # type: ignore[arg-type]
 
     def _store_transition(
         self,

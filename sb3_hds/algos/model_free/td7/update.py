@@ -7,8 +7,6 @@ Learning*, NeurIPS 2023.
 """
 
 import dataclasses
-import math
-from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple, cast
 
@@ -17,126 +15,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from sb3_hds.algos.model_free.sac.update import Batch, Turn, in_turn
-from sb3_hds.algos.nets.activations import Activation
-from sb3_hds.algos.nets.optimizers import Optimizer, Trained, Weights
+from sb3_hds.algos.model_free.update import Batch, UpdateStep, apply_schedule
+from sb3_hds.algos.nets.optimizers import Optimizer, TrainState, Weights
 from sb3_hds.core.numerics.compilation import QUICK_COMPILATION
-
-_EPSILON = 1e-8
-# Uniform, of variance 1 / (3 n) with n inputs.
-_KERNELS = nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")
-
-
-def average_l1_norm(x: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
-    """:return: of mean absolute value 1 (section 4.1 of the paper)"""
-    return x / jnp.maximum(jnp.mean(jnp.abs(x), -1, keepdims=True), _EPSILON)
-
-
-class Encoder(nn.Module):
-    """
-    State to embedding, and embedding and action to what the next state's embedding will be.
-
-    :param n: size of the embeddings
-    :param net_arch: hidden widths
-    :param activation_fn: between the layers
-    """
-
-    n: int
-    net_arch: Sequence[int]
-    activation_fn: Activation
-
-    def setup(self) -> None:
-        self.of_state = _Dense((*self.net_arch, self.n), self.activation_fn)
-        self.of_both = _Dense((*self.net_arch, self.n), self.activation_fn)
-
-    def __call__(self, obs: Array, action: Array) -> tuple[Array, Array]:
-        state = average_l1_norm(self.of_state(obs))
-        return state, self.of_both(jnp.concatenate([state, action], -1))
-
-
-class Actor(nn.Module):
-    """
-    Observation and its embedding to controls.
-
-    :param n_act: number of controls
-    :param net_arch: hidden widths; the observation passes the first, then its embedding joins
-    :param activation_fn: between the layers
-    """
-
-    n_act: int
-    net_arch: Sequence[int]
-    activation_fn: Activation
-
-    @nn.compact
-    def __call__(
-        self, obs: Float[Array, "*batch obs"], state: Float[Array, "*batch z"]
-    ) -> Float[Array, "*batch act"]:
-        own = average_l1_norm(_first(obs, self.net_arch))
-        hidden = _Dense((*self.net_arch, self.n_act), self.activation_fn)
-        return jnp.tanh(hidden(jnp.concatenate([own, state], -1)))
-
-
-class Critic(nn.Module):
-    """
-    Observation, action and both embeddings to a value.
-
-    :param net_arch: hidden widths; observation and action pass the first, then embeddings join
-    :param activation_fn: between the layers
-    """
-
-    net_arch: Sequence[int]
-    activation_fn: Activation
-
-    @nn.compact
-    def __call__(
-        self,
-        obs: Float[Array, "*batch obs"],
-        action: Float[Array, "*batch act"],
-        both: Float[Array, "*batch z"],
-        state: Float[Array, "*batch z"],
-    ) -> Float[Array, "*batch"]:
-        own = _first(jnp.concatenate([obs, action], -1), self.net_arch)
-        hidden = _Dense((*self.net_arch, 1), self.activation_fn)
-        return hidden(jnp.concatenate([average_l1_norm(own), both, state], -1))[..., 0]
-
-
-def _first(x: Array, net_arch: Sequence[int]) -> Array:
-    """A layer of the first width; without hidden layers, what comes in."""
-    return _linear(x, net_arch[0]) if net_arch else x
-
-
-class _Dense(nn.Module):
-    """Layers of these widths, the last one linear."""
-
-    sizes: Sequence[int]
-    activation_fn: Activation
-
-    @nn.compact
-    def __call__(self, x: Array) -> Array:
-        for size in self.sizes[:-1]:
-            x = self.activation_fn(_linear(x, size))
-        return _linear(x, self.sizes[-1])
-
-
-def _linear(x: Array, size: int) -> Array:
-    r"""
-    A layer that starts as torch's ``Linear``: weights and biases uniform within
-    :math:`\pm 1 / \sqrt{n}` of :math:`n` inputs.
-    """
-    limit = 1.0 / math.sqrt(x.shape[-1])
-
-    def biases(key: PRNGKeyArray, shape: Sequence[int], dtype: Any) -> Array:
-        return jax.random.uniform(key, shape, dtype, -limit, limit)
-
-    return nn.Dense(size, kernel_init=_KERNELS, bias_init=biases)(x)
 
 
 @dataclasses.dataclass(frozen=True)
-class Recipe:
+class UpdateConfig:
     """
     What an update is made of.
 
-    :param target_every: updates between two copies into the target networks
+    :param target_update_interval: updates between two copies into the target networks
     :param policy_delay: updates of the critics for each of the actor
     :param target_noise: standard deviation of the noise on the target policy's actions
     :param noise_clip: its limit
@@ -150,7 +39,7 @@ class Recipe:
     n_critics: int
     optimizer: Optimizer
     qf_optimizer: Optimizer
-    target_every: int = 250
+    target_update_interval: int = 250
     policy_delay: int = 2
     target_noise: float = 0.2
     noise_clip: float = 0.5
@@ -192,7 +81,7 @@ class Checkpoint(NamedTuple):
     kept: Float[Array, ""]
 
 
-class Learner(NamedTuple):
+class TD7State(NamedTuple):
     """
     Everything that an update changes.
 
@@ -201,9 +90,9 @@ class Learner(NamedTuple):
         ``clip`` becomes it with each copy
     """
 
-    encoder: Trained
-    actor: Trained
-    critic: Trained
+    encoder: TrainState
+    actor: TrainState
+    critic: TrainState
     copies: Copies
     checkpoint: Checkpoint
     clip: Range
@@ -212,7 +101,7 @@ class Learner(NamedTuple):
     n_updates: Int[Array, ""]
 
 
-class Report(NamedTuple):
+class UpdateMetrics(NamedTuple):
     """Of the last update; the actor's of the last one in which it was updated."""
 
     critic_loss: Float[Array, ""]
@@ -221,21 +110,21 @@ class Report(NamedTuple):
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=QUICK_COMPILATION)
-def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
+def init_state(config: UpdateConfig, n_obs: int, n_act: int, key: PRNGKeyArray) -> TD7State:
     """:return: fresh networks and optimisers"""
     key, encoder_key, actor_key, critic_key = jax.random.split(key, 4)
     obs, action = jnp.zeros((1, n_obs)), jnp.zeros((1, n_act))
-    encoder = recipe.encoder.init(encoder_key, obs, action)
-    state, both = cast(tuple[Array, Array], recipe.encoder.apply(encoder, obs, action))
-    actor = recipe.actor.init(actor_key, obs, state)
-    init = lambda key: recipe.critic.init(key, obs, action, both, state)  # noqa: E731
-    critic = jax.vmap(init)(jax.random.split(critic_key, recipe.n_critics))
+    encoder = config.encoder.init(encoder_key, obs, action)
+    zs, zsa = cast(tuple[Array, Array], config.encoder.apply(encoder, obs, action))
+    actor = config.actor.init(actor_key, obs, zs)
+    init = lambda key: config.critic.init(key, obs, action, zsa, zs)  # noqa: E731
+    critic = jax.vmap(init)(jax.random.split(critic_key, config.n_critics))
     zero = jnp.zeros(())
     infinite = jnp.full_like(zero, jnp.inf)
-    return Learner(
-        encoder=Trained(encoder, recipe.qf_optimizer.init(encoder["params"])),
-        actor=Trained(actor, recipe.optimizer.init(actor["params"])),
-        critic=Trained(critic, recipe.qf_optimizer.init(critic["params"])),
+    return TD7State(
+        encoder=TrainState(encoder, config.qf_optimizer.init(encoder["params"])),
+        actor=TrainState(actor, config.optimizer.init(actor["params"])),
+        critic=TrainState(critic, config.qf_optimizer.init(critic["params"])),
         copies=Copies(encoder, actor, critic, encoder),
         checkpoint=Checkpoint(encoder, actor, zero),
         clip=Range(zero, zero),
@@ -245,58 +134,60 @@ def begin(recipe: Recipe, n_obs: int, n_act: int, key: PRNGKeyArray) -> Learner:
     )
 
 
-def act(recipe: Recipe, encoder: Weights, actor: Weights, obs: Array) -> Array:
+def act(config: UpdateConfig, encoder: Weights, actor: Weights, obs: Array) -> Array:
     """:return: controls, by these weights"""
-    nothing = jnp.zeros((*obs.shape[:-1], cast(Any, recipe.actor).n_act))
-    state, _ = cast(tuple[Array, Array], recipe.encoder.apply(encoder, obs, nothing))
-    return cast(Array, recipe.actor.apply(actor, obs, state))
+    nothing = jnp.zeros((*obs.shape[:-1], cast(Any, config.actor).n_act))
+    zs, _ = cast(tuple[Array, Array], config.encoder.apply(encoder, obs, nothing))
+    return cast(Array, config.actor.apply(actor, obs, zs))
 
 
-def embed(recipe: Recipe, weights: Weights, obs: Array, action: Array) -> tuple[Array, Array]:
+def embed(config: UpdateConfig, weights: Weights, obs: Array, action: Array) -> tuple[Array, Array]:
     """:return: embeddings of states, and of pairs of state and action"""
-    return cast(tuple[Array, Array], recipe.encoder.apply(weights, obs, action))
+    return cast(tuple[Array, Array], config.encoder.apply(weights, obs, action))
 
 
-def judge(
-    recipe: Recipe, weights: Weights, obs: Array, action: Array, state: Array, both: Array
+def q_values(
+    config: UpdateConfig, weights: Weights, obs: Array, action: Array, zs: Array, zsa: Array
 ) -> Array:
     """:return: values of all critics, shape ``(critics, batch)``"""
-    one = lambda w: recipe.critic.apply(w, obs, action, both, state)  # noqa: E731
+    one = lambda w: config.critic.apply(w, obs, action, zsa, zs)  # noqa: E731
     return cast(Array, jax.vmap(one)(weights))
 
 
 @partial(jax.jit, static_argnums=0)
 def update(
-    recipe: Recipe,
-    learner: Learner,
+    config: UpdateConfig,
+    state: TD7State,
     batch: Batch,
     learning_rate: float,
     qf_learning_rate: float,
-    report: Report,
-) -> tuple[Learner, Report, Float[Array, " batch"]]:
+    metrics: UpdateMetrics,
+) -> tuple[TD7State, UpdateMetrics, Float[Array, " batch"]]:
     """
     :param batch: of one update
-    :return: the learner, what happened, and the transitions' priorities
+    :return: the state, what happened, and the transitions' priorities
     """
-    embedded = embed(recipe, learner.copies.encoder, batch.obs, batch.action)
-    critics = partial(_update_critics, recipe, batch, embedded, qf_learning_rate)
-    actor = partial(_update_actor, recipe, batch, embedded[0], learning_rate)
-    learner, found = in_turn(
-        learner,
-        _Found(report, jnp.zeros(batch.reward.shape)),
-        Turn(("encoder", "critic", "range"), 1, critics),
-        Turn(("actor",), recipe.policy_delay, actor),
-        Turn(("copies", "clip"), recipe.target_every, _copy),
+    embedded = embed(config, state.copies.encoder, batch.obs, batch.action)
+    critics = partial(_update_critics, config, batch, embedded, qf_learning_rate)
+    actor = partial(_update_actor, config, batch, embedded[0], learning_rate)
+    state, found = apply_schedule(
+        state,
+        _Found(metrics, jnp.zeros(batch.reward.shape)),
+        UpdateStep(("encoder", "critic", "range"), 1, critics),
+        UpdateStep(("actor",), config.policy_delay, actor),
+        UpdateStep(("copies", "clip"), config.target_update_interval, _copy),
     )
-    return learner, found.report, found.priority
+    return state, found.metrics, found.priority
 
 
-def priorities_of(recipe: Recipe, error: Float[Array, "critics batch"]) -> Float[Array, " batch"]:
+def priorities_of(
+    config: UpdateConfig, error: Float[Array, "critics batch"]
+) -> Float[Array, " batch"]:
     """:return: of transitions with these absolute errors"""
-    return jnp.maximum(error.max(0), 1.0) ** recipe.alpha
+    return jnp.maximum(error.max(0), 1.0) ** config.alpha
 
 
-def loss_of(recipe: Recipe, error: Float[Array, "critics batch"]) -> Float[Array, ""]:
+def loss_of(config: UpdateConfig, error: Float[Array, "critics batch"]) -> Float[Array, ""]:
     """
     :param error: absolute errors
     :return: LAP's loss; where transitions are drawn uniformly, the one of equal expected gradient
@@ -305,8 +196,8 @@ def loss_of(recipe: Recipe, error: Float[Array, "critics batch"]) -> Float[Array
     Sampling in Experience Replay*, NeurIPS 2020.
     """
     loss = jnp.where(error < 1.0, 0.5 * error**2, error)
-    if recipe.uniform:
-        priority = jax.lax.stop_gradient(priorities_of(recipe, error))
+    if config.uniform:
+        priority = jax.lax.stop_gradient(priorities_of(config, error))
         loss = loss * priority / priority.mean()
     return jnp.sum(jnp.mean(loss, 1))
 
@@ -316,88 +207,88 @@ class _Found(NamedTuple):
     :param priority: of the batch's transitions
     """
 
-    report: Report
+    metrics: UpdateMetrics
     priority: Float[Array, " batch"]
 
 
 def _update_critics(
-    recipe: Recipe,
+    config: UpdateConfig,
     batch: Batch,
     embedded: tuple[Array, Array],
     rate: float,
-    learner: Learner,
+    state: TD7State,
     found: _Found,
     key: PRNGKeyArray,
-) -> tuple[tuple[Trained, Trained, Range], _Found]:
+) -> tuple[tuple[TrainState, TrainState, Range], _Found]:
     """Embeddings, and critics by the embeddings and targets of copied networks."""
-    copies = learner.copies
-    encoder, encoder_loss = _update_encoder(recipe, learner.encoder, batch, rate)
-    noise = recipe.target_noise * jax.random.normal(key, batch.action.shape)
-    noise = jnp.clip(noise, -recipe.noise_clip, recipe.noise_clip)
-    next_action = act(recipe, copies.target_encoder, copies.actor, batch.next_obs)
+    copies = state.copies
+    encoder, encoder_loss = _update_encoder(config, state.encoder, batch, rate)
+    noise = config.target_noise * jax.random.normal(key, batch.action.shape)
+    noise = jnp.clip(noise, -config.noise_clip, config.noise_clip)
+    next_action = act(config, copies.target_encoder, copies.actor, batch.next_obs)
     next_action = jnp.clip(next_action + noise, -1.0, 1.0)
-    next_embedded = embed(recipe, copies.target_encoder, batch.next_obs, next_action)
-    next_value = judge(recipe, copies.critic, batch.next_obs, next_action, *next_embedded).min(0)
-    next_value = jnp.clip(next_value, learner.clip.low, learner.clip.high)
+    next_embedded = embed(config, copies.target_encoder, batch.next_obs, next_action)
+    next_value = q_values(config, copies.critic, batch.next_obs, next_action, *next_embedded).min(0)
+    next_value = jnp.clip(next_value, state.clip.low, state.clip.high)
     target = batch.reward + (1.0 - batch.terminated) * batch.discount * next_value
     seen = Range(
-        jnp.minimum(learner.range.low, target.min()), jnp.maximum(learner.range.high, target.max())
+        jnp.minimum(state.range.low, target.min()), jnp.maximum(state.range.high, target.max())
     )
 
     def loss_and_error(params: Any) -> tuple[Array, Array]:
-        value = judge(recipe, {"params": params}, batch.obs, batch.action, *embedded)
+        value = q_values(config, {"params": params}, batch.obs, batch.action, *embedded)
         error = jnp.abs(value - target)
-        return loss_of(recipe, error), error
+        return loss_of(config, error), error
 
     gradient = jax.value_and_grad(loss_and_error, has_aux=True)
-    (loss, error), slope = gradient(learner.critic.weights["params"])
-    critic = recipe.qf_optimizer.apply(slope, learner.critic, rate)
-    report = found.report._replace(critic_loss=loss, encoder_loss=encoder_loss)
-    return (encoder, critic, seen), _Found(report, priorities_of(recipe, error))
+    (loss, error), slope = gradient(state.critic.weights["params"])
+    critic = config.qf_optimizer.apply(slope, state.critic, rate)
+    metrics = found.metrics._replace(critic_loss=loss, encoder_loss=encoder_loss)
+    return (encoder, critic, seen), _Found(metrics, priorities_of(config, error))
 
 
 def _update_encoder(
-    recipe: Recipe, encoder: Trained, batch: Batch, rate: float
-) -> tuple[Trained, Array]:
-    """The embedding of state and action shall be that of the next state."""
-    wanted, _ = embed(recipe, encoder.weights, batch.next_obs, batch.action)
+    config: UpdateConfig, encoder: TrainState, batch: Batch, rate: float
+) -> tuple[TrainState, Array]:
+    """Regress the embedding of state and action on that of the next state."""
+    wanted, _ = embed(config, encoder.weights, batch.next_obs, batch.action)
 
     def loss(params: Any) -> Array:
-        _, both = embed(recipe, {"params": params}, batch.obs, batch.action)
-        return jnp.mean((both - jax.lax.stop_gradient(wanted)) ** 2)
+        _, zsa = embed(config, {"params": params}, batch.obs, batch.action)
+        return jnp.mean((zsa - jax.lax.stop_gradient(wanted)) ** 2)
 
     value, slope = jax.value_and_grad(loss)(encoder.weights["params"])
-    return recipe.qf_optimizer.apply(slope, encoder, rate), value
+    return config.qf_optimizer.apply(slope, encoder, rate), value
 
 
 def _update_actor(
-    recipe: Recipe,
+    config: UpdateConfig,
     batch: Batch,
-    state: Array,
+    zs: Array,
     rate: float,
-    learner: Learner,
+    state: TD7State,
     found: _Found,
     _: PRNGKeyArray,
-) -> tuple[tuple[Trained], _Found]:
-    """Climb what all critics think of the actor's own actions."""
+) -> tuple[tuple[TrainState], _Found]:
+    """Maximise the mean of the critics over the actor's actions."""
 
     def loss(params: Any) -> Array:
-        action = cast(Array, recipe.actor.apply({"params": params}, batch.obs, state))
-        _, both = embed(recipe, learner.copies.encoder, batch.obs, action)
-        value = judge(recipe, learner.critic.weights, batch.obs, action, state, both)
+        action = cast(Array, config.actor.apply({"params": params}, batch.obs, zs))
+        _, zsa = embed(config, state.copies.encoder, batch.obs, action)
+        value = q_values(config, state.critic.weights, batch.obs, action, zs, zsa)
         return -jnp.mean(value)
 
-    value, slope = jax.value_and_grad(loss)(learner.actor.weights["params"])
-    actor = recipe.optimizer.apply(slope, learner.actor, rate)
-    return (actor,), found._replace(report=found.report._replace(actor_loss=value))
+    value, slope = jax.value_and_grad(loss)(state.actor.weights["params"])
+    actor = config.optimizer.apply(slope, state.actor, rate)
+    return (actor,), found._replace(metrics=found.metrics._replace(actor_loss=value))
 
 
-def _copy(learner: Learner, found: _Found, _: PRNGKeyArray) -> tuple[tuple[Copies, Range], _Found]:
-    """Networks, and the range of targets, into those that do not move with every update."""
+def _copy(state: TD7State, found: _Found, _: PRNGKeyArray) -> tuple[tuple[Copies, Range], _Found]:
+    """Copy networks, and the range of targets, into those that targets go by."""
     copies = Copies(
-        learner.encoder.weights,
-        learner.actor.weights,
-        learner.critic.weights,
-        learner.copies.encoder,
+        state.encoder.weights,
+        state.actor.weights,
+        state.critic.weights,
+        state.copies.encoder,
     )
-    return (copies, learner.range), found
+    return (copies, state.range), found

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_hds.algos.twin.hds.recorded_steps import latest_steps
+from sb3_hds.algos.twin.hds.recorded_steps import last_steps
 from sb3_hds.algos.twin.hds.windows import (
     EXACT,
     FEWEST,
@@ -52,15 +52,14 @@ _TRUSTED = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
-class Wishes:
+class CorrectionConfig:
     """
-    What is to be corrected.
+    What is corrected, and how.
 
     :param names: parameters that are estimated; empty: none
     :param nominal: values that are believed before any data, by name
-    :param residual: whether a force is learned
     :param residual_kwargs: further arguments of ``sysid.fit_residual``
-    :param beta: share of rollouts in the learned model, or ``"auto"``
+    :param beta: share of rollouts in the learned model, or ``"auto"``; 0: no force is learned
     :param seed: of whatever is drawn
     :param suspected: effects that are estimated with the rest once the twin proves inexact, and
         stay attached where they explain something
@@ -68,7 +67,6 @@ class Wishes:
 
     names: tuple[str, ...]
     nominal: Mapping[str, float]
-    residual: bool
     residual_kwargs: Mapping[str, Any]
     beta: float | str
     seed: int
@@ -105,16 +103,35 @@ class Correction:
     error_calibrated: float = np.nan
     error_hybrid: float = np.nan
 
-    @property
-    def forgotten(self) -> bool:
-        """Whether data from before a change of the system were left out."""
-        return self.since is not None
+    def log(self) -> tuple[dict[str, float], dict[str, float]]:
+        """
+        :return: by key, errors that there are and parameters as the twin has them now; and for
+            those that it took over from the fit the ends of their intervals
+        """
+        values: dict[str, float] = {"beta": self.beta, "forgotten": int(self.since is not None)}
+        for name in ("error_twin", "error_calibrated", "error_hybrid"):
+            error = getattr(self, name)
+            if not (np.isnan(error) or (name == "error_calibrated" and self.fit is None)):
+                values[name] = error
+        if self.residual is not None:
+            values["disagreement"] = self.residual.disagreement
+        intervals: dict[str, float] = {}
+        for estimate in self.fit.estimates if self.fit is not None else ():
+            value = self.twin.values.get(estimate.name)
+            if value is None:
+                continue
+            values[estimate.name] = value
+            if value == estimate.estimate:
+                intervals[f"{estimate.name}_low"] = estimate.low
+                intervals[f"{estimate.name}_high"] = estimate.high
+        with_prefix = lambda found: {f"model/{name}": x for name, x in found.items()}  # noqa: E731
+        return with_prefix(values), with_prefix(intervals)
 
 
 def correct(
     twin: Twin,
     data: Trajectories,
-    wishes: Wishes,
+    config: CorrectionConfig,
     beta: float,
     learn_force: bool,
     n_new: int,
@@ -125,7 +142,7 @@ def correct(
 
     :param twin: as it is now
     :param data: everything measured, oldest first; ``origin`` numbers the recordings
-    :param wishes: what is to be corrected
+    :param config: what is corrected, and how
     :param beta: as it is now
     :param learn_force: whether it is time to learn the force again
     :param n_new: steps that came since the last correction
@@ -133,9 +150,9 @@ def correct(
     :raises CalibrationError: for data that cannot have been measured on what the twin simulates
     """
     check_fits(twin, data)
-    recent = data if since is None else latest_steps(data, since.n_steps)
+    recent = data if since is None else last_steps(data, since.n_steps)
     spread = spread_of(recent)
-    if twin.values == wishes.nominal:
+    if twin.values == config.nominal:
         single = single_step_errors(twin, recent, spread, _N_SINGLE)
         typical = float(np.quantile(single, _MOST_STEPS))
         if typical < _EXACT_STEP:
@@ -144,7 +161,7 @@ def correct(
         windows = windows_of(data, twin, spread, since)
     except TrajectoryError:
         return Correction(twin, beta, changed=False)
-    nominal = twin.with_parameters(**wishes.nominal)
+    nominal = twin.with_parameters(**config.nominal)
     bare, now = (windows.errors(t) for t in (nominal, twin))
     real = windows.counted
     if len(real) < FEWEST:
@@ -160,14 +177,14 @@ def correct(
         return Correction(
             twin, beta, changed=False, since=forgotten, error_twin=mean_error(bare[real])
         )
-    found = _corrected(nominal, twin, wishes, windows, bare, now, beta, learn_force)
+    found = _corrected(nominal, twin, config, windows, bare, now, beta, learn_force)
     return dataclasses.replace(found, since=forgotten)
 
 
 def _corrected(
     nominal: Twin,
     twin: Twin,
-    wishes: Wishes,
+    config: CorrectionConfig,
     windows: Windows,
     bare: np.ndarray,
     now: np.ndarray,
@@ -179,8 +196,8 @@ def _corrected(
     :param bare: errors of that
     :param now: errors of the twin as it is
     """
-    nominal, twin, wishes, added = _with_suspects(nominal, twin, wishes)
-    fit = _calibrated(nominal, twin, windows, wishes)
+    nominal, twin, config, added = _with_suspects(nominal, twin, config)
+    fit = _calibrated(nominal, twin, windows, config)
     calibrated, errors = _best(nominal, twin, fit, bare, now, windows)
     calibrated, errors, added = _cleared(calibrated, errors, added, windows)
     held = windows.held
@@ -195,28 +212,28 @@ def _corrected(
     )
     if beta > 0.0:
         now = windows.errors(twin, twin.params)
-    found, errors = _with_residual(found, windows, errors, wishes, learn_force)
+    found, errors = _with_residual(found, windows, errors, config, learn_force)
     return dataclasses.replace(found, changed=gain(errors[held], now[held]) > _NOTICEABLE)
 
 
 def _with_suspects(
-    nominal: Twin, twin: Twin, wishes: Wishes
-) -> tuple[Twin, Twin, Wishes, dict[str, float]]:
+    nominal: Twin, twin: Twin, config: CorrectionConfig
+) -> tuple[Twin, Twin, CorrectionConfig, dict[str, float]]:
     """
     Errors that are known already stay valid: new effects change nothing yet.
 
-    :return: both twins with the suspected effects, the wishes with their parameters, and what is
+    :return: both twins with the suspected effects, the config with their parameters, and what is
         believed of these
     """
-    missing = missing_effects(twin, wishes.suspected)
+    missing = missing_effects(twin, config.suspected)
     if not missing:
-        return nominal, twin, wishes, {}
+        return nominal, twin, config, {}
     nominal, twin = nominal.extend(*missing), twin.extend(*missing)
     added = nulls_of(missing)
-    wishes = dataclasses.replace(
-        wishes, names=(*wishes.names, *added), nominal={**wishes.nominal, **added}
+    config = dataclasses.replace(
+        config, names=(*config.names, *added), nominal={**config.nominal, **added}
     )
-    return nominal, twin, wishes, added
+    return nominal, twin, config, added
 
 
 def _cleared(
@@ -246,17 +263,17 @@ def _calibrated(
     nominal: Twin,
     twin: Twin,
     windows: Windows,
-    wishes: Wishes,
+    config: CorrectionConfig,
 ) -> Fit | None:
     """From the values as they are, with what was believed before any data as prior."""
-    if not wishes.names:
+    if not config.names:
         return None
-    believed = np.array([nominal.values[name] for name in wishes.names])
+    believed = np.array([nominal.values[name] for name in config.names])
     start = twin.with_parameters(**{k: 0.0 for k in shares_of(twin)})
     try:
         return fit_windows(
             start,
-            each(wishes.names),
+            each(config.names),
             windows.learned,
             windows.origin,
             windows.spread,
@@ -297,18 +314,18 @@ def _with_residual(
     found: Correction,
     windows: Windows,
     errors: np.ndarray,
-    wishes: Wishes,
+    config: CorrectionConfig,
     learn_force: bool,
 ) -> tuple[Correction, np.ndarray]:
     """:return: the correction, and the errors of the model that is planned in"""
     twin, residual, held = found.twin, None, windows.held
-    wanted = wishes.residual and wishes.beta != 0.0 and mean_error(errors[held]) > EXACT
+    wanted = config.beta != 0.0 and mean_error(errors[held]) > EXACT
     if wanted and learn_force:
         scale = 0.05 * windows.spread if found.fit is None else found.fit.noise
         scale = np.maximum(scale, 1e-3 * windows.spread)
         try:
             residual = fit_force(
-                twin, windows.shots, held, scale, seed=wishes.seed, **wishes.residual_kwargs
+                twin, windows.shots, held, scale, seed=config.seed, **config.residual_kwargs
             )
         except CalibrationError:
             residual = None
@@ -325,7 +342,7 @@ def _with_residual(
     share = 0.0
     if helps:
         trust = min(1.0, gain(whole[held], errors[held]) / _TRUSTED)
-        share = trust if wishes.beta == "auto" else float(wishes.beta)
+        share = trust if config.beta == "auto" else float(config.beta)
     twin = hybrid.with_parameters(**{key: 1.0 if helps else 0.0})
     found = dataclasses.replace(found, twin=twin, beta=share)
     return found, whole if share > 0.0 else errors

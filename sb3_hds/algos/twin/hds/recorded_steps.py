@@ -1,37 +1,49 @@
 """The real steps that a model has seen, and how they travel with it."""
 
-import copy
 import dataclasses
 import json
 import os
 import warnings
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_hds.algos.twin.hds.recordings import Recordings
 from sb3_hds.core import Trajectories
 from sb3_hds.core.trajectories.replay_buffer import episodes_in
 from sb3_hds.errors import TrajectoryError
 
-if TYPE_CHECKING:
-    from sb3_hds.algos.twin.hds.algorithm import HDS
-
 _COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
-class Measured:
+class Source(NamedTuple):
     """
-    What SB3 saves beside the policy: it has ``state_dict`` and ``load_state_dict``.
+    Where measured steps are.
 
-    :param model: whose replay buffer holds the data
+    :param buffer: SB3's replay buffer; None before there is one
+    :param dt: time step of the twin [s]; None while there is no twin
+    :param space: of the actions
+    :param limit: steps that are saved, the latest; 0: none
+    """
+
+    buffer: Any
+    dt: float | None
+    space: Any
+    limit: int
+
+
+class RecordedSteps:
+    """
+    The real steps that a model has seen. For SB3, which saves it beside the policy, it is a module
+    with ``state_dict`` and ``load_state_dict``.
+
+    :param source: says where they are now
     :param earlier: data from before this model, for example a file of random motion
     """
 
-    def __init__(self, model: "HDS", earlier: Trajectories | None = None) -> None:
-        self._model = model
+    def __init__(self, source: Callable[[], Source], earlier: Trajectories | None = None) -> None:
+        self._source = source
         self.earlier = None if earlier is None else _counted(earlier)
         self._recordings = Recordings(self._n_earlier)
 
@@ -40,17 +52,16 @@ class Measured:
         :param latest: only so many steps
         :return: everything measured, oldest first; None before anything was
         """
-        buffer, twin = self._model.replay_buffer, self._model.twin
+        buffer, dt, space, _ = self._source()
         parts = [] if self.earlier is None else [self.earlier]
-        if buffer is not None and buffer.size() > 0 and twin is not None:
-            space = self._model.action_space
+        if buffer is not None and buffer.size() > 0 and dt is not None:
             try:
-                found = Trajectories.from_replay_buffer(buffer, twin.dt, space, only_finite=True)
+                found = Trajectories.from_replay_buffer(buffer, dt, space, only_finite=True)
                 parts.append(found)
             except TrajectoryError:  # none of the steps is finite
                 pass
         data = Trajectories.concatenate(parts) if parts else None
-        return data if data is None or latest is None else latest_steps(data, latest)
+        return data if data is None or latest is None else last_steps(data, latest)
 
     def recordings(self) -> Trajectories | None:
         """
@@ -72,26 +83,25 @@ class Measured:
 
     def _numbered(self) -> Trajectories | None:
         """What is in the replay buffer, in the order in which it began."""
-        buffer, twin = self._model.replay_buffer, self._model.twin
-        if buffer is None or buffer.size() == 0 or twin is None:
+        buffer, dt, space, _ = self._source()
+        if buffer is None or buffer.size() == 0 or dt is None:
             return None
         try:
-            obs, actions, begins = episodes_in(buffer, self._model.action_space, only_finite=True)
+            obs, actions, begins = episodes_in(buffer, space, only_finite=True)
         except TrajectoryError:  # none of the steps is finite
             return None
         numbers = np.array(self._recordings.numbers(buffer, begins))
         if (numbers < 0).all():  # one that has no end is older than the buffer
             numbers[:] = self._recordings.latest
-        found = Trajectories.from_arrays(obs, actions, dt=twin.dt, conditions="replay buffer")
+        found = Trajectories.from_arrays(obs, actions, dt=dt, conditions="replay buffer")
         found = dataclasses.replace(found, origin=numbers)
         order = np.array(sorted(range(len(begins)), key=begins.__getitem__))
         return found[order[numbers[order] >= 0]]
 
     def state_dict(self) -> dict[str, th.Tensor]:
         """:return: the latest steps, oldest first, shape ``(steps, n_envs, ...)``; earlier data"""
-        limit = self._model.max_saved_steps if self._model.save_data else 0
+        buffer, _, _, limit = self._source()
         saved: dict[str, th.Tensor] = {}
-        buffer = _up_to_date(self._model)
         if buffer is not None and limit and buffer.size() > 0:
             order = np.arange(buffer.pos)
             if buffer.full:
@@ -117,7 +127,7 @@ class Measured:
         """
         if "earlier.obs" in tensors:
             self.earlier = _unpadded(_part(tensors, "earlier"))
-        buffer = self._model.replay_buffer
+        buffer = self._source().buffer
         if buffer is None or "observations" not in tensors:
             return
         columns = {name: tensors[name].cpu().numpy() for name in _COLUMNS if name in tensors}
@@ -141,23 +151,6 @@ class Measured:
             self._recordings.load_state_dict(_part(tensors, "recordings"), buffer, n_saved)
 
 
-def _up_to_date(model: "HDS") -> Any:
-    """The replay buffer, with the step that callbacks have seen and SB3 has not stored yet."""
-    buffer, step = model.replay_buffer, model.unstored_step
-    if buffer is None or step is None:
-        return buffer
-    buffer = copy.copy(buffer)
-    before = model._last_obs, model._last_original_obs
-    OffPolicyAlgorithm._store_transition(model, buffer, **_named(step))
-    model._last_obs, model._last_original_obs = before
-    return buffer
-
-
-def _named(step: dict[str, Any]) -> dict[str, Any]:
-    names = {"buffer_actions": "buffer_action", "rewards": "reward"}
-    return {names.get(name, name): value for name, value in step.items()}
-
-
 def data_from(source: Any) -> Trajectories | None:
     """
     :param source: trajectories, the path of a file that ``Trajectories.save`` wrote, or None
@@ -173,7 +166,7 @@ def data_from(source: Any) -> Trajectories | None:
     )
 
 
-def latest_steps(data: Trajectories, n_steps: int) -> Trajectories:
+def last_steps(data: Trajectories, n_steps: int) -> Trajectories:
     """The end of the data; the recording in which it begins is cut."""
     obs, actions, left = [], [], max(n_steps, 1)
     for i in reversed(range(len(data))):
@@ -192,7 +185,7 @@ def _whole(data: Trajectories, n_steps: int) -> Trajectories:
     """The latest recordings that have together no more steps than so many."""
     after = np.cumsum(data.lengths[::-1])[::-1]
     fit = np.flatnonzero(after <= n_steps)
-    return data[fit] if len(fit) else latest_steps(data, n_steps)
+    return data[fit] if len(fit) else last_steps(data, n_steps)
 
 
 def _counted(data: Trajectories) -> Trajectories:
@@ -242,3 +235,68 @@ def _unpadded(saved: dict[str, th.Tensor]) -> Trajectories:
         conditions=labels,
     )
     return dataclasses.replace(found, origin=origin)
+
+
+class Recordings:
+    """
+    Counts the recordings that went through a replay buffer.
+
+    Whether a window is held out depends on the number of its recording. Counted from the oldest
+    step that is left, recordings would get other numbers whenever old steps are overwritten, or
+    left out of a file, and what was learned from would be held out.
+
+    :param n_before: recordings that there were before any went through the buffer
+    """
+
+    def __init__(self, n_before: int = 0) -> None:
+        self._n_before = n_before
+        #: of each recording, at which step of all environments together it began
+        self.starts: list[int] = []
+        #: steps of each environment that had gone through the buffer when it was last looked at,
+        #: and where it stood
+        self._n_steps, self._position = 0, 0
+
+    def look_at(self, buffer: Any) -> None:
+        """To be called at least once while the buffer is filled."""
+        self._n_steps, self._position = self.n_steps(buffer), buffer.pos
+
+    def n_steps(self, buffer: Any) -> int:
+        """:return: steps of each environment that went through the buffer, those lost included"""
+        since = (buffer.pos - self._position) % buffer.buffer_size
+        return max(self._n_steps + since, buffer.size())
+
+    @property
+    def latest(self) -> int:
+        """The number that was given last."""
+        return max(0, self._n_before + len(self.starts) - 1)
+
+    def numbers(self, buffer: Any, begins: Sequence[tuple[int, int]]) -> list[int]:
+        """
+        :param begins: of each recording, steps since the oldest one in the buffer, and environment
+        :return: its number; -1 for the rest of one whose beginning is lost
+        """
+        self.look_at(buffer)
+        first = self._n_steps - buffer.size()
+        starts = [(first + row) * buffer.n_envs + env for row, env in begins]
+        # In each environment the first one that is left may have begun earlier.
+        oldest = {env: min(row for row, e in begins if e == env) for _, env in begins}
+        cut = [first > 0 and row == oldest[env] for row, env in begins]
+        known = set(self.starts)
+        whole = {s for s, rest in zip(starts, cut, strict=True) if not rest and s not in known}
+        self.starts += sorted(whole)
+        number = {start: self._n_before + i for i, start in enumerate(self.starts)}
+        return [number.get(start, -1) for start in starts]
+
+    def state_dict(self, buffer: Any, n_kept: int) -> dict[str, th.Tensor]:
+        """:param n_kept: steps of each environment that are saved, the latest"""
+        lost = self.n_steps(buffer) - n_kept
+        numbers = {"starts": self.starts, "lost": lost, "before": self._n_before}
+        return {name: th.as_tensor(value, dtype=th.int64) for name, value in numbers.items()}
+
+    def load_state_dict(self, saved: dict[str, th.Tensor], buffer: Any, n_saved: int) -> None:
+        """
+        :param buffer: filled with what was saved, or the latest of it
+        :param n_saved: steps of each environment that were saved
+        """
+        self.starts, self._n_before = saved["starts"].tolist(), int(saved["before"])
+        self._n_steps, self._position = int(saved["lost"]) + n_saved, buffer.pos

@@ -1,8 +1,9 @@
 """
-Critics whose values are quantiles: their loss, and targets without the largest of them.
+What critics are regressed on, their loss, and what the actor maximises: algorithms choose.
 
-Each is written twice, as one program serves neither processor: a CPU walks through memory once, and
-an accelerator, where every operation waits for the one before, does all in few of them.
+Sorting and the loss of quantiles are written twice, as one program serves neither processor: a CPU
+walks through memory once, and an accelerator, where every operation waits for the one before, does
+all in few of them.
 """
 
 import dataclasses
@@ -12,11 +13,38 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sb3_hds.algos.model_free.sac.update import Loss, Targets, Values
+Values = Float[Array, "critics batch values"]
+Targets = Float[Array, "batch targets"]
+Loss = Float[Array, ""]
+
+
+def min_values(values: Values) -> Targets:
+    """Of the critics, value by value: clipped double Q-learning (Fujimoto et al. 2018)."""
+    return jnp.min(values, 0)
+
+
+def mean_values(values: Values) -> Targets:
+    """Of the critics, value by value (BRO)."""
+    return jnp.mean(values, 0)
+
+
+def squared_error(values: Values, targets: Targets) -> Loss:
+    """Half the mean squared error, summed over critics."""
+    return 0.5 * jnp.sum(jnp.mean((values - targets[None]) ** 2, (1, 2)))
+
+
+def min_q(values: Values) -> Float[Array, " batch"]:
+    """Minimum over critics (SAC)."""
+    return jnp.min(jnp.mean(values, -1), 0)
+
+
+def mean_q(values: Values) -> Float[Array, " batch"]:
+    """Mean over critics and quantiles (DroQ, TQC, BRO)."""
+    return jnp.mean(values, (0, 2))
 
 
 @dataclasses.dataclass(frozen=True)
-class Truncated:
+class TruncatedQuantiles:
     """
     The quantiles of all critics in one pool, without its ``n_dropped * n_critics`` largest (TQC).
     Which critic these come from does not matter.
