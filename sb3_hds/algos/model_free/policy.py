@@ -65,14 +65,14 @@ class LearningPolicy(TensorPolicy):
         return self
 
     @property
-    def state(self) -> Any:
+    def agent_state(self) -> Any:
         """What updates change."""
         if self._agent_state is None:
             self.build_plain()
         return self._agent_state
 
-    @state.setter
-    def state(self, state: Any) -> None:
+    @agent_state.setter
+    def agent_state(self, state: Any) -> None:
         self._agent_state = state
 
     def move_to(self, device: Any) -> None:
