@@ -124,16 +124,21 @@ def test_what_is_there_shows_and_what_is_not_does_not(screened):
     assert shown == [True, True, False, True]
 
 
-def test_regressions_name_both_frictions_and_more(screened):
+def test_the_regression_of_others_is_the_equation_of_motion_of_the_smoothed_data(screened):
     given = several_rules.regression_of(screened)
-    names = {
-        rule.__name__: rule(given)
-        for rule in (several_rules.by_elimination, several_rules.by_forward_bic)
-    }
+    own = given.columns[:, [given.keys.index(VISCOUS), given.keys.index(DRY)]]
+    theta, (rss,), *_ = np.linalg.lstsq(own, given.missing, rcond=None)
 
-    for found in names.values():
-        assert {VISCOUS, DRY} <= {*found}
-    assert len(names["by_elimination"]) > 2
-    # Without noise and without anything missing, there is nothing to name.
-    nothing_missing = given._replace(missing=np.zeros_like(given.missing))
-    assert several_rules.by_forward_bic(nothing_missing) == []
+    # Friction is all that the model lacks, and both oppose the motion.
+    assert rss / (given.missing @ given.missing) < 0.01
+    assert (theta > 0.0).all()
+
+
+@pytest.mark.parametrize("rule", [several_rules.by_elimination, several_rules.by_forward_bic])
+def test_rules_keep_what_is_in_the_data_and_leave_what_is_not(rule):
+    rng, keys = np.random.default_rng(0), ("a", "b", "b", "c", "d")
+    columns = rng.standard_normal((2000, 5))
+    missing = columns @ [1.0, 0.0, 0.3, 0.0, 0.0] + 0.1 * rng.standard_normal(2000)
+
+    assert {*rule(several_rules.Regression(missing, columns, keys))} == {"a", "b"}
+    assert rule(several_rules.Regression(0.0 * missing, columns, keys)) == []
