@@ -16,6 +16,7 @@ from sb3_hds.errors import StudyError
 from sb3_hds.experiments.study import (
     Study,
     progress_of,
+    report,
     results_of,
     run_study,
     seconds_to_go,
@@ -194,8 +195,9 @@ def test_time_to_go_is_that_of_runs_like_it(tmp_path):
 
 
 @pytest.fixture
-def evaluated(tmp_path):
+def evaluated(tmp_path, monkeypatch):
     """A study whose runs have evaluations: droq_wide ends at -100, hds at -200, give or take."""
+    monkeypatch.setattr(report, "_REPS", 50)
     study, folder = study_of(tmp_path), tmp_path / "logs"
     run_study(study, folder, command=writer(tmp_path / "ledger"), tell=lambda _: None)
     for run in study.runs:

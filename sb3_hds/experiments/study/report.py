@@ -216,24 +216,20 @@ def _bars(axis: Any, names: Sequence[str], values: Any, ends: Any, title: str) -
 def _page(study: Study, root: Path, table: pd.DataFrame, images: dict[str, str]) -> str:
     from jinja2 import Environment
 
-    marks = {
-        run: json.loads((root / run.place / MARK).read_text())
-        for run in study.runs
-        if is_complete(study, run, root)
-    }
-    first = next(iter(marks.values()))
+    runs = [run for run in study.runs if is_complete(study, run, root)]
+    marks = [json.loads((root / run.place / MARK).read_text()) for run in runs]
     return (
         Environment(autoescape=True)
         .from_string(_TEMPLATE)
         .render(
             study=study,
-            n_runs=len(marks),
+            n_runs=len(runs),
             rows=_rows(table),
             images=images,
-            hyperparams=_hyperparams(marks, root),
-            versions=first["versions"],
-            machines={json.dumps(mark["machine"], sort_keys=True) for mark in marks.values()},
-            commands=[" ".join(map(str, mark["command"])) for mark in marks.values()],
+            hyperparams=_hyperparams(runs, root),
+            versions=marks[0]["versions"],
+            machines={json.dumps(mark["machine"], sort_keys=True) for mark in marks},
+            commands=[" ".join(map(str, mark["command"])) for mark in marks],
             level=round(100 * _LEVEL),
         )
     )
@@ -257,10 +253,10 @@ def _rows(table: pd.DataFrame) -> list[dict[str, Any]]:
     return rows
 
 
-def _hyperparams(marks: dict[Run, Any], root: Path) -> dict[str, str]:
+def _hyperparams(runs: Sequence[Run], root: Path) -> dict[str, str]:
     """Of the first run of each algorithm in each environment, as the zoo wrote them."""
     found: dict[str, str] = {}
-    for run in marks:
+    for run in runs:
         file = root / run.place / run.env_name / "config.yml"
         key = f"{run.label} on {run.env}"
         if key not in found and file.exists():

@@ -353,6 +353,7 @@ def _executed(study: Study, run: Run, root: Path, command: Command) -> str | Non
         error = (scratch / "output.txt").read_text(errors="replace")
         _error_file(root, run).parent.mkdir(parents=True, exist_ok=True)
         write_bytes(_error_file(root, run), error.encode())
+        shutil.rmtree(scratch, ignore_errors=True)
         return error.strip() or f"it ended with {code} and wrote nothing"
     if clock.exists():
         clock.replace(found[0] / CLOCK)
