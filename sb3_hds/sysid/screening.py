@@ -17,6 +17,7 @@ from sb3_hds.sysid.equation.selection import (
     members,
     propose,
     retuned,
+    simpler,
     what_is_left,
 )
 from sb3_hds.sysid.equation.weak_form import grams, weak_rows
@@ -59,6 +60,14 @@ class Screened(NamedTuple):
     def among(self, keys: Collection[str]) -> "Screened":
         """:return: the same with some members, solved and judged anew without the others"""
         p, rest = self.problem, [m.item for m in self.members if m.key in keys]
+        found = admitted(p, retuned(p, [*p.always, *rest]))
+        return self._replace(members=_members_of(self.hypotheses, p, found))
+
+    def without(self, keys: Collection[str]) -> "Screened":
+        """:return: the same with simpler members of their families instead of some, or none"""
+        p = self.problem
+        rest = [m.item for m in self.members if m.key not in keys]
+        rest += [o for m in self.members if m.key in keys for o in simpler(p, m.item)[:1]]
         found = admitted(p, retuned(p, [*p.always, *rest]))
         return self._replace(members=_members_of(self.hypotheses, p, found))
 
@@ -163,6 +172,7 @@ def screen(
         if small or (len(set_of) < 2 and x.predictable > _LEFT)
     ]
     keys = {m.key for m in set_of}
+    keys |= {p.items[o].key for m in set_of for o in simpler(p, m.item)}
     if small or len(set_of) < 2:
         keys |= {*(k for m in set_of for k in m.others), *_singles(p), *hints}
         keys |= _without_column(hypotheses, p, moved, where)

@@ -322,12 +322,12 @@ def admitted(p: Problem, keys: list[int]) -> list[int]:
     while beyond := [i for i in p.beyond(keys) if i not in p.always]:
         worst = max(beyond, key=lambda i: p.rarity[i])
         rest = [m for m in keys if m != worst]
-        trials = [rest, *([*rest, o] for o in _simpler(p, worst))]
+        trials = [rest, *([*rest, o] for o in simpler(p, worst))]
         keys = min(trials, key=lambda t: (len(p.beyond(t)), p.score(t)))
     return keys
 
 
-def _simpler(p: Problem, i: int) -> list[int]:
+def simpler(p: Problem, i: int) -> list[int]:
     """:return: items of the same family and place with fewer parameters"""
     name = _SIMPLER.get(p.items[i].candidate.name)
     return [
@@ -340,7 +340,7 @@ def _simpler(p: Problem, i: int) -> list[int]:
 def _simplified(p: Problem, keys: list[int]) -> list[int]:
     """A richer member of a family whose simpler one predicts held-out data as well is that one."""
     for i in list(keys):
-        others = _simpler(p, i)
+        others = simpler(p, i)
         if not others:
             continue
         rest = [m for m in keys if m != i]
