@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 class Entry(NamedTuple):
     """
-    Where an algorithm is, and what else goes by its name.
+    Where an algorithm is, and what belongs to it.
 
     :param name: public name of its class
     :param module: that defines the class, below ``sb3_hds.algos``
@@ -67,7 +67,7 @@ def load(name: str) -> Any:
 
 
 def registered_name(kind: Any) -> str | None:
-    """:return: the name by which :func:`load` finds this class; None for a class of one's own"""
+    """:return: the name by which :func:`load` finds this class; None for a user's class"""
     home = f"sb3_hds.algos.{MODULES.get(kind.__name__)}"
     return kind.__name__ if kind.__module__ == home else None
 

@@ -531,6 +531,7 @@ def _stepped(
     plan: _Plan, observed: Mapping[str, np.ndarray], joints: Any, own: Any, held: list[Any]
 ) -> tuple[np.ndarray, Any, list[Any]]:
     """One step of the policy in its wrappers, as they compute it: in double precision, by NumPy."""
+    start = np.array([own is None])
     seen, below = dict(observed), []
     for layer, memory in reversed(list(zip(plan.stack.layers, held, strict=True))):
         below.insert(0, seen[WHOLE].astype(np.float64))
@@ -543,11 +544,11 @@ def _stepped(
             states[:, list(places)] = values
         plan.policy.read_states, before = lambda: states, plan.policy.read_states
         try:
-            action, own = plan.policy.predict(_handed(seen), own, deterministic=True)
+            action, own = plan.policy.predict(_handed(seen), own, start, deterministic=True)
         finally:
             plan.policy.read_states = before
     else:
-        action, own = plan.policy.predict(_handed(seen), own, deterministic=True)
+        action, own = plan.policy.predict(_handed(seen), own, start, deterministic=True)
     after = []
     for layer, obs, memory in zip(plan.stack.layers, below, held, strict=True):
         read = tuple(np.asarray(joints, float)) if layer.joints else ()

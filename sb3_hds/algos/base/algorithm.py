@@ -31,8 +31,8 @@ from sb3_hds.errors import EnvironmentMismatchError
 
 # Steps per second below which a learner says what would make it faster.
 _SLOW = 5.0
-# Of the first calls of ``train``, which compile, nothing is seen; then, so many updates are enough,
-# or so much time. [s]
+# The first calls of ``train``, which compile, are ignored; then updates are timed, until there are
+# enough of them, or for long enough [s].
 _COMPILING, _UPDATES, _SECONDS = 2, 100, 10.0
 _STATISTICS = ("obs_rms", "ret_rms", "returns")
 

@@ -129,7 +129,7 @@ class TensorPolicy(BaseJaxPolicy):
         spaces_and_more.pop("normalize_images")
         arguments = by_names(self.arguments)
         if "lr_schedule" in arguments:
-            # As SB3: what acts needs none, and a function of one's own cannot be pickled.
+            # As in SB3: acting needs no schedule, and a user's function may not be picklable.
             arguments["lr_schedule"] = self._dummy_schedule
         return spaces_and_more | arguments
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 @contextlib.contextmanager
-def _misfits_told() -> Iterator[None]:
+def _space_mismatch_reported() -> Iterator[None]:
     """
     :raises EnvironmentMismatchError: where SB3 finds other spaces, in one line
     """
@@ -176,7 +176,7 @@ class SavesTensors(BaseAlgorithm):
         if kwargs.get("policy_kwargs"):
             kwargs["policy_kwargs"] = by_names(kwargs["policy_kwargs"])
         refuse_damaged(path, "data", "policy.pth")
-        with damage_reported(path), _misfits_told():
+        with damage_reported(path), _space_mismatch_reported():
             return super().load(path, env, device_or_cpu(device), *args, **kwargs)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -187,7 +187,7 @@ class SavesTensors(BaseAlgorithm):
         :param force_reset: False goes on from where the environment is
         :raises EnvironmentMismatchError: for one with other spaces, and for what is none
         """
-        with _misfits_told():
+        with _space_mismatch_reported():
             super().set_env(checked_env(type(self), env), force_reset)
 
     def _setup_learn(

@@ -147,7 +147,8 @@ class ModelFreeAlgorithm(TensorAlgorithm):
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
-        As in SB3; what updates and policies draw by is the model's own, and begins anew, too.
+        As in SB3; the random keys of updates and policies, which are the model's own, are reset,
+        too.
 
         :param seed: None: nothing changes
         """
@@ -270,7 +271,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         )
 
     def _end_episode(self) -> None:
-        """What was stored last shall not go on where the environment is reset to."""
+        """Mark the last stored step as truncated: the environment is reset."""
         buffer: Any = self.replay_buffer
         if buffer is None or not (buffer.full or buffer.pos):
             return

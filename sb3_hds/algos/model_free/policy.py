@@ -25,7 +25,7 @@ class LearningPolicy(TensorPolicy):
     held: ClassVar[tuple[str, ...]]
     #: hidden widths of the actor and of the critics
     widths: tuple[tuple[int, ...], tuple[int, ...]]
-    #: width of critics that a CPU bears
+    #: width of critics that a CPU can train
     narrow: ClassVar[int] = 256
     #: observations to rows of numbers
     flatten: Callable[[Any], np.ndarray]
@@ -50,14 +50,14 @@ class LearningPolicy(TensorPolicy):
         """
 
     def set_random_seed(self, seed: int) -> None:
-        """Updates, and actions by which the policy explores, draw from here on by this seed."""
+        """Reset the random key of updates and of exploratory actions."""
         # Networks of this seed were drawn by the key that is folded here.
         key = jax.random.fold_in(jax.random.key(seed, impl=GENERATOR), 1)
         placed = jax.device_put(key, self.agent_state.key.sharding)
         self.agent_state = self.agent_state._replace(key=placed)
 
     def forget_noise(self) -> None:
-        """What was drawn for several steps is drawn anew, where a policy explores so."""
+        """Draw exploration noise that lasts several steps again, where there is some."""
 
     @property
     def actor(self) -> "LearningPolicy":
@@ -65,14 +65,14 @@ class LearningPolicy(TensorPolicy):
         return self
 
     @property
-    def state(self) -> Any:
+    def agent_state(self) -> Any:
         """What updates change."""
         if self._agent_state is None:
             self.build_plain()
         return self._agent_state
 
-    @state.setter
-    def state(self, state: Any) -> None:
+    @agent_state.setter
+    def agent_state(self, state: Any) -> None:
         self._agent_state = state
 
     def move_to(self, device: Any) -> None:

@@ -48,7 +48,8 @@ class OpenLoop(SavesTensors):
     2024. It searches by CMA-ES too; what its ranges were and how it reckoned with the noise of
     resets is not published. Here:
 
-    - all candidates of a generation start from the same resets, and are judged by the mean return
+    - all candidates of a generation start from the same resets, and are compared by their mean
+      returns
     - rollouts are cut off after ``horizon`` steps, so that there are more of them
     - the last ``ranking_share`` of the steps compares the best candidates and the mean of the
       distribution over whole episodes from fresh resets; the worse half drops out each time
@@ -149,7 +150,7 @@ class OpenLoop(SavesTensors):
         :param offset: [rad]
         :param phase: [rad]
         :param kp: default: that of the constructor
-        :param kd: likewise
+        :param kd: default: that of the constructor
         :raises ParameterError: for another number of joints than there are, and for values that
             are not finite or frequencies that are not above 0
         """

@@ -30,7 +30,8 @@ class OpenLoopConfig(Config):
     :param kd: command per rad/s
     :param gain_factor: gains are searched up and down by it; 1: not
     :param amplitude: largest one [rad]; where there are no joints, in half ranges of the command
-    :param offset: largest one [rad] up and down from where the model rests, likewise
+    :param offset: largest one [rad] up and down from where the model rests; without joints, in half
+        ranges of the command
     :param frequency: smallest and largest [Hz]
     :param same_frequency: one for swing and stance
     :param phases: False: all joints move together

@@ -50,7 +50,7 @@ class GaitSpace:
     :param offset: range of the offset of each joint, shape ``(act, 2)``
     :param frequency: range of both frequencies [Hz]
     :param kp: gain of the tracking; searched up and down by ``gain_factor``
-    :param kd: likewise
+    :param kd: gain of the tracking of velocities; searched up and down by ``gain_factor``
     :param gain_factor: 1: gains are not searched
     :param same_frequency: whether swing and stance have one
     :param phases: whether joints have phases of their own; otherwise they move together

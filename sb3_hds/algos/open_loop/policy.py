@@ -135,9 +135,9 @@ class OscillatorPolicy(TensorPolicy):
     def command(self, targets: Targets, observations: Any, kp: Any, kd: Any) -> np.ndarray:
         """
         :param targets: one row for each copy of the environment
-        :param observations: likewise
+        :param observations: one row for each copy of the environment
         :param kp: gains, one row for each, or one for all
-        :param kd: likewise
+        :param kd: gains of velocities, one row for each, or one for all
         :return: actions, within their bounds
         """
         robot = self.robot

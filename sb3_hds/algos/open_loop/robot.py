@@ -35,11 +35,11 @@ class Robot:
         commands
     :param names: of the actuated joints, in the order of the actuators
     :param position: of each in ``qpos`` followed by ``qvel``; empty where nothing is tracked
-    :param velocity: of each, likewise
+    :param velocity: of each in ``qpos`` followed by ``qvel``
     :param seen_position: of each in the observation; empty if that does not have them all
-    :param seen_velocity: of each, likewise
+    :param seen_velocity: of each in the observation
     :param lower: ends of their ranges, or of the commands
-    :param upper: likewise
+    :param upper: the other ends
     :param rest: where the model puts them at first, or the middle of the commands
     """
 

@@ -54,7 +54,8 @@ from sb3_hds.core.numerics.compilation import GENERATOR
 from sb3_hds.envs.mirror import check_mirrors, twin_of
 from sb3_hds.errors import DivergedError
 
-# Decay of what counts as recent in the pretraining, per epoch, and the fewest epochs to judge by.
+# Decay of what counts as recent in the pretraining, per epoch, and the fewest epochs before it may
+# end early.
 _RECENT = 0.9
 _FEWEST_EPOCHS = 20
 
@@ -67,7 +68,7 @@ class TwinAlgorithm(TensorAlgorithm):
     config_class = TwinConfig
     policy: TwinPolicy
     twin: Twin | None
-    #: the twin contains the layers: it has to be told what they were told
+    #: the twin contains the layers, so its inputs are the actions before them
     stores_executed: ClassVar[bool] = False
     check_observations = staticmethod(check_twin_observes)
 

@@ -328,7 +328,7 @@ def _move_on(
 
 def _reset_rates(share: float, n: int) -> Float[Array, " rollouts"]:
     """
-    How often each rollout starts afresh: ``share`` on the average, spread from hardly ever to
+    How often each rollout is reset: ``share`` on average, distributed from hardly ever to
     nearly always, so that there are start states soon after a reset and long after one.
     """
     position = (jnp.arange(n) + 0.5) / n

@@ -28,7 +28,7 @@ def check_twin_observes(space: spaces.Space) -> None:
 
 def check_reward(twin: Twin) -> None:
     """
-    :raises RewardError: if planning has nothing to climb in this twin
+    :raises RewardError: if this twin has no reward that planning could improve
     """
     base = plant_of(twin)
     surrogate = type(base).planning_reward is not Twin.planning_reward
@@ -115,7 +115,7 @@ def check_known(names: Iterable[str]) -> None:
 def nulls_of(attached: Sequence[Effect]) -> dict[str, float]:
     """
     :param attached: effects that name their place
-    :return: what is believed of their parameters before any data, by full name
+    :return: nominal values of their parameters, by full name
     """
     return {
         f"{effect.name}.{effect.where}.{name}": parameter.null

@@ -28,10 +28,10 @@ class Pretraining(CallbackList):
     goes on where it stopped.
 
     The other callbacks are called after each epoch, and twice a second while programs compile, but
-    for those of SB3 that act every so many calls, as after a step of the environment that nobody
-    made: ``num_timesteps`` stays, ``locals["pretraining"]`` is True, there are no rewards, and no
-    episode ended. What they count as calls meanwhile is forgotten before the first real step, so
-    that ``eval_freq`` and ``save_freq`` go on counting steps alone.
+    for those of SB3 that act every n-th call, as if a step of the environment had been made:
+    ``num_timesteps`` stays, ``locals["pretraining"]`` is True, there are no rewards, and no episode
+    ended. What they count as calls meanwhile is forgotten before the first real step, so that
+    ``eval_freq`` and ``save_freq`` go on counting steps alone.
 
     :param callbacks: the others
     :param progress_bar: whether to show one
@@ -124,14 +124,15 @@ class OwnSeries(Logger):
 
 
 def nothing() -> None:
-    """To be called now and then where nobody waits."""
+    """Does nothing: there is no callback to call while programs compile."""
 
 
 def meanwhile(works: Sequence[Callable[[], Any]], poll: Callable[[], None]) -> list[Any]:
     """
     Work in other threads, so that this one can be interrupted.
 
-    What is interrupted here goes on there, in vain, and Python waits for it before it exits.
+    An interrupt ends the waiting only: the work goes on, its result is lost, and Python waits for
+    it before it exits.
 
     :param works: change nothing
     :param poll: is called now and then; what it raises ends the waiting
@@ -182,7 +183,7 @@ def _each(callbacks: Iterable[BaseCallback]) -> Iterator[BaseCallback]:
 
 def _call(callbacks: Iterable[BaseCallback], *but: type[BaseCallback]) -> None:
     """
-    :param but: those that act every so many steps of the environment, or count them
+    :param but: those that act every n-th step of the environment, or count steps
     :raises _StoppedError: if one of them wants training to stop
     """
     called = [each for each in _each(callbacks) if not isinstance(each, but)]

@@ -54,7 +54,7 @@ def programs(
 ) -> list[Callable[[], Any]]:
     """
     :param compares: whether policies will be compared
-    :return: the programs of an epoch, to be run side by side once for nothing, which compiles them
+    :return: the programs of an epoch; running them once, in parallel, compiles them
     """
     used = [plan_ahead, learn_from_plans, *([keep_better] if compares else [])]
     return [partial(program, config, state, hyper) for program in used]

@@ -83,7 +83,7 @@ class Hyperparams(NamedTuple):
     :param learning_rate: of policy and value
     :param noise: standard deviation of the exploration noise, in units of the control scale
     :param temperature: of the annealed acceptance, in units of the mean gain of the last epoch
-    :param reset_share: share of start states drawn afresh in each epoch
+    :param reset_share: share of start states drawn from the reset distribution in each epoch
     :param gain_weight: 0..1, how much a sample counts by what its plan gained
     :param sensitivity_weight: 0..1, how much a sample counts by what an error of it costs
     :param averaging: decay of the average of policies, per epoch

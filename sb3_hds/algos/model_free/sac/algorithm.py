@@ -45,7 +45,7 @@ class SACConfig(ModelFreeConfig):
         itself, as equation 18 of the paper, not in its logarithm, as in SB3, SBX and the authors'
         code of DroQ and TQC
     :param target_update_interval: updates of the critics between two updates of the target critics,
-        counted from the first; SB3 counts anew in each call of ``train``
+        counted from the first; SB3 restarts counting in each call of ``train``
     """
 
     _: KW_ONLY

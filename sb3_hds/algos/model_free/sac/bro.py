@@ -30,7 +30,7 @@ from sb3_hds.algos.nets.heads import Gaussian, squashed_between
 from sb3_hds.algos.nets.mlp import ORTHOGONAL, ORTHONORMAL, BroNet, orthogonal
 from sb3_hds.algos.nets.optimizers import Optimizer, TrainState, Weights
 
-# Steps of the environment at which the authors' networks start afresh: with the full replay ratio,
+# Steps of the environment at which the authors reset the networks: with the full replay ratio,
 # and with the fast one of 2.
 _RESETS = (15_000, 50_000, 250_000, 500_000, 750_000, 1_000_000, 1_500_000, 2_000_000)
 _FAST, _FAST_RESETS = 2, _RESETS[:1]
@@ -110,19 +110,19 @@ class BROConfig(SACConfig):
 class BRO(SoftActorCritic):
     r"""
     Bigger, regularised, optimistic: BroNet critics with 100 quantiles, whose **mean** is what both
-    targets and actor go by, a second actor that explores where the critics disagree, and networks
-    that start afresh.
+    targets and actor use, a second actor that explores where the critics disagree, and resets of
+    the networks.
 
     Source: Nauman et al., *Bigger, Regularized, Optimistic: scaling for compute and
     sample-efficient continuous control*, NeurIPS 2024: replay ratio 10 (``gradient_steps=10``; here
-    2, their fast variant, which two cores bear), batches of 128, AdamW with 3e-4, target entropy of
-    minus half the number of controls, Adam with b1 = 0.5 for the temperature and the multipliers.
-    Their first values are no arguments (optimism 1, regulariser 0.25). As in the authors' code (MIT
-    licence), fresh starts include the temperature, the multipliers and all optimisers, and the
-    logarithms of multipliers and of the deviation of actions are squashed into their limits by
-    :math:`\tanh`: actions start with a deviation near :math:`e^{-4}`, not near 1 as with SAC. Its
-    quantile loss is a sum over quantiles where this is their mean, a factor that Adam takes out
-    again. The loss of the entropy coefficient has the coefficient itself, as theirs. With
+    2, their fast variant, which two cores can train), batches of 128, AdamW with 3e-4, target
+    entropy of minus half the number of controls, Adam with b1 = 0.5 for the temperature and the
+    multipliers. Their first values are no arguments (optimism 1, regulariser 0.25). As in the
+    authors' code (MIT licence), fresh starts include the temperature, the multipliers and all
+    optimisers, and the logarithms of multipliers and of the deviation of actions are squashed into
+    their limits by :math:`\tanh`: actions start with a deviation near :math:`e^{-4}`, not near 1 as
+    with SAC. Its quantile loss is a sum over quantiles where this is their mean, a factor that Adam
+    takes out again. The loss of the entropy coefficient has the coefficient itself, as theirs. With
     ``use_sde=True``, which the paper does not have, the optimistic actor explores by gSDE's noise.
     SBX has no BRO.
     """

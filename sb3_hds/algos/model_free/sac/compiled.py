@@ -66,8 +66,8 @@ def learn_compiled(
     learned by then.
 
     :param model: says how to learn, and is left as it is: any algorithm of the SAC family, with an
-        environment that has a twin; BRO starts afresh after 15,000 steps unless it is made with
-        ``param_resets=[]``, and so is refused for more
+        environment that has a twin; BRO resets its networks after 15,000 steps unless it is made
+        with ``param_resets=[]``, and so is refused for more
     :param total_timesteps: of each seed, rounded up to whole rounds of ``train_freq``
     :param seeds: begin with the networks that the algorithm has with this seed
     :param progress_bar: show one

@@ -19,7 +19,7 @@ class CrossQPolicyConfig(GaussianPolicyConfig):
 
     :param net_arch: ``{"pi": [256, 256], "qf": [512, 512]}`` by default
     :param renorm_warmup_steps: batch normalisation in actor and critics, which becomes batch
-        renormalisation after so many updates; None: neither of them
+        renormalisation after this number of updates; None: neither of them
     """
 
     net_arch: Sequence[int] | Mapping[str, Sequence[int]] = dataclasses.field(
@@ -32,8 +32,8 @@ class CrossQPolicyConfig(GaussianPolicyConfig):
 class CrossQPolicy(GaussianPolicy):
     """
     Batch normalisation in actor and critics, and Adam's ``b1`` of 0.5 (Bhatt et al., ICLR 2024).
-    Their critics have 2048 units, which two cores do not bear: ``net_arch={"pi": [256, 256], "qf":
-    [2048, 2048]}``; the default has a quarter of them.
+    Their critics have 2048 units, which two cores are too slow for: ``net_arch={"pi": [256, 256],
+    "qf": [2048, 2048]}``; the default has a quarter of them.
     """
 
     @takes(CrossQPolicyConfig)
@@ -61,14 +61,12 @@ class CrossQ(SoftActorCritic):
     Source: Bhatt et al., *CrossQ: Batch Normalization in Deep Reinforcement Learning for Greater
     Sample Efficiency and Simplicity*, ICLR 2024: critics of width 2048
     (``policy_kwargs={"net_arch": {"pi": [256, 256], "qf": [2048, 2048]}}``; here 512, which two
-    cores bear), Adam with b1 = 0.5, learning rate 1e-3, three updates of the critics for each of
-    the actor.
-    Their discount is 0.99, but 0.9999 on Swimmer. Batch normalisation becomes batch
+    cores can train), Adam with b1 = 0.5, learning rate 1e-3, three updates of the critics for each
+    of the actor. Their discount is 0.99, but 0.9999 on Swimmer. Batch normalisation becomes batch
     renormalisation, in each network after 100,000 updates of its own, as in the authors' code
-    (``policy_kwargs={"renorm_warmup_steps": ...}``). SBX's default width is 1024, and its
-    learning rate never changes; here, schedules act. The loss of the entropy coefficient has the
-    coefficient itself, as in the authors' code, where SBX has its logarithm
-    (``linear_ent_coef=False``).
+    (``policy_kwargs={"renorm_warmup_steps": ...}``). SBX's default width is 1024, and its learning
+    rate never changes; here, schedules act. The loss of the entropy coefficient has the coefficient
+    itself, as in the authors' code, where SBX has its logarithm (``linear_ent_coef=False``).
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {

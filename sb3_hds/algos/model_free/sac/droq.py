@@ -28,8 +28,8 @@ class DroQ(SoftActorCritic):
     Dropout Q-functions: a replay ratio of 20 that critics survive by dropout and layer norm.
 
     Source: Hiraoka et al., *Dropout Q-Functions for Doubly Efficient Reinforcement Learning*, ICLR
-    2022. As there, and unlike SBX's setting of SAC, the actor climbs the **mean** of the critics
-    (algorithm 2), not the least of them. The paper's target entropies are -1 for Hopper, -2 for
+    2022. As there, and unlike SBX's setting of SAC, the actor maximises the **mean** of the critics
+    (algorithm 2), not their minimum. The paper's target entropies are -1 for Hopper, -2 for
     Humanoid, -3 for Walker2d and -4 for Ant; its code has -3 for HalfCheetah, which the paper
     leaves out.
     """

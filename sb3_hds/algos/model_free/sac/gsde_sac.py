@@ -27,8 +27,7 @@ class GSDESACConfig(SACConfig):
 class GSDESAC(SoftActorCritic):
     r"""
     SAC that explores by :math:`a = \mu(s) + \theta^T z(s)` with a noise matrix :math:`\theta` that
-    is drawn anew every few steps: smooth motion that depends on the state, which motors
-    stand.
+    is redrawn every few steps: smooth, state-dependent exploration that does not wear out motors.
 
     Source: Raffin, Kober and Stulp, *Smooth Exploration for Robotic Reinforcement Learning*, CoRL
     2021; on Haarnoja et al., *Soft Actor-Critic Algorithms and Applications*, 2018. SBX draws

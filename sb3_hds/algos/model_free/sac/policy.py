@@ -50,8 +50,8 @@ class GaussianPolicyConfig(PolicyConfig):
     :param dropout_rate: of the critics
     :param layer_norm: in the critics; the networks of SimBa and BRO have it in any case
     :param renorm_warmup_steps: batch normalisation in actor and critics, which becomes batch
-        renormalisation after so many updates, and CrossQ's update, without target networks; None:
-        neither
+        renormalisation after this number of updates, and CrossQ's update, without target networks;
+        None: neither
     :param batch_norm_momentum: the share of its running statistics that stays at an update, as in
         SBX; SB3-contrib's ``batch_norm_momentum=0.01`` is 0.99 here
     :param ortho_init: whether layers start orthogonal, as in JAXRL's SAC, rather than as flax and
@@ -252,7 +252,7 @@ class GaussianPolicy(LearningPolicy):
     def critic(self, obs: Any, actions: Any) -> tuple[np.ndarray, ...]:
         state, flat = self.agent_state, self.flatten(obs)
         taken = np.asarray(actions, np.float32).reshape(len(flat), -1)
-        values = _judged(self.update_config, state.critic.weights, state.obs_stats, flat, taken)
+        values = _q_values(self.update_config, state.critic.weights, state.obs_stats, flat, taken)
         return tuple(np.asarray(values))
 
     def reset_noise(self, batch_size: int = 1) -> None:
@@ -341,7 +341,8 @@ class SimbaPolicy(GaussianPolicy):
     """
     ``"SimbaPolicy"``: residual networks on observations normalised by running statistics (Lee et
     al., ICLR 2025), with the weight decay of the paper. Its critics have 512 units, which two cores
-    do not bear: ``net_arch={"pi": [128], "qf": [512, 512]}``; the default has a quarter of them.
+    are too slow for: ``net_arch={"pi": [128], "qf": [512, 512]}``; the default has a quarter of
+    them.
 
     What the algorithm samples from stays that of the algorithm: the logarithm of the deviation of
     actions is clipped, as in SBX, and starts near 0, which is what the first entropy coefficient of
@@ -379,7 +380,7 @@ def _check_ranges(config: GaussianPolicyConfig) -> None:
 
 
 @partial(jax.jit, static_argnums=0)
-def _judged(
+def _q_values(
     config: UpdateConfig, weights: Weights, stats: RunningStats, obs: Any, actions: Any
 ) -> jax.Array:
     """Dropout, where there is some, is the same in each call."""

@@ -64,13 +64,13 @@ class SimbaSAC(SoftActorCritic):
     Source: Lee et al., *SimBa: Simplicity Bias for Scaling Up Parameters in Deep Reinforcement
     Learning*, ICLR 2025: replay ratio 2, critics of width 512 and learning rate 1e-4
     (``policy_kwargs={"net_arch": {"pi": [128], "qf": [512, 512]}}, learning_rate=1e-4``; here a
-    quarter of that width, which two cores bear, and four times that rate, since a layer's values
-    change the less at an update the fewer units it has), weight decay 1e-2, initial temperature
-    0.01, target entropy of minus half the number of controls. The least of two critics counts in
-    tasks that end early; their later code takes all of MuJoCo's in Gymnasium for such, HalfCheetah
-    included. In others, the authors have one critic: ``clipped_double_q=False`` with
-    ``policy_kwargs={"n_critics": 1}``; of more, it takes the mean. Their
-    discount, 1 - 5 / T with episodes of T steps, within 0.95 and 0.995, is for ``gamma`` to say.
+    quarter of that width, which two cores can train, and four times that rate, since a layer's
+    values change the less at an update the fewer units it has), weight decay 1e-2, initial
+    temperature 0.01, target entropy of minus half the number of controls. The least of two critics
+    counts in tasks that end early; their later code takes all of MuJoCo's in Gymnasium for such,
+    HalfCheetah included. In others, the authors have one critic: ``clipped_double_q=False`` with
+    ``policy_kwargs={"n_critics": 1}``; of more, it takes the mean. Their discount, 1 - 5 / T with
+    episodes of T steps, within 0.95 and 0.995, is for ``gamma`` to say.
 
     As in the authors' code, :math:`\tanh` squashes the logarithm of the deviation of actions into
     [-10, 2]: actions start with a deviation near :math:`e^{-4}`, where SAC and SBX clip it to [-20,

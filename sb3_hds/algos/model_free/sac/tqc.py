@@ -15,8 +15,8 @@ class TQCConfig(SACConfig):
     """
     Arguments of TQC.
 
-    :param top_quantiles_to_drop_per_net: times the number of critics, so many of the largest of all
-        critics' next values are left out of the targets
+    :param top_quantiles_to_drop_per_net: times the number of critics: how many of the largest next
+        values of all critics together are left out of the targets
     :param policy_kwargs: ``n_quantiles`` is 25 unless given; see
         :class:`~sb3_hds.algos.GaussianPolicy`
     """

@@ -96,16 +96,16 @@ class TD7(ModelFreeAlgorithm):
     of them, in rewards of the environment itself; only then it is updated, once for each step that
     it made. That needs one environment, and episodes that end: from one that never does, ``learn``
     never returns, unless ``use_checkpoints=False``. ``gradient_steps`` is then not looked at; nor,
-    ever, is ``tau``: target networks are copied whole. Networks that start afresh
+    ever, is ``tau``: target networks are copied whole. Resets of the networks
     (``param_resets``) leave the checkpoint and its assessment as they are. Where a model with a
     checkpoint goes on learning without assessments, the first update drops it. Without a
     checkpoint, the policy as it is acts.
     SBX has no TD7.
 
     Prioritised replay draws from SB3's plain buffer. With ``n_steps`` above 1, Dict observations,
-    ``optimize_memory_usage`` or a buffer of one's own (``HerReplayBuffer``), transitions are drawn
-    uniformly, and weights in the loss make its expected gradient the same (Fujimoto, Meger and
-    Precup, NeurIPS 2020).
+    ``optimize_memory_usage`` or a replay buffer that is passed (``HerReplayBuffer``), transitions
+    are drawn uniformly, and weights in the loss make its expected gradient the same (Fujimoto,
+    Meger and Precup, NeurIPS 2020).
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {

@@ -143,7 +143,7 @@ class TD7Policy(LearningPolicy):
     def critic(self, obs: Any, actions: Any) -> tuple[np.ndarray, ...]:
         state, flat = self.agent_state, self.flatten(obs)
         taken = np.asarray(actions, np.float32).reshape(len(flat), -1)
-        values = _judged(
+        values = _q_values(
             self.update_config, state.copies.encoder, state.critic.weights, flat, taken
         )
         return tuple(np.asarray(values)[..., None])
@@ -153,7 +153,7 @@ class TD7Policy(LearningPolicy):
 
 
 @partial(jax.jit, static_argnums=0)
-def _judged(config: UpdateConfig, encoder: Any, critic: Any, obs: Any, actions: Any) -> jax.Array:
+def _q_values(config: UpdateConfig, encoder: Any, critic: Any, obs: Any, actions: Any) -> jax.Array:
     return q_values(config, critic, obs, actions, *embed(config, encoder, obs, actions))
 
 

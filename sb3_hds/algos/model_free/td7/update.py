@@ -58,8 +58,8 @@ class Copies(NamedTuple):
     """
     Weights that do not move with every update.
 
-    :param encoder: that actor and critics go by
-    :param target_encoder: that target actor and critics go by
+    :param encoder: whose embeddings actor and critics take
+    :param target_encoder: whose embeddings target actor and critics take
     """
 
     encoder: Weights
@@ -86,7 +86,7 @@ class TD7State(NamedTuple):
     Everything that an update changes.
 
     :param clip: range of values to which next values are clipped
-    :param range: of all targets so far, as in the authors' code, which never begins it anew;
+    :param range: of all targets so far, as in the authors' code, which never resets it;
         ``clip`` becomes it with each copy
     """
 
@@ -284,7 +284,7 @@ def _update_actor(
 
 
 def _copy(state: TD7State, found: _Found, _: PRNGKeyArray) -> tuple[tuple[Copies, Range], _Found]:
-    """Copy networks, and the range of targets, into those that targets go by."""
+    """Copy networks, and the range of targets, into those that the targets use."""
     copies = Copies(
         state.encoder.weights,
         state.actor.weights,

@@ -165,7 +165,7 @@ class HDS(TwinAlgorithm):
 
     def correct_model(self, gradient_steps: int = 0) -> Correction | None:
         """
-        Correct the twin by all that was measured; where that changes it noticeably, plan anew.
+        Correct the twin by all that was measured; where that changes it noticeably, plan again.
 
         :param gradient_steps: regression steps of each of those planning epochs; 0: no epochs
         :return: what the data say; None before anything was measured
@@ -232,7 +232,7 @@ class HDS(TwinAlgorithm):
         Diagnose what was measured, and attach the effects that the data name to the twin.
 
         Parameters that corrections estimate anyway are no findings here. The next correction
-        estimates the new effects with them, and learns the remaining force anew.
+        estimates the new effects with them, and learns the residual force again.
 
         :param arguments: as of :func:`sb3_hds.diagnose`
         :return: what the data say; None before anything was measured

@@ -38,14 +38,14 @@ from sb3_hds.sysid.residual import Residual, fit_force
 _EXACT_STEP, _MOST_STEPS, _N_SINGLE = 1e-4, 0.98, 256
 # Of the solver, in each of its passes: the next correction goes on where this one ends.
 _SOLVER_STEPS = 20
-# Plans are made anew where the corrected model's error is lower by this share.
+# Plans are made again where the corrected model's error is lower by this share.
 _NOTICEABLE = 0.1
 # A calibrated twin needs less proof than a learned force: it has few parameters, and a prior.
 _LEAST_OF_CALIBRATION = 0.02
 # A suspected effect stays where the error would be higher without it by this share.
 _LEAST_OF_SUSPECT = 0.01
 # Where held-out windows are of the same few recordings, values that the prior holds for so
-# improbable are not believed: a system that dry friction holds fast looks like a heavier one.
+# improbable are not accepted: a system that dry friction holds fast looks like a heavier one.
 _IMPROBABLE = 1e-3
 # A learned force that lowers the error by this share is planned in exclusively.
 _TRUSTED = 0.25
@@ -57,7 +57,7 @@ class CorrectionConfig:
     What is corrected, and how.
 
     :param names: parameters that are estimated; empty: none
-    :param nominal: values that are believed before any data, by name
+    :param nominal: values before any data, by name
     :param residual_kwargs: further arguments of ``sysid.fit_residual``
     :param beta: share of rollouts in the learned model, or ``"auto"``; 0: no force is learned
     :param seed: of whatever is drawn
@@ -81,9 +81,9 @@ class Correction:
 
     :param twin: to plan in from now on
     :param beta: share of rollouts in the learned model
-    :param changed: whether the model is so different that plans should be made anew
+    :param changed: whether the model is so different that plans should be made again
     :param since: what counts from now on, if data from before a change of the system were left out
-    :param attached: what was believed of the parameters of effects that the twin has now and had
+    :param attached: nominal values of the parameters of effects that the twin has now and had
         not before
     :param fit: of the parameters, if they were estimated
     :param residual: the learned force, if it was learned
@@ -265,7 +265,7 @@ def _calibrated(
     windows: Windows,
     config: CorrectionConfig,
 ) -> Fit | None:
-    """From the values as they are, with what was believed before any data as prior."""
+    """Starting from the current values, with the nominal model as prior."""
     if not config.names:
         return None
     believed = np.array([nominal.values[name] for name in config.names])

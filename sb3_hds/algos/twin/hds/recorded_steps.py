@@ -49,7 +49,7 @@ class RecordedSteps:
 
     def trajectories(self, latest: int | None = None) -> Trajectories | None:
         """
-        :param latest: only so many steps
+        :param latest: number of steps, the latest; None: all
         :return: everything measured, oldest first; None before anything was
         """
         buffer, dt, space, _ = self._source()
@@ -182,7 +182,7 @@ def last_steps(data: Trajectories, n_steps: int) -> Trajectories:
 
 
 def _whole(data: Trajectories, n_steps: int) -> Trajectories:
-    """The latest recordings that have together no more steps than so many."""
+    """The latest whole recordings that together have at most ``n_steps`` steps."""
     after = np.cumsum(data.lengths[::-1])[::-1]
     fit = np.flatnonzero(after <= n_steps)
     return data[fit] if len(fit) else last_steps(data, n_steps)
