@@ -31,8 +31,8 @@ SALT = int(os.environ.get("SB3_HDS_SALT", "0"))
 RUNS = 200
 
 
-#: of the twenty cases
-KINDS = Counter(effect=12, null=2, outside=2, pair=1, still=1) + Counter(NULLS[1:3])
+#: of the fourteen cases
+KINDS = Counter(effect=6, null=2, outside=2, pair=1, still=1) + Counter(NULLS[1:3])
 
 
 @pytest.mark.parametrize("system", SYSTEMS)
@@ -185,7 +185,7 @@ def table(tmp_path_factory):
     return prepared(pd.DataFrame(rows))
 
 
-# Twenty diagnoses take some ten minutes.
+# Fourteen diagnoses take some six minutes.
 def hidden(test):
     return pytest.mark.expensive(pytest.mark.timeout(3600)(test))
 

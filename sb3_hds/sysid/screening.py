@@ -10,9 +10,18 @@ from sb3_hds.core.twin import plant_of
 from sb3_hds.sysid.equation.columns import equation, refuted_by_kinematics
 from sb3_hds.sysid.equation.motion import Motion
 from sb3_hds.sysid.equation.problem import Problem, problem
-from sb3_hds.sysid.equation.selection import Left, Member, members, propose, what_is_left
+from sb3_hds.sysid.equation.selection import (
+    Left,
+    Member,
+    admitted,
+    members,
+    propose,
+    retuned,
+    simpler,
+    what_is_left,
+)
 from sb3_hds.sysid.equation.weak_form import grams, weak_rows
-from sb3_hds.sysid.hypotheses import Hypotheses
+from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
 from sb3_hds.sysid.priors import Belief
 
 # Single candidates that are simulated, besides those of the set and what may stand for them.
@@ -50,29 +59,38 @@ class Screened(NamedTuple):
 
     def among(self, keys: Collection[str]) -> "Screened":
         """:return: the same with some members, solved and judged anew without the others"""
-        rest = [m.item for m in self.members if m.key in keys]
-        return self._replace(members=_members_of(self.hypotheses, self.problem, rest))
+        p, rest = self.problem, [m.item for m in self.members if m.key in keys]
+        found = admitted(p, retuned(p, [*p.always, *rest]))
+        return self._replace(members=_members_of(self.hypotheses, p, found))
+
+    def without(self, keys: Collection[str]) -> "Screened":
+        """:return: the same with simpler members of their families instead of some, or none"""
+        p = self.problem
+        rest = [m.item for m in self.members if m.key not in keys]
+        rest += [o for m in self.members if m.key in keys for o in simpler(p, m.item)[:1]]
+        found = admitted(p, retuned(p, [*p.always, *rest]))
+        return self._replace(members=_members_of(self.hypotheses, p, found))
 
     def sizes_of(self, keys: Collection[str]) -> dict[str, float]:
         """:return: values of the parameters of some members, by full name, solved without others"""
-        p, rest = self.problem, [m for m in self.members if m.key in keys]
-        value, found = p.solve([*p.always, *(m.item for m in rest)]).value, {}
-        for member in rest:
-            item = p.items[member.item]
+        p, rest = self.problem, [m.item for m in self.members if m.key in keys]
+        items = retuned(p, [*p.always, *rest])
+        value, found = p.solve(items).value, {}
+        for item in (p.items[i] for i in items if i not in p.always):
             if set(item.free) <= value.keys():
                 effect = self.hypotheses.effect_of(item.candidate)
                 sizes = item.sizes(effect, [value[c] for c in item.free])
-                found |= self._by_full_name(member, sizes)
+                found |= self._by_full_name(item.candidate, sizes)
         return found
 
     def intervals_of(self, member: Member) -> dict[str, tuple[float, float, float]]:
         """:return: estimate and ends of the interval by full name"""
-        parts = [self._by_full_name(member, x) for x in (member.sizes, member.low, member.high)]
+        candidate = self.problem.items[member.item].candidate
+        parts = [self._by_full_name(candidate, x) for x in (member.sizes, member.low, member.high)]
         value, low, high = parts
         return {n: (value[n], min(low[n], high[n]), max(low[n], high[n])) for n in value}
 
-    def _by_full_name(self, member: Member, sizes: Mapping[str, float]) -> dict[str, float]:
-        candidate = self.problem.items[member.item].candidate
+    def _by_full_name(self, candidate: Candidate, sizes: Mapping[str, float]) -> dict[str, float]:
         if candidate.slot == "parameter":
             (name,) = sizes
             return {name: self.hypotheses.believed.values[name] + sizes[name]}
@@ -154,6 +172,7 @@ def screen(
         if small or (len(set_of) < 2 and x.predictable > _LEFT)
     ]
     keys = {m.key for m in set_of}
+    keys |= {p.items[o].key for m in set_of for o in simpler(p, m.item)}
     if small or len(set_of) < 2:
         keys |= {*(k for m in set_of for k in m.others), *_singles(p), *hints}
         keys |= _without_column(hypotheses, p, moved, where)

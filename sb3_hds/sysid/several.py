@@ -17,7 +17,7 @@ from sb3_hds.sysid.telling import Accepted
 # Level at which each member has to be missed by held-out recordings when it is left out.
 _LEVEL = 0.05
 # Members beyond which a set counts as large: their sizes are those in the equation of motion, and
-# each of them, confirmed there on held-out data, only must not make predictions worse.
+# each of them, confirmed there on held-out data, only must not surely make predictions worse.
 _MANY = 6
 # Steps of a fit of start states that begins where they were with one member more.
 _ROUGH_STEPS = 2
@@ -54,11 +54,15 @@ def confirmed_set(
     many = len(members) > _MANY
     verdicts: dict[str, Comparison] = {}
     if many:
-        verdicts = _each_left_out(search, screened, start, base, members)
-        if any(v.gain <= 0.0 for v in verdicts.values()):
-            members = {key: m for key, m in members.items() if verdicts[key].gain > 0.0}
+        verdicts = _each_left_out(search, screened, start, base, members, list(members))
+        harmful = {key for key, v in verdicts.items() if v.p_value >= 1.0 - _LEVEL}
+        if harmful:
+            screened = screened.without(harmful)
+            members = _members(search, screened)
             theta = _sizes_with(search, screened, start, members.keys())
             base = search.base(theta, base.free, near=base)
+            new = [key for key in members if key not in verdicts]
+            verdicts |= _each_left_out(search, screened, start, base, members, new)
     while members and not many:
         lost = {key: search.without(c, base, near=base) for key, (c, _) in members.items()}
         verdicts = {
@@ -81,6 +85,7 @@ def confirmed_set(
             share=carried[member.item], sizes=screened.intervals_of(member) if many else {}
         )
         for key, (candidate, member) in members.items()
+        if key in verdicts
     ]
     return found, base
 
@@ -96,8 +101,9 @@ def _each_left_out(
     start: Base,
     base: Base,
     members: Mapping[str, tuple[Candidate, Member]],
+    keys: Sequence[str],
 ) -> dict[str, Comparison]:
-    """:return: of each member of a large set, held-out errors with it beside those without it"""
+    """:return: of some members of a large set, held-out errors with each beside those without it"""
     half, some = search.confirm, evenly(search.confirm.evidence.shots.n, _SOME_WINDOWS)
     shots = Shots(*(np.asarray(leaf)[some] for leaf in half.evidence.shots))
     half = half._replace(evidence=half.evidence.on(shots), unit=half.unit[some])
@@ -108,7 +114,6 @@ def _each_left_out(
         rest = half.evidence.fit(theta, (), kept.offsets, _ROUGH_STEPS)
         return _at_own_joint(half, members[key][0], kept, rest)
 
-    keys = list(members)
     found: list[Comparison] = list(search.bar.over(in_threads(left_out, keys), len(keys)))
     return dict(zip(keys, found, strict=True))
 

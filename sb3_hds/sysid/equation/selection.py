@@ -303,11 +303,11 @@ def _confirmed(p: Problem, keys: list[int]) -> list[int]:
         if min(short) > 0.0:
             break
         rest = [i for i, x in zip(keys, short, strict=True) if x > min(short)]
-        keys = _admitted(p, _retuned(p, rest))
+        keys = admitted(p, retuned(p, rest))
     return keys
 
 
-def _retuned(p: Problem, keys: list[int]) -> list[int]:
+def retuned(p: Problem, keys: list[int]) -> list[int]:
     """What is not linear in a member, at the values that suit the others as they are now."""
     for place, i in enumerate(list(keys)):
         if p.items[i].settings and i not in p.always:
@@ -317,17 +317,17 @@ def _retuned(p: Problem, keys: list[int]) -> list[int]:
     return keys
 
 
-def _admitted(p: Problem, keys: list[int]) -> list[int]:
+def admitted(p: Problem, keys: list[int]) -> list[int]:
     """Without a member, another may fall out of its bounds: a simpler one stands in, or none."""
     while beyond := [i for i in p.beyond(keys) if i not in p.always]:
         worst = max(beyond, key=lambda i: p.rarity[i])
         rest = [m for m in keys if m != worst]
-        trials = [rest, *([*rest, o] for o in _simpler(p, worst))]
+        trials = [rest, *([*rest, o] for o in simpler(p, worst))]
         keys = min(trials, key=lambda t: (len(p.beyond(t)), p.score(t)))
     return keys
 
 
-def _simpler(p: Problem, i: int) -> list[int]:
+def simpler(p: Problem, i: int) -> list[int]:
     """:return: items of the same family and place with fewer parameters"""
     name = _SIMPLER.get(p.items[i].candidate.name)
     return [
@@ -340,7 +340,7 @@ def _simpler(p: Problem, i: int) -> list[int]:
 def _simplified(p: Problem, keys: list[int]) -> list[int]:
     """A richer member of a family whose simpler one predicts held-out data as well is that one."""
     for i in list(keys):
-        others = _simpler(p, i)
+        others = simpler(p, i)
         if not others:
             continue
         rest = [m for m in keys if m != i]
