@@ -269,7 +269,7 @@ def test_nothing_is_unpickled(tmp_path):
 
 
 def test_core_alone_reads_our_own_files_and_says_who_reads_logs(tmp_path, monkeypatch):
-    monkeypatch.setattr(trajectories, "_log_reader", None)
+    monkeypatch.setattr(trajectories, "log_reader", lambda: None)
     assert CoreTrajectories is Trajectories
     with pytest.raises(TrajectoryError, match="from sb3_hds import Trajectories"):
         CoreTrajectories.load(tmp_path / "log.csv", columns=COLUMNS)

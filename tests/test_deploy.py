@@ -191,7 +191,7 @@ def oscillators(control: str = "direct") -> OscillatorPolicy:
         "upper": (2.0, 5.0),
         "rest": (0.0, 2.5),
     }
-    policy = OscillatorPolicy(VECTOR, TORQUES, lambda _: 0.0, body=body)
+    policy = OscillatorPolicy(VECTOR, TORQUES, lambda _: 0.0, robot=body)
     policy.constants = policy.constants._replace(
         amplitude=np.array([1.5, 1.0]),
         offset=np.array([0.1, 2.0]),

@@ -58,8 +58,8 @@ def test_it_goes_by_steps_of_the_environment(seconds, n_updates, n_steps, slow, 
 
 
 def test_a_learner_says_which_of_its_arguments_matters(monkeypatch):
-    monkeypatch.setattr(pace, "_SLOW", 1e9)
-    monkeypatch.setattr(pace, "_UPDATES", 1)
+    monkeypatch.setattr(algorithm, "_SLOW", 1e9)
+    monkeypatch.setattr(algorithm, "_UPDATES", 1)
     model = small("droq", learning_starts=5)
 
     with pytest.warns(UserWarning, match="DroQ makes .* steps/s") as caught:

@@ -132,7 +132,8 @@ def test_importing_brings_nothing_but_environments_and_a_learner_not_what_fits_t
     )
 
     assert {name for name in ours - bare if not name.startswith("sb3_hds/")} == {
-        *("sb3_hds", "sb3_hds.envs", "sb3_hds.envs.registration")
+        *("sb3_hds", "sb3_hds.algos", "sb3_hds.algos.registry"),
+        *("sb3_hds.envs", "sb3_hds.envs.registration"),
     }
     assert "sb3_hds/CartPoleSwingUp-v0" in ours
     assert {"cmaes", "sb3_hds.sysid", "sb3_hds.twins"} & learner == set()

@@ -135,7 +135,7 @@ class Acrobot(AnalyticTwin):
         lengths = jnp.stack([params["link1_length"] + 0.0, 2.0 * params["link2_com"]])
         angles = jnp.stack([state.q[0], state.q[0] + state.q[1]])
         links = lengths[:, None] * jnp.stack([jnp.sin(angles), -jnp.cos(angles)], -1)
-        return jnp.concatenate([jnp.zeros((1, 2)), jnp.cumsum(links, 0)])
+        return jnp.concatenate([jnp.zeros((1, 2)), jnp.cumsum(links, axis=0)])
 
     def _potential(self, state: State, params: Params) -> Scalar:
         """The potential of the planning reward."""
