@@ -144,7 +144,8 @@ def _accepted(
 ) -> Accepted:
     known = {c.key: c for c in search.hypotheses.candidates}
     others = [k for k in member.others if k not in members]
-    simulated = [known[k] for k in others if k in known]
+    # Of a large set, what may stand for a member is told as the equation says it.
+    simulated = [] if len(members) > _MANY else [known[k] for k in others if k in known]
     tried = (
         search.finished(simulated, search.without(candidate, base, near=base)) if simulated else []
     )
