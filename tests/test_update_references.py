@@ -34,7 +34,7 @@ from sb3_hds import algos
 from sb3_hds.algos.model_free.sac.objectives import mean_values
 from sb3_hds.algos.model_free.sac.update import Hyperparams, UpdateMetrics, update
 from sb3_hds.algos.model_free.td7 import update as td7_update
-from sb3_hds.algos.model_free.update import Batch
+from sb3_hds.algos.model_free.update import Batch, zero_metrics
 from sb3_hds.algos.nets.mlp import Dropout
 from sb3_hds.algos.nets.observations import RunningStats
 
@@ -488,7 +488,7 @@ class Sale:
 
     def embed(self, w: Weights, obs: np.ndarray, action: np.ndarray) -> tuple[Any, Any]:
         state = average_l1(self._two(w["of_state"], obs, elu))
-        return state, self._two(w["of_both"], np.concatenate([state, action], -1), elu)
+        return state, self._two(w["of_pair"], np.concatenate([state, action], -1), elu)
 
     def act(self, w: Weights, obs: np.ndarray, state: np.ndarray) -> np.ndarray:
         own = average_l1(dense(w["Dense_0"], obs))
