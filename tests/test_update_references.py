@@ -545,7 +545,7 @@ class Sale:
         if self.n % self.update_config.policy_delay == 0:
             report["actor_loss"] = actor_loss(self.actor)
             self.actor = descend(actor_loss, self.actor, HYPER.learning_rate)
-        if self.n % self.update_config.target_every == 0:
+        if self.n % self.update_config.target_update_interval == 0:
             self.target_actor, self.target_critic = self.actor, self.critic
             self.target_encoder, self.fixed = self.fixed, self.encoder
             self.clip = tuple(self.range)
