@@ -7,6 +7,7 @@ elsewhere; recordings cut at other places; a channel that the log has twice.
 
 import dataclasses
 import math
+import os
 import re
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -350,6 +351,13 @@ def verdicts():
     return of
 
 
+#: whole diagnoses, two for each case: an hour, and not yet looked at as a whole
+wanted = pytest.mark.skipif(
+    not os.environ.get("SB3_HDS_METAMORPHIC"), reason="set SB3_HDS_METAMORPHIC=1: takes an hour"
+)
+
+
+@wanted
 @pytest.mark.expensive
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("name, other", COMBINATIONS)
@@ -362,6 +370,7 @@ def test_the_same_data_in_other_words_give_the_same_verdict(verdicts, name, othe
     same(sizes, found_sizes, changed)
 
 
+@wanted
 @pytest.mark.expensive
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("other", PAIRS)
