@@ -22,6 +22,7 @@ _PLANNING |= {"n_random_plans": 2, "gradient_steps": 4, "train_freq": 25}
 _MODEL_FREE = _LEARNING | {"learning_starts": 10, "train_freq": 5, "gradient_steps": 2}
 # What an algorithm has besides.
 _OWN = {
+    "pods": {"n_iterations": 1, "n_step_sizes": 3, "plan_memory": 2},
     "hds": {"residual_kwargs": {"n_members": 2, "net_arch": [4]}},
     "tqc_jax": {"policy_kwargs": {"net_arch": [8], "n_quantiles": 5}},
     "td7": {"use_checkpoints": False, "policy_kwargs": {"net_arch": [8], "embedding_size": 8}},

@@ -99,7 +99,7 @@ def test_the_rate_follows_its_schedule_over_the_epochs(monkeypatch):
 
 
 def test_where_no_sample_is_finite_no_scale_moves():
-    model = small("pods", point_mass_env(), twin=Broken(), pretrain_epochs=1)
+    model = small("pods", point_mass_env(), twin=Broken(), pretrain_epochs=0).learn(0)
     inside = model._epoch_state().networks.inside
     logged(model)
 
