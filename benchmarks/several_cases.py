@@ -21,6 +21,7 @@ from hidden_cases import (
     ASKED,
     CACHE,
     N_STEPS,
+    NOISES,
     PARAMETER,
     RIGS,
     Case,
@@ -142,8 +143,22 @@ def draw(
     scale = deal("scale", (True, False))
     capacity = _MOST.get(RIGS[system].dof, _MOST_OF_ALL)
     count = deal("count", range(_FEWEST, capacity + 1))
+    # Where nothing could show in so much noise, there is less.
+    levels = sorted(NOISES, key=NOISES.__getitem__)
+    for level in reversed(levels[: levels.index(case.noise) + 1]):
+        found = _drawn(dataclasses.replace(case, noise=level), scale, count, capacity)
+        if found is not None:
+            return found
+    raise RuntimeError(f"{system}, case {number}: nothing could be planted in {_TRIES} tries.")
+
+
+def _drawn(
+    case: Case, scale: bool, count: int, capacity: int
+) -> tuple[Case, Any, np.ndarray] | None:
+    """:return: as ``draw``; None if nothing could be planted"""
+    stream = zlib.crc32(f"{case.system}, {SEVERAL}".encode())
     for again in range(_TRIES):
-        rng = np.random.default_rng([number, zlib.crc32(f"{system}, {SEVERAL}".encode()), again])
+        rng = np.random.default_rng([case.number, stream, again])
         own = count if again < _SAME_COUNT else int(rng.integers(_FEWEST, capacity + 1))
         planted = _planted(case, own, scale, rng)
         if planted is None:
@@ -161,7 +176,7 @@ def draw(
             continue
         if _moves(changed, data, motion):
             return changed, data, motion
-    raise RuntimeError(f"{system}, case {number}: nothing could be planted in {_TRIES} tries.")
+    return None
 
 
 def _with(case: Case, planted: tuple[Planted, ...]) -> Case | None:
