@@ -1,6 +1,6 @@
 """Which causes, all at once: a search over families, judged on data that were held out."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +20,8 @@ _MATERIAL, _CONFIRMED, _RARE = 0.006, 2.0, 0.75
 _OUTSTANDING, _RAREST = 1.5, 2.0
 # An alternative may score worse by this, and predicts held-out data as well to this t or share.
 _CLOSE, _WORSE, _SAME = 8.0, 2.0, 0.2
+# Whatever its t, a loss below this share of what the place gains may come from any misfit.
+_EQUIVALENT = 0.05
 _MOST_ALTERNATIVES = 12
 _CONFIDENCE = 0.9
 # Members of a family that are another one with more parameters, and the gain in the logarithm of
@@ -103,6 +105,7 @@ def propose(problem: Problem) -> Proposal:
     keys = _shaken(problem, keys)
     keys = _material(problem, keys)
     keys = _simplified(problem, keys)
+    keys = _plausible_first(problem, keys)
     keys = _confirmed(problem, keys)
     kept, hints = outstanding(problem, keys)
     return Proposal(tuple(kept), tuple(hints))
@@ -345,12 +348,26 @@ def _simplified(p: Problem, keys: list[int]) -> list[int]:
             continue
         rest = [m for m in keys if m != i]
         held = p.held_out(keys)
+        gained, _ = worth(p, p.held_out(rest), held, i)
         for other in others:
             if not np.isfinite(p.score([*rest, other])):
                 continue
             lost, t = worth(p, p.held_out([*rest, other]), held, i)
-            if t < _WORSE or lost < _NO_MATTER:
+            if t < _WORSE or lost < max(_NO_MATTER, _EQUIVALENT * gained):
                 keys = [*rest, other]
+    return keys
+
+
+def _plausible_first(p: Problem, keys: list[int]) -> list[int]:
+    """Of what data cannot tell apart, what an engineer would think of first."""
+    for i in list(keys):
+        if i in p.always:
+            continue
+        rest, held = [m for m in keys if m != i], p.held_out(keys)
+        gained, _ = worth(p, p.held_out(rest), held, i)
+        others = [o for o in _equals(p, keys, i, held, gained) if p.rarity[o] < p.rarity[i]]
+        if others:
+            keys = [*rest, min(others, key=lambda o: (p.rarity[o], p.score([*rest, o])))]
     return keys
 
 
@@ -489,7 +506,7 @@ def members(p: Problem, keys: Sequence[int], effects: Mapping[str, Effect | None
                 high,
                 float(cost) if np.isfinite(cost) else 1e6,
                 t,
-                _alternatives(p, keys, i, held, gained),
+                tuple(dict.fromkeys(p.items[o].key for o in _equals(p, keys, i, held, gained))),
             )
         )
     return out
@@ -507,16 +524,21 @@ def _covariance(p: Problem, keys: Sequence[int], found: Solution) -> np.ndarray:
     return np.where(own, np.maximum(robust, found.inverse), robust)
 
 
-def _alternatives(
+def _equals(
     p: Problem, keys: Sequence[int], i: int, held: np.ndarray, gained: float
-) -> tuple[str, ...]:
-    own, rest, found = p.score(keys), [m for m in keys if m != i], []
+) -> Iterator[int]:
+    """
+    :param held: held-out errors of the set
+    :param gained: mean logarithm of their ratio without the member
+    :return: items in whose place of the member the set is as good
+    """
+    own, rest = p.score(keys), [m for m in keys if m != i]
     for other in p.ranking(rest, swaps(p, keys, i))[:_MOST_ALTERNATIVES]:
         if p.items[other].key == p.items[i].key:
             continue
         trial = [*rest, other]
         if p.score(trial) < own + _CLOSE:
             lost, t = worth(p, p.held_out(trial), held, i)
-            if t < _WORSE and lost < _SAME * max(gained, 1e-3):
-                found.append(p.items[other].key)
-    return tuple(dict.fromkeys(found))
+            few, surely = lost < _EQUIVALENT * gained, t >= _WORSE
+            if few or (not surely and lost < _SAME * max(gained, 1e-3)):
+                yield other
