@@ -61,6 +61,7 @@ PARAMETER = "parameter"
 JOINT = (
     "viscous_friction",
     "directional_viscous_friction",
+    "concave_friction",
     "coulomb_friction",
     "directional_coulomb_friction",
     "stribeck_friction",
@@ -304,6 +305,7 @@ def _effect(case: Case, kind: str, rng: np.random.Generator, index: int | None =
             "tau_s": 3.0 * s["tau_c"],
             "v_s": 0.3 * wide[rig.dof + index],
         },
+        "concave_friction": lambda: {"b": 3.0 * s["b"], "v_s": 0.5 * wide[rig.dof + index]},
         "load_dependent_friction": lambda: {"tau_c": 0.3 * s["tau_c"], "mu": min(s["mu"], 0.9)},
         "stiffness": lambda: {"k": s["k"], "q0": 0.3 * wide[index]},
         "cogging": lambda: {

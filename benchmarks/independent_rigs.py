@@ -338,6 +338,7 @@ FORCES: dict[str, Callable[..., float]] = {
     "stribeck_friction": lambda at, tau_c, tau_s, v_s: (
         -_sign(at.v) * (tau_c + (tau_s - tau_c) * math.exp(-((at.v / v_s) ** 2)))
     ),
+    "concave_friction": lambda at, b, v_s: -b * at.v / (1.0 + abs(at.v) / v_s),
     "load_dependent_friction": lambda at, tau_c, mu: (
         -_sign(at.v) * (tau_c + mu * abs(at.motor + at.load))
     ),

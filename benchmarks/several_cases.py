@@ -64,6 +64,7 @@ _OTHERS = {
     "motor_lag": "late",
     "stiffness": "spring",
     "stribeck_friction": "dry",
+    "concave_friction": "viscous",
     "load_dependent_friction": "dry",
     "quadratic_drag": "drag",
     "cogging": "cogging",
@@ -281,6 +282,7 @@ def _size(case: Case, kind: str, index: int, rng: np.random.Generator) -> Plante
         "motor_lag": lambda: {"time_constant": between("time_constant", _SLOWEST)},
         "stiffness": lambda: {"k": between("k", _DOMINANT * force / wide), "q0": 0.3 * side * wide},
         "stribeck_friction": falling,
+        "concave_friction": lambda: {"b": between("b", 2.0 * most / speed), "v_s": speed},
         "load_dependent_friction": by_load,
         "quadratic_drag": lambda: {"c": between("c", most / speed**2)},
         "cogging": lambda: {

@@ -13,6 +13,7 @@ from sb3_hds.core import JointMoment, State, explicit_euler, rk4, rollout, semi_
 from sb3_hds.effects import (
     Cogging,
     ConstantForce,
+    ConcaveFriction,
     CoulombFriction,
     CubicStiffness,
     DirectionalCoulombFriction,
@@ -114,6 +115,15 @@ def test_stribeck_friction_falls_from_static_to_sliding_and_without_a_rise_is_co
     for v in (-1.0, -0.003, 0.0, 0.02):
         both = (StribeckFriction(tau_c=0.3, tau_s=0.3), CoulombFriction(tau_c=0.3))
         assert torque_of(both[0], v) == pytest.approx(torque_of(both[1], v), rel=1e-14)
+
+
+def test_concave_friction_is_viscous_at_low_speed_halved_at_its_own_and_dry_far_above(x64):
+    torque = lambda v, v_s=2.0: torque_of(ConcaveFriction(b=0.3, v_s=v_s), v)  # noqa: E731
+
+    assert torque(-2.0) == pytest.approx(0.5 * 0.3 * 2.0, rel=1e-6)
+    assert torque(0.1) == pytest.approx(-0.03 / 1.05, rel=1e-6)
+    assert torque(1.0, v_s=0.05) == pytest.approx(torque(3.0, v_s=0.05), rel=0.05)
+    assert torque(0.0) == 0.0
 
 
 def test_load_dependent_friction_counts_both_sides_of_the_gear(x64):

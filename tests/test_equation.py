@@ -104,10 +104,10 @@ def test_a_spring_that_rests_far_from_where_the_axis_moves_is_an_offset():
     assert "stiffness.axis" not in {m.key for m in found.members}
 
 
-def test_friction_that_grows_ever_slower_does_not_fall_to_nothing():
+def test_friction_that_grows_ever_slower_is_concave_and_does_not_fall_to_nothing():
     found = screened(pull=lambda q, v: -4.0 * np.sign(v) * np.sqrt(abs(v)))
 
-    assert found.members
+    assert "concave_friction.axis" in {m.key for m in found.members}
     assert "stribeck_friction.axis" not in {m.key for m in found.members}
 
 

@@ -10,6 +10,7 @@ from sb3_hds.effects.actuator import (
     TorqueGain,
 )
 from sb3_hds.effects.joint import (
+    ConcaveFriction,
     CoulombFriction,
     DirectionalCoulombFriction,
     DirectionalViscousFriction,
@@ -31,6 +32,7 @@ from sb3_hds.effects.transmission import Backlash, JointElasticity
 ALL: tuple[type[Effect], ...] = (
     ViscousFriction,
     DirectionalViscousFriction,
+    ConcaveFriction,
     CoulombFriction,
     DirectionalCoulombFriction,
     StribeckFriction,
@@ -70,6 +72,7 @@ __all__ = [
     "Backlash",
     "ClearanceSpring",
     "Cogging",
+    "ConcaveFriction",
     "ConstantForce",
     "CoulombFriction",
     "CubicStiffness",

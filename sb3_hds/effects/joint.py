@@ -2,10 +2,12 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 import jax.numpy as jnp
+import numpy as np
 
-from sb3_hds.core import JointEffect, JointMoment, Memory, Parameter, Params, Scalar
+from sb3_hds.core import JointEffect, JointMoment, Memory, Parameter, Params, Ranges, Scalar
 from sb3_hds.effects.shapes import STANDSTILL, dry_friction
 from sb3_hds.errors import EffectError
 
@@ -13,6 +15,15 @@ from sb3_hds.errors import EffectError
 _FALLS = 10.0
 # Of the speed of a motion: up to where its friction may fall.
 _SHARES = (0.03, 0.1, 0.3, 1.0)
+# Likewise, where the slope of concave friction falls, and in how many steps equation errors try it.
+_BENDS, _STEPS = (0.2, 1.0), 8
+
+
+def _bends_beyond(parameters: Mapping[str, Parameter], standstill: float) -> dict[str, Parameter]:
+    """No curve of friction can be seen to bend at a speed at which it is smoothed."""
+    speed = _FALLS * standstill
+    bend = dataclasses.replace(parameters["v_s"], null=speed, scale=speed, lower=standstill)
+    return {**parameters, "v_s": bend}
 
 
 class ViscousFriction(JointEffect):
@@ -196,11 +207,7 @@ class StribeckFriction(DryFriction):
     def __init__(
         self, where: int | str = 0, *, standstill: float = STANDSTILL, **values: float
     ) -> None:
-        # Friction cannot be seen to fall at a speed at which it is smoothed.
-        falls = _FALLS * standstill
-        own = dict(type(self).parameters)
-        own["v_s"] = dataclasses.replace(own["v_s"], null=falls, scale=falls, lower=standstill)
-        self.parameters = own  # type: ignore[misc]  # of this instance
+        self.parameters = _bends_beyond(type(self).parameters, standstill)  # type: ignore[misc]
         super().__init__(where, standstill=standstill, **values)
 
     def starts(self, excursion: float, speed: float) -> tuple[dict[str, float], ...]:
@@ -211,6 +218,55 @@ class StribeckFriction(DryFriction):
         sticking = jnp.exp(-((joint.v / params["v_s"]) ** 2))
         level = params["tau_c"] + (params["tau_s"] - params["tau_c"]) * sticking
         return self.against(joint, level)
+
+
+class ConcaveFriction(DryFriction):
+    r"""
+    Viscous friction whose slope falls with speed, as of greased gears.
+
+    .. math:: \tau = -\frac{b\,|v|}{1 + |v| / v_s} \tanh(v / w)
+
+    At speeds far below :math:`v_s` it is viscous friction of coefficient :math:`b`, far above it is
+    dry friction of :math:`b\,v_s`. It is bounded around standstill as :class:`CoulombFriction` is.
+    Without friction, :math:`v_s` has no derivative.
+
+    Source: Waiboer, Aarts and Jonker, *Velocity dependence of joint friction in robotic
+    manipulators with gear transmissions*, ECCOMAS Multibody Dynamics 2005 (friction of lubricated
+    gears and bearings is concave over speed; the rational form is ours: two parameters, one of
+    which is linear).
+    """
+
+    name = "concave_friction"
+    parameters = {
+        "b": Parameter(null=0.0, scale=0.05, unit="N m s/rad", lower=0.0),
+        "v_s": Parameter(
+            null=_FALLS * STANDSTILL, scale=_FALLS * STANDSTILL, unit="rad/s", lower=STANDSTILL
+        ),
+    }
+    explanation = "The joint resists motion the more the faster it is, but less than in proportion."
+    source = "Waiboer et al. 2005"
+    equivalents = {
+        "viscous_friction": "while the joint moves several times slower than v_s",
+        "coulomb_friction": "while the joint moves several times faster than v_s",
+    }
+
+    def __init__(
+        self, where: int | str = 0, *, standstill: float = STANDSTILL, **values: float
+    ) -> None:
+        self.parameters = _bends_beyond(type(self).parameters, standstill)  # type: ignore[misc]
+        super().__init__(where, standstill=standstill, **values)
+
+    def starts(self, excursion: float, speed: float) -> tuple[dict[str, float], ...]:
+        """A curve that bends below all speeds of the motion, or above them, is another one's."""
+        return tuple({"v_s": max(share * speed, self.standstill)} for share in _BENDS)
+
+    def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
+        shares = np.geomspace(*_BENDS, _STEPS)
+        return tuple({"v_s": max(float(x) * ranges.speed, self.standstill)} for x in shares)
+
+    def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
+        speed = jnp.abs(joint.v)
+        return self.against(joint, params["b"] * speed / (1.0 + speed / params["v_s"]))
 
 
 class LoadDependentFriction(DryFriction):

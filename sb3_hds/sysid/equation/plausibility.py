@@ -45,6 +45,9 @@ TABLE: dict[str, Plausibility] = {
     "motor_lag": Plausibility("late", 2.0, reason="current loops are fast beside joints"),
     "stribeck_friction": Plausibility("dry", 2.0, _ONE_WAY, reason="shows at low speed only"),
     "quadratic_drag": Plausibility("drag", 2.0, _ONE_WAY, reason="only in media, or at speed"),
+    "concave_friction": Plausibility(
+        "viscous", 2.0, _ONE_WAY, reason="of greased gears over a wide range of speeds"
+    ),
     "load_dependent_friction": Plausibility("dry", 2.5, _ONE_WAY, reason="of gears under load"),
     "directional_viscous_friction": Plausibility("viscous", 3.0, _ONE_WAY, reason="few gears"),
     "directional_coulomb_friction": Plausibility("dry", 3.0, _ONE_WAY, reason="few gears"),

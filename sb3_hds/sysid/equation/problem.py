@@ -25,7 +25,7 @@ _LEAST_SLIDING = 0.3
 # Ranges of the motion by which a spring may rest outside of it: farther away, it is an offset.
 _BEYOND = 0.5
 # Numbers that what is not linear costs beside its coefficients: a speed, a period.
-_HIDDEN = {"stribeck_friction": 1, "cogging": 1}
+_HIDDEN = {"stribeck_friction": 1, "concave_friction": 1, "cogging": 1}
 
 
 class Solution(NamedTuple):

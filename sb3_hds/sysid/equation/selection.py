@@ -14,7 +14,7 @@ from sb3_hds.sysid.equation.weak_form import rich_columns
 _ADDED, _SWAPPED, _MOST_MOVES = 12, 5, 80
 # A member carries at least this share of a joint's force, and lowers held-out errors by a t of at
 # least this, and so much more for each unit of rarity.
-_MATERIAL, _CONFIRMED, _RARE = 0.006, 2.0, 0.75
+_MATERIAL, _CONFIRMED, _RARE = 0.006, 1.5, 0.9
 # A member whose force is below this multiple of what stays unexplained is a hint, no more; of what
 # is less rare than this, a smaller one.
 _OUTSTANDING, _RAREST = 1.5, 2.0
@@ -31,6 +31,7 @@ _SIMPLER = {
     "load_dependent_friction": "coulomb_friction",
     "directional_coulomb_friction": "coulomb_friction",
     "directional_viscous_friction": "viscous_friction",
+    "concave_friction": "viscous_friction",
     "directional_gain": "torque_gain",
 }
 _NO_MATTER = 0.02
