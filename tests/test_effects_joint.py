@@ -12,8 +12,8 @@ from sb3_hds import twins
 from sb3_hds.core import JointMoment, State, explicit_euler, rk4, rollout, semi_implicit_euler
 from sb3_hds.effects import (
     Cogging,
-    ConstantForce,
     ConcaveFriction,
+    ConstantForce,
     CoulombFriction,
     CubicStiffness,
     DirectionalCoulombFriction,

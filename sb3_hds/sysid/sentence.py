@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
+from sb3_hds.sysid.hypotheses import EVERY
 from sb3_hds.sysid.results import Estimate
 from sb3_hds.sysid.units import with_unit
 
@@ -10,8 +11,19 @@ _NUMBERS = (
     *("no", "one", "two", "three", "four", "five", "six"),
     *("seven", "eight", "nine", "ten", "eleven", "twelve"),
 )
-# What is said of a machine as a whole before anything else.
-_FRICTION = ("viscous_friction", "coulomb_friction")
+# Effects that are told of the machine as a whole before anything else, in the order of their words.
+_FRICTION = (
+    *("viscous_friction", "directional_viscous_friction", "concave_friction"),
+    *("coulomb_friction", "directional_coulomb_friction"),
+    *("stribeck_friction", "load_dependent_friction"),
+)
+_SHARED = {
+    "action_delay": "commands arrive {} late at all actuators",
+    "motor_lag": "all motors lag by {}",
+}
+# Words without an article, and from how many doubts on they are counted.
+_UNCOUNTED = ("stiffness", "cogging", "drag", "friction", "elasticity", "backlash", "saturation")
+_MANY_DOUBTS = 3
 
 
 class Found(Protocol):
@@ -34,9 +46,15 @@ class Found(Protocol):
 def spoken(key: str) -> str:
     """A candidate, for people: ``"coulomb_friction.hinge"`` is Coulomb friction at hinge."""
     name, _, place = key.partition(".")
+    if name == "parameter":
+        return place
+    return f"{_plain(name)} at {'all actuators' if place == EVERY else place}"
+
+
+def _plain(effect: str) -> str:
     for person in ("coulomb", "stribeck"):
-        name = name.replace(person, person.title())
-    return place if name == "parameter" else f"{name.replace('_', ' ')} at {place}"
+        effect = effect.replace(person, person.title())
+    return effect.replace("load_dependent", "load-dependent").replace("_", " ")
 
 
 def several_in_words(findings: Sequence[Found], joints: Sequence[str]) -> str:
@@ -46,48 +64,97 @@ def several_in_words(findings: Sequence[Found], joints: Sequence[str]) -> str:
     :return: a sentence: friction of the machine as a whole first, and what there is besides; and
         one on what the data cannot tell from other causes
     """
-    doubt = [
-        f"{spoken(f.key)} from {' or '.join(map(spoken, f.alternatives))}"
-        for f in findings
-        if f.alternatives
-    ]
-    open_ = f" The data cannot tell {'; '.join(doubt)}." if doubt else ""
-    return f"{_of_machine(findings, joints)}{open_}"
+    friction, rest = [], []
+    for f in findings:
+        (friction if f.effect in _FRICTION and f.where["slot"] == "joint" else rest).append(f)
+    besides = _listed([*_common(rest), *_offsets(rest), *map(_one, _others(rest))])
+    head = _friction_of(friction, joints)
+    told = f"{head}; {besides} besides." if head and rest else f"{head or besides}."
+    return f"{told[:1].upper()}{told[1:]}{_doubts(findings)}"
 
 
-def _of_machine(findings: Sequence[Found], joints: Sequence[str]) -> str:
-    friction = {
-        joint: tuple(n for n in _FRICTION if any(_is(f, n, joint) for f in findings))
-        for joint in joints
-    }
+def _friction_of(findings: Sequence[Found], joints: Sequence[str]) -> str:
+    """Of the machine as a whole, and by kind where joints differ."""
     groups: dict[tuple[str, ...], list[str]] = {}
-    for joint, names in friction.items():
-        if names:
-            groups.setdefault(names, []).append(joint)
+    for joint in joints:
+        own = {f.effect for f in findings if f.where["name"] == joint}
+        if own:
+            groups.setdefault(tuple(n for n in _FRICTION if n in own), []).append(joint)
+    if not groups:
+        return ""
+    where = [joint for joint in joints if any(joint in own for own in groups.values())]
+    subject = f"{_places(where, joints)} {_verb(where)}"
+    if len(groups) == 1:
+        (kinds,) = groups
+        carried = _carried(findings, "they carry" if len(kinds) > 1 else "it carries")
+        return f"{subject} {_kinds(kinds)} that the model lacks{carried}"
+    carried = _carried(findings, "it carries")
+    largest = sorted(groups.items(), key=lambda group: -len(group[1]))
+    by_kind = "; ".join(f"{_kinds(kinds)} at {_listed(own)}" for kinds, own in largest)
+    return f"{subject} friction that the model lacks{carried}: {by_kind}"
+
+
+def _common(findings: Sequence[Found]) -> list[str]:
+    """What all actuators share."""
     said = []
-    for names, where in sorted(groups.items(), key=lambda group: -len(group[1])):
-        own = [f for f in findings if f.effect in names and f.where["name"] in where]
-        said.append(f"{_places(where, joints)} {_verb(where)} {_kinds(names)}{_carried(own)}")
-    head = ", and ".join(said)
-    if head:
-        head += " that the model lacks"
-    rest = [f for f in findings if not (f.effect in _FRICTION and f.where["slot"] == "joint")]
-    besides = _listed([_one(f) for f in rest])
-    if not head:
-        return f"{besides[:1].upper()}{besides[1:]}."
-    head = f"{head[:1].upper()}{head[1:]}"
-    return f"{head}; {besides} besides." if rest else f"{head}."
+    for f in findings:
+        if f.where["name"] == EVERY:
+            how = _SHARED.get(f.effect, f"all actuators have {_article(_plain(f.effect))} of {{}}")
+            said.append(how.format(_size(f)))
+    return said
 
 
-def _is(finding: Found, effect: str, joint: str) -> bool:
-    return finding.effect == effect and finding.where["name"] == joint
+def _offsets(findings: Sequence[Found]) -> list[str]:
+    own = [f for f in findings if f.effect == "constant_force"]
+    if not own:
+        return []
+    where, sizes = [f.where["name"] for f in own], [_size(f) for f in own]
+    what = "an offset" if len(own) == 1 else "offsets"
+    return [f"{_listed(where)} {_verb(where)} {what} of {_listed(sizes)}"]
+
+
+def _others(findings: Sequence[Found]) -> list[Found]:
+    return [f for f in findings if f.where["name"] != EVERY and f.effect != "constant_force"]
+
+
+def _one(finding: Found) -> str:
+    name = finding.where["name"]
+    if finding.where["slot"] == "parameter":
+        first = next(iter(finding.parameters.values()))
+        return f"{name} is {_size(finding)}, not {first.before:.2g}"
+    return f"{name} has {_article(_plain(finding.effect))} of {_size(finding)}"
+
+
+def _size(finding: Found) -> str:
+    """The first of its parameters that is not nothing."""
+    every = list(finding.parameters.values())
+    told = next((e for e in every if e.estimate != 0.0), every[0])
+    return with_unit(f"{told.estimate:.2g}", told.unit)
+
+
+def _article(name: str) -> str:
+    if name.endswith(_UNCOUNTED):
+        return name
+    return f"{'an' if name[:1] in 'aeiou' else 'a'} {name}"
+
+
+def _doubts(findings: Sequence[Found]) -> str:
+    doubtful = [f for f in findings if f.alternatives]
+    if len(doubtful) > _MANY_DOUBTS:
+        n = _number(len(doubtful))
+        return f" Of {n} causes the data leave open which of several names is right."
+    doubt = [f"{spoken(f.key)} from {' or '.join(map(spoken, f.alternatives))}" for f in doubtful]
+    return f" The data cannot tell {'; '.join(doubt)}." if doubt else ""
 
 
 def _places(where: Sequence[str], joints: Sequence[str]) -> str:
     if len(where) == len(joints) and len(joints) > 1:
-        n = _NUMBERS[len(joints)] if len(joints) < len(_NUMBERS) else str(len(joints))
-        return "both joints" if len(joints) == 2 else f"all {n} joints"
+        return "both joints" if len(joints) == 2 else f"all {_number(len(joints))} joints"
     return _listed(list(where))
+
+
+def _number(n: int) -> str:
+    return _NUMBERS[n] if n < len(_NUMBERS) else str(n)
 
 
 def _verb(where: Sequence[str]) -> str:
@@ -95,11 +162,10 @@ def _verb(where: Sequence[str]) -> str:
 
 
 def _kinds(names: Sequence[str]) -> str:
-    short = {"viscous_friction": "viscous", "coulomb_friction": "Coulomb"}
-    return f"{' and '.join(short[name] for name in names)} friction"
+    return f"{' and '.join(_plain(name).removesuffix(' friction') for name in names)} friction"
 
 
-def _carried(own: Sequence[Found]) -> str:
+def _carried(own: Sequence[Found], verb: str) -> str:
     by_joint: dict[str, float] = {}
     for f in own:
         if f.share is None:
@@ -109,20 +175,7 @@ def _carried(own: Sequence[Found]) -> str:
     low, high = f"{min(shares):.0%}"[:-1], f"{max(shares):.0%}"[:-1]
     units = [e.unit for f in own for e in f.parameters.values()]
     what = "torque" if any("N m" in unit for unit in units) else "force"
-    return f" ({'it carries' if len(shares) == 1 else 'they carry'} " + (
-        f"{high} % of the {what})" if low == high else f"{low} to {high} % of the {what})"
-    )
-
-
-def _one(finding: Found) -> str:
-    first = next(iter(finding.parameters.values()))
-    size = with_unit(f"{first.estimate:.2g}", first.unit)
-    if finding.where["slot"] == "parameter":
-        return f"{finding.where['name']} is {size}, not {first.before:.2g}"
-    name, place = spoken(finding.key).rsplit(" at ", 1)
-    if finding.effect == "constant_force":
-        return f"{place} has an offset of {size}"
-    return f"{place} has {name} ({size})"
+    return f" ({verb} {high if low == high else f'{low} to {high}'} % of the {what})"
 
 
 def _listed(items: Sequence[str]) -> str:
