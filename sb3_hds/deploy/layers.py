@@ -12,11 +12,12 @@ from sb3_hds.errors import ExportError
 from sb3_hds.wrappers import CPGPrior
 from sb3_hds.wrappers.action_layer import TransformLayer
 
-# They change neither what is observed nor what is commanded.
+# They change neither what is observed nor what is commanded; RL Zoo patches Gymnasium's limit.
 _NEUTRAL = {
     "Monitor",
     "OrderEnforcing",
     "PassiveEnvChecker",
+    "PatchedTimeLimit",
     "RealTime",
     "Record",
     "RecordEpisodeStatistics",

@@ -147,7 +147,8 @@ class GymnasiumVecEnv(VecEnv):
     def _reset_by_mask(self, which: np.ndarray) -> tuple[Any, Any]:
         try:
             return self.env.reset(options={"reset_mask": which})
-        except ValueError as error:
+        # Gymnasium's normalisation refuses with one or the other, by its version.
+        except (ValueError, AssertionError) as error:
             raise RuntimeError(
                 f"{self.env} could not reset some of its copies alone ({error}). If a wrapper of "
                 "Gymnasium normalises there, put SB3's VecNormalize above this adapter instead; "
