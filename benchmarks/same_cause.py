@@ -110,6 +110,8 @@ CONDITIONS: dict[frozenset[str], Condition] = {
         ("coulomb_friction", "directional_coulomb_friction", one_way),
         ("coulomb_friction", "constant_force", one_way),
         ("coulomb_friction", "stribeck_friction", fast),
+        ("coulomb_friction", "concave_friction", fast),
+        ("viscous_friction", "concave_friction", slow),
         ("coulomb_friction", "dead_zone", as_driven),
         ("coulomb_friction", "load_dependent_friction", never),
         ("constant_force", "stiffness", hardly_moves),

@@ -46,7 +46,10 @@ class ViscousFriction(JointEffect):
         "The joint resists motion in proportion to its speed, as a lubricated bearing does."
     )
     source = "Olsson et al. 1998, section 2"
-    equivalents = {"directional_viscous_friction": "while the joint moves in one direction"}
+    equivalents = {
+        "directional_viscous_friction": "while the joint moves in one direction",
+        "concave_friction": "while the joint moves several times slower than v_s",
+    }
 
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
         return -jnp.minimum(params["b"], joint.inertia / joint.h) * joint.v
@@ -131,6 +134,7 @@ class CoulombFriction(DryFriction):
     source = "Olsson et al. 1998, section 2"
     equivalents = {
         "directional_coulomb_friction": "while the joint moves in one direction",
+        "concave_friction": "while the joint moves several times faster than v_s",
         "stribeck_friction": "while the joint moves several times faster than v_s",
         "load_dependent_friction": "where the joint transmits the same force all the time",
         "constant_force": "while the joint moves in one direction",

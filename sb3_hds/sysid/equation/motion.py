@@ -1,17 +1,27 @@
 """How the joints moved in a set of recordings, at an interval that suits the system."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from scipy.signal import savgol_filter
 
-from sb3_hds.core import Trajectories, Twin, explicit_euler, semi_implicit_euler
+from sb3_hds.core import (
+    Params,
+    Trajectories,
+    Twin,
+    explicit_euler,
+    rollout,
+    semi_implicit_euler,
+)
+from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.twin import plant_of
-from sb3_hds.sysid.equation.smoothing import smooth
+from sb3_hds.sysid.equation.plausibility import SET_POINTS
+from sb3_hds.sysid.equation.smoothing import Smoothed, smooth
 from sb3_hds.sysid.motion import motion_of
 
 # Samples from which it is told whether a velocity is measured.
@@ -121,13 +131,11 @@ def motion(twin: Twin, data: Trajectories) -> Motion:
     actions = [np.asarray(data.episode(i)[1], float) for i in range(len(data))]
     raws = [(*pair, u) for pair, u in zip(joint_motion(twin, data), actions, strict=True)]
     measured = _measured(twin, data)
-    found = []
-    for q, v, _ in raws:
-        columns = [
-            smooth(q[:, j], v[:, j] if measured[j] else None, data.dt, shift)
-            for j in range(q.shape[1])
-        ]
-        found.append(columns)
+    expected = _by_the_model(twin, data)
+    found = [
+        _smoothed(q, v, measured, data.dt, shift, known)
+        for (q, v, _), known in zip(raws, expected, strict=True)
+    ]
     values = [
         tuple(np.stack([getattr(c, name) for c in columns], 1) for name in ("q", "v", "a"))
         for columns in found
@@ -140,11 +148,11 @@ def motion(twin: Twin, data: Trajectories) -> Motion:
     every = min(every, max(1, int(data.lengths.min()) // _PER_PERIOD))
     every = min(every, -(-int(data.lengths.sum()) // _ENOUGH))
     recordings = []
-    for (q, v, commands), smoothed in zip(raws, values, strict=True):
+    for (q, v, commands), smoothed, known in zip(raws, values, expected, strict=True):
         raw = v.copy()
         still = ~measured
         if still.any():
-            raw[:, still] = differences(q[:, still], data.dt, shift)
+            raw[:, still] = _differences(q, data.dt, shift, known)[:, still]
         recordings.append(_thinned(smoothed, raw, commands, every))
     noise_q, noise_v = mean("noise_q"), mean("noise_v")
     noise_v = np.where(measured, noise_v, np.sqrt(0.5 + 6.0 * shift**2) * noise_q / data.dt)
@@ -163,6 +171,79 @@ def motion(twin: Twin, data: Trajectories) -> Motion:
         np.array([2.0 * np.pi if joint.unit == "rad" else np.inf for joint in twin.joints]),
         measured & kinematics([(q, v) for q, v, _ in raws], data.dt, period).agrees,
     )
+
+
+class _Expected(NamedTuple):
+    """What the model alone predicts of one recording, each leaf of shape ``(rows, dof)``."""
+
+    q: np.ndarray
+    v: np.ndarray
+
+
+def _by_the_model(twin: Twin, data: Trajectories) -> list[_Expected | None]:
+    """
+    A servo answers a step of its set point faster than samples follow one another, and no local
+    polynomial has such a corner. Its model has, and what it misses is smooth.
+
+    :return: of each recording; None where commands are no set points, or the model diverges
+    """
+    if not all(actuator.unit in SET_POINTS for actuator in twin.actuators):
+        return [None] * len(data)
+    n = int(data.lengths.max())
+    starts, commands = [], []
+    for i in range(len(data)):
+        obs, actions = data.episode(i)
+        starts.append(np.asarray(obs[0], float))
+        last = np.repeat(actions[-1:], n - len(actions), axis=0)
+        commands.append(np.concatenate([actions, last]))
+    with jax.enable_x64(True):
+        params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), dict(twin.params))
+        given = jnp.asarray(starts, jnp.float64), jnp.asarray(commands, jnp.float64)
+        q, v = map(np.asarray, _simulated(twin, params, *given))
+    rows = [int(length) + 1 for length in data.lengths]
+    found = [_Expected(q[i, :m], v[i, :m]) for i, m in enumerate(rows)]
+    return [one if np.isfinite(one.q).all() and np.isfinite(one.v).all() else None for one in found]
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
+def _simulated(twin: Twin, params: Params, starts: Array, commands: Array) -> tuple[Array, Array]:
+    def one(start: Array, actions: Array) -> tuple[Array, Array]:
+        states = rollout(twin, params, twin.infer(start, params), actions).states
+        return states.q, states.v
+
+    return jax.vmap(one)(starts, commands)
+
+
+def _smoothed(
+    q: np.ndarray,
+    v: np.ndarray,
+    measured: np.ndarray,
+    dt: float,
+    shift: float,
+    expected: _Expected | None,
+) -> list[Smoothed]:
+    """:return: each joint, as it moved beside what is expected where that leaves less noise"""
+    found = []
+    for j in range(q.shape[1]):
+        own = smooth(q[:, j], v[:, j] if measured[j] else None, dt, shift)
+        if expected is not None:
+            beside = expected.q[:, j], expected.v[:, j]
+            left = q[:, j] - beside[0], v[:, j] - beside[1] if measured[j] else None
+            rest = smooth(*left, dt, shift)
+            if rest.noise_q < own.noise_q and rest.noise_v <= own.noise_v:
+                own = rest._replace(
+                    q=beside[0] + rest.q,
+                    v=beside[1] + rest.v,
+                    a=np.gradient(beside[1], dt) + rest.a,
+                )
+        found.append(own)
+    return found
+
+
+def _differences(q: np.ndarray, dt: float, shift: float, expected: _Expected | None) -> np.ndarray:
+    if expected is None:
+        return differences(q, dt, shift)
+    return expected.v + differences(q - expected.q, dt, shift)
 
 
 def differences(

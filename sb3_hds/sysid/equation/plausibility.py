@@ -66,7 +66,8 @@ _UNKNOWN = Plausibility("", 3.0)
 # A set point is a number that arrives as it is, or late: no amplifier changes it.
 _SET_POINT = 3.0
 _OF_AMPLIFIERS = ("torque_gain", "directional_gain", "dead_zone", "saturation")
-_UNITS_OF_SET_POINTS = ("rad", "rad/s", "m", "m/s", "deg", "deg/s")
+#: units of commands that are targets of a servo
+SET_POINTS = ("rad", "rad/s", "m", "m/s", "deg", "deg/s")
 
 
 def plausibility(effect: str) -> Plausibility:
@@ -82,5 +83,5 @@ def rarity(effect: str, command: str = "") -> float:
     :return: minus the logarithm of the prior odds
     """
     own = plausibility(effect).rarity
-    set_point = effect in _OF_AMPLIFIERS and command in _UNITS_OF_SET_POINTS
+    set_point = effect in _OF_AMPLIFIERS and command in SET_POINTS
     return own + _SET_POINT if set_point else own
