@@ -61,6 +61,11 @@ def fast(motion: Motion, values: Values) -> bool:
     return slide is not None and bool(np.mean(np.abs(motion.v) > _SEVERAL * slide) >= _MOSTLY)
 
 
+def slow(motion: Motion, values: Values) -> bool:
+    slide = values.get("v_s")
+    return slide is not None and bool(np.mean(_SEVERAL * np.abs(motion.v) < slide) >= _MOSTLY)
+
+
 def as_driven(motion: Motion, _: Values) -> bool:
     return bool(np.mean(motion.u * motion.v > 0.0) >= _ALL)
 
