@@ -15,6 +15,7 @@ version = release = __version__
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
     "sphinx_copybutton",
     "generated_parts",
     "offline_math",
@@ -23,6 +24,8 @@ exclude_patterns = ["_build", "modules/_*.md"]
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
+
+autosummary_generate = False  # the tables link to what the pages describe
 
 autoclass_content = "both"  # arguments are documented where they are declared, by the constructor
 autodoc_member_order = "bysource"

@@ -1,11 +1,11 @@
 """
-Find out what is wrong with a simulation, mend it, and train in the mended one.
+Find out what is wrong with a simulation, correct it, and train in the corrected one.
 
     python examples/demo_diagnosis.py --folder demo
 
-The "robot" is a pendulum on MuJoCo's engine that stirs the air; `diagnose` is not told. Writes the
-recordings, ``report.html`` and ``policy_gain.png`` into ``demo/``, and prints the return on the
-robot of policies from both twins.
+The "robot" is a pendulum on MuJoCo's engine with air drag, of which `diagnose` is not told. Writes
+the recordings, ``report.html``, its figures (one is in the README) and ``policy_gain.png`` into
+``demo/``, and prints the return on the robot of policies from both twins.
 """
 
 import argparse
@@ -34,15 +34,17 @@ def main() -> None:
     data = record(options.folder / "recordings.jsonl")
     found = diagnose(twins.make(ROBOT), data)
     print(found)
+    figures = found.save_pictures(options.folder)
 
-    print(f"Runs in each twin: {options.seeds}. For a statement, take five: --seeds 5")
+    print(f"Runs in each twin: {options.seeds}. For a comparison use five: --seeds 5")
     gain = measure_policy_gain(
         found, robot(), seeds=options.seeds, ceiling=False, pretrain_epochs=EPOCHS
     )
     print(gain)
     report = found.to_html(options.folder / "report.html", gain.to_dict())
     picture = gain.plot(options.folder / "policy_gain.png")
-    print(f"Report: {report}\nReturn on the robot: {picture}")
+    print(f"Report: {report}\nFigures: {', '.join(map(str, figures))}")
+    print(f"Return on the robot: {picture}")
 
 
 def robot() -> gym.Env:
@@ -50,7 +52,7 @@ def robot() -> gym.Env:
 
 
 def record(path: Path) -> Trajectories:
-    """Ten recordings of torques that wander, as a wrapper writes them step by step."""
+    """Ten recordings of sinusoidal torques with a random phase, written step by step."""
     path.unlink(missing_ok=True)
     env, rng = Record(robot(), path), np.random.default_rng(0)
     for episode in range(N_RECORDINGS):

@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import os
 import pydoc
 import re
 import shlex
@@ -23,9 +24,11 @@ from sb3_hds.envs.registration import HARDWARE, STEP_LIMITS, TASKS
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
-sys.path.insert(0, str(DOCS / "extensions"))
+sys.path[:0] = [str(DOCS / "extensions"), str(ROOT / "examples")]
 
 import catalogue  # noqa: E402
+import demo_diagnosis  # noqa: E402
+import reference  # noqa: E402
 
 PAGES = sorted([*DOCS.glob("*.md"), *DOCS.glob("[!_]*/[!_]*.md"), ROOT / "README.md"])
 
@@ -37,7 +40,9 @@ SMALL_HDS = {"beta": 0.0}
 PLANNING = {"pretrain_epochs": 1, "gradient_steps": 2, "train_freq": 1_000}
 
 # Their code learns from data, for minutes.
-LONG = ("docs/guide/measured.md", "docs/guide/diagnose.md")
+LONG = ("README.md", "docs/index.md", "docs/guide/measured.md", "docs/guide/diagnose.md")
+# Their code reads published logs, which are not part of the repository.
+ON_MEASURED_DATA = {"docs/guide/from_logs_to_policy.md": "bam_xl330"}
 # Their code is DroQ's but for names.
 LIKE_DROQ = ("bro", "crossq_jax", "gsde_sac", "simba", "td7")
 
@@ -86,10 +91,26 @@ def small_and_tidy(monkeypatch, tmp_path):
         del gymnasium.registry[env_id]
 
 
+def marks_of(page: Path) -> tuple[pytest.MarkDecorator, ...]:
+    if name_of(page) in ON_MEASURED_DATA:
+        absent = "SB3_HDS_DATA" not in os.environ
+        skip = pytest.mark.skipif(absent, reason="data outside the repository")
+        return pytest.mark.measured, pytest.mark.expensive, skip
+    return (pytest.mark.expensive,) if name_of(page) in LONG else ()
+
+
+def prepare_files(page: Path) -> None:
+    """Put what the code of a page reads into the current folder."""
+    if name_of(page) == "docs/index.md":
+        demo_diagnosis.record(Path("log.jsonl"))
+    if data := ON_MEASURED_DATA.get(name_of(page)):
+        Path("logs").symlink_to(Path(os.environ["SB3_HDS_DATA"], data))
+
+
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, marks=pytest.mark.expensive if name_of(page) in LONG else ())
+        pytest.param(page, marks=marks_of(page))
         for page in PAGES
         if blocks(page, "python") and page.stem not in LIKE_DROQ
     ],
@@ -97,6 +118,7 @@ def small_and_tidy(monkeypatch, tmp_path):
 )
 def test_the_code_of_a_page_runs_from_top_to_bottom(page, small_and_tidy, capsys, monkeypatch):
     namespace = {"__name__": "a_page"}
+    prepare_files(page)
     if page.stem in ("hds", "measured"):  # the others act without having planned
         for name, value in PLANNING.items():
             set_default(monkeypatch, HDS.config_class, name, value)
@@ -174,6 +196,13 @@ def test_every_twin_effect_and_environment_is_listed_with_its_parameters():
     assert [i for i in STEP_LIMITS | HARDWARE | TASKS if f"`{i}`" not in listed] == []
 
 
+def test_every_public_name_is_in_the_reference():
+    listed = reference.as_markdown()
+    for package in reference.PACKAGES:
+        names = reference.public_names(package)
+        assert [n for n in names if not re.search(rf"[.`]{n}\b", listed)] == []
+
+
 @pytest.mark.expensive
 @pytest.mark.skipif(find_spec("sphinx") is None, reason="needs the extra 'dev'")
 def test_the_documentation_builds_without_warnings(tmp_path):
@@ -203,7 +232,7 @@ def objection(words: list[str]) -> str | None:
             if not (ROOT / script).is_file():
                 return f"no script {script}"
             return _missing("option", _options(options), _declared_options(ROOT / script))
-        case ["git", "clone", *_] | ["cd", _] | ["pip", "install", *_]:
+        case ["git", "clone" | "checkout", *_] | ["cd", _] | ["pip", "install", *_]:
             return None
     return f"unknown command {words[0]}"
 

@@ -12,13 +12,15 @@ from typing import Any
 import benchmark_results
 import catalogue
 import import_picture
+import reference
 import summaries
 
 # Between which planning in the data sheet's twin and in the true one lie, of the worn pendulum.
 WORN = ("hds_parts", "wrong twin", "ceiling")
 
-# What is shown beside each model-free algorithm on its page.
+# What is shown beside an algorithm on its page.
 LEARNED = {
+    "hds": ("sac", "sb3_sac", "sbx_sac"),
     "gsde_sac": ("sb3_gsde_sac", "sac", "sb3_sac", "sbx_sac"),
     "droq": ("sbx_droq", "sac"),
     "crossq_jax": ("crossq_jax_512", "crossq_jax_narrow", "contrib_crossq", "sbx_crossq", "sac"),
@@ -30,6 +32,7 @@ LEARNED = {
 
 PARTS: dict[str, Callable[[], str]] = {
     "imports": import_picture.as_markdown,
+    "reference": reference.as_markdown,
     "twins": catalogue.twins_as_markdown,
     "surrogates": catalogue.surrogates_as_markdown,
     "effects": catalogue.effects_as_markdown,
@@ -45,6 +48,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "ten_minutes": summaries.first_and_rest(
         "ten_minutes", 3, "return of each episode against minutes"
     ),
+    "control_tasks": summaries.over_seeds("control_tasks", "env", "return", "seconds"),
     "hds_parts": summaries.over_seeds(
         "hds_parts",
         "variant",

@@ -2,7 +2,7 @@
 """
 Learning algorithms behind Stable-Baselines3's API.
 
-Names are imported on first use: who learns without a twin does not wait for what fits one to data.
+Names are imported on first use, so that model-free learning does not import system identification.
 """
 
 import importlib

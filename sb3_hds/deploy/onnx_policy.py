@@ -68,7 +68,7 @@ class OnnxPolicy:
 
     @property
     def dt(self) -> float | None:
-        """How long a step is for the policy [s]; None where nobody said it."""
+        """Control period of the policy [s]; None if it is not known."""
         return self.metadata["dt"]
 
     @property

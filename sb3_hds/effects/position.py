@@ -89,8 +89,8 @@ class Cogging(JointEffect):
 
     It rests at :math:`q = \varphi`, and at every period :math:`\lambda` from there: both are
     positions of the joint. The bound is the same as that of :class:`Stiffness`, for the steepest
-    place. Without amplitude, period and phase have no derivative; and whoever searches for a period
-    finds the nearest one that fits at all.
+    place. At zero amplitude, period and phase have no derivative, and a local search for the period
+    ends at the nearest one that fits at all.
 
     Source: *MuJoCo DC motor model*, Google DeepMind 2026, section 1.2 (its phase is
     :math:`\pi - 2 \pi \varphi / \lambda`).

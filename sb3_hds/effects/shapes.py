@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from sb3_hds.core import Effect, JointMoment, Parameter, Scalar
 from sb3_hds.errors import EffectError
 
-# Speed below which dry friction is smoothed where nobody says [rad/s] or [m/s].
+# Default speed below which dry friction is smoothed [rad/s] or [m/s].
 STANDSTILL = 0.01
 # Longest delay that can be simulated by default [s].
 _LONGEST_DELAY = 0.2

@@ -13,7 +13,7 @@ from sb3_hds.errors import EffectError
 if TYPE_CHECKING:
     from sb3_hds.core import Twin
 
-# Share of a joint's inertia that turns with the motor, where nobody says: gears are commonly chosen
+# Default share of a joint's inertia that turns with the motor: gears are commonly chosen
 # so that the motor's inertia, seen from the load, equals the load's.
 _MATCHED = 0.5
 

@@ -246,7 +246,7 @@ def _range(space: gymnasium.spaces.Box) -> str:
 
 
 def _true_twin(real: gymnasium.Env, ceiling: bool | Twin) -> Twin | None:
-    """The twin that is the real system; None where nobody knows it, or nobody asks."""
+    """The twin of the real system; None if it is unknown or no ceiling is asked for."""
     if isinstance(ceiling, Twin):
         return ceiling
     if not ceiling:

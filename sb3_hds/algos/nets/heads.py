@@ -40,7 +40,7 @@ class Gaussian(NamedTuple):
 
 class GaussianActor(nn.Module):
     r"""
-    Observation to a Gaussian whose spread is a layer of its own.
+    Maps an observation to a Gaussian whose standard deviation has an output layer of its own.
 
     :param body: see ``mlp.py``
     :param n_act: number of controls
@@ -71,8 +71,8 @@ class GaussianActor(nn.Module):
 
 class ExploringActor(nn.Module):
     r"""
-    Observation to a Gaussian whose spread is that of :math:`\theta^T z` over noise matrices
-    :math:`\theta` (generalised state-dependent exploration).
+    Maps an observation to a Gaussian with the standard deviation of :math:`\theta^T z` over noise
+    matrices :math:`\theta` (generalised state-dependent exploration).
 
     :param body: its output is :math:`z`
     :param n_act: number of controls

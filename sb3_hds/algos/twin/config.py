@@ -31,9 +31,9 @@ _TEMPERATURE_DECAY = 0.9
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Refinements:
     """
-    How plans are improved and learned from. PODS has these as arguments, so that the setting of its
-    paper can be reached; HDS goes by the defaults, which ``benchmarks/payload.py`` compares with
-    the paper's.
+    How plans are improved and learned from. They are arguments of PODS, so that the setting of its
+    paper can be reached; HDS uses the defaults, which ``benchmarks/payload.py`` compares with the
+    paper's.
 
     :param n_iterations: improvements of each plan in an epoch (the paper: 1)
     :param n_step_sizes: candidates of each line search, "no change" included
@@ -50,11 +50,11 @@ class Refinements:
     :param adapt_scales: whether the scales of the networks' inputs and of the regression's errors
         follow the plans (near a balance both are far smaller than in random rollouts); False keeps
         those of the first rollouts
-    :param compare_every: epochs after which the average policy and the one that acts go through
-        whole episodes of the twin, and the better one acts from then on; 0: the average acts (the
-        paper)
+    :param compare_every: epochs after which the averaged policy and the one that acts are compared
+        on whole episodes of the twin, and the better one acts from then on; 0: the averaged policy
+        acts (the paper)
     :param least_gain: the pretraining ends when plans have gained less than this share of the
-        policy's return, on the average of about ten epochs; 0: never
+        policy's return, averaged over about ten epochs; 0: never
     """
 
     n_iterations: int = 3
@@ -94,18 +94,18 @@ class TwinConfig(OffPolicyConfig):
     :param planner: ``"ilqr"``: second-order steps with feedback and limits on the controls;
         ``"gauss_newton"``: the paper's open-loop second-order step; ``"first_order"``: gradient of
         the action sequence
-    :param n_random_plans: random sequences of which the best is improved too, for half of the start
-        states: the remedy against local optima; 0 switches it off (the paper)
-    :param lookahead: steps for which the policy is followed beyond the end of a plan when plans are
-        compared; None: five horizons; 0 switches it off (the paper)
-    :param terminal_value: whether a value network rates the end of a plan (the paper: no)
-    :param shift_ends: whether an episode that has terminated counts as one that earns the reward
-        zero for ever. Rewards are counted from the best one that was seen; without it, an end is
-        worth zero on that scale, and dying pays.
-    :param reset_share: share of start states drawn from the reset distribution in each epoch, the
-        others go on from where the policy went; 1 is the paper's choice
+    :param n_random_plans: random sequences of which the best is also improved, for half of the
+        start states, against local optima; 0 switches it off (the paper)
+    :param lookahead: steps for which the policy is rolled out beyond the end of a plan when plans
+        are compared; None: five horizons; 0 switches it off (the paper)
+    :param terminal_value: whether a learned value is added at the end of a plan (the paper: no)
+    :param shift_ends: whether a terminated episode counts as one that earns zero reward for ever.
+        The best reward seen is subtracted from all rewards; without the shift, termination is worth
+        zero on that scale, and terminating early pays.
+    :param reset_share: share of start states drawn from the reset distribution in each epoch; the
+        others are advanced by the policy (the paper: 1)
     :param exploration_noise: standard deviation of a constant offset of the controls while start
-        states go on, in units of the typical size of the plans' controls
+        states are advanced, in units of the typical size of the plans' controls
     :param randomisation: domain randomisation: standard deviation of the twin's parameters between
         rollouts, in units of each parameter's ``scale``; 0: none
     :param policy_kwargs: ``net_arch``, ``activation_fn``, ``linear_path``, ``max_grad_norm``; see

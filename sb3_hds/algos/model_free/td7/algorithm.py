@@ -261,9 +261,9 @@ class TD7(ModelFreeAlgorithm):
 
     def _assessed(self) -> int:
         """
-        Judge the policy by the episodes that it has made since it was updated last.
+        Assess the policy by its episodes since the last update.
 
-        :return: how many updates are due: none while it is still to be seen how good it is
+        :return: how many updates are due: none while the assessment is not complete
         """
         for reward, length in self._finished:
             self.assessed_episodes += 1

@@ -40,12 +40,13 @@ class Encoder(nn.Module):
     activation_fn: Activation
 
     def setup(self) -> None:
+        # Flax draws weights by these names, too: others would give a seed other networks.
         self.of_state = _Dense((*self.net_arch, self.n), self.activation_fn)
-        self.of_pair = _Dense((*self.net_arch, self.n), self.activation_fn)
+        self.of_both = _Dense((*self.net_arch, self.n), self.activation_fn)
 
     def __call__(self, obs: Array, action: Array) -> tuple[Array, Array]:
         zs = average_l1_norm(self.of_state(obs))
-        return zs, self.of_pair(jnp.concatenate([zs, action], -1))
+        return zs, self.of_both(jnp.concatenate([zs, action], -1))
 
 
 class Actor(nn.Module):

@@ -51,22 +51,21 @@ class HDSConfig(TwinConfig):
 
     :param exploration_decay: factor on the noise after each epoch (the HDS project: 0.5 to 0.99)
     :param temperature: of the annealed acceptance of step sizes and plans, in units of the mean
-        gain of the last epoch's plans, times 0.9 after each epoch; 0 takes the best always. The HDS
+        gain of the last epoch's plans, times 0.9 after each epoch; 0 always takes the best. The HDS
         project describes it and does not run it.
-    :param calibrated: parameters of the twin, and of attached effects, that data correct:
-        ``"all"``, names, or None
+    :param calibrated: parameters of the twin and of attached effects that are estimated: ``"all"``,
+        names, or None
     :param effects: attached to the twin, so that data can inform them: names from ``effects.ALL``
         (then at every joint or actuator), or effects
     :param suspected: names of effects that are estimated, at every joint or actuator, once data
         show that the twin is not exact, and stay where they explain something; only with
-        ``calibrated="all"``. Dry friction and late commands are rarely in a simulation, and neither
-        another parameter nor a learned force stands for them well, see the documentation.
+        ``calibrated="all"``. Simulations rarely contain dry friction and command delays, and
+        neither another parameter nor a learned force replaces them well, see the documentation.
     :param residual_kwargs: of the learned force: ``n_members``, ``net_arch``, ``caution``, see
         ``sysid.fit_residual``
-    :param beta: share of rollouts in the model with a force that was learned for what the corrected
-        twin does not explain, where that predicts held-out windows better than the model without;
-        ``"auto"``: in proportion to how much better, all of them from a quarter on; 0: no force is
-        learned. The HDS project: 0.05.
+    :param beta: share of rollouts in the model with a learned residual force, where it predicts
+        held-out windows better than the model without; ``"auto"``: in proportion to the
+        improvement, all of them from a quarter on; 0: no force is learned. The HDS project: 0.05.
     :param refit_freq: blocks of ``train_freq`` from one correction to the next; 0: never
     :param diagnose_freq: blocks of ``train_freq`` from one diagnosis to the next, which attaches
         the effects that the data name; 0: never
@@ -102,19 +101,17 @@ class HDSConfig(TwinConfig):
 
 class HDS(TwinAlgorithm):
     """
-    Hybrid differentiable simulation: PODS on a model that measured data keep correcting.
+    Hybrid differentiable simulation: PODS in a twin that is corrected by measured data.
 
-    What it adds to PODS: exploration noise that decays, annealed acceptance of step sizes, plans
-    that start where the real environment was seen; and after each block of real steps, the model is
-    corrected by what the environment answered: parameters of the twin and of effects are estimated
-    together, since one can stand for another; then a force is learned for what remains, again
-    whenever the data have doubled, and a share ``beta`` of the plans is made in that hybrid.
-    Nothing is kept that does not predict held-out windows of the data better; a twin that is exact
-    is left alone.
+    It adds to PODS exploration noise that decays, annealed acceptance of step sizes and plans, and
+    a correction of the model after each block of real steps: parameters of the twin and of effects
+    are estimated jointly, since one can absorb another; a residual force is then learned, anew
+    whenever the data have doubled; and a share ``beta`` of the plans is made in that hybrid.
+    Only what improves predictions of held-out windows is kept; an exact twin stays as it is.
 
-    Idea: the HDS course project (ETH Zurich, 2024), from its description; planning by short
-    horizons with a learned tail, weights and averaging are our own, see the documentation for what
-    each gains.
+    Idea: the HDS course project (ETH Zurich, 2024), from its description. Short horizons with a
+    learned terminal value, sample weights and averaging are our own; the documentation measures
+    them.
     """
 
     config_class = HDSConfig
@@ -165,10 +162,10 @@ class HDS(TwinAlgorithm):
 
     def correct_model(self, gradient_steps: int = 0) -> Correction | None:
         """
-        Correct the twin by all that was measured; where that changes it noticeably, plan again.
+        Correct the twin by all measured data; if that changes it noticeably, plan again.
 
         :param gradient_steps: regression steps of each of those planning epochs; 0: no epochs
-        :return: what the data say; None before anything was measured
+        :return: the correction; None before anything was measured
         :raises NoTwinError: if the model was loaded without environment and without twin
         """
         data, n_counted = self.measured.recordings(), self._since_change()
@@ -235,7 +232,7 @@ class HDS(TwinAlgorithm):
         estimates the new effects with them, and learns the residual force again.
 
         :param arguments: as of :func:`sb3_hds.diagnose`
-        :return: what the data say; None before anything was measured
+        :return: the correction; None before anything was measured
         """
         if self.twin is None or self.measured.trajectories(self._since_change()) is None:
             return None

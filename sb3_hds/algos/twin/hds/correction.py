@@ -76,8 +76,8 @@ class CorrectionConfig:
 @dataclasses.dataclass(frozen=True)
 class Correction:
     """
-    What the data say. Errors are root mean squares over held-out windows, in shares of the
-    channels' spread; not a number where there was nothing to compare.
+    Result of a correction. Errors are root mean squares over held-out windows, in standard
+    deviations of the channels; not a number where there was nothing to compare.
 
     :param twin: to plan in from now on
     :param beta: share of rollouts in the learned model
@@ -243,8 +243,8 @@ def _cleared(
     windows: Windows,
 ) -> tuple[Twin, np.ndarray, dict[str, float]]:
     """
-    What was suspected and explains nothing is let go, since simulating it costs time; it is
-    suspected again next time.
+    Detach suspected effects that explain nothing, since simulating them costs time; they are
+    estimated again next time.
 
     :return: the twin without those effects, its errors, and ``added`` without their parameters
     """

@@ -11,7 +11,7 @@ from sb3_hds.sysid.calibrate import default_window
 from sb3_hds.sysid.prediction import has_grown, hold_out, window_errors
 from sb3_hds.sysid.shooting import Shots, places_of, shots_of
 
-# A twin whose windows miss by less than this share of the channels' spread needs no correction.
+# A twin whose window errors are below this share of the channels' deviations needs no correction.
 EXACT = 1e-3
 # Fewer windows than this are too few to check on some what was learned from others.
 FEWEST = 6
@@ -23,7 +23,7 @@ _HELD, _HELD_OF_FEW, _MANY = 0.25, 0.5, 24
 
 class Since(NamedTuple):
     """
-    What counts of the data, after the system has become another one.
+    The data that count after the system has changed.
 
     :param n_steps: the latest of them
     :param recording: number of the recording in which they begin
@@ -35,13 +35,13 @@ class Since(NamedTuple):
 
 class Windows(NamedTuple):
     """
-    What models are compared on.
+    Windows of data on which models are compared.
 
     :param shots: windows of the data
     :param origin: of each window, the recording it is from; negative where it does not count
     :param place: of each window in its recording
     :param age: of each window, steps from its beginning to the end of the data
-    :param spread: of the channels
+    :param spread: standard deviation of each channel
     :param held: whether each window is held out of what is learned from
     """
 
