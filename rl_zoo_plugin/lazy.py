@@ -25,11 +25,9 @@ class LazyAlgorithm:
         self.__name__ = class_name
 
     def resolve(self) -> Any:
-        """:return: the class itself, with the compilation cache switched on for the command"""
+        """:return: the class itself"""
         import sb3_hds
-        from rl_zoo_plugin import compilation_cache
 
-        compilation_cache.enable()
         return getattr(sb3_hds, self.__name__)
 
     def __call__(self, *args: Any, **hyperparams: Any) -> Any:

@@ -1,7 +1,9 @@
 """Packages whose names are imported on first use."""
 
 import importlib
+import importlib.util
 import sys
+import threading
 from collections.abc import Mapping
 from types import ModuleType
 from typing import Any
@@ -40,3 +42,42 @@ def lazily(package: str, public: Mapping[str, str]) -> None:
     module: Any = sys.modules[package]
     module.__dict__["_public"] = dict(public)
     module.__class__ = _Package
+
+
+class _Postponed(ModuleType):
+    """A package whose ``__init__`` runs when a name is asked for that its submodules are not."""
+
+    def __getattr__(self, name: str) -> Any:
+        spec: Any = self.__spec__
+        with _one_at_a_time:
+            if type(self) is _Postponed and not self.__dict__.get("_running"):
+                self.__dict__["_running"] = True
+                try:
+                    spec.loader.exec_module(self)
+                finally:
+                    del self.__dict__["_running"]
+                self.__class__ = ModuleType
+        if name in self.__dict__:
+            return self.__dict__[name]
+        raise AttributeError(f"module '{self.__name__}' has no attribute '{name}'")
+
+
+_one_at_a_time = threading.RLock()
+
+
+def postpone(package: str) -> None:
+    """
+    Let submodules of a package be imported without all that its ``__init__`` imports, which runs
+    when one of the package's own names is first asked for. Nothing happens where it has run, or
+    where there is no such package.
+
+    :param package: its name
+    """
+    if package in sys.modules:
+        return
+    spec = importlib.util.find_spec(package)
+    if spec is None or spec.loader is None or spec.submodule_search_locations is None:
+        return
+    module = importlib.util.module_from_spec(spec)
+    module.__class__ = _Postponed
+    sys.modules[package] = module

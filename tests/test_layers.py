@@ -52,7 +52,6 @@ LIBRARIES = {
     "experiments": LEARNING | TABLES | {"scipy", "jinja2", "rliable"},
     "cli": LEARNING | TABLES,
     "rl_zoo_plugin": {"rl_zoo3", "optuna"},
-    "rl_zoo_plugin/compilation_cache.py": {"jax"},
     "rl_zoo_plugin/study_worker.py": {"stable_baselines3"},
     "rl_zoo_plugin/trial_progress.py": {"stable_baselines3"},
 }

@@ -5,14 +5,13 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-import jax
 import pytest
 import yaml
 from cases import each
 from small_models import small
 
 import sb3_hds
-from rl_zoo_plugin import __main__, compilation_cache, hook, lazy, samplers, tables, trials
+from rl_zoo_plugin import __main__, hook, lazy, samplers, tables, trials
 from rl_zoo_plugin import trial_progress as progress_of_trials
 from rl_zoo_plugin.lazy import LazyAlgorithm
 from rl_zoo_plugin.samplers import SAMPLERS
@@ -274,25 +273,3 @@ def test_a_zoo_is_extended_before_and_after_it_is_imported(tmp_path, before):
     assert ours == str(tables.hyperparams_file("hds")) and users == "mine.yml" and stock == "None"
     # Known by name only: neither jax nor torch is imported before an algorithm is used.
     assert names == f"{['sac', *ALGORITHMS]} False False"
-
-
-@each(
-    ({"SB3_HDS_CACHE": "/tmp/mine"}, "/tmp/mine"),
-    ({"SB3_HDS_CACHE": ""}, None),
-    ({"XDG_CACHE_HOME": "/tmp/xdg"}, "/tmp/xdg/sb3_hds/xla"),
-    ({"JAX_COMPILATION_CACHE_DIR": "/tmp/jax", "SB3_HDS_CACHE": "/tmp/mine"}, None),
-)
-def test_programs_are_kept_where_the_user_wants_them(environ, expected, monkeypatch):
-    for name in ("JAX_COMPILATION_CACHE_DIR", "SB3_HDS_CACHE", "XDG_CACHE_HOME"):
-        monkeypatch.delenv(name, raising=False)
-    for name, folder in environ.items():
-        monkeypatch.setenv(name, folder)
-    before, told = jax.config.jax_compilation_cache_dir, None
-    try:
-        jax.config.update("jax_compilation_cache_dir", None)
-        compilation_cache.enable()
-        told = jax.config.jax_compilation_cache_dir
-    finally:
-        jax.config.update("jax_compilation_cache_dir", before)
-
-    assert told == expected

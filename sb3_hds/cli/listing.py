@@ -2,9 +2,11 @@
 
 import argparse
 import inspect
+import json
 import re
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -15,28 +17,42 @@ _OF_A_TWIN = (
     "A parameter of the twin differs from its nominal value: each one of 'sb3-hds twins' that "
     "--calibrate does not name. Always a candidate; --effects does not take it."
 )
+#: the rows that :func:`rows_of_effects` makes, stored: reading the classes imports JAX
+STORED = Path(__file__).with_name("effects.json")
 
 
 def run_effects(given: argparse.Namespace) -> None:
     """All candidates, or those that have the words, with units and explanations."""
-    from sb3_hds.effects import ALL
-
     columns = ("effect", "acts on", "parameters", "what it is")
-    rows = [
-        (
-            effect.name,
-            effect.slot,
-            ", ".join(map(_sized, effect.parameters.items())),
-            effect.explanation + _FURTHER.get(effect.name, ""),
-        )
-        for effect in ALL
-    ]
-    rows.append(("parameter.NAME", "twin", "its own [unit]", _OF_A_TWIN))
+    rows = [tuple(row) for row in json.loads(STORED.read_text())]
     _show(columns, _with_words(rows, given.words, "effect"))
     print(
         "Units at joints are those of a rotary joint; for a slider, read N and m in place of N m "
         "and rad."
     )
+
+
+def rows_of_effects() -> list[list[str]]:
+    """:return: of each candidate, its name, what it acts on, its parameters, what it is"""
+    from sb3_hds.effects import ALL
+
+    rows = [
+        [
+            effect.name,
+            effect.slot,
+            ", ".join(map(_sized, effect.parameters.items())),
+            effect.explanation + _FURTHER.get(effect.name, ""),
+        ]
+        for effect in ALL
+    ]
+    return [*rows, ["parameter.NAME", "twin", "its own [unit]", _OF_A_TWIN]]
+
+
+def store_effects() -> None:
+    """Write the rows anew, after an effect was added or changed."""
+    temporary = STORED.with_suffix(".tmp")
+    temporary.write_text(json.dumps(rows_of_effects(), indent=1) + "\n")
+    temporary.replace(STORED)
 
 
 def _sized(parameter: "tuple[str, Parameter]") -> str:
@@ -106,3 +122,7 @@ def _show(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         # Units in brackets are no markup.
         table.add_row(*(escape(str(cell)) for cell in row))
     Console(width=None if sys.stdout.isatty() else 120).print(table)
+
+
+if __name__ == "__main__":
+    store_effects()

@@ -203,11 +203,12 @@ def _function_of(policy: Any) -> PolicyFunction | None:
     """
     :raises ExportError: for a policy of another kind
     """
-    from sbx.common.policies import BaseJaxPolicy
     from stable_baselines3.common.policies import BasePolicy
 
     if hasattr(policy, "policy_function"):
         return policy.policy_function()
+    from sbx.common.policies import BaseJaxPolicy
+
     if isinstance(policy, BaseJaxPolicy):
 
         def of_one(obs: Any) -> Any:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from sb3_hds.core import Parameter, Trajectories, Twin
 from sb3_hds.core.contract import check_methods
+from sb3_hds.core.numerics.kept_programs import keep_programs
 from sb3_hds.core.trajectories.episodes import same_interval
 from sb3_hds.data.resampling.report import Reading
 from sb3_hds.errors import CalibrationError
@@ -90,6 +91,7 @@ def calibrate(
     :raises TwinError: for a twin whose methods do not return what they have to
     """
     check_methods(twin)
+    keep_programs()
     wanted = tie(twin, free_names(twin, free), tied or {})
     check_fits(twin, data)
     if loss not in ("huber", "linear"):

@@ -3,8 +3,8 @@
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
-from scipy import stats
 
 from sb3_hds.core import Trajectories
 
@@ -65,8 +65,8 @@ def compare(
     if n < 2:
         return Comparison(float(1.0 - np.exp(-ratio.mean())), 1.0, -np.inf, 1.0, n)
     stderr = max(ratio.std(ddof=1) / np.sqrt(n), 1e-12)
-    p_value = float(stats.t.sf(ratio.mean() / stderr, n - 1))
-    half = stats.t.ppf(0.95, n - 1) * stderr
+    p_value = float(scipy.stats.t.sf(ratio.mean() / stderr, n - 1))
+    half = scipy.stats.t.ppf(0.95, n - 1) * stderr
     low, gain, high = 1.0 - np.exp(-ratio.mean() - np.array([-half, 0.0, half]))
     return Comparison(float(gain), p_value, float(low), float(high), n)
 
@@ -85,7 +85,7 @@ def confirm(
     ratio = np.log(before / after)
     if not np.any(ratio):
         return verdict
-    by_window: Any = stats.wilcoxon(ratio, alternative="greater")
+    by_window: Any = scipy.stats.wilcoxon(ratio, alternative="greater")
     return verdict._replace(p_value=min(verdict.p_value, _STRICTER * float(by_window.pvalue)))
 
 
@@ -125,7 +125,7 @@ def by_scores(
     variance = max(float(np.sum(noise[unit >= 0] ** 2)), correction * float(np.sum(by_unit**2)))
     if not variance:
         return 1.0
-    return float(stats.t.sf(leans[unit >= 0].sum() / np.sqrt(variance), len(labels) - 1))
+    return float(scipy.stats.t.sf(leans[unit >= 0].sum() / np.sqrt(variance), len(labels) - 1))
 
 
 def split(data: Trajectories, origin: Int[np.ndarray, " n"], seed: int) -> Split:

@@ -4,8 +4,8 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy import stats
 
 from sb3_hds.sysid.remainder import MissingForce, ShortWindows
 
@@ -101,9 +101,9 @@ def _tested(
     # So many windows of equal weight would know as much of the waves as these.
     weight = np.einsum("nkk->n", left_out)
     equal = np.sum(weight) ** 2 / max(np.sum(weight**2), 1e-300)
-    p_value = float(stats.f.sf(statistic / n_waves, n_waves, max(equal - n_waves, 1.0)))
+    p_value = float(scipy.stats.f.sf(statistic / n_waves, n_waves, max(equal - n_waves, 1.0)))
     # Windows may scatter less than the noise says, part of which are errors that nobody minds.
-    p_value = max(p_value, float(stats.chi2.sf(gained, n_waves)))
+    p_value = max(p_value, float(scipy.stats.chi2.sf(gained, n_waves)))
     return _Tested(p_value, 0.5 * real * gained)
 
 
@@ -119,5 +119,5 @@ def _quantities(missing: MissingForce) -> Iterator[tuple[str, np.ndarray]]:
 
 def _waves(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
     """Cosines over the ranks: as many windows everywhere, whatever the quantity's distribution."""
-    rank = (stats.rankdata(values) - 0.5) / len(values)
+    rank = (scipy.stats.rankdata(values) - 0.5) / len(values)
     return np.cos(np.pi * np.outer(rank, np.arange(1, _WAVES + 1)))

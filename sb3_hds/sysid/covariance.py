@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
-from scipy import stats
 
 # With fewer recordings than this more than there are parameters, windows count as independent.
 _FEWEST_RECORDINGS = 12
@@ -30,7 +30,7 @@ class Spread(NamedTuple):
 
     def quantile(self, level: float) -> float:
         """:return: half the width of a confidence interval, in standard errors"""
-        return float(stats.t.ppf(0.5 + 0.5 * level, self.freedom))
+        return float(scipy.stats.t.ppf(0.5 + 0.5 * level, self.freedom))
 
 
 def covariance_of(

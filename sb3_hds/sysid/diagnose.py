@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from sb3_hds.core import Effect, Trajectories, Twin
 from sb3_hds.core.contract import check_methods
+from sb3_hds.core.numerics.kept_programs import keep_programs
 from sb3_hds.effects import ALL, effect_named
 from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.calibrate import check_fits
@@ -65,6 +66,7 @@ def diagnose(
             f"{type(twin).__name__} and {type(data).__name__}."
         )
     check_methods(twin)
+    keep_programs()
     check_fits(twin, data)
     if budget not in EFFORTS:
         raise CalibrationError(f"budget must be 'full' or 'quick', got {budget!r}.")

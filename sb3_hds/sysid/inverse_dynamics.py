@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy.optimize import lsq_linear
 
 from sb3_hds.core import AnalyticTwin, State, Trajectories, Twin
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
@@ -117,7 +117,7 @@ def _within(table: np.ndarray, right: np.ndarray, room: tuple[np.ndarray, np.nda
     found = np.zeros(len(low))
     free = ~fixed
     if free.any():
-        found[free] = lsq_linear(table[:, free], right, (low[free], high[free])).x
+        found[free] = scipy.optimize.lsq_linear(table[:, free], right, (low[free], high[free])).x
     return found
 
 

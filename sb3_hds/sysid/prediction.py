@@ -6,8 +6,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy import stats
 
 from sb3_hds.core import Params, Trajectories, Twin
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
@@ -109,7 +109,7 @@ def has_grown(latest: Float[np.ndarray, " n"], older: Float[np.ndarray, " m"]) -
     level that allows for looking often).
     """
     new, old = (np.log(np.clip(errors, 1e-9, 1e9)) for errors in (latest, older))
-    test: Any = stats.ttest_ind(new, old, equal_var=False, alternative="greater")
+    test: Any = scipy.stats.ttest_ind(new, old, equal_var=False, alternative="greater")
     return bool(new.mean() - old.mean() > np.log(_GROWN) and test.pvalue < _GROWN_LEVEL)
 
 
@@ -125,7 +125,7 @@ def probability_before(fit: Fit, believed: Twin) -> float:
         (e.estimate - believed.values[e.name]) / believed.parameters[e.name].scale
         for e in fit.estimates
     ]
-    return float(stats.chi2.sf(np.sum(np.square(away)), len(away)))
+    return float(scipy.stats.chi2.sf(np.sum(np.square(away)), len(away)))
 
 
 def hold_out(number: np.ndarray, place: np.ndarray, share: float = 0.25) -> np.ndarray:

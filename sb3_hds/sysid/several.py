@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from sb3_hds.sysid.comparison import Comparison, confirm
 from sb3_hds.sysid.equation.selection import Member
@@ -151,7 +151,7 @@ def _accepted(
     )
     worse = {t.candidate.key for t in tried if not as_good(search.better(base.kept, t.kept))}
     equal = [k for k in others if k not in worse]
-    chance = float(stats.t.sf(member.t, _FREEDOM)) * len(known)
+    chance = float(scipy.stats.t.sf(member.t, _FREEDOM)) * len(known)
     same = Tried(candidate, base.point, base.kept, member.gain)
     return Accepted(same, verdict, tuple(equal), min(chance, 1.0))
 

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Int
-from scipy import stats
 
 from sb3_hds.sysid.account import standard_errors
 from sb3_hds.sysid.comparison import Comparison
@@ -102,7 +102,7 @@ def finding(
 
 def margin(n_units: int, stderr: np.ndarray) -> np.ndarray:
     """:return: half the width of a symmetric interval"""
-    return stats.t.ppf(0.5 + 0.5 * _CONFIDENCE, max(n_units - 1, 1)) * stderr
+    return scipy.stats.t.ppf(0.5 + 0.5 * _CONFIDENCE, max(n_units - 1, 1)) * stderr
 
 
 def to_tell_apart(found: Sequence[Accepted], hypotheses: Hypotheses) -> list[str]:

@@ -6,9 +6,10 @@ from typing import Any, Self
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from sbx.common.policies import BaseJaxPolicy
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space, maybe_transpose
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import get_device
+from stable_baselines3.common.utils import get_device, is_vectorized_observation
 
 from sb3_hds.algos.base.files import (
     by_names,
@@ -63,9 +64,10 @@ class PolicyConfig:
         return {name: getattr(self, name) for name in names}
 
 
-class TensorPolicy(BaseJaxPolicy):
+class TensorPolicy(BasePolicy):
     """
-    A policy whose networks are pytrees, saved as tensors.
+    A policy whose networks are pytrees, saved as tensors. It extends SB3's base class, not SBX's:
+    that one imports TensorFlow Probability, which nothing here needs.
 
     Subclasses implement ``weights`` and ``training_state``, each with a setter, and keep what they
     were made with in ``arguments``.
@@ -88,7 +90,24 @@ class TensorPolicy(BaseJaxPolicy):
             not finite
         """
         refuse_odd(observation)
-        return super().predict(observation, state, episode_start, deterministic)
+        batch, vectorized = self.prepare_obs(observation)
+        actions = np.array(self._predict(batch, deterministic=deterministic))
+        actions = actions.reshape(-1, *self.action_space.shape)  # type: ignore[misc]
+        if self.squash_output:
+            actions = self.unscale_action(np.clip(actions, -1.0, 1.0))
+        else:
+            space: Any = self.action_space
+            actions = np.clip(actions, space.low, space.high)
+        return actions if vectorized else actions.squeeze(axis=0), state
+
+    def prepare_obs(self, observation: Any) -> tuple[Any, bool]:
+        """:return: a batch of observations, and whether it was one already"""
+        space = self.observation_space
+        if is_image_space(space):
+            observation = maybe_transpose(observation, space)
+        rows = np.array(observation)
+        vectorized = is_vectorized_observation(rows, space)
+        return rows.reshape(-1, *space.shape), vectorized  # type: ignore[misc]
 
     def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
         """Rounding may lead out of the bounds, by one unit in the last place."""

@@ -27,6 +27,7 @@ from sb3_hds.algos.base.construct import (
 )
 from sb3_hds.algos.base.description import described
 from sb3_hds.algos.base.files import by_names, damage_reported, name_of, refuse_damaged, write_whole
+from sb3_hds.core.numerics.kept_programs import keep_programs
 from sb3_hds.errors import EnvironmentMismatchError
 
 if TYPE_CHECKING:
@@ -80,6 +81,7 @@ class SavesTensors(BaseAlgorithm):
 
         :param more: arguments of SB3's constructor that are not the user's to choose
         """
+        keep_programs()
         policy, env = policy_and_env(
             type(self), config.policy, config.env, self.check_observations, config.monitor_wrapper
         )

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy.signal import savgol_filter
 
 from sb3_hds.core import (
     Params,
@@ -371,7 +371,7 @@ def _thinned(
 def smooth_mean(x: np.ndarray, half: int) -> np.ndarray:
     """:return: the value of a local cubic in windows of ``2 half + 1`` samples"""
     width = min(2 * half + 1, len(x) - (1 - len(x) % 2))
-    return np.asarray(savgol_filter(x, width, 3, mode="interp")) if width > 3 else x
+    return np.asarray(scipy.signal.savgol_filter(x, width, 3, mode="interp")) if width > 3 else x
 
 
 def _rms(pieces: list[np.ndarray]) -> np.ndarray:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from sb3_hds.core import Effect
 from sb3_hds.sysid.equation.problem import Problem, Solution
@@ -480,7 +480,7 @@ def members(p: Problem, keys: Sequence[int], effects: Mapping[str, Effect | None
     """
     found = p.solve(keys)
     covariance = _covariance(p, keys, found)
-    quantile = stats.t.ppf(0.5 + _CONFIDENCE / 2.0, max(p.grams.n_blocks - 1, 5))
+    quantile = scipy.stats.t.ppf(0.5 + _CONFIDENCE / 2.0, max(p.grams.n_blocks - 1, 5))
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     stderr = dict(zip(found.free, errors, strict=True))
     base, held, out = p.score(keys, priced=False), p.held_out(keys), []

@@ -8,8 +8,8 @@ largest at which what it leaves is still noise.
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.ndimage import convolve1d
 
 # Degree of the polynomial, and half widths of its window in samples.
 _DEGREE, _HALVES = 4, (3, 4, 6, 8, 11, 15, 20, 28, 40)
@@ -102,9 +102,9 @@ def _fitted(
     def at(x: float, order: int) -> np.ndarray:
         """In the interior the fit is a convolution; at both ends the outermost window serves."""
         here = slope(np.array([x]), order)[0]
-        out = convolve1d(q, (here @ of_q)[::-1], mode="nearest")
+        out = scipy.ndimage.convolve1d(q, (here @ of_q)[::-1], mode="nearest")
         if v is not None:
-            out = out + convolve1d(v, (here @ of_v)[::-1], mode="nearest")
+            out = out + scipy.ndimage.convolve1d(v, (here @ of_v)[::-1], mode="nearest")
         for edge, first in (
             (slice(0, half), 0),
             (slice(len(q) - half, None), len(q) - 2 * half - 1),
