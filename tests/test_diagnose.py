@@ -144,7 +144,6 @@ def test_a_joint_that_is_counted_the_other_way_round_is_a_matter_of_convention()
 @each(
     (effects.Backlash("hinge", gap=0.15), 0.4),
     expensive(effects.JointElasticity("hinge", k=0.3, d=0.002), 0.05),
-    expensive(effects.Cogging("hinge", amplitude=0.03, period=0.3, phase=0.1), 0.05),
     expensive(effects.StribeckFriction("hinge", tau_c=0.01, tau_s=0.03, v_s=0.6), 0.05),
     ids=lambda value: getattr(value, "name", None),
 )
@@ -178,8 +177,6 @@ SLACK = effects.ClearanceSpring("hinge", k=0.3, low=-0.3, high=0.3), RUBBING
 @each(
     # Where no cause comes near.
     ([YIELDING], ["SensorBias"], [], "hysteresis.hinge"),
-    # What comes nearest is no cause where a force without a name predicts better.
-    expensive([YIELDING], ["Stiffness", "CoulombFriction"], [], "hysteresis.hinge (tau_c = 0."),
     # Beside one, a cause is still named.
     expensive(
         SLACK, ["Stiffness", "ViscousFriction"], ["viscous_friction"], "clearance_spring.hin"

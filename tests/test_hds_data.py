@@ -142,7 +142,8 @@ def test_what_has_no_parameter_is_left_to_the_learned_force():
     twin = twins.make("PendulumReal")
     data = measured(twin.extend(effects.CoulombFriction(0, tau_c=0.4)), noise=0.005, n=10)
 
-    found = corrected(twin, data, beta="auto", suspected=())
+    small = {"n_members": 2, "net_arch": [16]}
+    found = corrected(twin, data, beta="auto", suspected=(), residual_kwargs=small)
 
     assert found.beta > 0.0 and force_of(found.twin) is not None
     assert found.error_hybrid < 0.9 * found.error_calibrated < 0.9 * found.error_twin

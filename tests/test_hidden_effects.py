@@ -31,8 +31,8 @@ SALT = int(os.environ.get("SB3_HDS_SALT", "0"))
 RUNS = 200
 
 
-#: of the fourteen cases
-KINDS = Counter(effect=6, null=2, outside=2, pair=1, still=1) + Counter(NULLS[1:3])
+#: of the eight cases; benchmarks/hidden_effects.py runs hundreds
+KINDS = Counter(effect=4, null=1, outside=1, still=1) + Counter(NULLS[1:2])
 
 
 @pytest.mark.parametrize("system", SYSTEMS)
@@ -185,7 +185,7 @@ def table(tmp_path_factory):
     return prepared(pd.DataFrame(rows))
 
 
-# Fourteen diagnoses take some six minutes.
+# Eight diagnoses take some three minutes.
 def hidden(test):
     return pytest.mark.expensive(pytest.mark.timeout(3600)(test))
 
