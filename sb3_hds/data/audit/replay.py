@@ -54,7 +54,9 @@ class Replay(NamedTuple):
 
     def _by_acceleration(self, part: Float[np.ndarray, "n rows dof"]) -> np.ndarray:
         """Median over the half of the stretches in which a joint accelerates most."""
-        size, whole = (np.sum(x**2, axis=1) for x in (part, self.measured - self.extrapolated))
+        # A simulation without the friction of a machine may blow up: its error is infinite then.
+        with np.errstate(over="ignore", invalid="ignore"):
+            size, whole = (np.sum(x**2, axis=1) for x in (part, self.measured - self.extrapolated))
         fast = whole >= np.median(whole, axis=0)
         ratio = size / np.maximum(whole, np.finfo(float).tiny)
         ratio = np.where(np.isfinite(ratio), ratio, np.inf)
