@@ -256,7 +256,7 @@ def run(
     :return: what was planted and what was said
     """
     from sb3_hds import effects
-    from sb3_hds.sysid.inquiry import Inquiry
+    from sb3_hds.sysid.diagnosis.pipeline import Inquiry
 
     if (kind or kind_of(system, number)[0]) == SEVERAL:
         case, data, motion = several_cases.draw(system, number, noise=noise, most=most)

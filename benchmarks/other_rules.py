@@ -26,7 +26,7 @@ class Answer(NamedTuple):
 
 def asked(inquiry) -> dict[str, Answer]:
     """
-    :param inquiry: a `sb3_hds.sysid.inquiry.Inquiry` that has run
+    :param inquiry: a `sb3_hds.sysid.diagnosis.pipeline.Inquiry` that has run
     :return: by rule, what it says
     """
     search, h = inquiry.search, inquiry.hypotheses
@@ -75,7 +75,7 @@ def by_held_out(search, start, tried) -> Answer:
 
 def by_parameters(search, h, start) -> Answer:
     """Fit what the twin has; the parameter that moved most, in standard errors, is the cause."""
-    from sb3_hds.sysid.account import standard_errors
+    from sb3_hds.sysid.diagnosis.account import standard_errors
 
     own = [h.indices(c)[0] for c in h.candidates if c.slot == "parameter"]
     free = [*start.free, *own]
@@ -90,7 +90,7 @@ def by_parameters(search, h, start) -> Answer:
 
 def by_regression(inquiry, start) -> Answer:
     """Sequentially thresholded least squares (SINDy) of the missing force."""
-    from sb3_hds.sysid.remainder import missing_force, short_windows, weighed
+    from sb3_hds.sysid.comparison.unexplained import missing_force, short_windows, weighed
 
     short = short_windows(inquiry.search.select.evidence, start.point.theta, inquiry.data)
     missing = missing_force(short, inquiry.data)
@@ -145,8 +145,8 @@ def by_network(inquiry, start) -> Answer:
     """A network learns the missing force; something is wrong if it predicts any of the rest."""
     import torch
 
-    from sb3_hds.sysid.comparison import split
-    from sb3_hds.sysid.remainder import missing_force, short_windows, weighed
+    from sb3_hds.sysid.comparison.held_out import split
+    from sb3_hds.sysid.comparison.unexplained import missing_force, short_windows, weighed
 
     short = short_windows(inquiry.search.select.evidence, start.point.theta, inquiry.data)
     missing = missing_force(short, inquiry.data)

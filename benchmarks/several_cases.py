@@ -387,7 +387,7 @@ def visible(screened: Any, truths: Sequence[str]) -> list[bool]:
     without it as something twice as large as the detection limit would. That is four times the
     price of a cause, in -2 log likelihood.
 
-    :param screened: a `sb3_hds.sysid.screening.Screened`
+    :param screened: a `sb3_hds.sysid.equation.screening.Screened`
     :param truths: causes with their places; those that have no column count as visible
     """
     p = screened.problem
@@ -429,7 +429,7 @@ def _usual(system: str, noise: str, seen: str, loop: str) -> Usual:
 def _measured(system: str, noise: str, seen: str, loop: str) -> dict[str, Any]:
     from sb3_hds import effects
     from sb3_hds.sysid.equation.motion import motion
-    from sb3_hds.sysid.screening import screen
+    from sb3_hds.sysid.equation.screening import screen
 
     case = dataclasses.replace(nothing(system, noise), kind=SEVERAL, seen=seen, loop=loop)
     data, moved = _driven(case, 99)

@@ -54,7 +54,7 @@ class Answer(NamedTuple):
 
 def asked(inquiry: Any, twin: Any, data: Any, budget: str) -> dict[str, Answer]:
     """
-    :param inquiry: a `sb3_hds.sysid.inquiry.Inquiry` about these data
+    :param inquiry: a `sb3_hds.sysid.diagnosis.pipeline.Inquiry` about these data
     :return: by rule, what it says
     """
     found: dict[str, Answer] = {}
@@ -78,7 +78,7 @@ def _timed(rule: Callable[[], list[str]]) -> Answer:
 
 # ------------------------------------------------------------------------------ equation of motion
 def regression_of(screened: Any) -> Regression:
-    """:param screened: a `sb3_hds.sysid.screening.Screened`"""
+    """:param screened: a `sb3_hds.sysid.equation.screening.Screened`"""
     from sb3_hds.sysid.equation.columns import equation
     from sb3_hds.sysid.equation.terms import terms
 
@@ -169,8 +169,8 @@ def by_simulation(twin: Any, data: Any, seed: int) -> list[str]:
     toolbox for system identification does; what has an interval without its null is a cause.
     """
     from sb3_hds import effects
-    from sb3_hds.sysid.account import standard_errors
-    from sb3_hds.sysid.inquiry import Inquiry
+    from sb3_hds.sysid.diagnosis.account import standard_errors
+    from sb3_hds.sysid.diagnosis.pipeline import Inquiry
 
     kinds = (
         effects.ViscousFriction,
@@ -201,7 +201,7 @@ def by_simulation(twin: Any, data: Any, seed: int) -> list[str]:
 def one_by_one(twin: Any, data: Any, seed: int, budget: str) -> list[str]:
     """`diagnose` without the stage of several causes: candidates alone, each by simulation."""
     from sb3_hds import effects
-    from sb3_hds.sysid.inquiry import Inquiry
+    from sb3_hds.sysid.diagnosis.pipeline import Inquiry
 
     with _without_screening():
         inquiry = Inquiry(twin, data, effects.ALL, (), seed, budget, False)
@@ -211,7 +211,7 @@ def one_by_one(twin: Any, data: Any, seed: int, budget: str) -> list[str]:
 @contextmanager
 def _without_screening() -> Iterator[None]:
     """Nothing is proposed by equation errors: every candidate is simulated."""
-    from sb3_hds.sysid import inquiry
+    from sb3_hds.sysid.diagnosis import pipeline as inquiry
 
     screen = inquiry.screen
     inquiry.screen = lambda *_: None

@@ -20,7 +20,7 @@ from sb3_hds.experiments.policy_gain import _summarised
 from sb3_hds.sysid import Diagnosis
 from sb3_hds.twins import registry
 
-diagnose_module = importlib.import_module("sb3_hds.sysid.diagnose")
+diagnose_module = importlib.import_module("sb3_hds.sysid.diagnosis.diagnose")
 
 
 def ask(*words):
@@ -168,7 +168,7 @@ def asked(monkeypatch):
         warnings.warn("Rows are\nuneven.", UserWarning, stacklevel=2)
         return Diagnosis("none", twin, twin, data_hash="", seed=0)
 
-    monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
+    monkeypatch.setattr("sb3_hds.sysid.diagnosis.diagnose", diagnose)
     return seen
 
 

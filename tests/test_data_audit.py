@@ -15,7 +15,7 @@ from sb3_hds.core import Channel, State
 from sb3_hds.data import Finding
 from sb3_hds.effects import CoulombFriction
 from sb3_hds.errors import TrajectoryError
-from sb3_hds.sysid.timing import in_step
+from sb3_hds.sysid.checks.timing import in_step
 
 pytestmark = pytest.mark.filterwarnings("ignore::sb3_hds.data.SamplingWarning")
 

@@ -10,20 +10,20 @@ from measuring import jumping, measured
 
 from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import Trajectories
-from sb3_hds.sysid import inquiry
-from sb3_hds.sysid.account import standard_errors
-from sb3_hds.sysid.comparison import Comparison, compare, confirm, split
-from sb3_hds.sysid.constancy import Change
-from sb3_hds.sysid.diagnosis import HorizonGain
-from sb3_hds.sysid.evidence import Evidence, Point
-from sb3_hds.sysid.guesses import newton
-from sb3_hds.sysid.hypotheses import Candidate, Hypotheses
-from sb3_hds.sysid.progress import Bar
-from sb3_hds.sysid.remainder import MissingForce, remainder
-from sb3_hds.sysid.search import Half, Search
-from sb3_hds.sysid.sentence import several_in_words
-from sb3_hds.sysid.shooting import shots_of
-from sb3_hds.sysid.telling import NAMELESS, contradiction, errs_more, out_of_reach
+from sb3_hds.sysid.checks.parameter_stability import Change
+from sb3_hds.sysid.comparison.held_out import Comparison, compare, confirm, split
+from sb3_hds.sysid.comparison.search import Half, Search
+from sb3_hds.sysid.comparison.starts import newton
+from sb3_hds.sysid.comparison.unexplained import MissingForce, remainder
+from sb3_hds.sysid.diagnosis import pipeline as inquiry
+from sb3_hds.sysid.diagnosis.account import standard_errors
+from sb3_hds.sysid.diagnosis.findings import NAMELESS, contradiction, errs_more, out_of_reach
+from sb3_hds.sysid.diagnosis.progress import Bar
+from sb3_hds.sysid.estimation.evidence import Evidence, Point
+from sb3_hds.sysid.estimation.hypotheses import Candidate, Hypotheses
+from sb3_hds.sysid.estimation.shooting import shots_of
+from sb3_hds.sysid.reporting.diagnosis import HorizonGain
+from sb3_hds.sysid.reporting.sentence import several_in_words
 
 KINDS = ["ViscousFriction", "CoulombFriction", "TorqueGain", "ActionDelay"]
 TWIN = twins.make("PendulumReal")

@@ -9,11 +9,11 @@ import pytest
 
 from sb3_hds import diagnose
 from sb3_hds.core import rollout
-from sb3_hds.sysid.calibrate import spread_of
-from sb3_hds.sysid.evidence import Evidence, portion_for
-from sb3_hds.sysid.hypotheses import Hypotheses
-from sb3_hds.sysid.motion import motion_of
-from sb3_hds.sysid.shooting import shots_of
+from sb3_hds.sysid.estimation.calibrate import spread_of
+from sb3_hds.sysid.estimation.evidence import Evidence, portion_for
+from sb3_hds.sysid.estimation.hypotheses import Hypotheses
+from sb3_hds.sysid.estimation.motion import motion_of
+from sb3_hds.sysid.estimation.shooting import shots_of
 
 pytestmark = [
     pytest.mark.measured,

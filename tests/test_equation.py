@@ -6,15 +6,15 @@ import pytest
 import servo_leg
 
 from sb3_hds import Trajectories, effects, twins
-from sb3_hds.sysid.conventions import other_convention
+from sb3_hds.sysid.checks.conventions import other_convention
+from sb3_hds.sysid.checks.leapfrog import in_step_with_the_log
 from sb3_hds.sysid.equation.columns import equation
 from sb3_hds.sysid.equation.motion import differences, kinematics, motion
+from sb3_hds.sysid.equation.screening import screen
 from sb3_hds.sysid.equation.smoothing import smooth, white_noise
 from sb3_hds.sysid.equation.terms import effective_inertia, terms
 from sb3_hds.sysid.equation.weak_form import weak_rows
-from sb3_hds.sysid.hypotheses import Hypotheses
-from sb3_hds.sysid.leapfrog import in_step_with_the_log
-from sb3_hds.sysid.screening import screen
+from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 
 
 def proposed(twin, data, calibrate=()):

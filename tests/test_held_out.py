@@ -9,7 +9,7 @@ from small_models import small
 from sb3_hds import HDS, twins
 from sb3_hds.algos.twin.hds import correction
 from sb3_hds.errors import CalibrationError
-from sb3_hds.sysid.prediction import hold_out
+from sb3_hds.sysid.estimation.prediction import hold_out
 
 REAL = "sb3_hds/PendulumReal-v1"
 

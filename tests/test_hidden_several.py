@@ -17,9 +17,9 @@ from several_cases import SEVERAL, share_of_friction, visible
 from several_scores import judged
 
 from sb3_hds import effects
+from sb3_hds.sysid.checks.leapfrog import in_step_with_the_log
 from sb3_hds.sysid.equation.motion import motion
-from sb3_hds.sysid.leapfrog import in_step_with_the_log
-from sb3_hds.sysid.screening import screen
+from sb3_hds.sysid.equation.screening import screen
 
 VISCOUS, DRY = "viscous_friction.axis", "coulomb_friction.axis"
 

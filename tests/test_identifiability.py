@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sb3_hds.sysid.evidence import Point, Slopes
-from sb3_hds.sysid.family import chance_of_the_best
-from sb3_hds.sysid.profile import profiled
+from sb3_hds.sysid.comparison.family import chance_of_the_best
+from sb3_hds.sysid.comparison.profile import profiled
+from sb3_hds.sysid.estimation.evidence import Point, Slopes
 
 N_WINDOWS, N_ROWS, N_CANDIDATES = 30, 40, 25
 

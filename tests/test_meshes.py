@@ -9,9 +9,9 @@ from scipy.spatial import ConvexHull
 
 from sb3_hds import twins
 from sb3_hds.core import State
-from sb3_hds.sysid.film import section_of
-from sb3_hds.sysid.moving import moving_of
-from sb3_hds.sysid.pictures import replay_of
+from sb3_hds.sysid.reporting.film import section_of
+from sb3_hds.sysid.reporting.moving import moving_of
+from sb3_hds.sysid.reporting.pictures import replay_of
 
 BOX = np.array([[x, y, z] for x in (-0.1, 0.2) for y in (-0.05, 0.05) for z in (0.0, 0.5)])
 ARM = """<robot name="arm"><link name="world"/><link name="base"/>

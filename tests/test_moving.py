@@ -9,9 +9,9 @@ from browser import in_chromium, needs_chromium
 from sb3_hds import twins
 from sb3_hds.core import State
 from sb3_hds.errors import ParameterError
-from sb3_hds.sysid.film import STYLE, check_film, section_of, write_film
-from sb3_hds.sysid.moving import moving_of
-from sb3_hds.sysid.pictures import replay_of
+from sb3_hds.sysid.reporting.film import STYLE, check_film, section_of, write_film
+from sb3_hds.sysid.reporting.moving import moving_of
+from sb3_hds.sysid.reporting.pictures import replay_of
 
 
 def replayed(twin, n=2, rows=30):

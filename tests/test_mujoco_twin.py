@@ -20,7 +20,7 @@ from sb3_hds import Trajectories, effects, twins
 from sb3_hds.core import State, rollout
 from sb3_hds.data import audit
 from sb3_hds.errors import ModelFileError, ParameterError
-from sb3_hds.sysid.hypotheses import Hypotheses
+from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 
 EXPENSIVE = pytest.mark.expensive
 pytestmark = pytest.mark.usefixtures("x64")

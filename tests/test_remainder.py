@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_hds.sysid.remainder import _by_chance
+from sb3_hds.sysid.comparison.unexplained import _by_chance
 
 N_SETS, N_UNITS = 11, 8
 

@@ -66,11 +66,11 @@ def _check_targets(given: argparse.Namespace) -> None:
         check_target(target)
     measured.check_write(given)
     if given.animate:
-        from sb3_hds.sysid.film import check_film
+        from sb3_hds.sysid.reporting.film import check_film
 
         check_film(given.animate)
     if given.report:
-        from sb3_hds.sysid.report import check_installed, check_page
+        from sb3_hds.sysid.reporting.page import check_installed, check_page
 
         check_page(given.report)
         check_installed()

@@ -25,8 +25,8 @@ from sb3_hds.envs import TwinEnv, true_twin
 from sb3_hds.errors import EnvironmentMismatchError, ParameterError, TrajectoryError
 from sb3_hds.experiments.returns import returns_of
 from sb3_hds.sysid import Diagnosis
-from sb3_hds.sysid.plots import as_png, plot_policy_gain
-from sb3_hds.sysid.wording import policy_in_words
+from sb3_hds.sysid.reporting.figures import as_png, plot_policy_gain
+from sb3_hds.sysid.reporting.wording import policy_in_words
 from sb3_hds.wrappers.episodes.step_limit import step_limit_of
 
 _N_RESAMPLES = 2000

@@ -1,10 +1,10 @@
 """System identification: what measured data say about a twin."""
 
-from sb3_hds.sysid.calibrate import calibrate
-from sb3_hds.sysid.diagnose import diagnose
-from sb3_hds.sysid.diagnosis import Diagnosis, Finding
-from sb3_hds.sysid.residual import Residual, fit_residual
-from sb3_hds.sysid.results import Estimate, Fit
+from sb3_hds.sysid.diagnosis.diagnose import diagnose
+from sb3_hds.sysid.estimation.calibrate import calibrate
+from sb3_hds.sysid.estimation.residual_force import Residual, fit_residual
+from sb3_hds.sysid.estimation.results import Estimate, Fit
+from sb3_hds.sysid.reporting.diagnosis import Diagnosis, Finding
 
 __all__ = [
     "Diagnosis",

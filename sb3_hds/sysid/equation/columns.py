@@ -27,7 +27,7 @@ from sb3_hds.effects import SensorDelay
 from sb3_hds.effects.joint import DryFriction
 from sb3_hds.sysid.equation.motion import Motion
 from sb3_hds.sysid.equation.terms import Terms, effective_inertia, forces, portions, terms
-from sb3_hds.sysid.hypotheses import PARAMETER, Candidate, Hypotheses, encoders
+from sb3_hds.sysid.estimation.hypotheses import PARAMETER, Candidate, Hypotheses, encoders
 
 # Finite differences by a parameter or a sensor, in shares of its scale.
 _STEP = 1e-3

@@ -12,7 +12,7 @@ from sb3_hds.core import ActionEffect
 from sb3_hds.sysid.equation.columns import Equation, Item
 from sb3_hds.sysid.equation.plausibility import plausibility, rarity
 from sb3_hds.sysid.equation.weak_form import Grams
-from sb3_hds.sysid.hypotheses import PARAMETER, Hypotheses
+from sb3_hds.sysid.estimation.hypotheses import PARAMETER, Hypotheses
 
 # Variance of a size in units of what it would be alone: beyond that, columns cannot be told apart.
 _MOST_INFLATION = 200.0

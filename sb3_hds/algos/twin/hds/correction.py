@@ -23,15 +23,15 @@ from sb3_hds.algos.twin.model import missing_effects, nulls_of
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.errors import CalibrationError, TrajectoryError
 from sb3_hds.sysid import Fit
-from sb3_hds.sysid.calibrate import check_fits, fit_windows, spread_of
-from sb3_hds.sysid.free import each, every_name, free_names
-from sb3_hds.sysid.prediction import (
+from sb3_hds.sysid.estimation.calibrate import check_fits, fit_windows, spread_of
+from sb3_hds.sysid.estimation.free import each, every_name, free_names
+from sb3_hds.sysid.estimation.prediction import (
     gain,
     is_better,
     probability_before,
     single_step_errors,
 )
-from sb3_hds.sysid.residual import Residual, fit_force
+from sb3_hds.sysid.estimation.residual_force import Residual, fit_force
 
 # As `EXACT`, for nearly all of the latest single steps, since at rest any twin is exact: how
 # little, which share, of how many.

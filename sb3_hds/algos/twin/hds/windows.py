@@ -7,9 +7,9 @@ from jaxtyping import Float
 
 from sb3_hds.core import Params, Trajectories, Twin
 from sb3_hds.effects import force_of
-from sb3_hds.sysid.calibrate import default_window
-from sb3_hds.sysid.prediction import has_grown, hold_out, window_errors
-from sb3_hds.sysid.shooting import Shots, places_of, shots_of
+from sb3_hds.sysid.estimation.calibrate import default_window
+from sb3_hds.sysid.estimation.prediction import has_grown, hold_out, window_errors
+from sb3_hds.sysid.estimation.shooting import Shots, places_of, shots_of
 
 # A twin whose window errors are below this share of the channels' deviations needs no correction.
 EXACT = 1e-3

@@ -1,0 +1,123 @@
+"""Whether the size of a cause is the same wherever, whenever and however fast the system moves."""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from jaxtyping import Float
+
+from sb3_hds.sysid.comparison.unexplained import MissingForce, ShortWindows
+
+# Waves over the ranks of a quantity with which a size may change, and the level at which it does.
+_WAVES, _LEVEL = 4, 0.01
+# By which factor that level is stricter, because windows of one recording are not independent.
+_STRICTER = 25.0
+# Directions below this share of the largest curvature do not move; of what all windows know, the
+# share that others than one know at least.
+_RANK, _LEAST_OF_OTHERS = 1e-10, 1e-9
+
+
+class Change(NamedTuple):
+    """
+    :param goes_with: quantity with which the size of a cause changes
+    :param p_value: chance of that if it were constant
+    :param gain: by which the cost of the windows falls where it may change
+    """
+
+    goes_with: str
+    p_value: float
+    gain: float
+
+
+def change(
+    short: ShortWindows, missing: MissingForce, own: Sequence[int], free: Sequence[int]
+) -> Change | None:
+    r"""
+    A score test. Let a parameter :math:`\theta_i` become :math:`\theta_i + \sum_k c_k b_k(z)` with
+    waves :math:`b_k` over the ranks of a quantity :math:`z`. If it is constant, the slope of the
+    cost by each :math:`c_k`, with all that was fitted eliminated, has the mean zero; its variance
+    is that of the windows' slopes where the :math:`c_k` are fitted, so that the change itself does
+    not count as noise, each window left out of its own fit; the F distribution knows how many
+    windows tell of the change. A cause that is merely the nearest name, as dry friction is for
+    one that depends on position, fails this long before what it leaves can be told from noise.
+
+    Source: Hansen, *Testing for parameter instability in linear models*, J. Policy Modeling 14(4),
+    1992; Zeileis and Hornik, *Generalized M-fluctuation tests for parameter instability*,
+    Statistica Neerlandica 61(4), 2007 (scores ordered by any quantity).
+
+    :param missing: of the same windows
+    :param own: indices of the parameters of the cause
+    :param free: indices of all that was fitted, these among them
+    :return: what the cause changes with most, if it changes with anything
+    """
+    slopes = short.evidence.slopes(short.point, free)
+    quantities = list(_quantities(missing))
+    n_tests, found = len(own) * len(quantities), []
+    for parameter in (list(free).index(i) for i in own):
+        for name, values in quantities:
+            tested = _tested(slopes.curvature, slopes.scores, parameter, _waves(values))
+            found.append(Change(name, min(_STRICTER * n_tests * tested.p_value, 1.0), tested.gain))
+    sure = [one for one in found if one.p_value < _LEVEL]
+    return max(sure, key=lambda one: one.gain, default=None)
+
+
+class _Tested(NamedTuple):
+    p_value: float
+    gain: float
+
+
+def _tested(
+    curvature: Float[np.ndarray, "n f f"],
+    scores: Float[np.ndarray, "n f"],
+    parameter: int,
+    waves: Float[np.ndarray, "n k"],
+) -> _Tested:
+    at = parameter
+    whole = np.linalg.pinv(curvature.sum(0), rcond=_RANK, hermitian=True)
+    cross = np.einsum("nf,nk->fk", curvature[:, :, at], waves)
+    inner = np.einsum("n,nk,nl->kl", curvature[:, at, at], waves, waves)
+    follows = whole @ cross
+    free = np.linalg.pinv(inner - cross.T @ follows, rcond=_RANK, hermitian=True)
+
+    # How the waves, and what was fitted in their stead, move each window's scores.
+    moves = np.zeros((*waves.shape, curvature.shape[1]))
+    moves[:, :, at] = waves
+    moves -= follows.T
+
+    def by_window(scores: np.ndarray) -> np.ndarray:
+        return np.einsum("nkf,nf->nk", moves, scores)
+
+    slope = by_window(scores).sum(0)
+    of_fitted, of_waves = -whole @ scores.sum(0), -free @ slope
+    then = scores + curvature @ of_fitted + np.einsum("nfg,nkg,k->nf", curvature, moves, of_waves)
+    left_out = np.einsum("nkf,nfg,nlg->nkl", moves, curvature, moves) @ free
+    others = (1.0 + _LEAST_OF_OTHERS) * np.eye(waves.shape[1]) - left_out
+    noise = np.linalg.solve(others, by_window(then)[..., None])[..., 0]
+    statistic = float(slope @ np.linalg.pinv(noise.T @ noise, rcond=_RANK, hermitian=True) @ slope)
+    # Waves gain by chance, too: as much as they gain of the statistic.
+    n_waves, gained = waves.shape[1], float(slope @ free @ slope)
+    real = max(1.0 - n_waves / statistic, 0.0) if statistic else 0.0
+    # So many windows of equal weight would know as much of the waves as these.
+    weight = np.einsum("nkk->n", left_out)
+    equal = np.sum(weight) ** 2 / max(np.sum(weight**2), 1e-300)
+    p_value = float(scipy.stats.f.sf(statistic / n_waves, n_waves, max(equal - n_waves, 1.0)))
+    # Windows may scatter less than the noise says, part of which are errors that nobody minds.
+    p_value = max(p_value, float(scipy.stats.chi2.sf(gained, n_waves)))
+    return _Tested(p_value, 0.5 * real * gained)
+
+
+def _quantities(missing: MissingForce) -> Iterator[tuple[str, np.ndarray]]:
+    for joint in range(missing.position.shape[1]):
+        yield "position", missing.position[:, joint]
+        yield "velocity", missing.velocity[:, joint]
+        yield "speed", np.abs(missing.velocity[:, joint])
+    for actuator in range(missing.command.shape[1]):
+        yield "command", missing.command[:, actuator]
+    yield "time", missing.time
+
+
+def _waves(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
+    """Cosines over the ranks: as many windows everywhere, whatever the quantity's distribution."""
+    rank = (scipy.stats.rankdata(values) - 0.5) / len(values)
+    return np.cos(np.pi * np.outer(rank, np.arange(1, _WAVES + 1)))

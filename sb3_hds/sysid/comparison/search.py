@@ -1,0 +1,464 @@
+"""Which candidate explains what is left: proposed on some windows, confirmed on others."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sb3_hds.sysid.comparison.aliasing import imitators
+from sb3_hds.sysid.comparison.held_out import Comparison, by_scores, confirm, effective_size
+from sb3_hds.sysid.comparison.starts import Here, Places, guesses
+from sb3_hds.sysid.diagnosis.progress import Bar
+from sb3_hds.sysid.estimation.evidence import Evidence, Point, in_threads
+from sb3_hds.sysid.estimation.hypotheses import Candidate, Hypotheses
+from sb3_hds.sysid.estimation.shooting import Shots
+
+# What confirms a candidate: by which share the mean square error of held-out recordings falls, at
+# which level, and by how much the information criterion of the others.
+LEAST_GAIN, LEVEL, LEAST_BIC = 0.05, 0.025, 6.0
+# Another candidate belongs into the set unless it is worse than the best at this level.
+_LEVEL_OF_SET = 0.05
+# Candidates that may be confirmed, one after the other, and that others are tried beside.
+_MOST_LOOKS, _MOST_FIRSTS = 3, 4
+# Errors that differ by a smaller share are the same, however surely they differ.
+_SAME = 0.01
+# Mean square error of a window that cannot be simulated, in units of the noise.
+NOT_FINITE = 1e8
+# Steps of fits to the end, and of start states alone: to the end, and for a rough comparison.
+_ALL_STEPS, _KEPT_STEPS, _ROUGH_STEPS = 25, 6, 1
+
+_Given = TypeVar("_Given")
+_Told = TypeVar("_Told")
+
+
+class Half(NamedTuple):
+    """
+    :param evidence: windows of one half of the recordings
+    :param unit: piece of evidence of each window, shape ``(n,)``
+    :param irrelevant: error of each channel that nobody minds, shape ``(n_obs,)``
+    """
+
+    evidence: Evidence
+    unit: Int[np.ndarray, " n"]
+    irrelevant: Float[np.ndarray, " obs"]
+
+    def errors(self, point: Point) -> Float[np.ndarray, " n"]:
+        """:return: mean square of each window, with what is irrelevant added"""
+        noise = self.evidence.noise
+        errors = np.mean((point.raw / noise) ** 2, (1, 2))
+        errors = np.nan_to_num(errors, nan=NOT_FINITE, posinf=NOT_FINITE)
+        return errors + float(np.mean((self.irrelevant / noise) ** 2))
+
+    def total(self, point: Point) -> float:
+        return float(self.errors(point).sum())
+
+
+class Base(NamedTuple):
+    """
+    What is believed so far.
+
+    :param point: fitted to the windows for selection
+    :param kept: the same parameters on the other windows, start states refitted
+    :param free: indices of the parameters that are refitted under every hypothesis
+    """
+
+    point: Point
+    kept: Point
+    free: tuple[int, ...]
+
+
+class Tried(NamedTuple):
+    """
+    A candidate beside what is believed, and how it did.
+
+    :param candidate: which
+    :param point: the best that was found on the windows for selection
+    :param kept: the same parameters on the other windows, start states refitted
+    :param criterion: by which the information criterion is lower than without it
+    """
+
+    candidate: Candidate
+    point: Point
+    kept: Point
+    criterion: float
+
+
+class Effort(NamedTuple):
+    """
+    :param guessed: candidates that one Newton step must favour to be fitted at all
+    :param finalists: candidates that are fitted to the end
+    :param windows: most windows on which the others are compared
+    :param steps: of the fits that choose the finalists
+    :param profiles: whether intervals follow the likelihood, or are symmetric
+    """
+
+    guessed: int
+    finalists: int
+    windows: int
+    steps: int
+    profiles: bool
+
+
+class _Reached(NamedTuple):
+    """
+    How far the fit of a candidate has come.
+
+    :param theta: all parameters, shape ``(p,)``
+    :param offsets: of the start states of the windows that it was fitted to, shape ``(n, free)``
+    :param free: what was believed beside it
+    """
+
+    theta: np.ndarray
+    offsets: np.ndarray
+    free: tuple[int, ...]
+
+
+class Search:
+    """
+    Candidates on two halves of the evidence.
+
+    :param select: on which candidates are fitted and ranked
+    :param confirm: on which the best is confirmed
+    :param effort: how long to search
+    :param bar: shows how far it is
+    """
+
+    def __init__(self, select: Half, confirm: Half, effort: Effort, bar: Bar) -> None:
+        self.select, self.confirm, self.effort, self.bar = select, confirm, effort, bar
+        self._reached: dict[str, _Reached] = {}
+        self._far: set[str] = set()
+        # Of searches with several starts, the best one, by what is believed.
+        self._known: dict[tuple[str, ...], Places] = {}
+
+    @property
+    def hypotheses(self) -> Hypotheses:
+        return self.select.evidence.hypotheses
+
+    @property
+    def noise(self) -> Float[np.ndarray, " obs"]:
+        return self.select.evidence.noise
+
+    def set_noise(self, noise: Float[np.ndarray, " obs"]) -> None:
+        self.select, self.confirm = (
+            half._replace(evidence=half.evidence.with_noise(noise))
+            for half in (self.select, self.confirm)
+        )
+
+    def base(
+        self, theta: Float[np.ndarray, " p"], free: Sequence[int], near: Base | None = None
+    ) -> Base:
+        """
+        :param near: from whose start states to begin; default: as measured
+        :return: what is believed, ``free`` refitted from ``theta``
+        """
+        begin = (None, None) if near is None else (near.point.offsets, near.kept.offsets)
+        point = self.select.evidence.fit(theta, free, begin[0])
+        return Base(point, self.confirm.evidence.fit(point.theta, (), begin[1]), tuple(free))
+
+    def believing(self, tried: Tried, base: Base) -> Base:
+        """:return: what is believed, and this candidate besides"""
+        own = self.hypotheses.indices(tried.candidate)
+        return Base(tried.point, tried.kept, (*base.free, *own))
+
+    def without(self, candidate: Candidate, base: Base, near: Base | None = None) -> Base:
+        """
+        :param near: from whose start states to begin; default: as measured
+        :return: what is believed, but for this candidate; the rest refitted
+        """
+        own = self.hypotheses.indices(candidate)
+        theta = base.point.theta.copy()
+        theta[list(own)] = self.hypotheses.null[list(own)]
+        return self.base(theta, [i for i in base.free if i not in own], near)
+
+    def again(self, base: Base) -> Base:
+        """:return: the same belief, fitted under the noise that is known now"""
+        point, kept = base.point, base.kept
+        point = self.select.evidence.fit(point.theta, base.free, point.offsets)
+        kept = self.confirm.evidence.fit(point.theta, (), kept.offsets)
+        return Base(point, kept, base.free)
+
+    def whole(self, base: Base) -> tuple[Half, Point]:
+        """:return: all evidence, and what is believed fitted to it"""
+        pair = self.select, self.confirm
+        shots = (half.evidence.shots for half in pair)
+        shots = Shots(*map(np.concatenate, zip(*shots, strict=True)))
+        unit = np.concatenate([half.unit for half in pair])
+        every = Half(self.select.evidence.on(shots), unit, self.select.irrelevant)
+        offsets = np.concatenate([base.point.offsets, base.kept.offsets])
+        return every, every.evidence.fit(base.point.theta, base.free, offsets)
+
+    def glances(self, base: Base, accepted: Sequence[str]) -> list[tuple[Candidate, Point]]:
+        """
+        :param accepted: keys of candidates that belong to what is believed
+        :return: promising candidates, fitted roughly on a sample of windows, best first
+        """
+        left = [c for c in self.hypotheses.candidates if c.key not in accepted]
+        here = self._on_a_sample(base)
+        evidence, first = here.evidence, here.point
+        guessed = guesses(here, left, self._known.setdefault(tuple(accepted), {}))
+        begin = {}
+        for candidate, guess in zip(left, guessed, strict=True):
+            begin[candidate.key] = _Reached(guess.theta, guess.offsets, base.free)
+            self._reached.setdefault(candidate.key, begin[candidate.key])
+            if guess.blind:
+                self._far.add(candidate.key)
+        blind = [c for c, guess in zip(left, guessed, strict=True) if guess.blind]
+        seen = [(guess.gain, c) for c, guess in zip(left, guessed, strict=True) if not guess.blind]
+        seen = sorted(seen, key=lambda pair: -pair[0])[: self.effort.guessed]
+        likely = [*blind, *(candidate for _, candidate in seen)]
+
+        def glance(candidate: Candidate) -> Point:
+            own = self.hypotheses.indices(candidate)
+            places = [begin[candidate.key]]
+            if self._reached[candidate.key] is not places[0]:
+                places.append(self._reached[candidate.key])
+            theta, offsets = self._begin(candidate, first, base.free, evidence, places)
+            # The way is longer for what began elsewhere.
+            steps = self.effort.steps * (2 if candidate.key in self._far else 1)
+            return evidence.fit(theta, [*base.free, *own], offsets, steps)
+
+        points = self._each(glance, likely)
+        ranked = sorted(zip(likely, points, strict=True), key=lambda pair: pair[1].cost)
+        for candidate, point in ranked:
+            self._reached[candidate.key] = _Reached(point.theta, point.offsets, base.free)
+        return ranked
+
+    def finalists(self, base: Base, accepted: Sequence[str]) -> list[Tried]:
+        """
+        :param accepted: keys of candidates that belong to what is believed
+        :return: the most promising candidates, fitted to the end, best first
+        """
+        ranked = self.glances(base, accepted)
+        return self.finished([candidate for candidate, _ in ranked[: self.effort.finalists]], base)
+
+    def finished(self, candidates: Sequence[Candidate], base: Base) -> list[Tried]:
+        """:return: these candidates, fitted to the end, best first"""
+        self._guess([c for c in candidates if c.key not in self._reached], base)
+
+        def finish(candidate: Candidate) -> Tried:
+            point = self._continued(candidate, base)
+            half = self.confirm.evidence
+            offsets = self._starts(candidate, point.theta, base.kept.offsets, half)
+            kept = half.fit(point.theta, (), offsets, _KEPT_STEPS)
+            return Tried(candidate, point, kept, self.criterion([candidate], point, base.point))
+
+        tried = self._each(finish, candidates)
+        return sorted(tried, key=lambda t: -t.criterion)
+
+    def nameless(self, base: Base) -> list[Tried]:
+        """:return: what no finding is beside what is believed, fitted to the end, best first"""
+        self._guess(self.hypotheses.nameless, base)
+        return self.finished(self.hypotheses.nameless, base)
+
+    def _guess(self, candidates: Sequence[Candidate], base: Base) -> None:
+        """Where fits of candidates begin."""
+        if not candidates:
+            return
+        guessed = guesses(self._on_a_sample(base), candidates, {})
+        for candidate, guess in zip(candidates, guessed, strict=True):
+            self._reached[candidate.key] = _Reached(guess.theta, guess.offsets, base.free)
+
+    def relatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> list[Tried]:
+        """
+        :return: what looks like the best candidate, by declaration or in these windows, and was not
+            fitted to the end yet
+        """
+        done = {t.candidate.key for t in tried}
+        alike = imitators(self.select.evidence, best.point, best.candidate, base.free)
+        names = {c.key for c in self.hypotheses.related(best.candidate)} | set(alike)
+        left = [c for c in self.hypotheses.candidates if c.key in names - done]
+        return self.finished([c for c in left if not self.part_of(c, base)], base)
+
+    def part_of(self, candidate: Candidate, base: Base) -> bool:
+        """:return: whether what is believed has this candidate already"""
+        return set(self.hypotheses.indices(candidate)) <= set(base.free)
+
+    def others(self, base: Base, tried: Sequence[Tried]) -> list[tuple[Candidate, Comparison]]:
+        """:return: candidates that were no finalists, as they were left, on the other half"""
+        done = [t.candidate.key for t in tried]
+        rest = [c for c in self.hypotheses.candidates if c.key not in done]
+
+        def verdict(candidate: Candidate) -> Comparison:
+            theta, half = self._reached[candidate.key].theta, self.confirm.evidence
+            offsets = self._starts(candidate, theta, base.kept.offsets, half)
+            kept = half.fit(theta, (), offsets, _ROUGH_STEPS)
+            return self.confirmed(kept, base.kept)
+
+        return list(zip(rest, self._each(verdict, rest), strict=True))
+
+    def pairs(
+        self, firsts: Sequence[Tried], base: Base, known: Candidate
+    ) -> list[tuple[Tried, list[Tried]]]:
+        """
+        :param firsts: what was tried beside what is believed, best first
+        :param known: one of them, beside which others have been tried already
+        :return: of each pair the first cause, and what was tried beside it, best first; the pair
+            that selection prefers comes first
+        """
+        likely = [t for t in firsts if t.criterion >= LEAST_BIC and t.candidate != known]
+        pairs = []
+        for first in likely[:_MOST_FIRSTS]:
+            seconds = self.finalists(self.believing(first, base), [first.candidate.key])
+            if not seconds:
+                continue
+            both = [first.candidate, seconds[0].candidate]
+            pairs.append((self.criterion(both, seconds[0].point, base.point), first, seconds))
+        pairs.sort(key=lambda pair: -pair[0])
+        return [(first, seconds) for _, first, seconds in pairs]
+
+    def best(self, tried: Sequence[Tried], base: Base, n_found: int = 0) -> Tried | None:
+        """
+        :param tried: best first
+        :param n_found: causes and looks before this one: each makes the next harder to confirm
+        :return: the candidate that selection prefers, if the other recordings confirm it; of two
+            that they confirm and that predict equally well, the one with fewer parameters. Where
+            they do not, the next ones may be confirmed, each at half the level of the one before.
+        """
+        likely = [t for t in tried if t.criterion >= LEAST_BIC]
+        if not likely:
+            return None
+        simplest = likely[0]
+        for other in likely[1:]:
+            if _has_more_freedom(simplest, other) and as_good(
+                self.better(simplest.kept, other.kept)
+            ):
+                simplest = other
+        level = LEVEL / (1 + n_found)
+        for one in [simplest, *(t for t in likely if t is not simplest)][:_MOST_LOOKS]:
+            if passes(self.confirmed(one.kept, base.kept), level):
+                return one
+            level *= 0.5
+        return None
+
+    def preferred(self, first: Tried, tried: Sequence[Tried], base: Base) -> Tried:
+        """
+        :param first: confirmed
+        :param tried: it, and what else may be
+        :return: of all that are confirmed and have no fewer parameters, the one that both halves
+            together prefer; what has more has to be as far ahead as a cause has to be of none
+        """
+        error_of_first, ahead_of_first = self._of_all(first, base)
+        best, most = first, ahead_of_first
+        for other in (t for t in tried if t.criterion >= LEAST_BIC):
+            error, ahead = self._of_all(other, base)
+            surely = (
+                error <= (1.0 - LEAST_GAIN) * error_of_first and ahead >= ahead_of_first + LEAST_BIC
+            )
+            if (
+                ahead > most
+                and not _has_more_freedom(first, other)
+                and (surely or not _has_more_freedom(other, first))
+                and passes(self.confirmed(other.kept, base.kept))
+            ):
+                best, most = other, ahead
+        return best
+
+    def alternatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
+        """:return: what is not significantly worse than the best, without more freedom"""
+        others = [t for t in tried if t is not best and not _has_more_freedom(t, best)]
+        equal = [t for t in others if as_good(self.better(best.kept, t.kept))]
+        return tuple(t.candidate.key for t in equal if passes(self.confirmed(t.kept, base.kept)))
+
+    def needed(self, candidate: Candidate, base: Base) -> bool:
+        """:return: whether what is believed gets worse without this part of it"""
+        return passes(self.confirmed(base.kept, self.without(candidate, base).kept))
+
+    def criterion(self, candidates: Sequence[Candidate], point: Point, base: Point) -> float:
+        """:return: by which the information criterion is lower with these candidates"""
+        n = effective_size(base.raw / self.noise)
+        before, after = map(self.select.total, (base, point))
+        return _information(before, after, n, sum(len(c.parameters) for c in candidates))
+
+    def _of_all(self, tried: Tried, base: Base) -> tuple[float, float]:
+        """:return: error of both halves, parameters as they were selected; and its criterion"""
+        n = sum(effective_size(point.raw / self.noise) for point in (base.point, base.kept))
+        before, after = (
+            self.select.total(one.point) + self.confirm.total(one.kept) for one in (base, tried)
+        )
+        return after, _information(before, after, n, len(tried.candidate.parameters))
+
+    def better(self, new: Point, old: Point) -> Comparison:
+        """:return: whether one is better than another, both on the half that confirms"""
+        half = self.confirm
+        return confirm(half.errors(new), half.errors(old), half.unit)
+
+    def confirmed(self, new: Point, old: Point) -> Comparison:
+        """:return: as ``better``, of a model and one that it contains"""
+        verdict = self.better(new, old)
+        by_score = by_scores(new.raw / self.noise, old.raw / self.noise, self.confirm.unit)
+        return verdict._replace(p_value=min(verdict.p_value, by_score))
+
+    def _continued(self, candidate: Candidate, base: Base) -> Point:
+        evidence = self.select.evidence
+        moving = [*base.free, *self.hypotheses.indices(candidate)]
+        places = [self._reached[candidate.key]]
+        theta, offsets = self._begin(candidate, base.point, base.free, evidence, places)
+        point = evidence.fit(theta, moving, offsets, _ALL_STEPS)
+        return min(base.point, point, key=lambda p: p.cost)
+
+    def _begin(
+        self,
+        candidate: Candidate,
+        believed: Point,
+        free: tuple[int, ...],
+        evidence: Evidence,
+        places: Sequence[_Reached],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :param places: where the candidate is now; beside another belief, only its own values count
+        :return: the one of them that explains most, with the start states that explain each window
+            best there
+        """
+        tried = []
+        for place in places:
+            theta, moving = believed.theta.copy(), list(self.hypotheses.indices(candidate))
+            offsets = [believed.offsets]
+            if place.free == free:
+                moving += free
+                if len(place.offsets) == evidence.shots.n:
+                    offsets.append(place.offsets)
+            theta[moving] = place.theta[moving]
+            far = candidate.key in self._far
+            tried.append((theta, *evidence.nearest(theta, offsets, measured=far)))
+        theta, offsets, _ = min(tried, key=lambda one: one[2])
+        return theta, offsets
+
+    def _starts(
+        self, candidate: Candidate, theta: np.ndarray, offsets: np.ndarray, evidence: Evidence
+    ) -> np.ndarray:
+        """Far from what is believed, its start states may be those of another motion."""
+        if candidate.key not in self._far:
+            return offsets
+        return evidence.nearest(theta, [offsets], measured=True)[0]
+
+    def _on_a_sample(self, base: Base) -> Here:
+        """Of the windows that select, at most so many as the effort allows."""
+        evidence, point, most = self.select.evidence, base.point, self.effort.windows
+        if evidence.shots.n > most:
+            rng = np.random.default_rng(0)
+            sample = np.sort(rng.choice(evidence.shots.n, most, replace=False))
+            evidence = evidence.on(type(evidence.shots)(*(x[sample] for x in evidence.shots)))
+            point = point._replace(offsets=point.offsets[sample])
+        return Here(evidence, point, base.free, self.effort.steps)
+
+    def _each(self, work: Callable[[_Given], _Told], given: Sequence[_Given]) -> list[_Told]:
+        return list(self.bar.over(in_threads(work, given), len(given)))
+
+
+def _information(before: float, after: float, n: float, n_parameters: int) -> float:
+    """:return: by which Schwarz's criterion is lower; ``before`` and ``after``: sums of squares"""
+    return n * float(np.log(before / after)) - n_parameters * float(np.log(max(n, 2.0)))
+
+
+def _has_more_freedom(one: Tried, other: Tried) -> bool:
+    return len(one.candidate.parameters) > len(other.candidate.parameters)
+
+
+def as_good(better: Comparison) -> bool:
+    """:return: whether what was found better than another is so neither surely nor by much"""
+    return better.p_value > _LEVEL_OF_SET or better.gain < _SAME
+
+
+def passes(verdict: Comparison, level: float = LEVEL) -> bool:
+    return verdict.gain >= LEAST_GAIN and verdict.p_value < level

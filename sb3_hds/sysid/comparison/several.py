@@ -1,0 +1,190 @@
+"""Several causes at once: a set that equation errors propose, judged by simulation."""
+
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+import scipy
+
+from sb3_hds.sysid.comparison.held_out import Comparison, confirm
+from sb3_hds.sysid.comparison.search import (
+    LEAST_GAIN,
+    NOT_FINITE,
+    Base,
+    Half,
+    Search,
+    Tried,
+    as_good,
+    passes,
+)
+from sb3_hds.sysid.diagnosis.findings import Accepted
+from sb3_hds.sysid.equation.screening import Screened
+from sb3_hds.sysid.equation.selection import Member
+from sb3_hds.sysid.estimation.evidence import Point, in_threads
+from sb3_hds.sysid.estimation.hypotheses import Candidate, encoders
+from sb3_hds.sysid.estimation.shooting import Shots, evenly
+
+# Level at which each member has to be missed by held-out recordings when it is left out.
+_LEVEL = 0.05
+# Members beyond which a set counts as large: their sizes are those in the equation of motion, and
+# each of them, confirmed there on held-out data, only must not surely make predictions worse.
+_MANY = 6
+# Steps of a fit of start states that begins where they were with one member more.
+_ROUGH_STEPS = 2
+# Windows of a large machine on which each member of its set is left out once.
+_SOME_WINDOWS = 8
+# Folds of the data on which the equation's t is based.
+_FREEDOM = 7
+
+
+def proposed_set(search: Search, screened: Screened, start: Base) -> Base:
+    """
+    :return: what is believed with the whole set, with its sizes in the equation of motion; of a
+        small set, refitted
+    """
+    h, members = search.hypotheses, _members(search, screened)
+    theta = _with_sizes(search, start.point.theta, screened.sizes_of(members))
+    own = [i for candidate, _ in members.values() for i in h.indices(candidate)]
+    refitted = [] if len(members) > _MANY else [i for i in own if i not in start.free]
+    return search.base(theta, (*start.free, *refitted))
+
+
+def confirmed_set(
+    search: Search, screened: Screened, start: Base, base: Base
+) -> tuple[list[Accepted], Base]:
+    """
+    :param start: what is believed without any cause
+    :param base: with the whole set
+    :return: members without which held-out recordings are predicted worse, and what is believed
+        with them; none where the set as a whole does not predict better
+    """
+    members = _members(search, screened)
+    if not members or not passes(search.better(base.kept, start.kept)):
+        return [], start
+    many = len(members) > _MANY
+    verdicts: dict[str, Comparison] = {}
+    if many:
+        verdicts = _each_left_out(search, screened, start, base, members, list(members))
+        harmful = {key for key, v in verdicts.items() if v.p_value >= 1.0 - _LEVEL}
+        if harmful:
+            screened = screened.without(harmful)
+            members = _members(search, screened)
+            theta = _sizes_with(search, screened, start, members.keys())
+            base = search.base(theta, base.free, near=base)
+            new = [key for key in members if key not in verdicts]
+            verdicts |= _each_left_out(search, screened, start, base, members, new)
+    while members and not many:
+        lost = {key: search.without(c, base, near=base) for key, (c, _) in members.items()}
+        verdicts = {
+            key: _at_own_joint(search.confirm, members[key][0], base.kept, rest.kept)
+            for key, rest in lost.items()
+        }
+        weak = [k for k, v in verdicts.items() if v.p_value >= _LEVEL or v.gain < LEAST_GAIN]
+        if not weak:
+            break
+        worst: str = max(weak, key=lambda key: (verdicts[key].p_value, -verdicts[key].gain))
+        members.pop(worst)
+        base = lost[worst]
+    if len(members) < len(screened.members):
+        screened = screened.among(members)
+        members = _members(search, screened)
+    p, every = screened.problem, [m.item for m in screened.members]
+    carried = dict(zip(every, map(float, p.carried(every)), strict=True))
+    found = [
+        _accepted(search, candidate, member, members, verdicts[key], base)._replace(
+            share=carried[member.item], sizes=screened.intervals_of(member) if many else {}
+        )
+        for key, (candidate, member) in members.items()
+        if key in verdicts
+    ]
+    return found, base
+
+
+def _members(search: Search, screened: Screened) -> dict[str, tuple[Candidate, Member]]:
+    known = {c.key: c for c in search.hypotheses.candidates}
+    return {m.key: (known[m.key], m) for m in screened.members if m.key in known}
+
+
+def _each_left_out(
+    search: Search,
+    screened: Screened,
+    start: Base,
+    base: Base,
+    members: Mapping[str, tuple[Candidate, Member]],
+    keys: Sequence[str],
+) -> dict[str, Comparison]:
+    """:return: of some members of a large set, held-out errors with each beside those without it"""
+    half, some = search.confirm, evenly(search.confirm.evidence.shots.n, _SOME_WINDOWS)
+    shots = Shots(*(np.asarray(leaf)[some] for leaf in half.evidence.shots))
+    half = half._replace(evidence=half.evidence.on(shots), unit=half.unit[some])
+    kept = base.kept._replace(offsets=base.kept.offsets[some], raw=base.kept.raw[some])
+
+    def left_out(key: str) -> Comparison:
+        theta = _sizes_with(search, screened, start, members.keys() - {key})
+        rest = half.evidence.fit(theta, (), kept.offsets, _ROUGH_STEPS)
+        return _at_own_joint(half, members[key][0], kept, rest)
+
+    found: list[Comparison] = list(search.bar.over(in_threads(left_out, keys), len(keys)))
+    return dict(zip(keys, found, strict=True))
+
+
+def _sizes_with(
+    search: Search, screened: Screened, start: Base, keys: Collection[str]
+) -> np.ndarray:
+    """What is believed with these members only, with their sizes in the equation of motion."""
+    return _with_sizes(search, start.point.theta, screened.sizes_of(keys))
+
+
+def _with_sizes(search: Search, theta: np.ndarray, sizes: Mapping[str, float]) -> np.ndarray:
+    h, theta = search.hypotheses, theta.copy()
+    for name, value in sizes.items():
+        if name in h.names:
+            i = h.names.index(name)
+            theta[i] = np.clip(value, h.lower[i], h.upper[i])
+    return theta
+
+
+def _accepted(
+    search: Search,
+    candidate: Candidate,
+    member: Member,
+    members: Collection[str],
+    verdict: Comparison,
+    base: Base,
+) -> Accepted:
+    known = {c.key: c for c in search.hypotheses.candidates}
+    others = [k for k in member.others if k not in members]
+    # Of a large set, what may stand for a member is told as the equation says it.
+    simulated = [] if len(members) > _MANY else [known[k] for k in others if k in known]
+    tried = (
+        search.finished(simulated, search.without(candidate, base, near=base)) if simulated else []
+    )
+    worse = {t.candidate.key for t in tried if not as_good(search.better(base.kept, t.kept))}
+    equal = [k for k in others if k not in worse]
+    chance = float(scipy.stats.t.sf(member.t, _FREEDOM)) * len(known)
+    same = Tried(candidate, base.point, base.kept, member.gain)
+    return Accepted(same, verdict, tuple(equal), min(chance, 1.0))
+
+
+def _at_own_joint(half: Half, candidate: Candidate, new: Point, old: Point) -> Comparison:
+    """Held-out errors of the channels of the joint where a cause acts, or of all."""
+    channels = own_channels(half, candidate)
+    return confirm(_errors(half, new, channels), _errors(half, old, channels), half.unit)
+
+
+def own_channels(half: Half, candidate: Candidate) -> Sequence[int]:
+    """:return: indices of the channels that tell most of a candidate"""
+    twin = half.evidence.hypotheses.believed
+    every = range(len(twin.channels))
+    if candidate.slot not in ("joint", "actuator") or candidate.index < 0:
+        return every
+    if candidate.slot == "actuator" and len(twin.actuators) != len(twin.joints):
+        return every
+    encoder = encoders(twin).get(candidate.index)
+    return every if encoder is None else encoder.channels
+
+
+def _errors(half: Half, point: Point, channels: Sequence[int]) -> np.ndarray:
+    noise = half.evidence.noise[list(channels)]
+    errors = np.mean((point.raw[..., list(channels)] / noise) ** 2, (1, 2))
+    floor = float(np.mean((half.irrelevant[list(channels)] / noise) ** 2))
+    return np.nan_to_num(errors, nan=NOT_FINITE, posinf=NOT_FINITE) + floor

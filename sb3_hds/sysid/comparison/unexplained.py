@@ -1,0 +1,314 @@
+"""What no candidate explains: the missing force, and what it goes with."""
+
+from itertools import combinations, product
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sb3_hds.core import Trajectories
+from sb3_hds.sysid.comparison.held_out import Split, split
+from sb3_hds.sysid.estimation.evidence import Evidence, Point, Slopes
+from sb3_hds.sysid.estimation.motion import motion_of
+from sb3_hds.sysid.estimation.shooting import Shots, evenly, shots_of
+
+# Length of a window over which the missing force counts as constant, in periods of the motion, and
+# in steps.
+_WINDOW, _SHORTEST, _LONGEST = 0.2, 4, 25
+# Steps of the fit of their start states.
+_STEPS = 5
+# Windows that a smooth function is learned from; more cost memory in its square.
+_MOST_WINDOWS = 1500
+# Candidates of its regularisation, relative to the variance of the force.
+_RIDGES = (0.1, 1.0, 10.0, 100.0)
+# What counts as something: share of the force's variance that others' windows predict, and level.
+_LEAST_GAIN, _LEVEL = 0.05, 0.01
+# Patterns of signs: all of so many units, or so many drawn.
+_ALL_SIGNS_OF, _N_FLIPS = 12, 4096
+# By which factor the level of the test on windows is stricter than that on units.
+_STRICTER = 25.0
+# A smaller set of quantities that explains this share of what all explain tells where it lives.
+_MOST_OF_IT = 0.8
+_MOST_RATIO = 4.0
+
+
+class ShortWindows(NamedTuple):
+    """
+    Windows over which a missing force counts as constant, start states fitted.
+
+    :param evidence: of windows that are lengthened to those of its program
+    :param point: what is believed, on them
+    :param shots: the windows themselves
+    :param origin: recording of each, shape ``(n,)``
+    :param time: since the recording began [s], shape ``(n,)``
+    """
+
+    evidence: Evidence
+    point: Point
+    shots: Shots
+    origin: np.ndarray
+    time: np.ndarray
+
+
+class MissingForce(NamedTuple):
+    """
+    The force that each window asks for, beyond what the twin has.
+
+    :param force: shape ``(n, dof)`` [N m] or [N]
+    :param stderr: of each, from what a force leaves of so short windows, shape ``(n, dof)``
+    :param position: mean over the window, shape ``(n, dof)``
+    :param velocity: mean over the window, shape ``(n, dof)``
+    :param command: mean over the window, shape ``(n, n_act)``
+    :param time: since the recording began [s], shape ``(n,)``
+    :param origin: recording, shape ``(n,)``
+    :param numbers: measurements in a window
+    :param noise: of each channel, in so short windows, shape ``(n_obs,)``
+    """
+
+    force: np.ndarray
+    stderr: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    command: np.ndarray
+    time: np.ndarray
+    origin: np.ndarray
+    numbers: int
+    noise: np.ndarray
+
+
+class Remainder(NamedTuple):
+    """
+    :param joint: name of the joint where most is left
+    :param goes_with: quantities that predict it
+    :param gain: share of its variance that they predict on recordings not learned from
+    :param p_value: chance of that if nothing were there
+    :param power: what they predict, mean square in units of the force's error
+    """
+
+    joint: str
+    goes_with: tuple[str, ...]
+    gain: float
+    p_value: float
+    power: float
+
+
+class _Predicted(NamedTuple):
+    """
+    :param gain: share of the force's variance that is predicted
+    :param agreement: predicted times measured, of each window, shape ``(n,)``
+    """
+
+    gain: float
+    agreement: np.ndarray
+
+
+def short_windows(
+    evidence: Evidence,
+    theta: Float[np.ndarray, " p"],
+    data: Trajectories,
+    period: float,
+    most: int,
+) -> ShortWindows:
+    """
+    :param evidence: whose program simulates short windows too
+    :param theta: all parameters that may move, shape ``(p,)``; they stay as they are
+    :param data: measured
+    :param period: of the motion [s]
+    :param most: windows
+    """
+    longest = evidence.shots.actions.shape[1]
+    steps = min(int(np.clip(round(_WINDOW * period / data.dt), _SHORTEST, _LONGEST)), longest)
+    shots, origin = shots_of(data, steps, evidence.hypotheses.twin)
+    counter: dict[int, int] = {}
+    time = np.zeros(len(origin))
+    for i, recording in enumerate(origin):
+        counter[recording] = counter.get(recording, -1) + 1
+        time[i] = counter[recording] * (steps + 1) * data.dt
+    some = evenly(len(origin), most)
+    shots, origin = Shots(*(np.asarray(leaf)[some] for leaf in shots)), origin[some]
+    counted = (np.arange(longest + 1) <= steps).astype(float)
+    short = evidence.on(_lengthened(shots, longest), counted)
+    return ShortWindows(short, short.fit(theta, (), n_steps=_STEPS), shots, origin, time[some])
+
+
+def missing_force(short: ShortWindows, data: Trajectories) -> MissingForce:
+    """:param data: measured"""
+    evidence, point, shots, origin, time = short
+    h, steps = evidence.hypotheses, shots.actions.shape[1]
+    scale = h.scale[list(h.pushes)]
+    slopes = evidence.slopes(point, h.pushes)
+    informed = np.maximum(np.einsum("njj->nj", slopes.curvature), 1e-12)
+    numbers = (steps + 1) * data.n_obs
+    rest = _left_by_forces(short, slopes)
+    calmer = np.sqrt(np.median(rest) / max(numbers - point.offsets.shape[1] - len(scale), 1))
+    q, v = motion_of(h.believed, shots.obs, data.dt)
+    return MissingForce(
+        force=-scale * slopes.scores / informed,
+        stderr=calmer * scale / np.sqrt(informed),
+        position=np.unwrap(q, axis=1).mean(1),
+        velocity=v.mean(1),
+        command=shots.actions.mean(1),
+        time=time,
+        origin=origin,
+        numbers=numbers,
+        noise=calmer * evidence.noise,
+    )
+
+
+def _left_by_forces(short: ShortWindows, slopes: Slopes) -> Float[np.ndarray, " n"]:
+    """
+    What a constant force leaves of each window, sum of squares in units of the noise. That noise
+    was measured over long windows, where what is missing has had time to grow.
+    """
+    measured = short.shots.obs.shape[1]
+    raw = np.nan_to_num(short.point.raw[:, :measured], nan=0.0)
+    whole = np.sum((raw / short.evidence.noise) ** 2, (1, 2))
+    inverse = np.linalg.pinv(slopes.curvature, hermitian=True)
+    gained = np.einsum("ni,nij,nj->n", slopes.scores, inverse, slopes.scores)
+    return np.maximum(whole - gained, 0.0)
+
+
+def _lengthened(shots: Shots, steps: int) -> Shots:
+    """Windows of so many steps, the last ones of which are not measured."""
+
+    def filled(rows: np.ndarray, length: int) -> np.ndarray:
+        missing = length - rows.shape[1]
+        return np.concatenate([rows, np.repeat(rows[:, -1:], missing, 1)], 1)
+
+    return shots._replace(obs=filled(shots.obs, steps + 1), actions=filled(shots.actions, steps))
+
+
+def remainder(
+    missing: MissingForce,
+    data: Trajectories,
+    joints: tuple[str, ...],
+    seed: int,
+    least_power: float = 0.0,
+) -> Remainder | None:
+    """
+    Whether a smooth function of position, velocity, command and time, learned on one half of the
+    recordings, predicts the missing force of the other half, and the other way round.
+
+    :param least_power: of what is predicted, below which nobody minds
+    :return: where it is and what it goes with; None if nothing is left that can be predicted
+    """
+    parts = split(data, missing.origin, seed)
+    found: list[Remainder] = []
+    for j, joint in enumerate(joints):
+        quantities = {
+            "position": np.concatenate(
+                [np.cos(missing.position), np.sin(missing.position), missing.position], 1
+            ),
+            "velocity": np.concatenate(
+                [missing.velocity, np.tanh(3.0 * _scaled(missing.velocity))], 1
+            ),
+            "command": missing.command,
+            "time": missing.time[:, None],
+        }
+        quantities = {name: values for name, values in quantities.items() if values.shape[1]}
+        force = weighed(missing)[:, j]
+        force = np.clip(force, -_MOST_RATIO * force.std(), _MOST_RATIO * force.std())
+        told = {
+            names: _predicted(_together(quantities, names), force, parts)
+            for k in (1, 2, len(quantities))
+            for names in combinations(quantities, k)
+        }
+        p_values = _by_chance(np.stack([one.agreement for one in told.values()]), parts.unit)
+        chance = {
+            name: min(float(p) * len(joints), 1.0) for name, p in zip(told, p_values, strict=True)
+        }
+        best = max(told, key=lambda names: told[names].gain)
+        most = told[best].gain
+        if most < _LEAST_GAIN or chance[best] >= _LEVEL:
+            continue
+        enough = min((names for names in told if told[names].gain >= _MOST_OF_IT * most), key=len)
+        power = told[enough].gain * max(float(np.mean(force**2)), 1.0)
+        if power < least_power:
+            continue
+        found.append(Remainder(joint, enough, told[enough].gain, chance[enough], power))
+    return max(found, key=lambda r: r.gain, default=None)
+
+
+def weighed(missing: MissingForce) -> Float[np.ndarray, "n dof"]:
+    """:return: forces in units of their errors; those of windows that tell little count less"""
+    typical = np.median(missing.stderr, 0)
+    return missing.force / missing.stderr * np.minimum(1.0, typical / missing.stderr)
+
+
+def _together(quantities: dict[str, np.ndarray], names: tuple[str, ...]) -> list[np.ndarray]:
+    """Quantities, and products of friction's sign with where or when: few windows teach no more."""
+    found = [quantities[name] for name in names]
+    if "velocity" in names:
+        sign = np.tanh(3.0 * _scaled(quantities["velocity"]))
+        others = [_scaled(quantities[name]) for name in names if name in ("position", "time")]
+        found += [
+            sign[:, i : i + 1] * values for values in others for i in range(sign.shape[1] // 2)
+        ]
+    return found
+
+
+def _scaled(values: np.ndarray) -> np.ndarray:
+    spread = values.std(0)
+    return (values - values.mean(0)) / np.where(spread > 1e-9, spread, 1.0)
+
+
+def _predicted(quantities: list[np.ndarray], force: np.ndarray, parts: Split) -> _Predicted:
+    """Each half of the units is predicted from the other."""
+    features = _scaled(np.concatenate(quantities, 1))
+    guess = np.zeros_like(force)
+    for learn, check in ((~parts.confirm, parts.confirm), (parts.confirm, ~parts.confirm)):
+        rows = np.flatnonzero(learn)[:_MOST_WINDOWS]
+        guess[check] = _ridge(features[rows], force[rows], features[check])
+    # Forces are in units of their errors: below one, there is nothing to predict.
+    total = max(float(np.sum(force**2)), len(force))
+    gain = (np.sum(force**2) - np.sum((force - guess) ** 2)) / total
+    return _Predicted(float(gain), force * guess)
+
+
+def _by_chance(
+    agreement: Float[np.ndarray, "sets n"], unit: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, " sets"]:
+    """
+    Chance that some set of quantities predicts so well where there is nothing to predict: then what
+    was predicted agrees in sign with what was measured as often as not, whichever the set, so signs
+    are flipped for all sets together. Those of whole units are, as windows of one recording are not
+    independent; but what is met in a few recordings only, such as a wall, is seen there again and
+    again, so those of windows count too, at a much stricter level.
+
+    Source: Westfall and Young, *Resampling-based multiple testing*, Wiley 1993 (the largest
+    statistic of a family).
+
+    :return: for each set, shape ``(sets,)``
+    """
+    by_unit = np.stack([agreement[:, unit == label].sum(1) for label in np.unique(unit)], 1)
+    return np.minimum(_by_flips(by_unit), _STRICTER * _by_flips(agreement))
+
+
+def _by_flips(agreement: Float[np.ndarray, "sets n"]) -> Float[np.ndarray, " sets"]:
+    n = agreement.shape[1]
+    if n <= _ALL_SIGNS_OF:
+        signs = np.array(list(product((1.0, -1.0), repeat=n)))
+    else:
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (_N_FLIPS, n))
+        signs[0] = 1.0
+    largest = np.max(signs @ agreement.T, axis=1)
+    # The first pattern is that of the data themselves.
+    return np.mean(largest[:, None] >= agreement.sum(1) - 1e-9 * np.abs(agreement).sum(1), axis=0)
+
+
+def _ridge(features: np.ndarray, force: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Kernel ridge regression, its ridge chosen by generalised cross-validation."""
+    power, directions = np.linalg.eigh(_kernel(features, features))
+    power, rotated = np.maximum(power, 0.0), directions.T @ force
+
+    def score(ridge: float) -> float:
+        kept = ridge / (power + ridge)
+        return float(np.mean((kept * rotated) ** 2) / np.mean(kept) ** 2)
+
+    answer = directions @ (rotated / (power + min(_RIDGES, key=score)))
+    return _kernel(there, features) @ answer
+
+
+def _kernel(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    squared = np.sum((one[:, None] - other[None]) ** 2, 2)
+    return np.exp(-0.5 * squared / one.shape[1])

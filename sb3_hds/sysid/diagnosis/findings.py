@@ -1,0 +1,268 @@
+"""How what was found is told."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from jaxtyping import Int
+
+from sb3_hds.sysid.checks.parameter_stability import Change
+from sb3_hds.sysid.comparison.aliasing import imitators
+from sb3_hds.sysid.comparison.held_out import Comparison
+from sb3_hds.sysid.comparison.profile import profiled
+from sb3_hds.sysid.comparison.search import LEAST_GAIN, LEVEL, Base, Half, Tried
+from sb3_hds.sysid.comparison.unexplained import Remainder
+from sb3_hds.sysid.diagnosis.account import standard_errors
+from sb3_hds.sysid.estimation.evidence import Point
+from sb3_hds.sysid.estimation.hypotheses import Candidate, Hypotheses
+from sb3_hds.sysid.estimation.results import Estimate
+from sb3_hds.sysid.reporting.diagnosis import Finding, HorizonGain
+from sb3_hds.sysid.reporting.wording import TOO_LITTLE
+
+#: why a candidate was turned down that predicts better
+UNCERTAIN, SMALL, CHANCE = "its size is uncertain", "it is small beside the others", "may be chance"
+NO_CONSTANT = "it comes near, but its size is not constant"
+NAMELESS = "a force without a name predicts better"
+ANOTHER = "its fitted sizes are those of another effect"
+_CONFIDENCE = 0.9
+# Family-wise level of what contradicts that nothing is wrong, though it is no finding.
+_CONTRADICTS = 0.01
+# Error of a window that a twin does not come near, in units of the noise, or of what is usual.
+_LOST = 10.0
+
+
+class Accepted(NamedTuple):
+    """
+    A cause that was confirmed.
+
+    :param alternatives: what the data cannot tell from it
+    :param chance: that the best of all candidates would gain as much if nothing were wrong
+    :param share: of the force at its joint that it carries; None where that is not known
+    :param sizes: estimate and ends of the interval by parameter, where the equation of motion says
+        them and not the simulation
+    """
+
+    tried: Tried
+    verdict: Comparison
+    alternatives: tuple[str, ...]
+    chance: float
+    share: float | None = None
+    sizes: Mapping[str, tuple[float, float, float]] = {}
+
+
+def finding(
+    one: Accepted, half: Half, point: Point, free: Sequence[int], profiles: bool
+) -> Finding:
+    """
+    :param half: all evidence: what was confirmed is fitted to the whole of it
+    :param point: what is believed in the end, this cause among it, fitted to that
+    :param free: indices of what was fitted
+    :param profiles: whether intervals follow the likelihood, or are symmetric
+    """
+    h, theta = half.evidence.hypotheses, point.theta
+    stderr = standard_errors(half, point, free)
+    unit = margin(len(np.unique(half.unit)), np.ones(()))
+    reach = unit * stderr
+    candidate, parameters = one.tried.candidate, {}
+    shorts = [name.rpartition(".")[2] for name in candidate.parameters]
+    for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
+        if name in one.sizes:
+            estimate, low, high = one.sizes[name]
+            error = float((high - low) / (2.0 * unit))
+        else:
+            low, high = _interval(half, point, free, i, float(reach[i]), profiles)
+            estimate, error = float(theta[i]), float(stderr[i])
+        short = name.rpartition(".")[2]
+        # Of several places, each has its own.
+        own = short if shorts.count(short) == 1 else name.partition(".")[2]
+        parameters[own] = Estimate(
+            name=name,
+            estimate=estimate,
+            stderr=error,
+            low=low,
+            high=high,
+            unit=h.parameter(name).unit,
+            before=float(h.null[i]),
+            at_bound=bool(theta[i] <= h.lower[i] or theta[i] >= h.upper[i]),
+            added_to=h.added_to(name),
+        )
+    return Finding(
+        candidate.name,
+        h.place_of(candidate),
+        parameters,
+        one.alternatives,
+        one.verdict.p_value,
+        one.chance,
+        one.verdict.gain,
+        candidate.explanation,
+        one.share,
+    )
+
+
+def margin(n_units: int, stderr: np.ndarray) -> np.ndarray:
+    """:return: half the width of a symmetric interval"""
+    return scipy.stats.t.ppf(0.5 + 0.5 * _CONFIDENCE, max(n_units - 1, 1)) * stderr
+
+
+def to_tell_apart(found: Sequence[Accepted], hypotheses: Hypotheses) -> list[str]:
+    """:return: sentences on what to record, where the data cannot tell a cause from others"""
+    sentences, undeclared = [], []
+    for one in found:
+        key = one.tried.candidate.key
+        for other in one.alternatives:
+            if when := hypotheses.alike(key, other):
+                sentences.append(
+                    f"{key} and {other} look alike {when}. Recordings of which that is not true "
+                    "would tell them apart."
+                )
+            else:
+                undeclared.append(f"{key} from {other}")
+    if undeclared:
+        sentences.append(
+            f"To tell {', '.join(undeclared)}, record other speeds, positions and commands: in "
+            "these data they make much the same difference."
+        )
+    return sentences
+
+
+def look_alike(found: Sequence[Accepted], half: Half, base: Base) -> list[str]:
+    """:return: sentences on what imitates a cause, though held-out recordings prefer the cause"""
+    sentences = []
+    for one in found:
+        own = half.evidence.hypotheses.indices(one.tried.candidate)
+        rest = [i for i in base.free if i not in own]
+        alike = imitators(half.evidence, base.point, one.tried.candidate, rest)
+        alike = [name for name in alike if name not in one.alternatives]
+        if alike:
+            sentences.append(
+                f"In these data {', '.join(alike)} would do nearly the same as "
+                f"{one.tried.candidate.key}, which held-out recordings prefer. Recordings that "
+                "excite other speeds, positions and commands would tell them further apart."
+            )
+    return sentences
+
+
+def out_of_reach(half: Half, kept: Point, origin: Int[np.ndarray, " n"]) -> list[str]:
+    """
+    :param half: recordings that nothing was fitted to
+    :param kept: what is believed in the end, on their windows
+    :param origin: recording of each window
+    :return: a sentence on windows that the twin does not come near, if there are any
+    """
+    errors = np.sqrt(half.errors(kept))
+    lost = errors > _LOST * max(float(np.median(errors)), 1.0)
+    if not lost.any():
+        return []
+    where = ", ".join(f"trajectory {i}" for i in np.unique(origin[lost]))
+    return [
+        f"The simulation is off by more than ten times the noise in {lost.sum()} of {len(lost)} "
+        f"windows that nothing was fitted to ({where}). What happens there is not in the other "
+        "recordings: look at them, and record more of it."
+    ]
+
+
+def errs_more(gain: Mapping[int, HorizonGain]) -> list[str]:
+    """
+    :param gain: of all that is named, by horizon
+    :return: a sentence on the horizons at which the extended twin is worse, if there are any
+    """
+    worse = [g for g in gain.values() if g.high < 0.0]
+    if not worse:
+        return []
+    steps = " and ".join(f"{g.steps} (+{g.after / g.before - 1.0:.0%})" for g in worse)
+    return [
+        f"The extended twin errs more than before, steps ahead: {steps}. Over whole windows it "
+        "gains; but what is named may stand in for something else there."
+    ]
+
+
+def why(verdict: Comparison, turned_down: str | None) -> str:
+    """
+    :param verdict: on a candidate that is not named
+    :param turned_down: for which reason, if it was the best for a time
+    """
+    if verdict.gain < LEAST_GAIN:
+        return TOO_LITTLE
+    return turned_down or (CHANCE if verdict.p_value >= LEVEL else "others gain more")
+
+
+def stuck_in_words(ends: Sequence[tuple[str, float, float, str]]) -> str:
+    """
+    :param ends: of each nuisance at a bound, its name, its value there, the nominal value, and unit
+    :return: why nothing is named; empty if there is none
+    """
+    if not ends:
+        return ""
+    said = " and ".join(f"{n} = {x:.3g} {unit} (nominal {was:.3g})" for n, x, was, unit in ends)
+    verb = "ends at its bound" if len(ends) == 1 else "end at their bounds"
+    return (
+        f"Refitted, {said} {verb}: whatever is wrong, this is not how the system is. "
+        "Check conventions (signs, units, order of the columns), leave it out of calibrate, or "
+        "widen its bounds if such a value is possible: calibrate={name: (low, high)}."
+    )
+
+
+def in_words(left: Remainder) -> str:
+    share = f"{left.gain:.0%}"
+    return (
+        f"A force at {left.joint} goes with {' and '.join(left.goes_with)}; {share} of its "
+        f"variance is predictable on held-out recordings (p = {left.p_value:.2g})."
+    )
+
+
+def nearest_in_words(key: str, changes: Change) -> str:
+    return (
+        f"{key} comes nearest, but its size is no constant: it goes with {changes.goes_with} "
+        f"(p = {changes.p_value:.2g})."
+    )
+
+
+def nameless_in_words(
+    tried: Tried, better: Comparison, causes: Sequence[str], hypotheses: Hypotheses
+) -> str:
+    """
+    :param tried: a force without a name
+    :param better: than the causes
+    :param causes: in whose place it is; none: beside what is believed
+    """
+    force, values = tried.candidate, []
+    for name, i in zip(force.parameters, hypotheses.indices(force), strict=True):
+        unit = hypotheses.parameter(name).unit
+        size = f"{name.rpartition('.')[2]} = {tried.point.theta[i]:.3g}"
+        values.append(size if unit == "1" else f"{size} {unit}")
+    does = f"does better than {' and '.join(causes)}" if causes else "explains what is missing"
+    return (
+        f"A force that is no finding {does}: {force.key} ({', '.join(values)}), "
+        f"with {better.gain:.0%} less error (p = {better.p_value:.2g}). {force.explanation}"
+    )
+
+
+def contradiction(weighed: Sequence[tuple[Candidate, Comparison]]) -> str:
+    """
+    :param weighed: candidates that were not accepted, on the half that confirms
+    :return: a sentence on the one that gains most there, if not all of them may be chance; else
+        empty
+    """
+    sure = [
+        (verdict.gain, verdict.p_value, candidate.key)
+        for candidate, verdict in weighed
+        if verdict.gain >= LEAST_GAIN and len(weighed) * verdict.p_value < _CONTRADICTS
+    ]
+    if not sure:
+        return ""
+    gain, p_value, key = max(sure)
+    return (
+        f"{key} lowers the error of held-out recordings by {gain:.0%} (p = {p_value:.2g}), but "
+        "the other recordings do not support it as the cause."
+    )
+
+
+def _interval(
+    half: Half, point: Point, free: Sequence[int], index: int, reach: float, profiles: bool
+) -> tuple[float, float]:
+    """:param reach: half the width of the symmetric interval"""
+    h, best = half.evidence.hypotheses, float(point.theta[index])
+    if profiles:
+        return profiled(half.evidence, point, free, index, reach)
+    return max(best - reach, float(h.lower[index])), min(best + reach, float(h.upper[index]))

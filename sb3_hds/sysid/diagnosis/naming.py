@@ -1,0 +1,269 @@
+"""Which causes are named: one after the other, or, where that leads nowhere, two at once."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_hds.sysid.comparison.family import chance_of_the_best
+from sb3_hds.sysid.comparison.held_out import Comparison
+from sb3_hds.sysid.comparison.search import Base, Search, Tried, as_good, passes
+from sb3_hds.sysid.diagnosis.account import standard_errors
+from sb3_hds.sysid.diagnosis.findings import (
+    ANOTHER,
+    CHANCE,
+    NAMELESS,
+    SMALL,
+    UNCERTAIN,
+    Accepted,
+    margin,
+)
+
+# Causes that are looked for.
+_MOST = 3
+# A later cause that takes away a smaller share of the error than this, of what the ones before took
+# away, may be no more than what their model is off by.
+_LEAST_OF_EARLIER = 0.01
+# Family-wise level of what selection proposes.
+_FAMILY_LEVEL = 0.05
+
+
+class Nameless(NamedTuple):
+    """
+    A force without a name that predicts better than what has one, or than nothing.
+
+    :param tried: the force
+    :param better: how much better
+    :param causes: keys of the causes in whose place it is; none: it is beside them
+    """
+
+    tried: Tried
+    better: Comparison
+    causes: tuple[str, ...]
+
+
+class Naming:
+    """
+    :param search: candidates on two halves of the evidence
+    :param start: what is believed at first
+    :param seed: of the bootstrap
+    :param family: candidates of the whole catalogue for each that is asked about here
+    :param by_all: whether all the data say which of several confirmed candidates is the cause, or
+        it is the one that was confirmed first
+    """
+
+    def __init__(
+        self, search: Search, start: Base, seed: int, by_all: bool = True, family: float = 1.0
+    ) -> None:
+        self.search, self.start, self.seed, self.by_all = search, start, seed, by_all
+        self.family = family
+        self.turned_down: dict[str, str] = {}
+        # Whether all the data ever said something else than what was confirmed first.
+        self._overruled = False
+
+    def one_by_one(self, firsts: Sequence[Tried]) -> tuple[list[Accepted], Base]:
+        """
+        :param firsts: candidates beside what is believed at first, best first
+        :return: causes, each confirmed beside those before it, and what is believed with them
+        """
+        found: list[Accepted] = []
+        tried, base = firsts, self.start
+        while (one := self._next(tried, base, keys_of(found))) is not None:
+            found.append(one)
+            base = self.search.believing(one.tried, base)
+            found, base = self._pruned(found, base)
+            if len(found) == _MOST:
+                break
+            tried = self.search.finalists(base, keys_of(found))
+        if len(found) > 1:
+            again = [self._asked_again(one, base) for one in found]
+            pairs = zip(found, again, strict=True)
+            found = [new if passes(new.verdict) else old for old, new in pairs]
+        return found, base
+
+    def pair(
+        self, alone: Accepted, base: Base, firsts: Sequence[Tried]
+    ) -> tuple[list[Accepted], Base] | None:
+        """
+        A cause that is named first takes on what belongs to a second one, and may leave too little
+        of it to be confirmed. So others are tried as the first one.
+
+        :param alone: the cause beside which no second one was confirmed
+        :param base: what is believed with it
+        :param firsts: candidates beside what is believed at first, best first
+        :return: the pair that selection prefers among those of which both causes are confirmed
+            beside each other and predict better than the one alone, and what is believed with it
+        """
+        chosen = self.search.pairs(firsts, self.start, alone.tried.candidate)
+        for looks, (first, tried) in enumerate(chosen):
+            confirmed = self._confirmed(first, tried, looks, base, firsts)
+            if confirmed is not None:
+                return confirmed
+        return None
+
+    def several_as_confirmed(self, firsts: Sequence[Tried]) -> tuple[list[Accepted], Base] | None:
+        """
+        What all the data prefer as a single cause may take on so much of a second one that no pair
+        is surely better. So each cause is once more the one that was confirmed first.
+
+        :param firsts: candidates beside what is believed at first, best first
+        :return: causes, if that makes them several, and what is believed with them
+        """
+        if not self._overruled:
+            return None
+        plain = Naming(self.search, self.start, self.seed, False, self.family)
+        found, base = plain.one_by_one(firsts)
+        if len(found) == 1:
+            return plain.pair(found[0], base, firsts)
+        return (found, base) if found else None
+
+    def outdone(
+        self, found: Sequence[Accepted], base: Base
+    ) -> tuple[list[Accepted], Base, Nameless | None]:
+        """
+        Of the causes that have a name, one is the best, right or wrong. If a force without a name
+        surely predicts better in the place of all of them, or of one, that one is not the cause.
+
+        :return: causes that stand, what is believed with them, and the force; None if none is
+            better
+        """
+        if not found or not self.search.hypotheses.nameless:
+            return list(found), base, None
+        for place in (tuple(found), *((one,) for one in found if len(found) > 1)):
+            without = base
+            for one in place:
+                without = self.search.without(one.tried.candidate, without)
+            best = self.search.nameless(without)[0]
+            better = self.search.better(best.kept, base.kept)
+            if best.point.cost < base.point.cost and not as_good(better):
+                self.turned_down |= dict.fromkeys(keys_of(place), NAMELESS)
+                rest = [one for one in found if one not in place]
+                return rest, without, Nameless(best, better, tuple(keys_of(place)))
+        return list(found), base, None
+
+    def nameless(self, base: Base, known: Sequence[str]) -> Nameless | None:
+        """
+        :param known: keys of causes that belong to what is believed
+        :return: a force without a name beside that, as sure as a cause has to be
+        """
+        tried = self.search.nameless(base)
+        sure = [t for t in tried if self._determined(t, base)]
+        best = self._best(sure, base, len(known))
+        if best is None or self._chance(best, base, known) >= _FAMILY_LEVEL / (1 + len(known)):
+            return None
+        return Nameless(best, self.search.confirmed(best.kept, base.kept), ())
+
+    def _confirmed(
+        self, first: Tried, tried: Sequence[Tried], looks: int, base: Base, firsts: Sequence[Tried]
+    ) -> tuple[list[Accepted], Base] | None:
+        """
+        :param first: of a pair
+        :param tried: beside it, best first
+        :param looks: at pairs that were not confirmed: each makes the next harder to confirm
+        """
+        belief = self.search.believing(first, self.start)
+        second = self._next(tried, belief, [first.candidate.key], looks)
+        if second is None:
+            return None
+        both = self.search.believing(second.tried, belief)
+        if not passes(self.search.better(both.kept, base.kept)):
+            return None
+        chance = self._chance(first, self.start, [])
+        found, both = self._pruned(
+            [self._accepted(first, firsts, self.start, chance), second], both
+        )
+        found = [self._asked_again(one, both) for one in found]
+        if len(found) < 2 or not all(passes(one.verdict) for one in found):
+            return None
+        return found, both
+
+    def _next(
+        self, tried: Sequence[Tried], base: Base, known: Sequence[str], looks: int = 0
+    ) -> Accepted | None:
+        """
+        :param looks: at pairs that were not confirmed
+        :return: the best of what was tried, if it is a cause beside those that are known
+        """
+        sure = [t for t in tried if self._is_meant(t) and self._determined(t, base)]
+        best = self._best(sure, base, len(known) + looks)
+        if best is None:
+            return None
+        if self._is_leftover(best, base):
+            self.turned_down[best.candidate.key] = SMALL
+            return None
+        if (chance := self._chance(best, base, known)) >= _FAMILY_LEVEL / (1 + len(known) + looks):
+            self.turned_down[best.candidate.key] = CHANCE
+            return None
+        return self._accepted(best, tried, base, chance)
+
+    def _best(self, sure: Sequence[Tried], base: Base, looks: int) -> Tried | None:
+        """:return: what is confirmed, or what all the data prefer to that"""
+        first = self.search.best(sure, base, looks)
+        if first is None or not self.by_all:
+            return first
+        best = self.search.preferred(first, sure, base)
+        self._overruled |= best is not first
+        return best
+
+    def _accepted(self, best: Tried, tried: Sequence[Tried], base: Base, chance: float) -> Accepted:
+        """:param base: what is believed without it"""
+        rivals = [*tried, *self.search.relatives(best, tried, base)]
+        others = self.search.alternatives(best, rivals, base)
+        verdict = self.search.confirmed(best.kept, base.kept)
+        return Accepted(best, verdict, others, chance)
+
+    def _asked_again(self, one: Accepted, base: Base) -> Accepted:
+        """A cause beside what looks like it, now that the other causes are known."""
+        without = self.search.without(one.tried.candidate, base)
+        names = (one.tried.candidate.key, *one.alternatives)
+        named = [c for c in self.search.hypotheses.candidates if c.key in names]
+        named = [c for c in named if not self.search.part_of(c, without)]
+        tried = self.search.finished(named, without)
+        same = next(t for t in tried if t.candidate is one.tried.candidate)
+        return self._accepted(same, tried, without, one.chance)
+
+    def _determined(self, tried: Tried, base: Base) -> bool:
+        """Whether the interval of some parameter leaves out the value at which nothing changes."""
+        half, own = self.search.select, list(self.search.hypotheses.indices(tried.candidate))
+        free = [*base.free, *own]
+        stderr = standard_errors(half, tried.point, free)[own]
+        moved = np.abs(tried.point.theta - self.search.hypotheses.null)[own]
+        if not (sure := bool((moved > margin(len(np.unique(half.unit)), stderr)).any())):
+            self.turned_down[tried.candidate.key] = UNCERTAIN
+        return sure
+
+    def _is_meant(self, tried: Tried) -> bool:
+        """Whether what was fitted is what its name says."""
+        names = self.search.hypotheses.names
+        sizes = tried.point.theta[[names.index(name) for name in tried.candidate.ascending]]
+        if not (meant := bool(np.all(np.diff(sizes) >= 0.0))):
+            self.turned_down[tried.candidate.key] = ANOTHER
+        return meant
+
+    def _is_leftover(self, best: Tried, base: Base) -> bool:
+        """Whether an imperfect model of the causes before explains as much as this one."""
+        first, now, then = map(self.search.confirm.total, (self.start.kept, base.kept, best.kept))
+        return now - then < _LEAST_OF_EARLIER * (first - now)
+
+    def _chance(self, best: Tried, base: Base, known: Sequence[str]) -> float:
+        """:return: family-wise p-value on the half that selects"""
+        h = self.search.hypotheses
+        left = [c for c in (*h.candidates, *h.nameless) if c.key not in known]
+        slopes = self.search.select.evidence.slopes(best.point)
+        own = [h.indices(c) for c in left]
+        fitted = (*base.free, *h.indices(best.candidate))
+        gain = base.point.cost - best.point.cost
+        chance = chance_of_the_best(slopes, own, base.free, fitted, gain, self.seed)
+        return min(1.0, self.family * chance)
+
+    def _pruned(self, found: list[Accepted], base: Base) -> tuple[list[Accepted], Base]:
+        """Without causes that later ones have made superfluous."""
+        for one in found[:-1]:
+            if not self.search.needed(one.tried.candidate, base):
+                base = self.search.without(one.tried.candidate, base)
+                found = [other for other in found if other is not one]
+        return found, base
+
+
+def keys_of(found: Sequence[Accepted]) -> list[str]:
+    return [one.tried.candidate.key for one in found]

@@ -1,0 +1,221 @@
+"""Which causes are worth a simulation: sets of them, and single ones, by equation errors."""
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_hds.core import AnalyticTwin, Effect, Twin
+from sb3_hds.core.twin import plant_of
+from sb3_hds.sysid.equation.columns import equation, refuted_by_kinematics
+from sb3_hds.sysid.equation.motion import Motion
+from sb3_hds.sysid.equation.problem import Problem, problem
+from sb3_hds.sysid.equation.selection import (
+    Left,
+    Member,
+    admitted,
+    members,
+    propose,
+    retuned,
+    simpler,
+    what_is_left,
+)
+from sb3_hds.sysid.equation.weak_form import grams, weak_rows
+from sb3_hds.sysid.estimation.hypotheses import Candidate, Hypotheses
+from sb3_hds.sysid.estimation.priors import Belief
+
+# Single candidates that are simulated, besides those of the set and what may stand for them.
+_SINGLES = 10
+# Share of what the nominal model leaves that a cause explains at least, and by how much it has to
+# exceed its price, in -2 log likelihood.
+_TOLD, _SURELY = 0.05, 6.0
+# Share of a joint's force that a typical size changes.
+_TYPICAL = 0.05
+# Machines of more joints are not asked about what has no column at every joint, but where much is
+# left that can be predicted; where they have several causes, only these are simulated.
+SMALL_MACHINE, _LEFT = 2, 0.2
+
+
+class Screened(NamedTuple):
+    """
+    :param hypotheses: all candidates
+    :param problem: their columns
+    :param motion: of the joints
+    :param members: of the set that explains most for its price
+    :param hints: keys of what is small beside what stays unexplained
+    :param left: what the set leaves at each joint
+    :param keys: of the candidates that are worth a simulation
+    :param nameless_at: joints at which forces without a name are
+    """
+
+    hypotheses: Hypotheses
+    problem: Problem
+    motion: Motion
+    members: tuple[Member, ...]
+    hints: tuple[str, ...]
+    left: tuple[Left, ...]
+    keys: frozenset[str]
+    nameless_at: tuple[str, ...]
+
+    def among(self, keys: Collection[str]) -> "Screened":
+        """:return: the same with some members, solved and judged anew without the others"""
+        p, rest = self.problem, [m.item for m in self.members if m.key in keys]
+        found = admitted(p, retuned(p, [*p.always, *rest]))
+        return self._replace(members=_members_of(self.hypotheses, p, found))
+
+    def without(self, keys: Collection[str]) -> "Screened":
+        """:return: the same with simpler members of their families instead of some, or none"""
+        p = self.problem
+        rest = [m.item for m in self.members if m.key not in keys]
+        rest += [o for m in self.members if m.key in keys for o in simpler(p, m.item)[:1]]
+        found = admitted(p, retuned(p, [*p.always, *rest]))
+        return self._replace(members=_members_of(self.hypotheses, p, found))
+
+    def sizes_of(self, keys: Collection[str]) -> dict[str, float]:
+        """:return: values of the parameters of some members, by full name, solved without others"""
+        p, rest = self.problem, [m.item for m in self.members if m.key in keys]
+        items = retuned(p, [*p.always, *rest])
+        value, found = p.solve(items).value, {}
+        for item in (p.items[i] for i in items if i not in p.always):
+            if set(item.free) <= value.keys():
+                effect = self.hypotheses.effect_of(item.candidate)
+                sizes = item.sizes(effect, [value[c] for c in item.free])
+                found |= self._by_full_name(item.candidate, sizes)
+        return found
+
+    def intervals_of(self, member: Member) -> dict[str, tuple[float, float, float]]:
+        """:return: estimate and ends of the interval by full name"""
+        candidate = self.problem.items[member.item].candidate
+        parts = [self._by_full_name(candidate, x) for x in (member.sizes, member.low, member.high)]
+        value, low, high = parts
+        return {n: (value[n], min(low[n], high[n]), max(low[n], high[n])) for n in value}
+
+    def _by_full_name(self, candidate: Candidate, sizes: Mapping[str, float]) -> dict[str, float]:
+        if candidate.slot == "parameter":
+            (name,) = sizes
+            return {name: self.hypotheses.believed.values[name] + sizes[name]}
+        shorts = {name.rpartition(".")[2]: name for name in candidate.parameters}
+        return {shorts[short]: float(value) for short, value in sizes.items()}
+
+    @property
+    def detectable(self) -> dict[str, dict[str, float]]:
+        """
+        By candidate and short name, the smallest size that would explain a twentieth of what the
+        nominal model leaves, and be worth its price.
+        """
+        p = self.problem
+        start = p.solve(list(p.always))
+        cross = p.total[:, start.free]
+        seen = np.diag(p.total) - np.einsum("ij,jk,ik->i", cross, start.inverse, cross)
+        found: dict[str, dict[str, float]] = {}
+        for i, item in enumerate(p.items):
+            if item.key in found or i in p.always:
+                continue
+            needed = max(_TOLD * start.rss, p.price(i) + _SURELY)
+            sizes = found.setdefault(item.key, {})
+            for column, name in zip(item.columns, item.names, strict=True):
+                size = np.sqrt(needed / seen[column]) if seen[column] > 0.0 else np.inf
+                if item.rule == "chain":
+                    low, high = (setting[name] for setting in item.settings)
+                    size = abs(high - low) * size
+                sizes[name] = float(size)
+        return found
+
+    @property
+    def scales(self) -> dict[str, float]:
+        """What changes a joint's force by a twentieth, of parameters that have a slope there."""
+        p, found = self.problem, {}
+        for item in p.items:
+            if item.rule != "linear":
+                continue
+            shorts = {name.rpartition(".")[2]: name for name in item.candidate.parameters}
+            for column, name in zip(item.columns, item.names, strict=True):
+                share = float(np.max(p.shares[:, column] / p.force))
+                full = name if item.candidate.slot == "parameter" else shorts[name]
+                if share > 0.0:
+                    found.setdefault(full, _TYPICAL / share)
+        return found
+
+
+def screen(
+    twin: Twin,
+    moved: Motion,
+    effects: Sequence[type[Effect]],
+    calibrate: Sequence[str] | Mapping[str, Belief],
+) -> Screened | None:
+    """
+    :param twin: as it is believed
+    :param moved: joints, as measured
+    :return: None where there is no equation of motion, or nothing moves
+    """
+    if not isinstance(plant_of(twin), AnalyticTwin):
+        return None
+    if not moved.moves.any():
+        return None
+    coarse = moved.twin(twin)
+    hypotheses = Hypotheses.about(
+        coarse, effects, calibrate, period=moved.typical_period, speeds=tuple(moved.speed)
+    )
+    made = equation(hypotheses, moved)
+    if not made.items:
+        return None
+    p = problem(hypotheses, made, grams(made, weak_rows(made)))
+    found = propose(p)
+    set_of = _members_of(hypotheses, p, [i for i in found.keys if i not in p.always])
+    left = what_is_left(p, found.keys)
+    hints = tuple(p.items[i].key for i in found.hints)
+    joints = [joint.name for joint in coarse.joints]
+    small = len(joints) <= SMALL_MACHINE
+    where = [
+        name
+        for name, x in zip(joints, left, strict=True)
+        if small or (len(set_of) < 2 and x.predictable > _LEFT)
+    ]
+    keys = {m.key for m in set_of}
+    keys |= {p.items[o].key for m in set_of for o in simpler(p, m.item)}
+    if small or len(set_of) < 2:
+        keys |= {*(k for m in set_of for k in m.others), *_singles(p), *hints}
+        keys |= _without_column(hypotheses, p, moved, where)
+    return Screened(
+        hypotheses=hypotheses,
+        problem=p,
+        motion=moved,
+        members=set_of,
+        hints=hints,
+        left=tuple(left),
+        keys=frozenset(keys),
+        nameless_at=tuple(where),
+    )
+
+
+def _members_of(h: Hypotheses, p: Problem, items: Sequence[int]) -> tuple[Member, ...]:
+    effects = {c.key: h.effect_of(c) for c in h.candidates}
+    found = members(p, [*p.always, *items], effects)
+    return tuple(m for m in found if m.item not in p.always)
+
+
+def _singles(p: Problem) -> list[str]:
+    """Keys of what explains most beside nothing, best first."""
+    return list(dict.fromkeys(p.items[i].key for i in p.ranking(list(p.always))))[:_SINGLES]
+
+
+def _without_column(h: Hypotheses, p: Problem, moved: Motion, where: Sequence[str]) -> set[str]:
+    """What equation errors cannot say anything of, unless the kinematics refute it."""
+    there = {item.key for item in p.items}
+    refuted = refuted_by_kinematics(h.believed, moved)
+    found = set()
+    for candidate in h.candidates:
+        if candidate.key in there or candidate.key in refuted:
+            continue
+        if candidate.slot == "joint" and candidate.place not in where:
+            continue
+        if candidate.slot != "joint" and len(moved.speed) > SMALL_MACHINE:
+            continue
+        if candidate.slot == "parameter":
+            continue
+        found.add(candidate.key)
+    return found
+
+
+def effective(screened: Screened) -> float:
+    return float(np.mean(screened.problem.grams.effective))

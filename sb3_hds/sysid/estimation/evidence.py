@@ -1,0 +1,454 @@
+"""How well hypotheses explain windows of data: one compiled program for all of them."""
+
+import dataclasses
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
+from functools import cached_property, partial
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sb3_hds.core import Effect, EffectChain, Params, Twin
+from sb3_hds.core.effect_chain import Chosen
+from sb3_hds.core.numerics.compilation import QUICK_COMPILATION
+from sb3_hds.core.numerics.linear import uses_lapack
+from sb3_hds.sysid.estimation.hypotheses import Hypotheses
+from sb3_hds.sysid.estimation.motion import first_offsets
+from sb3_hds.sysid.estimation.shooting import Shots, n_steps_of, simulate, with_slopes
+
+# Beyond this, in units of the noise, an error counts in proportion, not by its square.
+_HUBER = 3.0
+# Stands for the error of a simulation that is not finite, in units of the noise.
+_NOT_FINITE = 1e4
+# Damping of the first step, relative to the curvature, how it changes, and where it ends.
+_DAMPING, _LESS, _MORE, _MOST_DAMPING = 1e-3, 0.2, 8.0, 1e6
+# A step that lowers the cost by a smaller share than this is the last.
+_ENOUGH = 1e-4
+# Added to curvatures, relative to their trace, so that what moves nothing stays where it is.
+_RIDGE = 1e-9
+# Most windows that are simulated at a time, and of what their number is a multiple.
+_PORTION, _ROUND = 64, 8
+# Steps of all windows, or joints, beyond which a second program, for start states alone, is worth
+# compiling.
+_MANY_STEPS, _MANY_JOINTS = 10_000, 3
+
+# Held by programs that must not run beside another one.
+_LAPACK = threading.Lock()
+
+_Given = TypeVar("_Given")
+_Told = TypeVar("_Told")
+
+
+def portion_for(n: int) -> int:
+    """:return: windows to simulate at a time where there are ``n`` or fewer"""
+    n_portions = -(-n // _PORTION)
+    return _ROUND * -(-n // (_ROUND * n_portions))
+
+
+class Point(NamedTuple):
+    """
+    Parameters and start states, and what they leave unexplained.
+
+    :param theta: all parameters that may move, shape ``(p,)``
+    :param offsets: of the start states, shape ``(n, free)``
+    :param raw: simulated minus measured, shape ``(n, steps + 1, n_obs)``
+    :param cost: what fits minimise: large errors count in proportion; with the prior of what moved
+    """
+
+    theta: np.ndarray
+    offsets: np.ndarray
+    raw: np.ndarray
+    cost: float
+
+
+class Solution(NamedTuple):
+    """
+    :param point: the end of the search
+    :param converged: whether another step would hardly lower the cost
+    :param n_steps: that were taken
+    """
+
+    point: Point
+    converged: bool
+    n_steps: int
+
+
+class Slopes(NamedTuple):
+    """
+    At a point, start states eliminated, parameters in units of their scale.
+
+    :param curvature: of the cost of each window, shape ``(n, p, p)``
+    :param scores: slopes of the cost of each window, shape ``(n, p)``
+    """
+
+    curvature: np.ndarray
+    scores: np.ndarray
+
+
+class _Blocks(NamedTuple):
+    """Normal equations of windows: of start states, of parameters, and between them."""
+
+    raw: np.ndarray
+    cost: np.ndarray
+    own: np.ndarray
+    cross: np.ndarray
+    shared: np.ndarray
+    by_start: np.ndarray
+    by_theta: np.ndarray
+
+
+class _Step(NamedTuple):
+    """Normal equations with the start states eliminated, and how those follow."""
+
+    curvature: np.ndarray
+    scores: np.ndarray
+    from_score: np.ndarray
+    from_step: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Evidence:
+    """
+    Windows of data under the hypotheses.
+
+    :param hypotheses: what may move
+    :param shots: windows, all of weight one
+    :param noise: of each channel, shape ``(n_obs,)``
+    :param width: most parameters that move at a time
+    :param rows: whether a row of a window counts, shape ``(steps + 1,)``; default: all do
+    :param portion: windows that are simulated at a time: one program serves data of every size
+    :param threshold: beyond which an error counts in proportion, not by its square, in units of the
+        noise
+    """
+
+    hypotheses: Hypotheses
+    shots: Shots
+    noise: Float[np.ndarray, " obs"]
+    width: int
+    rows: Float[np.ndarray, " rows"] | None = None
+    portion: int = _PORTION
+    threshold: float = _HUBER
+
+    def with_noise(self, noise: Float[np.ndarray, " obs"]) -> "Evidence":
+        return dataclasses.replace(self, noise=noise)
+
+    def on(self, shots: Shots, rows: Float[np.ndarray, " rows"] | None = None) -> "Evidence":
+        """:return: the same hypotheses on other windows of the same length"""
+        return dataclasses.replace(self, shots=shots, rows=rows)
+
+    def fit(
+        self,
+        theta: Float[np.ndarray, " p"],
+        free: Sequence[int],
+        offsets: Float[np.ndarray, "n free"] | None = None,
+        n_steps: int = 15,
+    ) -> Point:
+        """:return: where :meth:`solve` ends"""
+        return self.solve(theta, free, offsets, n_steps).point
+
+    def solve(
+        self,
+        theta: Float[np.ndarray, " p"],
+        free: Sequence[int],
+        offsets: Float[np.ndarray, "n free"] | None = None,
+        n_steps: int = 15,
+        enough: float = _ENOUGH,
+        least: float = 0.0,
+    ) -> "Solution":
+        """
+        Levenberg-Marquardt over the start states and some parameters, within their bounds.
+
+        :param theta: where to begin
+        :param free: indices of the parameters that move; none: only start states do
+        :param offsets: of the start states, where to begin; default: as measured
+        :param n_steps: at most
+        :param enough: a step that lowers the cost by a smaller share than this is the last
+        :param least: so is one that lowers it by less than this
+        """
+        h, moving = self.hypotheses, np.array(free, int)
+        low, high, size = h.lower[moving], h.upper[moving], h.scale[moving]
+        theta = np.array(theta, float)
+        offsets = self._measured(theta) if offsets is None else offsets
+        now, damping = self._blocks(theta, moving, offsets), _DAMPING
+        null, firm = h.null[moving], (size / h.prior[moving]) ** 2
+        doubt = lambda x: float(0.5 * firm @ ((x[moving] - null) / size) ** 2)  # noqa: E731
+        converged, taken = False, 0
+        for _ in range(n_steps):
+            taken += 1
+            step = _eliminated(now, damping)
+            new = theta.copy()
+            pull = firm, firm * (theta[moving] - null) / size
+            new[moving] = _moved(theta[moving], step, pull, size, low, high, damping)
+            z = (new[moving] - theta[moving]) / size
+            ahead = offsets + step.from_score + step.from_step @ z
+            then = self._blocks(new, moving, ahead)
+            if not len(moving):
+                # Start states of different windows have nothing to do with each other.
+                better = then.cost < now.cost
+                gained = np.sum((now.cost - then.cost)[better])
+                offsets = np.where(better[:, None], ahead, offsets)
+                now = _Blocks(
+                    *(
+                        np.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+                        for a, b in zip(then, now, strict=True)
+                    )
+                )
+            elif gained := max(now.cost.sum() + doubt(theta) - then.cost.sum() - doubt(new), 0.0):
+                theta, offsets, now = new, ahead, then
+            damping *= _LESS if gained else _MORE
+            if (gained and gained < enough * now.cost.sum() + least) or damping > _MOST_DAMPING:
+                converged = True
+                break
+        point = Point(theta, offsets, now.raw, float(now.cost.sum()) + doubt(theta))
+        return Solution(point, converged, taken)
+
+    def slopes(self, point: Point, index: Sequence[int] | None = None) -> Slopes:
+        """
+        :param index: of the parameters; default: all
+        """
+        every = np.arange(len(point.theta)) if index is None else np.array(index, int)
+        step = _eliminated(self._blocks(point.theta, every, point.offsets), 0.0)
+        return Slopes(step.curvature, step.scores)
+
+    def nearest(
+        self,
+        theta: Float[np.ndarray, " p"],
+        offsets: Sequence[Float[np.ndarray, "n free"]],
+        measured: bool = False,
+    ) -> tuple[Float[np.ndarray, "n free"], float]:
+        """
+        :param offsets: of the start states under other parameters, one or several
+        :param measured: whether the measured start states are to choose from, too
+        :return: of each window, the start state that explains it best; and the cost of that
+        """
+        every = [*offsets, self._measured(theta)] if measured else offsets
+        costs = [self._blocks(theta, np.array([], int), each).cost for each in every]
+        best = np.argmin(costs, 0)[None]
+        chosen = np.take_along_axis(np.stack(every), best[..., None], 0)[0]
+        return chosen, float(np.take_along_axis(np.stack(costs), best, 0).sum())
+
+    def _measured(self, theta: np.ndarray) -> np.ndarray:
+        h = self.hypotheses
+        params = h.fixed | dict(zip(h.names, theta, strict=True))
+        with jax.enable_x64(True):
+            return first_offsets(h.twin, np.asarray(self.shots.obs, float), h.twin.dt, params)
+
+    @cached_property
+    def _counted(self) -> np.ndarray:
+        return np.ones(self.shots.obs.shape[1]) if self.rows is None else self.rows
+
+    @cached_property
+    def _most_known(self) -> int:
+        """Of all windows, the most steps that were recorded before one."""
+        return int(np.asarray(self.shots.lead_known).sum(1).max(initial=0.0))
+
+    @cached_property
+    def _portions(self) -> list[tuple[Shots, slice]]:
+        """Windows, some at a time, the last ones filled up."""
+        found = []
+        with jax.enable_x64(True):
+            for first in range(0, self.shots.n, self.portion):
+                index = np.minimum(np.arange(first, first + self.portion), self.shots.n - 1)
+                portion = Shots(*(jnp.asarray(leaf[index], jnp.float64) for leaf in self.shots))
+                found.append((portion, slice(first, min(first + self.portion, self.shots.n))))
+        return found
+
+    def _width_for(self, index: np.ndarray) -> int:
+        n, rows = self.shots.obs.shape[:2]
+        large = len(self.hypotheses.twin.joints) > _MANY_JOINTS
+        return 0 if not len(index) and (large or n * rows > _MANY_STEPS) else self.width
+
+    def _lead_under(self, theta: np.ndarray, index: np.ndarray) -> int:
+        """:return: steps before a window in which memory must be filled under these parameters"""
+        h = self.hypotheses
+        active = theta != h.null
+        # What is absent remembers nothing, but its slope may need the last few commands.
+        begins = np.where(active, h.forgets, np.minimum(h.forgets, Effect.forgets * h.period))
+        active[index] = True
+        longest = max(h.always, float(begins[active].max(initial=0.0)))
+        return min(n_steps_of(longest, h.twin.dt), self._most_known)
+
+    def _blocks(self, theta: np.ndarray, index: np.ndarray, offsets: np.ndarray) -> _Blocks:
+        """Normal equations at a point, of the parameters named by ``index``."""
+
+        def of(portion: tuple[Shots, slice]) -> _Blocks:
+            shots, rows = portion
+            return self._portion(shots, theta, index, offsets[rows], rows.stop - rows.start)
+
+        found = in_threads(of, self._portions)
+        return _Blocks(*map(np.concatenate, zip(*found, strict=True)))
+
+    def _portion(
+        self, shots: Shots, theta: np.ndarray, index: np.ndarray, offsets: np.ndarray, n: int
+    ) -> _Blocks:
+        h, n_lead = self.hypotheses, self._lead_under(theta, index)
+        filled = np.zeros((self.portion, offsets.shape[1]))
+        filled[:n] = offsets
+        slopes = []
+        for own in _in_groups(index, self._width_for(index), len(theta)):
+            with jax.enable_x64(True), _alone(len(h.twin.joints)):
+                found = _look(
+                    h.twin,
+                    h.names,
+                    tuple(h.ties.items()),
+                    h.fixed,
+                    shots,
+                    theta,
+                    own,
+                    filled,
+                    h.scale,
+                    n_lead,
+                    h.chosen(theta, own),
+                )
+                found = [np.asarray(leaf)[:n] for leaf in found]
+            raw, by_start, by_theta = found
+            slopes.append(by_theta)
+        by_theta = np.concatenate(slopes, -1)[..., : len(index)]
+        return _normal(raw, by_start, by_theta, self.noise, self._counted, self.threshold)
+
+
+def _alone(n: int) -> AbstractContextManager:
+    """For programs that solve matrices of so many rows."""
+    return _LAPACK if uses_lapack(n) else nullcontext()
+
+
+def in_threads(work: Callable[[_Given], _Told], given: Sequence[_Given]) -> Iterator[_Told]:
+    """
+    As ``map``. Compiled programs leave the interpreter free, so threads share the cores.
+    """
+    if len(given) == 1:
+        yield work(given[0])
+        return
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        yield from pool.map(work, given)
+
+
+def _in_groups(index: np.ndarray, width: int, nothing: int) -> Iterator[np.ndarray]:
+    """Indices, so many at a time, the last ones filled up by one that names nothing."""
+    for first in range(0, max(len(index), 1), max(width, 1)):
+        own = index[first : first + width]
+        yield np.concatenate([own, np.full(width - len(own), nothing)])
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=QUICK_COMPILATION)
+def _look(
+    twin: Twin,
+    names: tuple[str, ...],
+    ties: tuple[tuple[str, tuple[str, ...]], ...],
+    fixed: Params,
+    shots: Shots,
+    theta: Float[Array, " p"],
+    index: Array,
+    offsets: Float[Array, "n free"],
+    scale: Float[Array, " p"],
+    n_lead: Array,
+    chosen: Chosen | None,
+) -> tuple[Array, Array, Array]:
+    """
+    :param ties: parameters that share one number, by the name of that number
+    :param n_lead: steps before each window that matter to what is remembered
+    :param chosen: the effects that may do something under these parameters; None: all
+    :return: simulated minus measured, and its slopes by start state and by the parameters that
+        ``index`` names (in units of their scale)
+    """
+    n, effects = offsets.shape[1], EffectChain((), {}, chosen)
+
+    def one(offset: Array, shot: Shots) -> tuple[Array, Array, Array]:
+        def of(both: Array) -> Array:
+            # The last place takes what belongs to no parameter.
+            step = jnp.zeros(len(names) + 1, theta.dtype).at[index].set(both[n:])
+            values = theta + scale * step[:-1]
+            params = fixed | {name: values[i] for i, name in enumerate(names)}
+            for name, own in ties:
+                for single in own:
+                    params[single] = params[single] + params[name] - fixed[single]
+            return simulate(twin, params, shot, offset + both[:n], n_lead, effects) - shot.obs
+
+        error, slopes = with_slopes(of, jnp.zeros(n + index.shape[0], theta.dtype))
+        return error, slopes[..., :n], slopes[..., n:]
+
+    return jax.vmap(one)(offsets, shots)
+
+
+# States that grow beyond any bound are counted as errors of a fixed size: they need no warning.
+@np.errstate(over="ignore", invalid="ignore")
+def _normal(
+    raw: np.ndarray,
+    by_start: np.ndarray,
+    by_theta: np.ndarray,
+    noise: np.ndarray,
+    counted: np.ndarray,
+    threshold: float,
+) -> _Blocks:
+    n = len(raw)
+    finite = np.isfinite(raw)
+    error = np.where(finite, raw / noise, _NOT_FINITE) * counted[:, None]
+    size = np.abs(error)
+    small = np.minimum(size, threshold)
+    cost = np.sum(0.5 * small**2 + threshold * (size - small), (1, 2))
+    weight = np.sqrt(np.minimum(1.0, threshold / np.maximum(size, 1e-12)))
+    factor = (weight * counted[:, None] / noise)[..., None]
+    start, theta = (
+        np.where(np.isfinite(slopes), slopes, 0.0) * factor for slopes in (by_start, by_theta)
+    )
+    numbers = raw[0].size
+    start, theta = (x.reshape(n, numbers, x.shape[-1]) for x in (start, theta))
+    right = (weight * error).reshape(n, -1, 1)
+    across = start.transpose(0, 2, 1)
+    return _Blocks(
+        raw=raw,
+        cost=cost,
+        own=across @ start,
+        cross=across @ theta,
+        shared=theta.transpose(0, 2, 1) @ theta,
+        by_start=(across @ right)[..., 0],
+        by_theta=(theta.transpose(0, 2, 1) @ right)[..., 0],
+    )
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _eliminated(blocks: _Blocks, damping: float) -> _Step:
+    free = blocks.own.shape[1]
+    diagonal = np.einsum("nff->nf", blocks.own)
+    ridge = damping * diagonal + _RIDGE * diagonal.sum(1, keepdims=True) + 1e-300
+    own = blocks.own + ridge[:, :, None] * np.eye(free)
+    solved = np.linalg.solve(own, np.concatenate([blocks.by_start[..., None], blocks.cross], 2))
+    back = blocks.cross.transpose(0, 2, 1)
+    return _Step(
+        curvature=blocks.shared - back @ solved[..., 1:],
+        scores=blocks.by_theta - (back @ solved[..., :1])[..., 0],
+        from_score=-solved[..., 0],
+        from_step=-solved[..., 1:],
+    )
+
+
+def _moved(
+    values: np.ndarray,
+    step: _Step,
+    pull: tuple[np.ndarray, np.ndarray],
+    size: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    damping: float,
+) -> np.ndarray:
+    """
+    Where the damped step leads; what would leave its bounds stays.
+
+    :param pull: curvature and slope of the prior
+    """
+    curvature = step.curvature.sum(0) + np.diag(pull[0])
+    score = step.scores.sum(0) + pull[1]
+    free = ~(((values <= low) & (score > 0.0)) | ((values >= high) & (score < 0.0)))
+    if not free.any():
+        return values
+    inner = curvature[np.ix_(free, free)]
+    ridge = damping * np.diag(inner) + _RIDGE * np.trace(inner) + 1e-300
+    moved = values.copy()
+    moved[free] -= size[free] * np.linalg.solve(inner + np.diag(ridge), score[free])
+    return np.clip(moved, low, high)

@@ -1,0 +1,143 @@
+"""Parameters by inverse dynamics: from the forces that measured motion needs, unsimulated."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jaxtyping import Array, Float
+
+from sb3_hds.core import AnalyticTwin, State, Trajectories, Twin
+from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
+from sb3_hds.sysid.equation.motion import motion
+from sb3_hds.sysid.estimation.free import one_each
+
+# Gauss-Newton steps: most parameters are linear, and need one; Huber's weights need a few.
+_STEPS = 6
+_HUBER = 1.345
+#: for plain squares: beyond any error, in units of the noise
+NO_THRESHOLD = 1e12
+_NORMAL = 1.4826
+# How firmly the twin's own values are believed, as a standard deviation in each parameter's scale:
+# enough to keep what the data do not tell.
+_BELIEF = 100.0
+
+
+class Forces(NamedTuple):
+    """
+    :param values: of the free parameters, within their bounds
+    :param errors: forces that are missing at these values, in units of their noise, weighted by
+        Huber's rule, shape ``(n, dof)``
+    :param slopes: of these by the parameters, shape ``(n, dof, p)``
+    :param recording: that each row is from, shape ``(n,)``
+    :param every: samples of the data between two rows
+    """
+
+    values: np.ndarray
+    errors: np.ndarray
+    slopes: np.ndarray
+    recording: np.ndarray
+    every: int
+
+    def windows(self, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """:return: errors, slopes and recording of pieces of so many samples"""
+        rows = max(1, steps // self.every)
+        places = []
+        for one in np.unique(self.recording):
+            own = np.flatnonzero(self.recording == one)
+            whole = len(own) // rows * rows
+            places.append(own[:whole].reshape(-1, rows))
+        index = np.concatenate(places)
+        n, p = len(index), self.slopes.shape[-1]
+        errors, slopes = self.errors[index], self.slopes[index]
+        return errors.reshape(n, -1), slopes.reshape(n, -1, p), self.recording[index[:, 0]]
+
+
+def by_inverse_dynamics(
+    twin: Twin, groups: tuple[tuple[str, ...], ...], data: Trajectories, threshold: float = _HUBER
+) -> Forces | None:
+    r"""
+    Least squares on the force that measured motion needs and the twin does not have,
+
+    .. math:: M(q)\,\dot v + c(q, v) - \tau(q, v, u)
+
+    Nothing is integrated: it leads where simulations under wrong values run away, and is the better
+    estimator where forces rather than sensors are uncertain, as of a geared arm whose torques are
+    logged. Noise of velocities biases it towards zero.
+
+    Source: Khalil and Dombre, *Modeling, Identification and Control of Robots*, 2002, section 12.
+
+    :param groups: free parameters
+    :param threshold: of the Huber loss, in units of the noise
+    :return: None for a twin that has more than an equation of motion
+    """
+    if not isinstance(twin, AnalyticTwin):
+        return None
+    moved = motion(twin, data)
+    middle = lambda x: 0.5 * (x[1:] + x[:-1])  # noqa: E731
+    parts = [(middle(r.q), middle(r.v), middle(r.a), r.actions) for r in moved.recordings]
+    recording = np.repeat(moved.origin, [len(r.actions) for r in moved.recordings])
+    parameters = [twin.parameters[group[0]] for group in groups]
+    scale = np.array([p.scale if p.scale > 0.0 else 1.0 for p in parameters])
+    own = np.array([twin.values[group[0]] for group in groups])
+    lower, upper = (np.array([getattr(p, end) for p in parameters]) for end in ("lower", "upper"))
+    values = own.copy()
+    with jax.enable_x64(True):
+        rows = tuple(jnp.asarray(np.concatenate(x), jnp.float64) for x in zip(*parts, strict=True))
+        fixed = {k: jnp.asarray(leaf, jnp.float64) for k, leaf in twin.params.items()}
+        look = partial(_missing, twin, groups, fixed)
+        for step in range(_STEPS + 1):
+            missing, slopes = map(np.asarray, look(jnp.asarray(values), *rows))
+            if not (np.isfinite(missing).all() and np.isfinite(slopes).all()):
+                return None
+            weight = _weights(missing, threshold)
+            errors, table = weight * missing, weight[..., None] * slopes
+            if step == _STEPS:
+                break
+            belief = np.diag(np.full(len(groups), 1.0 / _BELIEF))
+            whole = np.concatenate([table.reshape(-1, len(groups)) * scale, belief])
+            right = np.concatenate([-errors.ravel(), (own - values) / scale / _BELIEF])
+            room = (lower - values) / scale, (upper - values) / scale
+            values = np.clip(values + scale * _within(whole, right, room), lower, upper)
+    return Forces(values, errors, table, recording, moved.every)
+
+
+def _weights(missing: np.ndarray, threshold: float) -> np.ndarray:
+    noise = _NORMAL * np.median(np.abs(missing), 0)
+    noise = np.maximum(noise, 1e-12 * np.abs(missing).max() + 1e-300)
+    return np.sqrt(np.minimum(1.0, threshold * noise / np.maximum(np.abs(missing), 1e-300))) / noise
+
+
+def _within(table: np.ndarray, right: np.ndarray, room: tuple[np.ndarray, np.ndarray]) -> Any:
+    """Least squares between bounds, of which one that stands on the other leaves no room."""
+    low, high = room
+    fixed = high - low < 1e-12
+    found = np.zeros(len(low))
+    free = ~fixed
+    if free.any():
+        found[free] = scipy.optimize.lsq_linear(table[:, free], right, (low[free], high[free])).x
+    return found
+
+
+@partial(jax.jit, static_argnums=(0, 1), compiler_options=QUICKEST_COMPILATION)
+def _missing(
+    twin: AnalyticTwin,
+    groups: tuple[tuple[str, ...], ...],
+    fixed: dict[str, Array],
+    values: Array,
+    q: Array,
+    v: Array,
+    a: Array,
+    actions: Array,
+) -> tuple[Float[Array, "n dof"], Float[Array, "n dof p"]]:
+    def missing(values: Array, q: Array, v: Array, a: Array, action: Array) -> Array:
+        p = fixed | one_each(groups, values)
+        needed = twin.mass_matrix(q, p) @ a + twin.bias(q, v, p)
+        return needed - twin.actuate(State(q, v, {}), action, p)
+
+    def row(*given: Array) -> tuple[Array, Array]:
+        return missing(values, *given), jax.jacfwd(missing)(values, *given)
+
+    return jax.vmap(row)(q, v, a, actions)

@@ -1,0 +1,177 @@
+"""How well a twin predicts measured data, window by window."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jaxtyping import Array, Float
+
+from sb3_hds.core import Params, Trajectories, Twin
+from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
+from sb3_hds.sysid.estimation.results import Fit
+from sb3_hds.sysid.estimation.shooting import Shots, fit_start, n_free, simulate, with_slopes
+
+# Gauss-Newton steps of a start state.
+_N_STEPS = 8
+# Better is what lowers the error by this share, at this level, judged by so many samples.
+_LEAST_GAIN, _LEVEL, _N_BOOTSTRAP = 0.05, 0.05, 1000
+# The first recording that may be held out as a whole, and how many of its windows at most.
+_FIRST_WHOLE, _LONG = 3, 32
+# What `has_grown` asks for.
+_GROWN, _GROWN_LEVEL = 1.5, 1e-4
+
+
+def window_errors(
+    twin: Twin, params: Params, shots: Shots, scale: Float[np.ndarray, " obs"]
+) -> Float[np.ndarray, " n"]:
+    """
+    Root mean square error of each window, from the start state that suits the twin best. So the
+    noise of the first measurement does not count, and neither does a bias of the twin that moving
+    the start can hide.
+
+    :param params: full parameters of the twin
+    :param shots: windows
+    :param scale: what an error of one means in each channel
+    :return: errors in units of ``scale``, shape ``(n,)``; infinite where a simulation is not finite
+    """
+    with jax.enable_x64(True):
+        doubles = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
+        found = _errors(twin, doubles, Shots(*map(jnp.asarray, shots)), jnp.asarray(scale))[0]
+        return np.asarray(found)
+
+
+def start_states(
+    twin: Twin, params: Params, shots: Shots, scale: Float[np.ndarray, " obs"]
+) -> tuple[Float[np.ndarray, "n free"], Float[np.ndarray, "n residuals free"]]:
+    """
+    :return: of each window, the start state under which the twin comes closest to it, and an
+        orthonormal basis of the errors (in units of ``scale``, flattened) that moving it can make
+    """
+    with jax.enable_x64(True):
+        doubles = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
+        found = _errors(twin, doubles, Shots(*map(jnp.asarray, shots)), jnp.asarray(scale))
+        slopes = np.nan_to_num(np.asarray(found[2]), posinf=0.0, neginf=0.0)
+        return np.asarray(found[1]), np.linalg.qr(slopes)[0]
+
+
+def single_step_errors(
+    twin: Twin, data: Trajectories, scale: Float[np.ndarray, " obs"], n_rows: int
+) -> Float[np.ndarray, " n"]:
+    """
+    Errors of single steps from measured states: quick to compile, and enough to see that a twin is
+    exact. Where measurements are noisy, or states not fully observed, they say little.
+
+    :param n_rows: the latest steps are looked at, so many; where there are fewer, some count twice
+    :return: root mean square over the channels of each step, in units of ``scale``
+    """
+    episodes = [data.episode(i) for i in range(len(data))]
+    steps = [np.concatenate(part) for part in zip(*((x[:-1], u, x[1:]) for x, u in episodes))]  # noqa: B905
+    rows = np.resize(np.arange(len(steps[0]))[-n_rows:], n_rows)
+    given = (jnp.asarray(x, jnp.float32) for x in (*(part[rows] for part in steps), scale))
+    return np.asarray(_single_steps(twin, twin.params, *given))
+
+
+def gain(new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"]) -> float:
+    """
+    :param new: errors of each window
+    :param old: errors of the same windows
+    :return: by which share the root mean square over all windows is lower
+    """
+    squares = (np.sum(np.clip(errors, 1e-9, 1e9) ** 2) for errors in (new, old))
+    return float(1.0 - np.sqrt(np.divide(*squares)))
+
+
+def is_better(
+    new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], least: float = _LEAST_GAIN
+) -> bool:
+    """
+    Whether errors of the same held-out windows are lower on the whole, and not by chance: in 95 of
+    100 bootstrap samples of the windows, too.
+
+    :param new: errors of each window
+    :param old: errors of the same windows
+    :param least: the gain that counts
+    """
+    if len(new) < 2 or not gain(new, old) >= least:
+        return False
+    lower = np.clip(old, 1e-9, 1e9) ** 2 - np.clip(new, 1e-9, 1e9) ** 2
+    drawn = np.random.default_rng(0).integers(len(lower), size=(_N_BOOTSTRAP, len(lower)))
+    return bool(np.mean(lower[drawn].sum(1) <= 0.0) < _LEVEL)
+
+
+def has_grown(latest: Float[np.ndarray, " n"], older: Float[np.ndarray, " m"]) -> bool:
+    """
+    Whether the system is no longer the one that it was: errors of the latest windows are half as
+    large again as those of older ones, beyond chance (one-sided Welch test on the logarithms, at a
+    level that allows for looking often).
+    """
+    new, old = (np.log(np.clip(errors, 1e-9, 1e9)) for errors in (latest, older))
+    test: Any = scipy.stats.ttest_ind(new, old, equal_var=False, alternative="greater")
+    return bool(new.mean() - old.mean() > np.log(_GROWN) and test.pvalue < _GROWN_LEVEL)
+
+
+def probability_before(fit: Fit, believed: Twin) -> float:
+    """
+    How probable, before any data, values were that are at least so far from what was believed.
+
+    Source: Box, J. R. Stat. Soc. A 143, 1980 (a prior is checked by its predictive distribution).
+
+    :param believed: its values are the centre of the prior, its parameters' ``scale`` the width
+    """
+    away = [
+        (e.estimate - believed.values[e.name]) / believed.parameters[e.name].scale
+        for e in fit.estimates
+    ]
+    return float(scipy.stats.chi2.sf(np.sum(np.square(away)), len(away)))
+
+
+def hold_out(number: np.ndarray, place: np.ndarray, share: float = 0.25) -> np.ndarray:
+    """
+    Which windows are kept from learning: whole recordings where there are at least four, otherwise
+    stretches of each; of a recording that goes on for long, stretches from there on.
+
+    What was learned from is never held out later: not when more has come, for the first three
+    recordings are not held out as a whole; not when old windows are left out, since numbers and
+    places stay; and not when the share becomes smaller, as long as it is halved.
+
+    :param number: of each window's recording, counted from the first there ever was; -1 for
+        padding, shape ``(n,)``
+    :param place: of each window in its recording: 0, 1, ..., shape ``(n,)``
+    :return: shape ``(n,)``
+    """
+    every = max(2, round(1.0 / share))
+    stretches = (number + place) % every == every - 1
+    if number.max() < _FIRST_WHOLE:
+        return stretches & (number >= 0)
+    whole = (number % every == every - 1) & (number >= _FIRST_WHOLE)
+    return np.where(place < _LONG, whole, stretches) & (number >= 0)
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
+def _single_steps(
+    twin: Twin, params: Params, obs: Array, actions: Array, after: Array, scale: Array
+) -> Float[Array, " n"]:
+    def one(obs: Array, action: Array, after: Array) -> Array:
+        state = twin.step(twin.infer(obs, params), action, params)
+        error = (twin.observe(state, params) - after) / scale
+        return jnp.sqrt(jnp.mean(error**2))
+
+    return jax.vmap(one)(obs, actions, after)
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
+def _errors(
+    twin: Twin, params: Params, shots: Shots, scale: Float[Array, " obs"]
+) -> tuple[Float[Array, " n"], Float[Array, "n free"], Float[Array, "n residuals free"]]:
+    def one(shot: Shots) -> tuple[Array, Array, Array]:
+        first = jnp.zeros(n_free(twin), shot.obs.dtype)
+        offset = fit_start(twin, params, shot, scale, first, _N_STEPS)
+        error = lambda x: ((simulate(twin, params, shot, x) - shot.obs) / scale).ravel()  # noqa: E731
+        left, slopes = with_slopes(error, offset)
+        rms = jnp.sqrt(jnp.mean(left**2))
+        return jnp.where(jnp.isfinite(rms), rms, jnp.inf), offset, slopes
+
+    return jax.vmap(one)(shots)

@@ -1,0 +1,296 @@
+"""Pictures of results; matplotlib is imported only here, and only when one is drawn."""
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sb3_hds.sysid.reporting.wording import TRAINED_IN, share_in_words
+
+if TYPE_CHECKING:
+    from sb3_hds.sysid.estimation.results import Fit
+    from sb3_hds.sysid.reporting.diagnosis import Diagnosis
+    from sb3_hds.sysid.reporting.moving import Moving
+    from sb3_hds.sysid.reporting.pictures import Pictures
+
+_MEASURED, _BEFORE, _AFTER, _ALIKE, _QUIET = "#3b3a36", "#d1495b", "#27496d", "#8fabc9", "#9a978c"
+# Widths on a desk or on paper, and on a telephone [in]: letters keep their size.
+_WIDE, _NARROW = 9.0, 4.4
+_DPI = 150
+# A candidate that makes predictions worse than this is drawn as if it did so by this much.
+_WORST = -0.05
+
+
+def as_png(figure: Any) -> bytes:
+    """:return: the picture, as a file would hold it"""
+    data = io.BytesIO()
+    figure.savefig(data, dpi=_DPI, format="png")
+    return data.getvalue()
+
+
+def plot_fit(fit: "Fit", path: Any) -> None:
+    """Estimates with intervals on the left, errors of each channel on the right."""
+    from matplotlib.figure import Figure
+
+    n = max(len(fit.estimates), len(fit.channels))
+    figure = Figure(figsize=(9.0, 1.6 + 0.45 * n), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _draw_estimates(left, fit)
+    _draw_errors(right, fit)
+    figure.savefig(path, dpi=150)
+
+
+def plot_rollouts(p: "Pictures", narrow: bool = False) -> Any:
+    """Each channel, and beside it what the simulations miss."""
+    figure, panels = _figure(len(p.channels), 2, 1.6, narrow)
+    seen = p.replay
+    for j, (name, unit) in enumerate(p.channels):
+        left, right = panels[j]
+        left.plot(seen.time, seen.measured[:, j], ".", color=_MEASURED, ms=3, label="measured")
+        for values, colour, label in (
+            (seen.before, _BEFORE, "before"),
+            (seen.after, _AFTER, "after"),
+        ):
+            left.plot(seen.time, values[:, j], color=colour, lw=1.2, label=label)
+            missed = values[:, j] - seen.measured[:, j]
+            right.plot(seen.time, missed, color=colour, lw=1.2, label=label)
+        for axes, centre in ((left, seen.after), (right, seen.after - seen.measured)):
+            ends = [centre[:, j] + side * seen.margin[:, j] for side in (-1.0, 1.0)]
+            axes.fill_between(seen.time, *ends, color=_AFTER, alpha=0.15, lw=0.0)
+        right.axhline(0.0, color=_MEASURED, lw=0.6)
+        left.set_ylabel(f"{name} [{unit}]", fontsize=8)
+        if j == 0 or narrow:
+            left.set_title("simulated and measured", fontsize=9)
+            right.set_title("simulated minus measured", fontsize=9)
+    if narrow:
+        for row, (name, unit) in zip(panels, p.channels, strict=True):
+            row[1].set_ylabel(f"{name} [{unit}]", fontsize=8)
+    figure.legend(
+        *panels[0, 0].get_legend_handles_labels(),
+        fontsize=8,
+        frameon=False,
+        ncols=3,
+        loc="outside upper center",
+    )
+    for axes in panels[-1]:
+        axes.set_xlabel("time [s]", fontsize=8)
+    return figure
+
+
+def plot_horizons(d: "Diagnosis", p: "Pictures", narrow: bool = False) -> Any:
+    """Error against the number of steps that are predicted."""
+    figure, panels = _figure(1, 1, 2.6, narrow)
+    axes = panels[0, 0]
+    for errors, colour, label in zip(p.errors, (_BEFORE, _AFTER), ("before", "after"), strict=True):
+        axes.plot(p.steps, errors, "o-", color=colour, ms=3, label=label)
+    for gain in d.gain.values():
+        ends = [gain.before * np.sqrt(max(1.0 - end, 0.0)) for end in (gain.low, gain.high)]
+        axes.plot([gain.steps] * 2, ends, color=_AFTER, lw=4.0, alpha=0.3)
+    axes.axhline(1.0, color=_QUIET, lw=1.0, ls="--", label="what the best fit leaves")
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("steps from the start of a window", fontsize=8)
+    axes.set_ylabel("error / what the best fit leaves", fontsize=8)
+    axes.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def plot_missing_force(p: "Pictures", narrow: bool = False) -> Any:
+    """The force that is missing against position, velocity, command and time, joint by joint."""
+    columns = 4 if p.actuators else 3
+    figure, panels = _figure(len(p.joints), columns, 2.2, narrow)
+    explained = p.missing.force - p.left.force
+    for j, (name, unit) in enumerate(p.joints):
+        joint_unit = "m" if unit == "N" else "rad"
+        against: list[tuple[str, np.ndarray]] = [
+            (f"position [{joint_unit}]", p.missing.position[:, j]),
+            (f"velocity [{joint_unit}/s]", p.missing.velocity[:, j]),
+            ("time [s]", p.missing.time),
+        ]
+        if p.actuators:
+            command = min(j, len(p.actuators) - 1)
+            label = f"command [{p.actuators[command][1]}]"
+            against.insert(2, (label, p.missing.command[:, command]))
+        low, high = np.quantile(p.missing.force[:, j], [0.01, 0.99])
+        margin = 0.2 * (high - low) + 1e-12
+        for k, (axes, (label, values)) in enumerate(zip(panels[j], against, strict=True)):
+            axes.plot(values, p.missing.force[:, j], ".", color=_QUIET, ms=3)
+            if np.any(explained[:, j]):
+                axes.plot(values, explained[:, j], ".", color=_AFTER, ms=3)
+            axes.axhline(0.0, color=_MEASURED, lw=0.6)
+            axes.set_ylim(low - margin, high + margin)
+            axes.set_xlabel(label, fontsize=8)
+            if k == 0 or narrow:
+                axes.set_ylabel(f"{name} [{unit}]", fontsize=8)
+    return figure
+
+
+def plot_evidence(d: "Diagnosis", narrow: bool = False) -> Any:
+    """A bar for every candidate, those that were named first."""
+    from matplotlib.patches import Patch
+
+    alike = {name for finding in d.findings for name in finding.alternatives}
+    bars = [(f.key, f.gain, _AFTER) for f in d.findings]
+    bars += [(r.name, r.gain, _ALIKE if r.name in alike else _QUIET) for r in d.rejected]
+    figure, panels = _figure(1, 1, 0.4 + 0.18 * len(bars), narrow)
+    axes, rows = panels[0, 0], np.arange(len(bars))
+    axes.barh(rows, [max(gain, _WORST) for _, gain, _ in bars], color=[c for *_, c in bars])
+    axes.axvline(0.05, color=_BEFORE, lw=1.0, ls="--", zorder=0.5)
+    axes.axvline(0.0, color=_MEASURED, lw=0.6)
+    for row, (_, gain, _) in enumerate(bars):
+        axes.annotate(
+            share_in_words(gain),
+            (max(gain, 0.0), row),
+            (3, 0),
+            textcoords="offset points",
+            va="center",
+            size=7,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.4},
+        )
+    axes.set_yticks(rows, [name for name, *_ in bars], fontsize=7)
+    axes.tick_params(axis="y", length=0)
+    axes.set_ylim(len(bars) - 0.4, -0.6)
+    axes.set_xlim(_WORST - 0.01, 1.08)
+    axes.set_xlabel("gain on held-out recordings", fontsize=8)
+    kinds = {_AFTER: "named", _ALIKE: "cannot be told from it", _QUIET: "not accepted"}
+    drawn = [colour for colour in kinds if any(colour == c for *_, c in bars)]
+    if len(drawn) > 1:
+        handles = [Patch(color=colour, label=kinds[colour]) for colour in drawn]
+        figure.legend(
+            handles=handles, fontsize=7, frameon=False, ncols=3, loc="outside upper center"
+        )
+    return figure
+
+
+def plot_policy_gain(gain: Mapping[str, Any], narrow: bool = False) -> Any:
+    """
+    A dot for each run, a line at the interquartile mean, a bar over its interval; of a single run,
+    a dot for each start state, and no interval.
+
+    :param gain: ``PolicyGain.to_dict()``
+    """
+    colours = {"believed": _BEFORE, "extended": _AFTER, "true": _QUIET}
+    names = list(gain["simulations"])
+    figure, panels = _figure(1, 1, 0.5 + 0.6 * len(names), narrow)
+    axes = panels[0, 0]
+    for row, name in enumerate(names):
+        found, returns = gain["simulations"][name], np.asarray(gain["returns"][name])
+        dots = np.mean(returns, 1) if len(returns) > 1 else returns[0]
+        apart = row + np.linspace(-0.15, 0.15, len(dots) + 2)[1:-1]
+        if len(returns) > 1:
+            ends = [found["low"], found["high"]]
+            axes.plot(ends, [row] * 2, color=colours[name], lw=8, alpha=0.3)
+        axes.plot([found["mean"]] * 2, [row - 0.25, row + 0.25], color=colours[name], lw=2)
+        axes.plot(dots, apart, "o", color=colours[name], ms=4, alpha=0.6)
+    axes.set_yticks(range(len(names)), [TRAINED_IN[name] for name in names])
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.margins(x=0.1)
+    axes.set_xlabel("return on the real system", fontsize=8)
+    return figure
+
+
+def _figure(rows: int, columns: int, height: float, narrow: bool) -> tuple[Any, np.ndarray]:
+    """
+    :param height: of a row [in]
+    :param narrow: whether the panels of a row stand two in a row, or one
+    :return: figure, and its panels in ``rows`` and ``columns`` wherever they stand
+    """
+    from matplotlib.figure import Figure
+
+    beside = columns if not narrow else 2 if columns == 4 else 1
+    deep = rows * columns // beside
+    size = (_NARROW if narrow else _WIDE, 0.5 + height * deep)
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(deep, beside, squeeze=False).reshape(rows, columns)
+    for axes in panels.ravel():
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=8)
+    return figure, panels
+
+
+def _draw_estimates(axes: Any, fit: "Fit") -> None:
+    """Deviations from the values before, in units of each parameter's typical deviation."""
+    names = [estimate.name for estimate in fit.estimates]
+    for row, estimate in enumerate(fit.estimates):
+        scale = fit.twin.parameters[estimate.name].scale
+        at = (estimate.estimate - estimate.before) / scale
+        ends = [(end - estimate.before) / scale for end in (estimate.low, estimate.high)]
+        if np.isfinite(ends).all():
+            axes.plot(ends, [row, row], color=_AFTER, linewidth=2.0)
+        axes.plot(at, row, "o", color=_AFTER)
+        text = f"{estimate.estimate:.4g} {estimate.unit}"
+        axes.annotate(text, (at, row), (0, 6), textcoords="offset points", ha="center", fontsize=8)
+    axes.axvline(0.0, color=_BEFORE, linewidth=1.0)
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.margins(x=0.2)
+    axes.set_xlabel("change from the value before, in typical deviations")
+    axes.set_title(f"estimates and {100.0 * fit.level:g} % intervals", fontsize=10)
+
+
+def _draw_errors(axes: Any, fit: "Fit") -> None:
+    rows = np.arange(len(fit.channels))
+    axes.barh(rows - 0.2, fit.error_before / fit.noise, 0.35, color=_BEFORE, label="before")
+    axes.barh(rows + 0.2, fit.error_after / fit.noise, 0.35, color=_AFTER, label="after")
+    axes.axvline(1.0, color=_QUIET, linewidth=1.0, label="noise")
+    axes.set_xscale("log")
+    axes.set_yticks(rows, [name for name, _ in fit.channels])
+    axes.invert_yaxis()
+    axes.set_xlabel("error over a window, in units of the noise")
+    axes.set_title("prediction error", fontsize=10)
+    axes.legend(fontsize=8, frameon=False)
+
+
+def film_frames(
+    moving: "Moving", players: Sequence[tuple[str, str]], frames: np.ndarray
+) -> Iterator[np.ndarray]:
+    """
+    :param players: label and colour of each
+    :param frames: indices of those that are drawn
+    :return: pictures of 1,280 x 720 points, shape ``(720, 1280, 3)``
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Polygon
+
+    n = len(moving.names)
+    figure = Figure(figsize=(12.8, 7.2), dpi=100)
+    canvas = FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(max(n, 1), 2, width_ratios=(3, 2), left=0.02, right=0.98)
+    stage = figure.add_subplot(grid[:, 0])
+    stage.set(xlim=(0, 100), ylim=(100, 0), aspect="equal")
+    stage.axis("off")
+    drawn, shapes = [], []
+    for p, (label, colour) in enumerate(players):
+        patches = [Polygon(corners, closed=True) for corners in moving.outlines[p, 0]]
+        for patch in patches:
+            patch.set(facecolor=(colour, 0.25), edgecolor=colour, lw=0.8)
+            stage.add_patch(patch)
+        shapes.append(patches)
+        width = 3.5 * moving.width * (1.6, 1.0, 0.6)[p]
+        style = {"color": colour, "lw": width, "solid_capstyle": "round", "alpha": 0.9}
+        lines = [stage.plot([], [], **style)[0] for _ in moving.lines[p, 0]]
+        lines[0].set_label(label)
+        drawn.append(lines)
+    legend = stage.legend(loc="lower left", frameon=False)
+    for handle in legend.get_lines():
+        handle.set_linewidth(6.0)
+    cursors = []
+    for j, name in enumerate(moving.names):
+        axes = figure.add_subplot(grid[j, 1])
+        for values, (_, colour) in zip(moving.errors, players[1:], strict=True):
+            axes.plot(moving.time, values[:, j], color=colour, lw=1)
+        axes.set_ylabel(name, rotation=0, ha="right", fontsize=7)
+        axes.tick_params(labelsize=6, labelbottom=j == n - 1)
+        cursors.append(axes.axvline(0.0, color="#2b2a27", lw=0.8))
+    for frame in frames.tolist():
+        for lines, places in zip(drawn, moving.lines[:, frame], strict=True):
+            for line, ends in zip(lines, places, strict=True):
+                line.set_data(ends[:, 0], ends[:, 1])
+        for patches, places in zip(shapes, moving.outlines[:, frame], strict=True):
+            for patch, corners in zip(patches, places, strict=True):
+                patch.set_xy(corners)
+        for cursor in cursors:
+            cursor.set_xdata([moving.time[frame]] * 2)
+        canvas.draw()
+        yield np.asarray(canvas.buffer_rgba())[..., :3]

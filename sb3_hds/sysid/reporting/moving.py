@@ -1,0 +1,170 @@
+"""A machine that moves: as measured, as the twin as it came predicts it, as the extended one."""
+
+import json
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sb3_hds.core import Params, Twin
+from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
+from sb3_hds.core.twin import plant_of
+from sb3_hds.sysid.reporting.pictures import Replay
+from sb3_hds.twins import MechanismTwin
+
+#: who moves: label and colour, the widest first
+PLAYERS = (
+    ("measured", "#a9a59a"),
+    ("predicted by the model as it came", "#d1495b"),
+    ("predicted by the corrected model", "#27496d"),
+)
+# Frames that a page holds at most, and joints whose errors it shows.
+_MOST_FRAMES, _MOST_JOINTS = 400, 12
+# From where a mechanism is seen: turned about its vertical, then tipped towards the eye [rad].
+_AZIMUTH, _ELEVATION = 0.9, 0.35
+# Corners of what a mesh looks like.
+_CORNERS = 20
+# Size of the drawing in units of its own.
+_SIZE = 100.0
+
+
+class Moving(NamedTuple):
+    """
+    :param time: since the stretch begins [s], shape ``(frames,)``
+    :param lines: of each player, both ends of each capsule as they are seen, in the drawing's
+        units, shape ``(3, frames, capsules, 2, 2)``; not a number where a simulation is not finite
+    :param outlines: corners of what its model's meshes look like, in a circle, likewise, shape
+        ``(3, frames, shapes, corners, 2)``
+    :param names: of the joints, with their units
+    :param errors: predicted minus measured position of each joint, before and after, shape ``(2,
+        frames, joints)``
+    :param width: of a capsule, in the drawing's units
+    """
+
+    time: np.ndarray
+    lines: np.ndarray
+    outlines: np.ndarray
+    names: tuple[str, ...]
+    errors: np.ndarray
+    width: float
+
+    @property
+    def still(self) -> int:
+        """The frame that says most: where the two predictions are farthest apart."""
+        gap = np.abs(self.lines[1] - self.lines[2]).reshape(len(self.time), -1)
+        return int(np.argmax(np.nan_to_num(gap).max(1)))
+
+    def to_json(self) -> str:
+        """:return: for a page: rounded to what can be seen"""
+        plain = {
+            "time": _numbers(self.time, 3),
+            "lines": [[_numbers(frame, 1) for frame in player] for player in self.lines],
+            "outlines": [
+                [[_numbers(shape, 1) for shape in frame] for frame in player]
+                for player in self.outlines
+            ],
+            "still": self.still,
+        }
+        return json.dumps(plain, allow_nan=False, separators=(",", ":"))
+
+
+def moving_of(believed: Twin, extended: Twin, replay: Replay) -> Moving:
+    """
+    :param believed: the twin as it came, which reads positions from observations
+    :param extended: the corrected one
+    :param replay: a held-out recording
+    """
+    rows = np.flatnonzero(np.isfinite(replay.time))
+    rows = rows[:: max(1, -(-len(rows) // _MOST_FRAMES))]
+    seen = [np.asarray(part)[rows] for part in (replay.measured, replay.before, replay.after)]
+    found = [
+        tuple(map(np.asarray, _poses(twin, twin.params, jnp.asarray(obs, jnp.float32))))
+        for twin, obs in zip((believed, believed, extended), seen, strict=True)
+    ]
+    ends, joints, meshes = (np.stack(parts) for parts in zip(*found, strict=True))
+    seen_from = ends[..., [0, 2]] if not _is_solid(believed) else _projected(ends)
+    outlines = _outlines(_projected(meshes))
+    frame = _frame_of(np.concatenate([part[0].reshape(-1, 2) for part in (seen_from, outlines)]))
+    names = tuple(f"{joint.name} [{joint.unit}]" for joint in believed.joints)
+    capsules = ends.shape[2]
+    return Moving(
+        replay.time[rows] - replay.time[rows[0]],
+        frame(seen_from),
+        frame(outlines),
+        names[:_MOST_JOINTS],
+        (joints[1:] - joints[:1])[..., :_MOST_JOINTS],
+        (4.0 if capsules <= 8 else 2.5) * (0.3 if meshes.size else 1.0),
+    )
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
+def _poses(
+    twin: Twin, params: Params, obs: Float[Array, "frames obs"]
+) -> tuple[
+    Float[Array, "frames capsules 2 3"],
+    Float[Array, "frames joints"],
+    Float[Array, "frames shapes corners 3"],
+]:
+    plant = plant_of(twin)
+
+    def one(row: Array) -> tuple[Array, Array, Array]:
+        state = twin.infer(row, params)
+        own = {name: params[name] for name in plant.parameters}
+        if isinstance(plant, MechanismTwin):
+            return plant.skeleton(state), twin.coordinates(state.q), plant.meshes(state)
+        points = plant.sketch(state, own)
+        flat = jnp.stack([points[:, 0], jnp.zeros_like(points[:, 0]), points[:, 1]], 1)
+        bare = jnp.zeros((0, 0, 3), flat.dtype)
+        return jnp.stack([flat[:-1], flat[1:]], 1), twin.coordinates(state.q), bare
+
+    return jax.vmap(one)(obs)
+
+
+def _is_solid(twin: Twin) -> bool:
+    return isinstance(plant_of(twin), MechanismTwin)
+
+
+def _projected(ends: np.ndarray) -> np.ndarray:
+    """Parallel, from in front, to the right and above."""
+    c, s = np.cos(_AZIMUTH), np.sin(_AZIMUTH)
+    right, away = c * ends[..., 0] + s * ends[..., 1], -s * ends[..., 0] + c * ends[..., 1]
+    up = np.cos(_ELEVATION) * ends[..., 2] + np.sin(_ELEVATION) * away
+    return np.stack([right, up], -1)
+
+
+def _outlines(corners: np.ndarray) -> np.ndarray:
+    """
+    :param corners: of convex bodies, as they are seen, shape ``(..., corners, 2)``
+    :return: the farthest of them in each of some directions, in a circle
+    """
+    if not corners.size:
+        return np.zeros((*corners.shape[:-2], 0, 2))
+    angles = 2.0 * np.pi * np.arange(_CORNERS) / _CORNERS
+    along = corners @ np.stack([np.cos(angles), np.sin(angles)])
+    farthest = np.argmax(np.nan_to_num(along, nan=-np.inf), axis=-2)
+    return np.take_along_axis(corners, farthest[..., None], axis=-2)
+
+
+def _frame_of(measured: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """
+    :param measured: points, shape ``(n, 2)``
+    :return: what puts points in the drawing's units, y downwards, and these in the middle of it
+    """
+    real = measured[np.isfinite(measured).all(1)]
+    low, high = real.min(0), real.max(0)
+    scale = 0.84 * _SIZE / (float(np.max(high - low)) or 1.0)
+
+    def framed(seen: np.ndarray) -> np.ndarray:
+        flipped = (seen - 0.5 * (low + high)) * scale * [1.0, -1.0]
+        return np.clip(flipped + 0.5 * _SIZE, -_SIZE, 2.0 * _SIZE)
+
+    return framed
+
+
+def _numbers(x: Any, digits: int) -> list[float]:
+    rounded = np.round(np.nan_to_num(np.asarray(x, float)), digits)
+    return [int(v) if v == int(v) else v for v in rounded.ravel().tolist()]

@@ -1,0 +1,115 @@
+"""Phrases that the printed result and its page share, so that both say the same."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from sb3_hds.sysid.estimation.results import Estimate
+from sb3_hds.sysid.reporting.units import with_unit
+
+#: what each simulation of a measured gain in policy is called
+TRAINED_IN = {
+    "believed": "the twin as believed",
+    "extended": "the extended twin",
+    "true": "the true twin",
+}
+#: why a candidate is turned down that predicts hardly better than what is believed
+TOO_LITTLE = "gains too little"
+HORIZONS = "Held-out error by steps ahead, in units of what the best fit leaves"
+ALIKE = "The data cannot tell it from:"
+REJECTED = (
+    "gain: by how much the candidate lowers the mean square error of held-out recordings; p: that "
+    "chance alone would do as much"
+)
+PAIRED = "gain, paired"
+
+
+def share_in_words(gain: float) -> str:
+    """:return: a share of an error that is gained; nothing where there is no number"""
+    if math.isnan(gain):
+        return ""
+    # The sum turns minus nought into nought.
+    return "far worse" if gain < -1.0 else f"{round(gain, 2) + 0.0:.0%}"
+
+
+def chance_in_words(p_value: float) -> str:
+    """:return: a p-value; nothing where there is none"""
+    return "" if math.isnan(p_value) else f"{p_value:.2g}"
+
+
+def size_in_words(one: Estimate) -> str:
+    """:return: the estimate with its unit, and what it is added to"""
+    size = with_unit(f"{one.estimate:.4g}", one.unit)
+    if not one.added_to:
+        return size
+    return f"{size}, added to the twin's own {with_unit(f'{one.added_to:.4g}', one.unit)}"
+
+
+def interval_in_words(one: Estimate) -> str:
+    """:return: the ends of its interval"""
+    return f"{one.low:.4g} to {one.high:.4g}"
+
+
+def evidence_in_words(gain: float, p_value: float) -> str:
+    """:return: what speaks for a cause"""
+    return (
+        f"It lowers the mean square error of held-out recordings by {share_in_words(gain)} "
+        f"(p = {chance_in_words(p_value)})."
+    )
+
+
+def explained_in_words(share: float) -> str:
+    """:param share: of the missing force"""
+    return f"What was found explains {share:.0%} of the force that is missing and can be predicted."
+
+
+class PolicyWords(NamedTuple):
+    """
+    What is told of policies from several simulations.
+
+    :param measured: what the numbers are
+    :param columns: of the table
+    :param rows: of it
+    :param notes: a sentence each
+    """
+
+    measured: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...]
+
+
+def policy_in_words(gain: Mapping[str, Any]) -> PolicyWords:
+    """:param gain: ``PolicyGain.to_dict()``"""
+    runs, episodes, simulations = gain["runs"], gain["episodes"], gain["simulations"]
+    found = {TRAINED_IN[name]: one for name, one in simulations.items()} | {PAIRED: gain["gain"]}
+    starts = f"{episodes} start {'states' if episodes > 1 else 'state'}"
+    over = f"over {runs} runs of {starts} each" if runs > 1 else f"over {starts}, one run"
+    columns, rows = (
+        ("trained in", "return"),
+        [(name, f"{r['mean']:.1f}") for name, r in found.items()],
+    )
+    if runs > 1:
+        columns = (*columns, "90 % interval over runs")
+        ends = (f"{r['low']:.1f} to {r['high']:.1f}" for r in found.values())
+        rows = [(*row, interval) for row, interval in zip(rows, ends, strict=True)]
+    notes = [_paired_in_words(gain)]
+    if runs == 1:
+        notes.insert(0, "One run in each simulation tells nothing of how others would differ.")
+    if gain["share_of_ceiling"] is not None:
+        notes.append(f"{gain['share_of_ceiling']:.0%} of the gap to the true twin is closed.")
+    measured = f"Return on the real system, interquartile mean {over}"
+    return PolicyWords(measured, columns, tuple(rows), tuple(notes))
+
+
+def _paired_in_words(gain: Mapping[str, Any]) -> str:
+    alike = "of the same seed from the same start" if gain["runs"] > 1 else "from the same start"
+    told = f"{PAIRED}: interquartile mean of the differences between returns {alike}"
+    extended, believed = (gain["simulations"][name]["mean"] for name in ("extended", "believed"))
+    difference = f"{extended - believed:.1f}"
+    if difference == f"{gain['gain']['mean']:.1f}":
+        return f"{told}."
+    return (
+        f"{told}. The means themselves differ by {difference}: each leaves out its own best and "
+        "worst quarter."
+    )
