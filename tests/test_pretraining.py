@@ -123,8 +123,9 @@ def test_no_program_is_compiled_twice():
     jax.monitoring.register_event_duration_secs_listener(count)
     try:
         # Sizes that no other test has: nothing of it is compiled yet.
-        own = {"horizon": 5, "compare_every": 2, "policy_kwargs": {"net_arch": [5]}}
-        model = small("hds", pretrain_epochs=3, **own).learn(50)
+        own = {"horizon": 5, "policy_kwargs": {"net_arch": [5]}}
+        # Policies are compared after the tenth epoch.
+        model = small("hds", pretrain_epochs=10, **own).learn(25)
         # What is loaded has the types that it had when it was saved.
         reloaded(model).learn(50, reset_num_timesteps=False)
     finally:

@@ -9,7 +9,6 @@ in, nothing else; simulated steps are counted apart.
 import dataclasses
 import math
 from collections.abc import Callable
-from concurrent.futures import Future
 from functools import partial
 from typing import Any, ClassVar, Self
 
@@ -93,7 +92,7 @@ class TwinAlgorithm(TensorAlgorithm):
         self._epochs_planned, self._epochs_done = 0, 0
         self._workspace: Workspace | None = None
         self._compiled: EpochConfig | None = None
-        self._comparison: Future[Any] | None = None
+        self._comparison: Callable[[], Any] | None = None
         self.stopped = False
         self.poll: Callable[[], None] = nothing
 
@@ -170,10 +169,11 @@ class TwinAlgorithm(TensorAlgorithm):
         ahead = max(1, self._epochs_planned - self._epochs_done)
         compares = every > 0 and (self.comparison_due or n_epochs % every + ahead >= every)
         if compares and self._comparison is None:
-            self._comparison = beside(comparison(program, state, hyper))
+            self._comparison = beside(comparison(program, state, hyper)).result
         state, metrics = epoch(program, state, hyper)
         if self._comparison and is_compared(n_epochs + 1, every, self.comparison_due):
-            meanwhile([self._comparison.result], self.poll)
+            meanwhile([self._comparison], self.poll)
+            self._comparison = nothing
         state, returns = choose_policy(program, state, hyper, every, self.comparison_due)
         losses = float(metrics.policy_loss), float(metrics.value_loss)
         if not (all(map(math.isfinite, losses)) and all_finite(state.networks)):
