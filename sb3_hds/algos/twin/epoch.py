@@ -174,13 +174,15 @@ def learn_from_plans(
         gradient before it is clipped
     """
     learning = [partial(each, config, state, hyper) for each in regressions(config)]
-    ((actor, optimizer, (loss, norm)), average, n_epochs, key), *of_value = side_by_side(learning)
+    of_policy, *of_value = side_by_side(learning)
+    (actor, optimizer, (loss, norm)), average, n_epochs, key = of_policy
     nets = state.networks._replace(actor=actor, average=average)
     progress = state.progress._replace(actor_optimizer=optimizer, n_epochs=n_epochs, key=key)
     value_loss: Any = 0.0
-    for value, optimizer, losses in of_value:
+    if of_value:
+        value, optimizer, value_loss = of_value[0]
         nets = nets._replace(value=value)
-        progress, value_loss = progress._replace(value_optimizer=optimizer), losses[0]
+        progress = progress._replace(value_optimizer=optimizer)
     return state._replace(networks=nets, progress=progress), (loss, value_loss, norm)
 
 
@@ -206,8 +208,9 @@ def learn_policy(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> 
 
 @partial(jax.jit, static_argnums=0)
 def learn_value(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> tuple[Any, ...]:
-    """:return: see :func:`~sb3_hds.algos.twin.regression.regress_value`"""
-    return regress_value(config, state, hyper, _next_keys(state)[1])
+    """:return: the value's parameters, the state of Adam, and the mean loss"""
+    value, optimizer, losses = regress_value(config, state, hyper, _next_keys(state)[1])
+    return value, optimizer, losses[0]
 
 
 def side_by_side(works: Sequence[Callable[[], Any]]) -> list[Any]:
@@ -223,7 +226,8 @@ def side_by_side(works: Sequence[Callable[[], Any]]) -> list[Any]:
         return [first(), *(each.result() for each in beside)]
 
 
-def _next_keys(state: EpochState) -> PRNGKeyArray:
+def _next_keys(state: EpochState) -> jax.Array:
+    """:return: the random key after this half of the epoch, and the one for it"""
     return jax.random.split(jax.random.wrap_key_data(state.progress.key, impl=GENERATOR))
 
 

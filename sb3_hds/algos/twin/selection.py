@@ -86,7 +86,7 @@ def keep_better(
     pairs = ((nets.average, nets.inside), (nets.acting, nets.acting_inside))
     going = [partial(mean_return, config, hyper, progress.key, *pair) for pair in pairs]
     (of_average, key), (of_acting, _) = side_by_side(going)
-    returns = np.array([of_average, of_acting])
+    returns = np.array([float(of_average), float(of_acting)], np.float32)
     acting, inside = pairs[0] if returns[0] > returns[1] else pairs[1]
     return state._replace(
         networks=nets._replace(acting=acting, acting_inside=inside),
