@@ -14,6 +14,7 @@ from cases import each
 from measuring import measured
 
 from sb3_hds import Trajectories, cli, effects, twins
+from sb3_hds.cli import listing
 from sb3_hds.cli import measured as measured_room
 from sb3_hds.experiments import PolicyGain
 from sb3_hds.experiments.policy_gain import _summarised
@@ -156,6 +157,27 @@ def test_what_exists_is_listed_with_units_and_filtered_by_words(capsys):
     assert ":class:" not in listed
     some = shown("effects", "Coulomb-friction")
     assert "directional_coulomb_friction" in some and "quadratic_drag" not in some
+
+
+def test_the_stored_list_of_effects_is_what_their_classes_say():
+    stored = json.loads(listing.STORED.read_text())
+
+    assert stored == listing.rows_of_effects(), "write it anew: python -m sb3_hds.cli.listing"
+
+
+def test_help_and_the_list_of_effects_come_without_jax():
+    code = (
+        "import sys\n"
+        "from sb3_hds.cli import main\n"
+        "assert main(['effects', 'backlash']) == 0\n"
+        "try: main(['--help'])\n"
+        "except SystemExit as end: assert end.code == 0\n"
+        "print({'jax', 'torch', 'pandas', 'scipy'} & set(sys.modules))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], text=True, capture_output=True)
+
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "set()" and "diagnose" in done.stdout
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from sb3_hds import twins
 from sb3_hds.algos.twin import algorithm as twin_algorithm
 from sb3_hds.algos.twin.config import hyperparams
 from sb3_hds.algos.twin.policy import all_finite
-from sb3_hds.algos.twin.regression import regress
+from sb3_hds.algos.twin.regression import regress_policy, regress_value
 from sb3_hds.algos.twin.state import problem_of
 from sb3_hds.core import Twin
 from sb3_hds.errors import RewardError
@@ -198,7 +198,10 @@ def test_the_policy_learns_from_the_first_half_of_plans_and_the_value_from_all()
         changed = samples._replace(**{field: jnp.where(mask, rows + 1.0, rows)})
         workspace = state.workspace._replace(samples=changed)
         key = jax.random.key(0, impl="unsafe_rbg")
-        return regress(program, state._replace(workspace=workspace), hyper, key)[0].networks
+        given = (program, state._replace(workspace=workspace), hyper, key)
+        return state.networks._replace(
+            actor=regress_policy(*given)[0], value=regress_value(*given)[0]
+        )
 
     before = learned_with("control", jnp.zeros_like(late))
     assert close(learned_with("control", late).actor, before.actor)

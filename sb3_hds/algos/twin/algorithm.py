@@ -39,8 +39,14 @@ from sb3_hds.algos.twin.model import (
 )
 from sb3_hds.algos.twin.normalization import prepare_statistics, view_of
 from sb3_hds.algos.twin.policy import TwinPolicy, all_finite
-from sb3_hds.algos.twin.pretraining import Pretraining, meanwhile, nothing
-from sb3_hds.algos.twin.selection import choose_policy, programs, twin_steps_per_comparison
+from sb3_hds.algos.twin.pretraining import Pretraining, beside, meanwhile, nothing
+from sb3_hds.algos.twin.selection import (
+    choose_policy,
+    comparison,
+    is_compared,
+    programs,
+    twin_steps_per_comparison,
+)
 from sb3_hds.algos.twin.state import (
     EpochConfig,
     EpochState,
@@ -86,6 +92,7 @@ class TwinAlgorithm(TensorAlgorithm):
         self._epochs_planned, self._epochs_done = 0, 0
         self._workspace: Workspace | None = None
         self._compiled: EpochConfig | None = None
+        self._comparison: Callable[[], Any] | None = None
         self.stopped = False
         self.poll: Callable[[], None] = nothing
 
@@ -156,10 +163,17 @@ class TwinAlgorithm(TensorAlgorithm):
             config, n_epochs, rate, gradient_steps, program.twin.params, varied, view
         )
         if program != self._compiled:
-            compares = every > 0 and (self.comparison_due or every <= self._epochs_planned)
-            meanwhile(programs(program, state, hyper, compares), self.poll)
-            self._compiled = program
+            meanwhile(programs(program, state, hyper), self.poll)
+            self._compiled, self._comparison = program, None
+        # The first comparison is some epochs away: its program is compiled beside them.
+        ahead = max(1, self._epochs_planned - self._epochs_done)
+        compares = every > 0 and (self.comparison_due or n_epochs % every + ahead >= every)
+        if compares and self._comparison is None:
+            self._comparison = beside(comparison(program, state, hyper)).result
         state, metrics = epoch(program, state, hyper)
+        if self._comparison and is_compared(n_epochs + 1, every, self.comparison_due):
+            meanwhile([self._comparison], self.poll)
+            self._comparison = nothing
         state, returns = choose_policy(program, state, hyper, every, self.comparison_due)
         losses = float(metrics.policy_loss), float(metrics.value_loss)
         if not (all(map(math.isfinite, losses)) and all_finite(state.networks)):
@@ -352,6 +366,7 @@ class TwinAlgorithm(TensorAlgorithm):
             "twin",
             "_workspace",
             "_compiled",
+            "_comparison",
             "poll",
             "stopped",
             "unstored_step",

@@ -41,7 +41,7 @@ class Refinements:
     :param learned_share: share of each plan, from its start, that the policy learns from: what a
         plan does at its end depends most on the learned value (the paper: 1)
     :param loss: ``"smooth_absolute"``, in units of the typical control, or ``"squared"`` (the
-        paper); see :func:`~sb3_hds.algos.twin.regression.regress`
+        paper); see :func:`~sb3_hds.algos.twin.regression.regress_policy`
     :param gain_weight: 0..1, how much a sample counts in proportion to what its plan gained over
         the policy (the paper: 0)
     :param sensitivity_weight: 0..1, how much it counts in proportion to what an error of its

@@ -21,7 +21,7 @@ def view_of(normalise: VecNormalize | None, n_obs: int) -> View:
     :return: what it does to an observation of the twin
     """
     if normalise is None or not normalise.norm_obs:
-        return View(jnp.zeros(n_obs), jnp.ones(n_obs), jnp.full((), jnp.inf))
+        return View(jnp.zeros(n_obs), jnp.ones(n_obs), jnp.full((), jnp.inf, jnp.float32))
     statistics: Any = normalise.obs_rms
     scale = np.sqrt(statistics.var + normalise.epsilon)
     return View(

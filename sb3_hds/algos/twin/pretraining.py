@@ -1,7 +1,7 @@
 """Planning epochs before the first real step, and what callbacks and loggers make of them."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import Any
 
@@ -125,6 +125,19 @@ class OwnSeries(Logger):
 
 def nothing() -> None:
     """Does nothing: there is no callback to call while programs compile."""
+
+
+def beside(work: Callable[[], Any]) -> Future[Any]:
+    """
+    :param work: changes nothing
+    :return: what it will return; it is done in a thread of its own, which Python waits for before
+        it exits
+    """
+    pool = ThreadPoolExecutor(1)
+    try:
+        return pool.submit(work)
+    finally:
+        pool.shutdown(wait=False)
 
 
 def meanwhile(works: Sequence[Callable[[], Any]], poll: Callable[[], None]) -> list[Any]:

@@ -1,4 +1,7 @@
-"""Learning from plans: the samples that they give, and the regression on them."""
+"""Learning from plans: the samples that they give, and the regressions on them."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -106,69 +109,87 @@ def rescale(state: EpochState, samples: Samples) -> EpochState:
     )
 
 
-def regress(
+def regress_policy(
     config: EpochConfig, state: EpochState, hyper: Hyperparams, key: PRNGKeyArray
-) -> tuple[EpochState, Float[Array, " 3"]]:
+) -> tuple[Mapping[str, Any], Any, Float[Array, " 2"]]:
     r"""
     Adam on minibatches of the remembered samples.
 
     The policy learns from the first steps of each plan only: what a plan does towards its end
-    depends on the value found there. The value, which is asked for at the ends, learns from all.
+    depends on the value found there.
 
-    The policy's loss is :math:`w\,\sqrt{e^2 + 0.1^2}` with the error :math:`e` in units of the
-    control scale: a squared error averages between turning left and turning right, and blurs the
-    moments of switching. The paper's :math:`w\,e^2/2`, in units of the control, is a setting.
+    Its loss is :math:`w\,\sqrt{e^2 + 0.1^2}` with the error :math:`e` in units of the control
+    scale: a squared error averages between turning left and turning right, and blurs the moments
+    of switching. The paper's :math:`w\,e^2/2`, in units of the control, is a setting.
 
-    :return: the state; the mean losses of policy and value, and the mean norm of the policy's
+    :param key: that of :func:`regress_value`, too: both draw from it, and not the same
+    :return: the policy's parameters and the state of Adam; the mean loss, and the mean norm of the
         gradient before it is clipped
     """
-    adam, work = clipped_adam(config.max_grad_norm), state.workspace
-    filled = jnp.minimum(work.n_filled, config.plan_memory)
     inside, unit = state.networks.inside, state.progress.control_scale
 
-    n_columns = config.horizon * config.n_rollouts
-    n_early = config.n_learned * config.n_rollouts
-
-    def draw(key: PRNGKeyArray, n: int) -> Samples:
-        drawn = jax.random.randint(key, (config.batch_size,), 0, filled * n)
-        return jax.tree.map(lambda leaf: leaf[drawn // n, drawn % n], work.samples)
-
-    def policy_loss(actor, batch: Samples) -> jax.Array:
+    def loss(actor, batch: Samples) -> jax.Array:
         error = output(config.actor, actor, inside(batch.obs)) - batch.control
         if config.squared_error:
             return jnp.mean(batch.weight[:, None] * 0.5 * error**2)
         return jnp.mean(batch.weight[:, None] * jnp.sqrt((error / unit) ** 2 + _SMOOTH_ERROR**2))
 
-    def value_loss(value, batch: Samples) -> jax.Array:
+    n_early = config.n_learned * config.n_rollouts
+    begin = state.networks.actor, state.progress.actor_optimizer
+    keys = lambda i: jax.random.split(jax.random.fold_in(key, i))[0]  # noqa: E731
+    return _descent(config, state, hyper, loss, n_early, keys, *begin)
+
+
+def regress_value(
+    config: EpochConfig, state: EpochState, hyper: Hyperparams, key: PRNGKeyArray
+) -> tuple[Mapping[str, Any], Any, Float[Array, " 2"]]:
+    """
+    As :func:`regress_policy` does. The value, which is asked for at the ends of plans, learns from
+    all of their steps.
+
+    :return: the value's parameters and the state of Adam; the mean loss, and the mean norm of the
+        gradient before it is clipped
+    """
+    inside = state.networks.inside
+
+    def loss(value, batch: Samples) -> jax.Array:
         found = value_of(output(config.value, value, inside(batch.obs)))
         error = squash(found) - squash(batch.value)
         return jnp.mean(batch.alive * error**2)
 
-    def update(i, carry):
-        actor, value, actor_state, value_state, losses = carry
-        k_policy, k_value = jax.random.split(jax.random.fold_in(key, i))
-        loss_p, slope = jax.value_and_grad(policy_loss)(actor, draw(k_policy, n_early))
-        norm = optax.tree.norm(slope)
-        actor, actor_state = _descend(adam, slope, actor, actor_state, hyper.learning_rate)
-        loss_v = jnp.zeros(())
-        if config.terminal_value:
-            loss_v, slope = jax.value_and_grad(value_loss)(value, draw(k_value, n_columns))
-            value, value_state = _descend(adam, slope, value, value_state, hyper.learning_rate)
-        return actor, value, actor_state, value_state, losses + jnp.stack([loss_p, loss_v, norm])
+    n_columns = config.horizon * config.n_rollouts
+    begin = state.networks.value, state.progress.value_optimizer
+    keys = lambda i: jax.random.split(jax.random.fold_in(key, i))[1]  # noqa: E731
+    return _descent(config, state, hyper, loss, n_columns, keys, *begin)
 
-    nets, progress = state.networks, state.progress
-    optimisers = (progress.actor_optimizer, progress.value_optimizer)
-    first = (nets.actor, nets.value, *optimisers, jnp.zeros(3))
-    actor, value, actor_state, value_state, losses = jax.lax.fori_loop(
-        0, hyper.gradient_steps, update, first
-    )
-    decay = jnp.where(progress.n_epochs > 0, hyper.averaging, 0.0)
-    average = jax.tree.map(lambda a, new: decay * a + (1.0 - decay) * new, nets.average, actor)
-    state = state._replace(
-        networks=nets._replace(actor=actor, value=value, average=average),
-        progress=progress._replace(actor_optimizer=actor_state, value_optimizer=value_state),
-    )
-    return state, losses / jnp.maximum(hyper.gradient_steps, 1)
+
+def _descent(
+    config: EpochConfig,
+    state: EpochState,
+    hyper: Hyperparams,
+    loss: Callable[[Any, Samples], jax.Array],
+    n: int,
+    keys: Callable[[Any], PRNGKeyArray],
+    weights: Mapping[str, Any],
+    optimizer: Any,
+) -> tuple[Mapping[str, Any], Any, Float[Array, " 2"]]:
+    """Of each remembered epoch, the first ``n`` samples are drawn from."""
+    adam, work = clipped_adam(config.max_grad_norm), state.workspace
+    filled = jnp.minimum(work.n_filled, config.plan_memory)
+
+    def update(i, carry):
+        weights, optimizer, sums = carry
+        drawn = jax.random.randint(keys(i), (config.batch_size,), 0, filled * n)
+        batch = jax.tree.map(lambda leaf: leaf[drawn // n, drawn % n], work.samples)
+        lost, slope = jax.value_and_grad(loss)(weights, batch)
+        norm = optax.tree.norm(slope)
+        change, optimizer = adam.update(slope, optimizer, weights)
+        weights = jax.tree.map(lambda w, c: w - hyper.learning_rate * c, weights, change)
+        return weights, optimizer, sums + jnp.stack([lost, norm])
+
+    first = (weights, optimizer, jnp.zeros(2))
+    weights, optimizer, sums = jax.lax.fori_loop(0, hyper.gradient_steps, update, first)
+    return weights, optimizer, sums / jnp.maximum(hyper.gradient_steps, 1)
 
 
 def _to_go(problem: Problem, plan: Plan, tail: jax.Array) -> Float[Array, " horizon"]:
@@ -185,8 +206,3 @@ def _weight(quantity: jax.Array, share: float | jax.Array) -> jax.Array:
     finite = jnp.where(jnp.isfinite(quantity), quantity, 0.0)
     relative = finite / (jnp.mean(finite) + 1e-6)
     return 1.0 - share + share * jnp.minimum(relative, _LARGEST_WEIGHT)
-
-
-def _descend(adam, slope, weights, state, learning_rate):
-    change, state = adam.update(slope, state, weights)
-    return jax.tree.map(lambda w, c: w - learning_rate * c, weights, change), state

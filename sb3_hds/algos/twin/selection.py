@@ -7,9 +7,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from sb3_hds.algos.twin.epoch import learn_from_plans, plan_ahead
+from sb3_hds.algos.twin.epoch import plan_ahead, regressions, side_by_side
 from sb3_hds.algos.twin.networks import output
 from sb3_hds.algos.twin.state import (
     EpochConfig,
@@ -31,7 +31,7 @@ _FEWEST, _MOST = 32, 256
 
 def choose_policy(
     config: EpochConfig, state: EpochState, hyper: Hyperparams, every: int, due: bool
-) -> tuple[EpochState, Float[Array, " 2"] | None]:
+) -> tuple[EpochState, Float[np.ndarray, " 2"] | None]:
     """
     After an epoch: the average acts, until it was first compared; then the better one does.
 
@@ -40,7 +40,7 @@ def choose_policy(
     :return: the state, and the returns of a comparison, see :func:`keep_better`
     """
     n_epochs = int(state.progress.n_epochs)
-    if every and (due or n_epochs % every == 0):
+    if is_compared(n_epochs, every, due):
         return keep_better(config, state, hyper)
     if every and n_epochs > every:
         return state, None
@@ -49,15 +49,22 @@ def choose_policy(
     return state._replace(networks=acting), None
 
 
-def programs(
-    config: EpochConfig, state: EpochState, hyper: Hyperparams, compares: bool
-) -> list[Callable[[], Any]]:
-    """
-    :param compares: whether policies will be compared
-    :return: the programs of an epoch; running them once, in parallel, compiles them
-    """
-    used = [plan_ahead, learn_from_plans, *([keep_better] if compares else [])]
+def is_compared(n_epochs: int, every: int, due: bool) -> bool:
+    """:return: whether policies are compared after this number of epochs"""
+    return every > 0 and (due or n_epochs % every == 0)
+
+
+def programs(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> list[Callable[[], Any]]:
+    """:return: the programs of an epoch; running them once, in parallel, compiles them"""
+    used = [plan_ahead, *regressions(config)]
     return [partial(program, config, state, hyper) for program in used]
+
+
+def comparison(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> Callable[[], Any]:
+    """:return: the program of a comparison; running it once compiles it"""
+    nets = state.networks
+    given = (state.progress.key, nets.average, nets.inside)
+    return partial(mean_return, config, hyper, *given)
 
 
 def twin_steps_per_comparison(config: EpochConfig) -> int:
@@ -65,10 +72,9 @@ def twin_steps_per_comparison(config: EpochConfig) -> int:
     return 2 * _n_starts(config.twin) * longest_episode(config.twin)
 
 
-@partial(jax.jit, static_argnums=0, compiler_options=QUICK_COMPILATION)
 def keep_better(
     config: EpochConfig, state: EpochState, hyper: Hyperparams
-) -> tuple[EpochState, Float[Array, " 2"]]:
+) -> tuple[EpochState, Float[np.ndarray, " 2"]]:
     """
     Let the average and the policy that acts go through whole episodes of the twin, from the same
     start states, and let the better one act: where a system falls over, a single epoch may spoil
@@ -76,29 +82,41 @@ def keep_better(
 
     :return: the state, and the mean return of both, in planning rewards
     """
-    key, k_starts = jax.random.split(jax.random.wrap_key_data(state.progress.key, impl=GENERATOR))
-    twin, nets = config.twin, state.networks
+    nets, progress = state.networks, state.progress
+    pairs = ((nets.average, nets.inside), (nets.acting, nets.acting_inside))
+    going = [partial(mean_return, config, hyper, progress.key, *pair) for pair in pairs]
+    (of_average, key), (of_acting, _) = side_by_side(going)
+    returns = np.array([float(of_average), float(of_acting)], np.float32)
+    acting, inside = pairs[0] if returns[0] > returns[1] else pairs[1]
+    return state._replace(
+        networks=nets._replace(acting=acting, acting_inside=inside),
+        progress=progress._replace(key=key),
+    ), returns
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK_COMPILATION)
+def mean_return(
+    config: EpochConfig,
+    hyper: Hyperparams,
+    key: jax.Array,
+    actor: Mapping[str, Any],
+    inside: View,
+) -> tuple[jax.Array, jax.Array]:
+    """
+    :param key: random, as integers
+    :return: mean return of a policy over whole episodes of the twin, in planning rewards; the key
+        after that
+    """
+    after, k_starts = jax.random.split(jax.random.wrap_key_data(key, impl=GENERATOR))
+    twin = config.twin
     problem = Problem(twin, hyper.params)
     starts = resets(twin, hyper.params, k_starts, _n_starts(twin))
     length = longest_episode(twin)
     spread = np.linspace(0, config.n_rollouts - 1, _n_starts(twin)).round().astype(int)
     varied = jax.tree.map(lambda leaf: leaf[spread], hyper.varied)
-
-    def mean_return(actor: Mapping[str, Any], inside: View) -> jax.Array:
-        policy = lambda obs: output(config.actor, actor, inside(hyper.view(obs)))  # noqa: E731
-        value = lambda s, own: follow(problem.with_params(own), s, policy, length).value  # noqa: E731
-        return jnp.mean(for_each(value, starts, varied))
-
-    pairs = ((nets.average, nets.inside), (nets.acting, nets.acting_inside))
-    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pairs)
-    returns = jax.lax.map(lambda pair: mean_return(*pair), together)
-    better = returns[0] > returns[1]
-    acting, inside = jax.tree.map(lambda new, old: jnp.where(better, new, old), *pairs)
-    state = state._replace(
-        networks=nets._replace(acting=acting, acting_inside=inside),
-        progress=state.progress._replace(key=jax.random.key_data(key)),
-    )
-    return state, returns
+    policy = lambda obs: output(config.actor, actor, inside(hyper.view(obs)))  # noqa: E731
+    value = lambda s, own: follow(problem.with_params(own), s, policy, length).value  # noqa: E731
+    return jnp.mean(for_each(value, starts, varied)), jax.random.key_data(after)
 
 
 def _n_starts(twin: Twin) -> int:

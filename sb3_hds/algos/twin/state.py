@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.algos.twin.networks import Actor, Value, output, value_of
 from sb3_hds.core import Obs, Params, State, Twin
-from sb3_hds.core.numerics.compilation import GENERATOR, QUICK_COMPILATION
+from sb3_hds.core.numerics.compilation import GENERATOR, QUICK_COMPILATION, QUICKEST_COMPILATION
 from sb3_hds.planning import Plan, Problem, best_of_random
 
 # The typical shortfall of the first rollouts becomes this many units of the objective.
@@ -204,7 +204,7 @@ class EpochState(NamedTuple):
     workspace: Workspace
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3), compiler_options=QUICK_COMPILATION)
+@partial(jax.jit, static_argnums=(0, 1, 2, 3), compiler_options=QUICKEST_COMPILATION)
 def fresh_networks(
     actor: Actor, value: Value, n_obs: int, max_grad_norm: float, key: PRNGKeyArray
 ) -> tuple[Networks, Progress]:
@@ -212,7 +212,7 @@ def fresh_networks(
     k_actor, k_value, k_next = jax.random.split(key, 3)
     obs = jnp.zeros(n_obs)
     weights, value_weights = actor.init(k_actor, obs), value.init(k_value, obs)
-    inside = View(jnp.zeros(n_obs), jnp.ones(n_obs), jnp.full((), jnp.inf))
+    inside = View(jnp.zeros(n_obs), jnp.ones(n_obs), _unclipped())
     adam = clipped_adam(max_grad_norm)
     zero = jnp.zeros(())
     progress = Progress(
@@ -312,13 +312,18 @@ def problem_of(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> Pr
     )
 
 
+def _unclipped() -> jax.Array:
+    """Of a dtype of its own: one that adapts would be another program than a loaded model's."""
+    return jnp.full((), jnp.inf, jnp.float32)
+
+
 def _input_scales(seen: jax.Array, plans: Plan) -> View:
     lived = plans.alive[..., None] & jnp.isfinite(seen)
     count = jnp.maximum(jnp.sum(lived, (0, 1)), 1)
     mean = jnp.sum(jnp.where(lived, seen, 0.0), (0, 1)) / count
     variance = jnp.sum(jnp.where(lived, (seen - mean) ** 2, 0.0), (0, 1)) / count
     scale = jnp.sqrt(variance)
-    return View(mean, jnp.where(scale > 1e-6, scale, 1.0), jnp.full((), jnp.inf))
+    return View(mean, jnp.where(scale > 1e-6, scale, 1.0), _unclipped())
 
 
 def _best_reward(plans: Plan) -> jax.Array:
