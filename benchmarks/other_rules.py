@@ -92,7 +92,9 @@ def by_regression(inquiry, start) -> Answer:
     """Sequentially thresholded least squares (SINDy) of the missing force."""
     from sb3_hds.sysid.comparison.unexplained import missing_force, short_windows, weighed
 
-    short = short_windows(inquiry.search.select.evidence, start.point.theta, inquiry.data)
+    select = inquiry.search.select.evidence
+    wide = inquiry.period, 2 * inquiry.most_windows
+    short = short_windows(select, start.point.theta, inquiry.data, *wide)
     missing = missing_force(short, inquiry.data)
     twin, found = inquiry.hypotheses.twin, []
     weights = weighed(missing._replace(force=np.ones_like(missing.force)))
@@ -148,7 +150,9 @@ def by_network(inquiry, start) -> Answer:
     from sb3_hds.sysid.comparison.held_out import split
     from sb3_hds.sysid.comparison.unexplained import missing_force, short_windows, weighed
 
-    short = short_windows(inquiry.search.select.evidence, start.point.theta, inquiry.data)
+    select = inquiry.search.select.evidence
+    wide = inquiry.period, 2 * inquiry.most_windows
+    short = short_windows(select, start.point.theta, inquiry.data, *wide)
     missing = missing_force(short, inquiry.data)
     inputs = np.concatenate(
         [np.cos(missing.position), np.sin(missing.position), missing.velocity, missing.command], 1

@@ -49,6 +49,7 @@ class _Postponed(ModuleType):
 
     def __getattr__(self, name: str) -> Any:
         spec: Any = self.__spec__
+        package: Any = self
         with _one_at_a_time:
             if type(self) is _Postponed and not self.__dict__.get("_running"):
                 self.__dict__["_running"] = True
@@ -56,7 +57,7 @@ class _Postponed(ModuleType):
                     spec.loader.exec_module(self)
                 finally:
                     del self.__dict__["_running"]
-                self.__class__ = ModuleType
+                package.__class__ = ModuleType
         if name in self.__dict__:
             return self.__dict__[name]
         raise AttributeError(f"module '{self.__name__}' has no attribute '{name}'")

@@ -110,7 +110,10 @@ def epoch(
     """
     state, outcome = plan_ahead(config, state, hyper)
     state, losses = learn_from_plans(config, state, hyper)
-    return state, EpochMetrics(*outcome, *losses)
+    of_policy, of_value, norm = losses
+    return state, EpochMetrics(
+        *outcome, policy_loss=of_policy, value_loss=of_value, gradient_norm=norm
+    )
 
 
 def epoch_log(
