@@ -22,6 +22,10 @@ from scipy import stats
 _FEW_JOINTS = 2
 _CONFIDENCE = 0.9
 _RIDGE = 1e-9
+# Stability selection: blocks of rows of which half are drawn, how often, the share of draws in
+# which a cause has to come up, and how many false ones are expected at most.
+_BLOCKS, _DRAWS, _OFTEN, _FALSE = 20, 40, 0.8, 1.0
+_PENALTIES, _SWEEPS = np.geomspace(1.0, 1e-4, 60), 20
 
 
 class Regression(NamedTuple):
@@ -62,6 +66,7 @@ def asked(inquiry: Any, twin: Any, data: Any, budget: str) -> dict[str, Answer]:
         regression = regression_of(inquiry.screened)
         found["backward elimination"] = _timed(lambda: by_elimination(regression))
         found["forward BIC"] = _timed(lambda: by_forward_bic(regression))
+        found["group lasso, stability"] = _timed(lambda: by_stability(regression, inquiry.seed))
         if importlib.util.find_spec("pysindy"):
             found["PySINDy's STLSQ"] = _timed(lambda: by_stlsq(regression))
     found["all fitted by simulation"] = _timed(lambda: by_simulation(twin, data, inquiry.seed))
@@ -160,6 +165,48 @@ def by_stlsq(given: Regression) -> list[str]:
 
     fitted = STLSQ().fit(given.columns, given.missing[:, None])
     return given.named(np.ravel(fitted.coef_) != 0.0)
+
+
+def by_stability(given: Regression, seed: int) -> list[str]:
+    """
+    Group lasso with stability selection (Yuan and Lin 2006; Meinshausen and Buehlmann 2010): what
+    comes first in most half samples, so many at a time that no more than one is expected by chance.
+    """
+    names = list(dict.fromkeys(given.keys))
+    groups = [np.flatnonzero(np.array(given.keys) == name) for name in names]
+    x = given.columns.copy()
+    for own in groups:
+        x[:, own] = np.linalg.qr(x[:, own])[0] * np.sqrt(len(x))
+    blocks = np.array_split(np.arange(len(x)), _BLOCKS)
+    grams = np.stack([x[b].T @ x[b] for b in blocks])
+    rights = np.stack([x[b].T @ given.missing[b] for b in blocks])
+    most = max(1, round(np.sqrt((2.0 * _OFTEN - 1.0) * len(names) * _FALSE)))
+    rng, came = np.random.default_rng(seed), np.zeros(len(names))
+    for _ in range(_DRAWS):
+        half = rng.permutation(_BLOCKS)[: _BLOCKS // 2]
+        came += _first_groups(grams[half].sum(0), rights[half].sum(0), groups, most)
+    return [name for name, n in zip(names, came, strict=True) if n >= _OFTEN * _DRAWS]
+
+
+def _first_groups(
+    gram: np.ndarray, right: np.ndarray, groups: list[np.ndarray], most: int
+) -> np.ndarray:
+    """:return: whether each is in the model before more than so many are, by coordinate descent"""
+    theta, weights = np.zeros(len(right)), [np.sqrt(len(own)) for own in groups]
+    size = float(np.mean(np.diag(gram)))
+    strongest = max(np.linalg.norm(right[own]) / w for own, w in zip(groups, weights, strict=True))
+    active = np.zeros(len(groups), bool)
+    for penalty in strongest * _PENALTIES:
+        for _ in range(_SWEEPS):
+            for own, weight in zip(groups, weights, strict=True):
+                left = right[own] - gram[own] @ theta + size * theta[own]
+                shrunk = 1.0 - penalty * weight / (np.linalg.norm(left) + 1e-300)
+                theta[own] = max(shrunk, 0.0) * left / size
+        now = np.array([bool(np.any(theta[own])) for own in groups])
+        if now.sum() > most:
+            break
+        active = now
+    return active
 
 
 # ------------------------------------------------------------------------------ simulation

@@ -170,3 +170,51 @@ def test_a_quadruped_s_loop_is_calibrated_and_its_file_steps_held_out_seconds_be
     before, after = (np.sqrt(np.mean(np.square(found[name]))) for name in ("nominal", "corrected"))
 
     assert after < 0.5 * before
+
+
+def half_second_errors(twin, q, target, warm=6):
+    """
+    Root mean square over half seconds [mrad], from positions and differences of positions of the
+    log; commands before a window are played first, so that what is late has its past.
+    """
+    v, steps = np.gradient(q, 0.005, axis=0), 100
+    begins = np.arange(20, len(q) - steps - 1, steps)
+    params = {name: jnp.asarray(value, jnp.float64) for name, value in twin.values.items()}
+
+    def one(before, past, position, velocity, actions):
+        state = rollout(twin, params, twin.infer(before, params), past).states
+        state = jax.tree.map(lambda leaf: leaf[-1], state)
+        state = state._replace(q=position, v=velocity)
+        return rollout(twin, params, state, actions).states.q
+
+    given = (
+        q[begins - warm],
+        np.stack([target[k - warm : k] for k in begins]),
+        q[begins],
+        v[begins],
+        np.stack([target[k : k + steps] for k in begins]),
+    )
+    found = np.asarray(jax.jit(jax.vmap(one))(*map(jnp.asarray, given)))[:, 1:]
+    measured = np.stack([q[k + 1 : k + 1 + steps] for k in begins])
+    return 1e3 * np.sqrt(np.mean((found - measured) ** 2))
+
+
+# Twelve joints at 200 Hz: six minutes on one core.
+@pytest.mark.expensive
+@pytest.mark.timeout(3600)
+def test_a_diagnosis_of_a_quadruped_names_delay_and_friction_from_positions_alone(tmp_path, x64):
+    log = np.load(GO2 / "traj_0.npz")
+    (tmp_path / "map.yml").write_text(json.dumps(MAP))
+    words = ["diagnose", "--model", GO2 / "go2.urdf", "--data", GO2 / "traj_0.npz"]
+    words += ["--columns", tmp_path / "map.yml", "--actuators", "position", "kp:20", "kv:1.5"]
+    words += ["--budget", "quick", "--json", tmp_path / "found.json"]
+
+    assert cli.main([*map(str, words)]) == 0
+
+    told = json.loads((tmp_path / "found.json").read_text())
+    late = [f for f in told["findings"] if f["effect"] in ("action_delay", "motor_lag")]
+    rubbing = {f["where"]["name"] for f in told["findings"] if "friction" in f["effect"]}
+    assert [f["where"]["name"] for f in late] == ["all"] and rubbing == set(LEGS)
+    nominal, found = (twins.from_spec(told[name]) for name in ("believed", "twin"))
+    assert half_second_errors(nominal, log["position"], log["target"]) > 28.0
+    assert half_second_errors(found, log["position"], log["target"]) < 11.0

@@ -107,7 +107,7 @@ def propose(problem: Problem) -> Proposal:
     keys = _material(problem, keys)
     keys = _simplified(problem, keys)
     keys = _plausible_first(problem, keys)
-    keys = _confirmed(problem, keys)
+    keys = _simplified(problem, _confirmed(problem, keys))
     kept, hints = outstanding(problem, keys)
     return Proposal(tuple(kept), tuple(hints))
 
