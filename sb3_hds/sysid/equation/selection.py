@@ -15,6 +15,8 @@ _ADDED, _SWAPPED, _MOST_MOVES = 12, 5, 80
 # A member carries at least this share of a joint's force, and lowers held-out errors by a t of at
 # least this, and so much more for each unit of rarity.
 _MATERIAL, _CONFIRMED, _RARE = 0.006, 1.5, 0.9
+# Below that share, one counts that takes this much off the logarithm of what the others leave.
+_TRACE, _MOST_OF_THE_REST = 1e-3, 0.7
 # A member whose force is below this multiple of what stays unexplained is a hint, no more; of what
 # is less rare than this, a smaller one.
 _OUTSTANDING, _RAREST = 1.5, 2.0
@@ -286,11 +288,21 @@ def _shaken(p: Problem, keys: list[int]) -> list[int]:
 
 # ------------------------------------------------------------------------------ what stays
 def _material(p: Problem, keys: list[int]) -> list[int]:
+    """Without what carries next to nothing, unless it is most of what the others leave."""
+    held = p.held_out(keys)
+    kept: set[int] = set()
     while keys:
-        share = np.where([i in p.always for i in keys], 1.0, p.carried(keys))
-        if share.min() > _MATERIAL:
+        own = [i in p.always or i in kept for i in keys]
+        share = np.where(own, 1.0, p.carried(keys))
+        worst = int(np.argmin(share))
+        if share[worst] > _MATERIAL:
             break
-        keys = [i for i, x in zip(keys, share, strict=True) if x > share.min()]
+        rest = [i for i in keys if i != keys[worst]]
+        without = p.held_out(rest)
+        if share[worst] > _TRACE and worth(p, without, held, keys[worst])[0] > _MOST_OF_THE_REST:
+            kept.add(keys[worst])
+        else:
+            keys, held = rest, without
     return keys
 
 
