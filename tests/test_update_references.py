@@ -488,7 +488,7 @@ class Sale:
 
     def embed(self, w: Weights, obs: np.ndarray, action: np.ndarray) -> tuple[Any, Any]:
         state = average_l1(self._two(w["of_state"], obs, elu))
-        return state, self._two(w["of_pair"], np.concatenate([state, action], -1), elu)
+        return state, self._two(w["of_both"], np.concatenate([state, action], -1), elu)
 
     def act(self, w: Weights, obs: np.ndarray, state: np.ndarray) -> np.ndarray:
         own = average_l1(dense(w["Dense_0"], obs))
