@@ -164,7 +164,7 @@ def test_what_is_not_as_it_was_written_is_not_there(damage, tmp_path):
 
 
 def test_programs_that_were_not_used_for_longest_make_room(tmp_path):
-    programs = Programs(tmp_path, most=350)
+    programs = Programs(tmp_path, most=300)
     now = time.time()
     for i in range(3):
         programs.put(f"program_{i}", bytes([i]) * 100)
@@ -172,11 +172,11 @@ def test_programs_that_were_not_used_for_longest_make_room(tmp_path):
         os.utime(path, (now - 100 + i, now - 100 + i))
     assert programs.get("program_0") == bytes(100)
 
-    Programs(tmp_path, most=350).put("program_3", b"3" * 100)
+    Programs(tmp_path, most=300).put("program_3", b"3" * 100)
 
     kept = [i for i in range(4) if programs.get(f"program_{i}") is not None]
     assert kept == [0, 3]
-    assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= 350
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= 300
 
 
 def test_what_a_process_left_unfinished_goes_when_it_is_old(tmp_path):
