@@ -1,6 +1,7 @@
 """``sb3-hds effects`` and ``sb3-hds twins``: the catalogues."""
 
 import argparse
+import hashlib
 import inspect
 import json
 import re
@@ -24,12 +25,25 @@ STORED = Path(__file__).with_name("effects.json")
 def run_effects(given: argparse.Namespace) -> None:
     """All candidates, or those that have the words, with units and explanations."""
     columns = ("effect", "acts on", "parameters", "what it is")
-    rows = [tuple(row) for row in json.loads(STORED.read_text())]
+    rows = [tuple(row) for row in stored_rows() or rows_of_effects()]
     _show(columns, _with_words(rows, given.words, "effect"))
     print(
         "Units at joints are those of a rotary joint; for a slider, read N and m in place of N m "
         "and rad."
     )
+
+
+def stored_rows() -> list[list[str]]:
+    """:return: none where an effect was added or changed since they were stored"""
+    stored = json.loads(STORED.read_text())
+    return stored["rows"] if stored["sources"] == _sources() else []
+
+
+def _sources() -> str:
+    found = hashlib.sha256()
+    for path in sorted((Path(__file__).parents[1] / "effects").glob("*.py")):
+        found.update(path.read_bytes())
+    return found.hexdigest()[:16]
 
 
 def rows_of_effects() -> list[list[str]]:
@@ -51,7 +65,8 @@ def rows_of_effects() -> list[list[str]]:
 def store_effects() -> None:
     """Write the rows anew, after an effect was added or changed."""
     temporary = STORED.with_suffix(".tmp")
-    temporary.write_text(json.dumps(rows_of_effects(), indent=1) + "\n")
+    stored = {"sources": _sources(), "rows": rows_of_effects()}
+    temporary.write_text(json.dumps(stored, indent=1) + "\n")
     temporary.replace(STORED)
 
 

@@ -1,10 +1,12 @@
 """Black-box search by CMA-ES, generation by generation, whose state is a pytree of arrays."""
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from cmaes import CMA
 from jaxtyping import Float, Int
+
+if TYPE_CHECKING:
+    from cmaes import CMA
 
 # Where generations and rounds of a ranking get their random numbers.
 _SAMPLES, _RESETS, _ROUNDS = 0, 1, 2
@@ -120,8 +122,10 @@ def tell(state: SearchState) -> SearchState:
     )
 
 
-def _restored(state: SearchState) -> CMA:
+def _restored(state: SearchState) -> "CMA":
     """``cmaes`` has no public way to go on with a search, so its attributes are set."""
+    from cmaes import CMA  # it imports scipy.stats, for which no other learner should wait
+
     search = CMA(
         mean=np.array(state.mean),
         sigma=float(state.sigma),
@@ -137,7 +141,7 @@ def _restored(state: SearchState) -> CMA:
     return search
 
 
-def _asked(search: CMA, n: int) -> Float[np.ndarray, "population dim"]:
+def _asked(search: "CMA", n: int) -> Float[np.ndarray, "population dim"]:
     return np.stack([search.ask() for _ in range(n)])
 
 
