@@ -109,9 +109,9 @@ class BROConfig(SACConfig):
 
 class BRO(SoftActorCritic):
     r"""
-    Bigger, regularised, optimistic: BroNet critics with 100 quantiles, whose **mean** is what both
-    targets and actor use, a second actor that explores where the critics disagree, and resets of
-    the networks.
+    Bigger, regularised, optimistic: BroNet critics with 100 quantiles, of which targets and actor
+    use the **mean**; a second actor that explores where the critics disagree; and resets of the
+    networks.
 
     Source: Nauman et al., *Bigger, Regularized, Optimistic: scaling for compute and
     sample-efficient continuous control*, NeurIPS 2024: replay ratio 10 (``gradient_steps=10``; here

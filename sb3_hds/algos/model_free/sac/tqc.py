@@ -1,4 +1,4 @@
-"""TQC: quantile critics, of which the largest quantiles are left out."""
+"""TQC: quantile critics; the largest quantiles are dropped from the targets."""
 
 import dataclasses
 from dataclasses import KW_ONLY
@@ -15,8 +15,8 @@ class TQCConfig(SACConfig):
     """
     Arguments of TQC.
 
-    :param top_quantiles_to_drop_per_net: times the number of critics: how many of the largest next
-        values of all critics together are left out of the targets
+    :param top_quantiles_to_drop_per_net: times the number of critics: how many of the largest
+        quantiles of all critics together are dropped from the targets
     :param policy_kwargs: ``n_quantiles`` is 25 unless given; see
         :class:`~sb3_hds.algos.GaussianPolicy`
     """
@@ -31,7 +31,7 @@ class TQCConfig(SACConfig):
 
 class TQC(SoftActorCritic):
     """
-    TruncatedQuantiles quantile critics.
+    Truncated quantile critics.
 
     Source: Kuznetsov et al., *Controlling Overestimation Bias with Truncated Mixture of Continuous
     Distributional Quantile Critics*, ICML 2020: 25 quantiles, five networks of three layers of 512
