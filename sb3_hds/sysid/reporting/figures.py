@@ -230,15 +230,19 @@ def _draw_estimates(axes: Any, fit: "Fit") -> None:
 
 def _draw_errors(axes: Any, fit: "Fit") -> None:
     rows = np.arange(len(fit.channels))
-    axes.barh(rows - 0.2, fit.error_before / fit.noise, 0.35, color=_BEFORE, label="before")
+    known = np.isfinite(fit.error_before)
+    if known.any():
+        before = (fit.error_before / fit.noise)[known]
+        axes.barh(rows[known] - 0.2, before, 0.35, color=_BEFORE, label="before")
     axes.barh(rows + 0.2, fit.error_after / fit.noise, 0.35, color=_AFTER, label="after")
     axes.axvline(1.0, color=_QUIET, linewidth=1.0, label="noise")
     axes.set_xscale("log")
     axes.set_yticks(rows, [name for name, _ in fit.channels])
     axes.invert_yaxis()
-    axes.set_xlabel("error over a window, in units of the noise")
-    axes.set_title("prediction error", fontsize=10)
-    axes.legend(fontsize=8, frameon=False)
+    axes.set_xlabel("error / noise")
+    diverged = "" if known.all() else "\n(before: the simulation diverges)"
+    axes.set_title(f"prediction error over a window{diverged}", fontsize=10)
+    axes.legend(fontsize=8, frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.06))
 
 
 def film_frames(
