@@ -54,7 +54,8 @@ class Member(NamedTuple):
     :param item: index
     :param key: of the candidate
     :param sizes: by short name; of a parameter of the twin, its change
-    :param low: ends of 90 % intervals, by short name
+    :param low: ends of 90 % intervals, by short name; of what was tried at a few values only, the
+        ones next to it
     :param high: likewise
     :param gain: what leaving it out costs, in -2 log likelihood
     :param t: of the held-out gain over folds
@@ -508,6 +509,8 @@ def members(p: Problem, keys: Sequence[int], effects: Mapping[str, Effect | None
         sizes, low, high = (
             item.sizes(effect, coefficients + side * spread) for side in (0.0, -1.0, 1.0)
         )
+        for name, (below, above) in _tried_beside(p, i).items():
+            low[name], high[name] = below, above
         gained, t = worth(p, p.held_out(rest), held, i)
         cost = p.score(rest, priced=False) - base
         out.append(
@@ -523,6 +526,22 @@ def members(p: Problem, keys: Sequence[int], effects: Mapping[str, Effect | None
             )
         )
     return out
+
+
+def _tried_beside(p: Problem, i: int) -> dict[str, tuple[float, float]]:
+    """:return: of what stands at one of several values, such as a speed, the values next to it"""
+    item = p.items[i]
+    if item.rule != "linear" or not item.settings:
+        return {}
+    found = {}
+    for name, value in item.settings[0].items():
+        tried = {
+            o.settings[0][name] for o in p.items if o.key == item.key and name in o.settings[0]
+        }
+        below = max((x for x in tried if x < value), default=value)
+        above = min((x for x in tried if x > value), default=value)
+        found[name] = (float(below), float(above))
+    return found
 
 
 def _covariance(p: Problem, keys: Sequence[int], found: Solution) -> np.ndarray:
