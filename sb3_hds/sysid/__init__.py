@@ -1,6 +1,8 @@
 """System identification: what measured data say about a twin."""
 
+from sb3_hds.sysid.belief.handed_on import write_randomisation
 from sb3_hds.sysid.calibrate import calibrate
+from sb3_hds.sysid.design import Limits, NextExperiment
 from sb3_hds.sysid.diagnose import diagnose
 from sb3_hds.sysid.diagnosis import Diagnosis, Finding
 from sb3_hds.sysid.residual import Residual, fit_residual
@@ -11,8 +13,11 @@ __all__ = [
     "Estimate",
     "Finding",
     "Fit",
+    "Limits",
+    "NextExperiment",
     "Residual",
     "calibrate",
     "diagnose",
     "fit_residual",
+    "write_randomisation",
 ]
