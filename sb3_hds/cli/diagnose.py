@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from sb3_hds.core import Twin
     from sb3_hds.experiments import PolicyGain
     from sb3_hds.sysid import Diagnosis
+    from sb3_hds.sysid.design import NextExperiment
 
 
 def run(given: argparse.Namespace) -> None:
@@ -54,8 +55,28 @@ def run(given: argparse.Namespace) -> None:
         print("Nothing was simulated, so there is no film.")
     elif given.animate:
         print(f"The film is {found.to_film(given.animate)}.")
+    experiment = _next(given, found)
     if given.report:
-        print(f"The report is {found.to_html(given.report, gain)}.")
+        print(f"The report is {found.to_html(given.report, gain, experiment)}.")
+
+
+def _next(given: argparse.Namespace, found: "Diagnosis") -> "NextExperiment | None":
+    """Design what ``--next`` asks for, print it and write its commands."""
+    if not given.next:
+        return None
+    if found.opened is None:
+        print("No cause was looked for, so there is nothing to record next.")
+        return None
+    told = found.next_experiment(
+        given.limits,
+        n=given.recordings,
+        seconds=given.seconds,
+        seed=given.seed,
+        progress=sys.stderr.isatty(),
+    )
+    print(told)
+    print(f"The commands are {told.save(given.next)}.")
+    return told
 
 
 def _check_targets(given: argparse.Namespace) -> None:
@@ -69,11 +90,27 @@ def _check_targets(given: argparse.Namespace) -> None:
         from sb3_hds.sysid.reporting.film import check_film
 
         check_film(given.animate)
+    if given.next:
+        _check_next(given)
     if given.report:
         from sb3_hds.sysid.reporting.page import check_installed, check_page
 
         check_page(given.report)
         check_installed()
+
+
+def _check_next(given: argparse.Namespace) -> None:
+    from sb3_hds.errors import ParameterError
+    from sb3_hds.sysid.design import Limits
+    from sb3_hds.sysid.design.experiment import check_file
+
+    check_file(given.next)
+    if not given.limits:
+        raise ParameterError(
+            "--next chooses commands for a real machine: say what it may do, --limits limits.yml "
+            "with lines such as 'velocity: 6.0' or 'torque: {shoulder: 2.0}'."
+        )
+    Limits.of(given.limits)
 
 
 def _policy_question(

@@ -89,15 +89,15 @@ class ExtendedTwin(Twin):
         return ExtendedTwin(base, *self.effects_with_values())
 
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
-        return self._remember(self.base.initial(key, self._base_params(params)), params)
+        return self._remember(self.base.initial(key, self.base_params(params)), params)
 
     def infer(self, obs: Obs, params: Params) -> State:
         for a, sensor in reversed(self._sensors):
             obs = obs.at[a.index].set(sensor.invert(obs[a.index], a.own(params)))
-        return self._remember(self.base.infer(obs, self._base_params(params)), params)
+        return self._remember(self.base.infer(obs, self.base_params(params)), params)
 
     def observe(self, state: State, params: Params) -> Obs:
-        obs = self.base.observe(state, self._base_params(params))
+        obs = self.base.observe(state, self.base_params(params))
         for a, sensor in self._sensors:
             reported = sensor.sense(obs[a.index], state.memory[a.key], self.dt, a.own(params))
             obs = obs.at[a.index].set(reported)
@@ -107,10 +107,10 @@ class ExtendedTwin(Twin):
         self, state: State, action: Action, params: Params, effects: EffectChain = NO_EFFECTS
     ) -> State:
         effects = effects + EffectChain(self._simulated, params)
-        state = self.base.step(state, action, self._base_params(params), effects)
+        state = self.base.step(state, action, self.base_params(params), effects)
         if not self._sensors:
             return state
-        obs, memory = self.base.observe(state, self._base_params(params)), dict(state.memory)
+        obs, memory = self.base.observe(state, self.base_params(params)), dict(state.memory)
         for a, sensor in self._sensors:
             own = a.own(params)
             memory[a.key] = sensor.advance(obs[a.index], memory[a.key], self.dt, own)
@@ -119,19 +119,19 @@ class ExtendedTwin(Twin):
         return state._replace(memory=memory)
 
     def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        return self.base.reward(state, action, next_state, self._base_params(params))
+        return self.base.reward(state, action, next_state, self.base_params(params))
 
     def planning_reward(
         self, state: State, action: Action, next_state: State, params: Params
     ) -> Scalar:
-        base = self._base_params(params)
+        base = self.base_params(params)
         reward = self.base.planning_reward(state, action, next_state, base)
         for a in self._simulated:
             reward = reward - a.effect.doubt(self.base, state, action, base, a.own(params))
         return reward
 
     def terminated(self, state: State, params: Params) -> Flag:
-        return self.base.terminated(state, self._base_params(params))
+        return self.base.terminated(state, self.base_params(params))
 
     def coordinates(self, q: Position) -> Coordinates:
         return self.base.coordinates(q)
@@ -143,7 +143,7 @@ class ExtendedTwin(Twin):
         return self.base.retract(state, tangent)
 
     def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
-        return self.base.sketch(state, self._base_params(params))
+        return self.base.sketch(state, self.base_params(params))
 
     def choose(self, keys: Collection[str]) -> Chosen:
         """
@@ -173,7 +173,8 @@ class ExtendedTwin(Twin):
             **{name: self.values[name] for name in self.base.parameters}
         )
 
-    def _base_params(self, params: Params) -> Params:
+    def base_params(self, params: Params) -> Params:
+        """:return: parameters of the twin below, with what native effects change of them"""
         own = {name: params[name] for name in self.base.parameters}
         for a in self._native:
             for name, target in self.base.native_effects[a.effect.name, a.index].items():
@@ -189,7 +190,7 @@ class ExtendedTwin(Twin):
         for a in self._simulated:
             if isinstance(a.effect, ForceEffect | ActionEffect):
                 memory[a.key] = a.effect.memory(self.base)
-        obs = self.base.observe(state, self._base_params(params))
+        obs = self.base.observe(state, self.base_params(params))
         for a, sensor in self._sensors:
             memory[a.key] = sensor.memory(obs[a.index], self.base)
             reported = sensor.sense(obs[a.index], memory[a.key], self.dt, a.own(params))

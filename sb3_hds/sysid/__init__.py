@@ -1,5 +1,7 @@
 """System identification: what measured data say about a twin."""
 
+from sb3_hds.sysid.belief.handed_on import write_randomisation
+from sb3_hds.sysid.design import Limits, NextExperiment
 from sb3_hds.sysid.diagnosis.diagnose import diagnose
 from sb3_hds.sysid.estimation.calibrate import calibrate
 from sb3_hds.sysid.estimation.residual_force import Residual, fit_residual
@@ -11,8 +13,11 @@ __all__ = [
     "Estimate",
     "Finding",
     "Fit",
+    "Limits",
+    "NextExperiment",
     "Residual",
     "calibrate",
     "diagnose",
     "fit_residual",
+    "write_randomisation",
 ]

@@ -5,6 +5,7 @@ from numbers import Integral
 from typing import Any, Literal
 
 from sb3_hds.core import Effect, Trajectories, Twin
+from sb3_hds.core.belief import BeliefTwin
 from sb3_hds.core.contract import check_methods
 from sb3_hds.core.numerics.kept_programs import keep_programs
 from sb3_hds.effects import ALL, effect_named
@@ -42,7 +43,7 @@ def diagnose(
     missing; a cause that leaves too much of it is not believed. In the end, causes are fitted to
     all recordings.
 
-    :param twin: as it is believed
+    :param twin: as it is believed; of a belief over several, the likeliest
     :param data: measured, sampled at the twin's ``dt``
     :param effects: classes of the catalogue, their names, or classes of your own
     :param calibrate: parameters of the twin that are not believed: they are refitted under every
@@ -65,6 +66,7 @@ def diagnose(
             f"diagnose(twin, data) takes a twin, as from twins.make(...), and Trajectories, got "
             f"{type(twin).__name__} and {type(data).__name__}."
         )
+    twin = twin.member(0) if isinstance(twin, BeliefTwin) else twin
     check_methods(twin)
     keep_programs()
     check_fits(twin, data)

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from sb3_hds.data import Audit, audit
 from sb3_hds.data.audit.differences import BackwardDifference
 from sb3_hds.data.audit.outliers import Glitches, Outliers
 from sb3_hds.effects import NAMELESS as NAMELESS_EFFECTS
+from sb3_hds.sysid.belief.opened import nothing_known, open_answers
 from sb3_hds.sysid.checks.adequacy import distances, far_in_words, noise_of
 from sb3_hds.sysid.checks.conventions import Convention, other_convention
 from sb3_hds.sysid.checks.divergence import divergence_rate
@@ -338,7 +340,13 @@ class Inquiry:
             twin=self.believed,
             data_hash=self.data_hash,
             seed=self.seed,
+            opened=partial(nothing_known, self.believed, self._least_errors(), self.data),
         )
+
+    def _least_errors(self) -> np.ndarray:
+        """:return: errors of each channel that nobody minds, or its sensor's noise"""
+        least = np.maximum(_IRRELEVANT * self.spread, self.sensor_noise)
+        return np.maximum(least, _IRRELEVANT)
 
     def in_other_words(self, convention: Convention) -> Diagnosis:
         """:return: that the log is not written in the model's conventions"""
@@ -536,6 +544,17 @@ class Inquiry:
             seed=self.seed,
             pictures=pictures_of(
                 confirm, start.kept, base.kept, self.every, before.missing, left.missing
+            ),
+            opened=partial(
+                open_answers,
+                self.search,
+                found,
+                [one for one, _ in sorted(rejected, key=lambda pair: -pair[1].gain)],
+                base,
+                self._extended,
+                self.data,
+                self.every,
+                unexplained,
             ),
         )
 

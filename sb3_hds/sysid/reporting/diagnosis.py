@@ -3,13 +3,19 @@
 import dataclasses
 import os
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from sb3_hds.core import Params, Twin
-from sb3_hds.errors import ParameterError
+from sb3_hds.core.belief import BeliefTwin
+from sb3_hds.errors import CalibrationError, ParameterError
+from sb3_hds.sysid.belief.answers import Answers
+from sb3_hds.sysid.belief.belief import belief_of
+from sb3_hds.sysid.design.experiment import NextExperiment, next_experiment
+from sb3_hds.sysid.design.limits import Limits
 from sb3_hds.sysid.estimation.results import Estimate, plain
 from sb3_hds.sysid.reporting import wording
 from sb3_hds.sysid.reporting.pictures import Pictures
@@ -144,6 +150,7 @@ class Diagnosis:
     :param caveats: what to keep in mind, in words
     :param versions: of the libraries that computed this
     :param pictures: numbers ready to draw; not part of :meth:`to_dict`
+    :param opened: computes :attr:`answers`; not part of :meth:`to_dict`
     """
 
     verdict: Verdict
@@ -163,6 +170,7 @@ class Diagnosis:
         default_factory=lambda: {name: version(name) for name in ("sb3-hds", "jax", "numpy")}
     )
     pictures: Pictures | None = None
+    opened: Callable[[], Answers] | None = dataclasses.field(default=None, compare=False)
 
     @property
     def params(self) -> Params:
@@ -279,6 +287,70 @@ class Diagnosis:
             [*lines, f"  and {more} more, in the report and in `detectable`"] if more > 0 else lines
         )
 
+    @cached_property
+    def answers(self) -> Answers:
+        """
+        The answers that the data leave open, each fitted to all of them: the findings, every
+        alternative in the place of its finding, and where something has no name, the candidates
+        that come nearest. Computed when it is first asked for, in seconds.
+
+        :raises CalibrationError: where no cause was looked for
+        """
+        if self.opened is None:
+            raise CalibrationError(
+                f"There are no answers to choose between: {self.sentence} "
+                f"{self.unexplained}".strip()
+            )
+        return self.opened()
+
+    @cached_property
+    def belief(self) -> BeliefTwin:
+        """
+        The answers with their weights and uncertain parameters as one twin of 64 equally likely
+        draws, to train in; see :func:`~sb3_hds.sysid.belief.belief.belief_of` for another number.
+
+        :raises CalibrationError: where no cause was looked for
+        """
+        return belief_of(self.answers, seed=self.seed)
+
+    def next_experiment(
+        self,
+        limits: "Limits | Mapping[str, Any] | str | os.PathLike[str]",
+        *,
+        n: int = 1,
+        seconds: float = 10.0,
+        start: Any = None,
+        seed: int = 0,
+        progress: bool = True,
+    ) -> NextExperiment:
+        r"""
+        What to record next: smooth commands within the machine's limits that decide between the
+        :attr:`answers`; of a single answer, that tell most about its parameters.
+
+        The worst pair of answers counts: for each, how far one is from predicting what the other
+        does, its start states and parameters refitted within what the present data allow. Limits
+        hold for every answer, also with parameters two standard deviations off, with a tenth to
+        spare. Commands are those of the twin's actuators: where these are servos, set points of
+        the machine's own loop.
+
+        :param limits: what the machine may do, as :class:`~sb3_hds.sysid.design.Limits`, a
+            dictionary, or a yml file
+        :param n: recordings
+        :param seconds: length of each
+        :param start: observation at the start of each, shape ``(n_obs,)``; default: that of the
+            recording which began slowest
+        :param seed: of the search
+        :param progress: whether a bar shows how far it is
+        :return: the commands, what each answer predicts, how surely they would decide, and how
+            often they would have to be recorded; where that is no way to decide, what would be
+        :raises CalibrationError: where no cause was looked for, for an impossible number, length or
+            start, or if no commands within the limits were found
+        :raises ParameterError: for limits that do not fit the machine
+        """
+        return next_experiment(
+            self.answers, limits, n=n, seconds=seconds, start=start, seed=seed, progress=progress
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """
         :return: the same, as plain data for JSON: the twins as their specifications, numbers that
@@ -288,7 +360,7 @@ class Diagnosis:
         found = {
             field.name: getattr(self, field.name)
             for field in dataclasses.fields(self)
-            if field.name not in ("believed", "twin", "pictures")
+            if field.name not in ("believed", "twin", "pictures", "opened")
         }
         twins = {"believed": self.believed.to_spec(), "twin": self.twin.to_spec()}
         said = {"sentence": self.sentence, "params": self.twin.values}
@@ -298,12 +370,15 @@ class Diagnosis:
         self,
         path: str | os.PathLike[str],
         policy_gain: "Mapping[str, Any] | _Plain | None" = None,
+        experiment: NextExperiment | None = None,
     ) -> Path:
         """
         Write one self-contained page: the verdict, its evidence, pictures, caveats.
 
         :param path: of the file, which ends in ``.html``; one of that name is replaced as a whole
         :param policy_gain: what ``measure_policy_gain`` returned, where it was measured
+        :param experiment: what :meth:`next_experiment` returned, to be shown with its commands and
+            the motion that each answer predicts
         :return: its path
         :raises ImportError: without matplotlib and jinja2 (extra ``report``)
         :raises ParameterError: for another ending
@@ -312,7 +387,7 @@ class Diagnosis:
         from sb3_hds.sysid.reporting.page import write_report
 
         plain = policy_gain if isinstance(policy_gain, Mapping | None) else policy_gain.to_dict()
-        return write_report(self, path, plain)
+        return write_report(self, path, plain, experiment)
 
     def to_film(self, path: str | os.PathLike[str]) -> Path:
         """

@@ -11,6 +11,8 @@ import numpy as np
 
 from sb3_hds.core.trajectories.storage import check_target, write_bytes
 from sb3_hds.errors import ParameterError
+from sb3_hds.sysid.design.experiment import NextExperiment
+from sb3_hds.sysid.design.plots import plot_next
 from sb3_hds.sysid.reporting import figures as plots
 from sb3_hds.sysid.reporting import wording
 from sb3_hds.sysid.reporting.diagnosis import Diagnosis
@@ -87,6 +89,12 @@ td.short { white-space: nowrap; }
 {{ shown(picture) }}{% if picture.rows %}<p class="quiet">{{ wording.HORIZONS }}:</p>
 {{ table(("steps", "before", "after", "90 % interval of the gain"), picture.rows) }}{% endif %}
 </section>{% endfor %}
+{% if experiment %}<section class="picture"><h2>What to record next</h2>
+<p>{{ experiment.sentence }}</p>{{ shown(experiment.picture) }}
+{% if experiment.pairs %}{{ table(("if this is right", "this is ruled out with a chance of",
+"recordings for 90 %"), experiment.pairs) }}{% endif %}
+{{ table(("limit", "most that any answer takes"), experiment.usage) }}
+{% for words in experiment.would_tell %}<p>{{ words }}</p>{% endfor %}</section>{% endif %}
 {% if rejected %}<section><h2>Not accepted</h2>
 <p class="quiet">{{ wording.REJECTED }}.</p>
 {{ table(("candidate", "gain", "p", "why"), rejected) }}</section>{% endif %}
@@ -141,10 +149,12 @@ def write_report(
     diagnosis: Diagnosis,
     path: str | os.PathLike[str],
     policy_gain: Mapping[str, Any] | None = None,
+    experiment: NextExperiment | None = None,
 ) -> Path:
     """
     :param path: of the page; a file of that name is replaced as a whole
     :param policy_gain: as plain data
+    :param experiment: what to record next
     :raises ImportError: without matplotlib and jinja2
     :raises ParameterError: for a name that is none of a page
     :raises OSError: if there is no folder to write it in
@@ -159,6 +169,7 @@ def write_report(
         **_content(diagnosis),
         pictures=pictures,
         policy=_policy(policy_gain),
+        experiment=_experiment(experiment),
         style=STYLE,
         moving=_moving(diagnosis),
     )
@@ -259,6 +270,24 @@ def _policy(gain: Mapping[str, Any] | None) -> dict[str, Any] | None:
         lambda narrow: plots.plot_policy_gain(gain, narrow),
     )
     return {"picture": _inlined(picture), "told": wording.policy_in_words(gain)}
+
+
+def _experiment(told: NextExperiment | None) -> dict[str, Any] | None:
+    if told is None:
+        return None
+    picture = _Picture(
+        "Commands and predicted motions",
+        "The first of the recordings: the commands, and each channel as every answer predicts it "
+        "from the start state without correction.",
+        lambda narrow: plot_next(told, narrow),
+    )
+    return {
+        "sentence": told.sentence,
+        "picture": _inlined(picture),
+        "pairs": told.told_apart(),
+        "usage": [(name, f"{share:.0%}") for name, share in told.usage.items()],
+        "would_tell": told.would_tell,
+    }
 
 
 def _pictures(d: Diagnosis) -> list[_Picture]:

@@ -1,0 +1,163 @@
+"""Which answers a search leaves open, each fitted to all data, with its weight and covariance."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from sb3_hds.core import Trajectories, Twin
+from sb3_hds.sysid.belief.answers import Answer, Answers, everything_open, factor_of
+from sb3_hds.sysid.comparison.held_out import effective_size
+from sb3_hds.sysid.comparison.search import Base, Half, Search
+from sb3_hds.sysid.diagnosis.findings import Accepted
+from sb3_hds.sysid.equation.plausibility import rarity
+from sb3_hds.sysid.estimation.evidence import Point
+from sb3_hds.sysid.estimation.hypotheses import Candidate
+
+#: most answers that are kept, the likeliest ones
+MOST = 6
+# Steps of a window where no motion says how long it should be.
+_WINDOW = 20
+# Candidates that stand for what has no name.
+_NEAREST = 3
+# Directions below this share of the largest curvature do not move.
+_RANK = 1e-10
+# Step by which the twin's parameters are asked how they follow a candidate's, in typical
+# deviations: they are linear in it.
+_STEP = 1e-4
+
+#: keys of causes and all parameters -> the twin as it came with these causes
+Extended = Callable[[Sequence[str], np.ndarray], Twin]
+
+
+def open_answers(
+    search: Search,
+    found: Sequence[Accepted],
+    rejected: Sequence[Candidate],
+    base: Base,
+    extended: Extended,
+    data: Trajectories,
+    every: int,
+    unexplained: str = "",
+) -> Answers:
+    """
+    The causes as they were found; for each alternative of one of them, that in its place; and where
+    something has no name, what comes nearest beside them. Each is fitted to all data, and weighed
+    by its likelihood on held-out recordings and by its prior odds.
+
+    :param found: causes
+    :param rejected: candidates that were not accepted, the nearest first
+    :param base: what is believed with the causes
+    :param extended: makes the twin of an answer
+    :param data: of the same interval as the windows
+    :param every: steps of the twin in one of the windows
+    :param unexplained: what remains, in words; empty if nothing does
+    """
+    h = search.hypotheses
+    by_key = {c.key: c for c in h.candidates}
+    own = [one.tried.candidate for one in found]
+    sets = [(own, base)]
+    for n, one in enumerate(found):
+        alternatives = [by_key[key] for key in one.alternatives if key in by_key]
+        if alternatives:
+            without = search.without(one.tried.candidate, base)
+            alternatives = [c for c in alternatives if not search.part_of(c, without)]
+            sets += [
+                ([*own[:n], tried.candidate, *own[n + 1 :]], search.believing(tried, without))
+                for tried in search.finished(alternatives, without)
+            ]
+    if unexplained:
+        nearest = [c for c in rejected if not search.part_of(c, base)][:_NEAREST]
+        sets += [
+            ([*own, tried.candidate], search.believing(tried, base))
+            for tried in search.finished(nearest, base)
+        ]
+    n_effective = effective_size(base.kept.raw / search.noise)
+    least = min(search.confirm.total(one.kept) for _, one in sets)
+    answers = []
+    for candidates, one in sets:
+        likelihood = -0.5 * n_effective * np.log(search.confirm.total(one.kept) / least)
+        odds = -sum(_rarity(c, h.twin) for c in candidates)
+        answers.append((likelihood + odds, candidates, one))
+    answers = sorted(answers, key=lambda answer: -answer[0])[:MOST]
+    rows = base.kept.raw.shape[0] * base.kept.raw.shape[1] * base.kept.raw.shape[2]
+    return Answers(
+        tuple(_answer(search, weight, *one, extended) for weight, *one in answers),
+        np.asarray(search.noise, float),
+        max(rows / n_effective, 1.0),
+        every * (base.kept.raw.shape[1] - 1),
+        _slowest(h.believed, data),
+    )
+
+
+def nothing_known(twin: Twin, noise: Float[np.ndarray, " obs"], data: Trajectories) -> Answers:
+    """
+    Where data told nothing, everything is open.
+
+    :param noise: standard deviation of each channel's errors
+    """
+    return Answers((everything_open(twin),), noise, 1.0, _WINDOW, _slowest(twin, data))
+
+
+def _answer(
+    search: Search,
+    log_weight: float,
+    candidates: Sequence[Candidate],
+    base: Base,
+    extended: Extended,
+) -> Answer:
+    h, keys = search.hypotheses, tuple(c.key for c in candidates)
+    every, point = search.whole(base)
+    twin = extended(keys, point.theta)
+    if not base.free:
+        return Answer(keys, twin, {}, float(log_weight))
+    covariance = joint_covariance(every, point, base.free)
+    factor = factor_of(covariance, h.scale[list(base.free)])
+    rows: dict[str, np.ndarray] = {}
+    for row, i in zip(factor, base.free, strict=True):
+        inward = -1.0 if point.theta[i] + _STEP * h.scale[i] > h.upper[i] else 1.0
+        moved = point.theta.copy()
+        moved[i] += inward * _STEP * h.scale[i]
+        there = extended(keys, moved).values
+        for name, value in there.items():
+            slope = (value - twin.values[name]) / (moved[i] - point.theta[i])
+            if abs(slope) > 1e-9:
+                rows[name] = rows.get(name, np.zeros(len(factor))) + slope * row
+    return Answer(keys, twin, rows, float(log_weight))
+
+
+def joint_covariance(half: Half, point: Point, free: Sequence[int]) -> np.ndarray:
+    """
+    As :func:`~sb3_hds.sysid.diagnosis.account.standard_errors`: the jackknife over units, one
+    Newton step for each that is left out.
+
+    :param free: indices of what was fitted
+    :return: their covariance, shape ``(k, k)``; infinite where slopes are not finite
+    """
+    scale = half.evidence.hypotheses.scale[list(free)]
+    slopes, labels = half.evidence.slopes(point, free), np.unique(half.unit)
+    total, covariance = slopes.curvature.sum(0), np.zeros((len(free), len(free)))
+    if not (np.isfinite(slopes.curvature).all() and np.isfinite(slopes.scores).all()):
+        return np.full_like(covariance, np.inf)
+    for label in labels:
+        own = half.unit == label
+        rest = np.linalg.pinv(total - slopes.curvature[own].sum(0), rcond=_RANK, hermitian=True)
+        step = rest @ slopes.scores[own].sum(0)
+        covariance += np.outer(step, step)
+    # Fewer units than parameters leave directions in which nothing was left out.
+    covariance *= (len(labels) - 1) / len(labels)
+    floor = np.linalg.pinv(total, rcond=_RANK, hermitian=True)
+    if len(labels) <= len(free):
+        covariance = covariance + floor
+    return covariance * np.outer(scale, scale)
+
+
+def _rarity(candidate: Candidate, twin: Twin) -> float:
+    command = twin.actuators[candidate.index].unit if candidate.slot == "actuator" else ""
+    return rarity(candidate.name, command)
+
+
+def _slowest(twin: Twin, data: Trajectories) -> np.ndarray:
+    """:return: the first observation of the recording that begins slowest"""
+    speeds = [np.linalg.norm(twin.infer(obs, twin.params).v) for obs in data.obs[:, 0]]
+    return np.asarray(data.obs[int(np.argmin(speeds)), 0], float)

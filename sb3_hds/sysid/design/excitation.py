@@ -1,0 +1,296 @@
+r"""
+How well commands would decide between answers, as a differentiable program.
+
+Let answer :math:`a` be true. Recorded in windows, each simulated from a start state of its own,
+answer :math:`b` leaves at least
+
+.. math::
+   \lambda_{ab} = \min_{z, x_0} \frac{1}{c} \sum_k
+   \left\| \frac{y_a - y_b(\theta_b + L_b z, x_0)}{\sigma} \right\|^2 + \|z\|^2,
+
+linear in the start states :math:`x_0` and in :math:`z`: what the earlier data allow :math:`b` to
+change (:math:`L_b L_b^T` is the covariance of its parameters) counts as already changed in its
+favour. Half of it is the expected log-likelihood ratio, all data taken together; :math:`c` is the
+number of rows for each independent one.
+
+Source: T-optimality, Atkinson and Fedorov, *The design of experiments for discriminating between
+two rival models*, Biometrika 62(1), 1975, with the prior of Ponce de Leon and Atkinson, Biometrika
+78(3), 1991. Where there is only one answer: the information gain
+:math:`\frac{1}{2} \log\det(I + L^T F L)` (Bayesian D-optimality).
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from sb3_hds.core import (
+    AnalyticTwin,
+    EffectChain,
+    ExtendedTwin,
+    Params,
+    SensorEffect,
+    State,
+    TransformedTwin,
+    Twin,
+    rollout,
+)
+from sb3_hds.core.twin import layers_of, plant_of
+from sb3_hds.sysid.belief.answers import effect_key, effects_of
+from sb3_hds.sysid.design.limits import Bounds
+from sb3_hds.sysid.estimation.shooting import solve_normal, with_slopes
+
+# Frequencies in the commands, at most, and the share of a recording in which they fade in.
+_MOST_SINES, _FADE = 24, 0.04
+# Added to a ratio of likelihoods whose logarithm is maximised.
+_LEAST = 1e-3
+# Price of exceeding a limit, in units of the limit, and the share of it from which it counts.
+_PRICE, _NEAR = 200.0, 0.85
+
+
+class Question(NamedTuple):
+    """
+    The numbers of a design problem; those that no program depends on.
+
+    :param values: parameters of each answer, shape ``(m, p)``
+    :param factor: of their covariances, shape ``(m, p, k)``
+    :param corners: parameters for which limits hold, besides those of the answers, ``(c, p)``
+    :param start: observation at the start, shape ``(n_obs,)``
+    :param weight: reciprocal of the errors of each output, the channels first and then the forces
+        of the actuators at each joint; 0: it is not measured; shape ``(n_obs + dof,)``
+    :param correlated: rows for each independent one
+    """
+
+    values: np.ndarray
+    factor: np.ndarray
+    corners: np.ndarray
+    start: np.ndarray
+    weight: np.ndarray
+    correlated: float
+
+
+class Told(NamedTuple):
+    r"""
+    What commands for ``n`` recordings are worth, and what they ask of the machine.
+
+    :param ratios: :math:`\lambda_{ab}`, shape ``(m, m)``
+    :param gains: information about the parameters of each answer [nats], shape ``(m,)``
+    :param curvature: information matrix of the first answer, by ``z``, shape ``(k, k)``
+    :param outputs: channels, then forces, as each answer predicts them, shape
+        ``(m, n, steps + 1, n_obs + dof)``
+    :param usage: of each limit the largest share that any answer takes, by joint: position,
+        velocity, torque, power, jerk; shape ``(5, dof)``
+    """
+
+    ratios: Array
+    gains: Array
+    curvature: Array
+    outputs: Array
+    usage: Array
+
+
+class Excitation:
+    """
+    :param twin: has the effects of all answers
+    :param bounds: that hold
+    :param n_steps: of a recording
+    :param window: steps of the windows in which it will be compared
+    """
+
+    def __init__(self, twin: Twin, bounds: Bounds, n_steps: int, window: int) -> None:
+        self.twin, self.bounds, self.n_steps = twin, bounds, n_steps
+        self.window = min(window, n_steps)
+        sines = int(np.clip(bounds.bandwidth * n_steps * twin.dt, 1, _MOST_SINES))
+        highest = min(bounds.bandwidth * n_steps * twin.dt, n_steps / 2.0)
+        cycles = np.linspace(1.0, max(highest, 1.0), sines)
+        phase = 2.0 * np.pi * np.outer(np.arange(n_steps) / n_steps, cycles)
+        fade = np.clip(np.arange(n_steps) / max(_FADE * n_steps, 1.0), 0.0, 1.0)[:, None]
+        waves = fade * np.concatenate([np.sin(phase), np.cos(phase)], 1)
+        self.basis = np.concatenate([np.ones((n_steps, 1)), waves], 1)
+        self.cycles = np.concatenate([[0.0], cycles, cycles])
+        self.sensors = {effect_key(e) for e in effects_of(twin) if isinstance(e, SensorEffect)}
+        self._names = tuple(twin.parameters)
+        #: (commands, question) -> :class:`Told`
+        self.told = jax.jit(self._told)
+        #: (coefficients of each start, question) -> objective, largest usage of a limit, gradient
+        self.ascent = jax.jit(self._ascent)
+
+    def commands(self, coefficients: Float[Array, "n waves act"]) -> Float[Array, "n steps act"]:
+        """:return: smooth, and within their limits whatever the coefficients are"""
+        low, high = self.bounds.command.T
+        waves = jnp.einsum("tw,nwa->nta", self.basis, coefficients)
+        return 0.5 * (low + high) + 0.5 * (high - low) * jnp.tanh(waves)
+
+    def _ascent(
+        self, coefficients: Float[Array, "starts n waves act"], asked: Question
+    ) -> tuple[Array, Array, Array]:
+
+        def cost(one: Array) -> tuple[Array, tuple[Array, Array]]:
+            told = self._told(self.commands(one), asked)
+            m, usage = len(asked.values), told.usage
+            if m == 1:
+                worth = told.gains[0]
+            else:
+                pairs = told.ratios[~np.eye(m, dtype=bool)]
+                worth = -jnp.log(jnp.mean(1.0 / (pairs + _LEAST)))
+            finite = jnp.where(jnp.isfinite(usage), usage, 1e3)
+            over = jnp.maximum(finite - _NEAR, 0.0)
+            return -worth + _PRICE * jnp.sum(over**2), (worth, jnp.max(finite))
+
+        if self.twin.differentiability == "reverse":
+            (_, told), slopes = jax.vmap(jax.value_and_grad(cost, has_aux=True))(coefficients)
+        else:
+            slopes, told = jax.vmap(jax.jacfwd(cost, has_aux=True))(coefficients)
+        return told[0], told[1], slopes
+
+    def _between(
+        self, a: Any, b: Any, states: State, outputs: Array, actions: Array, asked: Question
+    ) -> tuple[Array, Array, Array]:
+        """What answer ``b`` leaves of what ``a`` predicts, scores and curvature by ``z``."""
+        mine, theirs = (jax.tree.map(lambda leaf, i=i: leaf[i], states) for i in (a, b))
+        own = asked.values[b], asked.factor[b], asked.weight
+        found = jax.vmap(lambda *one: self._normal(*one, *own))(mine, theirs, outputs[a], actions)
+        rest, score, curvature = (jnp.sum(x, 0) / asked.correlated for x in found)
+        return rest, score, curvature
+
+    def _told(self, actions: Float[Array, "n steps act"], asked: Question) -> Told:
+        states, outputs, usage = self._rollouts(actions, asked)
+        m = len(asked.values)
+
+        def of(pair: Array) -> tuple[Array, Array, Array]:
+            rest, score, curvature = self._between(*pair, states, outputs, actions, asked)
+            bread = curvature + jnp.eye(len(curvature), dtype=curvature.dtype)
+            moved = jnp.linalg.solve(bread, score)
+            return rest - score @ moved, 0.5 * jnp.linalg.slogdet(bread)[1], curvature
+
+        pairs = np.stack(np.meshgrid(range(m), range(m), indexing="ij"), -1).reshape(-1, 2)
+        ratios, gains, curvature = jax.vmap(of)(jnp.asarray(pairs))
+        own = jnp.diag(gains.reshape(m, m))
+        return Told(ratios.reshape(m, m), own, curvature[0], outputs[:m], usage)
+
+    def _rollouts(self, actions: Array, asked: Question) -> tuple[State, Array, Array]:
+        """Of the answers, then of the corners; only the answers' states are returned."""
+        vectors = jnp.concatenate([asked.values, asked.corners])
+
+        def one(vector: Array, commands: Array) -> tuple[State, Array, Array]:
+            params = self._params(vector)
+            begin = self.twin.infer(asked.start, params)
+            begin = jax.tree.map(lambda leaf: jnp.asarray(leaf, vector.dtype), begin)
+            run = rollout(self.twin, params, begin, commands)
+            force = self._forces(run.states, commands, params)
+            outputs = jnp.concatenate([run.obs, force], 1)
+            return run.states, outputs, self._usage(run.states, force)
+
+        states, outputs, usage = jax.vmap(lambda v: jax.vmap(lambda a: one(v, a))(actions))(vectors)
+        states = jax.tree.map(lambda leaf: leaf[: len(asked.values)], states)
+        return states, outputs, jnp.max(usage, (0, 1))
+
+    def _forces(self, states: State, commands: Array, params: Params) -> Array:
+        """Of the actuators at each joint, shape ``(steps + 1, dof)``; zeros where unknown."""
+        if not isinstance(plant_of(self.twin), AnalyticTwin):
+            return jnp.zeros((self.n_steps + 1, len(self.twin.joints)), commands.dtype)
+        before = jax.tree.map(lambda leaf: leaf[:-1], states)
+        force = jax.vmap(lambda s, u: actuator_force(self.twin, s, u, params))(before, commands)
+        return jnp.concatenate([force, force[-1:]])
+
+    def _usage(self, states: State, force: Array) -> Array:
+        """Largest share of each limit over time, shape ``(5, dof)``."""
+        b, dt = self.bounds, self.twin.dt
+        q, v = jax.vmap(self.twin.coordinates)(states.q), states.v
+        low, high = b.position.T
+        half = np.where(np.isfinite(high - low), 0.5 * (high - low), 1.0)
+        position = jnp.maximum(jnp.maximum(1.0 + (q - high) / half, 1.0 + (low - q) / half), 0.0)
+        jerk = (v[2:] - 2.0 * v[1:-1] + v[:-2]) / dt**2
+        return jnp.stack(
+            [
+                jnp.max(position, 0),
+                jnp.max(jnp.abs(v), 0) / b.velocity,
+                jnp.max(jnp.abs(force), 0) / b.torque,
+                jnp.max(jnp.abs(force * v), 0) / b.power,
+                jnp.max(jnp.abs(jerk), 0) / b.jerk,
+            ]
+        )
+
+    def _normal(
+        self,
+        mine: State,
+        theirs: State,
+        seen: Array,
+        commands: Array,
+        values: Array,
+        factor: Array,
+        weight: Array,
+    ) -> tuple[Array, Array, Array]:
+        """
+        One recording under answer ``b``, in windows that begin where answer ``a`` is.
+
+        :param mine: states of ``a``
+        :param theirs: states of ``b``, for what its drives remember
+        :param seen: outputs of ``a``
+        :return: sum of squares, scores and curvature by ``z``, start states eliminated
+        """
+        length, n = self.window, self.n_steps // self.window
+        firsts = length * np.arange(n)
+        memory = {k: (mine if k in self.sensors else theirs).memory[k] for k in mine.memory}
+        begins = jax.tree.map(lambda leaf: leaf[firsts], State(mine.q, mine.v, memory))
+        rows = firsts[:, None] + np.arange(length)
+        outputs = seen[firsts[:, None] + np.arange(length + 1)]
+        n_z, n_x = factor.shape[1], 2 * len(self.twin.joints)
+
+        def window(begin: State, actions: Array, outputs: Array) -> tuple[Array, Array, Array]:
+            rest = ravel_pytree(begin.memory)[0]
+
+            def error(both: Array) -> Array:
+                params = self._params(values + factor @ both[:n_z])
+                there = self.twin.retract(
+                    begin, jnp.concatenate([both[n_z:], jnp.zeros_like(rest)])
+                )
+                there = jax.tree.map(lambda leaf, was: leaf.astype(was.dtype), there, begin)
+                run = rollout(self.twin, params, there, actions)
+                states = jax.tree.map(lambda leaf: leaf[:-1], run.states)
+                force = self._force_of(states, actions, params)
+                told = jnp.concatenate([run.obs[:-1], force], 1)
+                return ((told - outputs[:-1]) * weight).ravel()
+
+            now, slopes = with_slopes(error, jnp.zeros(n_z + n_x, begin.q.dtype))
+            by_z, by_x = slopes[:, :n_z], slopes[:, n_z:]
+            both = jnp.concatenate([now[:, None], by_z], 1)
+            free = both - by_x @ jax.vmap(partial(solve_normal, by_x), 1, 1)(both)
+            own, along = free[:, 0], free[:, 1:]
+            return own @ own, along.T @ own, along.T @ along
+
+        found = jax.vmap(window)(begins, commands[rows], outputs)
+        return tuple(jnp.sum(x, 0) for x in found)
+
+    def _force_of(self, states: State, commands: Array, params: Params) -> Array:
+        if not isinstance(plant_of(self.twin), AnalyticTwin):
+            return jnp.zeros((len(commands), len(self.twin.joints)), commands.dtype)
+        return jax.vmap(lambda s, u: actuator_force(self.twin, s, u, params))(states, commands)
+
+    def _params(self, vector: Array) -> Params:
+        return {name: vector[i] for i, name in enumerate(self._names)} | dict(self.twin.tensors)
+
+
+def actuator_force(twin: Twin, state: State, action: Array, params: Params) -> Float[Array, " dof"]:
+    """
+    :param twin: of an ``AnalyticTwin``, with effects and wrappers or without
+    :param action: as the outermost twin takes it, shape ``(n_act,)``
+    :return: generalised force of the actuators at the beginning of a step, effects on the way of
+        the command included [N m] or [N]
+    """
+    command = action
+    for layer in layers_of(twin):
+        if isinstance(layer, TransformedTwin):
+            command = layer.command(state, command, params)
+        elif isinstance(layer, ExtendedTwin):
+            simulated = tuple(a for a in layer.attached if a.key in state.memory)
+            chain = EffectChain(simulated, params)
+            command, _ = chain.act(command, state.memory, twin.dt / twin.substeps)
+            params = layer.base_params(params)
+    plant = plant_of(twin)
+    assert isinstance(plant, AnalyticTwin)
+    return plant.actuate(state, command, params)

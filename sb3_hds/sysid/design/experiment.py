@@ -1,0 +1,475 @@
+"""The recording that would decide, found by gradients through the twins."""
+
+import dataclasses
+import io
+import math
+import os
+import textwrap
+from collections.abc import Mapping
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import optax
+from jaxtyping import Float
+from rich.progress import track
+from scipy import stats
+
+from sb3_hds.core import Trajectories, Twin
+from sb3_hds.core.trajectories.storage import check_target, write_bytes
+from sb3_hds.effects import ConstantForce
+from sb3_hds.errors import CalibrationError, ParameterError
+from sb3_hds.sysid.belief.answers import Answers, effect_key, effects_of, everything_open, union
+from sb3_hds.sysid.design.excitation import Excitation, Question
+from sb3_hds.sysid.design.limits import Limits
+from sb3_hds.sysid.estimation.results import plain
+from sb3_hds.sysid.reporting.units import with_unit
+
+_WIDTH = 80
+# Starts of the search, its steps, and their size, in units of the coefficients.
+_STARTS, _STEPS, _RATE = 6, 120, 0.05
+# What is used of a limit at most: real machines are none of the answers.
+_MOST = 0.9
+# Parameters of each answer for which limits hold besides: this many standard deviations either way
+# along the widest directions of its covariance.
+_DEVIATIONS, _DIRECTIONS = 2.0, 2
+# Odds at which a question is decided, and with which chance.
+_ODDS, _SURE = 19.0, 0.9
+# Recordings beyond which an experiment is no way to decide.
+_MOST_RECORDINGS = 100
+# Of a force sensor, its error as a share of the largest force; of a known load, its force as a
+# share of that; of better sensors, by how much.
+_SENSOR, _LOAD, _FINER = 0.02, 0.3, 10.0
+
+
+class Pair(NamedTuple):
+    """
+    Two answers, and what the recordings would say of them.
+
+    :param true: the answer that is right
+    :param other: the answer that is to be ruled out
+    :param ratio: expected logarithm of the likelihood ratio
+    :param chance: that the odds are beyond 19 to 1 for the right one
+    :param needed: as many recordings as these, over and over, for a chance of 90 %
+    """
+
+    true: str
+    other: str
+    ratio: float
+    chance: float
+    needed: float
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class NextExperiment:
+    """
+    What to record next, from ``Diagnosis.next_experiment``. Prints itself.
+
+    :param commands: one trajectory for each recording: its actions are the commands, its
+        observations what the likeliest answer predicts
+    :param answers: names of the answers, the likeliest first
+    :param predicted: channels as each answer predicts them, shape ``(m, n, steps + 1, n_obs)``
+    :param channels: name and unit of each
+    :param actuators: name and unit of each
+    :param pairs: of answers, those that are hardest to tell first; none where there is one answer
+    :param information: gained about the parameters of the likeliest answer [nats]
+    :param narrower: by its parameters, their standard deviation now and after the recordings
+    :param usage: by limit and joint, the largest share that any answer takes
+    :param decides: whether a number of such recordings that one can make would tell
+    :param would_tell: what would, where they do not, in words
+    """
+
+    commands: Trajectories
+    answers: tuple[str, ...]
+    predicted: Float[np.ndarray, "m n rows obs"]
+    channels: tuple[tuple[str, str], ...]
+    actuators: tuple[tuple[str, str], ...]
+    pairs: tuple[Pair, ...]
+    information: float
+    narrower: Mapping[str, tuple[float, float]]
+    usage: Mapping[str, float]
+    decides: bool
+    would_tell: tuple[str, ...] = ()
+
+    @property
+    def chance(self) -> float:
+        """That the recordings decide between the two answers that are hardest to tell."""
+        return self.pairs[0].chance if self.pairs else math.nan
+
+    @property
+    def needed(self) -> float:
+        """Recordings that would decide between these with a chance of 90 %."""
+        return self.pairs[0].needed if self.pairs else math.nan
+
+    @property
+    def sentence(self) -> str:
+        """What to do, in one sentence."""
+        n, seconds = len(self.commands), self.commands.n_steps / len(self.commands)
+        what = "this recording" if n == 1 else f"these {n} recordings"
+        what += f" of {seconds * self.commands.dt:.3g} s"
+        if not self.pairs:
+            return f"Play {what}: it is worth {self.information:.1f} nats about the parameters."
+        worst = self.pairs[0]
+        if not self.decides:
+            return (
+                f"No recording within these limits tells {worst.true} from {worst.other}: the best "
+                f"that was found would have to be made {_number(worst.needed)} times."
+            )
+        if worst.chance >= _SURE:
+            return f"Play {what}: the answers are told apart with a chance of {worst.chance:.0%}."
+        return (
+            f"Play {what}, {math.ceil(worst.needed)} times in all: one of them tells "
+            f"{worst.true} from {worst.other} with a chance of {worst.chance:.0%}."
+        )
+
+    def summary(self) -> str:
+        """:return: all of it in 80 columns"""
+        lines = [*textwrap.wrap(self.sentence, _WIDTH), "=" * _WIDTH]
+        lines += [f"Answers that the data leave open: {len(self.answers)}"]
+        lines += [f"  {name}" for name in self.answers]
+        if self.pairs:
+            lines.append("   chance, and recordings for one of 90 %, to find")
+            for name, chance, needed in self.told_apart():
+                told = f"  {chance:>7} {needed:>8}   {name}"
+                lines += textwrap.wrap(told, _WIDTH, subsequent_indent=" " * 21)
+        for name, (now, then) in self.narrower.items():
+            lines.append(f"  {name}: standard deviation {now:.3g} -> {then:.3g}")
+        lines.append("Most of each limit that any answer takes:")
+        lines += [f"  {name}: {share:.0%}" for name, share in self.usage.items()]
+        for words in self.would_tell:
+            lines += textwrap.wrap(words, _WIDTH)
+        return "\n".join(lines)
+
+    __str__ = __repr__ = summary
+
+    def told_apart(self) -> list[tuple[str, str, str]]:
+        """:return: of each pair its answers, the chance to decide, and recordings for 90 %"""
+        return [
+            (f"{p.true}, not {p.other}", f"{p.chance:.0%}", _number(p.needed)) for p in self.pairs
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """:return: plain data for JSON; what is not finite is None"""
+        told = {
+            "sentence": self.sentence,
+            "decides": self.decides,
+            "answers": self.answers,
+            "pairs": [pair._asdict() for pair in self.pairs],
+            "information": self.information,
+            "narrower": self.narrower,
+            "usage": self.usage,
+            "would_tell": self.would_tell,
+            "dt": self.commands.dt,
+            "commands": self.commands.actions,
+            "start": self.commands.obs[:, 0],
+        }
+        return plain(told)
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """
+        Write the commands.
+
+        :param path: ``.csv``: time, recording, commands and predicted channels by name, a row for
+            each step; ``.npz``: ``commands``, for ``Trajectories.load``. A file of that name is
+            replaced as a whole.
+        :return: its path
+        :raises ParameterError: for another ending
+        :raises OSError: if there is no folder to write it in
+        """
+        check_file(path)
+        if Path(path).suffix == ".npz":
+            return self.commands.save(path)
+        import pandas
+
+        data = self.commands
+        parts = []
+        for i in range(len(data)):
+            obs, actions = data.episode(i)
+            columns = {"recording": np.full(len(actions), i)}
+            columns["time"] = data.dt * np.arange(len(actions))
+            columns |= {n: actions[:, j] for j, (n, _) in enumerate(self.actuators)}
+            columns |= {f"predicted {n}": obs[:-1, j] for j, (n, _) in enumerate(self.channels)}
+            parts.append(pandas.DataFrame(columns))
+        text = io.StringIO()
+        pandas.concat(parts).to_csv(text, index=False, float_format="%.8g")
+        return write_bytes(path, text.getvalue().encode())
+
+    def plot(self, path: str | os.PathLike[str]) -> None:
+        """
+        Draw the commands and what each answer predicts.
+
+        :param path: of the picture, for example ``"next.png"``
+        """
+        from sb3_hds.sysid.design.plots import plot_next
+
+        plot_next(self).savefig(path, dpi=150)
+
+
+def check_file(path: str | os.PathLike[str]) -> None:
+    """
+    :raises ParameterError: for an ending other than ``.csv`` and ``.npz``
+    :raises OSError: if there is no folder to write the file in
+    """
+    if Path(path).suffix not in (".csv", ".npz"):
+        raise ParameterError(f"Commands are written as .csv or .npz, got {path}.")
+    check_target(path)
+
+
+def next_experiment(
+    answers: Answers,
+    limits: Limits | Mapping[str, Any] | str | os.PathLike[str],
+    *,
+    n: int = 1,
+    seconds: float = 10.0,
+    start: Any = None,
+    seed: int = 0,
+    progress: bool = True,
+) -> NextExperiment:
+    """
+    See ``Diagnosis.next_experiment``.
+
+    :param answers: that the data leave open
+    :raises CalibrationError: for an impossible number, length, start or seed, or if no commands
+        within the limits were found
+    :raises ParameterError: for limits that do not fit the machine
+    """
+    (first, *others) = answers.answers
+    if not (others or first.factor):
+        # Nothing is wrong and nothing uncertain: what would show if it were there?
+        answers = dataclasses.replace(answers, answers=(everything_open(first.twin),))
+    twin, asked, loads = question(answers, start)
+    bounds = Limits.of(limits).at(twin)
+    n_steps = _steps(seconds, twin, n, seed)
+    with jax.enable_x64(True):
+        excitation = Excitation(twin, bounds, n_steps, answers.window)
+        actions = np.asarray(excitation.commands(_found(excitation, asked, n, seed, progress)))
+        told = jax.tree.map(np.asarray, excitation.told(actions, asked))
+        pairs = _pairs(answers, told.ratios, n)
+        decides = not pairs or pairs[0].needed <= _MOST_RECORDINGS
+        would_tell = ()
+        if not decides:
+            would_tell = _would_tell(excitation, actions, asked, told.outputs, loads)
+        narrower = (
+            {} if len(answers.answers) > 1 else _narrower(excitation.twin, asked, told.curvature)
+        )
+    n_obs = len(twin.channels)
+    outputs = told.outputs[..., :n_obs]
+    return NextExperiment(
+        commands=Trajectories.from_arrays(
+            outputs[0], actions, dt=twin.dt, conditions="designed experiment"
+        ),
+        answers=tuple(answer.name for answer in answers.answers),
+        predicted=outputs,
+        channels=tuple((c.name, c.unit) for c in twin.channels),
+        actuators=tuple((a.name, a.unit) for a in twin.actuators),
+        pairs=pairs,
+        information=float(told.gains[0]),
+        narrower=narrower,
+        usage=_usage(told.usage, twin),
+        decides=decides,
+        would_tell=would_tell,
+    )
+
+
+def question(answers: Answers, start: Any = None) -> tuple[Twin, Question, tuple[int, ...]]:
+    """
+    :param answers: that the data leave open
+    :param start: observation at the start; default: that of the answers
+    :return: the twin with everything that any answer has, and a known load at each joint; what is
+        asked about it; and for each joint the index of its load's parameter, -1 without one
+    :raises CalibrationError: for an impossible start
+    """
+    twin, values, factor = union(answers.answers)
+    twin, values, factor, loads = _with_loads(twin, values, factor)
+    weight = np.concatenate([1.0 / answers.noise, np.zeros(len(twin.joints))])
+    begin, corners = _start(start, answers, twin), _corners(twin, values, factor)
+    return twin, Question(values, factor, corners, begin, weight, answers.correlated), loads
+
+
+def _steps(seconds: float, twin: Twin, n: int, seed: int) -> int:
+    if not isinstance(n, Integral) or n < 1:
+        raise CalibrationError(f"n must be a whole number of recordings, got {n!r}.")
+    if not isinstance(seed, Integral) or seed < 0:
+        raise CalibrationError(f"seed must be a whole number of at least 0, got {seed!r}.")
+    if not (isinstance(seconds, Real) and math.isfinite(seconds) and seconds >= 8 * twin.dt):
+        raise CalibrationError(
+            f"seconds must be at least eight intervals of {twin.dt:g} s, got {seconds!r}."
+        )
+    return round(float(seconds) / twin.dt)
+
+
+def _start(start: Any, answers: Answers, twin: Twin) -> np.ndarray:
+    found = np.asarray(answers.start if start is None else start, float)
+    if found.shape != (len(twin.channels),) or not np.isfinite(found).all():
+        raise CalibrationError(
+            f"start must be an observation, {len(twin.channels)} finite numbers "
+            f"({', '.join(c.name for c in twin.channels)}), got {start!r}."
+        )
+    return found
+
+
+def _with_loads(
+    twin: Twin, values: np.ndarray, factor: np.ndarray
+) -> tuple[Twin, np.ndarray, np.ndarray, tuple[int, ...]]:
+    """
+    A constant force at each joint, zero unless a known load is tried.
+
+    :return: the twin with them, its parameter vectors and factors, and their indices
+    """
+    there = {effect_key(effect) for effect in effects_of(twin)}
+    natives = {place for name, place in twin.native_effects if name == ConstantForce.name}
+    new = [
+        ConstantForce(joint.name)
+        for i, joint in enumerate(twin.joints)
+        if f"{ConstantForce.name}.{joint.name}" not in there and i not in natives
+    ]
+    names = tuple(twin.parameters)
+    extended = twin.extend(*new) if new else twin
+    after = tuple(extended.parameters)
+    order = [names.index(name) if name in names else -1 for name in after]
+    values = np.array([[v[i] if i >= 0 else 0.0 for i in order] for v in values])
+    factor = np.array([[f[i] if i >= 0 else np.zeros(f.shape[1]) for i in order] for f in factor])
+    loads = [f"{ConstantForce.name}.{joint.name}.tau_0" for joint in twin.joints]
+    return extended, values, factor, tuple(after.index(n) if n in after else -1 for n in loads)
+
+
+def _corners(twin: Twin, values: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    """Parameters at two standard deviations along the widest directions, within their bounds."""
+    scale = np.array([p.scale for p in twin.parameters.values()])
+    low = np.array([p.lower for p in twin.parameters.values()])
+    high = np.array([p.upper for p in twin.parameters.values()])
+    found = []
+    for value, own in zip(values, factor, strict=True):
+        widest = np.argsort(-np.linalg.norm(own / scale[:, None], axis=0))[:_DIRECTIONS]
+        for i in widest:
+            way = _DEVIATIONS * own[:, i]
+            found += [np.clip(value + way, low, high), np.clip(value - way, low, high)]
+    return np.array(found) if found else values[:1]
+
+
+def _found(
+    excitation: Excitation, asked: Question, n: int, seed: int, progress: bool
+) -> Float[np.ndarray, "n waves act"]:
+    """:return: the best coefficients that were met on the way of any start, within all limits"""
+    rng, n_act = np.random.default_rng(seed), len(excitation.twin.actuators)
+    shape = (_STARTS, n, excitation.basis.shape[1], n_act)
+    # Lower frequencies move a machine further; starts are of unequal strength.
+    falling = 1.0 / np.sqrt(1.0 + excitation.cycles)[:, None]
+    strength = np.geomspace(0.1, 1.0, _STARTS)[:, None, None, None]
+    now = strength * falling * rng.standard_normal(shape) / np.sqrt(np.sum(falling**2) / 2.0)
+    optimizer = optax.adam(optax.cosine_decay_schedule(_RATE, _STEPS))
+    state, best, worth = optimizer.init(now), None, -np.inf
+    steps = track(range(_STEPS), "designing", transient=True, disable=not progress)
+    for _ in steps:
+        told, usage, slopes = map(np.asarray, excitation.ascent(now, asked))
+        inside = np.where(np.isfinite(told) & (usage <= _MOST), told, -np.inf)
+        if inside.max() > worth:
+            worth, best = float(inside.max()), np.array(now[int(inside.argmax())])
+        slopes = np.nan_to_num(slopes, nan=0.0, posinf=0.0, neginf=0.0)
+        norm = np.sqrt(np.sum(slopes**2, (1, 2, 3), keepdims=True))
+        step, state = optimizer.update(slopes / np.maximum(norm, 1.0), state, now)
+        now = np.asarray(optax.apply_updates(now, step))
+    if best is None:
+        told = excitation.told(excitation.commands(now[0]), asked)
+        usage = _usage(np.asarray(told.usage), excitation.twin)
+        worst = max(usage, key=usage.__getitem__)
+        raise CalibrationError(
+            f"No commands were found that keep all limits under every answer: {worst} is taken to "
+            f"{usage[worst]:.0%}. Widen that limit, record for fewer seconds, or begin elsewhere "
+            "(start=...)."
+        )
+    return best
+
+
+def _pairs(answers: Answers, ratios: np.ndarray, n: int) -> tuple[Pair, ...]:
+    names = [answer.name for answer in answers.answers]
+    found = [
+        _pair(names[a], names[b], float(ratios[a, b]), n)
+        for a in range(len(names))
+        for b in range(len(names))
+        if a != b
+    ]
+    return tuple(sorted(found, key=lambda pair: pair.ratio))
+
+
+def _pair(true: str, other: str, strength: float, n: int) -> Pair:
+    """
+    The logarithm of the likelihood ratio is normal with half of ``strength`` as its mean and
+    ``strength`` as its variance.
+    """
+    strength = max(strength, 1e-12)
+    threshold, sure = math.log(_ODDS), float(stats.norm.ppf(_SURE))
+    chance = float(stats.norm.cdf((0.5 * strength - threshold) / math.sqrt(strength)))
+    enough = (sure + math.sqrt(sure**2 + 2.0 * threshold)) ** 2
+    return Pair(true, other, 0.5 * strength, chance, max(n * enough / strength, 1.0))
+
+
+def _would_tell(
+    excitation: Excitation, actions: Any, asked: Question, outputs: np.ndarray, loads: Any
+) -> tuple[str, ...]:
+    """What makes the pair that is hardest to tell apart easy, with the same commands."""
+    twin, m = excitation.twin, len(asked.values)
+    n_obs = len(twin.channels)
+    largest = np.abs(outputs[..., n_obs:]).max((0, 1, 2))
+    enough = _pair("", "", 1.0, 1).needed
+
+    def hardest(changed: Question) -> float:
+        ratios = np.asarray(excitation.told(actions, changed).ratios)
+        return float(ratios[~np.eye(m, dtype=bool)].min())
+
+    told = []
+    for j, joint in enumerate(twin.joints):
+        unit = "N" if joint.unit == "m" else "N m"
+        if not largest[j] > 0.0:
+            continue
+        weight = asked.weight.copy()
+        weight[n_obs + j] = 1.0 / (_SENSOR * largest[j])
+        if hardest(asked._replace(weight=weight)) >= enough:
+            error = with_unit(f"{_SENSOR * largest[j]:.2g}", unit)
+            told.append(
+                f"A sensor of the actuator's force at {joint.name}, good to {error}, would tell."
+            )
+        if loads[j] < 0:
+            continue
+        values = asked.values.copy()
+        values[:, loads[j]] += _LOAD * largest[j]
+        if hardest(asked._replace(values=values)) >= enough:
+            force = with_unit(f"{_LOAD * largest[j]:.2g}", unit)
+            told.append(
+                f"A known load at {joint.name}, a constant force of {force} as of a weight on a "
+                "string, would tell."
+            )
+    finer = asked._replace(weight=_FINER * asked.weight)
+    if hardest(finer) >= enough:
+        told.append(f"Errors {_FINER:.0f} times smaller, of sensors and of the model, would tell.")
+    if not told:
+        told.append(
+            "Neither a force sensor nor a known load nor ten times better sensors would tell with "
+            "these commands: to a policy, the answers may be the same."
+        )
+    return tuple(told)
+
+
+def _narrower(twin: Twin, asked: Question, curvature: np.ndarray) -> dict[str, tuple[float, float]]:
+    """Standard deviations of the only answer's parameters, before and after."""
+    factor = asked.factor[0]
+    after = factor @ np.linalg.inv(curvature + np.eye(len(curvature))) @ factor.T
+    now, then = (np.sqrt(np.maximum(np.diag(c), 0.0)) for c in (factor @ factor.T, after))
+    names = tuple(twin.parameters)
+    return {n: (float(a), float(b)) for n, a, b in zip(names, now, then, strict=True) if a > 0.0}
+
+
+def _usage(usage: np.ndarray, twin: Twin) -> dict[str, float]:
+    limits = ("position", "velocity", "torque", "power", "jerk")
+    return {
+        f"{limit} of {joint.name}": float(usage[i, j])
+        for i, limit in enumerate(limits)
+        for j, joint in enumerate(twin.joints)
+        if usage[i, j] > 0.0
+    }
+
+
+def _number(recordings: float) -> str:
+    return "1,000 or more" if recordings >= 1000 else f"{math.ceil(recordings):d}"
