@@ -418,6 +418,10 @@ class Diagnosis:
 
         return write_pictures(self, folder)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What was asked for stays; the data that further answers would need do not."""
+        return self.__dict__ | {"opened": None}
+
     def __str__(self) -> str:
         return self.summary()
 
