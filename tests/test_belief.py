@@ -16,6 +16,7 @@ from sb3_hds.errors import ParameterError
 from sb3_hds.sysid.belief.answers import Answer, Answers
 from sb3_hds.sysid.belief.belief import belief_of
 from sb3_hds.sysid.belief.handed_on import write_randomisation
+from sb3_hds.sysid.belief.plots import plot_belief
 
 TWIN = twins.make("PendulumReal")
 UNION = TWIN.extend(effects.ViscousFriction(0), effects.ActionDelay(0))
@@ -162,6 +163,12 @@ def test_what_all_draws_share_is_a_parameter_as_of_any_twin(belief):
     assert heavier.to_spec()["parameters"]["mass"] == 1.3
     with pytest.raises(ParameterError, match="no parameter"):
         belief.with_parameters(**{NAMES[B]: 0.1})
+
+
+def test_a_picture_has_a_panel_for_each_parameter_that_differs(two, tmp_path):
+    plot_belief(belief_of(two, n=40), tmp_path / "belief.png")
+
+    assert (tmp_path / "belief.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.expensive  # compiles epochs of planning

@@ -10,6 +10,7 @@ from cases import each
 
 from sb3_hds import effects, twins
 from sb3_hds.core import rollout
+from sb3_hds.core.belief import BeliefTwin
 from sb3_hds.errors import ModelFileError
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -146,3 +147,16 @@ def test_what_cannot_be_written_is_refused_and_leaves_no_file(name, source, mess
     with pytest.raises(ModelFileError, match=message):
         twins.write_model(twin, tmp_path / name, source)
     assert not list(tmp_path.iterdir())
+
+
+def test_draws_of_a_belief_are_files_of_which_the_first_is_the_likeliest(tmp_path):
+    twin = twins.from_mujoco(ARM, dt=0.01)
+    names = list(twin.parameters)
+    draws = np.tile(list(twin.values.values()), (5, 1))
+    draws[:, names.index("j0_damping")] = [0.3, 0.4, 0.5, 0.6, 0.7]
+
+    written = twins.write_models(BeliefTwin(twin, draws), tmp_path / "models", ARM, n=3)
+
+    paths = sorted((tmp_path / "models").iterdir())
+    found = [twins.from_mujoco(path).values["j0_damping"] for path in paths]
+    assert found == pytest.approx([0.3, 0.5, 0.7]) and len(written) == 3

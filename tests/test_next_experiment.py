@@ -1,5 +1,9 @@
 """What to record next: within every limit, under every answer, and worth what it says."""
 
+import copy
+import dataclasses
+import pickle
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +16,7 @@ from scipy.optimize import least_squares
 from sb3_hds import Trajectories, diagnose, effects, twins
 from sb3_hds.core import rollout
 from sb3_hds.errors import CalibrationError, ParameterError
+from sb3_hds.sysid import Diagnosis
 from sb3_hds.sysid.belief.answers import Answer, Answers, factor_of, union
 from sb3_hds.sysid.design import Limits
 from sb3_hds.sysid.design.excitation import Excitation
@@ -223,6 +228,14 @@ def test_one_answer_asks_for_narrower_parameters():
 def test_limits_that_nothing_keeps_are_said():
     with pytest.raises(CalibrationError, match="velocity of hinge is taken to"):
         designed(LATE, LAGGING, start=[1.0, 0.0, 6.0], limits={"velocity": 1.0})
+
+
+def test_a_diagnosis_that_looked_for_no_cause_has_nothing_to_ask_and_is_copied():
+    nothing = copy.copy(Diagnosis("unknown", TWIN, TWIN, "", 0, unexplained="Degrees."))
+
+    with pytest.raises(CalibrationError, match="no answers to choose between"):
+        nothing.next_experiment(LIMITS)
+    assert pickle.loads(pickle.dumps(dataclasses.replace(nothing, opened=lambda: 0))).opened is None
 
 
 @pytest.mark.expensive  # a whole diagnosis, and a design for what it leaves open

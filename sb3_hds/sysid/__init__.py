@@ -1,6 +1,7 @@
 """System identification: what measured data say about a twin."""
 
 from sb3_hds.sysid.belief.handed_on import write_randomisation
+from sb3_hds.sysid.belief.plots import plot_belief
 from sb3_hds.sysid.design import Limits, NextExperiment
 from sb3_hds.sysid.diagnosis.diagnose import diagnose
 from sb3_hds.sysid.estimation.calibrate import calibrate
@@ -19,5 +20,6 @@ __all__ = [
     "calibrate",
     "diagnose",
     "fit_residual",
+    "plot_belief",
     "write_randomisation",
 ]

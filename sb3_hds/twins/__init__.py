@@ -11,7 +11,7 @@ from sb3_hds.twins.environments.mountain_car import MountainCar
 from sb3_hds.twins.environments.payload_pendulum import PayloadPendulum
 from sb3_hds.twins.environments.pendulum import Pendulum
 from sb3_hds.twins.environments.pendulum_real import PendulumReal
-from sb3_hds.twins.mujoco import MechanismTwin, Written, from_mujoco, write_model
+from sb3_hds.twins.mujoco import MechanismTwin, Written, from_mujoco, write_model, write_models
 from sb3_hds.twins.registry import all_ids, from_env, from_spec, get, make, names, register
 from sb3_hds.twins.rigs.double_pendulum import DoublePendulum
 from sb3_hds.twins.rigs.duffing import Duffing
@@ -72,4 +72,5 @@ __all__ = [
     "names",
     "register",
     "write_model",
+    "write_models",
 ]

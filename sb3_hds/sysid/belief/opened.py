@@ -80,11 +80,10 @@ def open_answers(
         odds = -sum(_rarity(c, h.twin) for c in candidates)
         answers.append((likelihood + odds, candidates, one))
     answers = sorted(answers, key=lambda answer: -answer[0])[:MOST]
-    rows = base.kept.raw.shape[0] * base.kept.raw.shape[1] * base.kept.raw.shape[2]
     return Answers(
         tuple(_answer(search, weight, *one, extended) for weight, *one in answers),
         np.asarray(search.noise, float),
-        max(rows / n_effective, 1.0),
+        every * max(base.kept.raw.size / n_effective, 1.0),
         every * (base.kept.raw.shape[1] - 1),
         _slowest(h.believed, data),
     )

@@ -44,7 +44,8 @@ from sb3_hds.sysid.belief.answers import effect_key, effects_of
 from sb3_hds.sysid.design.limits import Bounds
 from sb3_hds.sysid.estimation.shooting import solve_normal, with_slopes
 
-# Frequencies in the commands, at most, and the share of a recording in which they fade in.
+# Frequencies in the commands, at most, and the share of a recording in which they fade in, and
+# out.
 _MOST_SINES, _FADE = 24, 0.04
 # Added to a ratio of likelihoods whose logarithm is maximised.
 _LEAST = 1e-3
@@ -108,7 +109,8 @@ class Excitation:
         highest = min(bounds.bandwidth * n_steps * twin.dt, n_steps / 2.0)
         cycles = np.linspace(1.0, max(highest, 1.0), sines)
         phase = 2.0 * np.pi * np.outer(np.arange(n_steps) / n_steps, cycles)
-        fade = np.clip(np.arange(n_steps) / max(_FADE * n_steps, 1.0), 0.0, 1.0)[:, None]
+        ends = np.minimum(np.arange(n_steps), np.arange(n_steps)[::-1])
+        fade = np.clip(ends / max(_FADE * n_steps, 1.0), 0.0, 1.0)[:, None]
         waves = fade * np.concatenate([np.sin(phase), np.cos(phase)], 1)
         self.basis = np.concatenate([np.ones((n_steps, 1)), waves], 1)
         self.cycles = np.concatenate([[0.0], cycles, cycles])
@@ -182,19 +184,30 @@ class Excitation:
             begin = jax.tree.map(lambda leaf: jnp.asarray(leaf, vector.dtype), begin)
             run = rollout(self.twin, params, begin, commands)
             force = self._forces(run.states, commands, params)
+            # What is on its way to the motor arrives, if only when the recording is over.
+            plain = self._forces(run.states, commands, params, on_its_way=False)
+            most = jnp.maximum(jnp.abs(force), jnp.abs(plain))
             outputs = jnp.concatenate([run.obs, force], 1)
-            return run.states, outputs, self._usage(run.states, force)
+            return run.states, outputs, self._usage(run.states, most)
 
         states, outputs, usage = jax.vmap(lambda v: jax.vmap(lambda a: one(v, a))(actions))(vectors)
         states = jax.tree.map(lambda leaf: leaf[: len(asked.values)], states)
         return states, outputs, jnp.max(usage, (0, 1))
 
-    def _forces(self, states: State, commands: Array, params: Params) -> Array:
-        """Of the actuators at each joint, shape ``(steps + 1, dof)``; zeros where unknown."""
+    def _forces(
+        self, states: State, commands: Array, params: Params, on_its_way: bool = True
+    ) -> Array:
+        """
+        Of the actuators at each joint, shape ``(steps + 1, dof)``; zeros where unknown.
+
+        :param on_its_way: whether what happens to a command on its way to the motor counts
+        """
         if not isinstance(plant_of(self.twin), AnalyticTwin):
-            return jnp.zeros((self.n_steps + 1, len(self.twin.joints)), commands.dtype)
+            return jnp.zeros((len(commands) + 1, len(self.twin.joints)), commands.dtype)
         before = jax.tree.map(lambda leaf: leaf[:-1], states)
-        force = jax.vmap(lambda s, u: actuator_force(self.twin, s, u, params))(before, commands)
+        force = jax.vmap(lambda s, u: actuator_force(self.twin, s, u, params, on_its_way))(
+            before, commands
+        )
         return jnp.concatenate([force, force[-1:]])
 
     def _usage(self, states: State, force: Array) -> Array:
@@ -251,10 +264,9 @@ class Excitation:
                 )
                 there = jax.tree.map(lambda leaf, was: leaf.astype(was.dtype), there, begin)
                 run = rollout(self.twin, params, there, actions)
-                states = jax.tree.map(lambda leaf: leaf[:-1], run.states)
-                force = self._force_of(states, actions, params)
-                told = jnp.concatenate([run.obs[:-1], force], 1)
-                return ((told - outputs[:-1]) * weight).ravel()
+                force = self._forces(run.states, actions, params)
+                told = jnp.concatenate([run.obs, force], 1)
+                return ((told - outputs)[:-1] * weight).ravel()
 
             now, slopes = with_slopes(error, jnp.zeros(n_z + n_x, begin.q.dtype))
             by_z, by_x = slopes[:, :n_z], slopes[:, n_z:]
@@ -266,30 +278,28 @@ class Excitation:
         found = jax.vmap(window)(begins, commands[rows], outputs)
         return tuple(jnp.sum(x, 0) for x in found)
 
-    def _force_of(self, states: State, commands: Array, params: Params) -> Array:
-        if not isinstance(plant_of(self.twin), AnalyticTwin):
-            return jnp.zeros((len(commands), len(self.twin.joints)), commands.dtype)
-        return jax.vmap(lambda s, u: actuator_force(self.twin, s, u, params))(states, commands)
-
     def _params(self, vector: Array) -> Params:
         return {name: vector[i] for i, name in enumerate(self._names)} | dict(self.twin.tensors)
 
 
-def actuator_force(twin: Twin, state: State, action: Array, params: Params) -> Float[Array, " dof"]:
+def actuator_force(
+    twin: Twin, state: State, action: Array, params: Params, on_its_way: bool = True
+) -> Float[Array, " dof"]:
     """
     :param twin: of an ``AnalyticTwin``, with effects and wrappers or without
     :param action: as the outermost twin takes it, shape ``(n_act,)``
-    :return: generalised force of the actuators at the beginning of a step, effects on the way of
-        the command included [N m] or [N]
+    :param on_its_way: whether effects on the way of the command count, such as a gain or a delay
+    :return: generalised force of the actuators at the beginning of a step [N m] or [N]
     """
     command = action
     for layer in layers_of(twin):
         if isinstance(layer, TransformedTwin):
             command = layer.command(state, command, params)
         elif isinstance(layer, ExtendedTwin):
-            simulated = tuple(a for a in layer.attached if a.key in state.memory)
-            chain = EffectChain(simulated, params)
-            command, _ = chain.act(command, state.memory, twin.dt / twin.substeps)
+            if on_its_way:
+                simulated = tuple(a for a in layer.attached if a.key in state.memory)
+                chain = EffectChain(simulated, params)
+                command, _ = chain.act(command, state.memory, twin.dt / twin.substeps)
             params = layer.base_params(params)
     plant = plant_of(twin)
     assert isinstance(plant, AnalyticTwin)

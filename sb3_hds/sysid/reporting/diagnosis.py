@@ -126,7 +126,7 @@ class HorizonGain:
 @dataclasses.dataclass(frozen=True, repr=False)
 class Diagnosis:
     """
-    Result of :func:`~sb3_hds.sysid.diagnose`. Prints itself.
+    Result of :func:`~sb3_hds.sysid.diagnosis.diagnose`. Prints itself.
 
     :param verdict: ``"named"``, ``"ambiguous"``, ``"none"``, ``"unknown"`` or
         ``"not_identifiable"``; the first two are about the first finding, and a later one may have
@@ -417,6 +417,10 @@ class Diagnosis:
         from sb3_hds.sysid.reporting.page import write_pictures
 
         return write_pictures(self, folder)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What was asked for stays; the data that further answers would need do not."""
+        return self.__dict__ | {"opened": None}
 
     def __str__(self) -> str:
         return self.summary()
