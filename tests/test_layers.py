@@ -65,7 +65,7 @@ LATE = {
 }
 """Imports that close a circle and may."""
 
-TANGLED = {"sysid": 7}
+TANGLED = {"sysid": 5}
 """How many files of a layer import each other in a circle: to become fewer, never more."""
 
 DRAWING = {"figures.py", "plots.py", "rendering.py", "report.py"}

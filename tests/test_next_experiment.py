@@ -208,13 +208,12 @@ def test_commands_are_written_for_a_controller_and_read_back(told, tmp_path):
         told.save(tmp_path / "next.txt")
 
 
-def test_mass_and_gain_are_one_without_a_force_sensor_or_a_known_load():
+def test_mass_and_gain_are_one_without_a_force_sensor():
     told = designed(HEAVY, WEAK)
 
     assert not told.decides and told.needed > 100
     assert "No recording within these limits" in told.sentence
     assert any("sensor of the actuator's force" in words for words in told.would_tell)
-    assert any("known load" in words for words in told.would_tell)
 
 
 def test_one_answer_asks_for_narrower_parameters():

@@ -154,8 +154,10 @@ class Excitation:
     ) -> tuple[Array, Array, Array]:
         """What answer ``b`` leaves of what ``a`` predicts, scores and curvature by ``z``."""
         mine, theirs = (jax.tree.map(lambda leaf, i=i: leaf[i], states) for i in (a, b))
-        own = asked.values[b], asked.factor[b], asked.weight
-        found = jax.vmap(lambda *one: self._normal(*one, *own))(mine, theirs, outputs[a], actions)
+        own = (jnp.asarray(x) for x in (asked.values[b], asked.factor[b], asked.weight))
+        values, factor, weight = own
+        normal = lambda x, y, told, u: self._normal(x, y, told, u, values, factor, weight)  # noqa: E731
+        found = jax.vmap(normal)(mine, theirs, outputs[a], actions)
         rest, score, curvature = (jnp.sum(x, 0) / asked.correlated for x in found)
         return rest, score, curvature
 
@@ -164,7 +166,9 @@ class Excitation:
         m = len(asked.values)
 
         def of(pair: Array) -> tuple[Array, Array, Array]:
-            rest, score, curvature = self._between(*pair, states, outputs, actions, asked)
+            rest, score, curvature = self._between(
+                pair[0], pair[1], states, outputs, actions, asked
+            )
             bread = curvature + jnp.eye(len(curvature), dtype=curvature.dtype)
             moved = jnp.linalg.solve(bread, score)
             return rest - score @ moved, 0.5 * jnp.linalg.slogdet(bread)[1], curvature
@@ -180,7 +184,7 @@ class Excitation:
 
         def one(vector: Array, commands: Array) -> tuple[State, Array, Array]:
             params = self._params(vector)
-            begin = self.twin.infer(asked.start, params)
+            begin = self.twin.infer(jnp.asarray(asked.start), params)
             begin = jax.tree.map(lambda leaf: jnp.asarray(leaf, vector.dtype), begin)
             run = rollout(self.twin, params, begin, commands)
             force = self._forces(run.states, commands, params)
@@ -275,8 +279,8 @@ class Excitation:
             own, along = free[:, 0], free[:, 1:]
             return own @ own, along.T @ own, along.T @ along
 
-        found = jax.vmap(window)(begins, commands[rows], outputs)
-        return tuple(jnp.sum(x, 0) for x in found)
+        rest, score, curvature = jax.vmap(window)(begins, commands[rows], outputs)
+        return jnp.sum(rest, 0), jnp.sum(score, 0), jnp.sum(curvature, 0)
 
     def _params(self, vector: Array) -> Params:
         return {name: vector[i] for i, name in enumerate(self._names)} | dict(self.twin.tensors)

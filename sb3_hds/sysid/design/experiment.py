@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Float
@@ -37,6 +38,11 @@ _MOST = 0.9
 _DEVIATIONS, _DIRECTIONS = 2.0, 2
 # Odds at which a question is decided, and with which chance.
 _ODDS, _SURE = 19.0, 0.9
+# Of commands that tell as much, those are preferred that move the machine more: in logarithms of a
+# likelihood ratio, for what the tightest limit allows.
+_LIVELY = 1e-3
+# Norm of a slope below which nothing tells the answers apart.
+_LEVEL = 1e-6
 # Recordings beyond which an experiment is no way to decide.
 _MOST_RECORDINGS = 100
 # Of a force sensor, its error as a share of the largest force; of a known load, its force as a
@@ -244,7 +250,8 @@ def next_experiment(
     n_steps = _steps(seconds, twin, n, seed)
     with jax.enable_x64(True):
         excitation = Excitation(twin, bounds, n_steps, answers.window)
-        actions = np.asarray(excitation.commands(_found(excitation, asked, n, seed, progress)))
+        found = _found(excitation, asked, n, seed, progress)
+        actions = np.asarray(excitation.commands(jnp.asarray(found)))
         told = jax.tree.map(np.asarray, excitation.told(actions, asked))
         pairs = _pairs(answers, told.ratios, n)
         decides = not pairs or pairs[0].needed <= _MOST_RECORDINGS
@@ -364,12 +371,15 @@ def _found(
     steps = track(range(_STEPS), "designing", transient=True, disable=not progress)
     for _ in steps:
         told, usage, slopes = map(np.asarray, excitation.ascent(now, asked))
+        told = told + _LIVELY * usage
         inside = np.where(np.isfinite(told) & (usage <= _MOST), told, -np.inf)
         if inside.max() > worth:
             worth, best = float(inside.max()), np.array(now[int(inside.argmax())])
         slopes = np.nan_to_num(slopes, nan=0.0, posinf=0.0, neginf=0.0)
         norm = np.sqrt(np.sum(slopes**2, (1, 2, 3), keepdims=True))
-        step, state = optimizer.update(slopes / np.maximum(norm, 1.0), state, now)
+        # Adam would make strides of a slope that is rounding alone.
+        slopes = np.where(norm > _LEVEL, slopes / np.maximum(norm, 1.0), 0.0)
+        step, state = optimizer.update(slopes, state, now)
         now = np.asarray(optax.apply_updates(now, step))
     if best is None:
         told = excitation.told(excitation.commands(now[0]), asked)

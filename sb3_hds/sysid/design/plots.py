@@ -1,11 +1,8 @@
 """Pictures of a designed experiment; matplotlib is imported only when one is drawn."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from sb3_hds.sysid.design.experiment import NextExperiment
 
 _COLOURS = ("#27496d", "#d1495b", "#8a6d1d", "#2e7d6b", "#7a4f9a", "#9a978c")
 _COMMAND = "#3b3a36"
@@ -13,8 +10,12 @@ _COMMAND = "#3b3a36"
 _WIDE, _NARROW = 9.0, 4.4
 
 
-def plot_next(told: "NextExperiment", narrow: bool = False) -> Any:
-    """The commands of the first recording, and below them each channel as each answer has it."""
+def plot_next(told: Any, narrow: bool = False) -> Any:
+    """
+    The commands of the first recording, and below them each channel as each answer has it.
+
+    :param told: a :class:`~sb3_hds.sysid.NextExperiment`
+    """
     from matplotlib.figure import Figure
 
     rows = len(told.actuators) + len(told.channels)

@@ -10,7 +10,6 @@ from sb3_hds.sysid.reporting.wording import TRAINED_IN, share_in_words
 
 if TYPE_CHECKING:
     from sb3_hds.sysid.estimation.results import Fit
-    from sb3_hds.sysid.reporting.diagnosis import Diagnosis
     from sb3_hds.sysid.reporting.moving import Moving
     from sb3_hds.sysid.reporting.pictures import Pictures
 
@@ -78,7 +77,7 @@ def plot_rollouts(p: "Pictures", narrow: bool = False) -> Any:
     return figure
 
 
-def plot_horizons(d: "Diagnosis", p: "Pictures", narrow: bool = False) -> Any:
+def plot_horizons(d: Any, p: "Pictures", narrow: bool = False) -> Any:
     """Error against the number of steps that are predicted."""
     figure, panels = _figure(1, 1, 2.6, narrow)
     axes = panels[0, 0]
@@ -125,7 +124,7 @@ def plot_missing_force(p: "Pictures", narrow: bool = False) -> Any:
     return figure
 
 
-def plot_evidence(d: "Diagnosis", narrow: bool = False) -> Any:
+def plot_evidence(d: Any, narrow: bool = False) -> Any:
     """A bar for every candidate, those that were named first."""
     from matplotlib.patches import Patch
 
