@@ -86,7 +86,7 @@ def recorded(joints: int) -> Any:
 
 def worker(joints: int, budget: str) -> dict:
     from sb3_hds import diagnose, twins
-    from sb3_hds.sysid.reporting.diagnosis import pipeline as inquiry
+    from sb3_hds.sysid.diagnosis import pipeline as inquiry
 
     data = recorded(joints)
     twin = twins.from_mujoco(arm(joints), dt=data.dt)

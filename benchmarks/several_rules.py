@@ -258,7 +258,7 @@ def one_by_one(twin: Any, data: Any, seed: int, budget: str) -> list[str]:
 @contextmanager
 def _without_screening() -> Iterator[None]:
     """Nothing is proposed by equation errors: every candidate is simulated."""
-    from sb3_hds.sysid.reporting.diagnosis import pipeline as inquiry
+    from sb3_hds.sysid.diagnosis import pipeline as inquiry
 
     screen = inquiry.screen
     inquiry.screen = lambda *_: None

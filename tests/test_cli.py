@@ -193,7 +193,7 @@ def asked(monkeypatch):
         warnings.warn("Rows are\nuneven.", UserWarning, stacklevel=2)
         return Diagnosis("none", twin, twin, data_hash="", seed=0)
 
-    monkeypatch.setattr("sb3_hds.sysid.diagnosis.diagnose", diagnose)
+    monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
     return seen
 
 

@@ -59,7 +59,7 @@ def asked(monkeypatch):
         seen.append((twin, data))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sb3_hds.sysid.diagnosis.diagnose", diagnose)
+    monkeypatch.setattr("sb3_hds.sysid.diagnose", diagnose)
     return seen
 
 

@@ -15,6 +15,7 @@ from sb3_hds.sysid.comparison.held_out import Comparison, compare, confirm, spli
 from sb3_hds.sysid.comparison.search import Half, Search
 from sb3_hds.sysid.comparison.starts import newton
 from sb3_hds.sysid.comparison.unexplained import MissingForce, remainder
+from sb3_hds.sysid.diagnosis import pipeline as inquiry
 from sb3_hds.sysid.diagnosis.account import standard_errors
 from sb3_hds.sysid.diagnosis.findings import NAMELESS, contradiction, errs_more, out_of_reach
 from sb3_hds.sysid.diagnosis.progress import Bar
@@ -22,7 +23,6 @@ from sb3_hds.sysid.estimation.evidence import Evidence, Point
 from sb3_hds.sysid.estimation.hypotheses import Candidate, Hypotheses
 from sb3_hds.sysid.estimation.shooting import shots_of
 from sb3_hds.sysid.reporting.diagnosis import HorizonGain
-from sb3_hds.sysid.reporting.diagnosis import pipeline as inquiry
 from sb3_hds.sysid.reporting.sentence import several_in_words
 
 KINDS = ["ViscousFriction", "CoulombFriction", "TorqueGain", "ActionDelay"]
