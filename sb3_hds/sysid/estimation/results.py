@@ -42,7 +42,7 @@ class Estimate:
 @dataclasses.dataclass(frozen=True, repr=False)
 class Fit:
     """
-    Result of :func:`~sb3_hds.sysid.estimation.calibrate`.
+    Result of :func:`~sb3_hds.sysid.calibrate`.
 
     :param twin: with the estimated values
     :param estimates: one for each free parameter, in the order asked for

@@ -126,7 +126,7 @@ class HorizonGain:
 @dataclasses.dataclass(frozen=True, repr=False)
 class Diagnosis:
     """
-    Result of :func:`~sb3_hds.sysid.diagnosis.diagnose`. Prints itself.
+    Result of :func:`~sb3_hds.sysid.diagnose`. Prints itself.
 
     :param verdict: ``"named"``, ``"ambiguous"``, ``"none"``, ``"unknown"`` or
         ``"not_identifiable"``; the first two are about the first finding, and a later one may have
