@@ -24,7 +24,6 @@ from sb3_hds.errors import CalibrationError, ParameterError
 from sb3_hds.sysid.belief.answers import Answers, effect_key, effects_of, everything_open, union
 from sb3_hds.sysid.design.excitation import Excitation, Question
 from sb3_hds.sysid.design.limits import Limits
-from sb3_hds.sysid.results import plain
 from sb3_hds.sysid.units import with_unit
 
 _WIDTH = 80
@@ -151,21 +150,20 @@ class NextExperiment:
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """:return: plain data for JSON; what is not finite is None"""
-        told = {
+        """:return: plain data for JSON"""
+        return {
             "sentence": self.sentence,
             "decides": self.decides,
-            "answers": self.answers,
+            "answers": list(self.answers),
             "pairs": [pair._asdict() for pair in self.pairs],
             "information": self.information,
-            "narrower": self.narrower,
-            "usage": self.usage,
-            "would_tell": self.would_tell,
+            "narrower": {name: list(pair) for name, pair in self.narrower.items()},
+            "usage": dict(self.usage),
+            "would_tell": list(self.would_tell),
             "dt": self.commands.dt,
-            "commands": self.commands.actions,
-            "start": self.commands.obs[:, 0],
+            "commands": self.commands.actions.tolist(),
+            "start": self.commands.obs[:, 0].tolist(),
         }
-        return plain(told)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """
@@ -247,7 +245,7 @@ def next_experiment(
         actions = np.asarray(excitation.commands(_found(excitation, asked, n, seed, progress)))
         told = jax.tree.map(np.asarray, excitation.told(actions, asked))
         pairs = _pairs(answers, told.ratios, n)
-        decides = not pairs or pairs[0].needed <= _MOST_RECORDINGS
+        decides = not pairs or bool(pairs[0].needed <= _MOST_RECORDINGS)
         would_tell = ()
         if not decides:
             would_tell = _would_tell(excitation, actions, asked, told.outputs, loads)
