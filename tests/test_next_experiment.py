@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import json
 import pickle
 
 import jax
@@ -197,6 +198,12 @@ def test_late_and_lagging_motors_are_told_apart_and_the_hardest_pair_comes_first
     assert max(map(len, str(told).splitlines())) <= 80
 
 
+def test_what_is_told_is_plain_data(told):
+    plain = json.loads(json.dumps(told.to_dict(), allow_nan=False))
+
+    assert plain["commands"] == told.commands.actions.tolist() and plain["decides"] is True
+
+
 def test_commands_are_written_for_a_controller_and_read_back(told, tmp_path):
     table = pandas.read_csv(told.save(tmp_path / "next.csv"))
     again = Trajectories.load(told.save(tmp_path / "next.npz"))
@@ -238,14 +245,26 @@ def test_a_diagnosis_that_looked_for_no_cause_has_nothing_to_ask_and_is_copied()
 
 
 @pytest.mark.expensive  # a whole diagnosis, and a design for what it leaves open
-def test_a_diagnosis_asks_for_what_would_decide():
-    late = TWIN.extend(effects.ActionDelay(0, delay=0.05))
-    data = measured(late, 8, 80, noise=0.05, share=0.4)
-    kinds = [effects.ActionDelay, effects.MotorLag]
+def test_a_diagnosis_asks_for_what_would_decide_and_believes_in_all_of_it():
+    data = measured(TWIN.with_parameters(mass=1.15), 8, 80, noise=0.01)
+    kinds = [effects.TorqueGain, effects.ViscousFriction]
     found = diagnose(TWIN, data, effects=kinds, budget="quick", progress=False)
     assert found.verdict == "ambiguous", found
 
-    asked = found.next_experiment(LIMITS, seconds=5.0, progress=False)
+    asked = found.next_experiment(LIMITS, seconds=3.0, progress=False)
+    belief = found.belief
 
-    assert {"action_delay.torque", "motor_lag.torque"} <= {*asked.answers}
-    assert asked.decides
+    assert {"parameter.mass", "torque_gain.torque"} <= {*asked.answers}
+    assert not asked.decides and any("force" in words for words in asked.would_tell)
+    assert asked.answers == belief.answers and sum(belief.weights) == pytest.approx(1.0)
+    mass, gain = belief.answers.index("parameter.mass"), belief.answers.index("torque_gain.torque")
+    values = dict(zip(belief.base.parameters, belief.draws.T, strict=True))
+    heavy, weak = belief.origin == mass, belief.origin == gain
+    # What was planted, and its reciprocal: within three of the errors that the data leave.
+    for name, own, truth in (
+        ("mass", heavy, 1.15),
+        ("torque_gain.torque.gain", weak, 1.0 / 1.15),
+    ):
+        assert values[name][own].mean() == pytest.approx(truth, abs=0.03)
+        assert values[name][own].std() < 0.03
+    assert np.all(values["mass"][weak] == TWIN.values["mass"])

@@ -47,8 +47,9 @@ from sb3_hds.sysid.estimation.shooting import solve_normal, with_slopes
 # Frequencies in the commands, at most, and the share of a recording in which they fade in, and
 # out.
 _MOST_SINES, _FADE = 24, 0.04
-# Added to a ratio of likelihoods whose logarithm is maximised.
-_LEAST = 1e-3
+# Added to the evidence whose logarithm is maximised: less than this decides nothing. And how much
+# information about parameters counts beside it: where nothing decides, the machine moves at least.
+_LEAST, _BESIDE = 1.0, 0.1
 # Price of exceeding a limit, in units of the limit, and the share of it from which it counts.
 _PRICE, _NEAR = 200.0, 0.85
 
@@ -139,6 +140,7 @@ class Excitation:
             else:
                 pairs = told.ratios[~np.eye(m, dtype=bool)]
                 worth = -jnp.log(jnp.mean(1.0 / (pairs + _LEAST)))
+                worth += _BESIDE * jnp.mean(told.gains)
             finite = jnp.where(jnp.isfinite(usage), usage, 1e3)
             over = jnp.maximum(finite - _NEAR, 0.0)
             return -worth + _PRICE * jnp.sum(over**2), (worth, jnp.max(finite))

@@ -25,7 +25,6 @@ from sb3_hds.errors import CalibrationError, ParameterError
 from sb3_hds.sysid.belief.answers import Answers, effect_key, effects_of, everything_open, union
 from sb3_hds.sysid.design.excitation import Excitation, Question
 from sb3_hds.sysid.design.limits import Limits
-from sb3_hds.sysid.estimation.results import plain
 from sb3_hds.sysid.reporting.units import with_unit
 
 _WIDTH = 80
@@ -38,11 +37,6 @@ _MOST = 0.9
 _DEVIATIONS, _DIRECTIONS = 2.0, 2
 # Odds at which a question is decided, and with which chance.
 _ODDS, _SURE = 19.0, 0.9
-# Of commands that tell as much, those are preferred that move the machine more: in logarithms of a
-# likelihood ratio, for what the tightest limit allows.
-_LIVELY = 1e-3
-# Norm of a slope below which nothing tells the answers apart.
-_LEVEL = 1e-6
 # Recordings beyond which an experiment is no way to decide.
 _MOST_RECORDINGS = 100
 # Of a force sensor, its error as a share of the largest force; of a known load, its force as a
@@ -157,21 +151,20 @@ class NextExperiment:
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """:return: plain data for JSON; what is not finite is None"""
-        told = {
+        """:return: plain data for JSON"""
+        return {
             "sentence": self.sentence,
             "decides": self.decides,
-            "answers": self.answers,
+            "answers": list(self.answers),
             "pairs": [pair._asdict() for pair in self.pairs],
             "information": self.information,
-            "narrower": self.narrower,
-            "usage": self.usage,
-            "would_tell": self.would_tell,
+            "narrower": {name: list(pair) for name, pair in self.narrower.items()},
+            "usage": dict(self.usage),
+            "would_tell": list(self.would_tell),
             "dt": self.commands.dt,
-            "commands": self.commands.actions,
-            "start": self.commands.obs[:, 0],
+            "commands": self.commands.actions.tolist(),
+            "start": self.commands.obs[:, 0].tolist(),
         }
-        return plain(told)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """
@@ -254,7 +247,7 @@ def next_experiment(
         actions = np.asarray(excitation.commands(jnp.asarray(found)))
         told = jax.tree.map(np.asarray, excitation.told(actions, asked))
         pairs = _pairs(answers, told.ratios, n)
-        decides = not pairs or pairs[0].needed <= _MOST_RECORDINGS
+        decides = not pairs or bool(pairs[0].needed <= _MOST_RECORDINGS)
         would_tell = ()
         if not decides:
             would_tell = _would_tell(excitation, actions, asked, told.outputs, loads)
@@ -371,15 +364,12 @@ def _found(
     steps = track(range(_STEPS), "designing", transient=True, disable=not progress)
     for _ in steps:
         told, usage, slopes = map(np.asarray, excitation.ascent(now, asked))
-        told = told + _LIVELY * usage
         inside = np.where(np.isfinite(told) & (usage <= _MOST), told, -np.inf)
         if inside.max() > worth:
             worth, best = float(inside.max()), np.array(now[int(inside.argmax())])
         slopes = np.nan_to_num(slopes, nan=0.0, posinf=0.0, neginf=0.0)
         norm = np.sqrt(np.sum(slopes**2, (1, 2, 3), keepdims=True))
-        # Adam would make strides of a slope that is rounding alone.
-        slopes = np.where(norm > _LEVEL, slopes / np.maximum(norm, 1.0), 0.0)
-        step, state = optimizer.update(slopes, state, now)
+        step, state = optimizer.update(slopes / np.maximum(norm, 1.0), state, now)
         now = np.asarray(optax.apply_updates(now, step))
     if best is None:
         told = excitation.told(excitation.commands(now[0]), asked)

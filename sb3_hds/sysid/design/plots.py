@@ -1,8 +1,10 @@
 """Pictures of a designed experiment; matplotlib is imported only when one is drawn."""
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+
+from sb3_hds.core import Trajectories
 
 _COLOURS = ("#27496d", "#d1495b", "#8a6d1d", "#2e7d6b", "#7a4f9a", "#9a978c")
 _COMMAND = "#3b3a36"
@@ -10,12 +12,23 @@ _COMMAND = "#3b3a36"
 _WIDE, _NARROW = 9.0, 4.4
 
 
-def plot_next(told: Any, narrow: bool = False) -> Any:
-    """
-    The commands of the first recording, and below them each channel as each answer has it.
+class Designed(Protocol):
+    """What is drawn of a ``NextExperiment``."""
 
-    :param told: a :class:`~sb3_hds.sysid.NextExperiment`
-    """
+    @property
+    def commands(self) -> Trajectories: ...
+    @property
+    def predicted(self) -> np.ndarray: ...
+    @property
+    def answers(self) -> tuple[str, ...]: ...
+    @property
+    def channels(self) -> tuple[tuple[str, str], ...]: ...
+    @property
+    def actuators(self) -> tuple[tuple[str, str], ...]: ...
+
+
+def plot_next(told: Designed, narrow: bool = False) -> Any:
+    """The commands of the first recording, and below them each channel as each answer has it."""
     from matplotlib.figure import Figure
 
     rows = len(told.actuators) + len(told.channels)
