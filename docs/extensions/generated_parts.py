@@ -104,6 +104,7 @@ PARTS: dict[str, Callable[[], str]] = {
         "diagnosis_cost", "seconds of a diagnosis against the number of recordings"
     ),
     "model_files": summaries.whole("model_files"),
+    "joints_cost": summaries.whole("joints_cost"),
     "diagnosis_cost_lines": summaries.whole("diagnosis_cost_lines"),
     **{f"learned_{method}": summaries.learned(method, *peers) for method, peers in LEARNED.items()},
     "learned": summaries.learned(),
