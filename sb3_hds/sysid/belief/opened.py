@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -158,5 +159,5 @@ def _rarity(candidate: Candidate, twin: Twin) -> float:
 
 def _slowest(twin: Twin, data: Trajectories) -> np.ndarray:
     """:return: the first observation of the recording that begins slowest"""
-    speeds = [np.linalg.norm(twin.infer(obs, twin.params).v) for obs in data.obs[:, 0]]
+    speeds = [np.linalg.norm(twin.infer(jnp.asarray(obs), twin.params).v) for obs in data.obs[:, 0]]
     return np.asarray(data.obs[int(np.argmin(speeds)), 0], float)
