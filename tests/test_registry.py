@@ -109,7 +109,7 @@ def test_what_is_added_is_known_everywhere(tmp_path):
     (twins / "rigs" / "heavy_axis.py").write_text(TWIN)
     insert(
         twins / "__init__.py",
-        ("import MechanismTwin, Written, from_mujoco, write_model\n", IMPORT),
+        ("Written, from_mujoco, write_model, write_models\n", IMPORT),
         ("for _twin in (\n", "    HeavyAxis,\n"),
     )
 

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import scipy
 from jaxtyping import Float
 from rich.progress import track
-from scipy import stats
 
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.core.trajectories.storage import check_target, write_bytes
@@ -400,8 +400,8 @@ def _pair(true: str, other: str, strength: float, n: int) -> Pair:
     ``strength`` as its variance.
     """
     strength = max(strength, 1e-12)
-    threshold, sure = math.log(_ODDS), float(stats.norm.ppf(_SURE))
-    chance = float(stats.norm.cdf((0.5 * strength - threshold) / math.sqrt(strength)))
+    threshold, sure = math.log(_ODDS), float(scipy.stats.norm.ppf(_SURE))
+    chance = float(scipy.stats.norm.cdf((0.5 * strength - threshold) / math.sqrt(strength)))
     enough = (sure + math.sqrt(sure**2 + 2.0 * threshold)) ** 2
     return Pair(true, other, 0.5 * strength, chance, max(n * enough / strength, 1.0))
 
