@@ -143,7 +143,8 @@ def gaits() -> str:
 
 def learned(*methods: str) -> Callable[[], str]:
     """
-    :param methods: of `model_free.py` that are shown, in this order; none: all
+    :param methods: of `model_free.py` that are shown, in this order, in the environments in which
+        the first one or a variant of it was run; none: all
     :return: what makes the Markdown of how well they learn, by environment
     """
 
@@ -153,6 +154,8 @@ def learned(*methods: str) -> Callable[[], str]:
         lines = []
         for env in dict.fromkeys(run["env"] for run in runs):
             own = {run["method"]: run for run in runs if run["env"] == env}
+            if methods and not any(method.startswith(methods[0]) for method in own):
+                continue
             for run in (own[method] for method in shown if method in own):
                 mean, low, high, worst = map(
                     rounded, (run[name] for name in ("return", "low", "high", "worst"))
