@@ -81,7 +81,7 @@ def open_answers(
         answers.append((likelihood + odds, candidates, one))
     answers = sorted(answers, key=lambda answer: -answer[0])[:MOST]
     return Answers(
-        tuple(_answer(search, weight, *one, extended) for weight, *one in answers),
+        tuple(_answer(search, weight, causes, one, extended) for weight, causes, one in answers),
         np.asarray(search.noise, float),
         every * max(base.kept.raw.size / n_effective, 1.0),
         every * (base.kept.raw.shape[1] - 1),

@@ -122,7 +122,9 @@ class Excitation:
         #: (coefficients of each start, question) -> objective, largest usage of a limit, gradient
         self.ascent = jax.jit(self._ascent)
 
-    def commands(self, coefficients: Float[Array, "n waves act"]) -> Float[Array, "n steps act"]:
+    def commands(
+        self, coefficients: Float[Array, "n waves act"] | np.ndarray
+    ) -> Float[Array, "n steps act"]:
         """:return: smooth, and within their limits whatever the coefficients are"""
         low, high = self.bounds.command.T
         waves = jnp.einsum("tw,nwa->nta", self.basis, coefficients)
@@ -156,8 +158,13 @@ class Excitation:
     ) -> tuple[Array, Array, Array]:
         """What answer ``b`` leaves of what ``a`` predicts, scores and curvature by ``z``."""
         mine, theirs = (jax.tree.map(lambda leaf, i=i: leaf[i], states) for i in (a, b))
-        own = asked.values[b], asked.factor[b], asked.weight
-        found = jax.vmap(lambda *one: self._normal(*one, *own))(mine, theirs, outputs[a], actions)
+        values, factor = jnp.asarray(asked.values[b]), jnp.asarray(asked.factor[b])
+        weight = jnp.asarray(asked.weight)
+
+        def one(mine: State, theirs: State, seen: Array, commands: Array) -> tuple[Array, ...]:
+            return self._normal(mine, theirs, seen, commands, values, factor, weight)
+
+        found = jax.vmap(one)(mine, theirs, outputs[a], actions)
         rest, score, curvature = (jnp.sum(x, 0) / asked.correlated for x in found)
         return rest, score, curvature
 
@@ -166,7 +173,9 @@ class Excitation:
         m = len(asked.values)
 
         def of(pair: Array) -> tuple[Array, Array, Array]:
-            rest, score, curvature = self._between(*pair, states, outputs, actions, asked)
+            rest, score, curvature = self._between(
+                pair[0], pair[1], states, outputs, actions, asked
+            )
             bread = curvature + jnp.eye(len(curvature), dtype=curvature.dtype)
             moved = jnp.linalg.solve(bread, score)
             return rest - score @ moved, 0.5 * jnp.linalg.slogdet(bread)[1], curvature
@@ -182,7 +191,7 @@ class Excitation:
 
         def one(vector: Array, commands: Array) -> tuple[State, Array, Array]:
             params = self._params(vector)
-            begin = self.twin.infer(asked.start, params)
+            begin = self.twin.infer(jnp.asarray(asked.start), params)
             begin = jax.tree.map(lambda leaf: jnp.asarray(leaf, vector.dtype), begin)
             run = rollout(self.twin, params, begin, commands)
             force = self._forces(run.states, commands, params)
@@ -278,7 +287,8 @@ class Excitation:
             return own @ own, along.T @ own, along.T @ along
 
         found = jax.vmap(window)(begins, commands[rows], outputs)
-        return tuple(jnp.sum(x, 0) for x in found)
+        rest, score, curvature = (jnp.sum(x, 0) for x in found)
+        return rest, score, curvature
 
     def _params(self, vector: Array) -> Params:
         return {name: vector[i] for i, name in enumerate(self._names)} | dict(self.twin.tensors)
