@@ -288,7 +288,7 @@ def test_a_diagnosis_that_looked_for_no_cause_has_nothing_to_ask_and_is_copied()
 
 
 @pytest.mark.expensive  # a whole diagnosis, and a design for what it leaves open
-def test_a_diagnosis_asks_for_what_would_decide_and_believes_in_all_of_it():
+def test_a_diagnosis_asks_for_what_would_decide_and_believes_in_all_of_it(tmp_path):
     data = measured(TWIN.with_parameters(mass=1.15), 8, 80, noise=0.01)
     kinds = [effects.TorqueGain, effects.ViscousFriction]
     found = diagnose(TWIN, data, effects=kinds, budget="quick", progress=False)
@@ -299,6 +299,8 @@ def test_a_diagnosis_asks_for_what_would_decide_and_believes_in_all_of_it():
 
     assert {"parameter.mass", "torque_gain.torque"} <= {*asked.answers}
     assert not asked.decides and any("force" in words for words in asked.would_tell)
+    page = found.to_html(tmp_path / "page.html", experiment=asked).read_text()
+    assert "What to record next" in page and asked.would_tell[0] in page
     assert asked.answers == belief.answers and sum(belief.weights) == pytest.approx(1.0)
     mass, gain = belief.answers.index("parameter.mass"), belief.answers.index("torque_gain.torque")
     values = dict(zip(belief.base.parameters, belief.draws.T, strict=True))

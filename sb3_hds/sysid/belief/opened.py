@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Sequence
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -158,5 +160,6 @@ def _rarity(candidate: Candidate, twin: Twin) -> float:
 
 def _slowest(twin: Twin, data: Trajectories) -> np.ndarray:
     """:return: the first observation of the recording that begins slowest"""
-    speeds = [np.linalg.norm(twin.infer(obs, twin.params).v) for obs in data.obs[:, 0]]
+    velocities = jax.vmap(lambda obs: twin.infer(obs, twin.params).v)(jnp.asarray(data.obs[:, 0]))
+    speeds = np.linalg.norm(np.asarray(velocities), axis=1)
     return np.asarray(data.obs[int(np.argmin(speeds)), 0], float)
