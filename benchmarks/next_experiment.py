@@ -5,14 +5,16 @@ or a pseudo-random binary sequence of the same length, within the same limits.
     python benchmarks/next_experiment.py --systems pendulum linear_axis --cases 8
     python benchmarks/next_experiment.py --report-only
 
-Cases are those of `hidden_effects.py` that ended ambiguous there and whose truth has a name, in the
-order of their numbers. Each is diagnosed again; then one recording is made on the engine for each
-kind of command, from rest, and everything is diagnosed once more with it. Limits are what the
-case's own recordings took, and a quarter more, and the rig's typical command; the three other
-signals are made as large as the limits allow under every answer.
+Cases are those of `hidden_effects.py` that ended ambiguous there, with one planted cause that has a
+name, in the order of their numbers. Each is diagnosed again; then one recording is made on the
+engine for each kind of command, from rest, and the answers are weighed by it
+(`Diagnosis.decided_by`). Limits are what the case's own recordings took, and a quarter more, and
+the rig's typical command; the three other signals are made as large as the limits allow under every
+answer.
 
-`settled`: the set of the new diagnosis is the planted cause, and nothing else but names that mean
-the same in these recordings (`same_cause.py`). `broken`: the largest share of a limit that the real
+`settled`: after the recording, the planted cause, or names that mean the same in these recordings
+(`same_cause.py`), have 95 % of the weight; `wrong`: others have; `open`: the planted cause was
+among the answers at all. `broken`: the largest share of a limit that the real
 rig took.
 """
 
@@ -40,6 +42,8 @@ _ROOM = 1.25
 # Share of a limit that other signals take at most, as the designed one does, and how finely their
 # size is sought.
 _MOST, _HALVINGS = 0.9, 7
+# Weight from which a question is settled.
+_SURE = 0.95
 # Sampling intervals that a level of a binary sequence lasts.
 _LEVEL = 5
 
@@ -107,6 +111,8 @@ def run(system: str, number: int, budget: str) -> list[dict[str, Any]]:
     from sb3_hds.sysid.design.limits import Limits
 
     case, data, motion = draw(system, number)
+    if len(case.truths) != 1:
+        return [{"system": system, "case": number, "signal": ""}]
     twin, rig = believed(system, case.seen), RIGS[system]
     asked: dict[str, Any] = {
         "calibrate": case.nuisances,
@@ -134,20 +140,25 @@ def run(system: str, number: int, budget: str) -> list[dict[str, Any]]:
             commands = as_large_as_allowed(signal, excitation, numbers, rig, rng)
         obs, true = played(case, commands, rng)
         more = Trajectories.from_arrays([obs], [commands], dt=rig.dt, conditions="experiment")
-        after = diagnose(twin, Trajectories.concatenate([data, more]), **asked)
-        names = [key(f) for f in after.findings]
-        values = {key(f): {n: e.estimate for n, e in f.parameters.items()} for f in after.findings}
+        after = found.decided_by(more)
+        names = [answer.name for answer in after.answers]
+        values = {answer.name: values_of(answer) for answer in after.answers}
         every = np.concatenate([motion, true[:-1]])
         pressed = np.concatenate([*(data.episode(i)[1] for i in range(len(data))), commands])
         same = {case.truths[0], *equals(case, every, pressed, names, values)[case.truths[0]]}
-        left = set(told(after).split(";"))
+        right = [name in same for name in names]
         rows.append(
             common
             | {
                 "signal": signal,
-                "verdict": after.verdict,
-                "set after": told(after),
-                "settled": after.verdict == "named" and bool(left) and left <= same,
+                "verdict": found.verdict,
+                "set after": ";".join(
+                    f"{name} {weight:.3f}"
+                    for name, weight in zip(names, after.weights, strict=True)
+                ),
+                "open": any(right),
+                "settled": float(after.weights[right].sum()) >= _SURE,
+                "wrong": float(after.weights[right].sum()) <= 1.0 - _SURE,
                 "broken": largest_share(limits, true, rig),
                 "expected": designed.chance if signal == "designed" else np.nan,
                 "needed": designed.needed if signal == "designed" else np.nan,
@@ -164,6 +175,11 @@ def told(found: Any) -> str:
     if not found.findings:
         return ""
     return ";".join((key(found.findings[0]), *found.findings[0].alternatives))
+
+
+def values_of(answer: Any) -> dict[str, float]:
+    """:return: its parameters by short name"""
+    return {name.rpartition(".")[2]: answer.twin.values[name] for name in answer.factor}
 
 
 def limits_of(rig: Any, motion: np.ndarray) -> dict[str, Any]:
@@ -256,8 +272,8 @@ def report() -> None:
     print(f"{table[['system', 'case']].drop_duplicates().shape[0]} cases")
     for signal, own in table.groupby("signal"):
         print(
-            f"{signal:14s} settled {own.settled.astype(bool).sum()} of {len(own)}, largest share "
-            f"of a limit {own.broken.max():.2f}"
+            f"{signal:14s} settled {own.settled.astype(bool).sum()} of {len(own)}, wrong "
+            f"{own.wrong.astype(bool).sum()}, largest share of a limit {own.broken.max():.2f}"
         )
 
 

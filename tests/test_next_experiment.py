@@ -19,6 +19,7 @@ from sb3_hds.core import rollout
 from sb3_hds.errors import CalibrationError, ParameterError
 from sb3_hds.sysid import Diagnosis
 from sb3_hds.sysid.belief.answers import Answer, Answers, factor_of, union
+from sb3_hds.sysid.belief.updated import updated
 from sb3_hds.sysid.design import Limits
 from sb3_hds.sysid.design.excitation import Excitation
 from sb3_hds.sysid.design.experiment import next_experiment, question
@@ -204,6 +205,47 @@ def test_what_is_told_is_plain_data(told):
     assert plain["commands"] == told.commands.actions.tolist() and plain["decides"] is True
 
 
+def recorded(twin, actions, seed=0):
+    """What a machine like this twin would show under these commands, from rest."""
+    rng = np.random.default_rng(seed)
+    with jax.enable_x64(True):
+        start = twin.infer(jnp.asarray(HANGING), twin.params)
+        obs = rollout(twin, twin.params, start, jnp.asarray(actions)).obs
+    noise = np.array([0.01, 0.01, 0.05]) * rng.standard_normal(obs.shape)
+    return Trajectories.from_arrays([np.asarray(obs) + noise], [actions], dt=twin.dt)
+
+
+@each((LATE, "action_delay.torque"), (LAGGING, "motor_lag.torque"))
+def test_the_recording_that_was_asked_for_decides_for_what_is_true(true, name, told):
+    known = left_open(LATE, LAGGING)
+    # A delay of 0.05 s, or a lag of 0.07 s: not what the answers believe, but within what is open.
+    (row,) = true.factor
+    off = -0.01 if true is LATE else 0.01
+    machine = true.twin.with_parameters(**{row: 0.06 + off})
+
+    after = updated(known, recorded(machine, told.commands.actions[0]))
+
+    assert after.settled and after.answers[0].name == name, after
+    assert after.answers[0].twin.values[row] == pytest.approx(0.06 + off, abs=0.004)
+    # The deviation was 0.01 s before.
+    assert np.linalg.norm(after.answers[0].factor[row]) < 0.008
+
+
+def test_what_no_recording_tells_stays_as_likely_as_it_was(told):
+    after = updated(left_open(HEAVY, WEAK), recorded(HEAVY.twin, told.commands.actions[0]))
+
+    # Both are fitted as well; what differs is how far each had to move, a standard deviation or so.
+    assert not after.settled and after.weights.min() > 0.2
+
+
+def test_recordings_of_another_machine_decide_nothing(told):
+    with pytest.raises(CalibrationError, match="Choose the columns"):
+        updated(
+            left_open(LATE),
+            Trajectories.from_arrays([np.zeros((9, 1))], [np.zeros((8, 1))], dt=0.05),
+        )
+
+
 def test_commands_are_written_for_a_controller_and_read_back(told, tmp_path):
     table = pandas.read_csv(told.save(tmp_path / "next.csv"))
     again = Trajectories.load(told.save(tmp_path / "next.npz"))
@@ -245,7 +287,7 @@ def test_a_diagnosis_that_looked_for_no_cause_has_nothing_to_ask_and_is_copied()
 
 
 @pytest.mark.expensive  # a whole diagnosis, and a design for what it leaves open
-def test_a_diagnosis_asks_for_what_would_decide_and_believes_in_all_of_it():
+def test_a_diagnosis_asks_for_what_would_decide_and_believes_in_all_of_it(tmp_path):
     data = measured(TWIN.with_parameters(mass=1.15), 8, 80, noise=0.01)
     kinds = [effects.TorqueGain, effects.ViscousFriction]
     found = diagnose(TWIN, data, effects=kinds, budget="quick", progress=False)
@@ -256,6 +298,8 @@ def test_a_diagnosis_asks_for_what_would_decide_and_believes_in_all_of_it():
 
     assert {"parameter.mass", "torque_gain.torque"} <= {*asked.answers}
     assert not asked.decides and any("force" in words for words in asked.would_tell)
+    page = found.to_html(tmp_path / "page.html", experiment=asked).read_text()
+    assert "What to record next" in page and asked.would_tell[0] in page
     assert asked.answers == belief.answers and sum(belief.weights) == pytest.approx(1.0)
     mass, gain = belief.answers.index("parameter.mass"), belief.answers.index("torque_gain.torque")
     values = dict(zip(belief.base.parameters, belief.draws.T, strict=True))

@@ -14,6 +14,8 @@ from sb3_hds.effects import CoulombFriction, ViscousFriction
 
 # Standard deviation of a parameter of which the data say nothing, in units of its scale.
 _UNKNOWN = 3.0
+# Weight from which an answer is the answer.
+_SETTLED = 0.95
 
 
 class Answer(NamedTuple):
@@ -65,6 +67,19 @@ class Answers:
         logs = np.array([answer.log_weight for answer in self.answers])
         weights = np.exp(logs - logs.max())
         return weights / weights.sum()
+
+    @property
+    def settled(self) -> bool:
+        """Whether the likeliest has 95 % of the weight."""
+        return bool(self.weights[0] >= _SETTLED)
+
+    def __str__(self) -> str:
+        """The answers, with their weights."""
+        lines = [
+            f"{weight:7.1%}  {answer.name}"
+            for answer, weight in zip(self.answers, self.weights, strict=True)
+        ]
+        return "\n".join(lines)
 
     @property
     def twin(self) -> Twin:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -82,7 +83,7 @@ def open_answers(
         answers.append((likelihood + odds, candidates, one))
     answers = sorted(answers, key=lambda answer: -answer[0])[:MOST]
     return Answers(
-        tuple(_answer(search, weight, own, one, extended) for weight, own, one in answers),
+        tuple(_answer(search, weight, causes, one, extended) for weight, causes, one in answers),
         np.asarray(search.noise, float),
         every * max(base.kept.raw.size / n_effective, 1.0),
         every * (base.kept.raw.shape[1] - 1),
@@ -159,5 +160,6 @@ def _rarity(candidate: Candidate, twin: Twin) -> float:
 
 def _slowest(twin: Twin, data: Trajectories) -> np.ndarray:
     """:return: the first observation of the recording that begins slowest"""
-    speeds = [np.linalg.norm(twin.infer(jnp.asarray(obs), twin.params).v) for obs in data.obs[:, 0]]
+    velocities = jax.vmap(lambda obs: twin.infer(obs, twin.params).v)(jnp.asarray(data.obs[:, 0]))
+    speeds = np.linalg.norm(np.asarray(velocities), axis=1)
     return np.asarray(data.obs[int(np.argmin(speeds)), 0], float)

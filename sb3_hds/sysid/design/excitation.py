@@ -122,7 +122,9 @@ class Excitation:
         #: (coefficients of each start, question) -> objective, largest usage of a limit, gradient
         self.ascent = jax.jit(self._ascent)
 
-    def commands(self, coefficients: Float[Array, "n waves act"]) -> Float[Array, "n steps act"]:
+    def commands(
+        self, coefficients: Float[Array, "n waves act"] | np.ndarray
+    ) -> Float[Array, "n steps act"]:
         """:return: smooth, and within their limits whatever the coefficients are"""
         low, high = self.bounds.command.T
         waves = jnp.einsum("tw,nwa->nta", self.basis, coefficients)
@@ -156,10 +158,13 @@ class Excitation:
     ) -> tuple[Array, Array, Array]:
         """What answer ``b`` leaves of what ``a`` predicts, scores and curvature by ``z``."""
         mine, theirs = (jax.tree.map(lambda leaf, i=i: leaf[i], states) for i in (a, b))
-        own = (jnp.asarray(x) for x in (asked.values[b], asked.factor[b], asked.weight))
-        values, factor, weight = own
-        normal = lambda x, y, told, u: self._normal(x, y, told, u, values, factor, weight)  # noqa: E731
-        found = jax.vmap(normal)(mine, theirs, outputs[a], actions)
+        values, factor = jnp.asarray(asked.values[b]), jnp.asarray(asked.factor[b])
+        weight = jnp.asarray(asked.weight)
+
+        def one(mine: State, theirs: State, seen: Array, commands: Array) -> tuple[Array, ...]:
+            return self._normal(mine, theirs, seen, commands, values, factor, weight)
+
+        found = jax.vmap(one)(mine, theirs, outputs[a], actions)
         rest, score, curvature = (jnp.sum(x, 0) / asked.correlated for x in found)
         return rest, score, curvature
 
@@ -281,8 +286,9 @@ class Excitation:
             own, along = free[:, 0], free[:, 1:]
             return own @ own, along.T @ own, along.T @ along
 
-        rest, score, curvature = jax.vmap(window)(begins, commands[rows], outputs)
-        return jnp.sum(rest, 0), jnp.sum(score, 0), jnp.sum(curvature, 0)
+        found = jax.vmap(window)(begins, commands[rows], outputs)
+        rest, score, curvature = (jnp.sum(x, 0) for x in found)
+        return rest, score, curvature
 
     def _params(self, vector: Array) -> Params:
         return {name: vector[i] for i, name in enumerate(self._names)} | dict(self.twin.tensors)

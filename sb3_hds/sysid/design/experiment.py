@@ -37,8 +37,9 @@ _MOST = 0.9
 _DEVIATIONS, _DIRECTIONS = 2.0, 2
 # Odds at which a question is decided, and with which chance.
 _ODDS, _SURE = 19.0, 0.9
-# Recordings beyond which an experiment is no way to decide.
-_MOST_RECORDINGS = 100
+# Recordings beyond which an experiment is no way to decide, and of those that another sensor or a
+# load may take.
+_MOST_RECORDINGS, _FEW = 100, 10
 # Of a force sensor, its error as a share of the largest force; of a known load, its force as a
 # share of that; of better sensors, by how much.
 _SENSOR, _LOAD, _FINER = 0.02, 0.3, 10.0
@@ -415,9 +416,13 @@ def _would_tell(
     largest = np.abs(outputs[..., n_obs:]).max((0, 1, 2))
     enough = _pair("", "", 1.0, 1).needed
 
-    def hardest(changed: Question) -> float:
+    def in_words(changed: Question) -> str:
+        """Nothing where a few such recordings would not tell."""
         ratios = np.asarray(excitation.told(actions, changed).ratios)
-        return float(ratios[~np.eye(m, dtype=bool)].min())
+        needed = enough / max(float(ratios[~np.eye(m, dtype=bool)].min()), 1e-12)
+        if needed > _FEW:
+            return ""
+        return "would tell." if needed <= 1.0 else f"would tell in {math.ceil(needed)} recordings."
 
     told = []
     for j, joint in enumerate(twin.joints):
@@ -426,24 +431,23 @@ def _would_tell(
             continue
         weight = asked.weight.copy()
         weight[n_obs + j] = 1.0 / (_SENSOR * largest[j])
-        if hardest(asked._replace(weight=weight)) >= enough:
+        if verb := in_words(asked._replace(weight=weight)):
             error = with_unit(f"{_SENSOR * largest[j]:.2g}", unit)
             told.append(
-                f"A sensor of the actuator's force at {joint.name}, good to {error}, would tell."
+                f"A sensor of the actuator's force at {joint.name}, good to {error}, {verb}"
             )
         if loads[j] < 0:
             continue
         values = asked.values.copy()
         values[:, loads[j]] += _LOAD * largest[j]
-        if hardest(asked._replace(values=values)) >= enough:
+        if verb := in_words(asked._replace(values=values)):
             force = with_unit(f"{_LOAD * largest[j]:.2g}", unit)
             told.append(
                 f"A known load at {joint.name}, a constant force of {force} as of a weight on a "
-                "string, would tell."
+                f"string, {verb}"
             )
-    finer = asked._replace(weight=_FINER * asked.weight)
-    if hardest(finer) >= enough:
-        told.append(f"Errors {_FINER:.0f} times smaller, of sensors and of the model, would tell.")
+    if verb := in_words(asked._replace(weight=_FINER * asked.weight)):
+        told.append(f"Errors {_FINER:.0f} times smaller, of sensors and of the model, {verb}")
     if not told:
         told.append(
             "Neither a force sensor nor a known load nor ten times better sensors would tell with "

@@ -9,11 +9,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
-from sb3_hds.core import Params, Twin
+from sb3_hds.core import Params, Trajectories, Twin
 from sb3_hds.core.belief import BeliefTwin
 from sb3_hds.errors import CalibrationError, ParameterError
 from sb3_hds.sysid.belief.answers import Answers
 from sb3_hds.sysid.belief.belief import belief_of
+from sb3_hds.sysid.belief.updated import updated
 from sb3_hds.sysid.design.experiment import NextExperiment, next_experiment
 from sb3_hds.sysid.design.limits import Limits
 from sb3_hds.sysid.estimation.results import Estimate, plain
@@ -302,6 +303,21 @@ class Diagnosis:
                 f"{self.unexplained}".strip()
             )
         return self.opened()
+
+    def decided_by(self, data: Trajectories) -> Answers:
+        """
+        Weigh the :attr:`answers` by recordings made since, such as those that
+        :meth:`next_experiment` asked for. A diagnosis of all data together asks every candidate
+        again, and counts recordings: one new one among many old ones hardly moves it.
+
+        :param data: recorded since, sampled at the twin's ``dt``
+        :return: the answers with weights and parameters as all data have them, likeliest first;
+            ``settled`` where one has 95 % of the weight
+        :raises CalibrationError: where no cause was looked for, or for other channels or another
+            interval than the twin's
+        :raises TrajectoryError: if no recording is long enough
+        """
+        return updated(self.answers, data)
 
     @cached_property
     def belief(self) -> BeliefTwin:
