@@ -232,12 +232,17 @@ class Search:
         ranked = self.glances(base, accepted)
         return self.finished([candidate for candidate, _ in ranked[: self.effort.finalists]], base)
 
-    def finished(self, candidates: Sequence[Candidate], base: Base) -> list[Tried]:
-        """:return: these candidates, fitted to the end, best first"""
+    def finished(
+        self, candidates: Sequence[Candidate], base: Base, rival: float = np.inf
+    ) -> list[Tried]:
+        """
+        :param rival: cost to come below, where nothing else matters
+        :return: these candidates, fitted to the end, best first
+        """
         self._guess([c for c in candidates if c.key not in self._reached], base)
 
         def finish(candidate: Candidate) -> Tried:
-            point = self._continued(candidate, base)
+            point = self._continued(candidate, base, rival)
             half = self.confirm.evidence
             offsets = self._starts(candidate, point.theta, base.kept.offsets, half)
             kept = half.fit(point.theta, (), offsets, _KEPT_STEPS)
@@ -246,10 +251,13 @@ class Search:
         tried = self._each(finish, candidates)
         return sorted(tried, key=lambda t: -t.criterion)
 
-    def nameless(self, base: Base) -> list[Tried]:
-        """:return: what no finding is beside what is believed, fitted to the end, best first"""
+    def nameless(self, base: Base, rival: float = np.inf) -> list[Tried]:
+        """
+        :param rival: cost to come below, where nothing else matters
+        :return: what no finding is beside what is believed, fitted to the end, best first
+        """
         self._guess(self.hypotheses.nameless, base)
-        return self.finished(self.hypotheses.nameless, base)
+        return self.finished(self.hypotheses.nameless, base, rival)
 
     def _guess(self, candidates: Sequence[Candidate], base: Base) -> None:
         """Where fits of candidates begin."""
@@ -389,12 +397,12 @@ class Search:
         by_score = by_scores(new.raw / self.noise, old.raw / self.noise, self.confirm.unit)
         return verdict._replace(p_value=min(verdict.p_value, by_score))
 
-    def _continued(self, candidate: Candidate, base: Base) -> Point:
+    def _continued(self, candidate: Candidate, base: Base, rival: float) -> Point:
         evidence = self.select.evidence
         moving = [*base.free, *self.hypotheses.indices(candidate)]
         places = [self._reached[candidate.key]]
         theta, offsets = self._begin(candidate, base.point, base.free, evidence, places)
-        point = evidence.fit(theta, moving, offsets, _ALL_STEPS)
+        point = evidence.fit(theta, moving, offsets, _ALL_STEPS, rival)
         return min(base.point, point, key=lambda p: p.cost)
 
     def _begin(

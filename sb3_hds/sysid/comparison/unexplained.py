@@ -118,7 +118,7 @@ def short_windows(
     """
     longest = evidence.shots.actions.shape[1]
     steps = min(int(np.clip(round(_WINDOW * period / data.dt), _SHORTEST, _LONGEST)), longest)
-    shots, origin = shots_of(data, steps, evidence.hypotheses.twin)
+    shots, origin = shots_of(data, steps, evidence.hypotheses.twin, period=period)
     counter: dict[int, int] = {}
     time = np.zeros(len(origin))
     for i, recording in enumerate(origin):

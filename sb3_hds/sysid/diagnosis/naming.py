@@ -133,7 +133,7 @@ class Naming:
             without = base
             for one in place:
                 without = self.search.without(one.tried.candidate, without)
-            best = self.search.nameless(without)[0]
+            best = self.search.nameless(without, base.point.cost)[0]
             better = self.search.better(best.kept, base.kept)
             if best.point.cost < base.point.cost and not as_good(better):
                 self.turned_down |= dict.fromkeys(keys_of(place), NAMELESS)
