@@ -63,9 +63,9 @@ SITUATIONS = {
     ),
     "drag or friction": Situation(
         PENDULUM,
-        {"drag": 0.06},
+        {"drag": 0.1},
         ("ViscousFriction", "CoulombFriction", "QuadraticDrag"),
-        torque=0.4,
+        torque=0.2,
         gentle=True,
     ),
     "delay +- 20 ms": Situation(CART_POLE, {}),
