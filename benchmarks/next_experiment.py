@@ -5,17 +5,20 @@ or a pseudo-random binary sequence of the same length, within the same limits.
     python benchmarks/next_experiment.py --systems pendulum linear_axis --cases 40
     python benchmarks/next_experiment.py --report-only
 
-Cases have one planted cause, drawn as `hidden_effects.py` draws them, but with sensors' errors of
-5 % and six recordings at most, which leave more open. Each is diagnosed. Where that ends ambiguous,
+Cases have one planted cause, drawn as `hidden_effects.py` draws them, but so that data leave more
+open: twice as large as would just show, with sensors' errors of 5 % and six recordings at most.
+Only causes that have near relatives are taken, and the diagnosis is asked about these: friction and
+drag; what is late; gain, scale and, as always, the twin's own parameters. Where it ends ambiguous,
 one recording is made on the engine for each kind of command, from rest, and the answers are weighed
 by it (`Diagnosis.decided_by`). Limits are what the case's own recordings took, and a quarter more,
 and the rig's typical command; the three other signals are made as large as the limits allow under
 every answer.
 
 `open`: the planted cause, or a name that means the same in these recordings (`same_cause.py`), is
-among the answers. `tellable`: a hundred designed recordings at most tell it from every other
-answer, by the tool's own account. `settled`: after one recording it has 95 % of the weight;
-`wrong`: other names have. `broken`: the largest share of a limit that the real rig took.
+among the answers. `needed`: designed recordings that tell it from every other answer with a chance
+of 90 %, by the tool's own account; `tellable`: a hundred at most. `settled`: after one recording it
+has 95 % of the weight; `wrong`: other names have. `broken`: the largest share of a limit that the
+real rig took.
 
 `inside`: of every case that is diagnosed, ambiguous or not, another recording of the rig is held
 out: the share of its instants within the central 90 % of what the draws of `Diagnosis.belief`
@@ -36,7 +39,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from hidden_cases import N_STEPS, RIGS, believed, draw, recorded, sensed, spread
+from hidden_cases import N_STEPS, RIGS, believed, dealt, draw, plantable, recorded, sensed, spread
 from hidden_effects import key
 from independent_rigs import Loop, simulate
 from runs import RESULTS, save
@@ -47,6 +50,16 @@ _TABLE = RESULTS / "next_experiment.csv"
 SIGNALS = ("designed", "chirp", "random smooth", "PRBS")
 # What makes data leave more open.
 _NOISE, _RECORDINGS = "5 %", 6
+_FACTOR, _FACTORS = 2.0, (2.0, 4.0, 8.0)
+_FAMILIES = (
+    (
+        *("viscous_friction", "directional_viscous_friction", "concave_friction"),
+        *("coulomb_friction", "directional_coulomb_friction", "stribeck_friction"),
+        *("load_dependent_friction", "quadratic_drag"),
+    ),
+    ("action_delay", "motor_lag", "sensor_delay"),
+    ("torque_gain", "directional_gain", "sensor_scale", "parameter"),
+)
 # Recordings that are held out, what numbers them apart, and the tails beyond the band.
 _HELD_OUT, _SEED, _TAIL = 2, 1_000_000, 0.05
 # Recordings beyond which the tool says that commands do not tell.
@@ -83,15 +96,25 @@ def main() -> None:
         # Systems take turns, so that the table is at any time like the whole.
         turns = itertools.product(range(arguments.cases), list[str](arguments.systems))
         for number, system in turns:
-            if (system, number) in done():
+            deal = functools.partial(dealt, number, system, "effect")
+            large = deal("factor", _FACTORS) != _FACTOR
+            lonely = not family_of(deal("effect", plantable(RIGS[system])))
+            if large or lonely or (system, number) in done():
                 continue
             try:
                 rows = run(system, number, arguments.budget)
             except Exception:  # one case that fails must not take the others with it
                 print(f"{system} {number}:\n{traceback.format_exc()}", file=sys.stderr)
                 continue
-            keep(rows)
+            if rows:
+                keep(rows)
     report()
+
+
+def family_of(effect: str) -> tuple[str, ...]:
+    """:return: names of effects that act much like this one; none: it has no relatives"""
+    name = effect.partition(".")[0]
+    return next((family for family in _FAMILIES if name in family), ())
 
 
 def done() -> set[tuple[str, int]]:
@@ -111,6 +134,7 @@ def keep(rows: list[dict[str, Any]]) -> None:
 def run(system: str, number: int, budget: str) -> list[dict[str, Any]]:
     """:return: a row for each signal; one row without a signal where the verdict is another"""
     from sb3_hds import Trajectories, diagnose
+    from sb3_hds.effects import ALL
     from sb3_hds.sysid.design.excitation import Excitation
     from sb3_hds.sysid.design.experiment import question
     from sb3_hds.sysid.design.limits import Limits
@@ -118,7 +142,11 @@ def run(system: str, number: int, budget: str) -> list[dict[str, Any]]:
     began = time.time()
     case, data, motion = draw(system, number, kind="effect", noise=_NOISE, most=_RECORDINGS)
     twin, rig = believed(system, case.seen), RIGS[system]
+    family = family_of(case.planted[0].effect)
+    if not family:  # what was dealt cannot be planted here, and something else was
+        return []
     asked: dict[str, Any] = {
+        "effects": [effect for effect in ALL if effect.name in family],
         "calibrate": case.nuisances,
         "seed": number,
         "budget": budget,
@@ -319,22 +347,23 @@ def report() -> None:
     played = table[table.signal.isin(SIGNALS)].copy()
     flags = ["open", "tellable", "settled", "wrong"]
     played[flags] = played[flags].astype(bool)
+    one = played.open & (played.needed <= 1.0)
+    several = played.open & played.tellable & ~one
+    classes = {
+        "settled, where one designed recording should do": one,
+        "settled, where several should": several,
+        "settled, where the tool says none can": played.open & ~played.tellable,
+    }
     rows = []
     for signal in SIGNALS:
-        own = played[played.signal == signal]
-        can, cannot = own[own.open & own.tellable], own[own.open & ~own.tellable]
-        rows.append(
-            {
-                "commands": signal,
-                "settled, of those that can be told": f"{can.settled.sum()} of {len(can)}",
-                "settled, of those that the tool says cannot": (
-                    f"{cannot.settled.sum()} of {len(cannot)}"
-                ),
-                "wrong name settled": f"{own[own.open].wrong.sum()} of {own.open.sum()}",
-                "planted cause not among the answers": f"{(~own.open).sum()} of {len(own)}",
-                "largest share of a limit": own.broken.max(),
-            }
-        )
+        mine = played.signal == signal
+        row: dict[str, Any] = {"commands": signal}
+        for title, inside in classes.items():
+            row[title] = f"{played[mine & inside].settled.sum()} of {(mine & inside).sum()}"
+        wrong = played[mine & played.open].wrong
+        row["another name settled"] = f"{wrong.sum()} of {len(wrong)}"
+        row["planted cause not among the answers"] = f"{(mine & ~played.open).sum()}"
+        rows.append(row | {"largest share of a limit": played[mine].broken.max()})
     print(save(rows, "next_experiment_settled").to_string(index=False))
 
 

@@ -20,12 +20,12 @@ from sb3_hds.experiments import returns_of
 from sb3_hds.sysid import Diagnosis, NextExperiment
 
 ROBOT = "sb3_hds/PendulumReal-v1"
-HIDDEN = {"drag": 0.1, "noise": 0.02}
+HIDDEN = {"drag": 0.06, "noise": 0.02}
 SUSPECTS = [effects.ViscousFriction, effects.CoulombFriction, effects.QuadraticDrag]
 HANGING = {"state": (np.pi, 0.0)}
 # What the robot may do while it is being identified [rad/s, N m], and for how long [s].
 LIMITS, SECONDS = {"velocity": 6.0, "torque": 1.8}, 5.0
-N_RECORDINGS, N_STEPS, GENTLE = 8, 100, 0.5  # [N m]
+N_RECORDINGS, N_STEPS, GENTLE = 8, 100, 0.6  # [N m]
 EPOCHS, EPISODES = 60, 20
 
 
