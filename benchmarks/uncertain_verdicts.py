@@ -19,7 +19,8 @@ return on the machine; `decile`: its lowest decile over start states; `worst`: t
 return over machines that are each of the answers and the real one. The first name is the likeliest
 answer, the worst member that of the answers whose policy has the lowest `worst`.
 
-Each run is a process of its own; runs that are in the table are not done again.
+Each run is a process of its own. Runs that are in the table are not done again, and one that was
+interrupted goes on with the policy that it was at.
 """
 
 import argparse
@@ -28,12 +29,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from hidden_cases import write
 from intervals import of_mean
 from runs import CACHE, RESULTS, fresh_process, resume, save, seconds_since_start
 
 EPISODES, EPOCHS = 20, 60
 # Of answers that are trained in, the likeliest, and of draws.
-MOST, DRAWS = 4, 64
+MOST, DRAWS = 3, 64
 BOXES = {"box of 20 %": 0.2, "box of 50 %": 0.5}
 # Start states are numbered from here.
 _FIRST_START = 70_000
@@ -97,36 +99,55 @@ def main() -> None:
 
 def worker(name: str, seed: int) -> list[dict[str, Any]]:
     """:return: a row for each policy"""
-    from sb3_hds import twins
-    from sb3_hds.sysid.belief.belief import belief_of
+    from sb3_hds import effects, twins
 
+    path = CACHE / "uncertain_verdicts" / f"{name.replace(' ', '_')}_{seed}.json"
     situation = SITUATIONS[name]
     nominal = twins.make(situation.env)
     true = truth(situation, nominal, seed)
-    verdict, answers = left_open(situation, nominal, true, seed)
-    belief = belief_of(answers, DRAWS, seed)
-    members = [answer.twin for answer in answers.answers[:MOST]]
-    machines = [*members, true]
-    trained = {"nominal": nominal, "belief": belief, "truth": true}
+    kept = json.loads(path.read_text()) if path.exists() else None
+    if kept is None:
+        kept = asked(situation, nominal, true, seed) | {"rows": []}
+        write(path, json.dumps(kept))
+    back = lambda spec: twins.from_spec(spec, effects.ALL)  # noqa: E731
+    members = [back(spec) for spec in kept["members"]]
+    trained = {"nominal": nominal, "belief": back(kept["belief"]), "truth": true}
     trained |= {box: boxed(nominal, share, seed) for box, share in BOXES.items()}
     trained |= {f"answer {i}": member for i, member in enumerate(members)}
-    rows = []
+    done = {row["policy"] for row in kept["rows"]}
     for policy, twin in trained.items():
+        if policy in done:
+            continue
         model = policy_of(twin, seed)
         real = returns_on_machine(model, situation, true)
-        others = [returns_in(model, machine).mean() for machine in machines[:-1]]
-        rows.append(
+        others = [returns_in(model, member).mean() for member in members]
+        kept["rows"].append(
             {
                 "policy": policy,
-                "verdict": verdict,
-                "answers": ";".join(answer.name for answer in answers.answers),
-                "real": real.mean(),
-                "decile": np.quantile(real, 0.1),
-                "worst": min(real.mean(), *others),
+                "verdict": kept["verdict"],
+                "answers": kept["answers"],
+                "real": float(real.mean()),
+                "decile": float(np.quantile(real, 0.1)),
+                "worst": float(min(real.mean(), *others)),
                 "seconds": seconds_since_start(),
             }
         )
-    return rows
+        write(path, json.dumps(kept))
+    return kept["rows"]
+
+
+def asked(situation: Situation, nominal: Any, true: Any, seed: int) -> dict[str, Any]:
+    """:return: what the recordings leave open, as plain data"""
+    from sb3_hds.sysid.belief.belief import belief_of
+
+    verdict, answers = left_open(situation, nominal, true, seed)
+    weights = zip(answers.answers, answers.weights, strict=True)
+    return {
+        "verdict": verdict,
+        "answers": ";".join(f"{answer.name} {weight:.3f}" for answer, weight in weights),
+        "members": [answer.twin.to_spec() for answer in answers.answers[:MOST]],
+        "belief": belief_of(answers, DRAWS, seed).to_spec(),
+    }
 
 
 def truth(situation: Situation, nominal: Any, seed: int) -> Any:

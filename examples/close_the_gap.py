@@ -20,7 +20,7 @@ from sb3_hds.experiments import returns_of
 from sb3_hds.sysid import Diagnosis, NextExperiment
 
 ROBOT = "sb3_hds/PendulumReal-v1"
-HIDDEN = {"drag": 0.06, "noise": 0.02}
+HIDDEN: dict[str, Any] = {"drag": 0.06, "noise": 0.02}
 SUSPECTS = [effects.ViscousFriction, effects.CoulombFriction, effects.QuadraticDrag]
 HANGING = {"state": (np.pi, 0.0)}
 # What the robot may do while it is being identified [rad/s, N m], and for how long [s].
@@ -63,7 +63,7 @@ def main() -> None:
     print(f"Picture: {picture}")
 
 
-def robot(**changes: float) -> gym.Env:
+def robot(**changes: Any) -> gym.Env:
     return gym.make(ROBOT, **(HIDDEN | changes))
 
 
@@ -99,8 +99,8 @@ def draw(
 
     blue, red, grey = "#27496d", "#d1495b", "#9a978c"
     figure = Figure(figsize=(9.0, 6.0), layout="constrained")
-    top, bottom = figure.subfigures(2, 1)
-    motion = top.subplots(1, 1)
+    panels: Any = figure.subplot_mosaic([["motion", "motion"], ["weights", "earned"]])
+    motion, weights, earned = (panels[name] for name in ("motion", "weights", "earned"))
     times = more.dt * np.arange(more.obs.shape[1])
     for own, name, colour in zip(asked.predicted, asked.answers, (blue, red, grey), strict=False):
         motion.plot(times, own[0, :, 2], color=colour, lw=2, label=f"if it is {name}")
@@ -108,7 +108,6 @@ def draw(
     motion.set(title="The recording that was asked for", xlabel="time [s]", ylabel="speed [rad/s]")
     motion.legend(frameon=False, fontsize=8)
 
-    weights, earned = bottom.subplots(1, 2)
     names = list(asked.answers)
     before = dict(zip(names, found.answers.weights, strict=True))
     now = dict(zip((a.name for a in after.answers), after.weights, strict=True))

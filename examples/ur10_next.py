@@ -22,6 +22,9 @@ from scipy.signal import savgol_filter
 from sb3_hds import Trajectories, diagnose, twins
 from sb3_hds.sysid import NextExperiment
 
+# Its functions are not in its type stubs.
+_engine: Any = mujoco
+
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 FIFTH, DT = 4, 0.008
 # Of the data sheet: 54 N m and, with all joints, 2 rad/s; half of that beside people [rad, rad/s].
@@ -49,7 +52,7 @@ def asked_of_joint_5(folder: Path) -> tuple[Any, NextExperiment]:
     urdf = str(folder / "ur10.urdf")
     alone = alone_at(urdf, arm.obs[0, :, : len(JOINTS)].mean(0))
     twin = twins.from_mujoco(alone, dt=DT, actuators="torque")
-    data = of_joint_5(arm, mujoco.MjModel.from_xml_path(urdf), alone.compile())
+    data = of_joint_5(arm, _engine.MjModel.from_xml_path(urdf), alone.compile())
     found = diagnose(twin, data, budget="quick", progress=False)
     return found, found.next_experiment(LIMITS, seconds=SECONDS, progress=False)
 
@@ -66,14 +69,14 @@ def columns_of(bag: Path) -> Trajectories:
 
 def alone_at(urdf: str, pose: np.ndarray) -> Any:
     """:return: the model in which all joints but the fifth are fixed in a pose"""
-    spec = mujoco.MjSpec.from_file(urdf)
+    spec = _engine.MjSpec.from_file(urdf)
     for joint, angle in zip(JOINTS, pose, strict=True):
         if joint == JOINTS[FIFTH]:
             continue
         hinge = spec.joint(f"{joint}_joint")
         turn, quat = np.zeros(4), np.zeros(4)
-        mujoco.mju_axisAngle2Quat(turn, hinge.axis, angle)
-        mujoco.mju_mulQuat(quat, hinge.parent.quat, turn)
+        _engine.mju_axisAngle2Quat(turn, hinge.axis, angle)
+        _engine.mju_mulQuat(quat, hinge.parent.quat, turn)
         hinge.parent.quat = quat
         spec.delete(hinge)
     return spec
@@ -84,7 +87,7 @@ def of_joint_5(arm: Trajectories, whole: Any, alone: Any) -> Trajectories:
     obs, actions = arm.episode(0)
     n = len(actions)
     q, v = obs[:n, : len(JOINTS)], obs[:n, len(JOINTS) :]
-    a = savgol_filter(v, _ROWS, _DEGREE, deriv=1, delta=DT, axis=0)
+    a: Any = savgol_filter(v, _ROWS, _DEGREE, deriv=1, delta=DT, axis=0)
     fifth = [FIFTH]
     torque = actions[:, fifth] - inverse_dynamics(whole, q, v, a)[:, fifth]
     torque += inverse_dynamics(alone, q[:, fifth], v[:, fifth], a[:, fifth])
@@ -93,9 +96,9 @@ def of_joint_5(arm: Trajectories, whole: Any, alone: Any) -> Trajectories:
 
 
 def inverse_dynamics(model: Any, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    data, torques = mujoco.MjData(model), []
+    data, torques = _engine.MjData(model), []
     for data.qpos[:], data.qvel[:], data.qacc[:] in zip(q, v, a, strict=True):
-        mujoco.mj_inverse(model, data)
+        _engine.mj_inverse(model, data)
         torques.append(data.qfrc_inverse.copy())
     return np.array(torques)
 

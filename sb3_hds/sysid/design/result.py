@@ -93,6 +93,7 @@ class NextExperiment:
             return (
                 f"No recording within these limits tells {worst.true} from {worst.other}: the best "
                 f"that was found would have to be made {_number(worst.needed)} times."
+                f"{self._at_least()}"
             )
         if worst.chance >= SURE:
             return f"Play {what}: the answers are told apart with a chance of {worst.chance:.0%}."
@@ -100,6 +101,14 @@ class NextExperiment:
             f"Play {what}, {math.ceil(worst.needed)} times in all: one of them tells "
             f"{worst.true} from {worst.other} with a chance of {worst.chance:.0%}."
         )
+
+    def _at_least(self) -> str:
+        """What the recordings tell where they do not tell all."""
+        unsure = {frozenset(p[:2]) for p in self.pairs if p.chance < SURE}
+        every = {frozenset(p[:2]) for p in self.pairs}
+        if unsure == every:
+            return ""
+        return f" Of {len(every)} pairs of answers, it tells {len(every - unsure)} apart."
 
     def summary(self) -> str:
         """:return: all of it in 80 columns"""

@@ -175,10 +175,11 @@ class HDS(TwinAlgorithm):
 
     def _check_first_commands(self) -> None:
         shape = None if self.action_space is None else self.action_space.shape
-        if self._commands_asked and shape and np.shape(self._commands_asked)[1:] != shape:
+        given = np.shape(self._commands_asked or ())[1:]
+        if given and shape and given != shape:
             raise TrajectoryError(
-                f"first_commands are actions of shape {np.shape(self._commands_asked)[1:]}, and the "
-                f"environment takes {shape}. Design them for the twin of this environment."
+                f"first_commands are actions of shape {given}, and the environment takes {shape}. "
+                "Design them for the twin of this environment."
             )
 
     def remedies(self, updates_per_step: float) -> list[str]:
