@@ -1,6 +1,6 @@
 """Which candidate explains what is left: proposed on some windows, confirmed on others."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -251,13 +251,17 @@ class Search:
         tried = self._each(finish, candidates)
         return sorted(tried, key=lambda t: -t.criterion)
 
-    def nameless(self, base: Base, rival: float = np.inf) -> list[Tried]:
+    def nameless(
+        self, base: Base, joints: Collection[int] | None = None, rival: float = np.inf
+    ) -> list[Tried]:
         """
+        :param joints: where a force may act; default: anywhere
         :param rival: cost to come below, where nothing else matters
         :return: what no finding is beside what is believed, fitted to the end, best first
         """
-        self._guess(self.hypotheses.nameless, base)
-        return self.finished(self.hypotheses.nameless, base, rival)
+        forces = [c for c in self.hypotheses.nameless if joints is None or c.index in joints]
+        self._guess(forces, base)
+        return self.finished(forces, base, rival)
 
     def _guess(self, candidates: Sequence[Candidate], base: Base) -> None:
         """Where fits of candidates begin."""
