@@ -39,6 +39,10 @@ def test_joint_5_of_a_ur10_is_asked_within_its_limits():
     found, asked = ur10_next.asked_of_joint_5(Path(os.environ["SB3_HDS_DATA"], "ur10"))
 
     speeds, limits = asked.predicted[..., 1], ur10_next.LIMITS
-    assert "coulomb_friction.wrist_2_joint" in {f.key for f in found.findings}
+    (offset,) = (f for f in found.findings if f.key == "constant_force.wrist_2_joint")
+    told = offset.parameters["tau_0"]
+    assert told.estimate == pytest.approx(-0.9, abs=0.2)  # 0.9 N m by its publishers' data
+    (row,) = (a.factor["constant_force.wrist_2_joint.tau_0"] for a in found.answers.answers[:1])
+    assert np.linalg.norm(row) == pytest.approx(told.stderr, rel=0.3)
     assert np.abs(asked.commands.actions).max() <= limits["torque"]
     assert np.abs(speeds).max() <= limits["velocity"]
