@@ -22,7 +22,7 @@ from sb3_hds.sysid.diagnosis.progress import Bar
 from sb3_hds.sysid.estimation.evidence import Evidence, Point
 from sb3_hds.sysid.estimation.hypotheses import Candidate, Hypotheses
 from sb3_hds.sysid.estimation.shooting import shots_of
-from sb3_hds.sysid.reporting.diagnosis import HorizonGain
+from sb3_hds.sysid.reporting.finding import HorizonGain
 from sb3_hds.sysid.reporting.sentence import several_in_words
 
 KINDS = ["ViscousFriction", "CoulombFriction", "TorqueGain", "ActionDelay"]

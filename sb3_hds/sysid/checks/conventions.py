@@ -14,7 +14,7 @@ from sb3_hds.core.twin import plant_of
 from sb3_hds.effects import ConstantForce, CoulombFriction, ViscousFriction
 from sb3_hds.sysid.equation.columns import equation
 from sb3_hds.sysid.equation.motion import Motion, Moved
-from sb3_hds.sysid.equation.problem import problem
+from sb3_hds.sysid.equation.screening import problem
 from sb3_hds.sysid.equation.weak_form import grams, weak_rows
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 

@@ -25,7 +25,7 @@ from sb3_hds.errors import CalibrationError, ParameterError
 from sb3_hds.sysid.belief.answers import Answers, effect_key, effects_of, everything_open, union
 from sb3_hds.sysid.design.excitation import Excitation, Question
 from sb3_hds.sysid.design.limits import Limits
-from sb3_hds.sysid.reporting.units import with_unit
+from sb3_hds.sysid.reporting.wording import with_unit
 
 _WIDTH = 80
 # Starts of the search, its steps, and their size, in units of the coefficients.

@@ -9,7 +9,7 @@ from sb3_hds.sysid.comparison.held_out import compare
 from sb3_hds.sysid.comparison.search import LEAST_GAIN, NOT_FINITE, Half
 from sb3_hds.sysid.comparison.unexplained import MissingForce
 from sb3_hds.sysid.estimation.evidence import Point
-from sb3_hds.sysid.reporting.diagnosis import HorizonGain
+from sb3_hds.sysid.reporting.finding import HorizonGain
 from sb3_hds.sysid.reporting.pictures import Pictures, replay_of
 
 # Directions below this share of the largest curvature do not move.

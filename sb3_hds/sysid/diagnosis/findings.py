@@ -17,7 +17,7 @@ from sb3_hds.sysid.diagnosis.account import standard_errors
 from sb3_hds.sysid.estimation.evidence import Point
 from sb3_hds.sysid.estimation.hypotheses import Candidate, Hypotheses
 from sb3_hds.sysid.estimation.results import Estimate
-from sb3_hds.sysid.reporting.diagnosis import Finding, HorizonGain
+from sb3_hds.sysid.reporting.finding import Finding, HorizonGain
 from sb3_hds.sysid.reporting.wording import TOO_LITTLE
 
 #: why a candidate was turned down that predicts better

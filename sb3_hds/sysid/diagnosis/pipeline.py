@@ -34,11 +34,7 @@ from sb3_hds.sysid.comparison.unexplained import (
     short_windows,
     weighed,
 )
-from sb3_hds.sysid.diagnosis.account import (
-    by_horizon,
-    detectable,
-    pictures_of,
-)
+from sb3_hds.sysid.diagnosis.account import by_horizon, detectable, pictures_of
 from sb3_hds.sysid.diagnosis.findings import (
     NO_CONSTANT,
     SMALL,
@@ -65,7 +61,8 @@ from sb3_hds.sysid.estimation.hypotheses import Candidate, Hypotheses
 from sb3_hds.sysid.estimation.priors import Belief, at_limit
 from sb3_hds.sysid.estimation.shooting import Shots, evenly, shots_of
 from sb3_hds.sysid.estimation.thinning import thinned
-from sb3_hds.sysid.reporting.diagnosis import MANY, Diagnosis, Rejected
+from sb3_hds.sysid.reporting.diagnosis import MANY, Diagnosis
+from sb3_hds.sysid.reporting.finding import Rejected
 
 # Length of a window in periods of the motion, within these numbers of steps; it is half as long
 # where there would be fewer windows than that.

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.lib.stride_tricks import sliding_window_view
 
-from sb3_hds.sysid.equation.columns import Equation, Item
+from sb3_hds.sysid.equation.regression import Equation, Item
 from sb3_hds.sysid.estimation.hypotheses import PARAMETER
 
 # Width of a bump, in periods of the joint's motion, and its least number of intervals.
