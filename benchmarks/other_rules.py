@@ -93,9 +93,9 @@ def by_regression(inquiry, start) -> Answer:
     from sb3_hds.sysid.comparison.unexplained import missing_force, short_windows, weighed
 
     select = inquiry.search.select.evidence
-    wide = inquiry.period, 2 * inquiry.most_windows
-    short = short_windows(select, start.point.theta, inquiry.data, *wide)
-    missing = missing_force(short, inquiry.data)
+    wide = inquiry.given.period, 2 * inquiry.given.most_windows
+    short = short_windows(select, start.point.theta, inquiry.given.data, *wide)
+    missing = missing_force(short, inquiry.given.data)
     twin, found = inquiry.hypotheses.twin, []
     weights = weighed(missing._replace(force=np.ones_like(missing.force)))
     for j, joint in enumerate(twin.joints):
@@ -151,14 +151,14 @@ def by_network(inquiry, start) -> Answer:
     from sb3_hds.sysid.comparison.unexplained import missing_force, short_windows, weighed
 
     select = inquiry.search.select.evidence
-    wide = inquiry.period, 2 * inquiry.most_windows
-    short = short_windows(select, start.point.theta, inquiry.data, *wide)
-    missing = missing_force(short, inquiry.data)
+    wide = inquiry.given.period, 2 * inquiry.given.most_windows
+    short = short_windows(select, start.point.theta, inquiry.given.data, *wide)
+    missing = missing_force(short, inquiry.given.data)
     inputs = np.concatenate(
         [np.cos(missing.position), np.sin(missing.position), missing.velocity, missing.command], 1
     )
     inputs = (inputs - inputs.mean(0)) / (inputs.std(0) + 1e-9)
-    confirm = split(inquiry.data, missing.origin, inquiry.seed).confirm
+    confirm = split(inquiry.given.data, missing.origin, inquiry.seed).confirm
     x, y = (torch.tensor(a, dtype=torch.float32) for a in (inputs, weighed(missing)))
     torch.manual_seed(0)
     net = torch.nn.Sequential(

@@ -13,8 +13,8 @@ from sb3_hds.sysid.comparison.held_out import effective_size
 from sb3_hds.sysid.comparison.search import Base, Half, Search
 from sb3_hds.sysid.diagnosis.findings import Accepted
 from sb3_hds.sysid.equation.plausibility import rarity
+from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point
-from sb3_hds.sysid.estimation.hypotheses import Candidate
 
 #: most answers that are kept, the likeliest ones
 MOST = 6

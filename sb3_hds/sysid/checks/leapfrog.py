@@ -10,7 +10,7 @@ from sb3_hds.core.numerics.integrators import Integrator
 from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.sysid.checks.conventions import what_friction_leaves
 from sb3_hds.sysid.equation.motion import joint_motion, kinematics, lag_of, motion
-from sb3_hds.sysid.estimation.hypotheses import encoders
+from sb3_hds.sysid.estimation.candidates import encoders
 
 # Velocities that are true half an interval before their positions, give or take so much.
 _HALF, _ABOUT = -0.5, 0.1

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point
-from sb3_hds.sysid.estimation.hypotheses import Candidate
 
 # Cosine of the angle between what two causes do beyond which they look alike.
 _IMITATION = 0.95

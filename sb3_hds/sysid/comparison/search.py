@@ -10,8 +10,9 @@ from sb3_hds.sysid.comparison.aliasing import imitators
 from sb3_hds.sysid.comparison.held_out import Comparison, by_scores, confirm, effective_size
 from sb3_hds.sysid.comparison.starts import Here, Places, guesses
 from sb3_hds.sysid.diagnosis.progress import Bar
+from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point, in_threads
-from sb3_hds.sysid.estimation.hypotheses import Candidate, Hypotheses
+from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.shooting import Shots
 
 # What confirms a candidate: by which share the mean square error of held-out recordings falls, at

@@ -19,8 +19,8 @@ from sb3_hds.sysid.comparison.search import (
 from sb3_hds.sysid.diagnosis.findings import Accepted
 from sb3_hds.sysid.equation.confirmation import Member
 from sb3_hds.sysid.equation.screening import Screened
+from sb3_hds.sysid.estimation.candidates import Candidate, encoders
 from sb3_hds.sysid.estimation.evidence import Point, in_threads
-from sb3_hds.sysid.estimation.hypotheses import Candidate, encoders
 from sb3_hds.sysid.estimation.shooting import Shots, evenly
 
 # Level at which each member has to be missed by held-out recordings when it is left out.

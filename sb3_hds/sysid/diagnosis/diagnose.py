@@ -13,7 +13,7 @@ from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.diagnosis.pipeline import EFFORTS, Inquiry
 from sb3_hds.sysid.diagnosis.progress import Bar
 from sb3_hds.sysid.estimation.calibrate import check_fits
-from sb3_hds.sysid.estimation.priors import Belief
+from sb3_hds.sysid.estimation.parameters import Belief
 from sb3_hds.sysid.reporting.diagnosis import Diagnosis
 
 _DESCRIBED = ("name", "slot", "parameters", "explanation")  # what a finding is told with
@@ -77,7 +77,7 @@ def diagnose(
     kinds, nuisances = classes_of(effects), _beliefs_of(calibrate)
     with Bar(progress) as bar:
         inquiry = Inquiry(twin, data, kinds, nuisances, int(seed), budget, bar)
-        reason = inquiry.poor()
+        reason = inquiry.given.poor
         return inquiry.refused(reason) if reason else inquiry.run()
 
 

@@ -16,7 +16,8 @@ from sb3_hds.sysid.equation.effect_columns import (
 from sb3_hds.sysid.equation.motion import Motion
 from sb3_hds.sysid.equation.regression import STEP, Equation, Item, Rows, put
 from sb3_hds.sysid.equation.terms import effective_inertia, terms
-from sb3_hds.sysid.estimation.hypotheses import PARAMETER, Candidate, Hypotheses, encoders
+from sb3_hds.sysid.estimation.candidates import PARAMETER, Candidate, encoders
+from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 
 # Columns below this share of the typical force change nothing.
 _NOTHING = 1e-9

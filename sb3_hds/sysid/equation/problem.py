@@ -11,7 +11,7 @@ from jaxtyping import Float
 from sb3_hds.sysid.equation.plausibility import plausibility
 from sb3_hds.sysid.equation.regression import Item
 from sb3_hds.sysid.equation.weak_form import Grams
-from sb3_hds.sysid.estimation.hypotheses import PARAMETER
+from sb3_hds.sysid.estimation.candidates import PARAMETER
 
 # Variance of a size in units of what it would be alone: beyond that, columns cannot be told apart.
 _MOST_INFLATION = 200.0

@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_hds.core import Effect, Ranges
 from sb3_hds.sysid.equation.motion import Motion
-from sb3_hds.sysid.estimation.hypotheses import Candidate
+from sb3_hds.sysid.estimation.candidates import Candidate
 
 # Finite differences by a parameter or a sensor, in shares of its scale.
 STEP = 1e-3

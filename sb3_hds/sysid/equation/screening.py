@@ -23,8 +23,9 @@ from sb3_hds.sysid.equation.problem import Problem
 from sb3_hds.sysid.equation.regression import Equation, Item
 from sb3_hds.sysid.equation.selection import propose
 from sb3_hds.sysid.equation.weak_form import Grams, grams, weak_rows
-from sb3_hds.sysid.estimation.hypotheses import PARAMETER, Candidate, Hypotheses
-from sb3_hds.sysid.estimation.priors import Belief
+from sb3_hds.sysid.estimation.candidates import PARAMETER, Candidate
+from sb3_hds.sysid.estimation.hypotheses import Hypotheses
+from sb3_hds.sysid.estimation.parameters import Belief
 
 # Single candidates that are simulated, besides those of the set and what may stand for them.
 _SINGLES = 10

@@ -19,8 +19,13 @@ from sb3_hds.core.effect_chain import Chosen
 from sb3_hds.core.numerics.compilation import QUICK_COMPILATION
 from sb3_hds.core.numerics.linear import uses_lapack
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
-from sb3_hds.sysid.estimation.motion import first_offsets
-from sb3_hds.sysid.estimation.shooting import Shots, n_steps_of, simulate, with_slopes
+from sb3_hds.sysid.estimation.shooting import (
+    Shots,
+    first_offsets,
+    n_steps_of,
+    simulate,
+    with_slopes,
+)
 
 # Beyond this, in units of the noise, an error counts in proportion, not by its square.
 _HUBER = 3.0

@@ -22,6 +22,7 @@ from sb3_hds.sysid.reporting.finding import Finding, HorizonGain, Rejected
 from sb3_hds.sysid.reporting.pictures import Pictures
 from sb3_hds.sysid.reporting.printed import (
     WIDTH,
+    choice,
     finding_in_lines,
     not_accepted,
     table_of,
@@ -114,9 +115,9 @@ class Diagnosis:
             return several_in_words(self.findings, [j.name for j in self.believed.joints])
         if self.verdict == "ambiguous":
             first, *others = self.findings
-            choice = " or ".join(map(spoken, (first.key, *first.alternatives)))
+            named = " or ".join(map(spoken, (first.key, *first.alternatives)))
             also = f", and {' and '.join(map(choice, others))}" if others else ""
-            return f"The simulation is wrong about {choice}{also}: the data cannot tell which."
+            return f"The simulation is wrong about {named}{also}: the data cannot tell which."
         if self.convention:
             return OTHER_CONVENTION
         if self.verdict != "named":

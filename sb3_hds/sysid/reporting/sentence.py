@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from sb3_hds.sysid.estimation.hypotheses import EVERY
+from sb3_hds.sysid.estimation.candidates import EVERY
 from sb3_hds.sysid.reporting.finding import Finding
 from sb3_hds.sysid.reporting.wording import with_unit
 
