@@ -18,33 +18,28 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import (
-    GymEnv,
-    MaybeCallback,
-    RolloutReturn,
-    TrainFreq,
-)
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, TrainFreq
 
 from sb3_hds.algos.base.algorithm import TensorAlgorithm
 from sb3_hds.algos.base.construct import callbacks_of, jax_device
 from sb3_hds.algos.twin.config import TwinConfig, epoch_config, hyperparams
-from sb3_hds.algos.twin.epoch import EpochMetrics, epoch, epoch_log, twin_steps_per_epoch
+from sb3_hds.algos.twin.epoch import EpochMetrics, epoch, epoch_log, programs, twin_steps_per_epoch
 from sb3_hds.algos.twin.model import (
     Tensors,
     check_reward,
     check_twin_observes,
+    prepare_statistics,
     required,
     twin_from_spec,
     twin_given,
+    view_of,
 )
-from sb3_hds.algos.twin.normalization import prepare_statistics, view_of
 from sb3_hds.algos.twin.policy import TwinPolicy, all_finite
 from sb3_hds.algos.twin.pretraining import Pretraining, beside, meanwhile, nothing
-from sb3_hds.algos.twin.selection import (
+from sb3_hds.algos.twin.regression import (
     choose_policy,
     comparison,
     is_compared,
-    programs,
     twin_steps_per_comparison,
 )
 from sb3_hds.algos.twin.state import (

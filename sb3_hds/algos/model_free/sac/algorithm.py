@@ -17,7 +17,6 @@ from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from sb3_hds.algos.base.config import between, takes
 from sb3_hds.algos.base.construct import jax_device
 from sb3_hds.algos.model_free.algorithm import ModelFreeAlgorithm, ModelFreeConfig
-from sb3_hds.algos.model_free.replay import batches_of
 from sb3_hds.algos.model_free.sac.objectives import squared_error
 from sb3_hds.algos.model_free.sac.policy import GaussianPolicy, SimbaPolicy
 from sb3_hds.algos.model_free.sac.update import (
@@ -27,7 +26,7 @@ from sb3_hds.algos.model_free.sac.update import (
     log_of,
     update,
 )
-from sb3_hds.algos.model_free.update import zero_metrics
+from sb3_hds.algos.model_free.update import batches_of, zero_metrics
 
 # Updates of one compiled call; more are made in several.
 _MOST_UPDATES = 64
