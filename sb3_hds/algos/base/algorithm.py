@@ -237,6 +237,18 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         if self.stores_executed:
             buffer_action = executed(self.action_space, buffer_action, infos)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
+        self.stored(new_obs, reward, dones)
+
+    def stored(
+        self, new_obs: np.ndarray | dict[str, np.ndarray], reward: np.ndarray, dones: np.ndarray
+    ) -> None:
+        """
+        A step of every environment is in the replay buffer.
+
+        :param new_obs: after it, normalised as policies see it
+        :param reward: shape ``(n_envs,)``, normalised where the environment is
+        :param dones: whether the episode ended, shape ``(n_envs,)``
+        """
 
     def _keep_statistics(self) -> None:
         normalizer = self._vec_normalize_env

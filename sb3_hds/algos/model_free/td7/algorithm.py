@@ -314,16 +314,9 @@ class TD7(ModelFreeAlgorithm):
         drawn = buffer.draw(batch_size)
         return Batch(**transitions(self.replay_source, *drawn)), drawn  # type: ignore[arg-type]
 
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
+    def stored(
+        self, new_obs: np.ndarray | dict[str, np.ndarray], reward: np.ndarray, dones: np.ndarray
     ) -> None:
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         if not self.assesses:
             return
         normalizer = self.get_vec_normalize_env()
