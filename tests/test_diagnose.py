@@ -16,8 +16,8 @@ from sb3_hds.sysid.comparison.search import Half, Search
 from sb3_hds.sysid.comparison.starts import newton
 from sb3_hds.sysid.comparison.unexplained import MissingForce, remainder
 from sb3_hds.sysid.diagnosis import residuals
-from sb3_hds.sysid.diagnosis.account import standard_errors
 from sb3_hds.sysid.diagnosis.findings import NAMELESS, contradiction, errs_more, out_of_reach
+from sb3_hds.sysid.diagnosis.inference import standard_errors
 from sb3_hds.sysid.diagnosis.progress import Bar
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point

@@ -129,7 +129,7 @@ def _answer(
 
 def joint_covariance(half: Half, point: Point, free: Sequence[int]) -> np.ndarray:
     """
-    As :func:`~sb3_hds.sysid.diagnosis.account.standard_errors`: the jackknife over units, one
+    As :func:`~sb3_hds.sysid.diagnosis.inference.standard_errors`: the jackknife over units, one
     Newton step for each that is left out.
 
     :param free: indices of what was fitted

@@ -13,7 +13,7 @@ from sb3_hds.sysid.comparison.held_out import Comparison
 from sb3_hds.sysid.comparison.profile import profiled
 from sb3_hds.sysid.comparison.search import LEAST_GAIN, LEVEL, Base, Half, Tried
 from sb3_hds.sysid.comparison.unexplained import Remainder
-from sb3_hds.sysid.diagnosis.account import standard_errors
+from sb3_hds.sysid.diagnosis.inference import standard_errors
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses

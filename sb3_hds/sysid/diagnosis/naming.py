@@ -8,7 +8,6 @@ import numpy as np
 from sb3_hds.sysid.comparison.family import chance_of_the_best
 from sb3_hds.sysid.comparison.held_out import Comparison
 from sb3_hds.sysid.comparison.search import Base, Search, Tried, as_good, passes
-from sb3_hds.sysid.diagnosis.account import standard_errors
 from sb3_hds.sysid.diagnosis.findings import (
     ANOTHER,
     CHANCE,
@@ -18,6 +17,7 @@ from sb3_hds.sysid.diagnosis.findings import (
     Accepted,
     margin,
 )
+from sb3_hds.sysid.diagnosis.inference import standard_errors
 
 # Causes that are looked for.
 _MOST = 3

@@ -11,11 +11,10 @@ from sb3_hds.effects import NAMELESS as NAMELESS_EFFECTS
 from sb3_hds.sysid.belief.opened import nothing_known, open_answers
 from sb3_hds.sysid.checks.adequacy import distances, far_in_words
 from sb3_hds.sysid.checks.conventions import Convention
-from sb3_hds.sysid.checks.leapfrog import stepping_by
+from sb3_hds.sysid.checks.timing import stepping_by
 from sb3_hds.sysid.comparison.held_out import Comparison
 from sb3_hds.sysid.comparison.search import Base, Effort, Search, Tried, as_good
 from sb3_hds.sysid.comparison.several import confirmed_set, proposed_set
-from sb3_hds.sysid.diagnosis.account import by_horizon, detectable, pictures_of
 from sb3_hds.sysid.diagnosis.findings import (
     SMALL,
     Accepted,
@@ -30,6 +29,7 @@ from sb3_hds.sysid.diagnosis.findings import (
     to_tell_apart,
     why,
 )
+from sb3_hds.sysid.diagnosis.inference import detectable
 from sb3_hds.sysid.diagnosis.naming import Naming, keys_of
 from sb3_hds.sysid.diagnosis.preparation import IRRELEVANT, hash_of, prepare
 from sb3_hds.sysid.diagnosis.progress import Bar
@@ -40,6 +40,7 @@ from sb3_hds.sysid.estimation.evidence import Point
 from sb3_hds.sysid.estimation.parameters import Belief, at_limit
 from sb3_hds.sysid.reporting.diagnosis import MANY, Diagnosis
 from sb3_hds.sysid.reporting.finding import Rejected
+from sb3_hds.sysid.reporting.pictures import by_horizon, pictures_of
 
 # Several causes that explain less than this share of what can be explained are not believed.
 _LEAST_OF_SEVERAL = 0.5
