@@ -1,4 +1,4 @@
-"""Which causes would do nearly the same to these data as another one."""
+"""Aliased candidates: causes whose effects on these data are nearly collinear."""
 
 from collections.abc import Sequence
 
@@ -17,11 +17,11 @@ def imitators(
     evidence: Evidence, point: Point, found: Candidate, nuisances: Sequence[int]
 ) -> list[str]:
     """
-    :param point: where the twin with this cause has been fitted
+    :param point: the fit with this cause
     :param found: the cause
     :param nuisances: indices of what else is refitted
-    :return: other candidates that could stand for nearly all of what the cause does to these
-        windows, to first order: the cosine between the two exceeds 0.95
+    :return: keys of aliased candidates: after projecting out the nuisances, the cosine between what
+        they and the cause change in these windows exceeds 0.95, to first order
     """
     h, total = evidence.hypotheses, evidence.slopes(point).curvature.sum(0)
     rest = list(nuisances)

@@ -1,4 +1,4 @@
-"""How much the best of a whole catalogue would seem to explain where nothing is wrong."""
+"""Family-wise significance: the largest gain among all candidates under the null hypothesis."""
 
 from collections.abc import Sequence
 

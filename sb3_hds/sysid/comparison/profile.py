@@ -1,4 +1,4 @@
-"""Intervals that follow the likelihood where it is no parabola."""
+"""Profile-likelihood intervals."""
 
 from collections.abc import Sequence
 

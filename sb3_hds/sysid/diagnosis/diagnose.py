@@ -43,14 +43,13 @@ def diagnose(
     missing; a cause that leaves too much of it is not believed. In the end, causes are fitted to
     all recordings.
 
-    :param twin: as it is believed; of a belief over several, the likeliest
+    :param twin: nominal model; of a belief over several, the likeliest
     :param data: measured, sampled at the twin's ``dt``
     :param effects: classes of the catalogue, their names, or classes of your own
-    :param calibrate: parameters of the twin that are not believed: they are refitted under every
-        hypothesis, and are never a finding. The prior of each is normal around the twin's value
-        with the parameter's ``scale`` as its standard deviation, within a factor of 20:
-        ``{"mass": 3.0}`` widens it three times, ``{"mass": (0.5, 8.0)}`` sets other bounds. Where
-        one ends at a bound, nothing is named.
+    :param calibrate: nuisance parameters: they are refitted under every hypothesis, and are never a
+        finding. The prior of each is normal around the twin's value with the parameter's ``scale``
+        as its standard deviation, within a factor of 20: ``{"mass": 3.0}`` widens it three times,
+        ``{"mass": (0.5, 8.0)}`` sets other bounds. Where one ends at a bound, nothing is named.
     :param seed: of the split
     :param budget: ``"full"``, or ``"quick"``: fewer candidates are fitted to the end
     :param progress: whether a bar shows how far it is, with an estimate of the time left

@@ -14,14 +14,15 @@ _RANK = 1e-10
 
 def standard_errors(half: Half, point: Point, free: Sequence[int]) -> Float[np.ndarray, " p"]:
     """
-    The jackknife over units, one Newton step for each that is left out. Units are few, and the fit
-    has made the scores of each smaller than they were: the sandwich would be too sure.
+    Jackknife over clusters, by one Newton step for each that is left out. With few clusters, the
+    sandwich estimator is too narrow, because the fit has shrunk their scores.
 
     Source: MacKinnon, Nielsen, Webb, *Fast and reliable jackknife and bootstrap methods for
     cluster-robust inference*, J. Applied Econometrics 38, 2023 (CV3).
 
     :param free: indices of what was fitted
-    :return: of all parameters; infinite for what was not fitted, or where slopes are not finite
+    :return: of all parameters; infinite for parameters that were not fitted, or if derivatives are
+        not finite
     """
     result = np.full(len(point.theta), np.inf)
     if not free:
@@ -43,7 +44,7 @@ def standard_errors(half: Half, point: Point, free: Sequence[int]) -> Float[np.n
 
 def detectable(half: Half, point: Point) -> dict[str, dict[str, float]]:
     """
-    :param point: the twin as it came, nuisances refitted
+    :param point: the nominal model, nuisances refitted
     :return: by candidate and parameter, the smallest size that lowers the error by the least gain
         that counts, to first order
     """

@@ -1,4 +1,4 @@
-"""How a diagnosis goes: propose on some recordings, confirm once on others, see what is left."""
+"""The course of a diagnosis: propose on half of the recordings, confirm on the others."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -54,12 +54,12 @@ _WORST = 10.0
 
 class Inquiry:
     """
-    One diagnosis on its way.
+    One run of :func:`~sb3_hds.sysid.diagnose`, step by step.
 
-    :param twin: as it is believed
+    :param twin: nominal model
     :param data: measured
     :param effects: classes of what may be wrong
-    :param calibrate: names of nuisances, or what is believed of each
+    :param calibrate: names of nuisance parameters, or a prior for each
     :param seed: of the split
     :param budget: how long to search: a key of ``EFFORTS``
     :param progress: whether a bar shows how far it is, or that bar
@@ -83,7 +83,7 @@ class Inquiry:
         self.effort = EFFORTS[budget]
 
     def prepare(self) -> None:
-        """Two halves of the evidence, and sizes of parameters that suit the machine."""
+        """Set up both halves of the data, and typical sizes of the parameters on this machine."""
         select, confirm = self.given.halves()
         self.hypotheses = select.evidence.hypotheses
         self.search = Search(select, confirm, self.effort, self.bar)
@@ -175,7 +175,7 @@ class Inquiry:
         return self._told(found, beaten, start, base, before, left, nearest)
 
     def _outdone_by_a_candidate(self, start: Base, base: Base) -> bool:
-        """Whether a force without a name that somebody asked for does better than the set."""
+        """Whether a flexible force that somebody asked for does better than the set."""
         names = {kind.name for kind in NAMELESS_EFFECTS}
         asked = [c for c in self.hypotheses.candidates if c.name in names]
         return any(
@@ -209,7 +209,7 @@ class Inquiry:
         return np.maximum(least, IRRELEVANT)
 
     def in_other_words(self, convention: Convention) -> Diagnosis:
-        """:return: that the log is not written in the model's conventions"""
+        """:return: the verdict that the log does not follow the conventions of the model"""
         return Diagnosis(
             verdict="unknown",
             believed=self.believed,
@@ -225,7 +225,7 @@ class Inquiry:
         )
 
     def settle_noise(self) -> None:
-        """What is left under the best explanation, of whatever kind, is the noise."""
+        """Estimate the noise from the residuals of the best explanation, of whatever kind."""
         self.bar.stage("settling the noise")
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
         self._set_noise(base.point)

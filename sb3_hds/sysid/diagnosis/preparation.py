@@ -177,10 +177,10 @@ def prepare(
     bar: Bar,
 ) -> Prepared:
     """
-    :param twin: as it is believed
+    :param twin: nominal model
     :param data: measured
     :param effects: classes of what may be wrong
-    :param calibrate: names of nuisances, or what is believed of each
+    :param calibrate: names of nuisance parameters, or a prior for each
     :param seed: of the split
     :param bar: shows how far it is
     """
@@ -230,7 +230,7 @@ def prepare(
 
 
 def hash_of(data: Trajectories) -> str:
-    """:return: what tells these recordings from others"""
+    """:return: a checksum of the recordings"""
     digest = hashlib.sha256()
     for leaf in (data.obs, data.actions, data.mask):
         digest.update(np.ascontiguousarray(leaf).tobytes())

@@ -1,4 +1,4 @@
-"""What the twin leaves unexplained, and whether the size of a cause is constant."""
+"""The residual force beside the causes, and whether their sizes are constant."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -30,13 +30,14 @@ _OF_IRRELEVANT = 0.18
 
 class Left(NamedTuple):
     """
-    What a twin leaves.
+    What a model leaves unexplained.
 
-    :param remainder: what can be predicted of it
-    :param predicted: mean square of that, in units of the force's error under the search's noise
-    :param power: mean square of all of it, likewise
+    :param remainder: the part that can be predicted
+    :param predicted: mean square of that part, in units of the force's standard error under the
+        noise of the search
+    :param power: mean square of the whole residual force, likewise
     :param missing: all of it
-    :param short: windows that ask for it
+    :param short: the short windows in which it was estimated
     """
 
     remainder: Remainder | None
@@ -60,7 +61,7 @@ class Residuals:
         self.turned_down: dict[str, str] = {}
 
     def left(self, base: Base) -> Left:
-        """:return: what the twin leaves as it is believed now"""
+        """:return: what the current model leaves"""
         short = self._short(base.point.theta)
         missing = missing_force(short, self.given.data)
         joints = tuple(joint.name for joint in self.hypotheses.twin.joints)
@@ -75,11 +76,11 @@ class Residuals:
 
     def constant(self, found: list[Accepted], base: Base) -> tuple[list[Accepted], Base, Left, str]:
         """
-        A cause whose size is no constant is not the cause, but what comes nearest. What remembers
-        is not asked, as windows so short hardly see it.
+        A cause whose size is not constant is only the nearest name. Effects with memory are not
+        tested, since short windows are insensitive to them.
 
-        :return: the causes before the first that is none, what is believed and left with them, and
-            a sentence on that one
+        :return: the causes before the first one that varies, the model and the residuals with
+            them, and a sentence on that one
         """
         left = self.left(base)
         for n, one in enumerate(found):
@@ -93,7 +94,9 @@ class Residuals:
         return found, base, left, ""
 
     def left_by(self, found: Sequence[Accepted], base: Base) -> Left | None:
-        """:return: what is left beside these causes; None: the size of one of them changes"""
+        """
+        :return: the residuals beside these causes; None if the size of one of them is not constant
+        """
         left = self.left(base)
         return None if any(self._varies(one, base, left) for one in found) else left
 
@@ -106,8 +109,8 @@ class Residuals:
         left: Left,
     ) -> float:
         """
-        How much of what is wrong is explained: of the missing force, or, if a cause remembers, of
-        the error of whole windows, as windows so short hardly see what went on in it before.
+        Share of the predictable residual force that is explained; for a cause with memory, of the
+        error of whole windows if that is more, since short windows are insensitive to memory.
         """
         share = _share(before, left)
         if any(self.hypotheses.remembers(one.tried.candidate) for one in found):

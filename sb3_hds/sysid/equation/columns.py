@@ -1,4 +1,4 @@
-"""What each candidate would add to the equation of motion: columns, linear in their sizes."""
+"""Regressor columns: what each candidate adds to the equation of motion, linear in its size."""
 
 import jax
 import numpy as np
@@ -25,9 +25,10 @@ _NOTHING = 1e-9
 
 def equation(hypotheses: Hypotheses, motion: Motion, quick: bool = False) -> Equation:
     """
-    :param hypotheses: candidates, and the twin as it is believed, at the interval of the motion
+    :param hypotheses: candidates, and the nominal model, at the interval of the motion
     :param motion: of the joints
-    :param quick: forces of ``CLOSED_FORMS`` only, which run no program, beside the bare mass matrix
+    :param quick: only the forces of ``CLOSED_FORMS``, which need no compilation, with the mass
+        matrix as it is
     """
     twin, rows = hypotheses.believed, _rows(motion)
     params = twin.params

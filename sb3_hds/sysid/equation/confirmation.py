@@ -1,4 +1,4 @@
-"""What of a set held-out data confirm: its members, their sizes, and what it leaves."""
+"""Which members of a set held-out data confirm, their sizes, and what the set leaves."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -47,9 +47,9 @@ class Member(NamedTuple):
     :param low: ends of 90 % intervals, by short name; of what was tried at a few values only, the
         ones next to it
     :param high: likewise
-    :param gain: what leaving it out costs, in -2 log likelihood
-    :param t: of the held-out gain over folds
-    :param others: keys of candidates that held-out data do not tell from it
+    :param gain: increase of -2 log likelihood without it
+    :param t: t statistic of the held-out gain over folds
+    :param others: keys of candidates that predict held-out data as well in its place
     """
 
     item: int
@@ -66,11 +66,11 @@ class Left(NamedTuple):
     """
     What a set leaves at a joint.
 
-    :param share: of its force, root mean square of rows
-    :param noise: the same in units of what the noise of the velocities alone would leave
-    :param predictable: share of it that all columns together predict on held-out data
-    :param most: key of the candidate that takes most of it
-    :param gain: by which the set lowers the held-out error of the nominal model
+    :param share: residual over force at the joint, root mean squares over rows
+    :param noise: residual in units of what velocity noise alone would leave
+    :param predictable: share of its variance that all columns together predict on held-out data
+    :param most: key of the candidate that would reduce it most
+    :param gain: relative decrease of the held-out error, compared with the nominal model
     """
 
     share: float
@@ -82,7 +82,7 @@ class Left(NamedTuple):
 
 # ------------------------------------------------------------------------------ what stays
 def material(p: Problem, keys: list[int]) -> list[int]:
-    """Without what carries next to nothing, unless it is most of what the others leave."""
+    """Remove members with a negligible force, unless they explain most of what the others leave."""
     held = p.held_out(keys)
     kept: set[int] = set()
     while keys:
@@ -118,7 +118,7 @@ def confirmed(p: Problem, keys: list[int]) -> list[int]:
 
 
 def retuned(p: Problem, keys: list[int]) -> list[int]:
-    """What is not linear in a member, at the values that suit the others as they are now."""
+    """Choose the nonlinear parameters of each member anew, given the other members."""
     for place, i in enumerate(list(keys)):
         if p.items[i].settings and i not in p.always:
             same = [o for o, item in enumerate(p.items) if item.key == p.items[i].key]
@@ -128,7 +128,7 @@ def retuned(p: Problem, keys: list[int]) -> list[int]:
 
 
 def admitted(p: Problem, keys: list[int]) -> list[int]:
-    """Without a member, another may fall out of its bounds: a simpler one stands in, or none."""
+    """Replace members that left their bounds by simpler ones of their family, or remove them."""
     while beyond := [i for i in p.beyond(keys) if i not in p.always]:
         worst = max(beyond, key=lambda i: p.rarity[i])
         rest = [m for m in keys if m != worst]
@@ -148,7 +148,7 @@ def simpler(p: Problem, i: int) -> list[int]:
 
 
 def simplified(p: Problem, keys: list[int]) -> list[int]:
-    """A richer member of a family whose simpler one predicts held-out data as well is that one."""
+    """Replace a member by a simpler one of its family that predicts held-out data as well."""
     for i in list(keys):
         others = simpler(p, i)
         if not others:
@@ -166,7 +166,9 @@ def simplified(p: Problem, keys: list[int]) -> list[int]:
 
 
 def plausible_first(p: Problem, keys: list[int]) -> list[int]:
-    """Of what data cannot tell apart, what an engineer would think of first."""
+    """
+    Among candidates that the data cannot distinguish, choose the one with the best prior odds.
+    """
     for i in list(keys):
         if i in p.always:
             continue
@@ -180,7 +182,7 @@ def plausible_first(p: Problem, keys: list[int]) -> list[int]:
 
 def worth(p: Problem, without: np.ndarray, held: np.ndarray, i: int) -> tuple[float, float]:
     """
-    :param without: held-out errors without a member
+    :param without: held-out squared errors without a member, shape ``(folds, dof)``
     :param held: with it
     :return: mean logarithm of their ratio, and its t over folds, at the member's own joint; where
         it acts at several, at the one that gains most; of what all actuators share, over all
@@ -199,8 +201,7 @@ def _least_t(p: Problem, i: int) -> float:
 
 def outstanding(p: Problem, keys: Sequence[int]) -> tuple[list[int], list[int]]:
     """
-    Where a model misses structure of some size, an effect that is no larger is as likely a part of
-    the misfit.
+    An effect that is no larger than the unexplained structure may be a part of that misfit.
 
     :return: members that stand out, and hints
     """

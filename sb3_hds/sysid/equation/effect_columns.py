@@ -1,4 +1,4 @@
-"""Columns of effects: forces at joints, commands as they arrive, sensors as they are read."""
+"""Columns of effects: forces at joints, delayed or distorted commands, misread sensors."""
 
 import copy
 import dataclasses
@@ -86,8 +86,9 @@ def nodes_of(
     made: Equation, rows: Rows, bias: np.ndarray, inertia: np.ndarray, joint: int
 ) -> dict[str, np.ndarray]:
     """
-    Where forces are evaluated: at three places of each interval (Simpson's rule, within what the
-    twin's integrator sees of it), each at three velocities (the sign of one is not known exactly).
+    Quadrature nodes: three points of each interval (Simpson's rule, over the part that the twin's
+    integrator evaluates), each at three velocities (Gauss-Hermite, for the uncertainty of its
+    sign).
     """
     motion, dt = made.motion, made.motion.dt
     places, shares = motion.seen * np.array([0.0, 0.5, 1.0]), np.array([1.0, 4.0, 1.0]) / 6.0
@@ -219,7 +220,7 @@ def add_command(
 
 
 def add_common(made: Equation, hypotheses: Hypotheses) -> None:
-    """What all actuators share, such as a bus that is late: sums of the columns of each."""
+    """Causes that all actuators share, such as a late bus: sums of the columns of each actuator."""
     for candidate in (c for c in hypotheses.candidates if c.slot == "actuator" and c.index < 0):
         own = [item for item in made.items if item.candidate.name == candidate.name]
         by_settings: dict[str, list[Item]] = {}
@@ -294,7 +295,7 @@ def add_sensor(
     rows: Rows,
     smooth: np.ndarray,
 ) -> None:
-    """Minus the change of the missing force when the channel is read as the effect says."""
+    """Minus the change of the residual force if the channel is read as the effect says."""
     twin, channels = hypotheses.believed, (candidate.index,)
     if candidate.slot == "joint":
         channels = encoders(twin)[candidate.index].channels

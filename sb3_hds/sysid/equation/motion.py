@@ -1,4 +1,4 @@
-"""How the joints moved in a set of recordings, at an interval that suits the system."""
+"""Joint positions, velocities and accelerations of recordings, smoothed, at a suitable interval."""
 
 from collections.abc import Sequence
 from functools import partial

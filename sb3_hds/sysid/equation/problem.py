@@ -1,4 +1,6 @@
-"""Sets of candidates on normal equations: their sizes, what they explain, what they cost."""
+"""
+Subset selection on normal equations: coefficients, residuals and penalties of sets of candidates.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -58,15 +60,15 @@ class Problem:
     :param grams: normal equations
     :param lower: smallest coefficient of each column
     :param upper: largest
-    :param prior: of each column, the inverse variance of what is believed of its coefficient
+    :param prior: of each column, the inverse variance of the prior of its coefficient
     :param force: typical force of each joint [N m] or [N]
     :param shares: of each column, its root mean square at each joint, shape ``(dof, columns)``
-    :param passes: of items that cut commands off, the share of changes that still passes
+    :param passes: of saturations and dead zones, the share of commands that still pass
     :param mass: some mass matrices, shape ``(n, dof, dof)``
     :param slopes: of these by inertial parameters, by key
     :param drives: share of each joint's actuator force by parameters, by key
     :param rests: of springs, shares of their second column that are admissible
-    :param always: items that belong to every set: what is refitted anyway
+    :param always: items of every set: the nuisance parameters
     :param rarity: of each item, minus the logarithm of its prior odds
     """
 
@@ -96,7 +98,7 @@ class Problem:
         return candidate.slot, candidate.index
 
     def family(self, i: int) -> tuple:
-        """Of items with an equal family, a set has one at most."""
+        """A set contains at most one item of each family."""
         return self._families[i]
 
     @cached_property
@@ -231,7 +233,7 @@ class Problem:
         return np.diag(inverse) * (self.diagonal[own] + self.prior[own])
 
     def admissible(self, keys: Sequence[int], found: Solution) -> bool:
-        """Whether no member stands at its bounds alone, and all can be told apart."""
+        """Whether all members are inside their bounds, and not collinear."""
         if not np.isfinite(found.rss):
             return False
         if found.free and self._inflation(found.free, found.inverse).max() > _MOST_INFLATION:
@@ -239,7 +241,7 @@ class Problem:
         return all(self._inside(i, found) for i in keys)
 
     def beyond(self, keys: Sequence[int]) -> list[int]:
-        """:return: members that stand at their bounds alone, or have sizes that nothing has"""
+        """:return: members at their bounds, or with sizes that are physically impossible"""
         found = self.solve(keys)
         return [i for i in keys if not self._inside(i, found)]
 
@@ -265,7 +267,7 @@ class Problem:
         return bool(np.all(np.diff(sizes) >= 0.0) and sizes[0] >= _LEAST_SLIDING * sizes[-1])
 
     def score(self, keys: Sequence[int], priced: bool = True) -> float:
-        """:return: Schwarz's criterion with prior odds; infinite for what cannot be"""
+        """:return: Schwarz's criterion with prior odds; infinite for inadmissible sets"""
         found = self.solve(keys)
         if not self.admissible(keys, found):
             return np.inf

@@ -20,11 +20,11 @@ Rule = Literal["linear", "chain", "blend", "switch"]
 @dataclasses.dataclass(frozen=True)
 class Item:
     """
-    A candidate with what is not linear in it at fixed values, or between two.
+    A candidate with its nonlinear parameters at fixed values, or between two.
 
     :param candidate: which
     :param columns: indices
-    :param fixed: of each column, the coefficient that is no choice; None: it is estimated
+    :param fixed: of each column, a fixed coefficient; None: it is estimated
     :param rule: how coefficients become sizes
     :param settings: values of its parameters, by short name, at which the columns were taken
     :param names: short name of the parameter of each column
@@ -91,7 +91,7 @@ class Equation:
     """
     The equation of motion along all recordings, one row for each interval.
 
-    :param missing: force that the nominal model lacks, shape ``(n, dof)`` [N m] or [N]
+    :param missing: residual force of the nominal model, shape ``(n, dof)`` [N m] or [N]
     :param columns: what candidates would add
     :param items: candidates, several with different settings
     :param recording: that each row is from, shape ``(n,)``
@@ -100,7 +100,8 @@ class Equation:
     :param load: force that the nominal model transmits: inertia, gravity, shape ``(n, dof)``
     :param actuator: force of the actuators, shape ``(n, dof)``
     :param mass: mass matrix, shape ``(n, dof, dof)``
-    :param effective: inertia that a constant force meets over an interval, likewise
+    :param effective: effective inertia over an interval, likewise: force over change of velocity,
+        with damping
     :param slopes: of the mass matrix by inertial parameters, by key of the candidate
     :param drives: by which share of the actuators' force that changes with a unit of a parameter,
         at each joint, likewise

@@ -1,4 +1,4 @@
-"""Which causes are worth a simulation: sets of them, and single ones, by equation errors."""
+"""Screening by equation errors: which sets of causes, and which single ones, to simulate."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
@@ -46,11 +46,11 @@ class Screened(NamedTuple):
     :param hypotheses: all candidates
     :param problem: their columns
     :param motion: of the joints
-    :param members: of the set that explains most for its price
-    :param hints: keys of what is small beside what stays unexplained
+    :param members: of the best set by information criterion
+    :param hints: keys of effects that are small beside the unexplained residual
     :param left: what the set leaves at each joint
     :param keys: of the candidates that are worth a simulation
-    :param nameless_at: joints at which forces without a name are
+    :param nameless_at: joints at which flexible forces are tried
     """
 
     hypotheses: Hypotheses
@@ -149,7 +149,7 @@ def screen(
     calibrate: Sequence[str] | Mapping[str, Belief],
 ) -> Screened | None:
     """
-    :param twin: as it is believed
+    :param twin: nominal model
     :param moved: joints, as measured
     :return: None where there is no equation of motion, or nothing moves
     """

@@ -1,4 +1,4 @@
-"""What may be wrong with a twin: every effect at every place, every parameter."""
+"""Candidates: every effect at every place, and every parameter of the twin."""
 
 import dataclasses
 from collections.abc import Callable, Collection, Sequence
@@ -49,8 +49,8 @@ class Candidate:
         those of the twin
     :param parameters: full names in the extended twin
     :param explanation: one sentence for people
-    :param equivalents: names of effects that data may not tell from this one, and when
-    :param ascending: those of the parameters that may not fall from one to the next
+    :param equivalents: effects that may be indistinguishable from this one, and under which motion
+    :param ascending: parameters that must be in ascending order
     """
 
     name: str
@@ -68,7 +68,10 @@ class Candidate:
         return self.name if self.slot == PARAMETER else f"{self.name}.{self.place}"
 
     def resembles(self, other: "Candidate") -> str:
-        """:return: when it looks like another one, as it declares; nothing at another place"""
+        """
+        :return: when it is indistinguishable from another one, as declared by the effect; empty
+            otherwise
+        """
         elsewhere = other.slot == self.slot and other.index != self.index
         return "" if elsewhere else dict(self.equivalents).get(other.name, "")
 

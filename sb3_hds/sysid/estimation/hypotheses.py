@@ -1,4 +1,4 @@
-"""What may be wrong with a twin: all candidates at once, each switched by its parameters."""
+"""All hypotheses in one model: every candidate attached, each switched on by its parameters."""
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
@@ -36,19 +36,19 @@ class Hypotheses:
     """
     A twin with every candidate attached, all at the value at which they change nothing.
 
-    :param believed: the twin as it came
+    :param believed: nominal model
     :param twin: extended by all effects
     :param candidates: what may be named
     :param names: all parameters that may move, nuisances first
     :param null: their values when nothing is wrong, shape ``(p,)``
-    :param scale: their typical deviations
+    :param scale: their typical deviations from it
     :param lower: smallest admissible values
     :param upper: largest admissible values
     :param nuisances: indices of those that are refitted under every hypothesis
     :param prior: standard deviation of the prior of each nuisance around its value in ``null``;
         infinite for all other parameters
     :param pushes: index of a constant force at each joint, to measure what force is missing
-    :param nameless: forces that no finding is, and that findings have to beat
+    :param nameless: flexible forces: never a finding, but findings have to beat them
     :param ties: parameters of which one number is shared, by the name of that number
     :param period: of the motion [s]
     :param starts: for candidates by key, values by full name at which a search may begin
@@ -82,14 +82,14 @@ class Hypotheses:
         speeds: Sequence[float] = (),
     ) -> "Hypotheses":
         """
-        :param twin: as it is believed
+        :param twin: nominal model
         :param effects: classes that are tried at every place
         :param only: keys of the candidates that are kept; default: all
-        :param nameless_at: joints at which forces without a name are tried; default: all
+        :param nameless_at: joints at which flexible forces are tried; default: all
         :param period: of the motion [s]: what is later than a third of it is no delay
         :param speeds: root mean square velocity of each joint, in which dry friction is smoothed;
             default: as the effects have it
-        :param calibrate: parameters of the twin that are not believed, and not worth a finding; see
+        :param calibrate: nuisance parameters, which are no findings; see
             :func:`~sb3_hds.sysid.estimation.parameters.prior_of`
         :raises CalibrationError: for a name in ``calibrate`` that the twin does not have, or a
             belief that is none
@@ -179,7 +179,7 @@ class Hypotheses:
         prior: float = 0.0,
     ) -> "Hypotheses":
         """
-        No cause, but values of parameters that are not known.
+        No candidates: only parameters to estimate.
 
         :param twin: as it is
         :param free: parameters, by the name of the value that they take
@@ -253,7 +253,7 @@ class Hypotheses:
 
     @cached_property
     def always(self) -> float:
-        """:return: the same for what the twin as it came remembers [s]"""
+        """:return: the same for what the nominal model remembers [s]"""
         return remembered_for(self.believed, self.period)
 
     def effect_of(self, candidate: Candidate) -> Effect | None:
@@ -267,16 +267,16 @@ class Hypotheses:
         return found[0] if found else None
 
     def remembers(self, candidate: Candidate) -> bool:
-        """:return: whether it is a force or a command that depends on what was before"""
+        """:return: whether it has memory of earlier states or commands"""
         effect = self.effect_of(candidate)
         return isinstance(effect, ForceEffect | ActionEffect) and has_memory(effect, self.twin)
 
     def related(self, candidate: Candidate) -> list[Candidate]:
-        """:return: what is declared to look like a candidate, at its place"""
+        """:return: candidates that are declared indistinguishable from one, at its place"""
         return [other for other in self.candidates if candidate.resembles(other)]
 
     def alike(self, key: str, other: str) -> str:
-        """:return: when two candidates look alike, as one of them declares, or nothing"""
+        """:return: when two candidates are indistinguishable, as declared; empty otherwise"""
         known = {c.key: c for c in self.candidates}
         if not {key, other} <= known.keys():
             return ""
@@ -286,7 +286,7 @@ class Hypotheses:
         return tuple(self.names.index(name) for name in candidate.parameters)
 
     def added_to(self, name: str) -> float:
-        """:return: what the twin as it came has already of an effect's parameter"""
+        """:return: what the nominal model already has of an effect's parameter"""
         target = native_targets(self.believed, self.candidates).get(name)
         if target is None or self.twin.parameters[name].null != 0.0:
             return 0.0
@@ -301,7 +301,7 @@ class Hypotheses:
         """
         :param causes: names and places of candidates
         :param theta: all parameters, shape ``(p,)``
-        :return: the twin as it came, with the nuisances refitted and these causes in it
+        :return: the nominal model, with the nuisances refitted and these causes in it
         """
         value = dict(zip(self.names, map(float, theta), strict=True))
         chosen = [c for c in self.candidates if c.key in causes]

@@ -62,7 +62,7 @@ class Diagnosis:
     :param verdict: ``"named"``, ``"ambiguous"``, ``"none"``, ``"unknown"`` or
         ``"not_identifiable"``; the first two are about the first finding, and a later one may have
         alternatives all the same
-    :param believed: the twin as it came
+    :param believed: nominal model
     :param twin: extended, ready to train in
     :param data_hash: of the data
     :param seed: of the split and of what else was drawn

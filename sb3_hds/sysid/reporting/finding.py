@@ -15,7 +15,8 @@ class Finding:
     :param effect: name in the catalogue, or ``"parameter.NAME"``
     :param where: ``slot``, ``index`` and ``name`` of its place
     :param parameters: estimates with intervals and units, by short name
-    :param alternatives: what the data cannot tell from it, by name and place
+    :param alternatives: keys of candidates that the data cannot distinguish from it, by name and
+        place
     :param p_value: that held-out recordings would gain as much by chance, by the test that
         confirmed it; where others were asked about before it, it had to pass a stricter level
     :param family_p_value: that the best of all candidates would gain as much on the recordings that
@@ -68,7 +69,7 @@ class HorizonGain:
     their noise.
 
     :param steps: ahead
-    :param before: root mean square error of the twin as it came, nuisances refitted
+    :param before: root mean square error of the nominal model, nuisances refitted
     :param after: of the extended one
     :param low: lower end of the 90 % interval of the relative gain
     :param high: upper end

@@ -21,7 +21,7 @@ class Replay(NamedTuple):
 
     :param time: since its first window [s], shape ``(rows,)``; not a number between windows
     :param measured: shape ``(rows, n_obs)``
-    :param before: by the twin as it came, nuisances refitted
+    :param before: by the nominal model, nuisances refitted
     :param after: by the extended twin
     :param margin: half the width of its 90 % interval, by what it misses in all held-out windows
     """
@@ -42,8 +42,8 @@ class Pictures(NamedTuple):
     :param steps: ahead, shape ``(k,)``
     :param errors: root mean square over all held-out windows, in units of the noise, before and
         after, shape ``(2, k)``
-    :param missing: the force that is missing before
-    :param left: and after
+    :param missing: residual force of the nominal model
+    :param left: residual force of the extended model
     """
 
     channels: tuple[tuple[str, str], ...]
@@ -112,8 +112,8 @@ def pictures_of(
 ) -> Pictures:
     """
     :param every: steps of the data in one of the windows
-    :param missing: force before
-    :param left: force after
+    :param missing: residual force of the nominal model
+    :param left: residual force of the extended model
     """
     evidence, twin = half.evidence, half.evidence.hypotheses.twin
     rows = np.flatnonzero(half.unit == half.unit[0])

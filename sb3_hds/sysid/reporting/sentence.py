@@ -1,4 +1,4 @@
-"""What several causes at once are called in a sentence."""
+"""Several causes in one sentence."""
 
 from collections.abc import Sequence
 

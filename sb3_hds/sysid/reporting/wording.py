@@ -1,4 +1,4 @@
-"""Phrases that the printed result and its page share, so that both say the same."""
+"""Phrases that the printed result and the report share."""
 
 import math
 from collections.abc import Mapping
@@ -64,7 +64,7 @@ def evidence_in_words(gain: float, p_value: float) -> str:
 
 
 def explained_in_words(share: float) -> str:
-    """:param share: of the missing force"""
+    """:param share: of the predictable residual force"""
     return f"What was found explains {share:.0%} of the force that is missing and can be predicted."
 
 
