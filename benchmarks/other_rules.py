@@ -75,7 +75,7 @@ def by_held_out(search, start, tried) -> Answer:
 
 def by_parameters(search, h, start) -> Answer:
     """Fit what the twin has; the parameter that moved most, in standard errors, is the cause."""
-    from sb3_hds.sysid.diagnosis.inference import standard_errors
+    from sb3_hds.sysid.comparison.inference import standard_errors
 
     own = [h.indices(c)[0] for c in h.candidates if c.slot == "parameter"]
     free = [*start.free, *own]

@@ -216,7 +216,7 @@ def by_simulation(twin: Any, data: Any, seed: int) -> list[str]:
     toolbox for system identification does; what has an interval without its null is a cause.
     """
     from sb3_hds import effects
-    from sb3_hds.sysid.diagnosis.inference import standard_errors
+    from sb3_hds.sysid.comparison.inference import standard_errors
     from sb3_hds.sysid.diagnosis.pipeline import Inquiry
 
     kinds = (

@@ -11,13 +11,14 @@ from measuring import jumping, measured
 from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import Trajectories
 from sb3_hds.sysid.checks.parameter_stability import Change
+from sb3_hds.sysid.comparison.halves import Half
 from sb3_hds.sysid.comparison.held_out import Comparison, compare, confirm, split
-from sb3_hds.sysid.comparison.search import Half, Search
+from sb3_hds.sysid.comparison.inference import standard_errors
+from sb3_hds.sysid.comparison.search import Search
 from sb3_hds.sysid.comparison.starts import newton
 from sb3_hds.sysid.comparison.unexplained import MissingForce, remainder
 from sb3_hds.sysid.diagnosis import residuals
 from sb3_hds.sysid.diagnosis.findings import NAMELESS, contradiction, errs_more, out_of_reach
-from sb3_hds.sysid.diagnosis.inference import standard_errors
 from sb3_hds.sysid.diagnosis.progress import Bar
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point

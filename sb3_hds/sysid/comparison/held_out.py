@@ -16,6 +16,13 @@ _MOST_RATIO = 1e6
 _STRICTER = 25.0
 # Errors beyond this, in units of the noise, say no more.
 _MOST_ERROR = 1e4
+# What confirms a candidate: by which share the mean square error of held-out recordings falls, at
+# which level, and by how much the information criterion of the others.
+LEAST_GAIN, LEVEL, LEAST_BIC = 0.05, 0.025, 6.0
+# Another candidate belongs into the set unless it is worse than the best at this level.
+_LEVEL_OF_SET = 0.05
+# Errors that differ by a smaller share are the same, however surely they differ.
+_SAME = 0.01
 
 
 class Comparison(NamedTuple):
@@ -173,3 +180,19 @@ def _in_blocks(origin: np.ndarray, recordings: np.ndarray) -> np.ndarray:
             if len(rows):
                 unit[rows], label = label, label + 1
     return unit
+
+
+def as_good(better: Comparison) -> bool:
+    """
+    :return: whether one model is not significantly better than another, or by a negligible amount
+    """
+    return better.p_value > _LEVEL_OF_SET or better.gain < _SAME
+
+
+def passes(verdict: Comparison, level: float = LEVEL) -> bool:
+    return verdict.gain >= LEAST_GAIN and verdict.p_value < level
+
+
+def information_gain(before: float, after: float, n: float, n_parameters: int) -> float:
+    """:return: by which Schwarz's criterion is lower; ``before`` and ``after``: sums of squares"""
+    return n * float(np.log(before / after)) - n_parameters * float(np.log(max(n, 2.0)))

@@ -32,16 +32,16 @@ def diagnose(
     """
     Name what a simulation gets wrong, if the data can.
 
-    The data are audited first: what cannot support a verdict is refused with the reason, and other
-    defects are caveats. Recordings are cut into windows, each simulated from a start state of its
-    own. On one half of the recordings every candidate is fitted; the best is then confirmed on the
-    other half, by at least 5 % less mean square error, a one-sided test on the logarithms of error
-    ratios (one for each recording) or on scores, and an information criterion that counts
-    correlated errors as fewer. Of those that are confirmed, both halves together choose. What is
-    not significantly worse than that on the other half stays as an alternative. After each cause
-    that is accepted, everything is tested again. What remains is looked for in the force that is
-    missing; a cause that leaves too much of it is not believed. In the end, causes are fitted to
-    all recordings.
+    The data are audited first: data that cannot support a verdict are refused with the reason,
+    other defects become caveats. Candidates are screened by equation errors if the twin has an
+    equation of motion, and a set of several causes is then confirmed by simulation as a whole.
+    Otherwise single candidates are fitted to half of the recordings, by simulation of short windows
+    with free start states (multiple shooting). The best is confirmed on the other half: 5 % lower
+    mean square error, and a one-sided t test on the log error ratios of the recordings or a score
+    test. Candidates that are not significantly worse there become alternatives. After each cause,
+    everything is tested again. A cause is not named if it leaves too much of the predictable
+    residual force, or if its size is not constant. Finally, all causes are fitted to all
+    recordings.
 
     :param twin: nominal model; of a belief over several, the likeliest
     :param data: measured, sampled at the twin's ``dt``

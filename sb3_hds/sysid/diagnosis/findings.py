@@ -8,12 +8,10 @@ import scipy
 from jaxtyping import Int
 
 from sb3_hds.sysid.checks.parameter_stability import Change
-from sb3_hds.sysid.comparison.aliasing import imitators
-from sb3_hds.sysid.comparison.held_out import Comparison
-from sb3_hds.sysid.comparison.profile import profiled
-from sb3_hds.sysid.comparison.search import LEAST_GAIN, LEVEL, Base, Half, Tried
+from sb3_hds.sysid.comparison.halves import Base, Half, Tried
+from sb3_hds.sysid.comparison.held_out import LEAST_GAIN, LEVEL, Comparison
+from sb3_hds.sysid.comparison.inference import aliased_with, profiled, standard_errors
 from sb3_hds.sysid.comparison.unexplained import Remainder
-from sb3_hds.sysid.diagnosis.inference import standard_errors
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
@@ -137,7 +135,7 @@ def look_alike(found: Sequence[Accepted], half: Half, base: Base) -> list[str]:
     for one in found:
         own = half.evidence.hypotheses.indices(one.tried.candidate)
         rest = [i for i in base.free if i not in own]
-        alike = imitators(half.evidence, base.point, one.tried.candidate, rest)
+        alike = aliased_with(half.evidence, base.point, one.tried.candidate, rest)
         alike = [name for name in alike if name not in one.alternatives]
         if alike:
             sentences.append(

@@ -12,8 +12,10 @@ from sb3_hds.sysid.belief.opened import nothing_known, open_answers
 from sb3_hds.sysid.checks.adequacy import distances, far_in_words
 from sb3_hds.sysid.checks.conventions import Convention
 from sb3_hds.sysid.checks.timing import stepping_by
-from sb3_hds.sysid.comparison.held_out import Comparison
-from sb3_hds.sysid.comparison.search import Base, Effort, Search, Tried, as_good
+from sb3_hds.sysid.comparison.halves import Base, Effort, Tried
+from sb3_hds.sysid.comparison.held_out import Comparison, as_good
+from sb3_hds.sysid.comparison.inference import detectable
+from sb3_hds.sysid.comparison.search import Search
 from sb3_hds.sysid.comparison.several import confirmed_set, proposed_set
 from sb3_hds.sysid.diagnosis.findings import (
     SMALL,
@@ -29,7 +31,6 @@ from sb3_hds.sysid.diagnosis.findings import (
     to_tell_apart,
     why,
 )
-from sb3_hds.sysid.diagnosis.inference import detectable
 from sb3_hds.sysid.diagnosis.naming import Naming, keys_of
 from sb3_hds.sysid.diagnosis.preparation import IRRELEVANT, hash_of, prepare
 from sb3_hds.sysid.diagnosis.progress import Bar

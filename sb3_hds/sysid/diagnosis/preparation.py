@@ -17,9 +17,9 @@ from sb3_hds.data.audit.outliers import Glitches, Outliers
 from sb3_hds.sysid.checks.adequacy import noise_of
 from sb3_hds.sysid.checks.conventions import Convention, other_convention
 from sb3_hds.sysid.checks.timing import in_step, in_step_with_the_log
+from sb3_hds.sysid.comparison.halves import Half
 from sb3_hds.sysid.comparison.held_out import Split, split
 from sb3_hds.sysid.comparison.scales import sized
-from sb3_hds.sysid.comparison.search import Half
 from sb3_hds.sysid.diagnosis.progress import Bar
 from sb3_hds.sysid.equation.motion import Motion, motion
 from sb3_hds.sysid.equation.screening import SMALL_MACHINE, Screened, screen

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_hds.sysid.checks.parameter_stability import Change, change
-from sb3_hds.sysid.comparison.search import Base, Search
+from sb3_hds.sysid.comparison.halves import Base
+from sb3_hds.sysid.comparison.search import Search
 from sb3_hds.sysid.comparison.unexplained import (
     MissingForce,
     Remainder,

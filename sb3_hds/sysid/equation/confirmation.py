@@ -101,6 +101,7 @@ def material(p: Problem, keys: list[int]) -> list[int]:
 
 
 def confirmed(p: Problem, keys: list[int]) -> list[int]:
+    """Remove members, the least significant first, until all lower held-out errors."""
     while keys:
         held = p.held_out(keys)
         t = [

@@ -39,6 +39,7 @@ def add_force(
     nodes: Mapping[str, np.ndarray],
     rows: Rows,
 ) -> None:
+    """Columns of a force at a joint: its derivatives by its parameters, at fixed settings."""
     j, motion = candidate.index, made.motion
     ranges = ranges_of(made, rows, j, None)
     settings = effect.grid(ranges)
@@ -76,6 +77,7 @@ def add_force(
 
 
 def add_closed_form(made: Equation, candidate: Candidate, nodes: Mapping[str, np.ndarray]) -> None:
+    """The column of a force in :data:`CLOSED_FORMS`."""
     name, by_speed = CLOSED_FORMS[candidate.name]
     values = np.sum(nodes["weights"] * by_speed(nodes["v"]), axis=(1, 2))
     column = put(made, candidate.index, values)
@@ -176,6 +178,7 @@ def add_command(
     effect: ActionEffect,
     rows: Rows,
 ) -> None:
+    """Columns of what delays or distorts commands: changes of the actuators\' force."""
     twin, i, dt = hypotheses.believed, candidate.index, made.motion.dt
     if not rows.actions.size or not np.ptp(rows.actions[:, i]) > 0.0:
         return

@@ -70,6 +70,8 @@ class Problem:
     :param rests: of springs, shares of their second column that are admissible
     :param always: items of every set: the nuisance parameters
     :param rarity: of each item, minus the logarithm of its prior odds
+    :param total: normal matrix over all joints, shape ``(columns + 1, columns + 1)``
+    :param cost: penalty of one parameter: the logarithm of the effective number of rows
     """
 
     items: tuple[Item, ...]
@@ -94,6 +96,7 @@ class Problem:
         return len(self.grams.effective)
 
     def place(self, i: int) -> tuple[str, int]:
+        """:return: slot and index"""
         candidate = self.items[i].candidate
         return candidate.slot, candidate.index
 
@@ -111,6 +114,7 @@ class Problem:
         )
 
     def clashes(self, keys: Sequence[int]) -> bool:
+        """Whether two items exclude each other."""
         families = [self.family(i) for i in keys]
         if len(set(families)) < len(families):
             return True
@@ -142,6 +146,7 @@ class Problem:
         return float(np.linalg.slogdet(self.mass)[1].mean())
 
     def price(self, i: int) -> float:
+        """:return: penalty of an item in the criterion: its parameters and its prior odds"""
         if i in self.always:
             return 0.0
         item = self.items[i]

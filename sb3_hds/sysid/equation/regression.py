@@ -138,12 +138,13 @@ class Rows(NamedTuple):
 
 
 def put(made: Equation, joint: int | None, values: np.ndarray) -> int:
+    """:return: index of a new column"""
     made.columns.append(Column(joint, values))
     return len(made.columns) - 1
 
 
 def put_acting(made: Equation, values: np.ndarray) -> int:
-    """A column at the one joint at which it acts, if it is one."""
+    """:return: index of a new column, at a single joint if it acts at one only"""
     acting = np.flatnonzero(np.abs(values).max(0) > 0.0)
     return (
         put(made, int(acting[0]), values[:, acting[0]])
@@ -153,6 +154,7 @@ def put_acting(made: Equation, values: np.ndarray) -> int:
 
 
 def ranges_of(made: Equation, rows: Rows, joint: int | None, actuator: int | None) -> Ranges:
+    """:return: ranges of the motion and the commands, from which effects choose their settings"""
     motion, command = made.motion, np.zeros(1)
     if actuator is not None:
         command = rows.actions[:, actuator]

@@ -231,7 +231,7 @@ def _content(d: Diagnosis) -> dict[str, Any]:
         "findings": findings,
         "explained": wording.explained_in_words(d.explained),
         "rejected": [
-            (r.name, wording.share_in_words(r.gain), wording.chance_in_words(r.p_value), r.why)
+            (r.name, wording.share_in_words(r.gain), wording.p_value_in_words(r.p_value), r.why)
             for r in d.rejected
         ],
         "parameters": _parameters(d),

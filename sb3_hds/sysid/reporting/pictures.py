@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from sb3_hds.sysid.comparison.halves import NOT_FINITE, Half
 from sb3_hds.sysid.comparison.held_out import compare
-from sb3_hds.sysid.comparison.search import NOT_FINITE, Half
 from sb3_hds.sysid.comparison.unexplained import MissingForce
 from sb3_hds.sysid.estimation.evidence import Point
 from sb3_hds.sysid.reporting.finding import HorizonGain

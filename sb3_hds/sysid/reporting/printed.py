@@ -62,7 +62,7 @@ def not_accepted(rejected: Sequence[Rejected]) -> list[str]:
     width = max(len(r.name) for r in best)
     lines = [f"{'Not accepted':<{width + 2}} {'gain':>9} {'p':>7}  why"]
     for r in best:
-        gain, p_value = wording.share_in_words(r.gain), wording.chance_in_words(r.p_value)
+        gain, p_value = wording.share_in_words(r.gain), wording.p_value_in_words(r.p_value)
         row = f"  {r.name:<{width}} {gain:>9} {p_value:>7}  {r.why}"
         lines += [row] if len(row) <= WIDTH else [row.removesuffix(f"  {r.why}"), f"    {r.why}"]
     for why in dict.fromkeys(r.why for r in others):

@@ -37,7 +37,7 @@ def share_in_words(gain: float) -> str:
     return "far worse" if gain < -1.0 else f"{round(gain, 2) + 0.0:.0%}"
 
 
-def chance_in_words(p_value: float) -> str:
+def p_value_in_words(p_value: float) -> str:
     """:return: a p-value; nothing where there is none"""
     return "" if math.isnan(p_value) else f"{p_value:.2g}"
 
@@ -59,7 +59,7 @@ def evidence_in_words(gain: float, p_value: float) -> str:
     """:return: what speaks for a cause"""
     return (
         f"It lowers the mean square error of held-out recordings by {share_in_words(gain)} "
-        f"(p = {chance_in_words(p_value)})."
+        f"(p = {p_value_in_words(p_value)})."
     )
 
 
