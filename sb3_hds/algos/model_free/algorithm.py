@@ -115,7 +115,13 @@ class ModelFreeConfig(OffPolicyConfig):
 
 
 class ModelFreeAlgorithm(TensorAlgorithm):
-    """Abstract: off-policy learning from transitions."""
+    """
+    Abstract: off-policy learning from transitions.
+
+    SB3's ``learn`` alternates between ``collect_rollouts``, which fills the replay buffer, and
+    :meth:`train`, which calls :meth:`_updates`: it draws batches (``batches_of``) and hands them to
+    the compiled update of the family (``sac/update.py``, ``td7/update.py``).
+    """
 
     #: steps of ``learn()`` without a number
     default_timesteps: ClassVar[int] = 20_000

@@ -93,7 +93,11 @@ class SoftActorCritic(ModelFreeAlgorithm):
         super().construct(dataclasses.replace(config, policy_kwargs=policy_kwargs), **more)
 
     def update_config(self) -> UpdateConfig:
-        """:return: what an update is made of"""
+        """
+        What an update is made of: SAC's for the networks of the policy, see
+        ``GaussianPolicy.plain_update_config``, with the arguments of this algorithm. Subclasses
+        replace parts of it.
+        """
         config = self.config
         return dataclasses.replace(
             self.policy.plain_update_config(),
@@ -131,7 +135,8 @@ class SoftActorCritic(ModelFreeAlgorithm):
     ) -> None:
         super().set_parameters(load_path_or_dict, exact_match, device)
         if not isinstance(self.ent_coef, str):
-            # What is no parameter of this model is not another one's to set; ``load`` passes here.
+            # A fixed coefficient is an argument, not learned: keep this model's own value. ``load``
+            # calls this, too.
             before = self.policy.agent_state.log_ent_coef
             fixed = {"params": log_of(self.ent_coef)}
             now = before._replace(weights=fixed)
