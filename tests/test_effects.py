@@ -12,7 +12,7 @@ from cases import each
 from free_mass import Mass, moved
 
 from sb3_hds import effects, twins
-from sb3_hds.core import EffectChain, rollout
+from sb3_hds.core import EffectChain, ForceEffect, Moment, rollout
 from sb3_hds.effects import CoulombFriction, ViscousFriction
 from sb3_hds.errors import EffectError, ParameterError
 
@@ -226,6 +226,28 @@ def test_only_chosen_forces_act_and_slopes_are_theirs(x64):
     np.testing.assert_allclose(found, wanted, rtol=1e-11, atol=1e-13)
     for name, slope in slopes.items():
         np.testing.assert_allclose(slope, wanted_slopes.get(name, 0.0), rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "effect", [e for e in ENTRIES if issubclass(e, ForceEffect)], ids=lambda effect: effect.name
+)
+def test_an_effect_that_says_so_does_not_depend_on_the_load(effect, x64):
+    """What it says decides whether the load is computed for it at all."""
+    twin = twins.make("DoublePendulum").extend(effect(0, **sizes(effect)))
+    memory = twin.initial(jax.random.key(0), twin.params).memory.get(twin.attached[0].key, ())
+    own = twin.attached[0].own(twin.params)
+
+    def felt(load, bend):
+        q, v = jnp.array([0.3, -0.4]), jnp.array([0.9, 0.5])
+        matrix = jnp.array([[2.0, 0.3], [0.3, 1.0]]) * (1.0 + bend)
+        moment = Moment(q, v, jnp.array([0.2, 0.1]), load, matrix, 1e-3)
+        bound = twin.attached[0].effect
+        return bound.force(moment, 0, memory, own), bound.advance(moment, 0, memory, own)
+
+    slopes = jax.jacfwd(felt, (0, 1))(jnp.array([0.7, -0.2]), jnp.array(0.0))
+
+    felt_at_all = any(np.any(np.asarray(slope)) for slope in jax.tree.leaves(slopes))
+    assert felt_at_all == effect.uses_load
 
 
 def test_extending_an_extended_twin_flattens_and_keeps_order_and_values():

@@ -83,10 +83,12 @@ class AnalyticTwin(Twin):
         def substep(state: State, _: None) -> tuple[State, None]:
             command, memory = effects.act(action, state.memory, h)
 
-            def moment(q: Position, v: Velocity) -> Moment:
+            def moment(q: Position, v: Velocity, *, whole: bool = False) -> Moment:
                 actuator = self.actuate(State(q, v, state.memory), command, params)
-                load, mass_matrix = self.bias(q, v, params), self.mass_matrix(q, params)
-                return Moment(self.coordinates(q), v, actuator, load, mass_matrix, h)
+                bias = lambda: self.bias(q, v, params)  # noqa: E731
+                mass_matrix = lambda: self.mass_matrix(q, params)  # noqa: E731
+                own = (bias(), mass_matrix()) if whole else effects.load(bias, mass_matrix)
+                return Moment(self.coordinates(q), v, actuator, *own, h)
 
             still = jnp.zeros_like(state.v)
             held, middle = still, None

@@ -45,7 +45,8 @@ class Moment(NamedTuple):
     :param q: position of each joint, shape ``(dof,)``
     :param v: generalised velocity, shape ``(dof,)``
     :param actuator: generalised force of the actuators, shape ``(dof,)``
-    :param load: generalised force of gravity and inertia (``bias``), shape ``(dof,)``
+    :param load: generalised force of gravity and inertia (``bias``), shape ``(dof,)``; zero where
+        no effect uses it
     :param mass_matrix: shape ``(dof, dof)``
     :param h: length of the sub-step [s]
     """
@@ -246,6 +247,10 @@ class ForceEffect(Effect):
     #: whether it is evaluated once, in the middle of each sub-step, and not at every stage of the
     #: integrator; its memory then advances from the same moment, so that force and memory agree
     held: ClassVar[bool] = False
+    #: whether it depends on the load, or on how the mass matrix depends on the position. Where no
+    #: effect that is evaluated does, the load is zero and the mass matrix has no derivative: they
+    #: are most of what a step of a robot with many joints costs
+    uses_load: ClassVar[bool] = True
 
     def memory(self, twin: "Twin") -> Memory:
         """:return: the memory at the start of an episode; a pytree of float arrays"""

@@ -11,7 +11,16 @@ import numpy as np
 
 from sb3_hds.core.effect import ActionEffect, Effect, ForceEffect, Moment
 from sb3_hds.core.numerics.linear import solve_spd
-from sb3_hds.core.types import Action, Force, Memory, Params, Position, Scalar, Velocity
+from sb3_hds.core.types import (
+    Action,
+    Force,
+    MassMatrix,
+    Memory,
+    Params,
+    Position,
+    Scalar,
+    Velocity,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,9 +132,34 @@ class EffectChain:
         add = lambda i, total: total + jax.lax.switch(order[i], forces)  # noqa: E731
         return jax.lax.fori_loop(0, n, add, total)
 
+    def load(
+        self,
+        bias: Callable[[], Force],
+        mass_matrix: Callable[[], MassMatrix],
+    ) -> tuple[Force, MassMatrix]:
+        """
+        :return: both, or no load and a mass matrix without derivative where no effect that is
+            evaluated depends on them
+        """
+
+        def both() -> tuple[Force, MassMatrix]:
+            return bias(), mass_matrix()
+
+        def neither() -> tuple[Force, MassMatrix]:
+            matrix = jax.lax.stop_gradient(mass_matrix())
+            return jnp.zeros_like(matrix[0]), matrix
+
+        using = [attached.key for attached, effect, _ in self._forces if effect.uses_load]
+        if not using:
+            return neither()
+        if self._chosen is None:
+            return both()
+        any_is_on = jnp.any(jnp.stack([jnp.asarray(self._chosen.on[key]) for key in using]))
+        return jax.lax.cond(any_is_on, both, neither)
+
     def held(
         self,
-        moment: Callable[[Position, Velocity], Moment],
+        moment: Callable[..., Moment],
         q: Position,
         v: Velocity,
         memory: dict[str, Memory],
@@ -133,7 +167,8 @@ class EffectChain:
         displace: Callable[[Position, Velocity], Position],
     ) -> tuple[Force, Moment]:
         """
-        :param moment: the system at a position and a velocity
+        :param moment: the system at a position and a velocity; ``whole`` asks for its load even
+            where no effect uses it
         :param q: at the start of the sub-step
         :param v: at the start of the sub-step
         :param displace: moves a position along a velocity times a time
@@ -145,7 +180,7 @@ class EffectChain:
 
         def towards(now: tuple[Force, Velocity], ahead: Scalar) -> tuple[Any, Any]:
             place = displace(q, ahead * v), v + ahead * now[1]
-            there = moment(*place)
+            there = moment(*place, whole=True)
             force = self.force(there, memory, held=True)
             total = there.actuator + force - there.load
             return (force, solve_spd(there.mass_matrix, total)), place

@@ -40,6 +40,7 @@ class ViscousFriction(JointEffect):
     4(3), 1998, section 2.
     """
 
+    uses_load = False
     name = "viscous_friction"
     parameters = {"b": Parameter(null=0.0, scale=0.05, unit="N m s/rad", lower=0.0)}
     explanation = (
@@ -70,6 +71,7 @@ class DirectionalViscousFriction(JointEffect):
     4(3), 1998, section 2 (curves of friction over speed need not be symmetrical).
     """
 
+    uses_load = False
     name = "directional_viscous_friction"
     parameters = {
         "b_pos": Parameter(null=0.0, scale=0.05, unit="N m s/rad", lower=0.0),
@@ -94,6 +96,7 @@ class DryFriction(JointEffect):
     :raises EffectError: unless that is positive
     """
 
+    uses_load = False
     options = ("standstill",)
 
     def __init__(
@@ -290,6 +293,7 @@ class LoadDependentFriction(DryFriction):
     actuators*, arXiv 2410.08650, 2024, model M3 (without its viscous friction).
     """
 
+    uses_load = True
     name = "load_dependent_friction"
     parameters = {
         "tau_c": Parameter(null=0.0, scale=0.1, unit="N m", lower=0.0),
@@ -316,6 +320,7 @@ class QuadraticDrag(JointEffect):
     section 6.4.
     """
 
+    uses_load = False
     name = "quadratic_drag"
     parameters = {"c": Parameter(null=0.0, scale=0.02, unit="N m s2/rad2", lower=0.0)}
     explanation = "The joint moves through a medium, such as air, that resists fast motion most."

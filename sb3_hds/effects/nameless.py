@@ -39,6 +39,7 @@ class ClearanceSpring(JointEffect):
     and Vibration 90(1), 1983.
     """
 
+    uses_load = False
     name = "clearance_spring"
     parameters = {
         "k": Parameter(null=0.0, scale=0.5, unit="N m/rad", lower=0.0),
@@ -76,6 +77,7 @@ class Hysteresis(JointEffect):
     chapter 2, without the part by which it hardens.
     """
 
+    uses_load = False
     name = "hysteresis"
     parameters = {
         "tau_c": Parameter(null=0.0, scale=0.1, unit="N m", lower=0.0),

@@ -55,6 +55,7 @@ class NeuralForce(ForceEffect):
 
     name = "neural_force"
     held = True
+    uses_load = False
     options = ("n_members", "net_arch", "caution")
     parameters = {"share": Parameter(null=0.0, scale=1.0, unit="1", lower=0.0, upper=1.0)}
     explanation = "Something acts on the joints that has no name here, and was learned from data."

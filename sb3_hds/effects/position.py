@@ -31,6 +31,7 @@ class Stiffness(JointEffect):
     Source: Rao, *Mechanical Vibrations*, Prentice Hall 2011, section 1.7 (spring elements).
     """
 
+    uses_load = False
     name = "stiffness"
     parameters = {
         "k": Parameter(null=0.0, scale=0.2, unit="N m/rad", lower=0.0),
@@ -71,6 +72,7 @@ class CubicStiffness(JointEffect):
     Source: Kovacic and Brennan, *The Duffing Equation*, Wiley 2011, chapter 2.
     """
 
+    uses_load = False
     name = "cubic_stiffness"
     parameters = {"k3": Parameter(null=0.0, scale=0.05, unit="N m/rad3", lower=0.0)}
     explanation = "Something elastic resists large deflections much more than small ones."
@@ -96,6 +98,7 @@ class Cogging(JointEffect):
     :math:`\pi - 2 \pi \varphi / \lambda`).
     """
 
+    uses_load = False
     name = "cogging"
     parameters = {
         "amplitude": Parameter(null=0.0, scale=0.1, unit="N m", lower=0.0),
@@ -147,6 +150,7 @@ class ConstantForce(JointEffect):
     Nonlinear System Identification Benchmarks, 2019 (the offset).
     """
 
+    uses_load = False
     name = "constant_force"
     parameters = {"tau_0": Parameter(null=0.0, scale=0.1, unit="N m")}
     explanation = "Something pushes the joint the same way all the time, as an offset of its drive."
