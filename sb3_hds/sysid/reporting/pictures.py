@@ -1,11 +1,15 @@
-"""What a diagnosis shows: numbers ready to draw."""
+"""Errors by horizon, and what a diagnosis shows: numbers ready to draw."""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from sb3_hds.sysid.comparison.halves import NOT_FINITE, Half
+from sb3_hds.sysid.comparison.held_out import compare
 from sb3_hds.sysid.comparison.unexplained import MissingForce
+from sb3_hds.sysid.estimation.evidence import Point
+from sb3_hds.sysid.reporting.finding import HorizonGain
 
 # Of a normal distribution, 90 % lie within so many standard deviations.
 _NORMAL_90 = 1.645
@@ -17,7 +21,7 @@ class Replay(NamedTuple):
 
     :param time: since its first window [s], shape ``(rows,)``; not a number between windows
     :param measured: shape ``(rows, n_obs)``
-    :param before: by the twin as it came, nuisances refitted
+    :param before: by the nominal model, nuisances refitted
     :param after: by the extended twin
     :param margin: half the width of its 90 % interval, by what it misses in all held-out windows
     """
@@ -38,8 +42,8 @@ class Pictures(NamedTuple):
     :param steps: ahead, shape ``(k,)``
     :param errors: root mean square over all held-out windows, in units of the noise, before and
         after, shape ``(2, k)``
-    :param missing: the force that is missing before
-    :param left: and after
+    :param missing: residual force of the nominal model
+    :param left: residual force of the extended model
     """
 
     channels: tuple[tuple[str, str], ...]
@@ -74,3 +78,58 @@ def replay_of(
     time[rows :: rows + 1] = np.nan
     margin = gap(np.broadcast_to(_NORMAL_90 * rms, measured.shape))
     return Replay(time, gap(measured), gap(measured + before), gap(measured + after), margin)
+
+
+def by_horizon(half: Half, before: Point, after: Point, every: int) -> dict[int, HorizonGain]:
+    """
+    :param every: steps of the data in one of the windows
+    :return: errors some steps ahead, by the number of steps of the data
+    """
+    found, last = {}, before.raw.shape[1] - 1
+    for ahead in sorted({1, max(last // 4, 1), last}):
+        old, new = (
+            _bounded(np.mean((point.raw[:, ahead] / half.evidence.noise) ** 2, 1))
+            for point in (before, after)
+        )
+        gained = compare(new, old, half.unit)
+        rms = [float(np.sqrt(np.mean(errors))) for errors in (old, new)]
+        found[ahead * every] = HorizonGain(ahead * every, rms[0], rms[1], gained.low, gained.high)
+    return found
+
+
+def _bounded(errors: np.ndarray) -> np.ndarray:
+    """What has run away counts as far off."""
+    return np.nan_to_num(np.minimum(errors, NOT_FINITE), nan=NOT_FINITE)
+
+
+def pictures_of(
+    half: Half,
+    before: Point,
+    after: Point,
+    every: int,
+    missing: MissingForce,
+    left: MissingForce,
+) -> Pictures:
+    """
+    :param every: steps of the data in one of the windows
+    :param missing: residual force of the nominal model
+    :param left: residual force of the extended model
+    """
+    evidence, twin = half.evidence, half.evidence.hypotheses.twin
+    rows = np.flatnonzero(half.unit == half.unit[0])
+    measured = np.asarray(evidence.shots.obs)[rows]
+    errors = [
+        np.sqrt(np.mean(_bounded((point.raw / evidence.noise) ** 2), (0, 2)))
+        for point in (before, after)
+    ]
+    rms = np.sqrt(np.mean(after.raw**2, 0))
+    return Pictures(
+        channels=tuple((c.name, c.unit) for c in twin.channels),
+        joints=tuple((j.name, "N" if j.unit == "m" else "N m") for j in twin.joints),
+        actuators=tuple((a.name, a.unit) for a in twin.actuators),
+        replay=replay_of(measured, before.raw[rows], after.raw[rows], rms, twin.dt),
+        steps=every * np.arange(measured.shape[1]),
+        errors=np.stack(errors),
+        missing=missing,
+        left=left,
+    )
