@@ -270,10 +270,8 @@ class Search:
             return None
         simplest = likely[0]
         for other in likely[1:]:
-            if has_more_freedom(simplest, other) and as_good(
-                self.better(simplest.kept, other.kept)
-            ):
-                simplest = other
+            if has_more_freedom(simplest, other):
+                simplest = other if as_good(self.better(simplest.kept, other.kept)) else simplest
         level = LEVEL / (1 + n_found)
         for one in [simplest, *(t for t in likely if t is not simplest)][:_MOST_LOOKS]:
             if passes(self.confirmed(one.kept, base.kept), level):

@@ -9,7 +9,7 @@ from jaxtyping import Int
 
 from sb3_hds.sysid.checks.parameter_stability import Change
 from sb3_hds.sysid.comparison.halves import Base, Half, Tried
-from sb3_hds.sysid.comparison.held_out import LEAST_GAIN, LEVEL, Comparison
+from sb3_hds.sysid.comparison.held_out import LEAST_GAIN, LEVEL, Comparison, compare
 from sb3_hds.sysid.comparison.inference import aliased_with, profiled, standard_errors
 from sb3_hds.sysid.comparison.unexplained import Remainder
 from sb3_hds.sysid.estimation.candidates import Candidate
@@ -17,6 +17,7 @@ from sb3_hds.sysid.estimation.evidence import Point
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.results import Estimate
 from sb3_hds.sysid.reporting.finding import Finding, HorizonGain
+from sb3_hds.sysid.reporting.pictures import bounded
 from sb3_hds.sysid.reporting.wording import TOO_LITTLE
 
 #: why a candidate was turned down that predicts better
@@ -269,3 +270,20 @@ def _interval(
     if profiles:
         return profiled(half.evidence, point, free, index, reach)
     return max(best - reach, float(h.lower[index])), min(best + reach, float(h.upper[index]))
+
+
+def by_horizon(half: Half, before: Point, after: Point, every: int) -> dict[int, HorizonGain]:
+    """
+    :param every: steps of the data in one of the windows
+    :return: errors some steps ahead, by the number of steps of the data
+    """
+    found, last = {}, before.raw.shape[1] - 1
+    for ahead in sorted({1, max(last // 4, 1), last}):
+        old, new = (
+            bounded(np.mean((point.raw[:, ahead] / half.evidence.noise) ** 2, 1))
+            for point in (before, after)
+        )
+        gained = compare(new, old, half.unit)
+        rms = [float(np.sqrt(np.mean(errors))) for errors in (old, new)]
+        found[ahead * every] = HorizonGain(ahead * every, rms[0], rms[1], gained.low, gained.high)
+    return found

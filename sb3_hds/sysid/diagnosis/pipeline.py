@@ -20,6 +20,7 @@ from sb3_hds.sysid.comparison.several import confirmed_set, proposed_set
 from sb3_hds.sysid.diagnosis.findings import (
     SMALL,
     Accepted,
+    by_horizon,
     contradiction,
     errs_more,
     finding,
@@ -41,7 +42,7 @@ from sb3_hds.sysid.estimation.evidence import Point
 from sb3_hds.sysid.estimation.parameters import Belief, at_limit
 from sb3_hds.sysid.reporting.diagnosis import MANY, Diagnosis
 from sb3_hds.sysid.reporting.finding import Rejected
-from sb3_hds.sysid.reporting.pictures import by_horizon, pictures_of
+from sb3_hds.sysid.reporting.pictures import pictures_of
 
 # Several causes that explain less than this share of what can be explained are not believed.
 _LEAST_OF_SEVERAL = 0.5

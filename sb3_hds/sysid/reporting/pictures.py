@@ -1,4 +1,4 @@
-"""Errors by horizon, and what a diagnosis shows: numbers ready to draw."""
+"""What a diagnosis shows: numbers ready to draw."""
 
 from typing import NamedTuple
 
@@ -6,10 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sb3_hds.sysid.comparison.halves import NOT_FINITE, Half
-from sb3_hds.sysid.comparison.held_out import compare
 from sb3_hds.sysid.comparison.unexplained import MissingForce
 from sb3_hds.sysid.estimation.evidence import Point
-from sb3_hds.sysid.reporting.finding import HorizonGain
 
 # Of a normal distribution, 90 % lie within so many standard deviations.
 _NORMAL_90 = 1.645
@@ -80,24 +78,7 @@ def replay_of(
     return Replay(time, gap(measured), gap(measured + before), gap(measured + after), margin)
 
 
-def by_horizon(half: Half, before: Point, after: Point, every: int) -> dict[int, HorizonGain]:
-    """
-    :param every: steps of the data in one of the windows
-    :return: errors some steps ahead, by the number of steps of the data
-    """
-    found, last = {}, before.raw.shape[1] - 1
-    for ahead in sorted({1, max(last // 4, 1), last}):
-        old, new = (
-            _bounded(np.mean((point.raw[:, ahead] / half.evidence.noise) ** 2, 1))
-            for point in (before, after)
-        )
-        gained = compare(new, old, half.unit)
-        rms = [float(np.sqrt(np.mean(errors))) for errors in (old, new)]
-        found[ahead * every] = HorizonGain(ahead * every, rms[0], rms[1], gained.low, gained.high)
-    return found
-
-
-def _bounded(errors: np.ndarray) -> np.ndarray:
+def bounded(errors: np.ndarray) -> np.ndarray:
     """What has run away counts as far off."""
     return np.nan_to_num(np.minimum(errors, NOT_FINITE), nan=NOT_FINITE)
 
@@ -119,7 +100,7 @@ def pictures_of(
     rows = np.flatnonzero(half.unit == half.unit[0])
     measured = np.asarray(evidence.shots.obs)[rows]
     errors = [
-        np.sqrt(np.mean(_bounded((point.raw / evidence.noise) ** 2), (0, 2)))
+        np.sqrt(np.mean(bounded((point.raw / evidence.noise) ** 2), (0, 2)))
         for point in (before, after)
     ]
     rms = np.sqrt(np.mean(after.raw**2, 0))
