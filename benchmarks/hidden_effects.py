@@ -264,7 +264,7 @@ def run(
         case, data, motion = draw(system, number, kind=kind, noise=noise, most=most)
     twin, started = believed(system, case.seen), time.time()
     inquiry = Inquiry(twin, data, effects.ALL, case.nuisances, number, budget, False)
-    reason = inquiry.poor()
+    reason = inquiry.given.poor
     found = inquiry.refused(reason) if reason else inquiry.run()
     seconds = time.time() - started
     names = [key(finding) for finding in found.findings]
@@ -276,7 +276,7 @@ def run(
     if case.kind == SEVERAL:
         said = of_several(case, inquiry.screened, found)
     # A log in other conventions is told before anything is simulated.
-    wanted = rules and case.asked and not reason and inquiry.convention is None
+    wanted = rules and case.asked and not reason and inquiry.given.convention is None
     if wanted:
         said |= (
             others_of_several(case, inquiry, data, motion, commands, budget)

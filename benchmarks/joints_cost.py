@@ -86,19 +86,19 @@ def recorded(joints: int) -> Any:
 
 def worker(joints: int, budget: str) -> dict:
     from sb3_hds import diagnose, twins
-    from sb3_hds.sysid.diagnosis import pipeline as inquiry
+    from sb3_hds.sysid.diagnosis import preparation
 
     data = recorded(joints)
     twin = twins.from_mujoco(arm(joints), dt=data.dt)
     proposed: dict[str, float] = {}
-    screen = inquiry.screen
+    screen = preparation.screen
 
     def timed(*given: Any) -> Any:
         found = screen(*given)
         proposed["at"] = seconds_since_start()
         return found
 
-    inquiry.screen = timed
+    preparation.screen = timed
     begun, busy = seconds_since_start(), time.process_time()
     found = diagnose(twin, data, budget=budget, progress=False)
     friction = ("viscous_friction", "coulomb_friction")

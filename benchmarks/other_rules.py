@@ -75,7 +75,7 @@ def by_held_out(search, start, tried) -> Answer:
 
 def by_parameters(search, h, start) -> Answer:
     """Fit what the twin has; the parameter that moved most, in standard errors, is the cause."""
-    from sb3_hds.sysid.diagnosis.account import standard_errors
+    from sb3_hds.sysid.comparison.inference import standard_errors
 
     own = [h.indices(c)[0] for c in h.candidates if c.slot == "parameter"]
     free = [*start.free, *own]
@@ -93,9 +93,9 @@ def by_regression(inquiry, start) -> Answer:
     from sb3_hds.sysid.comparison.unexplained import missing_force, short_windows, weighed
 
     select = inquiry.search.select.evidence
-    wide = inquiry.period, 2 * inquiry.most_windows
-    short = short_windows(select, start.point.theta, inquiry.data, *wide)
-    missing = missing_force(short, inquiry.data)
+    wide = inquiry.given.period, 2 * inquiry.given.most_windows
+    short = short_windows(select, start.point.theta, inquiry.given.data, *wide)
+    missing = missing_force(short, inquiry.given.data)
     twin, found = inquiry.hypotheses.twin, []
     weights = weighed(missing._replace(force=np.ones_like(missing.force)))
     for j, joint in enumerate(twin.joints):
@@ -120,8 +120,11 @@ def by_regression(inquiry, start) -> Answer:
         return Answer()
     # What it names is then fitted as everything else is.
     name, h = max(found)[1], inquiry.hypotheses
-    (chosen,) = (h.indices(c) for c in h.candidates if c.key == name)
-    fitted = inquiry.search.base(start.point.theta, [*start.free, *chosen])
+    chosen = [h.indices(c) for c in h.candidates if c.key == name]
+    if not chosen:
+        # The equation of motion left it out of what is simulated.
+        return Answer(name)
+    fitted = inquiry.search.base(start.point.theta, [*start.free, *chosen[0]])
     return Answer(name, gain(inquiry.search, start, fitted.kept))
 
 
@@ -151,14 +154,14 @@ def by_network(inquiry, start) -> Answer:
     from sb3_hds.sysid.comparison.unexplained import missing_force, short_windows, weighed
 
     select = inquiry.search.select.evidence
-    wide = inquiry.period, 2 * inquiry.most_windows
-    short = short_windows(select, start.point.theta, inquiry.data, *wide)
-    missing = missing_force(short, inquiry.data)
+    wide = inquiry.given.period, 2 * inquiry.given.most_windows
+    short = short_windows(select, start.point.theta, inquiry.given.data, *wide)
+    missing = missing_force(short, inquiry.given.data)
     inputs = np.concatenate(
         [np.cos(missing.position), np.sin(missing.position), missing.velocity, missing.command], 1
     )
     inputs = (inputs - inputs.mean(0)) / (inputs.std(0) + 1e-9)
-    confirm = split(inquiry.data, missing.origin, inquiry.seed).confirm
+    confirm = split(inquiry.given.data, missing.origin, inquiry.seed).confirm
     x, y = (torch.tensor(a, dtype=torch.float32) for a in (inputs, weighed(missing)))
     torch.manual_seed(0)
     net = torch.nn.Sequential(

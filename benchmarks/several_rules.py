@@ -216,7 +216,7 @@ def by_simulation(twin: Any, data: Any, seed: int) -> list[str]:
     toolbox for system identification does; what has an interval without its null is a cause.
     """
     from sb3_hds import effects
-    from sb3_hds.sysid.diagnosis.account import standard_errors
+    from sb3_hds.sysid.comparison.inference import standard_errors
     from sb3_hds.sysid.diagnosis.pipeline import Inquiry
 
     kinds = (
@@ -228,7 +228,7 @@ def by_simulation(twin: Any, data: Any, seed: int) -> list[str]:
     )
     with _without_screening():
         inquiry = Inquiry(twin, data, kinds, (), seed, "full", False)
-    if inquiry.convention is not None or inquiry.poor():
+    if inquiry.given.convention is not None or inquiry.given.poor:
         return []
     inquiry.prepare()
     search, h = inquiry.search, inquiry.hypotheses
@@ -252,17 +252,17 @@ def one_by_one(twin: Any, data: Any, seed: int, budget: str) -> list[str]:
 
     with _without_screening():
         inquiry = Inquiry(twin, data, effects.ALL, (), seed, budget, False)
-    return [] if inquiry.poor() else [finding.key for finding in inquiry.run().findings]
+    return [] if inquiry.given.poor else [finding.key for finding in inquiry.run().findings]
 
 
 @contextmanager
 def _without_screening() -> Iterator[None]:
     """Nothing is proposed by equation errors: every candidate is simulated."""
-    from sb3_hds.sysid.diagnosis import pipeline as inquiry
+    from sb3_hds.sysid.diagnosis import preparation
 
-    screen = inquiry.screen
-    inquiry.screen = lambda *_: None
+    screen = preparation.screen
+    preparation.screen = lambda *_: None
     try:
         yield
     finally:
-        inquiry.screen = screen
+        preparation.screen = screen

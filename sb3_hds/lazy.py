@@ -4,7 +4,7 @@ import importlib
 import importlib.util
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import ModuleType
 from typing import Any
 
@@ -32,15 +32,20 @@ class _Package(ModuleType):
         return sorted(self._public)
 
 
-def lazily(package: str, public: Mapping[str, str]) -> None:
+def lazily(package: str, public: Mapping[str, Iterable[str]]) -> None:
     """
     Called at the end of a package's ``__init__``.
 
     :param package: its name
-    :param public: names, and the module that each is imported from
+    :param public: names, by the module that they are imported from: below the package, or with
+        its whole name, which begins with ``sb3_hds``
     """
     module: Any = sys.modules[package]
-    module.__dict__["_public"] = dict(public)
+    homes = {
+        home if home.startswith("sb3_hds.") else f"{package}.{home}": names
+        for home, names in public.items()
+    }
+    module.__dict__["_public"] = {name: home for home, names in homes.items() for name in names}
     module.__class__ = _Package
 
 

@@ -11,18 +11,20 @@ from measuring import jumping, measured
 from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import Trajectories
 from sb3_hds.sysid.checks.parameter_stability import Change
+from sb3_hds.sysid.comparison.halves import Half
 from sb3_hds.sysid.comparison.held_out import Comparison, compare, confirm, split
-from sb3_hds.sysid.comparison.search import Half, Search
+from sb3_hds.sysid.comparison.inference import standard_errors
+from sb3_hds.sysid.comparison.search import Search
 from sb3_hds.sysid.comparison.starts import newton
 from sb3_hds.sysid.comparison.unexplained import MissingForce, remainder
-from sb3_hds.sysid.diagnosis import pipeline as inquiry
-from sb3_hds.sysid.diagnosis.account import standard_errors
+from sb3_hds.sysid.diagnosis import residuals
 from sb3_hds.sysid.diagnosis.findings import NAMELESS, contradiction, errs_more, out_of_reach
 from sb3_hds.sysid.diagnosis.progress import Bar
+from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point
-from sb3_hds.sysid.estimation.hypotheses import Candidate, Hypotheses
+from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.shooting import shots_of
-from sb3_hds.sysid.reporting.diagnosis import HorizonGain
+from sb3_hds.sysid.reporting.finding import HorizonGain
 from sb3_hds.sysid.reporting.sentence import several_in_words
 
 KINDS = ["ViscousFriction", "CoulombFriction", "TorqueGain", "ActionDelay"]
@@ -377,7 +379,7 @@ def test_friction_that_changes_with_place_or_time_is_left_over(where, seed):
 @each(("speed", 0.08, True), ("speed", 0.12, False), ("time", 0.03, True), ("time", 0.08, False))
 def test_a_size_may_change_less_with_time_than_with_speed(goes_with, share, steady, monkeypatch):
     changes = Change(goes_with, 1e-6, gain=share)
-    monkeypatch.setattr(inquiry, "change", lambda *_: changes)
+    monkeypatch.setattr(residuals, "change", lambda *_: changes)
     asking = SimpleNamespace(
         hypotheses=SimpleNamespace(remembers=lambda _: False, indices=lambda _: (0,)),
         _gone=lambda *_: 1.0 - share,
@@ -385,7 +387,7 @@ def test_a_size_may_change_less_with_time_than_with_speed(goes_with, share, stea
     one = SimpleNamespace(tried=SimpleNamespace(candidate=None))
     left = SimpleNamespace(short=None, missing=None)
 
-    found = inquiry.Inquiry._varies(asking, one, SimpleNamespace(free=()), left)
+    found = residuals.Residuals._varies(asking, one, SimpleNamespace(free=()), left)
 
     assert found is (None if steady else changes)
 

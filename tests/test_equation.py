@@ -7,7 +7,7 @@ import servo_leg
 
 from sb3_hds import Trajectories, effects, twins
 from sb3_hds.sysid.checks.conventions import other_convention
-from sb3_hds.sysid.checks.leapfrog import in_step_with_the_log
+from sb3_hds.sysid.checks.timing import in_step_with_the_log
 from sb3_hds.sysid.equation.columns import equation
 from sb3_hds.sysid.equation.motion import differences, kinematics, motion
 from sb3_hds.sysid.equation.screening import screen

@@ -9,7 +9,7 @@ from measuring import measured
 from sb3_hds import effects, twins
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid import calibrate
-from sb3_hds.sysid.estimation.free import tie
+from sb3_hds.sysid.estimation.parameters import tie
 
 DAMPING = ("j0_damping", "j1_damping")
 LATE = ("action_delay.m0.delay", "action_delay.m1.delay")

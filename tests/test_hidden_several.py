@@ -17,7 +17,7 @@ from several_cases import SEVERAL, share_of_friction, visible
 from several_scores import judged
 
 from sb3_hds import effects
-from sb3_hds.sysid.checks.leapfrog import in_step_with_the_log
+from sb3_hds.sysid.checks.timing import in_step_with_the_log
 from sb3_hds.sysid.equation.motion import motion
 from sb3_hds.sysid.equation.screening import screen
 

@@ -5,8 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sb3_hds.sysid.comparison.family import chance_of_the_best
-from sb3_hds.sysid.comparison.profile import profiled
+from sb3_hds.sysid.comparison.inference import family_p_value, profiled
 from sb3_hds.sysid.estimation.evidence import Point, Slopes
 
 N_WINDOWS, N_ROWS, N_CANDIDATES = 30, 40, 25
@@ -35,7 +34,7 @@ def linear(rng, effect=0.0, colour=0.95):
 
 
 def chance(slopes, gain):
-    return chance_of_the_best(slopes, [[1 + c] for c in range(N_CANDIDATES)], [0], [0, 1], gain)
+    return family_p_value(slopes, [[1 + c] for c in range(N_CANDIDATES)], [0], [0, 1], gain)
 
 
 @pytest.mark.parametrize("colour", [0.0, 0.95])

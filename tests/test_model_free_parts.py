@@ -21,7 +21,7 @@ from sb3_hds.algos.model_free.sac.objectives import (
 )
 from sb3_hds.algos.nets.mlp import Dropout
 from sb3_hds.algos.nets.observations import flattener
-from sb3_hds.algos.nets.optimizers import TrainState, optimizer_of
+from sb3_hds.algos.nets.options import TrainState, optimizer_of
 
 
 def test_every_processor_sorts_and_compares_quantiles_alike():

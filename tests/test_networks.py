@@ -13,7 +13,7 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_hds.algos import TwinPolicy
-from sb3_hds.algos.nets.activations import ACTIVATIONS, activation
+from sb3_hds.algos.nets.options import ACTIVATIONS, activation
 from sb3_hds.algos.twin import networks as nets
 from sb3_hds.algos.twin.networks import Actor, value_of
 

@@ -15,7 +15,7 @@ from stable_baselines3 import SAC
 
 import sb3_hds
 from sb3_hds import algos
-from sb3_hds.algos.base.description import space_from_plain, space_to_plain
+from sb3_hds.algos.base.policy_file import space_from_plain, space_to_plain
 
 
 @pytest.mark.parametrize("name", ["simba", "td7", "hds", "openloop"])

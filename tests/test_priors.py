@@ -7,7 +7,7 @@ from sb3_hds import Trajectories
 from sb3_hds.core import Channel, Parameter
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.checks.adequacy import distances, far_in_words, noise_of
-from sb3_hds.sysid.estimation.priors import at_limit, prior_of
+from sb3_hds.sysid.estimation.parameters import at_limit, prior_of
 
 MASS = Parameter(null=1.0, scale=0.1, unit="kg", lower=1e-6)
 DAMPING = Parameter(null=0.0, scale=0.1, unit="N s/m", lower=0.0)

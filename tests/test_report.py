@@ -14,7 +14,8 @@ from measuring import measured
 from sb3_hds import diagnose, effects, twins
 from sb3_hds.errors import ParameterError
 from sb3_hds.sysid.diagnosis import findings as telling
-from sb3_hds.sysid.reporting.diagnosis import SENTENCES, Rejected
+from sb3_hds.sysid.reporting.diagnosis import SENTENCES
+from sb3_hds.sysid.reporting.finding import Rejected
 
 TWIN = twins.make("PendulumReal")
 KINDS = (effects.CoulombFriction, effects.ViscousFriction)

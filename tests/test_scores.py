@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sb3_hds.sysid.comparison.halves import Half
 from sb3_hds.sysid.comparison.held_out import by_scores, compare
-from sb3_hds.sysid.comparison.search import Half
-from sb3_hds.sysid.diagnosis.account import standard_errors
+from sb3_hds.sysid.comparison.inference import standard_errors
 from sb3_hds.sysid.estimation.evidence import Point, Slopes
 
 N_UNITS, N_WINDOWS, N_ROWS = 4, 3, 50

@@ -70,7 +70,7 @@ def run(given: argparse.Namespace) -> None:
     from sb3_hds.errors import TrajectoryError
     from sb3_hds.sysid import calibrate
     from sb3_hds.sysid.estimation.calibrate import check_fits
-    from sb3_hds.sysid.estimation.free import free_names
+    from sb3_hds.sysid.estimation.parameters import free_names
 
     for target in filter(None, (given.json, given.write)):
         check_target(target)

@@ -4,8 +4,9 @@ Policies on a robot: an ONNX file that needs no learning library, and a header o
 Names are imported on first use: running a file imports neither jax nor torch.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from sb3_hds.lazy import lazily
 
 if TYPE_CHECKING:
     from sb3_hds.deploy.c_header import Header, export_c
@@ -26,24 +27,13 @@ __all__ = [
     "run_policy",
 ]
 
-_MODULES = {
-    "Exported": "export",
-    "Header": "c_header",
-    "Latencies": "run",
-    "Memory": "policy_function",
-    "OnnxPolicy": "onnx_policy",
-    "PolicyFunction": "policy_function",
-    "export_c": "c_header",
-    "export_onnx": "export",
-    "run_policy": "run",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+lazily(
+    __name__,
+    {
+        "c_header": ("Header", "export_c"),
+        "export": ("Exported", "export_onnx"),
+        "onnx_policy": ("OnnxPolicy",),
+        "policy_function": ("Memory", "PolicyFunction"),
+        "run": ("Latencies", "run_policy"),
+    },
+)

@@ -1,20 +1,26 @@
 """Operations of ONNX as statements of C, for a batch of one, with all shapes known."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from sb3_hds.deploy.c_text import (
+    EXPRESSIONS,
+    FOLDED,
+    KINDS,
+    REDUCED,
+    activation,
+    array_of,
+    layer_norm,
+    loop_over,
+    over_last,
+    place_of,
+)
+from sb3_hds.deploy.conversion import attributes_of, evaluated, numpy_type
 from sb3_hds.errors import ExportError
 
-_KINDS = {
-    "float32": "float",
-    "float64": "double",
-    "int64": "long long",
-    "int32": "int",
-    "bool": "unsigned char",
-}
 # What only moves numbers: its effect on their places is found by moving the places themselves.
 _MOVES = {
     "Concat",
@@ -29,52 +35,6 @@ _MOVES = {
     "Transpose",
     "Unsqueeze",
 }
-# Of one number each; {f}: the suffix of functions of single precision.
-_EXPRESSIONS: dict[str, str] = {
-    "Abs": "fabs{f}({0})",
-    "Add": "{0} + {1}",
-    "And": "{0} && {1}",
-    "Atan": "atan{f}({0})",
-    "Ceil": "ceil{f}({0})",
-    "Cos": "cos{f}({0})",
-    "Div": "{0} / {1}",
-    "Equal": "{0} == {1}",
-    "Erf": "erf{f}({0})",
-    "Exp": "exp{f}({0})",
-    "Floor": "floor{f}({0})",
-    "Greater": "{0} > {1}",
-    "GreaterOrEqual": "{0} >= {1}",
-    "Less": "{0} < {1}",
-    "LessOrEqual": "{0} <= {1}",
-    "Log": "log{f}({0})",
-    "Mul": "{0} * {1}",
-    "Neg": "-{0}",
-    "Not": "!{0}",
-    "Or": "{0} || {1}",
-    "Pow": "pow{f}({0}, {1})",
-    "Reciprocal": "1 / {0}",
-    "Relu": "{0} > 0 ? {0} : 0",
-    "Sigmoid": "1 / (1 + exp{f}(-{0}))",
-    "Sign": "({0} > 0) - ({0} < 0)",
-    "Sin": "sin{f}({0})",
-    "Softplus": "{0} > 0 ? {0} + log1p{f}(exp{f}(-{0})) : log1p{f}(exp{f}({0}))",
-    "Softsign": "{0} / (1 + fabs{f}({0}))",
-    "Sqrt": "sqrt{f}({0})",
-    "Sub": "{0} - {1}",
-    "Tanh": "tanh{f}({0})",
-    "Where": "{0} ? {1} : {2}",
-}
-# Of any number of inputs, by that of two.
-_FOLDED = {"Max": "{0} > {1} ? {0} : {1}", "Min": "{0} < {1} ? {0} : {1}"}
-_REDUCED = {
-    "ReduceMax": ("{x}[0]", "total = {v} > total ? {v} : total;", "total"),
-    "ReduceMean": ("0", "total += {v};", "total / {n}"),
-    "ReduceMin": ("{x}[0]", "total = {v} < total ? {v} : total;", "total"),
-    "ReduceSum": ("0", "total += {v};", "total"),
-    "ReduceSumSquare": ("0", "total += {v} * {v};", "total"),
-}
-# Weights in one line of the header.
-_PER_LINE = 8
 
 
 class Translation:
@@ -92,7 +52,7 @@ class Translation:
         graph = proto.graph
         held = {part.name: numpy_helper.to_array(part) for part in graph.initializer}
         zeros = {
-            port.name: np.zeros(shapes[port.name], _numpy_type(port.type.tensor_type.elem_type))
+            port.name: np.zeros(shapes[port.name], numpy_type(port.type.tensor_type.elem_type))
             for port in graph.input
         }
         with np.errstate(all="ignore"):
@@ -119,7 +79,7 @@ class Translation:
 
     def kind(self, name: str) -> str:
         """:return: the type of C of an array"""
-        return _KINDS[self._values[name].dtype.name]
+        return KINDS[self._values[name].dtype.name]
 
     def size(self, name: str) -> int:
         """:return: how many numbers it has"""
@@ -147,9 +107,9 @@ class Translation:
         """:return: their declarations, in the namespace of ``prefix``"""
         lines = []
         for name in self._used:
-            lines += _array(self.kind(name), f"{prefix}_{self.symbol(name)}", self._values[name])
+            lines += array_of(self.kind(name), f"{prefix}_{self.symbol(name)}", self._values[name])
         for symbol, table in self._tables.items():
-            lines += _array("int", f"{prefix}_{symbol}", table)
+            lines += array_of("int", f"{prefix}_{symbol}", table)
         return lines
 
     def body(self, prefix: str) -> list[str]:
@@ -181,7 +141,7 @@ class Translation:
     def _translate(self, node: Any) -> None:
         inputs = [name for name in node.input if name]
         kind = node.op_type
-        attributes = _attributes(node)
+        attributes = attributes_of(node)
         if not any(map(self.size, node.output)):
             return
         if kind in _MOVES:
@@ -189,17 +149,19 @@ class Translation:
         elif kind == "Cast":
             to_bool = self._values[node.output[0]].dtype == np.bool_
             self._elementwise(node.output[0], "{0} != 0" if to_bool else "{0}", inputs)
-        elif kind in _EXPRESSIONS:
-            self._elementwise(node.output[0], _EXPRESSIONS[kind], inputs)
-        elif kind in _FOLDED:
-            self._folded(node.output[0], _FOLDED[kind], inputs)
+        elif kind in EXPRESSIONS:
+            self._elementwise(node.output[0], EXPRESSIONS[kind], inputs)
+        elif kind in FOLDED:
+            others = [(name, FOLDED[kind]) for name in inputs[1:]]
+            self._folded(node.output[0], inputs[0], others)
         elif kind == "Clip":
-            self._clip(node)
+            ends = zip(node.input[1:], (FOLDED["Max"], FOLDED["Min"]), strict=False)
+            self._folded(node.output[0], node.input[0], [end for end in ends if end[0]])
         elif kind in ("Elu", "LeakyRelu", "Selu", "Celu", "HardSigmoid", "Gelu"):
-            self._elementwise(node.output[0], _activation(kind, attributes), inputs)
+            self._elementwise(node.output[0], activation(kind, attributes), inputs)
         elif kind in ("Gemm", "MatMul", "Einsum"):
             self._product(node, inputs, attributes)
-        elif kind in _REDUCED:
+        elif kind in REDUCED:
             self._reduce(node, inputs)
         elif kind == "LayerNormalization":
             self._layer_norm(node, inputs, attributes)
@@ -264,21 +226,13 @@ class Translation:
             f"for (i = 0; i < {n}; ++i) {self._new(output)}[i] = ({kind})({text});"
         )
 
-    def _folded(self, output: str, expression: str, inputs: Sequence[str]) -> None:
+    def _folded(self, output: str, first: str, others: Iterable[tuple[str, str]]) -> None:
+        """:param others: inputs, and the expression by which each is added to what is before it"""
         shape = self._values[output].shape
-        text = self._at(shape, inputs[0])
-        for name in inputs[1:]:
+        text = self._at(shape, first)
+        for name, expression in others:
             other = self._at(shape, name)
             text = "(" + expression.replace("{0}", text).replace("{1}", other) + ")"
-        self._loop(output, text)
-
-    def _clip(self, node: Any) -> None:
-        output, shape = node.output[0], self._values[node.output[0]].shape
-        text = self._at(shape, node.input[0])
-        for name, expression in zip(node.input[1:], (_FOLDED["Max"], _FOLDED["Min"]), strict=False):
-            if name:
-                other = self._at(shape, name)
-                text = "(" + expression.replace("{0}", text).replace("{1}", other) + ")"
         self._loop(output, text)
 
     def _move(self, node: Any, inputs: Sequence[str]) -> None:
@@ -294,7 +248,7 @@ class Translation:
             else:
                 given.append(value)
         ends = np.cumsum([0, *(self.size(name) for name in data)])
-        for output, places in zip(node.output, self._evaluated(node, given), strict=True):
+        for output, places in zip(node.output, evaluated(node, given, self._opset), strict=True):
             table = np.asarray(places).ravel()
             whole = table.size and np.array_equal(table, np.arange(ends[1]))
             if whole and len(data) == 1:
@@ -317,28 +271,6 @@ class Translation:
                 f"for (i = 0; i < {len(run)}; ++i) "
                 f"{target}[{run[0]} + i] = {self._read(data[place])}[{start} + i];"
             )
-
-    def _evaluated(self, node: Any, given: Sequence[np.ndarray]) -> list[Any]:
-        """What an operation does to these arrays, by ONNX's own reference."""
-        from onnx import TensorProto, helper
-        from onnx.reference import ReferenceEvaluator
-
-        names = [f"x{i}" for i in range(len(given))]
-        copy = type(node)()
-        copy.CopyFrom(node)
-        filled = iter(names)
-        inputs = [next(filled) if name else "" for name in node.input]
-        del copy.input[:]
-        copy.input.extend(inputs)
-        kind = TensorProto.INT64
-        graph = helper.make_graph(
-            [copy],
-            "one",
-            [helper.make_tensor_value_info(name, kind, None) for name in names],
-            [helper.make_tensor_value_info(name, kind, None) for name in node.output],
-        )
-        model = helper.make_model(graph, opset_imports=self._opset)
-        return ReferenceEvaluator(model).run(None, dict(zip(names, given, strict=True)))  # type: ignore[return-value]
 
     def _product(self, node: Any, inputs: Sequence[str], attributes: Mapping[str, Any]) -> None:
         output = node.output[0]
@@ -372,16 +304,16 @@ class Translation:
         summed = [label for label in extent if label not in result and extent[label] > 1]
         read = []
         for labels, name in zip(terms, inputs, strict=True):
-            read.append(f"{self._read(name)}[{_place(labels, self._values[name].shape)}]")
-        place = _place(result, self._values[output].shape)
+            read.append(f"{self._read(name)}[{place_of(labels, self._values[name].shape)}]")
+        place = place_of(result, self._values[output].shape)
         kind, target = self.kind(output), self._new(output)
         start = "0"
         if bias is not None:
             index = self._index(self._values[output].shape, bias, "o")
             scale = "" if beta == 1.0 else f"{beta!r}f * "
             start = f"{scale}{self._read(bias)}[{index}]"
-        loops = "".join(_for(label, extent[label]) for label in outer)
-        inner = "".join(_for(label, extent[label]) for label in summed)
+        loops = "".join(loop_over(label, extent[label]) for label in outer)
+        inner = "".join(loop_over(label, extent[label]) for label in summed)
         self.n_operations += 2 * int(np.prod([extent[label] for label in outer + summed]))
         self._statements.append(
             f"{loops}{{ const int o = {place}; {kind} total = {start}; "
@@ -390,7 +322,7 @@ class Translation:
 
     def _reduce(self, node: Any, inputs: Sequence[str]) -> None:
         n_outer, n = self._last(node, inputs)
-        first, each, after = _REDUCED[node.op_type]
+        first, each, after = REDUCED[node.op_type]
         x = f"({self._read(inputs[0])} + j * {n})"
         fill = {"x": x, "v": f"{x}[k]", "n": str(n)}
         self._rows(
@@ -407,7 +339,7 @@ class Translation:
 
     def _last(self, node: Any, inputs: Sequence[str]) -> tuple[int, int]:
         """How many rows, and how long they are, where an operation goes over the last axes."""
-        value, attributes = self._values[inputs[0]], _attributes(node)
+        value, attributes = self._values[inputs[0]], attributes_of(node)
         axes = attributes.get("axes", attributes.get("axis"))
         if len(inputs) > 1:
             axes = self._values[inputs[1]].ravel().tolist()
@@ -422,19 +354,17 @@ class Translation:
         value = self._values[inputs[0]]
         axis = attributes.get("axis", -1) % value.ndim
         n = int(np.prod(value.shape[axis:]))
-        kind, epsilon = self.kind(inputs[0]), attributes.get("epsilon", 1e-5)
-        root = "sqrtf" if kind == "float" else "sqrt"
         x, y = f"({self._read(inputs[0])} + j * {n})", f"({self._new(node.output[0])} + j * {n})"
-        scaled = f"({x}[k] - mean) * scale * {self._read(inputs[1])}[k]"
-        if len(inputs) > 2:
-            scaled += f" + {self._read(inputs[2])}[k]"
+        weights = [f"{self._read(name)}[k]" for name in inputs[1:]]
         self.n_operations += 8 * value.size
         self._statements.append(
-            f"for (j = 0; j < {value.size // n}; ++j) {{ {kind} mean = 0, scale = 0; "
-            f"for (k = 0; k < {n}; ++k) mean += {x}[k]; mean /= {n}; "
-            f"for (k = 0; k < {n}; ++k) scale += ({x}[k] - mean) * ({x}[k] - mean); "
-            f"scale = 1 / {root}(scale / {n} + ({kind}){epsilon!r}); "
-            f"for (k = 0; k < {n}; ++k) {y}[k] = {scaled}; }}"
+            layer_norm(
+                self.kind(inputs[0]),
+                (value.size // n, n),
+                (x, y),
+                weights,
+                attributes.get("epsilon", 1e-5),
+            )
         )
 
     def _over_last(self, node: Any, inputs: Sequence[str]) -> None:
@@ -442,87 +372,6 @@ class Translation:
         n_outer, n = (
             self._last(node, inputs[:1]) if kind != "ReduceLogSumExp" else self._last(node, inputs)
         )
-        of, x = self.kind(inputs[0]), f"({self._read(inputs[0])} + j * {n})"
-        f, y = "f" if of == "float" else "", self._new(output)
+        x, y = f"({self._read(inputs[0])} + j * {n})", self._new(output)
         self.n_operations += 3 * n_outer * n
-        most = f"{of} most = {x}[0], total = 0; "
-        most += f"for (k = 1; k < {n}; ++k) most = {x}[k] > most ? {x}[k] : most; "
-        summed = f"for (k = 0; k < {n}; ++k) total += exp{f}({x}[k] - most); "
-        if kind == "ArgMax":
-            inside = f"{y}[j] = 0; for (k = 1; k < {n}; ++k) if ({x}[k] > {x}[{y}[j]]) {y}[j] = k; "
-        elif kind == "Softmax":
-            write = f"for (k = 0; k < {n}; ++k) {y}[j * {n} + k] = exp{f}({x}[k] - most) / total; "
-            inside = most + summed + write
-        else:
-            inside = f"{most}{summed}{y}[j] = most + log{f}(total); "
-        self._statements.append(f"for (j = 0; j < {n_outer}; ++j) {{ {inside}}}")
-
-
-def _attributes(node: Any) -> dict[str, Any]:
-    from onnx import helper
-
-    found = {part.name: helper.get_attribute_value(part) for part in node.attribute}
-    return {k: v.decode() if isinstance(v, bytes) else v for k, v in found.items()}
-
-
-def _activation(kind: str, attributes: Mapping[str, Any]) -> str:
-    alpha = f"{attributes.get('alpha', {'LeakyRelu': 0.01, 'HardSigmoid': 0.2}.get(kind, 1.0))!r}"
-    return {
-        "Elu": f"{{0}} > 0 ? {{0}} : {alpha} * expm1{{f}}({{0}})",
-        "Celu": f"{{0}} > 0 ? {{0}} : {alpha} * expm1{{f}}({{0}} / {alpha})",
-        "LeakyRelu": f"{{0}} > 0 ? {{0}} : {alpha} * {{0}}",
-        "Selu": f"{attributes.get('gamma', 1.0507009873554805)!r} * ({{0}} > 0 ? {{0}} : "
-        f"{attributes.get('alpha', 1.6732632423543772)!r} * expm1{{f}}({{0}}))",
-        "HardSigmoid": f"{alpha} * {{0}} + {attributes.get('beta', 0.5)!r} < 0 ? 0 : ({alpha} * "
-        f"{{0}} + {attributes.get('beta', 0.5)!r} > 1 ? 1 : {alpha} * {{0}} + "
-        f"{attributes.get('beta', 0.5)!r})",
-        "Gelu": "0.5f * {0} * (1 + erf{f}({0} * 0.70710678118654752f))"
-        if attributes.get("approximate", "none") == "none"
-        else "0.5f * {0} * (1 + tanh{f}(0.79788456080286536f * {0} * (1 + 0.044715f * {0} * {0})))",
-    }[kind]
-
-
-def _place(labels: str, shape: tuple[int, ...]) -> str:
-    """Of an entry among the numbers of an array, by the indices of its axes."""
-    parts, stride = [], 1
-    for label, n in zip(reversed(labels), reversed(shape), strict=True):
-        if n > 1:
-            parts.append(f"n_{label}" if stride == 1 else f"{stride} * n_{label}")
-        stride *= n
-    return " + ".join(reversed(parts)) or "0"
-
-
-def _for(label: str, n: int) -> str:
-    return f"for (int n_{label} = 0; n_{label} < {n}; ++n_{label}) "
-
-
-def _numpy_type(kind: int) -> Any:
-    from onnx import helper
-
-    return helper.tensor_dtype_to_np_dtype(kind)
-
-
-def _array(kind: str, symbol: str, values: np.ndarray) -> list[str]:
-    write: Callable[[Any], str] = {
-        "float": lambda x: _literal(float(x), 9, "f"),
-        "double": lambda x: _literal(float(x), 17, ""),
-    }.get(kind, lambda x: str(int(x)))
-    numbers = list(map(write, values.ravel()))
-    rows = [numbers[i : i + _PER_LINE] for i in range(0, len(numbers), _PER_LINE)]
-    return [
-        f"static const {kind} {symbol}[{len(numbers)}] = {{",
-        *(f"    {', '.join(row)}," for row in rows),
-        "};",
-    ]
-
-
-def _literal(x: float, digits: int, suffix: str) -> str:
-    """
-    :raises ExportError: for a weight that C has no literal for
-    """
-    if np.isinf(x):
-        return f"{'-' if x < 0 else ''}HUGE_VAL{suffix.upper()}"
-    if np.isnan(x):
-        raise ExportError("A weight of the policy is not a number.")
-    text = f"{x:.{digits}g}"
-    return f"{text if any(c in text for c in '.e') else f'{text}.0'}{suffix}"
+        self._statements.append(over_last(kind, self.kind(inputs[0]), (n_outer, n), (x, y)))

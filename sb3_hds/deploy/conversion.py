@@ -182,3 +182,44 @@ def _double_atan2(y: jax.Array, x: jax.Array) -> jax.Array:
     radius = jnp.sqrt(x * x + y * y)
     away = (y * jnp.cos(rough) - x * jnp.sin(rough)) / jnp.where(radius > 0.0, radius, 1.0)
     return rough + away
+
+
+# --- what ONNX says of its own operations
+
+
+def attributes_of(node: Any) -> dict[str, Any]:
+    """:return: of one operation, by name"""
+    from onnx import helper
+
+    found = {part.name: helper.get_attribute_value(part) for part in node.attribute}
+    return {k: v.decode() if isinstance(v, bytes) else v for k, v in found.items()}
+
+
+def numpy_type(kind: int) -> Any:
+    """:return: the type of NumPy of a type of ONNX"""
+    from onnx import helper
+
+    return helper.tensor_dtype_to_np_dtype(kind)
+
+
+def evaluated(node: Any, given: Sequence[np.ndarray], opset: Sequence[Any]) -> list[Any]:
+    """:return: what an operation does to these arrays, by ONNX's own reference"""
+    from onnx import TensorProto, helper
+    from onnx.reference import ReferenceEvaluator
+
+    names = [f"x{i}" for i in range(len(given))]
+    copy = type(node)()
+    copy.CopyFrom(node)
+    filled = iter(names)
+    inputs = [next(filled) if name else "" for name in node.input]
+    del copy.input[:]
+    copy.input.extend(inputs)
+    kind = TensorProto.INT64
+    graph = helper.make_graph(
+        [copy],
+        "one",
+        [helper.make_tensor_value_info(name, kind, None) for name in names],
+        [helper.make_tensor_value_info(name, kind, None) for name in node.output],
+    )
+    model = helper.make_model(graph, opset_imports=opset)
+    return ReferenceEvaluator(model).run(None, dict(zip(names, given, strict=True)))  # type: ignore[return-value]

@@ -7,8 +7,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_hds.deploy.conversion import Port
-from sb3_hds.deploy.normalization import WHOLE, Normalization
-from sb3_hds.deploy.ports import parts_of
+from sb3_hds.deploy.observations import WHOLE, Normalization, parts_of
 
 
 class _Deterministic(th.nn.Module):

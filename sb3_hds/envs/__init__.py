@@ -4,8 +4,9 @@ Environments made of twins, and the way back: the twin that mirrors an environme
 Names are imported on first use, so that registering our ids costs neither jax nor torch.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from sb3_hds.lazy import lazily
 
 if TYPE_CHECKING:
     from sb3_hds.envs.constant_reward import ConstantReward
@@ -33,26 +34,18 @@ __all__ = [
     "verify_mirror",
 ]
 
-_MODULES = {
-    "ConstantReward": "constant_reward",
-    "ElasticQuadruped": "elastic_quadruped",
-    "InvertedPendulumFriction": "inverted_pendulum_friction",
-    "PendulumReal": "pendulum_real",
-    "TwinEnv": "twin_env",
-    "TwinVecEnv": "twin_vec_env",
-    "check_mirrors": "mirror",
-    "register_environments": "registration",
-    "true_twin": "ground_truth",
-    "twin_of": "mirror",
-    "verify_mirror": "verify",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+lazily(
+    __name__,
+    {
+        "constant_reward": ("ConstantReward",),
+        "elastic_quadruped": ("ElasticQuadruped",),
+        "ground_truth": ("true_twin",),
+        "inverted_pendulum_friction": ("InvertedPendulumFriction",),
+        "mirror": ("check_mirrors", "twin_of"),
+        "pendulum_real": ("PendulumReal",),
+        "registration": ("register_environments",),
+        "twin_env": ("TwinEnv",),
+        "twin_vec_env": ("TwinVecEnv",),
+        "verify": ("verify_mirror",),
+    },
+)

@@ -25,11 +25,8 @@ __all__ = [
 lazily(
     __name__,
     {
-        "PERTURBATIONS": "sb3_hds.experiments.robustness",
-        "PolicyGain": "sb3_hds.experiments.policy_gain",
-        "Robustness": "sb3_hds.experiments.robustness",
-        "measure_policy_gain": "sb3_hds.experiments.policy_gain",
-        "measure_robustness": "sb3_hds.experiments.robustness",
-        "returns_of": "sb3_hds.experiments.returns",
+        "policy_gain": ("PolicyGain", "measure_policy_gain"),
+        "returns": ("returns_of",),
+        "robustness": ("PERTURBATIONS", "Robustness", "measure_robustness"),
     },
 )

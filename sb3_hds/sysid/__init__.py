@@ -7,7 +7,8 @@ from sb3_hds.sysid.diagnosis.diagnose import diagnose
 from sb3_hds.sysid.estimation.calibrate import calibrate
 from sb3_hds.sysid.estimation.residual_force import Residual, fit_residual
 from sb3_hds.sysid.estimation.results import Estimate, Fit
-from sb3_hds.sysid.reporting.diagnosis import Diagnosis, Finding
+from sb3_hds.sysid.reporting.diagnosis import Diagnosis
+from sb3_hds.sysid.reporting.finding import Finding
 
 __all__ = [
     "Diagnosis",

@@ -25,8 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 import torch as th
 
-from sb3_hds.algos.nets.activations import activation_name
-from sb3_hds.algos.nets.optimizers import optimizer_name
+from sb3_hds.algos.nets.options import activation_name, optimizer_name
 
 
 def write_whole(

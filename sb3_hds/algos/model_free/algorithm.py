@@ -24,11 +24,10 @@ from stable_baselines3.her import HerReplayBuffer
 
 from sb3_hds.algos.base.algorithm import TensorAlgorithm
 from sb3_hds.algos.base.config import Config, OffPolicyConfig, Rate, between, is_count, schedule_of
-from sb3_hds.algos.model_free.policy import LearningPolicy
-from sb3_hds.algos.model_free.replay import Source
-from sb3_hds.algos.nets.activations import finite_leaves
+from sb3_hds.algos.base.policy import LearningPolicy
+from sb3_hds.algos.model_free.update import Source
 from sb3_hds.algos.nets.observations import check_actions, check_observations
-from sb3_hds.algos.nets.optimizers import TrainState
+from sb3_hds.algos.nets.options import TrainState, finite_leaves
 from sb3_hds.errors import DivergedError, EnvironmentMismatchError
 
 # What is logged of updates of the actor, which not every call of ``train`` makes.
@@ -116,7 +115,13 @@ class ModelFreeConfig(OffPolicyConfig):
 
 
 class ModelFreeAlgorithm(TensorAlgorithm):
-    """Abstract: off-policy learning from transitions."""
+    """
+    Abstract: off-policy learning from transitions.
+
+    SB3's ``learn`` alternates between ``collect_rollouts``, which fills the replay buffer, and
+    :meth:`train`, which calls :meth:`_updates`: it draws batches (``batches_of``) and hands them to
+    the compiled update of the family (``sac/update.py``, ``td7/update.py``).
+    """
 
     #: steps of ``learn()`` without a number
     default_timesteps: ClassVar[int] = 20_000

@@ -13,7 +13,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sb3_hds.algos.nets.dense import Last, product
+from sb3_hds.algos.nets.mlp import Last, product
 
 _EPSILON = 1e-6
 _LOG_SQRT_TAU = 0.5 * math.log(2.0 * math.pi)

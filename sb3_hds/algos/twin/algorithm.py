@@ -18,33 +18,28 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import (
-    GymEnv,
-    MaybeCallback,
-    RolloutReturn,
-    TrainFreq,
-)
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, TrainFreq
 
 from sb3_hds.algos.base.algorithm import TensorAlgorithm
 from sb3_hds.algos.base.construct import callbacks_of, jax_device
 from sb3_hds.algos.twin.config import TwinConfig, epoch_config, hyperparams
-from sb3_hds.algos.twin.epoch import EpochMetrics, epoch, epoch_log, twin_steps_per_epoch
+from sb3_hds.algos.twin.epoch import EpochMetrics, epoch, epoch_log, programs, twin_steps_per_epoch
 from sb3_hds.algos.twin.model import (
     Tensors,
     check_reward,
     check_twin_observes,
+    prepare_statistics,
     required,
     twin_from_spec,
     twin_given,
+    view_of,
 )
-from sb3_hds.algos.twin.normalization import prepare_statistics, view_of
 from sb3_hds.algos.twin.policy import TwinPolicy, all_finite
 from sb3_hds.algos.twin.pretraining import Pretraining, beside, meanwhile, nothing
-from sb3_hds.algos.twin.selection import (
+from sb3_hds.algos.twin.regression import (
     choose_policy,
     comparison,
     is_compared,
-    programs,
     twin_steps_per_comparison,
 )
 from sb3_hds.algos.twin.state import (
@@ -67,7 +62,14 @@ _FEWEST_EPOCHS = 20
 
 
 class TwinAlgorithm(TensorAlgorithm):
-    """Abstract: what PODS and HDS share."""
+    """
+    Abstract: what PODS and HDS share.
+
+    ``learn`` runs the planning epochs of the pretraining (``pretraining.py``), then SB3 alternates
+    between real steps and :meth:`train`. Both call :meth:`run_epoch`: ``epoch`` (``epoch.py``)
+    plans in the twin and regresses the policy on the plans, ``choose_policy`` (``regression.py``)
+    decides which policy acts.
+    """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": TwinPolicy}
     policy_family = TwinPolicy
@@ -82,17 +84,21 @@ class TwinAlgorithm(TensorAlgorithm):
         config = dataclasses.replace(config, twin=twin_given(config.twin))
         super().construct(config, sde_support=False, **more)
         self.twin_spec: dict[str, Any] | None = None
+        # Running means over epochs of the pretraining, which ends where plans gain nothing more.
         self.recent_gain, self.recent_return = 0.0, 0.0
-        self.unstored_step: dict[str, Any] | None = None
-        self.real_timesteps = 0
-        self.learned_force = Tensors(self)
         self.n_pretrained = 0
-        self.twin_timesteps = 0
+        # A step that callbacks have seen and the replay buffer does not have yet.
+        self.unstored_step: dict[str, Any] | None = None
+        self.real_timesteps, self.twin_timesteps = 0, 0
+        self.learned_force = Tensors(self)
         self._n_updates = 0
+        # Of this call of ``learn``.
         self._epochs_planned, self._epochs_done = 0, 0
         self._workspace: Workspace | None = None
+        # What programs are compiled for, and the comparison of policies while it compiles.
         self._compiled: EpochConfig | None = None
         self._comparison: Callable[[], Any] | None = None
+        # Whether a callback ended the training, and what is called while programs compile.
         self.stopped = False
         self.poll: Callable[[], None] = nothing
 

@@ -2,11 +2,10 @@
 One planning epoch as a pure function: roll the policy out in the twin, improve the plans, keep what
 is better, regress the policy on it, move on.
 
-The stateful shell around it is ``twin_algorithm.py``. Nothing here knows an environment's name.
+The stateful shell around it is ``algorithm.py``. Nothing here knows an environment's name.
 """
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,8 +16,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.algos.twin.networks import output
 from sb3_hds.algos.twin.regression import (
-    regress_policy,
-    regress_value,
+    learn_from_plans,
+    regressions,
     remember,
     rescale,
     samples_of,
@@ -164,74 +163,6 @@ def plan_ahead(
     progress = state.progress._replace(gain=_mean(gain, finite), key=jax.random.key_data(key))
     workspace = state.workspace._replace(starts=moved, ages=ages)
     return state._replace(progress=progress, workspace=workspace), outcome
-
-
-def learn_from_plans(
-    config: EpochConfig, state: EpochState, hyper: Hyperparams
-) -> tuple[EpochState, tuple[Any, Any, Any]]:
-    """
-    The second half of an epoch: the regressions. That of the policy and that of the value know
-    nothing of each other, and with small networks one of them keeps little more than one core busy.
-
-    :return: the state; the mean losses of policy and value, and the mean norm of the policy's
-        gradient before it is clipped
-    """
-    learning = [partial(each, config, state, hyper) for each in regressions(config)]
-    of_policy, *of_value = side_by_side(learning)
-    (actor, optimizer, (loss, norm)), average, n_epochs, key = of_policy
-    nets = state.networks._replace(actor=actor, average=average)
-    progress = state.progress._replace(actor_optimizer=optimizer, n_epochs=n_epochs, key=key)
-    value_loss: Any = 0.0
-    if of_value:
-        value, optimizer, value_loss = of_value[0]
-        nets = nets._replace(value=value)
-        progress = progress._replace(value_optimizer=optimizer)
-    return state._replace(networks=nets, progress=progress), (loss, value_loss, norm)
-
-
-def regressions(config: EpochConfig) -> list[Callable[..., Any]]:
-    """:return: the programs of the second half of an epoch"""
-    return [learn_policy, *([learn_value] if config.terminal_value else [])]
-
-
-@partial(jax.jit, static_argnums=0)
-def learn_policy(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> tuple[Any, ...]:
-    """
-    :return: see :func:`~sb3_hds.algos.twin.regression.regress_policy`; the average of policies, the
-        number of epochs and the random key after this one
-    """
-    nets, progress = state.networks, state.progress
-    key, k_regress = _next_keys(state)
-    actor, optimizer, (loss, norm) = regress_policy(config, state, hyper, k_regress)
-    decay = jnp.where(progress.n_epochs > 0, hyper.averaging, 0.0)
-    average = jax.tree.map(lambda a, new: decay * a + (1.0 - decay) * new, nets.average, actor)
-    learned = (actor, optimizer, (loss, norm))
-    return learned, average, progress.n_epochs + 1, jax.random.key_data(key)
-
-
-@partial(jax.jit, static_argnums=0)
-def learn_value(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> tuple[Any, ...]:
-    """:return: the value's parameters, the state of Adam, and the mean loss"""
-    value, optimizer, losses = regress_value(config, state, hyper, _next_keys(state)[1])
-    return value, optimizer, losses[0]
-
-
-def side_by_side(works: Sequence[Callable[[], Any]]) -> list[Any]:
-    """
-    :param works: change nothing; the first is done in this thread
-    :return: what they returned
-    """
-    first, *others = works
-    if not others:
-        return [first()]
-    with ThreadPoolExecutor(len(others)) as pool:
-        beside = [pool.submit(other) for other in others]
-        return [first(), *(each.result() for each in beside)]
-
-
-def _next_keys(state: EpochState) -> jax.Array:
-    """:return: the random key after this half of the epoch, and the one for it"""
-    return jax.random.split(jax.random.wrap_key_data(state.progress.key, impl=GENERATOR))
 
 
 def control_of(config: EpochConfig, state: EpochState, hyper: Hyperparams, obs: Obs) -> Control:
@@ -431,3 +362,9 @@ def _where(condition, new, old):
     """Choose row by row."""
     rows = lambda leaf: condition.reshape(-1, *[1] * (leaf.ndim - 1))  # noqa: E731
     return jax.tree.map(lambda a, b: jnp.where(rows(a), a, b), new, old)
+
+
+def programs(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> list[Callable[[], Any]]:
+    """:return: the programs of an epoch; running them once, in parallel, compiles them"""
+    used = [plan_ahead, *regressions(config)]
+    return [partial(program, config, state, hyper) for program in used]

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sb3_hds.algos.nets.activations import Activation
+from sb3_hds.algos.nets.options import Activation
 
 # Width around zero where the value is linear rather than a square root, in units of the scaled
 # reward.

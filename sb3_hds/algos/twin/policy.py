@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from sb3_hds.algos.base.config import takes
 from sb3_hds.algos.base.policy import PolicyConfig, TensorPolicy, TrainingTensors
-from sb3_hds.algos.nets.activations import Activation, activation, finite_leaves, widths_of
+from sb3_hds.algos.nets.options import Activation, activation, finite_leaves, widths_of
 from sb3_hds.algos.twin.networks import Actor, Value
 from sb3_hds.algos.twin.state import Networks, Progress, fresh_networks
 from sb3_hds.core.numerics.compilation import GENERATOR

@@ -1,16 +1,31 @@
-"""Learning from plans: the samples that they give, and the regressions on them."""
+"""Learning from plans: regress policy and value on them, and choose the policy that acts."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sb3_hds.algos.twin.networks import output, squash, value_of, with_input_scales
-from sb3_hds.algos.twin.state import EpochConfig, EpochState, Hyperparams, Samples, clipped_adam
-from sb3_hds.planning import Plan, Problem
+from sb3_hds.algos.twin.state import (
+    EpochConfig,
+    EpochState,
+    Hyperparams,
+    Samples,
+    View,
+    clipped_adam,
+    for_each,
+    longest_episode,
+    resets,
+)
+from sb3_hds.core import Twin
+from sb3_hds.core.numerics.compilation import GENERATOR, QUICK_COMPILATION
+from sb3_hds.planning import Plan, Problem, follow
 
 # Where the absolute error of the regression turns into a squared one, in units of the control
 # scale.
@@ -21,6 +36,9 @@ _FORGETTING = 3.0
 _LEAST_SPREAD, _LEAST_EFFORT = 1e-6, 1e-3
 # No sample counts more than this many times the mean.
 _LARGEST_WEIGHT = 20.0
+# Simulated steps of a policy in a comparison, and the numbers of episodes between which they make.
+_STEPS_COMPARED = 64_000
+_FEWEST, _MOST = 32, 256
 
 
 def samples_of(
@@ -206,3 +224,159 @@ def _weight(quantity: jax.Array, share: float | jax.Array) -> jax.Array:
     finite = jnp.where(jnp.isfinite(quantity), quantity, 0.0)
     relative = finite / (jnp.mean(finite) + 1e-6)
     return 1.0 - share + share * jnp.minimum(relative, _LARGEST_WEIGHT)
+
+
+def learn_from_plans(
+    config: EpochConfig, state: EpochState, hyper: Hyperparams
+) -> tuple[EpochState, tuple[Any, Any, Any]]:
+    """
+    The second half of an epoch: the regressions. That of the policy and that of the value know
+    nothing of each other, and with small networks one of them keeps little more than one core busy.
+
+    :return: the state; the mean losses of policy and value, and the mean norm of the policy's
+        gradient before it is clipped
+    """
+    learning = [partial(each, config, state, hyper) for each in regressions(config)]
+    of_policy, *of_value = side_by_side(learning)
+    (actor, optimizer, (loss, norm)), average, n_epochs, key = of_policy
+    nets = state.networks._replace(actor=actor, average=average)
+    progress = state.progress._replace(actor_optimizer=optimizer, n_epochs=n_epochs, key=key)
+    value_loss: Any = 0.0
+    if of_value:
+        value, optimizer, value_loss = of_value[0]
+        nets = nets._replace(value=value)
+        progress = progress._replace(value_optimizer=optimizer)
+    return state._replace(networks=nets, progress=progress), (loss, value_loss, norm)
+
+
+def regressions(config: EpochConfig) -> list[Callable[..., Any]]:
+    """:return: the programs of the second half of an epoch"""
+    return [learn_policy, *([learn_value] if config.terminal_value else [])]
+
+
+@partial(jax.jit, static_argnums=0)
+def learn_policy(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> tuple[Any, ...]:
+    """
+    :return: see :func:`~sb3_hds.algos.twin.regression.regress_policy`; the average of policies, the
+        number of epochs and the random key after this one
+    """
+    nets, progress = state.networks, state.progress
+    key, k_regress = _next_keys(state)
+    actor, optimizer, (loss, norm) = regress_policy(config, state, hyper, k_regress)
+    decay = jnp.where(progress.n_epochs > 0, hyper.averaging, 0.0)
+    average = jax.tree.map(lambda a, new: decay * a + (1.0 - decay) * new, nets.average, actor)
+    learned = (actor, optimizer, (loss, norm))
+    return learned, average, progress.n_epochs + 1, jax.random.key_data(key)
+
+
+@partial(jax.jit, static_argnums=0)
+def learn_value(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> tuple[Any, ...]:
+    """:return: the value's parameters, the state of Adam, and the mean loss"""
+    value, optimizer, losses = regress_value(config, state, hyper, _next_keys(state)[1])
+    return value, optimizer, losses[0]
+
+
+def side_by_side(works: Sequence[Callable[[], Any]]) -> list[Any]:
+    """
+    :param works: change nothing; the first is done in this thread
+    :return: what they returned
+    """
+    first, *others = works
+    if not others:
+        return [first()]
+    with ThreadPoolExecutor(len(others)) as pool:
+        beside = [pool.submit(other) for other in others]
+        return [first(), *(each.result() for each in beside)]
+
+
+def _next_keys(state: EpochState) -> jax.Array:
+    """:return: the random key after this half of the epoch, and the one for it"""
+    return jax.random.split(jax.random.wrap_key_data(state.progress.key, impl=GENERATOR))
+
+
+def choose_policy(
+    config: EpochConfig, state: EpochState, hyper: Hyperparams, every: int, due: bool
+) -> tuple[EpochState, Float[np.ndarray, " 2"] | None]:
+    """
+    After an epoch: the average acts, until it was first compared; then the better one does.
+
+    :param every: epochs from one comparison to the next; 0: never
+    :param due: compare after this epoch in any case, unless never
+    :return: the state, and the returns of a comparison, see :func:`keep_better`
+    """
+    n_epochs = int(state.progress.n_epochs)
+    if is_compared(n_epochs, every, due):
+        return keep_better(config, state, hyper)
+    if every and n_epochs > every:
+        return state, None
+    nets = state.networks
+    acting = nets._replace(acting=nets.average, acting_inside=nets.inside)
+    return state._replace(networks=acting), None
+
+
+def is_compared(n_epochs: int, every: int, due: bool) -> bool:
+    """:return: whether policies are compared after this number of epochs"""
+    return every > 0 and (due or n_epochs % every == 0)
+
+
+def comparison(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> Callable[[], Any]:
+    """:return: the program of a comparison; running it once compiles it"""
+    nets = state.networks
+    given = (state.progress.key, nets.average, nets.inside)
+    return partial(mean_return, config, hyper, *given)
+
+
+def twin_steps_per_comparison(config: EpochConfig) -> int:
+    """:return: simulated steps of a comparison, if no episode ends early"""
+    return 2 * _n_starts(config.twin) * longest_episode(config.twin)
+
+
+def keep_better(
+    config: EpochConfig, state: EpochState, hyper: Hyperparams
+) -> tuple[EpochState, Float[np.ndarray, " 2"]]:
+    """
+    Let the average and the policy that acts go through whole episodes of the twin, from the same
+    start states, and let the better one act: where a system falls over, a single epoch may spoil
+    what took many to learn.
+
+    :return: the state, and the mean return of both, in planning rewards
+    """
+    nets, progress = state.networks, state.progress
+    pairs = ((nets.average, nets.inside), (nets.acting, nets.acting_inside))
+    going = [partial(mean_return, config, hyper, progress.key, *pair) for pair in pairs]
+    (of_average, key), (of_acting, _) = side_by_side(going)
+    returns = np.array([float(of_average), float(of_acting)], np.float32)
+    acting, inside = pairs[0] if returns[0] > returns[1] else pairs[1]
+    return state._replace(
+        networks=nets._replace(acting=acting, acting_inside=inside),
+        progress=progress._replace(key=key),
+    ), returns
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK_COMPILATION)
+def mean_return(
+    config: EpochConfig,
+    hyper: Hyperparams,
+    key: jax.Array,
+    actor: Mapping[str, Any],
+    inside: View,
+) -> tuple[jax.Array, jax.Array]:
+    """
+    :param key: random, as integers
+    :return: mean return of a policy over whole episodes of the twin, in planning rewards; the key
+        after that
+    """
+    after, k_starts = jax.random.split(jax.random.wrap_key_data(key, impl=GENERATOR))
+    twin = config.twin
+    problem = Problem(twin, hyper.params)
+    starts = resets(twin, hyper.params, k_starts, _n_starts(twin))
+    length = longest_episode(twin)
+    spread = np.linspace(0, config.n_rollouts - 1, _n_starts(twin)).round().astype(int)
+    varied = jax.tree.map(lambda leaf: leaf[spread], hyper.varied)
+    policy = lambda obs: output(config.actor, actor, inside(hyper.view(obs)))  # noqa: E731
+    value = lambda s, own: follow(problem.with_params(own), s, policy, length).value  # noqa: E731
+    return jnp.mean(for_each(value, starts, varied)), jax.random.key_data(after)
+
+
+def _n_starts(twin: Twin) -> int:
+    return int(np.clip(_STEPS_COMPARED // longest_episode(twin), _FEWEST, _MOST))

@@ -20,7 +20,7 @@ __all__ = [
 lazily(
     __name__,
     {
-        "Trajectories": "sb3_hds.core.trajectories.trajectories",
-        "read_logs_by": "sb3_hds.core.trajectories.log_reader",
+        "log_reader": ("read_logs_by",),
+        "trajectories": ("Trajectories",),
     },
 )

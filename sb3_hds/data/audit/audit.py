@@ -17,13 +17,11 @@ from sb3_hds.data.audit.limits import reached_limits
 from sb3_hds.data.audit.outliers import Outliers, glitches, outliers
 from sb3_hds.data.audit.results import Audit, ChannelSummary
 from sb3_hds.data.audit.stretches import Stretch, joined, stretches_of
-from sb3_hds.data.audit.timing import (
-    timing,
-)
+from sb3_hds.data.audit.timing import timing
 from sb3_hds.data.audit.units import mistaken_units, other_units, swapped
 from sb3_hds.data.audit.velocity import matches_of, velocity_shifts
 from sb3_hds.data.resampling.report import Reading
-from sb3_hds.data.resampling.resolution import resolutions
+from sb3_hds.data.resampling.values import resolutions
 from sb3_hds.errors import TrajectoryError
 
 

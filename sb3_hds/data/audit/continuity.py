@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_hds.data.audit.finding import Finding, Place, listed, percent
 from sb3_hds.data.audit.stretches import Stretch, joined, runs
-from sb3_hds.data.resampling.angles import whole_turns
+from sb3_hds.data.resampling.values import whole_turns
 
 _STEPS = 8.0  # smallest steps per sample: slower motion repeats values because of quantisation
 _ROUGH = 3.0  # typical changes of the step from sample to sample: slower motion does so by chance

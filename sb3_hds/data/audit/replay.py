@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.core.twin import State, Twin
-from sb3_hds.data.resampling.angles import unwrapped
+from sb3_hds.data.resampling.values import unwrapped
 
 _SECONDS, _SHORTEST, _LONGEST = 0.3, 6, 60  # of a stretch, within these numbers of steps
 _MOST = 64  # stretches

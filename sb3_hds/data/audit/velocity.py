@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.data.audit.finding import Finding, recordings
 from sb3_hds.data.audit.stretches import all_samples
-from sb3_hds.data.resampling.angles import unwrapped
+from sb3_hds.data.resampling.values import unwrapped
 
 _REACH = 0.05  # [s] longest shift that is looked for, but at least _FEWEST samples
 _FEWEST, _MOST = 8, 100  # samples

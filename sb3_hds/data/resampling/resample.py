@@ -9,7 +9,6 @@ import numpy as np
 
 from sb3_hds.core.trajectories.episodes import same_interval
 from sb3_hds.data.columns import Columns
-from sb3_hds.data.resampling.angles import whole_turns
 from sb3_hds.data.resampling.clock import (
     ON_GRID,
     Clock,
@@ -21,9 +20,9 @@ from sb3_hds.data.resampling.clock import (
     typical_interval,
 )
 from sb3_hds.data.resampling.report import Part, Reading, Sampling
-from sb3_hds.data.resampling.resolution import resolutions
 from sb3_hds.data.resampling.rows import Rows
 from sb3_hds.data.resampling.stamps import check_resolved, values_follow_stamps, written_twice
+from sb3_hds.data.resampling.values import resolutions, whole_turns
 from sb3_hds.errors import TrajectoryError
 
 _UNEVEN = 0.1  # of the median interval

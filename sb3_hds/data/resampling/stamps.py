@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Bool
 
-from sb3_hds.data.resampling.angles import unwrapped
 from sb3_hds.data.resampling.clock import Clock, shares_stamps
 from sb3_hds.data.resampling.rows import Rows
+from sb3_hds.data.resampling.values import unwrapped
 from sb3_hds.errors import TrajectoryError
 
 _NEIGHBOURS = 5  # rows before and after a repeated stamp that say whether there is a row too many

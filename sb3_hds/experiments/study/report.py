@@ -15,7 +15,8 @@ from jaxtyping import Float
 
 from sb3_hds.core.trajectories.storage import write_bytes
 from sb3_hds.errors import StudyError
-from sb3_hds.experiments.study.runner import CLOCK, MARK, Run, Study, is_complete
+from sb3_hds.experiments.study.definition import Run, Study
+from sb3_hds.experiments.study.runner import CLOCK, MARK, is_complete
 
 _REPS = 2_000
 _LEVEL = 0.95

@@ -9,12 +9,13 @@ from jaxtyping import Float
 
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.sysid.belief.answers import Answer, Answers, everything_open, factor_of
+from sb3_hds.sysid.comparison.halves import Base, Half
 from sb3_hds.sysid.comparison.held_out import effective_size
-from sb3_hds.sysid.comparison.search import Base, Half, Search
+from sb3_hds.sysid.comparison.search import Search
 from sb3_hds.sysid.diagnosis.findings import Accepted
 from sb3_hds.sysid.equation.plausibility import rarity
+from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point
-from sb3_hds.sysid.estimation.hypotheses import Candidate
 
 #: most answers that are kept, the likeliest ones
 MOST = 6
@@ -139,7 +140,7 @@ def _typical(search: Search, theta: np.ndarray) -> np.ndarray:
 
 def joint_covariance(half: Half, point: Point, free: Sequence[int]) -> np.ndarray:
     """
-    As :func:`~sb3_hds.sysid.diagnosis.account.standard_errors`: the jackknife over units, one
+    As :func:`~sb3_hds.sysid.comparison.inference.standard_errors`: the jackknife over units, one
     Newton step for each that is left out.
 
     :param free: indices of what was fitted

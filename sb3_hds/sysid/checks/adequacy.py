@@ -1,4 +1,4 @@
-"""How far a model is from what was measured: in the unit of each channel, and beside its noise."""
+"""Model adequacy: prediction errors of each channel, in its unit and relative to its noise."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -19,12 +19,12 @@ _NORMAL = 1.4826
 
 class Distance(NamedTuple):
     """
-    How far predictions of a channel are off, on windows that nothing was fitted to.
+    Prediction error of a channel on held-out windows.
 
     :param channel: name and unit
     :param error: root mean square [channel's unit]
     :param noise: of the sensor, estimated from fourth differences of its samples, likewise
-    :param spread: standard deviation of what was measured, likewise
+    :param spread: standard deviation of the measurements, likewise
     """
 
     channel: Channel
@@ -67,7 +67,7 @@ def distances(
     """
     :param raw: simulated minus measured
     :param noise: of each channel
-    :param spread: of each channel
+    :param spread: standard deviation of each channel
     """
     errors = np.sqrt(np.mean(np.minimum(np.nan_to_num(raw**2, nan=np.inf), 1e6), axis=(0, 1)))
     return tuple(
@@ -77,7 +77,9 @@ def distances(
 
 
 def far_in_words(found: Sequence[Distance]) -> str:
-    """:return: a sentence on the channels that are not near; empty if all are"""
+    """
+    :return: a sentence on the channels that are not predicted to near the noise; empty if all are
+    """
     far = [one for one in found if not one.near]
     if not far:
         return ""

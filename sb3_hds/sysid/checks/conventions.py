@@ -14,7 +14,7 @@ from sb3_hds.core.twin import plant_of
 from sb3_hds.effects import ConstantForce, CoulombFriction, ViscousFriction
 from sb3_hds.sysid.equation.columns import equation
 from sb3_hds.sysid.equation.motion import Motion, Moved
-from sb3_hds.sysid.equation.problem import problem
+from sb3_hds.sysid.equation.screening import problem
 from sb3_hds.sysid.equation.weak_form import grams, weak_rows
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 
@@ -31,8 +31,8 @@ _FINE = 2.0
 
 class Convention(NamedTuple):
     """
-    :param key: what kind it is, and where: ``"direction.hinge"``
-    :param words: what is the case, and what to write
+    :param key: kind and place: ``"direction.hinge"``
+    :param words: sentences on what differs, and on what to write into the map of columns
     :param before: what the equation of motion leaves of the log as it is, in units of the noise
     :param after: the same with the convention changed
     """
@@ -55,7 +55,7 @@ class _Change(NamedTuple):
 
 def other_convention(twin: Twin, motion: Motion, nuisances: Sequence[str]) -> Convention | None:
     """
-    :param twin: as it is believed
+    :param twin: nominal model
     :param motion: as measured
     :param nuisances: parameters that are refitted
     :return: the one change of the whole log under which the equation of motion, with friction and

@@ -1,4 +1,4 @@
-"""Whether the size of a cause is the same wherever, whenever and however fast the system moves."""
+"""Parameter-stability test: is a parameter the same at every position, speed and time?"""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -20,9 +20,9 @@ _RANK, _LEAST_OF_OTHERS = 1e-10, 1e-9
 
 class Change(NamedTuple):
     """
-    :param goes_with: quantity with which the size of a cause changes
-    :param p_value: chance of that if it were constant
-    :param gain: by which the cost of the windows falls where it may change
+    :param goes_with: quantity on which the parameter depends
+    :param p_value: p-value of the hypothesis that it is constant
+    :param gain: decrease of the cost (minus log likelihood) if it may change
     """
 
     goes_with: str
@@ -49,7 +49,7 @@ def change(
     :param missing: of the same windows
     :param own: indices of the parameters of the cause
     :param free: indices of all that was fitted, these among them
-    :return: what the cause changes with most, if it changes with anything
+    :return: the quantity on which it depends most; None if the parameters are constant
     """
     slopes = short.evidence.slopes(short.point, free)
     quantities = list(_quantities(missing))

@@ -1,4 +1,4 @@
-"""Which of two models predicts better: units of evidence are recordings, not samples."""
+"""Comparison of two models on held-out windows, clustered by recording."""
 
 from typing import Any, NamedTuple
 
@@ -16,17 +16,24 @@ _MOST_RATIO = 1e6
 _STRICTER = 25.0
 # Errors beyond this, in units of the noise, say no more.
 _MOST_ERROR = 1e4
+# What confirms a candidate: by which share the mean square error of held-out recordings falls, at
+# which level, and by how much the information criterion of the others.
+LEAST_GAIN, LEVEL, LEAST_BIC = 0.05, 0.025, 6.0
+# Another candidate belongs into the set unless it is worse than the best at this level.
+_LEVEL_OF_SET = 0.05
+# Errors that differ by a smaller share are the same, however surely they differ.
+_SAME = 0.01
 
 
 class Comparison(NamedTuple):
     """
     One model against another on the same windows.
 
-    :param gain: share by which the mean square error is lower, by the geometric mean of the units
-    :param p_value: one-sided: chance of such a gain if there were none
+    :param gain: relative decrease of the mean square error, geometric mean over clusters
+    :param p_value: one-sided p-value of the hypothesis that there is no gain
     :param low: lower end of the 90 % interval of the gain
     :param high: upper end
-    :param n_units: pieces of evidence
+    :param n_units: clusters
     """
 
     gain: float
@@ -38,7 +45,7 @@ class Comparison(NamedTuple):
 
 class Split(NamedTuple):
     """
-    :param unit: piece of evidence of each window, -1 for padding, shape ``(n,)``
+    :param unit: cluster of each window, -1 for padding, shape ``(n,)``
     :param confirm: whether the window is kept from selection, shape ``(n,)``
     """
 
@@ -50,12 +57,12 @@ def compare(
     new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], unit: Int[np.ndarray, " n"]
 ) -> Comparison:
     """
-    A t test on the logarithms of error ratios, one for each unit: ratios of single windows, or
+    A t test on the logarithms of error ratios, one for each cluster: ratios of single windows, or
     differences instead of ratios, have tails too heavy for it.
 
     :param new: mean square error of each window
     :param old: the same of the model that is to be beaten
-    :param unit: piece of evidence of each window; negative: does not count
+    :param unit: cluster of each window; negative: does not count
     """
     labels = np.unique(unit[unit >= 0])
     sums = [[errors[unit == label].sum() for label in labels] for errors in (new, old)]
@@ -75,10 +82,10 @@ def confirm(
     new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], unit: Int[np.ndarray, " n"]
 ) -> Comparison:
     """
-    As ``compare``, with a second chance. Four or five units of which some gain a little and others
-    nearly all are too few for a t test, though every window speaks for the new model: so a signed
-    rank test on windows, which has no tails to fear, counts too, at a much stricter level, because
-    windows of one recording are not independent.
+    As ``compare``, with a second chance. Four or five clusters of which some gain a little and
+    others nearly all are too few for a t test, though every window speaks for the new model: so a
+    signed rank test on windows, which has no tails to fear, counts too, at a much stricter level,
+    because windows of one recording are not independent.
     """
     verdict = compare(new, old, unit)
     before, after = (np.maximum(errors[unit >= 0], 1e-300) for errors in (old, new))
@@ -95,14 +102,15 @@ def by_scores(
     unit: Int[np.ndarray, " n"],
 ) -> float:
     r"""
-    Whether errors of a model lean to the side on which another one predicts otherwise.
+    One-sided score test: are the residuals of a model correlated with the change that another one
+    predicts?
 
     With errors :math:`r` of the old and :math:`r'` of the new model, and :math:`\delta = r - r'`,
     the sum of :math:`\delta \cdot r` has the mean zero if the old model is right, whatever the new
-    one is, as long as neither has seen these data. Its variance is told by the same sum with
-    :math:`r'`, which the effect is not in: so recordings that show an effect strongly and others
-    that show it weakly are no sign of chance, as they are for a t test on gains. What errors of one
-    recording have in common counts once.
+    one is, as long as neither has seen these data. Its variance is estimated by the same sum with
+    :math:`r'`, which the effect is not in. So recordings that show an effect strongly and others
+    that show it weakly do not raise the p-value, as they would in a t test on gains. Errors are
+    clustered by recording.
 
     Source: a score (Lagrange multiplier) test, its covariance clustered and taken under the
     alternative; Cameron and Miller, *A practitioner's guide to cluster-robust inference*, Journal
@@ -110,7 +118,7 @@ def by_scores(
 
     :param new: errors of windows in units of the noise
     :param old: the same of the model that is to be beaten
-    :param unit: piece of evidence of each window; negative: does not count
+    :param unit: cluster of each window; negative: does not count
     :return: one-sided p-value
     """
     labels = np.unique(unit[unit >= 0])
@@ -130,9 +138,9 @@ def by_scores(
 
 def split(data: Trajectories, origin: Int[np.ndarray, " n"], seed: int) -> Split:
     """
-    Half of the units to select on, half to confirm. Where there are several recordings of each
+    Half of the clusters to select on, half to confirm. Where there are several recordings of each
     condition, both halves see all conditions; where recordings are few, stretches of them are the
-    units.
+    clusters.
 
     :param origin: recording of each window, -1 for padding, in order of time
     """
@@ -156,7 +164,7 @@ def split(data: Trajectories, origin: Int[np.ndarray, " n"], seed: int) -> Split
 
 
 def effective_size(raw: Float[np.ndarray, "n rows obs"]) -> float:
-    """:return: how many independent numbers these errors are worth, by their lag-one correlation"""
+    """:return: effective sample size of these errors, by their lag-one autocorrelation"""
     before, after = raw[:, :-1], raw[:, 1:]
     power = np.sum(raw**2, (0, 1)) + 1e-300
     correlation = np.clip(np.sum(before * after, (0, 1)) / power, 0.0, 0.999)
@@ -172,3 +180,19 @@ def _in_blocks(origin: np.ndarray, recordings: np.ndarray) -> np.ndarray:
             if len(rows):
                 unit[rows], label = label, label + 1
     return unit
+
+
+def as_good(better: Comparison) -> bool:
+    """
+    :return: whether one model is not significantly better than another, or by a negligible amount
+    """
+    return better.p_value > _LEVEL_OF_SET or better.gain < _SAME
+
+
+def passes(verdict: Comparison, level: float = LEVEL) -> bool:
+    return verdict.gain >= LEAST_GAIN and verdict.p_value < level
+
+
+def information_gain(before: float, after: float, n: float, n_parameters: int) -> float:
+    """:return: by which Schwarz's criterion is lower; ``before`` and ``after``: sums of squares"""
+    return n * float(np.log(before / after)) - n_parameters * float(np.log(max(n, 2.0)))

@@ -1,4 +1,4 @@
-"""How large a parameter is on a given machine: a servo and an axis of 100 kg share a catalogue."""
+"""Typical sizes of parameters on a given machine: a servo and a 100 kg axis share one catalogue."""
 
 import dataclasses
 import math
@@ -13,7 +13,7 @@ from sb3_hds.core.twin import plant_of
 from sb3_hds.errors import EffectError
 from sb3_hds.sysid.estimation.evidence import Evidence
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
-from sb3_hds.sysid.estimation.motion import motion_of
+from sb3_hds.sysid.estimation.shooting import motion_of
 
 # A typical size moves what is predicted by this share of what is measured.
 _SHARE = 0.05
@@ -36,10 +36,10 @@ class _Moved(NamedTuple):
 
 def sized(evidence: Evidence, data: Trajectories) -> Hypotheses:
     """
-    :param evidence: windows, with the spread of each channel as its noise
-    :raises EffectError: if the twin does not listen to effects
-    :return: the hypotheses, with a scale for each parameter that these windows can see, and with
-        starts for searches that need several
+    :param evidence: windows, with the standard deviation of each channel as its noise
+    :raises EffectError: if the twin ignores the effects that are passed to its step
+    :return: the hypotheses, with a scale for each parameter that these windows are sensitive to,
+        and start values for those that need several
     """
     h = evidence.hypotheses
     point = evidence.fit(h.null, ())

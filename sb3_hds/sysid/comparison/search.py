@@ -1,103 +1,38 @@
-"""Which candidate explains what is left: proposed on some windows, confirmed on others."""
+"""The search for causes: proposed on half of the recordings, confirmed on the others."""
 
 from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from sb3_hds.sysid.comparison.aliasing import imitators
-from sb3_hds.sysid.comparison.held_out import Comparison, by_scores, confirm, effective_size
+from sb3_hds.sysid.comparison.halves import Base, Effort, Half, Tried, has_more_freedom
+from sb3_hds.sysid.comparison.held_out import (
+    LEAST_BIC,
+    LEAST_GAIN,
+    LEVEL,
+    Comparison,
+    as_good,
+    by_scores,
+    confirm,
+    effective_size,
+    information_gain,
+    passes,
+)
+from sb3_hds.sysid.comparison.inference import aliased_with
 from sb3_hds.sysid.comparison.starts import Here, Places, guesses
 from sb3_hds.sysid.diagnosis.progress import Bar
+from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point, in_threads
-from sb3_hds.sysid.estimation.hypotheses import Candidate, Hypotheses
+from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.shooting import Shots
 
-# What confirms a candidate: by which share the mean square error of held-out recordings falls, at
-# which level, and by how much the information criterion of the others.
-LEAST_GAIN, LEVEL, LEAST_BIC = 0.05, 0.025, 6.0
-# Another candidate belongs into the set unless it is worse than the best at this level.
-_LEVEL_OF_SET = 0.05
 # Candidates that may be confirmed, one after the other, and that others are tried beside.
 _MOST_LOOKS, _MOST_FIRSTS = 3, 4
-# Errors that differ by a smaller share are the same, however surely they differ.
-_SAME = 0.01
-# Mean square error of a window that cannot be simulated, in units of the noise.
-NOT_FINITE = 1e8
 # Steps of fits to the end, and of start states alone: to the end, and for a rough comparison.
 _ALL_STEPS, _KEPT_STEPS, _ROUGH_STEPS = 25, 6, 1
-
 _Given = TypeVar("_Given")
 _Told = TypeVar("_Told")
-
-
-class Half(NamedTuple):
-    """
-    :param evidence: windows of one half of the recordings
-    :param unit: piece of evidence of each window, shape ``(n,)``
-    :param irrelevant: error of each channel that nobody minds, shape ``(n_obs,)``
-    """
-
-    evidence: Evidence
-    unit: Int[np.ndarray, " n"]
-    irrelevant: Float[np.ndarray, " obs"]
-
-    def errors(self, point: Point) -> Float[np.ndarray, " n"]:
-        """:return: mean square of each window, with what is irrelevant added"""
-        noise = self.evidence.noise
-        errors = np.mean((point.raw / noise) ** 2, (1, 2))
-        errors = np.nan_to_num(errors, nan=NOT_FINITE, posinf=NOT_FINITE)
-        return errors + float(np.mean((self.irrelevant / noise) ** 2))
-
-    def total(self, point: Point) -> float:
-        return float(self.errors(point).sum())
-
-
-class Base(NamedTuple):
-    """
-    What is believed so far.
-
-    :param point: fitted to the windows for selection
-    :param kept: the same parameters on the other windows, start states refitted
-    :param free: indices of the parameters that are refitted under every hypothesis
-    """
-
-    point: Point
-    kept: Point
-    free: tuple[int, ...]
-
-
-class Tried(NamedTuple):
-    """
-    A candidate beside what is believed, and how it did.
-
-    :param candidate: which
-    :param point: the best that was found on the windows for selection
-    :param kept: the same parameters on the other windows, start states refitted
-    :param criterion: by which the information criterion is lower than without it
-    """
-
-    candidate: Candidate
-    point: Point
-    kept: Point
-    criterion: float
-
-
-class Effort(NamedTuple):
-    """
-    :param guessed: candidates that one Newton step must favour to be fitted at all
-    :param finalists: candidates that are fitted to the end
-    :param windows: most windows on which the others are compared
-    :param steps: of the fits that choose the finalists
-    :param profiles: whether intervals follow the likelihood, or are symmetric
-    """
-
-    guessed: int
-    finalists: int
-    windows: int
-    steps: int
-    profiles: bool
 
 
 class _Reached(NamedTuple):
@@ -150,21 +85,21 @@ class Search:
     ) -> Base:
         """
         :param near: from whose start states to begin; default: as measured
-        :return: what is believed, ``free`` refitted from ``theta``
+        :return: a model, ``free`` refitted from ``theta``
         """
         begin = (None, None) if near is None else (near.point.offsets, near.kept.offsets)
         point = self.select.evidence.fit(theta, free, begin[0])
         return Base(point, self.confirm.evidence.fit(point.theta, (), begin[1]), tuple(free))
 
     def believing(self, tried: Tried, base: Base) -> Base:
-        """:return: what is believed, and this candidate besides"""
+        """:return: the model with this candidate"""
         own = self.hypotheses.indices(tried.candidate)
         return Base(tried.point, tried.kept, (*base.free, *own))
 
     def without(self, candidate: Candidate, base: Base, near: Base | None = None) -> Base:
         """
         :param near: from whose start states to begin; default: as measured
-        :return: what is believed, but for this candidate; the rest refitted
+        :return: the model without this candidate; the rest refitted
         """
         own = self.hypotheses.indices(candidate)
         theta = base.point.theta.copy()
@@ -172,14 +107,14 @@ class Search:
         return self.base(theta, [i for i in base.free if i not in own], near)
 
     def again(self, base: Base) -> Base:
-        """:return: the same belief, fitted under the noise that is known now"""
+        """:return: the same model, refitted with the current noise"""
         point, kept = base.point, base.kept
         point = self.select.evidence.fit(point.theta, base.free, point.offsets)
         kept = self.confirm.evidence.fit(point.theta, (), kept.offsets)
         return Base(point, kept, base.free)
 
     def whole(self, base: Base) -> tuple[Half, Point]:
-        """:return: all evidence, and what is believed fitted to it"""
+        """:return: all windows, and the model fitted to them"""
         pair = self.select, self.confirm
         shots = (half.evidence.shots for half in pair)
         shots = Shots(*map(np.concatenate, zip(*shots, strict=True)))
@@ -190,7 +125,7 @@ class Search:
 
     def glances(self, base: Base, accepted: Sequence[str]) -> list[tuple[Candidate, Point]]:
         """
-        :param accepted: keys of candidates that belong to what is believed
+        :param accepted: keys of candidates that the model contains
         :return: promising candidates, fitted roughly on a sample of windows, best first
         """
         left = [c for c in self.hypotheses.candidates if c.key not in accepted]
@@ -226,7 +161,7 @@ class Search:
 
     def finalists(self, base: Base, accepted: Sequence[str]) -> list[Tried]:
         """
-        :param accepted: keys of candidates that belong to what is believed
+        :param accepted: keys of candidates that the model contains
         :return: the most promising candidates, fitted to the end, best first
         """
         ranked = self.glances(base, accepted)
@@ -236,7 +171,7 @@ class Search:
         self, candidates: Sequence[Candidate], base: Base, rival: float = np.inf
     ) -> list[Tried]:
         """
-        :param rival: cost to come below, where nothing else matters
+        :param rival: cost to come below; fits that are far from it are given up
         :return: these candidates, fitted to the end, best first
         """
         self._guess([c for c in candidates if c.key not in self._reached], base)
@@ -256,8 +191,8 @@ class Search:
     ) -> list[Tried]:
         """
         :param joints: where a force may act; default: anywhere
-        :param rival: cost to come below, where nothing else matters
-        :return: what no finding is beside what is believed, fitted to the end, best first
+        :param rival: cost to come below; fits that are far from it are given up
+        :return: flexible forces beside the model, fitted to the end, best first
         """
         forces = [c for c in self.hypotheses.nameless if joints is None or c.index in joints]
         self._guess(forces, base)
@@ -273,21 +208,24 @@ class Search:
 
     def relatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> list[Tried]:
         """
-        :return: what looks like the best candidate, by declaration or in these windows, and was not
-            fitted to the end yet
+        :return: candidates that are aliased with the best one, by declaration or in these windows,
+            and were not fitted to the end yet
         """
         done = {t.candidate.key for t in tried}
-        alike = imitators(self.select.evidence, best.point, best.candidate, base.free)
+        alike = aliased_with(self.select.evidence, best.point, best.candidate, base.free)
         names = {c.key for c in self.hypotheses.related(best.candidate)} | set(alike)
         left = [c for c in self.hypotheses.candidates if c.key in names - done]
         return self.finished([c for c in left if not self.part_of(c, base)], base)
 
     def part_of(self, candidate: Candidate, base: Base) -> bool:
-        """:return: whether what is believed has this candidate already"""
+        """:return: whether the model has this candidate already"""
         return set(self.hypotheses.indices(candidate)) <= set(base.free)
 
     def others(self, base: Base, tried: Sequence[Tried]) -> list[tuple[Candidate, Comparison]]:
-        """:return: candidates that were no finalists, as they were left, on the other half"""
+        """
+        :return: candidates that were no finalists, with their rough fits, compared on the other
+            half
+        """
         done = [t.candidate.key for t in tried]
         rest = [c for c in self.hypotheses.candidates if c.key not in done]
 
@@ -303,8 +241,8 @@ class Search:
         self, firsts: Sequence[Tried], base: Base, known: Candidate
     ) -> list[tuple[Tried, list[Tried]]]:
         """
-        :param firsts: what was tried beside what is believed, best first
-        :param known: one of them, beside which others have been tried already
+        :param firsts: candidates beside the model, best first
+        :param known: the one beside which others have been tried already
         :return: of each pair the first cause, and what was tried beside it, best first; the pair
             that selection prefers comes first
         """
@@ -322,7 +260,7 @@ class Search:
     def best(self, tried: Sequence[Tried], base: Base, n_found: int = 0) -> Tried | None:
         """
         :param tried: best first
-        :param n_found: causes and looks before this one: each makes the next harder to confirm
+        :param n_found: causes and comparisons before this one: each makes the level stricter
         :return: the candidate that selection prefers, if the other recordings confirm it; of two
             that they confirm and that predict equally well, the one with fewer parameters. Where
             they do not, the next ones may be confirmed, each at half the level of the one before.
@@ -332,10 +270,8 @@ class Search:
             return None
         simplest = likely[0]
         for other in likely[1:]:
-            if _has_more_freedom(simplest, other) and as_good(
-                self.better(simplest.kept, other.kept)
-            ):
-                simplest = other
+            if has_more_freedom(simplest, other):
+                simplest = other if as_good(self.better(simplest.kept, other.kept)) else simplest
         level = LEVEL / (1 + n_found)
         for one in [simplest, *(t for t in likely if t is not simplest)][:_MOST_LOOKS]:
             if passes(self.confirmed(one.kept, base.kept), level):
@@ -359,44 +295,49 @@ class Search:
             )
             if (
                 ahead > most
-                and not _has_more_freedom(first, other)
-                and (surely or not _has_more_freedom(other, first))
+                and not has_more_freedom(first, other)
+                and (surely or not has_more_freedom(other, first))
                 and passes(self.confirmed(other.kept, base.kept))
             ):
                 best, most = other, ahead
         return best
 
     def alternatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
-        """:return: what is not significantly worse than the best, without more freedom"""
-        others = [t for t in tried if t is not best and not _has_more_freedom(t, best)]
+        """
+        :return: candidates that are not significantly worse than the best and have no more
+            parameters
+        """
+        others = [t for t in tried if t is not best and not has_more_freedom(t, best)]
         equal = [t for t in others if as_good(self.better(best.kept, t.kept))]
         return tuple(t.candidate.key for t in equal if passes(self.confirmed(t.kept, base.kept)))
 
     def needed(self, candidate: Candidate, base: Base) -> bool:
-        """:return: whether what is believed gets worse without this part of it"""
+        """:return: whether the model is significantly worse without this candidate"""
         return passes(self.confirmed(base.kept, self.without(candidate, base).kept))
 
     def criterion(self, candidates: Sequence[Candidate], point: Point, base: Point) -> float:
         """:return: by which the information criterion is lower with these candidates"""
         n = effective_size(base.raw / self.noise)
         before, after = map(self.select.total, (base, point))
-        return _information(before, after, n, sum(len(c.parameters) for c in candidates))
+        return information_gain(before, after, n, sum(len(c.parameters) for c in candidates))
 
     def _of_all(self, tried: Tried, base: Base) -> tuple[float, float]:
-        """:return: error of both halves, parameters as they were selected; and its criterion"""
+        """
+        :return: error on both halves, with the parameters fitted to the first; and the criterion
+        """
         n = sum(effective_size(point.raw / self.noise) for point in (base.point, base.kept))
         before, after = (
             self.select.total(one.point) + self.confirm.total(one.kept) for one in (base, tried)
         )
-        return after, _information(before, after, n, len(tried.candidate.parameters))
+        return after, information_gain(before, after, n, len(tried.candidate.parameters))
 
     def better(self, new: Point, old: Point) -> Comparison:
-        """:return: whether one is better than another, both on the half that confirms"""
+        """:return: comparison of two models on the half that confirms"""
         half = self.confirm
         return confirm(half.errors(new), half.errors(old), half.unit)
 
     def confirmed(self, new: Point, old: Point) -> Comparison:
-        """:return: as ``better``, of a model and one that it contains"""
+        """:return: as :meth:`better`, of nested models"""
         verdict = self.better(new, old)
         by_score = by_scores(new.raw / self.noise, old.raw / self.noise, self.confirm.unit)
         return verdict._replace(p_value=min(verdict.p_value, by_score))
@@ -456,21 +397,3 @@ class Search:
 
     def _each(self, work: Callable[[_Given], _Told], given: Sequence[_Given]) -> list[_Told]:
         return list(self.bar.over(in_threads(work, given), len(given)))
-
-
-def _information(before: float, after: float, n: float, n_parameters: int) -> float:
-    """:return: by which Schwarz's criterion is lower; ``before`` and ``after``: sums of squares"""
-    return n * float(np.log(before / after)) - n_parameters * float(np.log(max(n, 2.0)))
-
-
-def _has_more_freedom(one: Tried, other: Tried) -> bool:
-    return len(one.candidate.parameters) > len(other.candidate.parameters)
-
-
-def as_good(better: Comparison) -> bool:
-    """:return: whether what was found better than another is so neither surely nor by much"""
-    return better.p_value > _LEVEL_OF_SET or better.gain < _SAME
-
-
-def passes(verdict: Comparison, level: float = LEVEL) -> bool:
-    return verdict.gain >= LEAST_GAIN and verdict.p_value < level

@@ -5,22 +5,14 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 import scipy
 
-from sb3_hds.sysid.comparison.held_out import Comparison, confirm
-from sb3_hds.sysid.comparison.search import (
-    LEAST_GAIN,
-    NOT_FINITE,
-    Base,
-    Half,
-    Search,
-    Tried,
-    as_good,
-    passes,
-)
+from sb3_hds.sysid.comparison.halves import NOT_FINITE, Base, Half, Tried
+from sb3_hds.sysid.comparison.held_out import LEAST_GAIN, Comparison, as_good, confirm, passes
+from sb3_hds.sysid.comparison.search import Search
 from sb3_hds.sysid.diagnosis.findings import Accepted
+from sb3_hds.sysid.equation.confirmation import Member
 from sb3_hds.sysid.equation.screening import Screened
-from sb3_hds.sysid.equation.selection import Member
+from sb3_hds.sysid.estimation.candidates import Candidate, encoders
 from sb3_hds.sysid.estimation.evidence import Point, in_threads
-from sb3_hds.sysid.estimation.hypotheses import Candidate, encoders
 from sb3_hds.sysid.estimation.shooting import Shots, evenly
 
 # Level at which each member has to be missed by held-out recordings when it is left out.
@@ -54,8 +46,8 @@ def confirmed_set(
     """
     :param start: what is believed without any cause
     :param base: with the whole set
-    :return: members without which held-out recordings are predicted worse, and what is believed
-        with them; none where the set as a whole does not predict better
+    :return: members without which held-out recordings are predicted worse, and the model with them;
+        none where the set as a whole does not predict better
     """
     members = _members(search, screened)
     if not members or not passes(search.better(base.kept, start.kept)):

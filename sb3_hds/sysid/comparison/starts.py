@@ -6,8 +6,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
+from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point, in_threads
-from sb3_hds.sysid.estimation.hypotheses import Candidate
 
 # Where fits begin for which the slope at the null is no guide, in units of each parameter's scale.
 _AWAY = 3.0

@@ -1,4 +1,4 @@
-"""What no candidate explains: the missing force, and what it goes with."""
+"""The residual force that no candidate explains, and what it depends on."""
 
 from itertools import combinations, product
 from typing import NamedTuple
@@ -9,8 +9,7 @@ from jaxtyping import Float, Int
 from sb3_hds.core import Trajectories
 from sb3_hds.sysid.comparison.held_out import Split, split
 from sb3_hds.sysid.estimation.evidence import Evidence, Point, Slopes
-from sb3_hds.sysid.estimation.motion import motion_of
-from sb3_hds.sysid.estimation.shooting import Shots, evenly, shots_of
+from sb3_hds.sysid.estimation.shooting import Shots, evenly, motion_of, shots_of
 
 # Length of a window over which the missing force counts as constant, in periods of the motion, and
 # in steps.
@@ -52,17 +51,19 @@ class ShortWindows(NamedTuple):
 
 class MissingForce(NamedTuple):
     """
-    The force that each window asks for, beyond what the twin has.
+    Residual force of each window: the constant generalised force that the model lacks there.
 
     :param force: shape ``(n, dof)`` [N m] or [N]
-    :param stderr: of each, from what a force leaves of so short windows, shape ``(n, dof)``
+    :param stderr: standard error of each, from the residuals of the window with that force, shape
+        ``(n, dof)``
     :param position: mean over the window, shape ``(n, dof)``
     :param velocity: mean over the window, shape ``(n, dof)``
     :param command: mean over the window, shape ``(n, n_act)``
     :param time: since the recording began [s], shape ``(n,)``
     :param origin: recording, shape ``(n,)``
     :param numbers: measurements in a window
-    :param noise: of each channel, in so short windows, shape ``(n_obs,)``
+    :param noise: standard deviation of each channel's error in such short windows, shape
+        ``(n_obs,)``
     """
 
     force: np.ndarray
@@ -78,11 +79,11 @@ class MissingForce(NamedTuple):
 
 class Remainder(NamedTuple):
     """
-    :param joint: name of the joint where most is left
-    :param goes_with: quantities that predict it
-    :param gain: share of its variance that they predict on recordings not learned from
-    :param p_value: chance of that if nothing were there
-    :param power: what they predict, mean square in units of the force's error
+    :param joint: joint with the largest predictable share
+    :param goes_with: quantities that it depends on
+    :param gain: share of its variance that they predict in held-out recordings
+    :param p_value: p-value of the hypothesis that nothing can be predicted
+    :param power: mean square of the prediction, in units of the force's standard error
     """
 
     joint: str
@@ -187,10 +188,11 @@ def remainder(
 ) -> Remainder | None:
     """
     Whether a smooth function of position, velocity, command and time, learned on one half of the
-    recordings, predicts the missing force of the other half, and the other way round.
+    recordings, predicts the residual force of the other half, and the other way round
+    (cross-validation).
 
-    :param least_power: of what is predicted, below which nobody minds
-    :return: where it is and what it goes with; None if nothing is left that can be predicted
+    :param least_power: of what is predicted, below which it is too small to matter
+    :return: joint and quantities; None if nothing can be predicted
     """
     parts = split(data, missing.origin, seed)
     found: list[Remainder] = []
@@ -230,7 +232,10 @@ def remainder(
 
 
 def weighed(missing: MissingForce) -> Float[np.ndarray, "n dof"]:
-    """:return: forces in units of their errors; those of windows that tell little count less"""
+    """
+    :return: forces in units of their standard errors, with less weight for windows that determine
+        them poorly
+    """
     typical = np.median(missing.stderr, 0)
     return missing.force / missing.stderr * np.minimum(1.0, typical / missing.stderr)
 

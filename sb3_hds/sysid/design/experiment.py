@@ -22,7 +22,7 @@ from sb3_hds.sysid.belief.answers import Answers, effect_key, effects_of, everyt
 from sb3_hds.sysid.design.excitation import Excitation, Question
 from sb3_hds.sysid.design.limits import Limits
 from sb3_hds.sysid.design.result import SURE, NextExperiment, Pair
-from sb3_hds.sysid.reporting.units import with_unit
+from sb3_hds.sysid.reporting.wording import with_unit
 
 # Starts of the search, its steps, and their size, in units of the coefficients.
 _STARTS, _STEPS, _RATE = 6, 120, 0.05

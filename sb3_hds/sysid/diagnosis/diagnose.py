@@ -13,7 +13,7 @@ from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.diagnosis.pipeline import EFFORTS, Inquiry
 from sb3_hds.sysid.diagnosis.progress import Bar
 from sb3_hds.sysid.estimation.calibrate import check_fits
-from sb3_hds.sysid.estimation.priors import Belief
+from sb3_hds.sysid.estimation.parameters import Belief
 from sb3_hds.sysid.reporting.diagnosis import Diagnosis
 
 _DESCRIBED = ("name", "slot", "parameters", "explanation")  # what a finding is told with
@@ -32,25 +32,24 @@ def diagnose(
     """
     Name what a simulation gets wrong, if the data can.
 
-    The data are audited first: what cannot support a verdict is refused with the reason, and other
-    defects are caveats. Recordings are cut into windows, each simulated from a start state of its
-    own. On one half of the recordings every candidate is fitted; the best is then confirmed on the
-    other half, by at least 5 % less mean square error, a one-sided test on the logarithms of error
-    ratios (one for each recording) or on scores, and an information criterion that counts
-    correlated errors as fewer. Of those that are confirmed, both halves together choose. What is
-    not significantly worse than that on the other half stays as an alternative. After each cause
-    that is accepted, everything is tested again. What remains is looked for in the force that is
-    missing; a cause that leaves too much of it is not believed. In the end, causes are fitted to
-    all recordings.
+    The data are audited first: data that cannot support a verdict are refused with the reason,
+    other defects become caveats. Candidates are screened by equation errors if the twin has an
+    equation of motion, and a set of several causes is then confirmed by simulation as a whole.
+    Otherwise single candidates are fitted to half of the recordings, by simulation of short windows
+    with free start states (multiple shooting). The best is confirmed on the other half: 5 % lower
+    mean square error, and a one-sided t test on the log error ratios of the recordings or a score
+    test. Candidates that are not significantly worse there become alternatives. After each cause,
+    everything is tested again. A cause is not named if it leaves too much of the predictable
+    residual force, or if its size is not constant. Finally, all causes are fitted to all
+    recordings.
 
-    :param twin: as it is believed; of a belief over several, the likeliest
+    :param twin: nominal model; of a belief over several, the likeliest
     :param data: measured, sampled at the twin's ``dt``
     :param effects: classes of the catalogue, their names, or classes of your own
-    :param calibrate: parameters of the twin that are not believed: they are refitted under every
-        hypothesis, and are never a finding. The prior of each is normal around the twin's value
-        with the parameter's ``scale`` as its standard deviation, within a factor of 20:
-        ``{"mass": 3.0}`` widens it three times, ``{"mass": (0.5, 8.0)}`` sets other bounds. Where
-        one ends at a bound, nothing is named.
+    :param calibrate: nuisance parameters: they are refitted under every hypothesis, and are never a
+        finding. The prior of each is normal around the twin's value with the parameter's ``scale``
+        as its standard deviation, within a factor of 20: ``{"mass": 3.0}`` widens it three times,
+        ``{"mass": (0.5, 8.0)}`` sets other bounds. Where one ends at a bound, nothing is named.
     :param seed: of the split
     :param budget: ``"full"``, or ``"quick"``: fewer candidates are fitted to the end
     :param progress: whether a bar shows how far it is, with an estimate of the time left
@@ -77,7 +76,7 @@ def diagnose(
     kinds, nuisances = classes_of(effects), _beliefs_of(calibrate)
     with Bar(progress) as bar:
         inquiry = Inquiry(twin, data, kinds, nuisances, int(seed), budget, bar)
-        reason = inquiry.poor()
+        reason = inquiry.given.poor
         return inquiry.refused(reason) if reason else inquiry.run()
 
 

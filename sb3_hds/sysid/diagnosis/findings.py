@@ -1,4 +1,4 @@
-"""How what was found is told."""
+"""Findings in words: sizes, intervals, reasons, caveats."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -8,16 +8,16 @@ import scipy
 from jaxtyping import Int
 
 from sb3_hds.sysid.checks.parameter_stability import Change
-from sb3_hds.sysid.comparison.aliasing import imitators
-from sb3_hds.sysid.comparison.held_out import Comparison
-from sb3_hds.sysid.comparison.profile import profiled
-from sb3_hds.sysid.comparison.search import LEAST_GAIN, LEVEL, Base, Half, Tried
+from sb3_hds.sysid.comparison.halves import Base, Half, Tried
+from sb3_hds.sysid.comparison.held_out import LEAST_GAIN, LEVEL, Comparison, compare
+from sb3_hds.sysid.comparison.inference import aliased_with, profiled, standard_errors
 from sb3_hds.sysid.comparison.unexplained import Remainder
-from sb3_hds.sysid.diagnosis.account import standard_errors
+from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point
-from sb3_hds.sysid.estimation.hypotheses import Candidate, Hypotheses
+from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.results import Estimate
-from sb3_hds.sysid.reporting.diagnosis import Finding, HorizonGain
+from sb3_hds.sysid.reporting.finding import Finding, HorizonGain
+from sb3_hds.sysid.reporting.pictures import bounded
 from sb3_hds.sysid.reporting.wording import TOO_LITTLE
 
 #: why a candidate was turned down that predicts better
@@ -36,11 +36,12 @@ class Accepted(NamedTuple):
     """
     A cause that was confirmed.
 
-    :param alternatives: what the data cannot tell from it
-    :param chance: that the best of all candidates would gain as much if nothing were wrong
+    :param alternatives: keys of candidates that the data cannot distinguish from it
+    :param chance: family-wise p-value: that the best of all candidates gains as much if nothing is
+        wrong
     :param share: of the force at its joint that it carries; None where that is not known
-    :param sizes: estimate and ends of the interval by parameter, where the equation of motion says
-        them and not the simulation
+    :param sizes: estimate and interval by parameter, if they come from the equation of motion
+        rather than from simulation
     """
 
     tried: Tried
@@ -55,8 +56,8 @@ def finding(
     one: Accepted, half: Half, point: Point, free: Sequence[int], profiles: bool
 ) -> Finding:
     """
-    :param half: all evidence: what was confirmed is fitted to the whole of it
-    :param point: what is believed in the end, this cause among it, fitted to that
+    :param half: all windows: confirmed causes are fitted to both halves
+    :param point: the final model, with this cause, fitted to that
     :param free: indices of what was fitted
     :param profiles: whether intervals follow the likelihood, or are symmetric
     """
@@ -106,7 +107,7 @@ def margin(n_units: int, stderr: np.ndarray) -> np.ndarray:
 
 
 def to_tell_apart(found: Sequence[Accepted], hypotheses: Hypotheses) -> list[str]:
-    """:return: sentences on what to record, where the data cannot tell a cause from others"""
+    """:return: sentences on what to record if a cause is not distinguishable from others"""
     sentences, undeclared = [], []
     for one in found:
         key = one.tried.candidate.key
@@ -127,12 +128,15 @@ def to_tell_apart(found: Sequence[Accepted], hypotheses: Hypotheses) -> list[str
 
 
 def look_alike(found: Sequence[Accepted], half: Half, base: Base) -> list[str]:
-    """:return: sentences on what imitates a cause, though held-out recordings prefer the cause"""
+    """
+    :return: sentences on candidates that are aliased with a cause in these windows, though held-out
+        recordings prefer the cause
+    """
     sentences = []
     for one in found:
         own = half.evidence.hypotheses.indices(one.tried.candidate)
         rest = [i for i in base.free if i not in own]
-        alike = imitators(half.evidence, base.point, one.tried.candidate, rest)
+        alike = aliased_with(half.evidence, base.point, one.tried.candidate, rest)
         alike = [name for name in alike if name not in one.alternatives]
         if alike:
             sentences.append(
@@ -145,10 +149,10 @@ def look_alike(found: Sequence[Accepted], half: Half, base: Base) -> list[str]:
 
 def out_of_reach(half: Half, kept: Point, origin: Int[np.ndarray, " n"]) -> list[str]:
     """
-    :param half: recordings that nothing was fitted to
-    :param kept: what is believed in the end, on their windows
+    :param half: held-out recordings
+    :param kept: the final model, on their windows
     :param origin: recording of each window
-    :return: a sentence on windows that the twin does not come near, if there are any
+    :return: a sentence on windows that the model does not predict at all, if there are any
     """
     errors = np.sqrt(half.errors(kept))
     lost = errors > _LOST * max(float(np.median(errors)), 1.0)
@@ -179,8 +183,8 @@ def errs_more(gain: Mapping[int, HorizonGain]) -> list[str]:
 
 def why(verdict: Comparison, turned_down: str | None) -> str:
     """
-    :param verdict: on a candidate that is not named
-    :param turned_down: for which reason, if it was the best for a time
+    :param verdict: the comparison of a candidate that is not named
+    :param turned_down: why it was rejected, if it was ever the best
     """
     if verdict.gain < LEAST_GAIN:
         return TOO_LITTLE
@@ -222,9 +226,9 @@ def nameless_in_words(
     tried: Tried, better: Comparison, causes: Sequence[str], hypotheses: Hypotheses
 ) -> str:
     """
-    :param tried: a force without a name
+    :param tried: a flexible force
     :param better: than the causes
-    :param causes: in whose place it is; none: beside what is believed
+    :param causes: in whose place it is; none: beside the current model
     """
     force, values = tried.candidate, []
     for name, i in zip(force.parameters, hypotheses.indices(force), strict=True):
@@ -266,3 +270,20 @@ def _interval(
     if profiles:
         return profiled(half.evidence, point, free, index, reach)
     return max(best - reach, float(h.lower[index])), min(best + reach, float(h.upper[index]))
+
+
+def by_horizon(half: Half, before: Point, after: Point, every: int) -> dict[int, HorizonGain]:
+    """
+    :param every: steps of the data in one of the windows
+    :return: errors some steps ahead, by the number of steps of the data
+    """
+    found, last = {}, before.raw.shape[1] - 1
+    for ahead in sorted({1, max(last // 4, 1), last}):
+        old, new = (
+            bounded(np.mean((point.raw[:, ahead] / half.evidence.noise) ** 2, 1))
+            for point in (before, after)
+        )
+        gained = compare(new, old, half.unit)
+        rms = [float(np.sqrt(np.mean(errors))) for errors in (old, new)]
+        found[ahead * every] = HorizonGain(ahead * every, rms[0], rms[1], gained.low, gained.high)
+    return found

@@ -1,14 +1,14 @@
-"""Which causes are named: one after the other, or, where that leads nowhere, two at once."""
+"""Forward selection: which causes are named, one after the other, or two at once."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from sb3_hds.sysid.comparison.family import chance_of_the_best
-from sb3_hds.sysid.comparison.held_out import Comparison
-from sb3_hds.sysid.comparison.search import Base, Search, Tried, as_good, passes
-from sb3_hds.sysid.diagnosis.account import standard_errors
+from sb3_hds.sysid.comparison.halves import Base, Tried
+from sb3_hds.sysid.comparison.held_out import Comparison, as_good, passes
+from sb3_hds.sysid.comparison.inference import family_p_value, standard_errors
+from sb3_hds.sysid.comparison.search import Search
 from sb3_hds.sysid.diagnosis.findings import (
     ANOTHER,
     CHANCE,
@@ -30,7 +30,7 @@ _FAMILY_LEVEL = 0.05
 
 class Nameless(NamedTuple):
     """
-    A force without a name that predicts better than what has one, or than nothing.
+    A flexible force that predicts better than the named causes, or than none.
 
     :param tried: the force
     :param better: how much better
@@ -45,11 +45,12 @@ class Nameless(NamedTuple):
 class Naming:
     """
     :param search: candidates on two halves of the evidence
-    :param start: what is believed at first
+    :param start: the model at the start
     :param seed: of the bootstrap
-    :param family: candidates of the whole catalogue for each that is asked about here
-    :param by_all: whether all the data say which of several confirmed candidates is the cause, or
-        it is the one that was confirmed first
+    :param family: number of all candidates per candidate that is simulated, for family-wise
+        p-values
+    :param by_all: whether confirmed candidates are re-ranked on all data; otherwise, the first one
+        is named
     """
 
     def __init__(
@@ -63,8 +64,8 @@ class Naming:
 
     def one_by_one(self, firsts: Sequence[Tried]) -> tuple[list[Accepted], Base]:
         """
-        :param firsts: candidates beside what is believed at first, best first
-        :return: causes, each confirmed beside those before it, and what is believed with them
+        :param firsts: candidates beside the model at the start, best first
+        :return: causes, each confirmed beside those before it, and the model with them
         """
         found: list[Accepted] = []
         tried, base = firsts, self.start
@@ -85,14 +86,14 @@ class Naming:
         self, alone: Accepted, base: Base, firsts: Sequence[Tried]
     ) -> tuple[list[Accepted], Base] | None:
         """
-        A cause that is named first takes on what belongs to a second one, and may leave too little
-        of it to be confirmed. So others are tried as the first one.
+        The first cause can absorb a part of a second one, which is then not confirmed. So the other
+        candidates are tried as the first cause.
 
         :param alone: the cause beside which no second one was confirmed
-        :param base: what is believed with it
-        :param firsts: candidates beside what is believed at first, best first
+        :param base: the model with it
+        :param firsts: candidates beside the model at the start, best first
         :return: the pair that selection prefers among those of which both causes are confirmed
-            beside each other and predict better than the one alone, and what is believed with it
+            beside each other and predict better than the one alone, and the model with it
         """
         chosen = self.search.pairs(firsts, self.start, alone.tried.candidate)
         for looks, (first, tried) in enumerate(chosen):
@@ -103,11 +104,11 @@ class Naming:
 
     def several_as_confirmed(self, firsts: Sequence[Tried]) -> tuple[list[Accepted], Base] | None:
         """
-        What all the data prefer as a single cause may take on so much of a second one that no pair
-        is surely better. So each cause is once more the one that was confirmed first.
+        Re-ranking on all data can absorb a second cause into the first, so that no pair is
+        significantly better: repeat without re-ranking.
 
-        :param firsts: candidates beside what is believed at first, best first
-        :return: causes, if that makes them several, and what is believed with them
+        :param firsts: candidates beside the model at the start, best first
+        :return: causes, if that makes them several, and the model with them
         """
         if not self._overruled:
             return None
@@ -121,10 +122,10 @@ class Naming:
         self, found: Sequence[Accepted], base: Base
     ) -> tuple[list[Accepted], Base, Nameless | None]:
         """
-        Of the causes that have a name, one is the best, right or wrong. If a force without a name
-        surely predicts better in the place of all of them, or of one, that one is not the cause.
+        One of the named causes is always the best, right or wrong. If a flexible force predicts
+        significantly better in the place of all of them, or of one, that one is not named.
 
-        :return: causes that stand, what is believed with them, and the force; None if none is
+        :return: the remaining causes, the model with them, and the flexible force; None if none is
             better
         """
         if not found or not self.search.hypotheses.nameless:
@@ -157,8 +158,8 @@ class Naming:
 
     def nameless(self, base: Base, known: Sequence[str]) -> Nameless | None:
         """
-        :param known: keys of causes that belong to what is believed
-        :return: a force without a name beside that, as sure as a cause has to be
+        :param known: keys of causes that the model contains
+        :return: a flexible force beside the model, as significant as a cause has to be
         """
         tried = self.search.nameless(base)
         sure = [t for t in tried if self._determined(t, base)]
@@ -267,7 +268,7 @@ class Naming:
         own = [h.indices(c) for c in left]
         fitted = (*base.free, *h.indices(best.candidate))
         gain = base.point.cost - best.point.cost
-        chance = chance_of_the_best(slopes, own, base.free, fitted, gain, self.seed)
+        chance = family_p_value(slopes, own, base.free, fitted, gain, self.seed)
         return min(1.0, self.family * chance)
 
     def _pruned(self, found: list[Accepted], base: Base) -> tuple[list[Accepted], Base]:

@@ -1,4 +1,4 @@
-"""How the joints moved in a set of recordings, at an interval that suits the system."""
+"""Joint positions, velocities and accelerations of recordings, smoothed, at a suitable interval."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -10,19 +10,12 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from sb3_hds.core import (
-    Params,
-    Trajectories,
-    Twin,
-    explicit_euler,
-    rollout,
-    semi_implicit_euler,
-)
+from sb3_hds.core import Params, Trajectories, Twin, explicit_euler, rollout, semi_implicit_euler
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.twin import plant_of
 from sb3_hds.sysid.equation.plausibility import SET_POINTS
 from sb3_hds.sysid.equation.smoothing import Smoothed, smooth
-from sb3_hds.sysid.estimation.motion import motion_of
+from sb3_hds.sysid.estimation.shooting import motion_of
 
 # Samples from which it is told whether a velocity is measured.
 _SOME = 50

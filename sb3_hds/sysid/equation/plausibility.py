@@ -28,6 +28,7 @@ class Plausibility(NamedTuple):
 
 
 _ONE_WAY = 0.0
+
 #: by the name of an effect; ``parameter`` stands for the twin's own parameters
 TABLE: dict[str, Plausibility] = {
     "viscous_friction": Plausibility(
@@ -66,6 +67,7 @@ _UNKNOWN = Plausibility("", 3.0)
 # A set point is a number that arrives as it is, or late: no amplifier changes it.
 _SET_POINT = 3.0
 _OF_AMPLIFIERS = ("torque_gain", "directional_gain", "dead_zone", "saturation")
+
 #: units of commands that are targets of a servo
 SET_POINTS = ("rad", "rad/s", "m", "m/s", "deg", "deg/s")
 

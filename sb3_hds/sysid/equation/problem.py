@@ -1,4 +1,6 @@
-"""Sets of candidates on normal equations: their sizes, what they explain, what they cost."""
+"""
+Subset selection on normal equations: coefficients, residuals and penalties of sets of candidates.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -8,11 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.core import ActionEffect
-from sb3_hds.sysid.equation.columns import Equation, Item
-from sb3_hds.sysid.equation.plausibility import plausibility, rarity
+from sb3_hds.sysid.equation.plausibility import plausibility
+from sb3_hds.sysid.equation.regression import Item
 from sb3_hds.sysid.equation.weak_form import Grams
-from sb3_hds.sysid.estimation.hypotheses import PARAMETER, Hypotheses
+from sb3_hds.sysid.estimation.candidates import PARAMETER
 
 # Variance of a size in units of what it would be alone: beyond that, columns cannot be told apart.
 _MOST_INFLATION = 200.0
@@ -22,10 +23,10 @@ _RIDGE = 1e-9
 # Of friction that falls as a joint begins to slide, the least share that stays: what falls further
 # stands for a curve of another form.
 _LEAST_SLIDING = 0.3
-# Ranges of the motion by which a spring may rest outside of it: farther away, it is an offset.
-_BEYOND = 0.5
 # Numbers that what is not linear costs beside its coefficients: a speed, a period.
 _HIDDEN = {"stribeck_friction": 1, "concave_friction": 1, "cogging": 1}
+# Place of what all actuators have in common.
+SHARED = ("actuator", -1)
 
 
 class Solution(NamedTuple):
@@ -59,16 +60,18 @@ class Problem:
     :param grams: normal equations
     :param lower: smallest coefficient of each column
     :param upper: largest
-    :param prior: of each column, the inverse variance of what is believed of its coefficient
+    :param prior: of each column, the inverse variance of the prior of its coefficient
     :param force: typical force of each joint [N m] or [N]
     :param shares: of each column, its root mean square at each joint, shape ``(dof, columns)``
-    :param passes: of items that cut commands off, the share of changes that still passes
+    :param passes: of saturations and dead zones, the share of commands that still pass
     :param mass: some mass matrices, shape ``(n, dof, dof)``
     :param slopes: of these by inertial parameters, by key
     :param drives: share of each joint's actuator force by parameters, by key
     :param rests: of springs, shares of their second column that are admissible
-    :param always: items that belong to every set: what is refitted anyway
+    :param always: items of every set: the nuisance parameters
     :param rarity: of each item, minus the logarithm of its prior odds
+    :param total: normal matrix over all joints, shape ``(columns + 1, columns + 1)``
+    :param cost: penalty of one parameter: the logarithm of the effective number of rows
     """
 
     items: tuple[Item, ...]
@@ -93,11 +96,12 @@ class Problem:
         return len(self.grams.effective)
 
     def place(self, i: int) -> tuple[str, int]:
+        """:return: slot and index"""
         candidate = self.items[i].candidate
         return candidate.slot, candidate.index
 
     def family(self, i: int) -> tuple:
-        """Of items with an equal family, a set has one at most."""
+        """A set contains at most one item of each family."""
         return self._families[i]
 
     @cached_property
@@ -110,6 +114,7 @@ class Problem:
         )
 
     def clashes(self, keys: Sequence[int]) -> bool:
+        """Whether two items exclude each other."""
         families = [self.family(i) for i in keys]
         if len(set(families)) < len(families):
             return True
@@ -141,6 +146,7 @@ class Problem:
         return float(np.linalg.slogdet(self.mass)[1].mean())
 
     def price(self, i: int) -> float:
+        """:return: penalty of an item in the criterion: its parameters and its prior odds"""
         if i in self.always:
             return 0.0
         item = self.items[i]
@@ -232,7 +238,7 @@ class Problem:
         return np.diag(inverse) * (self.diagonal[own] + self.prior[own])
 
     def admissible(self, keys: Sequence[int], found: Solution) -> bool:
-        """Whether no member stands at its bounds alone, and all can be told apart."""
+        """Whether all members are inside their bounds, and not collinear."""
         if not np.isfinite(found.rss):
             return False
         if found.free and self._inflation(found.free, found.inverse).max() > _MOST_INFLATION:
@@ -240,7 +246,7 @@ class Problem:
         return all(self._inside(i, found) for i in keys)
 
     def beyond(self, keys: Sequence[int]) -> list[int]:
-        """:return: members that stand at their bounds alone, or have sizes that nothing has"""
+        """:return: members at their bounds, or with sizes that are physically impossible"""
         found = self.solve(keys)
         return [i for i in keys if not self._inside(i, found)]
 
@@ -266,7 +272,7 @@ class Problem:
         return bool(np.all(np.diff(sizes) >= 0.0) and sizes[0] >= _LEAST_SLIDING * sizes[-1])
 
     def score(self, keys: Sequence[int], priced: bool = True) -> float:
-        """:return: Schwarz's criterion with prior odds; infinite for what cannot be"""
+        """:return: Schwarz's criterion with prior odds; infinite for inadmissible sets"""
         found = self.solve(keys)
         if not self.admissible(keys, found):
             return np.inf
@@ -370,99 +376,3 @@ class Problem:
         for c, fixed in zip(item.columns, item.fixed, strict=True):
             total += (value.get(c, fixed or 0.0) * self.shares[:, c]) ** 2
         return np.sqrt(total)
-
-
-def _rests(equation: Equation, items: Sequence[Item]) -> dict[int, tuple[float, float]]:
-    """Of springs, between which shares of both columns one rests near where the joint moves."""
-    found = {}
-    for number, item in enumerate(items):
-        if item.candidate.name != "stiffness" or item.rule != "blend":
-            continue
-        q = equation.q[:, item.candidate.index]
-        beyond = _BEYOND * float(np.ptp(q))
-        first, second = (at["q0"] for at in item.settings)
-        ends = (float(q.min()) - beyond, float(q.max()) + beyond)
-        low, high = ((end - first) / (second - first) for end in ends)
-        found[number] = (low, high)
-    return found
-
-
-def problem(hypotheses: Hypotheses, equation: Equation, made: Grams) -> Problem:
-    """:param made: normal equations of the equation"""
-    items, n = tuple(equation.items), len(equation.columns)
-    lower, upper, prior = np.full(n, -np.inf), np.full(n, np.inf), np.zeros(n + 1)
-    always = []
-    for number, item in enumerate(items):
-        if item.candidate.slot == PARAMETER and item.candidate.index < 0:
-            always.append(number)
-        for c, name in zip(item.columns, item.names, strict=True):
-            if item.rule == "chain":
-                lower[c], upper[c] = 0.0, 1.0
-            elif item.rule == "linear":
-                lower[c], upper[c] = _bounds(hypotheses, item, name)
-    for number in always:
-        (column,), name = items[number].columns, items[number].candidate.place
-        prior[column] = hypotheses.prior[hypotheses.names.index(name)] ** -2.0
-    dof = equation.missing.shape[1]
-    shares = np.zeros((dof, n))
-    for c, column in enumerate(equation.columns):
-        own = slice(None) if column.joint is None else column.joint
-        shares[own, c] = np.sqrt(np.mean(column.values**2, axis=0))
-    force = np.sqrt(np.mean(equation.actuator**2, axis=0))
-    force = np.maximum(force, np.sqrt(np.mean(equation.load**2, axis=0))) + 1e-300
-    some = np.linspace(0, len(equation.mass) - 1, min(32, len(equation.mass))).astype(int)
-    total = made.by_joint.sum(0)
-    return Problem(
-        items=items,
-        grams=made,
-        lower=lower,
-        upper=upper,
-        prior=prior,
-        force=force,
-        shares=shares,
-        passes=_passing(hypotheses, equation, items),
-        mass=equation.mass[some],
-        slopes={key: slope[some] for key, slope in equation.slopes.items()},
-        drives=equation.drives,
-        rests=_rests(equation, items),
-        always=tuple(always),
-        rarity=tuple(_rarity(hypotheses, item) for item in items),
-        total=total,
-        cost=float(np.log(made.effective.mean())),
-    )
-
-
-def _rarity(h: Hypotheses, item: Item) -> float:
-    actuators = h.believed.actuators
-    command = actuators[item.candidate.index].unit if item.candidate.slot == "actuator" else ""
-    return rarity(item.candidate.name, command)
-
-
-def _bounds(h: Hypotheses, item: Item, name: str) -> tuple[float, float]:
-    """Of a change from the null: what physics allows, and what machines have."""
-    known = plausibility(item.candidate.name)
-    if item.candidate.slot == PARAMETER:
-        place = item.candidate.place
-        i = h.names.index(place)
-        value = h.believed.values[place]
-        return h.lower[i] - value, h.upper[i] - value
-    full = next(p for p in item.candidate.parameters if p.rpartition(".")[2] == name)
-    i = h.names.index(full)
-    low, high = h.lower[i] - h.null[i], h.upper[i] - h.null[i]
-    return max(low, known.lower if known.lower != 0.0 else low), min(high, known.upper)
-
-
-def _passing(h: Hypotheses, equation: Equation, items: Sequence[Item]) -> dict[int, float]:
-    found = {}
-    commands = np.concatenate([r.actions for r in equation.motion.recordings])
-    for number, item in enumerate(items):
-        if item.candidate.name not in ("saturation", "dead_zone"):
-            continue
-        effect = h.effect_of(item.candidate)
-        assert isinstance(effect, ActionEffect)
-        low, high = (at[effect.chained] for at in item.settings)
-        size = np.abs(commands[:, item.candidate.index])
-        middle = 0.5 * (low + high)
-        passing = size < middle if item.candidate.name == "saturation" else size > 0.5 * middle
-        found[number] = float(np.mean(passing))
-    return found

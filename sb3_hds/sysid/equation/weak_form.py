@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.lib.stride_tricks import sliding_window_view
 
-from sb3_hds.sysid.equation.columns import Equation, Item
-from sb3_hds.sysid.estimation.hypotheses import PARAMETER
+from sb3_hds.sysid.equation.regression import Equation, Item
+from sb3_hds.sysid.estimation.candidates import PARAMETER
 
 # Width of a bump, in periods of the joint's motion, and its least number of intervals.
 _WIDTH, _LEAST = 0.3, 6

@@ -15,9 +15,9 @@ from sb3_hds.data.resampling.report import Reading
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.estimation.covariance import Spread, covariance_of
 from sb3_hds.sysid.estimation.evidence import Evidence, portion_for
-from sb3_hds.sysid.estimation.free import Free, free_names, one_each, own_values, tie
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.inverse_dynamics import NO_THRESHOLD, Forces, by_inverse_dynamics
+from sb3_hds.sysid.estimation.parameters import Free, free_names, one_each, own_values, tie
 from sb3_hds.sysid.estimation.results import Estimate, Fit
 from sb3_hds.sysid.estimation.shooting import Shots, n_free, shots_of
 
@@ -54,7 +54,7 @@ def calibrate(
     seed: int = 0,
 ) -> Fit:
     """
-    Find the parameter values under which a twin reproduces measured data best.
+    Estimate parameters of a twin from measured data, with standard errors.
 
     Levenberg-Marquardt in double precision over short windows with free start states, which are
     eliminated from the normal equations. Each channel is weighted by its noise, which is estimated
@@ -71,13 +71,13 @@ def calibrate(
         for it: ``{"hip_damping": ["left_hip_damping", "right_hip_damping"]}``
     :param window: steps per window; default: half a second, between 5 and 50 steps, and not longer
         than the longest recording
-    :param errors: that are made small: ``"simulation"``, of the channels over a window; or
-        ``"force"``, of the equation of motion, which suits logs of torques that the twin explains
-        worse than its sensors measure. Where simulations with the twin's own values run away, what
-        forces say is where the search begins.
+    :param errors: that are minimised: ``"simulation"`` errors, of the channels over a window
+        (output error); or ``"force"`` errors, of the equation of motion (inverse dynamics), for
+        logged torques that are less certain than the sensors. If simulations with the twin's own
+        values diverge, the search starts from the inverse-dynamics estimate.
     :param loss: ``"huber"``, for which outliers count less, or ``"linear"`` for plain squares
-    :param prior: how firmly to believe the twin's own values: its reciprocal is the standard
-        deviation of that belief, in units of each parameter's ``scale``. 0: not at all.
+    :param prior: strength of a normal prior around the twin's own values: the reciprocal of its
+        standard deviation, in units of each parameter's ``scale``. 0: no prior.
     :param level: of the confidence intervals
     :param n_windows: number of windows that are used: a random choice of more, or a compiled
         program for more than there are; default: all
@@ -142,11 +142,11 @@ def fit_windows(
     :param free: parameters, by the name of the value that they take
     :param shots: windows; those of weight zero do not count
     :param origin: recording of each window, shape ``(n,)``
-    :param spread: of each channel over the data
+    :param spread: standard deviation of each channel over the data
     :param threshold: of the Huber loss, in units of the noise
     :param believed: centre of the prior; default: the twin's own values
-    :param elsewhere: where else the search may begin, asked where simulations with the twin's own
-        values miss a channel by more than it varies
+    :param elsewhere: another start of the search, used if simulations with the twin's own values
+        err by more than a channel's standard deviation
     :raises CalibrationError: for fewer measurements than unknowns
     """
     _check_enough(twin, free, shots)

@@ -1,4 +1,4 @@
-"""How sure estimates are."""
+"""Covariance of estimates, clustered, and directions that the data do not determine."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ class Spread(NamedTuple):
     :param covariance: of the estimates, shape ``(p, p)``; infinite where they are undetermined
     :param stderr: standard errors, shape ``(p,)``
     :param freedom: degrees of freedom of the t distribution
-    :param n_groups: independent pieces of evidence
+    :param n_groups: independent clusters
     :param undetermined: unit vectors that the data do not determine, shape ``(k, p)``, in units of
         each parameter's scale
     """
@@ -51,8 +51,9 @@ def covariance_of(
     :param scores: slopes of the cost of each window, likewise
     :param origin: recording of each window
     :param scale: typical deviation of each parameter
-    :param prior: reciprocal of what is believed of each parameter's deviation, in units of scale
-    :param n_measured: numbers that were measured, less those of the start states
+    :param prior: reciprocal of the standard deviation of each parameter's prior, in units of its
+        scale
+    :param n_measured: number of measurements minus number of start-state parameters
     """
     n, p = scores.shape
     recordings = np.unique(origin)

@@ -1,4 +1,4 @@
-"""How well hypotheses explain windows of data: one compiled program for all of them."""
+"""Fits of hypotheses to windows of data: multiple shooting, by one compiled program for all."""
 
 import dataclasses
 import os
@@ -19,13 +19,22 @@ from sb3_hds.core.effect_chain import Chosen
 from sb3_hds.core.numerics.compilation import QUICK_COMPILATION
 from sb3_hds.core.numerics.linear import uses_lapack
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
-from sb3_hds.sysid.estimation.motion import first_offsets
-from sb3_hds.sysid.estimation.shooting import Shots, n_steps_of, simulate, with_slopes
+from sb3_hds.sysid.estimation.normal_equations import (
+    Blocks,
+    damped_step,
+    eliminate_starts,
+    normal_equations,
+)
+from sb3_hds.sysid.estimation.shooting import (
+    Shots,
+    first_offsets,
+    n_steps_of,
+    simulate,
+    with_slopes,
+)
 
 # Beyond this, in units of the noise, an error counts in proportion, not by its square.
 _HUBER = 3.0
-# Stands for the error of a simulation that is not finite, in units of the noise.
-_NOT_FINITE = 1e4
 # Damping of the first step, relative to the curvature, how it changes, and where it ends.
 _DAMPING, _LESS, _MORE, _MOST_DAMPING = 1e-3, 0.2, 8.0, 1e6
 # A step that lowers the cost by a smaller share than this is the last.
@@ -34,17 +43,13 @@ _ENOUGH = 1e-4
 # joint with two frictions, forces in the place of one were then 15 to 9,000 times as far from the
 # data, and the one that did better had 0.8 times as much.
 _PATIENCE, _HOPELESS = 8, 5.0
-# Added to curvatures, relative to their trace, so that what moves nothing stays where it is.
-_RIDGE = 1e-9
 # Most windows that are simulated at a time, and of what their number is a multiple.
 _PORTION, _ROUND = 64, 8
 # Steps of all windows, or joints, beyond which a second program, for start states alone, is worth
 # compiling: 8 s for one joint with all its effects, as 50 passes over so many steps take.
 _MANY_STEPS, _MANY_JOINTS = 60_000, 3
-
 # Held by programs that must not run beside another one.
 _LAPACK = threading.Lock()
-
 _Given = TypeVar("_Given")
 _Told = TypeVar("_Told")
 
@@ -57,12 +62,12 @@ def portion_for(n: int) -> int:
 
 class Point(NamedTuple):
     """
-    Parameters and start states, and what they leave unexplained.
+    Parameters, start states, and the residuals with them.
 
     :param theta: all parameters that may move, shape ``(p,)``
     :param offsets: of the start states, shape ``(n, free)``
     :param raw: simulated minus measured, shape ``(n, steps + 1, n_obs)``
-    :param cost: what fits minimise: large errors count in proportion; with the prior of what moved
+    :param cost: minus log likelihood with Huber's loss, plus the prior of the fitted parameters
     """
 
     theta: np.ndarray
@@ -95,33 +100,12 @@ class Slopes(NamedTuple):
     scores: np.ndarray
 
 
-class _Blocks(NamedTuple):
-    """Normal equations of windows: of start states, of parameters, and between them."""
-
-    raw: np.ndarray
-    cost: np.ndarray
-    own: np.ndarray
-    cross: np.ndarray
-    shared: np.ndarray
-    by_start: np.ndarray
-    by_theta: np.ndarray
-
-
-class _Step(NamedTuple):
-    """Normal equations with the start states eliminated, and how those follow."""
-
-    curvature: np.ndarray
-    scores: np.ndarray
-    from_score: np.ndarray
-    from_step: np.ndarray
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Evidence:
     """
-    Windows of data under the hypotheses.
+    Windows of data, and the likelihood of hypotheses given them.
 
-    :param hypotheses: what may move
+    :param hypotheses: hypotheses and parameters
     :param shots: windows, all of weight one
     :param noise: of each channel, shape ``(n_obs,)``
     :param width: most parameters that move at a time
@@ -176,7 +160,7 @@ class Evidence:
         :param n_steps: at most
         :param enough: a step that lowers the cost by a smaller share than this is the last
         :param least: so is one that lowers it by less than this
-        :param rival: the cost to come below; what is far from it for long is given up
+        :param rival: the cost to come below: a fit that stays far above it is given up
         """
         h, moving = self.hypotheses, np.array(free, int)
         low, high, size = h.lower[moving], h.upper[moving], h.scale[moving]
@@ -188,10 +172,10 @@ class Evidence:
         converged, taken = False, 0
         for _ in range(n_steps):
             taken += 1
-            step = _eliminated(now, damping)
+            step = eliminate_starts(now, damping)
             new = theta.copy()
             pull = firm, firm * (theta[moving] - null) / size
-            new[moving] = _moved(theta[moving], step, pull, size, low, high, damping)
+            new[moving] = damped_step(theta[moving], step, pull, size, low, high, damping)
             z = (new[moving] - theta[moving]) / size
             ahead = offsets + step.from_score + step.from_step @ z
             then = self._blocks(new, moving, ahead)
@@ -200,7 +184,7 @@ class Evidence:
                 better = then.cost < now.cost
                 gained = np.sum((now.cost - then.cost)[better])
                 offsets = np.where(better[:, None], ahead, offsets)
-                now = _Blocks(
+                now = Blocks(
                     *(
                         np.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b)
                         for a, b in zip(then, now, strict=True)
@@ -222,7 +206,7 @@ class Evidence:
         :param index: of the parameters; default: all
         """
         every = np.arange(len(point.theta)) if index is None else np.array(index, int)
-        step = _eliminated(self._blocks(point.theta, every, point.offsets), 0.0)
+        step = eliminate_starts(self._blocks(point.theta, every, point.offsets), 0.0)
         return Slopes(step.curvature, step.scores)
 
     def nearest(
@@ -283,19 +267,19 @@ class Evidence:
         longest = max(h.always, float(begins[active].max(initial=0.0)))
         return min(n_steps_of(longest, h.twin.dt), self._most_known)
 
-    def _blocks(self, theta: np.ndarray, index: np.ndarray, offsets: np.ndarray) -> _Blocks:
+    def _blocks(self, theta: np.ndarray, index: np.ndarray, offsets: np.ndarray) -> Blocks:
         """Normal equations at a point, of the parameters named by ``index``."""
 
-        def of(portion: tuple[Shots, slice]) -> _Blocks:
+        def of(portion: tuple[Shots, slice]) -> Blocks:
             shots, rows = portion
             return self._portion(shots, theta, index, offsets[rows], rows.stop - rows.start)
 
         found = in_threads(of, self._portions)
-        return _Blocks(*map(np.concatenate, zip(*found, strict=True)))
+        return Blocks(*map(np.concatenate, zip(*found, strict=True)))
 
     def _portion(
         self, shots: Shots, theta: np.ndarray, index: np.ndarray, offsets: np.ndarray, n: int
-    ) -> _Blocks:
+    ) -> Blocks:
         h, n_lead = self.hypotheses, self._lead_under(theta, index)
         filled = np.zeros((self.portion, offsets.shape[1]))
         filled[:n] = offsets
@@ -319,7 +303,7 @@ class Evidence:
             raw, by_start, by_theta = found
             slopes.append(by_theta)
         by_theta = np.concatenate(slopes, -1)[..., : len(index)]
-        return _normal(raw, by_start, by_theta, self.noise, self._counted, self.threshold)
+        return normal_equations(raw, by_start, by_theta, self.noise, self._counted, self.threshold)
 
 
 def _alone(n: int) -> AbstractContextManager:
@@ -383,81 +367,3 @@ def _look(
         return error, slopes[..., :n], slopes[..., n:]
 
     return jax.vmap(one)(offsets, shots)
-
-
-# States that grow beyond any bound are counted as errors of a fixed size: they need no warning.
-@np.errstate(over="ignore", invalid="ignore")
-def _normal(
-    raw: np.ndarray,
-    by_start: np.ndarray,
-    by_theta: np.ndarray,
-    noise: np.ndarray,
-    counted: np.ndarray,
-    threshold: float,
-) -> _Blocks:
-    n = len(raw)
-    finite = np.isfinite(raw)
-    error = np.where(finite, raw / noise, _NOT_FINITE) * counted[:, None]
-    size = np.abs(error)
-    small = np.minimum(size, threshold)
-    cost = np.sum(0.5 * small**2 + threshold * (size - small), (1, 2))
-    weight = np.sqrt(np.minimum(1.0, threshold / np.maximum(size, 1e-12)))
-    factor = (weight * counted[:, None] / noise)[..., None]
-    start, theta = (
-        np.where(np.isfinite(slopes), slopes, 0.0) * factor for slopes in (by_start, by_theta)
-    )
-    numbers = raw[0].size
-    start, theta = (x.reshape(n, numbers, x.shape[-1]) for x in (start, theta))
-    right = (weight * error).reshape(n, -1, 1)
-    across = start.transpose(0, 2, 1)
-    return _Blocks(
-        raw=raw,
-        cost=cost,
-        own=across @ start,
-        cross=across @ theta,
-        shared=theta.transpose(0, 2, 1) @ theta,
-        by_start=(across @ right)[..., 0],
-        by_theta=(theta.transpose(0, 2, 1) @ right)[..., 0],
-    )
-
-
-@np.errstate(over="ignore", invalid="ignore")
-def _eliminated(blocks: _Blocks, damping: float) -> _Step:
-    free = blocks.own.shape[1]
-    diagonal = np.einsum("nff->nf", blocks.own)
-    ridge = damping * diagonal + _RIDGE * diagonal.sum(1, keepdims=True) + 1e-300
-    own = blocks.own + ridge[:, :, None] * np.eye(free)
-    solved = np.linalg.solve(own, np.concatenate([blocks.by_start[..., None], blocks.cross], 2))
-    back = blocks.cross.transpose(0, 2, 1)
-    return _Step(
-        curvature=blocks.shared - back @ solved[..., 1:],
-        scores=blocks.by_theta - (back @ solved[..., :1])[..., 0],
-        from_score=-solved[..., 0],
-        from_step=-solved[..., 1:],
-    )
-
-
-def _moved(
-    values: np.ndarray,
-    step: _Step,
-    pull: tuple[np.ndarray, np.ndarray],
-    size: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    damping: float,
-) -> np.ndarray:
-    """
-    Where the damped step leads; what would leave its bounds stays.
-
-    :param pull: curvature and slope of the prior
-    """
-    curvature = step.curvature.sum(0) + np.diag(pull[0])
-    score = step.scores.sum(0) + pull[1]
-    free = ~(((values <= low) & (score > 0.0)) | ((values >= high) & (score < 0.0)))
-    if not free.any():
-        return values
-    inner = curvature[np.ix_(free, free)]
-    ridge = damping * np.diag(inner) + _RIDGE * np.trace(inner) + 1e-300
-    moved = values.copy()
-    moved[free] -= size[free] * np.linalg.solve(inner + np.diag(ridge), score[free])
-    return np.clip(moved, low, high)

@@ -1,4 +1,4 @@
-"""Parameters by inverse dynamics: from the forces that measured motion needs, unsimulated."""
+"""Inverse-dynamics estimation: least squares on the equation of motion, without simulation."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from sb3_hds.core import AnalyticTwin, State, Trajectories, Twin
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.sysid.equation.motion import motion
-from sb3_hds.sysid.estimation.free import one_each
+from sb3_hds.sysid.estimation.parameters import one_each
 
 # Gauss-Newton steps: most parameters are linear, and need one; Huber's weights need a few.
 _STEPS = 6
@@ -59,13 +59,13 @@ def by_inverse_dynamics(
     twin: Twin, groups: tuple[tuple[str, ...], ...], data: Trajectories, threshold: float = _HUBER
 ) -> Forces | None:
     r"""
-    Least squares on the force that measured motion needs and the twin does not have,
+    Least squares on the residual of the equation of motion,
 
     .. math:: M(q)\,\dot v + c(q, v) - \tau(q, v, u)
 
-    Nothing is integrated: it leads where simulations under wrong values run away, and is the better
-    estimator where forces rather than sensors are uncertain, as of a geared arm whose torques are
-    logged. Noise of velocities biases it towards zero.
+    Nothing is integrated, so it converges where simulations with wrong values diverge, and it is
+    the better estimator if torques are less certain than sensors, as on a geared arm. Velocity
+    noise biases it towards zero.
 
     Source: Khalil and Dombre, *Modeling, Identification and Control of Robots*, 2002, section 12.
 

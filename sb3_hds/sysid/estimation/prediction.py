@@ -1,4 +1,4 @@
-"""How well a twin predicts measured data, window by window."""
+"""Prediction errors of a twin, window by window, and tests on them."""
 
 from functools import partial
 from typing import Any
@@ -88,8 +88,8 @@ def is_better(
     new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], least: float = _LEAST_GAIN
 ) -> bool:
     """
-    Whether errors of the same held-out windows are lower on the whole, and not by chance: in 95 of
-    100 bootstrap samples of the windows, too.
+    Whether the errors of held-out windows are significantly lower: also in 95 % of bootstrap
+    samples of the windows.
 
     :param new: errors of each window
     :param old: errors of the same windows
@@ -115,7 +115,7 @@ def has_grown(latest: Float[np.ndarray, " n"], older: Float[np.ndarray, " m"]) -
 
 def probability_before(fit: Fit, believed: Twin) -> float:
     """
-    How probable, before any data, values were that are at least so far from what was believed.
+    Prior predictive check: the prior probability of values at least as far from the nominal ones.
 
     Source: Box, J. R. Stat. Soc. A 143, 1980 (a prior is checked by its predictive distribution).
 

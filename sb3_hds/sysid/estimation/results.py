@@ -1,4 +1,4 @@
-"""What comes out of system identification: results that print themselves and their caveats."""
+"""Results of a calibration, which print themselves with their caveats."""
 
 import dataclasses
 import math
@@ -54,12 +54,12 @@ class Fit:
     :param noise: estimated standard deviation of each channel's noise, shape ``(n_obs,)``
     :param n_windows: windows used
     :param window: steps of each
-    :param n_groups: pieces of evidence that count as independent: recordings, or windows
+    :param n_groups: independent clusters: recordings, or windows
     :param level: of the confidence intervals
     :param converged: whether the solver says so
     :param n_steps: that it took
     :param undetermined: groups of parameters of which the data determine only combinations
-    :param errors: that were made small: ``"simulation"`` or ``"force"``
+    :param errors: that were minimised: ``"simulation"`` or ``"force"``
     """
 
     twin: Twin

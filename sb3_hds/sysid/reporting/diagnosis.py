@@ -2,8 +2,7 @@
 
 import dataclasses
 import os
-import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -18,22 +17,27 @@ from sb3_hds.sysid.belief.updated import updated
 from sb3_hds.sysid.design.experiment import next_experiment
 from sb3_hds.sysid.design.limits import Limits
 from sb3_hds.sysid.design.result import NextExperiment
-from sb3_hds.sysid.estimation.results import Estimate, plain
+from sb3_hds.sysid.estimation.results import plain
 from sb3_hds.sysid.reporting import wording
+from sb3_hds.sysid.reporting.finding import Finding, HorizonGain, Rejected
 from sb3_hds.sysid.reporting.pictures import Pictures
+from sb3_hds.sysid.reporting.printed import (
+    WIDTH,
+    choice,
+    finding_in_lines,
+    not_accepted,
+    table_of,
+    would_have_shown,
+    wrapped,
+)
 from sb3_hds.sysid.reporting.sentence import several_in_words, spoken
-from sb3_hds.sysid.reporting.units import sizes_in_words, with_unit
+from sb3_hds.sysid.reporting.wording import with_unit
 
 Verdict = Literal["named", "ambiguous", "none", "unknown", "not_identifiable"]
-
-_WIDTH = 80
 # Causes beyond which they are told as those of a machine, and one that the data cannot tell from
 # others leaves the others named; and beyond which they are in a table.
 MANY, _TABLE = 2, 3
-# Candidates whose smallest sizes are printed; all are in the report.
-_MOST_SHOWN = 12
-# Rejected candidates that get a line of their own.
-_MOST_IN_TABLE = 5
+
 #: what each verdict means
 SENTENCES = {
     "named": "The data name what is missing.",
@@ -51,80 +55,6 @@ class _Plain(Protocol):
     def to_dict(self) -> dict[str, Any]: ...
 
 
-@dataclasses.dataclass(frozen=True)
-class Finding:
-    """
-    One cause.
-
-    :param effect: name in the catalogue, or ``"parameter.NAME"``
-    :param where: ``slot``, ``index`` and ``name`` of its place
-    :param parameters: estimates with intervals and units, by short name
-    :param alternatives: what the data cannot tell from it, by name and place
-    :param p_value: that held-out recordings would gain as much by chance, by the test that
-        confirmed it; where others were asked about before it, it had to pass a stricter level
-    :param family_p_value: that the best of all candidates would gain as much on the recordings that
-        proposed it if nothing were wrong
-    :param gain: share by which it lowers the mean square error of held-out recordings
-    :param explanation: one sentence for people
-    :param share: of the force at its joint that it carries, root mean squares; None where that was
-        not computed
-    """
-
-    effect: str
-    where: Mapping[str, Any]
-    parameters: Mapping[str, Estimate]
-    alternatives: tuple[str, ...]
-    p_value: float
-    family_p_value: float
-    gain: float
-    explanation: str
-    share: float | None = None
-
-    @property
-    def key(self) -> str:
-        """Name and place, as in ``rejected`` and ``detectable``."""
-        own = self.where["slot"] == "parameter"
-        return self.effect if own else f"{self.effect}.{self.where['name']}"
-
-
-@dataclasses.dataclass(frozen=True)
-class Rejected:
-    """
-    A candidate that was not accepted.
-
-    :param name: effect and place
-    :param gain: share by which it lowers the mean square error of held-out recordings, after what
-        was accepted
-    :param p_value: that they would gain as much by chance
-    :param why: in words
-    """
-
-    name: str
-    gain: float
-    p_value: float
-    why: str
-
-
-@dataclasses.dataclass(frozen=True)
-class HorizonGain:
-    """
-    Error of predictions so many steps ahead, on held-out recordings, over all channels, in units of
-    their noise.
-
-    :param steps: ahead
-    :param before: root mean square error of the twin as it came, nuisances refitted
-    :param after: of the extended one
-    :param low: lower end of the 90 % interval of the relative gain
-    :param high: upper end
-    """
-
-    steps: int
-    before: float
-    after: float
-    low: float
-    high: float
-
-
 @dataclasses.dataclass(frozen=True, repr=False)
 class Diagnosis:
     """
@@ -133,7 +63,7 @@ class Diagnosis:
     :param verdict: ``"named"``, ``"ambiguous"``, ``"none"``, ``"unknown"`` or
         ``"not_identifiable"``; the first two are about the first finding, and a later one may have
         alternatives all the same
-    :param believed: the twin as it came
+    :param believed: nominal model
     :param twin: extended, ready to train in
     :param data_hash: of the data
     :param seed: of the split and of what else was drawn
@@ -186,9 +116,9 @@ class Diagnosis:
             return several_in_words(self.findings, [j.name for j in self.believed.joints])
         if self.verdict == "ambiguous":
             first, *others = self.findings
-            choice = " or ".join(map(spoken, (first.key, *first.alternatives)))
-            also = f", and {' and '.join(map(_choice, others))}" if others else ""
-            return f"The simulation is wrong about {choice}{also}: the data cannot tell which."
+            named = " or ".join(map(spoken, (first.key, *first.alternatives)))
+            also = f", and {' and '.join(map(choice, others))}" if others else ""
+            return f"The simulation is wrong about {named}{also}: the data cannot tell which."
         if self.convention:
             return OTHER_CONVENTION
         if self.verdict != "named":
@@ -196,7 +126,7 @@ class Diagnosis:
         new = [f for f in self.findings if self._is_new(f)]
         said = {"lacks": new, "is wrong about": [f for f in self.findings if f not in new]}
         parts = [
-            f"{verb} {' and '.join(map(_choice, found))}" for verb, found in said.items() if found
+            f"{verb} {' and '.join(map(choice, found))}" for verb, found in said.items() if found
         ]
         return f"The simulation {' and '.join(parts)}."
 
@@ -207,21 +137,21 @@ class Diagnosis:
 
     def summary(self) -> str:
         """:return: all of it in 80 columns"""
-        lines = [*_wrapped(f"{self.verdict}: {self.sentence}"), "=" * _WIDTH]
+        lines = [*wrapped(f"{self.verdict}: {self.sentence}"), "=" * WIDTH]
         if len(self.findings) > _TABLE:
-            lines += _table_of(self.findings)
+            lines += table_of(self.findings)
         else:
             for finding in self.findings:
-                lines += _of_finding(finding)
+                lines += finding_in_lines(finding)
         if self.findings:
-            lines += _wrapped(wording.explained_in_words(self.explained))
+            lines += wrapped(wording.explained_in_words(self.explained))
         if self.verdict == "none":
-            lines += self._would_have_shown()
+            lines += would_have_shown(self.twin, self.detectable)
         if self.unexplained:
-            lines += _wrapped(f"Unexplained: {self.unexplained}")
+            lines += wrapped(f"Unexplained: {self.unexplained}")
         if self.refitted:
             changes = ", ".join(f"{name} {a} -> {b}" for name, a, b in self.refitted)
-            lines += _wrapped(f"Refitted: {changes}")
+            lines += wrapped(f"Refitted: {changes}")
         if self.gain:
             lines.append(f"{wording.HORIZONS}:")
             lines += [
@@ -229,10 +159,10 @@ class Diagnosis:
                 f"(90 % interval of the gain {g.low:.0%} to {g.high:.0%})"
                 for g in self.gain.values()
             ]
-        lines += self._not_accepted()
+        lines += not_accepted(self.rejected)
         for caveat in self.caveats:
-            lines += _wrapped(f"Caveat: {caveat}")
-        text = "\n".join([*lines, *_wrapped(self.made_with)])
+            lines += wrapped(f"Caveat: {caveat}")
+        text = "\n".join([*lines, *wrapped(self.made_with)])
         return text.replace("\N{NO-BREAK SPACE}", " ")
 
     @property
@@ -251,43 +181,6 @@ class Diagnosis:
         """What a diagnosis is computed again from."""
         versions = "".join(f", {name} {version}" for name, version in self.versions.items())
         return f"Data {self.data_hash}, seed {self.seed}{versions}."
-
-    def _not_accepted(self) -> list[str]:
-        """The best as a table, and all others by the reason."""
-        if not self.rejected:
-            return []
-        best, others = self.rejected[:_MOST_IN_TABLE], self.rejected[_MOST_IN_TABLE:]
-        width = max(len(r.name) for r in best)
-        lines = [f"{'Not accepted':<{width + 2}} {'gain':>9} {'p':>7}  why"]
-        for r in best:
-            gain, chance = wording.share_in_words(r.gain), wording.chance_in_words(r.p_value)
-            row = f"  {r.name:<{width}} {gain:>9} {chance:>7}  {r.why}"
-            lines += (
-                [row] if len(row) <= _WIDTH else [row.removesuffix(f"  {r.why}"), f"    {r.why}"]
-            )
-        for why in dict.fromkeys(r.why for r in others):
-            names = [
-                r.name
-                if why == wording.TOO_LITTLE
-                else f"{r.name} {wording.share_in_words(r.gain)}"
-                for r in others
-                if r.why == why
-            ]
-            lines += _wrapped(f"{why}: {', '.join(map(str.strip, names))}", "  ")
-        return [*lines, *_wrapped(f"({wording.REJECTED})", "  ")]
-
-    def _would_have_shown(self) -> list[str]:
-        shown = [
-            f"  {key}: {words}"
-            for key, sizes in self.detectable.items()
-            if (words := sizes_in_words(self.twin, key, sizes))
-        ]
-        lines = ["They would have shown, if it were no smaller than:"] if shown else []
-        lines += [line for each in shown[:_MOST_SHOWN] for line in _wrapped(each)]
-        more = len(shown) - _MOST_SHOWN
-        return (
-            [*lines, f"  and {more} more, in the report and in `detectable`"] if more > 0 else lines
-        )
 
     @cached_property
     def answers(self) -> Answers:
@@ -443,60 +336,3 @@ class Diagnosis:
         return self.summary()
 
     __repr__ = __str__
-
-
-def _table_of(findings: Sequence[Finding]) -> list[str]:
-    """Many causes, one line for each size."""
-    rows = []
-    for finding in findings:
-        name = spoken(finding.key).replace(f" at {finding.where['name']}", "")
-        own = finding.where["slot"] == "parameter"
-        place = "" if own else finding.where["name"]
-        share = "" if finding.share is None else f"{finding.share:.0%}"
-        for e in finding.parameters.values():
-            rows.append(
-                (place, name, wording.size_in_words(e), wording.interval_in_words(e), share)
-            )
-    head = ("joint", "cause", "size", "90 % interval", "of force")
-    widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
-    lines = [
-        "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in [head, *rows]
-    ]
-    alike = [
-        f"{spoken(f.key)}: the data cannot tell it from {' or '.join(map(spoken, f.alternatives))}."
-        for f in findings
-        if f.alternatives
-    ]
-    return [*lines, *(line for text in alike for line in _wrapped(text))]
-
-
-def _of_finding(finding: Finding) -> list[str]:
-    own, place = finding.where["slot"] == "parameter", finding.where["name"]
-    lines = [finding.effect if own else f"{finding.effect} at {finding.where['slot']} {place}"]
-    lines += _wrapped(finding.explanation, "  ")
-    for name, e in finding.parameters.items():
-        said = f"{name} = {wording.size_in_words(e)}, standard error {e.stderr:.2g}, 90 % interval "
-        lines += _wrapped(f"{said}{wording.interval_in_words(e)}", "  ")
-    lines += _wrapped(wording.evidence_in_words(finding.gain, finding.p_value), "  ")
-    if finding.alternatives:
-        lines += _wrapped(f"{wording.ALIKE} {', '.join(finding.alternatives)}.", "  ")
-    return lines
-
-
-def _choice(finding: Finding) -> str:
-    """With what cannot be told from it."""
-    names = [spoken(key) for key in (finding.key, *finding.alternatives)]
-    return names[0] if len(names) == 1 else f"either {' or '.join(names)}"
-
-
-def _wrapped(text: str, indent: str = "") -> list[str]:
-    # A name that is longer than a line stays whole.
-    return textwrap.wrap(
-        text,
-        _WIDTH,
-        initial_indent=indent,
-        subsequent_indent=indent + "  ",
-        break_long_words=False,
-        break_on_hyphens=False,
-    )

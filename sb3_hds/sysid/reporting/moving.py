@@ -1,4 +1,4 @@
-"""A machine that moves: as measured, as the twin as it came predicts it, as the extended one."""
+"""A machine that moves: as measured, and as predicted by the nominal and by the extended model."""
 
 import json
 from collections.abc import Callable
@@ -74,7 +74,7 @@ class Moving(NamedTuple):
 
 def moving_of(believed: Twin, extended: Twin, replay: Replay) -> Moving:
     """
-    :param believed: the twin as it came, which reads positions from observations
+    :param believed: nominal model, which reads positions from observations
     :param extended: the corrected one
     :param replay: a held-out recording
     """

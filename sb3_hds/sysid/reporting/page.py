@@ -18,7 +18,7 @@ from sb3_hds.sysid.reporting import wording
 from sb3_hds.sysid.reporting.diagnosis import Diagnosis
 from sb3_hds.sysid.reporting.film import STYLE, section_of
 from sb3_hds.sysid.reporting.moving import moving_of
-from sb3_hds.sysid.reporting.units import sizes_in_words, with_unit
+from sb3_hds.sysid.reporting.wording import sizes_in_words, with_unit
 
 _INSTALL = "A report needs matplotlib and jinja2: pip install 'sb3-hds[report]'."
 _COLOURS = {"named": "#27496d", "ambiguous": "#8a6d1d", "unknown": "#d1495b"}
@@ -231,7 +231,7 @@ def _content(d: Diagnosis) -> dict[str, Any]:
         "findings": findings,
         "explained": wording.explained_in_words(d.explained),
         "rejected": [
-            (r.name, wording.share_in_words(r.gain), wording.chance_in_words(r.p_value), r.why)
+            (r.name, wording.share_in_words(r.gain), wording.p_value_in_words(r.p_value), r.why)
             for r in d.rejected
         ],
         "parameters": _parameters(d),

@@ -5,7 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from sb3_hds.sysid.comparison.halves import NOT_FINITE, Half
 from sb3_hds.sysid.comparison.unexplained import MissingForce
+from sb3_hds.sysid.estimation.evidence import Point
 
 # Of a normal distribution, 90 % lie within so many standard deviations.
 _NORMAL_90 = 1.645
@@ -17,7 +19,7 @@ class Replay(NamedTuple):
 
     :param time: since its first window [s], shape ``(rows,)``; not a number between windows
     :param measured: shape ``(rows, n_obs)``
-    :param before: by the twin as it came, nuisances refitted
+    :param before: by the nominal model, nuisances refitted
     :param after: by the extended twin
     :param margin: half the width of its 90 % interval, by what it misses in all held-out windows
     """
@@ -38,8 +40,8 @@ class Pictures(NamedTuple):
     :param steps: ahead, shape ``(k,)``
     :param errors: root mean square over all held-out windows, in units of the noise, before and
         after, shape ``(2, k)``
-    :param missing: the force that is missing before
-    :param left: and after
+    :param missing: residual force of the nominal model
+    :param left: residual force of the extended model
     """
 
     channels: tuple[tuple[str, str], ...]
@@ -74,3 +76,41 @@ def replay_of(
     time[rows :: rows + 1] = np.nan
     margin = gap(np.broadcast_to(_NORMAL_90 * rms, measured.shape))
     return Replay(time, gap(measured), gap(measured + before), gap(measured + after), margin)
+
+
+def bounded(errors: np.ndarray) -> np.ndarray:
+    """What has run away counts as far off."""
+    return np.nan_to_num(np.minimum(errors, NOT_FINITE), nan=NOT_FINITE)
+
+
+def pictures_of(
+    half: Half,
+    before: Point,
+    after: Point,
+    every: int,
+    missing: MissingForce,
+    left: MissingForce,
+) -> Pictures:
+    """
+    :param every: steps of the data in one of the windows
+    :param missing: residual force of the nominal model
+    :param left: residual force of the extended model
+    """
+    evidence, twin = half.evidence, half.evidence.hypotheses.twin
+    rows = np.flatnonzero(half.unit == half.unit[0])
+    measured = np.asarray(evidence.shots.obs)[rows]
+    errors = [
+        np.sqrt(np.mean(bounded((point.raw / evidence.noise) ** 2), (0, 2)))
+        for point in (before, after)
+    ]
+    rms = np.sqrt(np.mean(after.raw**2, 0))
+    return Pictures(
+        channels=tuple((c.name, c.unit) for c in twin.channels),
+        joints=tuple((j.name, "N" if j.unit == "m" else "N m") for j in twin.joints),
+        actuators=tuple((a.name, a.unit) for a in twin.actuators),
+        replay=replay_of(measured, before.raw[rows], after.raw[rows], rms, twin.dt),
+        steps=every * np.arange(measured.shape[1]),
+        errors=np.stack(errors),
+        missing=missing,
+        left=left,
+    )

@@ -1,11 +1,10 @@
-"""What several causes at once are called in a sentence."""
+"""Several causes in one sentence."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Sequence
 
-from sb3_hds.sysid.estimation.hypotheses import EVERY
-from sb3_hds.sysid.estimation.results import Estimate
-from sb3_hds.sysid.reporting.units import with_unit
+from sb3_hds.sysid.estimation.candidates import EVERY
+from sb3_hds.sysid.reporting.finding import Finding
+from sb3_hds.sysid.reporting.wording import with_unit
 
 _NUMBERS = (
     *("no", "one", "two", "three", "four", "five", "six"),
@@ -26,23 +25,6 @@ _UNCOUNTED = ("stiffness", "cogging", "drag", "friction", "elasticity", "backlas
 _MANY_DOUBTS = 3
 
 
-class Found(Protocol):
-    """What is told of a cause."""
-
-    @property
-    def effect(self) -> str: ...
-    @property
-    def key(self) -> str: ...
-    @property
-    def where(self) -> Mapping[str, Any]: ...
-    @property
-    def parameters(self) -> Mapping[str, Estimate]: ...
-    @property
-    def share(self) -> float | None: ...
-    @property
-    def alternatives(self) -> Sequence[str]: ...
-
-
 def spoken(key: str) -> str:
     """A candidate, for people: ``"coulomb_friction.hinge"`` is Coulomb friction at hinge."""
     name, _, place = key.partition(".")
@@ -57,7 +39,7 @@ def _plain(effect: str) -> str:
     return effect.replace("load_dependent", "load-dependent").replace("_", " ")
 
 
-def several_in_words(findings: Sequence[Found], joints: Sequence[str]) -> str:
+def several_in_words(findings: Sequence[Finding], joints: Sequence[str]) -> str:
     """
     :param findings: more than a few
     :param joints: names of all joints of the machine
@@ -73,7 +55,7 @@ def several_in_words(findings: Sequence[Found], joints: Sequence[str]) -> str:
     return f"{told[:1].upper()}{told[1:]}{_doubts(findings)}"
 
 
-def _friction_of(findings: Sequence[Found], joints: Sequence[str]) -> str:
+def _friction_of(findings: Sequence[Finding], joints: Sequence[str]) -> str:
     """Of the machine as a whole, and by kind where joints differ."""
     groups: dict[tuple[str, ...], list[str]] = {}
     for joint in joints:
@@ -94,7 +76,7 @@ def _friction_of(findings: Sequence[Found], joints: Sequence[str]) -> str:
     return f"{subject} friction that the model lacks{carried}: {by_kind}"
 
 
-def _common(findings: Sequence[Found]) -> list[str]:
+def _common(findings: Sequence[Finding]) -> list[str]:
     """What all actuators share."""
     said = []
     for f in findings:
@@ -104,7 +86,7 @@ def _common(findings: Sequence[Found]) -> list[str]:
     return said
 
 
-def _offsets(findings: Sequence[Found]) -> list[str]:
+def _offsets(findings: Sequence[Finding]) -> list[str]:
     own = [f for f in findings if f.effect == "constant_force"]
     if not own:
         return []
@@ -113,11 +95,11 @@ def _offsets(findings: Sequence[Found]) -> list[str]:
     return [f"{_listed(where)} {_verb(where)} {what} of {_listed(sizes)}"]
 
 
-def _others(findings: Sequence[Found]) -> list[Found]:
+def _others(findings: Sequence[Finding]) -> list[Finding]:
     return [f for f in findings if f.where["name"] != EVERY and f.effect != "constant_force"]
 
 
-def _one(finding: Found) -> str:
+def _one(finding: Finding) -> str:
     name = finding.where["name"]
     if finding.where["slot"] == "parameter":
         first = next(iter(finding.parameters.values()))
@@ -125,7 +107,7 @@ def _one(finding: Found) -> str:
     return f"{name} has {_article(_plain(finding.effect))} of {_size(finding)}"
 
 
-def _size(finding: Found) -> str:
+def _size(finding: Finding) -> str:
     """The first of its parameters that is not nothing."""
     every = list(finding.parameters.values())
     told = next((e for e in every if e.estimate != 0.0), every[0])
@@ -138,7 +120,7 @@ def _article(name: str) -> str:
     return f"{'an' if name[:1] in 'aeiou' else 'a'} {name}"
 
 
-def _doubts(findings: Sequence[Found]) -> str:
+def _doubts(findings: Sequence[Finding]) -> str:
     doubtful = [f for f in findings if f.alternatives]
     if len(doubtful) > _MANY_DOUBTS:
         n = _number(len(doubtful))
@@ -165,7 +147,7 @@ def _kinds(names: Sequence[str]) -> str:
     return f"{' and '.join(_plain(name).removesuffix(' friction') for name in names)} friction"
 
 
-def _carried(own: Sequence[Found], verb: str) -> str:
+def _carried(own: Sequence[Finding], verb: str) -> str:
     by_joint: dict[str, float] = {}
     for f in own:
         if f.share is None:

@@ -1,11 +1,15 @@
-"""Phrases that the printed result and its page share, so that both say the same."""
+"""Phrases that the printed result and the report share."""
 
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from sb3_hds.core import Effect, Twin
+from sb3_hds.effects import ALL
+from sb3_hds.errors import EffectError
 from sb3_hds.sysid.estimation.results import Estimate
-from sb3_hds.sysid.reporting.units import with_unit
 
 #: what each simulation of a measured gain in policy is called
 TRAINED_IN = {
@@ -13,6 +17,7 @@ TRAINED_IN = {
     "extended": "the extended twin",
     "true": "the true twin",
 }
+
 #: why a candidate is turned down that predicts hardly better than what is believed
 TOO_LITTLE = "gains too little"
 HORIZONS = "Held-out error by steps ahead, in units of what the best fit leaves"
@@ -32,7 +37,7 @@ def share_in_words(gain: float) -> str:
     return "far worse" if gain < -1.0 else f"{round(gain, 2) + 0.0:.0%}"
 
 
-def chance_in_words(p_value: float) -> str:
+def p_value_in_words(p_value: float) -> str:
     """:return: a p-value; nothing where there is none"""
     return "" if math.isnan(p_value) else f"{p_value:.2g}"
 
@@ -54,12 +59,12 @@ def evidence_in_words(gain: float, p_value: float) -> str:
     """:return: what speaks for a cause"""
     return (
         f"It lowers the mean square error of held-out recordings by {share_in_words(gain)} "
-        f"(p = {chance_in_words(p_value)})."
+        f"(p = {p_value_in_words(p_value)})."
     )
 
 
 def explained_in_words(share: float) -> str:
-    """:param share: of the missing force"""
+    """:param share: of the predictable residual force"""
     return f"What was found explains {share:.0%} of the force that is missing and can be predicted."
 
 
@@ -113,3 +118,35 @@ def _paired_in_words(gain: Mapping[str, Any]) -> str:
         f"{told}. The means themselves differ by {difference}: each leaves out its own best and "
         "worst quarter."
     )
+
+
+def with_unit(number: str, unit: str) -> str:
+    """Without a break between them."""
+    return number if unit == "1" else f"{number} {unit}".strip().replace(" ", "\N{NO-BREAK SPACE}")
+
+
+def sizes_in_words(twin: Twin, key: str, sizes: Mapping[str, float]) -> str:
+    """
+    :param key: of a candidate of this twin
+    :param sizes: by short name of the parameter
+    :return: those that are finite
+    """
+    shown = [
+        f"{name} {with_unit(f'{value:.2g}', _unit(twin, key, name))}"
+        for name, value in sizes.items()
+        if np.isfinite(value)
+    ]
+    return ", ".join(shown)
+
+
+def _unit(twin: Twin, key: str, name: str) -> str:
+    """Unit of a candidate's parameter; empty for an effect that is not of the catalogue."""
+    effect, _, place = key.partition(".")
+    full = place if effect == "parameter" else f"{key}.{name}"
+    kinds: dict[str, type[Effect]] = {kind.name: kind for kind in ALL}
+    if full not in twin.parameters and effect in kinds:
+        try:
+            twin = twin.extend(kinds[effect](place))
+        except EffectError:
+            return ""
+    return twin.parameters[full].unit if full in twin.parameters else ""

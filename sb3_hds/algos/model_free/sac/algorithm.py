@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 
 import jax
 import numpy as np
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
@@ -17,7 +16,6 @@ from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from sb3_hds.algos.base.config import between, takes
 from sb3_hds.algos.base.construct import jax_device
 from sb3_hds.algos.model_free.algorithm import ModelFreeAlgorithm, ModelFreeConfig
-from sb3_hds.algos.model_free.replay import batches_of
 from sb3_hds.algos.model_free.sac.objectives import squared_error
 from sb3_hds.algos.model_free.sac.policy import GaussianPolicy, SimbaPolicy
 from sb3_hds.algos.model_free.sac.update import (
@@ -27,7 +25,7 @@ from sb3_hds.algos.model_free.sac.update import (
     log_of,
     update,
 )
-from sb3_hds.algos.model_free.update import zero_metrics
+from sb3_hds.algos.model_free.update import batches_of, zero_metrics
 
 # Updates of one compiled call; more are made in several.
 _MOST_UPDATES = 64
@@ -95,7 +93,11 @@ class SoftActorCritic(ModelFreeAlgorithm):
         super().construct(dataclasses.replace(config, policy_kwargs=policy_kwargs), **more)
 
     def update_config(self) -> UpdateConfig:
-        """:return: what an update is made of"""
+        """
+        What an update is made of: SAC's for the networks of the policy, see
+        ``GaussianPolicy.plain_update_config``, with the arguments of this algorithm. Subclasses
+        replace parts of it.
+        """
         config = self.config
         return dataclasses.replace(
             self.policy.plain_update_config(),
@@ -133,7 +135,8 @@ class SoftActorCritic(ModelFreeAlgorithm):
     ) -> None:
         super().set_parameters(load_path_or_dict, exact_match, device)
         if not isinstance(self.ent_coef, str):
-            # What is no parameter of this model is not another one's to set; ``load`` passes here.
+            # A fixed coefficient is an argument, not learned: keep this model's own value. ``load``
+            # calls this, too.
             before = self.policy.agent_state.log_ent_coef
             fixed = {"params": log_of(self.ent_coef)}
             now = before._replace(weights=fixed)
@@ -187,16 +190,9 @@ class SoftActorCritic(ModelFreeAlgorithm):
         freq: Any = self.train_freq
         return freq.unit == TrainFrequencyUnit.STEP
 
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
+    def stored(
+        self, new_obs: np.ndarray | dict[str, np.ndarray], reward: np.ndarray, dones: np.ndarray
     ) -> None:
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self.policy.observed(new_obs)
 
 

@@ -25,10 +25,9 @@ from sb3_hds.algos.model_free.sac.update import (
     q_values,
 )
 from sb3_hds.algos.model_free.update import Batch
-from sb3_hds.algos.nets.dense import Last
 from sb3_hds.algos.nets.heads import Gaussian, squashed_between
-from sb3_hds.algos.nets.mlp import ORTHOGONAL, ORTHONORMAL, BroNet, orthogonal
-from sb3_hds.algos.nets.optimizers import Optimizer, TrainState, Weights
+from sb3_hds.algos.nets.mlp import ORTHOGONAL, ORTHONORMAL, BroNet, Last, orthogonal
+from sb3_hds.algos.nets.options import Optimizer, TrainState, Weights
 
 # Steps of the environment at which the authors reset the networks: with the full replay ratio,
 # and with the fast one of 2.

@@ -13,26 +13,28 @@ import jax.numpy as jnp
 import numpy as np
 
 from sb3_hds.algos.base.config import between, check_count, takes
-from sb3_hds.algos.base.policy import PolicyConfig
-from sb3_hds.algos.model_free.policy import LearningPolicy
+from sb3_hds.algos.base.policy import LearningPolicy, PolicyConfig
 from sb3_hds.algos.model_free.sac.objectives import min_q, min_values, squared_error
 from sb3_hds.algos.model_free.sac.update import (
-    SACState,
     UpdateConfig,
     actor_distribution,
     explore,
     init_state,
     q_values,
 )
-from sb3_hds.algos.nets.activations import Activation, activation, widths
 from sb3_hds.algos.nets.heads import USUAL, Critic, ExploringActor, GaussianActor, noise_std
 from sb3_hds.algos.nets.mlp import ORTHOGONAL, ORTHONORMAL, Mlp, SimbaNet
 from sb3_hds.algos.nets.observations import RunningStats, flattener, normalize, size_of
-from sb3_hds.algos.nets.optimizers import Optimizer, Weights, optimizer_of
+from sb3_hds.algos.nets.options import (
+    Activation,
+    Optimizer,
+    Weights,
+    activation,
+    optimizer_of,
+    widths,
+)
 from sb3_hds.core.numerics.compilation import GENERATOR
 from sb3_hds.deploy.policy_function import PolicyFunction
-
-_OF_GSDE = ("log_std_init", "full_std", "use_expln", "clip_mean")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -100,16 +102,14 @@ class GaussianPolicyConfig(PolicyConfig):
     unused: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        """
-        :raises ValueError: for arguments out of range, and those that these networks do not use
-        """
+        """:raises ValueError: for arguments out of range, or that these networks do not use"""
         check_count("n_critics", self.n_critics)
         check_count("n_quantiles", self.n_quantiles)
         if self.renorm_warmup_steps is not None:
             check_count("renorm_warmup_steps", self.renorm_warmup_steps, 0)
         _check_ranges(self)
-        defaults = {field.name: field.default for field in dataclasses.fields(self)}
-        given = {name for name, usual in defaults.items() if getattr(self, name) != usual}
+        fields = dataclasses.fields(self)
+        given = {field.name for field in fields if getattr(self, field.name) != field.default}
         has_batch_norm = self.renorm_warmup_steps is not None
         for name in (*self.unused, *(() if has_batch_norm else ("batch_norm_momentum",))):
             if name in given:
@@ -118,11 +118,12 @@ class GaussianPolicyConfig(PolicyConfig):
                     f"{type(self).__name__.removesuffix('Config')} do not use {name} here; leave "
                     "it out."
                 )
-        idle = [name for name in _OF_GSDE if name in given]
+        idle = [
+            name for name in ("log_std_init", "full_std", "use_expln", "clip_mean") if name in given
+        ]
         if idle and not self.use_sde:
             warnings.warn(f"{', '.join(idle)} in policy_kwargs say nothing without use_sde=True.")
-        momentum = self.batch_norm_momentum
-        if momentum < 0.5:
+        if (momentum := self.batch_norm_momentum) < 0.5:
             warnings.warn(
                 f"batch_norm_momentum={momentum} is the share of the running statistics that "
                 "stays at an update, as in SBX. SB3-contrib's is the share of the new: pass "
@@ -140,9 +141,8 @@ class GaussianPolicyConfig(PolicyConfig):
         if self.optimizer_class is not None:
             make, usual = self.optimizer_class, {}
         own = {**usual, **(self.optimizer_kwargs or {})}
-        return optimizer_of(make, own), optimizer_of(
-            make, own | dict(self.qf_optimizer_kwargs or {})
-        )
+        of_critics = {**own, **(self.qf_optimizer_kwargs or {})}
+        return optimizer_of(make, own), optimizer_of(make, of_critics)
 
 
 class GaussianPolicy(LearningPolicy):
@@ -152,7 +152,6 @@ class GaussianPolicy(LearningPolicy):
     """
 
     held = ("target", "obs_stats")
-    state: SACState
 
     @takes(GaussianPolicyConfig)
     def __init__(self, config: GaussianPolicyConfig) -> None:
@@ -177,8 +176,8 @@ class GaussianPolicy(LearningPolicy):
             gsde = (config.log_std_init, config.full_std, config.use_expln, config.clip_mean)
             self.actor_network = ExploringActor(body, self.n_act, *gsde, of_mean)
         else:
-            squash = config.squash_log_std
-            squash = config.squashes if squash is None else bool(squash)
+            asked = config.squash_log_std
+            squash = config.squashes if asked is None else bool(asked)
             self.actor_network = GaussianActor(body, self.n_act, squash, of_mean, of_std)
         self.critic_network = Critic(self.critic_body(qf), config.n_quantiles, of_mean)
         self.optimizers = config.optimizers()
@@ -186,24 +185,15 @@ class GaussianPolicy(LearningPolicy):
         self._noise = np.random.default_rng(0)
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
-        return Mlp(
-            net_arch,
-            self.activation_fn,
-            renorm_warmup_steps=self.config.renorm_warmup_steps,
-            momentum=self.config.batch_norm_momentum,
-            ortho_init=bool(self.config.ortho_init),
-        )
+        return self._mlp(net_arch)
 
     def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
-        return Mlp(
-            net_arch,
-            self.activation_fn,
-            float(self.config.dropout_rate),
-            self.config.layer_norm,
-            self.config.renorm_warmup_steps,
-            self.config.batch_norm_momentum,
-            bool(self.config.ortho_init),
-        )
+        return self._mlp(net_arch, float(self.config.dropout_rate), self.config.layer_norm)
+
+    def _mlp(self, net_arch: Sequence[int], dropout: float = 0.0, layer_norm: bool = False) -> Mlp:
+        of_batch = self.config.renorm_warmup_steps, self.config.batch_norm_momentum
+        start = bool(self.config.ortho_init)
+        return Mlp(net_arch, self.activation_fn, dropout, layer_norm, *of_batch, start)
 
     def last_layers(self) -> tuple[nn.initializers.Initializer, nn.initializers.Initializer]:
         """:return: where they start: those of means and values, and those of deviations"""
@@ -262,7 +252,7 @@ class GaussianPolicy(LearningPolicy):
         :param batch_size: number of environments
         """
         if self.use_sde:
-            std = np.asarray(noise_std(self.actor_network, self.agent_state.actor.weights))  # type: ignore[arg-type]
+            std = self.get_std()
             drawn = self._noise.standard_normal((batch_size, *std.shape), np.float32)
             self.matrices = drawn * std
 
@@ -300,25 +290,24 @@ class GaussianPolicy(LearningPolicy):
         """:return: what the policy computes where nothing is explored, to be exported"""
         state, scales = self.agent_state, None
         if self.normalize_observations:
-            variance = np.asarray(state.obs_stats.variance)
-            scales = np.asarray(state.obs_stats.mean), np.sqrt(variance)
+            stats = state.obs_stats
+            scales = np.asarray(stats.mean), np.sqrt(np.asarray(stats.variance))
         act = partial(_mean, self.actor_network, state.actor.weights, state.obs_stats)
         return PolicyFunction.without_memory(act, squashed=True, scales=scales)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
-        obs, actor = self.flatten(observation), self.agent_state.actor.weights
+        obs, state = self.flatten(observation), self.agent_state
+        actor, stats = state.actor.weights, state.obs_stats
         if deterministic:
-            return np.asarray(_mean(self.actor_network, actor, self.agent_state.obs_stats, obs))
-        stats, extra = self.agent_state.obs_stats, self.agent_state.extra
+            return np.asarray(_mean(self.actor_network, actor, stats, obs))
         if not self.use_sde:
             noise = self._noise.standard_normal((len(obs), self.n_act), np.float32)
-            return np.asarray(_scattered(self.update_config, actor, extra, stats, obs, noise))
+            return np.asarray(_scattered(self.update_config, actor, state.extra, stats, obs, noise))
         if self.matrices is None:
             self.reset_noise()
         matrices: Any = self.matrices
-        if len(matrices) != len(obs):
-            matrices = matrices[:1]
-        return np.asarray(_moved(self.update_config, actor, extra, stats, obs, matrices))
+        matrices = matrices if len(matrices) == len(obs) else matrices[:1]
+        return np.asarray(_moved(self.update_config, actor, state.extra, stats, obs, matrices))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

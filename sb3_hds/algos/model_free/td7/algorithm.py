@@ -17,11 +17,10 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from sb3_hds.algos.base.config import takes
 from sb3_hds.algos.base.construct import jax_device
 from sb3_hds.algos.model_free.algorithm import ModelFreeAlgorithm, ModelFreeConfig
-from sb3_hds.algos.model_free.replay import batches_of, transitions
 from sb3_hds.algos.model_free.td7.policy import TD7Policy
 from sb3_hds.algos.model_free.td7.prioritized_replay import LapReplayBuffer
 from sb3_hds.algos.model_free.td7.update import UpdateConfig, UpdateMetrics, update
-from sb3_hds.algos.model_free.update import Batch, zero_metrics
+from sb3_hds.algos.model_free.update import Batch, batches_of, transitions, zero_metrics
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -315,16 +314,9 @@ class TD7(ModelFreeAlgorithm):
         drawn = buffer.draw(batch_size)
         return Batch(**transitions(self.replay_source, *drawn)), drawn  # type: ignore[arg-type]
 
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
+    def stored(
+        self, new_obs: np.ndarray | dict[str, np.ndarray], reward: np.ndarray, dones: np.ndarray
     ) -> None:
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         if not self.assesses:
             return
         normalizer = self.get_vec_normalize_env()

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.algos.nets.activations import Activation
+from sb3_hds.algos.nets.options import Activation
 
 _EPSILON = 1e-8
 # Uniform, of variance 1 / (3 n) with n inputs.

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sb3_hds.algos.base.config import check_count, takes
-from sb3_hds.algos.base.policy import PolicyConfig
-from sb3_hds.algos.model_free.policy import LearningPolicy
+from sb3_hds.algos.base.policy import LearningPolicy, PolicyConfig
 from sb3_hds.algos.model_free.td7.networks import Actor, Critic, Encoder
 from sb3_hds.algos.model_free.td7.update import (
     Checkpoint,
@@ -22,9 +21,8 @@ from sb3_hds.algos.model_free.td7.update import (
     init_state,
     q_values,
 )
-from sb3_hds.algos.nets.activations import Activation, activation, widths
 from sb3_hds.algos.nets.observations import flattener, size_of
-from sb3_hds.algos.nets.optimizers import optimizer_of
+from sb3_hds.algos.nets.options import Activation, activation, optimizer_of, widths
 from sb3_hds.core.numerics.compilation import GENERATOR
 from sb3_hds.deploy.policy_function import PolicyFunction
 

@@ -127,14 +127,18 @@ class HDS(TwinAlgorithm):
         self.construct(config)
 
     def construct(self, config: HDSConfig, **more: Any) -> None:  # type: ignore[override]
+        # Share of rollouts with the learned force, and the twin's values before any correction.
         self.model_beta = 0.0
         self.nominal: dict[str, float] = {}
         self.measured = RecordedSteps(self._source, data_from(config.pretrain_data))
         asked = data_from(config.first_commands, "first_commands")
         self._commands_asked = None if asked is None else asked.episode(0)[1].tolist()
+        # Blocks of real steps; real steps at the last correction, and when the force was learned.
         self._n_blocks, self._refitted_at, self._steps_at_force = 0, 0, 0
+        # Real step and recording since which the system is another one; None: it never changed.
         self._changed_at: int | None = None
         self._changed_in = 0
+        # Whether ``pretrain_data`` were used; planning epochs that are left after a correction.
         self._saw_earlier = False
         self._replanning = 0
         # Files hold attributes, and plain data only.
@@ -265,7 +269,7 @@ class HDS(TwinAlgorithm):
         estimates the new effects with them, and learns the residual force again.
 
         :param arguments: as of :func:`sb3_hds.diagnose`
-        :return: the correction; None before anything was measured
+        :return: the diagnosis; None before anything was measured
         """
         if self.twin is None or self.measured.trajectories(self._since_change()) is None:
             return None

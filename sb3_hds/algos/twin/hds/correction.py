@@ -24,7 +24,7 @@ from sb3_hds.core import Trajectories, Twin
 from sb3_hds.errors import CalibrationError, TrajectoryError
 from sb3_hds.sysid import Fit
 from sb3_hds.sysid.estimation.calibrate import check_fits, fit_windows, spread_of
-from sb3_hds.sysid.estimation.free import each, every_name, free_names
+from sb3_hds.sysid.estimation.parameters import each, every_name, free_names
 from sb3_hds.sysid.estimation.prediction import (
     gain,
     is_better,

@@ -1,7 +1,8 @@
-"""What goes into an exported policy: observations by name, with what is known of them."""
+"""Observations of an exported policy: inputs by name, and ``VecNormalize`` as a part of it."""
 
+import os
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +10,28 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_hds.deploy.conversion import Port
-from sb3_hds.deploy.normalization import WHOLE, Normalization
 from sb3_hds.errors import ExportError
 
 # Where an entry of an observation has no limits, or wider ones: it is drawn from a Gaussian.
 _WIDEST = 1e3
 OBSERVATION = "observation"
+
+#: name of an observation that is no dictionary
+WHOLE = ""
+
+
+class Normalization(NamedTuple):
+    """
+    What ``VecNormalize`` does to one observation: ``clip((obs - mean) / scale)``.
+
+    :param mean: of the shape of the observation
+    :param scale: likewise
+    :param clip: largest absolute value that comes out
+    """
+
+    mean: np.ndarray
+    scale: np.ndarray
+    clip: float
 
 
 def parts_of(space: spaces.Space) -> dict[str, spaces.Space]:
@@ -99,4 +116,48 @@ def drawn(
         ends = np.where(within, low, 0.0), np.where(within, high, 1.0)
         values = np.where(within, rng.uniform(*ends, size=values.shape), values)
         found[key] = values.astype(np.float32)
+    return found
+
+
+def normalizations(normalize: Any) -> dict[str, Normalization]:
+    """
+    :param normalize: a ``VecNormalize``, or None
+    :return: by the key of each observation, :data:`WHOLE` where they are no dictionary; nothing
+        where observations are left alone
+    """
+    if normalize is None or not normalize.norm_obs:
+        return {}
+    found = normalize.obs_rms if isinstance(normalize.obs_rms, dict) else {WHOLE: normalize.obs_rms}
+    return {
+        name: Normalization(
+            np.asarray(part.mean, np.float64),
+            np.sqrt(np.asarray(part.var, np.float64) + normalize.epsilon),
+            float(normalize.clip_obs),
+        )
+        for name, part in found.items()
+    }
+
+
+def load_vec_normalize(path: str | os.PathLike[str]) -> Any:
+    """
+    Unpickles: load what you have saved yourself.
+
+    :param path: ``vecnormalize.pkl`` of a training
+    :raises ExportError: for a file that holds something else
+    """
+    import pickle
+
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    with open(path, "rb") as file:
+        try:
+            found = pickle.load(file)
+        # Where pickle meets damage, it may raise anything.
+        except Exception as error:
+            raise ExportError(f"'{path}' cannot be unpickled: {error}.") from error
+    if not isinstance(found, VecNormalize):
+        raise ExportError(
+            f"'{path}' holds a {type(found).__name__} instead of a VecNormalize, which RL Zoo "
+            "saves as vecnormalize.pkl beside a model."
+        )
     return found

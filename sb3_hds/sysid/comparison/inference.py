@@ -1,0 +1,201 @@
+"""Standard errors, profile likelihoods, family-wise p-values, aliased candidates."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from sb3_hds.sysid.comparison.halves import Half
+from sb3_hds.sysid.comparison.held_out import LEAST_GAIN
+from sb3_hds.sysid.estimation.candidates import Candidate
+from sb3_hds.sysid.estimation.evidence import Evidence, Point, Slopes
+
+# Directions below this share of the largest curvature do not move.
+_RANK = 1e-10
+# Cosine of the angle between what two causes do beyond which they look alike.
+_IMITATION = 0.95
+# How close to the wanted rise of the cost is close enough (in its root), and how often to try.
+_CLOSE, _MOST_TRIES = 0.1, 5
+# Most by which one try is farther from, or nearer to, the estimate than the one before.
+_FARTHER, _NEARER = 3.0, 0.2
+# Steps of a fit of the other parameters.
+_STEPS = 6
+# Draws of the bootstrap, and how many at a time, so that memory stays small.
+_N_DRAWS, _AT_A_TIME = 999, 250
+# Directions below this share of the largest curvature do not move.
+_WEAK = 1e-9
+
+
+def standard_errors(half: Half, point: Point, free: Sequence[int]) -> Float[np.ndarray, " p"]:
+    """
+    Jackknife over clusters, by one Newton step for each that is left out. With few clusters, the
+    sandwich estimator is too narrow, because the fit has shrunk their scores.
+
+    Source: MacKinnon, Nielsen, Webb, *Fast and reliable jackknife and bootstrap methods for
+    cluster-robust inference*, J. Applied Econometrics 38, 2023 (CV3).
+
+    :param free: indices of what was fitted
+    :return: of all parameters; infinite for parameters that were not fitted, or if derivatives are
+        not finite
+    """
+    result = np.full(len(point.theta), np.inf)
+    if not free:
+        return result
+    slopes, labels = half.evidence.slopes(point, free), np.unique(half.unit)
+    total, variance = slopes.curvature.sum(0), np.zeros(len(free))
+    if not (np.isfinite(slopes.curvature).all() and np.isfinite(slopes.scores).all()):
+        # Simulations blow up nearby: nobody knows how well the size is known.
+        return result
+    for label in labels:
+        own = half.unit == label
+        rest = np.linalg.pinv(total - slopes.curvature[own].sum(0), rcond=_RANK, hermitian=True)
+        with np.errstate(over="ignore"):  # infinite is right: one unit alone knows of it
+            variance += (rest @ slopes.scores[own].sum(0)) ** 2
+    variance *= (len(labels) - 1) / len(labels)
+    result[list(free)] = np.sqrt(variance) * half.evidence.hypotheses.scale[list(free)]
+    return result
+
+
+def detectable(half: Half, point: Point) -> dict[str, dict[str, float]]:
+    """
+    :param point: the nominal model, nuisances refitted
+    :return: by candidate and parameter, the smallest size that lowers the error by the least gain
+        that counts, to first order
+    """
+    h, total = half.evidence.hypotheses, half.evidence.slopes(point).curvature.sum(0)
+    numbers = point.raw.shape[1] * point.raw.shape[2]
+    needed = 0.5 * LEAST_GAIN * half.total(point) * numbers
+    nuisances, found = list(h.nuisances), {}
+    inner = np.linalg.pinv(total[np.ix_(nuisances, nuisances)], rcond=_RANK)
+    for candidate in h.candidates:
+        sizes = {}
+        for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
+            cross = total[i, nuisances]
+            curvature = total[i, i] - cross @ inner @ cross
+            size = np.sqrt(2.0 * needed / curvature) if curvature > 1e-12 else np.inf
+            sizes[name.rpartition(".")[2]] = float(size * h.scale[i])
+        found[candidate.key] = sizes
+    return found
+
+
+def aliased_with(
+    evidence: Evidence, point: Point, found: Candidate, nuisances: Sequence[int]
+) -> list[str]:
+    """
+    :param point: the fit with this cause
+    :param found: the cause
+    :param nuisances: indices of what else is refitted
+    :return: keys of aliased candidates: after projecting out the nuisances, the cosine between what
+        they and the cause change in these windows exceeds 0.95, to first order
+    """
+    h, total = evidence.hypotheses, evidence.slopes(point).curvature.sum(0)
+    rest = list(nuisances)
+    inner = np.linalg.pinv(total[np.ix_(rest, rest)], rcond=_RANK, hermitian=True)
+    total = total - total[:, rest] @ inner @ total[rest]
+    own = list(h.indices(found))
+    direction = ((point.theta - h.null) / h.scale)[own]
+    strength = direction @ total[np.ix_(own, own)] @ direction
+    names = []
+    for candidate in h.candidates:
+        other = list(h.indices(candidate))
+        if set(other) & {*own, *rest} or np.diag(total)[other].min() <= 1e-9 * strength:
+            continue
+        shared = total[np.ix_(other, own)] @ direction
+        caught = shared @ np.linalg.pinv(total[np.ix_(other, other)], hermitian=True) @ shared
+        if caught > _IMITATION**2 * strength:
+            names.append(candidate.key)
+    return names
+
+
+def profiled(
+    evidence: Evidence, point: Point, free: Sequence[int], index: int, half: float
+) -> tuple[float, float]:
+    """
+    The interval of a parameter by its profile likelihood: where the cost, all other free parameters
+    and the start states refitted, has risen by what the parabola at the best fit rises over
+    ``half``. So it is as wide as a standard error that allows for correlated errors wants it, but
+    need not be symmetric: a dead zone or a delay may be known on one side only.
+
+    Source: Raue et al., Bioinformatics 25, 2009 (profile likelihood); the rise is scaled as the
+    parabola is.
+
+    :param point: the best fit
+    :param free: indices of what was fitted
+    :param index: of the parameter, one of ``free``
+    :param half: half the width of the symmetric interval
+    :return: both ends; a physical bound where the cost does not rise enough before it
+    """
+    h = evidence.hypotheses
+    others = [i for i in free if i != index]
+    curvature = evidence.slopes(point, [index, *others]).curvature.sum(0)
+    inner = np.linalg.pinv(curvature[1:, 1:], rcond=_RANK, hermitian=True)
+    along = curvature[0, 0] - curvature[0, 1:] @ inner @ curvature[1:, 0]
+    rise = 0.5 * max(along, 0.0) * (half / h.scale[index]) ** 2
+    best = point.theta[index]
+    if not np.isfinite(half) or not 0.0 < rise < np.inf:
+        return float(h.lower[index]), float(h.upper[index])
+    follow = -inner @ curvature[1:, 0] * h.scale[others] / h.scale[index]
+
+    def end(side: float) -> float:
+        bound = float(h.lower[index] if side < 0.0 else h.upper[index])
+        away, offsets = half, point.offsets
+        for _ in range(_MOST_TRIES):
+            value = float(np.clip(best + side * away, h.lower[index], h.upper[index]))
+            theta = point.theta.copy()
+            theta[index] = value
+            moved = theta[others] + follow * (value - best)
+            theta[others] = np.clip(moved, h.lower[others], h.upper[others])
+            cost = evidence.fit(theta, others, offsets, _STEPS).cost - point.cost
+            ratio = np.sqrt(max(cost, 0.0) / rise)
+            if abs(ratio - 1.0) < _CLOSE or (value == bound and ratio < 1.0):
+                return value
+            away = abs(value - best) * float(np.clip(1.0 / max(ratio, 1e-9), _NEARER, _FARTHER))
+        return float(np.clip(best + side * away, h.lower[index], h.upper[index]))
+
+    return end(-1.0), end(1.0)
+
+
+def family_p_value(
+    slopes: Slopes,
+    candidates: Sequence[Sequence[int]],
+    free: Sequence[int],
+    fitted: Sequence[int],
+    gain: float,
+    seed: int = 0,
+) -> float:
+    """
+    Family-wise p-value of the best candidate: how often the largest gain over all candidates would
+    be as large if nothing were wrong but the noise, of whatever colour.
+
+    Multipliers are drawn for whole windows and weigh their scores: the sums have the covariance
+    that scores have under what remains, so the noise needs no model. What was fitted has made the
+    scores of few windows smaller than they were, which is undone.
+
+    Source: Chernozhukov, Chetverikov, Kato, *Gaussian approximations and multiplier bootstrap for
+    maxima of sums of high-dimensional random vectors*, Ann. Stat. 41, 2013; MacKinnon, White, *Some
+    heteroskedasticity-consistent covariance matrix estimators*, J. Econometrics 29, 1985.
+
+    :param slopes: where the best candidate is fitted, so that what it explains is no noise
+    :param candidates: for each, the indices of its parameters
+    :param free: indices of what is refitted whichever candidate it is
+    :param fitted: indices of what has been fitted: ``free`` and the best candidate's parameters
+    :param gain: by which the best candidate lowers the cost
+    """
+    scores, curvature = slopes.scores, slopes.curvature.sum(0)
+    fixed = list(free)
+    inner = np.linalg.pinv(curvature[np.ix_(fixed, fixed)], rcond=_WEAK, hermitian=True)
+    onto = curvature[:, fixed] @ inner
+    scores = scores - scores[:, fixed] @ onto.T
+    n = len(scores)
+    scores = (scores - scores.mean(0)) * n / max(n - len(fitted), 1)
+    curvature = curvature - onto @ curvature[fixed]
+    sizes = [
+        (list(own), np.linalg.pinv(curvature[np.ix_(own, own)], rcond=_WEAK, hermitian=True))
+        for own in candidates
+    ]
+    rng, as_large = np.random.default_rng(seed), 1
+    for first in range(0, _N_DRAWS, _AT_A_TIME):
+        drawn = rng.standard_normal((min(_AT_A_TIME, _N_DRAWS - first), n)) @ scores
+        gains = [0.5 * np.einsum("di,ij,dj->d", drawn[:, o], k, drawn[:, o]) for o, k in sizes]
+        as_large += int(np.sum(np.max(gains, axis=0) >= gain))
+    return as_large / (1 + _N_DRAWS)

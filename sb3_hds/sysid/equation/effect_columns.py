@@ -1,0 +1,376 @@
+"""Columns of effects: forces at joints, delayed or distorted commands, misread sensors."""
+
+import copy
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from sb3_hds.core import ActionEffect, JointEffect, JointMoment, SensorEffect, State, Twin
+from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
+from sb3_hds.effects import SensorDelay
+from sb3_hds.effects.joint import DryFriction
+from sb3_hds.sysid.equation.regression import STEP, Equation, Item, Rows, put, put_acting, ranges_of
+from sb3_hds.sysid.equation.terms import forces, portions, terms
+from sb3_hds.sysid.estimation.candidates import Candidate, encoders
+from sb3_hds.sysid.estimation.hypotheses import Hypotheses
+
+# Places of a normal distribution, in standard deviations, and their weights (Gauss-Hermite).
+_PLACES, _WEIGHTS = np.array([0.0, -np.sqrt(3.0), np.sqrt(3.0)]), np.array([4.0, 1.0, 1.0]) / 6.0
+
+#: by effect, its parameter and the force per unit of it at a velocity
+CLOSED_FORMS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
+    "viscous_friction": ("b", np.negative),
+    "coulomb_friction": ("tau_c", lambda v: -np.sign(v)),
+    "constant_force": ("tau_0", np.ones_like),
+}
+
+
+# ------------------------------------------------------------------------------ forces at joints
+def add_force(
+    made: Equation,
+    candidate: Candidate,
+    effect: JointEffect,
+    nodes: Mapping[str, np.ndarray],
+    rows: Rows,
+) -> None:
+    """Columns of a force at a joint: its derivatives by its parameters, at fixed settings."""
+    j, motion = candidate.index, made.motion
+    ranges = ranges_of(made, rows, j, None)
+    settings = effect.grid(ranges)
+    names = tuple(effect.parameters)
+    nulls = {name: p.null for name, p in effect.parameters.items()}
+    given = settings or ({},)
+    values = np.array([[{**nulls, **at}[name] for name in names] for at in given])
+    slopes = _force_slopes(effect.at(0), values, nodes, motion.dt)
+    if settings and effect.blended:
+        # By pairs: the slope by the first parameter at two values of the blended one.
+        for first in range(0, len(settings) - 1, 2):
+            pair = [put(made, j, slopes[first + k, 0]) for k in (0, 1)]
+            own = (settings[first], settings[first + 1])
+            made.items.append(
+                Item(candidate, tuple(pair), (None, None), "blend", own, (names[0], names[0]))
+            )
+        return
+    for at, by_name in zip(given, slopes, strict=True):
+        useful = [
+            i for i, name in enumerate(names) if name not in at and np.abs(by_name[i]).max() > 0.0
+        ]
+        if useful:
+            columns = tuple(put(made, j, by_name[i]) for i in useful)
+            own = (at,) if at else ()
+            made.items.append(
+                Item(
+                    candidate,
+                    columns,
+                    (None,) * len(columns),
+                    "linear",
+                    own,
+                    tuple(names[i] for i in useful),
+                )
+            )
+
+
+def add_closed_form(made: Equation, candidate: Candidate, nodes: Mapping[str, np.ndarray]) -> None:
+    """The column of a force in :data:`CLOSED_FORMS`."""
+    name, by_speed = CLOSED_FORMS[candidate.name]
+    values = np.sum(nodes["weights"] * by_speed(nodes["v"]), axis=(1, 2))
+    column = put(made, candidate.index, values)
+    made.items.append(Item(candidate, (column,), (None,), "linear", (), (name,)))
+
+
+def nodes_of(
+    made: Equation, rows: Rows, bias: np.ndarray, inertia: np.ndarray, joint: int
+) -> dict[str, np.ndarray]:
+    """
+    Quadrature nodes: three points of each interval (Simpson's rule, over the part that the twin's
+    integrator evaluates), each at three velocities (Gauss-Hermite, for the uncertainty of its
+    sign).
+    """
+    motion, dt = made.motion, made.motion.dt
+    places, shares = motion.seen * np.array([0.0, 0.5, 1.0]), np.array([1.0, 4.0, 1.0]) / 6.0
+    if motion.seen == 0.0:
+        places, shares = np.array([0.0]), np.array([1.0])
+    q, v, next_q, next_v = (x[:, joint, None] for x in (rows.q, rows.v, rows.next_q, rows.next_v))
+    # A cubic through both ends, of velocities a line.
+    s = places
+    position = (2 * s**3 - 3 * s**2 + 1) * q + dt * (s**3 - 2 * s**2 + s) * v
+    position = position + (3 * s**2 - 2 * s**3) * next_q + dt * (s**3 - s**2) * next_v
+    speed = (v * (1 - s) + next_v * s)[..., None] + motion.error_v[joint] * _PLACES
+    return {
+        "q": np.broadcast_to(position[..., None], speed.shape),
+        "v": speed,
+        "actuator": made.load[:, joint],
+        "load": bias[:, joint],
+        "inertia": inertia[:, joint],
+        "weights": shares[:, None] * _WEIGHTS,
+    }
+
+
+def _force_slopes(
+    effect: JointEffect, settings: np.ndarray, nodes: Mapping[str, np.ndarray], h: float
+) -> np.ndarray:
+    """:return: derivative of the mean force by each parameter, ``(settings, parameters, n)``"""
+    weights, found = nodes["weights"], []
+    effect, standstill = _for_any_joint(effect)
+    rows = {name: x for name, x in nodes.items() if name != "weights"}
+    with jax.enable_x64(True):
+        for index, n in portions(len(rows["load"])):
+            given = {name: jnp.asarray(x[index], jnp.float64) for name, x in rows.items()}
+            slopes = [_slopes_of(effect, standstill, each, given, weights, h) for each in settings]
+            found.append(np.stack(slopes)[..., :n])
+    return np.concatenate(found, -1)
+
+
+def _for_any_joint(effect: JointEffect) -> tuple[JointEffect, float]:
+    """One program serves all joints: what differs between them is told apart from the effect."""
+    if not isinstance(effect, DryFriction):
+        return effect, 0.0
+    return _standing_still_at(effect, 1.0), effect.standstill
+
+
+def _standing_still_at(effect: DryFriction, speed: Any) -> DryFriction:
+    changed = copy.copy(effect)
+    changed.standstill = speed
+    return changed
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
+def _slopes_of(
+    effect: JointEffect,
+    standstill: Array,
+    values: Array,
+    nodes: dict[str, Array],
+    weights: Array,
+    h: float,
+) -> Array:
+    names = tuple(effect.parameters)
+    if isinstance(effect, DryFriction):
+        effect = _standing_still_at(effect, standstill)
+
+    def mean(values: Array, q: Array, v: Array, actuator: Array, load: Array, inertia: Array):
+        params = dict(zip(names, values, strict=True))
+        one = lambda q, v: effect.torque(  # noqa: E731
+            JointMoment(q, v, actuator, load, inertia, h), (), params
+        )
+        return jnp.sum(weights * jax.vmap(jax.vmap(one))(q, v))
+
+    along = lambda way: jax.jvp(  # noqa: E731
+        lambda x: jax.vmap(partial(mean, x))(
+            nodes["q"], nodes["v"], nodes["actuator"], nodes["load"], nodes["inertia"]
+        ),
+        (values,),
+        (way,),
+    )[1]
+    return jax.vmap(along)(jnp.eye(len(names), dtype=values.dtype))
+
+
+# ------------------------------------------------------------------------------ commands
+def add_command(
+    made: Equation,
+    hypotheses: Hypotheses,
+    candidate: Candidate,
+    effect: ActionEffect,
+    rows: Rows,
+) -> None:
+    """Columns of what delays or distorts commands: changes of the actuators\' force."""
+    twin, i, dt = hypotheses.believed, candidate.index, made.motion.dt
+    if not rows.actions.size or not np.ptp(rows.actions[:, i]) > 0.0:
+        return
+    ranges = ranges_of(made, rows, None, i)
+    settings, names = effect.grid(ranges), tuple(effect.parameters)
+    nulls = {name: p.null for name, p in effect.parameters.items()}
+    if effect.chained and len(settings) < 2:
+        return
+    if not effect.chained:
+        steps = [STEP * effect.parameters[name].scale for name in names]
+        given = [{**nulls, name: nulls[name] + s} for name, s in zip(names, steps, strict=True)]
+    else:
+        given = [{**nulls, **at} for at in settings]
+    commands = _commanded(effect, given, rows, i, twin, dt)
+    before = forces(twin, twin.params, rows.q, rows.v, rows.actions[None])[0]
+    after = forces(twin, twin.params, rows.q, rows.v, commands)
+    changes = after - before
+    if not effect.chained:
+        columns, useful = [], []
+        for name, step, change in zip(names, steps, changes, strict=True):
+            if np.abs(change).max() > 0.0:
+                columns.append(put_acting(made, change / step))
+                useful.append(name)
+        if columns:
+            made.items.append(
+                Item(candidate, tuple(columns), (None,) * len(columns), "linear", (), tuple(useful))
+            )
+        return
+    for k in range(len(settings) - 1):
+        whole = put_acting(made, changes[k])
+        part = put_acting(made, changes[k + 1] - changes[k])
+        made.items.append(
+            Item(
+                candidate,
+                (whole, part),
+                (1.0, None),
+                "chain",
+                (settings[k], settings[k + 1]),
+                (effect.chained, effect.chained),
+            )
+        )
+
+
+def add_common(made: Equation, hypotheses: Hypotheses) -> None:
+    """Causes that all actuators share, such as a late bus: sums of the columns of each actuator."""
+    for candidate in (c for c in hypotheses.candidates if c.slot == "actuator" and c.index < 0):
+        own = [item for item in made.items if item.candidate.name == candidate.name]
+        by_settings: dict[str, list[Item]] = {}
+        for item in own:
+            by_settings.setdefault(repr(item.settings), []).append(item)
+        places = len({item.candidate.index for item in own})
+        for items in by_settings.values():
+            if len(items) < places or places < 2:
+                continue
+            first = items[0]
+            columns = []
+            for k in range(len(first.columns)):
+                total = np.zeros_like(made.missing)
+                for item in items:
+                    column = made.columns[item.columns[k]]
+                    own_joint = slice(None) if column.joint is None else column.joint
+                    total[:, own_joint] += column.values
+                columns.append(put(made, None, total))
+            made.items.append(
+                dataclasses.replace(first, candidate=candidate, columns=tuple(columns))
+            )
+
+
+def _commanded(
+    effect: ActionEffect,
+    settings: Sequence[Mapping[str, float]],
+    rows: Rows,
+    index: int,
+    twin: Twin,
+    dt: float,
+) -> np.ndarray:
+    """:return: commands as they arrive under each setting, shape ``(settings, n, n_act)``"""
+    found = np.repeat(rows.actions[None], len(settings), 0).astype(float)
+    names = tuple(effect.parameters)
+    values = np.array([[at[name] for name in names] for at in settings])
+    at_interval = twin.at_interval(dt, 1) if twin.dt != dt else twin
+    with jax.enable_x64(True):
+        memory = jax.tree.map(
+            lambda leaf: jnp.asarray(leaf, jnp.float64), effect.memory(at_interval)
+        )
+        for r in np.unique(rows.recording):
+            own = rows.recording == r
+            commands = jnp.asarray(rows.actions[own, index], jnp.float64)
+            found[:, own, index] = np.asarray(
+                _arrived(effect.at(0), jnp.asarray(values), commands, memory, dt)
+            )
+    return found
+
+
+@partial(jax.jit, static_argnums=(0, 4), compiler_options=QUICKEST_COMPILATION)
+def _arrived(effect: ActionEffect, values: Array, commands: Array, memory: Any, h: float) -> Array:
+    names = tuple(effect.parameters)
+
+    def under(setting: Array) -> Array:
+        params = dict(zip(names, setting, strict=True))
+
+        def advance(memory: Any, command: Array) -> tuple[Any, Array]:
+            arrived, after = effect.act(command, memory, h, params)
+            return after, arrived
+
+        return jax.lax.scan(advance, memory, commands)[1]
+
+    return jax.vmap(under)(values)
+
+
+# ------------------------------------------------------------------------------ sensors
+def add_sensor(
+    made: Equation,
+    hypotheses: Hypotheses,
+    candidate: Candidate,
+    effect: SensorEffect,
+    rows: Rows,
+    smooth: np.ndarray,
+) -> None:
+    """Minus the change of the residual force if the channel is read as the effect says."""
+    twin, channels = hypotheses.believed, (candidate.index,)
+    if candidate.slot == "joint":
+        channels = encoders(twin)[candidate.index].channels
+    if isinstance(effect, SensorDelay):
+        return
+    (name, parameter), *others = effect.parameters.items()
+    if others or parameter.upper - parameter.lower == 1.0:
+        return  # a switch is no matter of degree
+    spread = np.std(_observed(twin, rows.q, rows.v)[:, channels[0]])
+    step = STEP * (spread if parameter.unit == "channel unit" else 1.0)
+    if not step > 0.0:
+        return
+
+    def read(q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return _reread(twin, effect.at(0), channels, q, v, float(parameter.null + step))
+
+    q, v = read(rows.q, rows.v)
+    _, next_v = read(rows.next_q, rows.next_v)
+    there = terms(twin, twin.params, q, v, rows.actions)
+    effective = made.effective + there.mass - made.mass
+    moved = np.einsum("nij,nj->ni", effective, next_v - v - there.change) / made.motion.dt
+    column = -(moved - smooth) / step
+    if np.isfinite(column).all() and np.abs(column).max() > 0.0:
+        index = put(made, None, column)
+        made.items.append(Item(candidate, (index,), (None,), "linear", (), (name,)))
+
+
+def _observed(twin: Twin, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    with jax.enable_x64(True):
+        return np.asarray(_observations(twin, jnp.asarray(q), jnp.asarray(v)))
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
+def _observations(twin: Twin, q: Array, v: Array) -> Array:
+    memory = twin.infer(jnp.zeros(len(twin.channels), q.dtype), twin.params).memory
+    return jax.vmap(lambda q, v: twin.observe(State(q, v, memory), twin.params))(q, v)
+
+
+def _reread(
+    twin: Twin,
+    effect: SensorEffect,
+    channels: tuple[int, ...],
+    q: np.ndarray,
+    v: np.ndarray,
+    value: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """What joints did if a channel reports what the effect makes of it."""
+    with jax.enable_x64(True):
+        found = _inverted(twin, effect, channels, jnp.asarray(q), jnp.asarray(v), value)
+        new_q, new_v = map(np.asarray, found)
+    if not new_v.any():
+        new_v = v  # no velocity is observed: its scale is that of the position
+        (name,) = effect.parameters
+        if name == "scale":
+            new_v = v / value
+    turns = 2.0 * np.pi * np.round((q - new_q) / (2.0 * np.pi))
+    rotary = np.array([joint.unit == "rad" for joint in twin.joints])
+    return new_q + np.where(rotary, turns, 0.0), new_v
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=QUICKEST_COMPILATION)
+def _inverted(
+    twin: Twin, effect: SensorEffect, channels: tuple[int, ...], q: Array, v: Array, value: float
+) -> tuple[Array, Array]:
+    (name,) = effect.parameters
+    memory = twin.infer(jnp.zeros(len(twin.channels), q.dtype), twin.params).memory
+
+    def one(q: Array, v: Array) -> tuple[Array, Array]:
+        obs = twin.observe(State(q, v, memory), twin.params)
+        for i in channels:
+            obs = obs.at[i].set(effect.invert(obs[i], {name: value}))
+        state = twin.infer(obs, twin.params)
+        return state.q, state.v
+
+    return jax.vmap(one)(q, v)

@@ -1,0 +1,170 @@
+"""The equation of motion as a regression: a row for each interval, columns for candidates."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from sb3_hds.core import Effect, Ranges
+from sb3_hds.sysid.equation.motion import Motion
+from sb3_hds.sysid.estimation.candidates import Candidate
+
+# Finite differences by a parameter or a sensor, in shares of its scale.
+STEP = 1e-3
+
+Rule = Literal["linear", "chain", "blend", "switch"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Item:
+    """
+    A candidate with its nonlinear parameters at fixed values, or between two.
+
+    :param candidate: which
+    :param columns: indices
+    :param fixed: of each column, a fixed coefficient; None: it is estimated
+    :param rule: how coefficients become sizes
+    :param settings: values of its parameters, by short name, at which the columns were taken
+    :param names: short name of the parameter of each column
+    """
+
+    candidate: Candidate
+    columns: tuple[int, ...]
+    fixed: tuple[float | None, ...]
+    rule: Rule
+    settings: tuple[Mapping[str, float], ...]
+    names: tuple[str, ...]
+
+    @property
+    def key(self) -> str:
+        return self.candidate.key
+
+    @cached_property
+    def free(self) -> tuple[int, ...]:
+        """Columns whose coefficients are estimated."""
+        return tuple(c for c, f in zip(self.columns, self.fixed, strict=True) if f is None)
+
+    def sizes(
+        self, effect: Effect | None, coefficients: Sequence[float] | np.ndarray
+    ) -> dict[str, float]:
+        """
+        :param effect: the candidate's; None for a parameter
+        :param coefficients: of the free columns
+        :return: values of the candidate's parameters by short name; of a parameter, its change
+        """
+        if self.rule == "chain":
+            (name,), (low, high) = self.names[-1:], self.settings
+            share = float(coefficients[0])
+            return {name: low[name] + share * (high[name] - low[name])}
+        if self.rule == "blend":
+            assert effect is not None
+            return effect.blend((coefficients[0], coefficients[1]), self.settings)  # type: ignore[arg-type]
+        if self.rule == "switch":
+            return dict(self.settings[0])
+        found = dict(self.settings[0]) if self.settings else {}
+        for name, value in zip(self.names, coefficients, strict=True):
+            null = effect.parameters[name].null if effect is not None else 0.0
+            found[name] = null + float(value)
+        return found
+
+
+class Column(NamedTuple):
+    """
+    :param joint: at which it acts; None: at all, and ``values`` has a column for each
+    :param values: force at each interval, shape ``(n,)`` or ``(n, dof)`` [N m] or [N]
+    """
+
+    joint: int | None
+    values: np.ndarray
+
+    def at(self, joint: int) -> np.ndarray | None:
+        """:return: force at one joint; None if there is none"""
+        if self.joint is None:
+            return self.values[:, joint]
+        return self.values if self.joint == joint else None
+
+
+@dataclasses.dataclass
+class Equation:
+    """
+    The equation of motion along all recordings, one row for each interval.
+
+    :param missing: residual force of the nominal model, shape ``(n, dof)`` [N m] or [N]
+    :param columns: what candidates would add
+    :param items: candidates, several with different settings
+    :param recording: that each row is from, shape ``(n,)``
+    :param q: smoothed positions where an interval begins, shape ``(n, dof)``
+    :param v: smoothed velocities there
+    :param load: force that the nominal model transmits: inertia, gravity, shape ``(n, dof)``
+    :param actuator: force of the actuators, shape ``(n, dof)``
+    :param mass: mass matrix, shape ``(n, dof, dof)``
+    :param effective: effective inertia over an interval, likewise: force over change of velocity,
+        with damping
+    :param slopes: of the mass matrix by inertial parameters, by key of the candidate
+    :param drives: by which share of the actuators' force that changes with a unit of a parameter,
+        at each joint, likewise
+    :param motion: what they come from
+    """
+
+    missing: np.ndarray
+    columns: list[Column]
+    items: list[Item]
+    recording: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    load: np.ndarray
+    actuator: np.ndarray
+    mass: np.ndarray
+    effective: np.ndarray
+    slopes: dict[str, np.ndarray]
+    drives: dict[str, np.ndarray]
+    motion: Motion
+
+
+class Rows(NamedTuple):
+    """All recordings, one after the other: where intervals begin and end."""
+
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    change: np.ndarray  # of the smoothed velocity
+    measured: np.ndarray  # of the measured velocity
+    actions: np.ndarray
+    recording: np.ndarray
+    next_q: np.ndarray
+    next_v: np.ndarray
+
+
+def put(made: Equation, joint: int | None, values: np.ndarray) -> int:
+    """:return: index of a new column"""
+    made.columns.append(Column(joint, values))
+    return len(made.columns) - 1
+
+
+def put_acting(made: Equation, values: np.ndarray) -> int:
+    """:return: index of a new column, at a single joint if it acts at one only"""
+    acting = np.flatnonzero(np.abs(values).max(0) > 0.0)
+    return (
+        put(made, int(acting[0]), values[:, acting[0]])
+        if len(acting) == 1
+        else put(made, None, values)
+    )
+
+
+def ranges_of(made: Equation, rows: Rows, joint: int | None, actuator: int | None) -> Ranges:
+    """:return: ranges of the motion and the commands, from which effects choose their settings"""
+    motion, command = made.motion, np.zeros(1)
+    if actuator is not None:
+        command = rows.actions[:, actuator]
+    own = slice(None) if joint is None else slice(joint, joint + 1)
+    return Ranges(
+        excursion=float(np.max(motion.excursion[own])),
+        speed=float(np.max(motion.speed[own])),
+        command=float(np.sqrt(np.mean(command**2))),
+        largest=float(np.abs(command).max()),
+        dt=motion.dt,
+        period=float(np.min(motion.period[own])),
+        turn=motion.turn[joint] if joint is not None else np.inf,
+    )

@@ -1,0 +1,281 @@
+"""Candidates: every effect at every place, and every parameter of the twin."""
+
+import dataclasses
+from collections.abc import Callable, Collection, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sb3_hds.core import ActionEffect, Effect, ExtendedTwin, ForceEffect, SensorEffect, Twin
+from sb3_hds.core.twin import layers_of, plant_of
+from sb3_hds.effects import (
+    ActionDelay,
+    ConstantForce,
+    DryFriction,
+    NeuralForce,
+    SensorDelay,
+    SignFlip,
+    reversed_joint,
+)
+from sb3_hds.errors import EffectError
+
+# Longest delay, in periods of the motion, and the speed below which dry friction is smoothed, in
+# root mean square ones.
+_LATEST, _STANDSTILL = 0.3, 0.01
+
+#: the slot of a twin's own parameter, beside those of effects
+PARAMETER = "parameter"
+
+#: where something acts that all actuators share
+EVERY = "all"
+# What they may share: a bus, a controller.
+_SHARED = ("action_delay", "motor_lag")
+# What a velocity takes over from the position that it is derived from.
+_DERIVED = ("sensor_scale", "sensor_delay")
+_OF_DIRECTION = "The direction of the joint is taken the wrong way round, in position and velocity."
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """
+    A cause that data may confirm.
+
+    :param name: of the effect; ``"parameter.mass"`` for a parameter of the twin
+    :param slot: ``"joint"``, ``"actuator"``, ``"channel"`` or ``"parameter"``
+    :param place: name of the joint, actuator or channel; of the parameter
+    :param index: of the joint, actuator or channel, -1 for all actuators; of the parameter among
+        those of the twin
+    :param parameters: full names in the extended twin
+    :param explanation: one sentence for people
+    :param equivalents: effects that may be indistinguishable from this one, and under which motion
+    :param ascending: parameters that must be in ascending order
+    """
+
+    name: str
+    slot: str
+    place: str
+    index: int
+    parameters: tuple[str, ...]
+    explanation: str
+    equivalents: tuple[tuple[str, str], ...] = ()
+    ascending: tuple[str, ...] = ()
+
+    @property
+    def key(self) -> str:
+        """Name and place: unique."""
+        return self.name if self.slot == PARAMETER else f"{self.name}.{self.place}"
+
+    def resembles(self, other: "Candidate") -> str:
+        """
+        :return: when it is indistinguishable from another one, as declared by the effect; empty
+            otherwise
+        """
+        elsewhere = other.slot == self.slot and other.index != self.index
+        return "" if elsewhere else dict(self.equivalents).get(other.name, "")
+
+
+def single_keys(keys: Collection[str], twin: Twin) -> set[str]:
+    """:return: keys of what is attached: of a cause at several places, what is at each"""
+    found = set(keys)
+    for key in keys:
+        name, _, place = key.partition(".")
+        if place == EVERY:
+            found |= {f"{name}.{actuator.name}" for actuator in twin.actuators}
+        if name in (SignFlip.name, *_DERIVED):
+            found |= {f"{name}.{channel.name}" for channel in twin.channels}
+    return found
+
+
+def with_pushes(kept: Callable[[type[Effect], str], bool]) -> Callable[[type[Effect], str], bool]:
+    """Constant forces serve to measure what force is missing."""
+    return lambda kind, place: kind is ConstantForce or kept(kind, place)
+
+
+def options_for(
+    period: float, speeds: Sequence[float], kind: type[Effect], place: int
+) -> dict[str, float]:
+    """Scales of the motion in the place of seconds and radians that suit most machines."""
+    if issubclass(kind, ActionDelay | SensorDelay):
+        return {"longest": _LATEST * period}
+    if issubclass(kind, DryFriction) and len(speeds) and speeds[place] > 0.0:
+        return {"standstill": _STANDSTILL * speeds[place]}
+    return {}
+
+
+def attach(
+    twin: Twin,
+    effects: Sequence[type[Effect]],
+    kept: Callable[[type[Effect], str], bool],
+    options: Callable[[type[Effect], int], dict[str, float]],
+) -> tuple[Twin, list[Candidate]]:
+    """Every effect that is wanted at every place where it is not already."""
+    there = {a.key for a in attached_of(twin)}
+    wanted: list[Effect] = []
+    places = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}
+    for kind in effects:
+        if issubclass(kind, NeuralForce):
+            raise EffectError(
+                "NeuralForce is never the name of a cause. Leave it out: what remains is "
+                "reported by itself."
+            )
+        for i, place in enumerate(places[kind.slot]):
+            if f"{kind.name}.{place.name}" not in there and kept(kind, place.name):
+                wanted.append(kind(i, **options(kind, i)))
+    extended = twin.extend(*wanted) if wanted else twin
+    candidates = []
+    for a in attached_of(extended):
+        if isinstance(a.effect, NeuralForce):
+            continue
+        candidates.append(
+            Candidate(
+                a.effect.name,
+                a.effect.slot,
+                places[a.effect.slot][a.index].name,
+                a.index,
+                tuple(f"{a.key}.{name}" for name in a.effect.parameters),
+                a.effect.explanation,
+                tuple(a.effect.equivalents.items()),
+                tuple(f"{a.key}.{name}" for name in a.effect.ascending),
+            )
+        )
+    if SignFlip in effects:
+        candidates += _reversed_joints(twin)
+    return extended, candidates + _shared(twin, candidates)
+
+
+def _shared(twin: Twin, candidates: Sequence[Candidate]) -> list[Candidate]:
+    """One bus or one power supply behind all actuators: one size for all of them."""
+    found = _of_encoders(twin, candidates)
+    for name in _SHARED:
+        own = [c for c in candidates if c.name == name and c.slot == "actuator"]
+        if len(own) > 1 and len(own) == len(twin.actuators):
+            tie = f"{name}.{EVERY}"
+            names = tuple(f"{tie}.{p.rpartition('.')[2]}" for p in own[0].parameters)
+            found.append(dataclasses.replace(own[0], place=EVERY, index=-1, parameters=names))
+    return found
+
+
+def _of_encoders(twin: Twin, candidates: Sequence[Candidate]) -> list[Candidate]:
+    """What is wrong with a sensor is wrong with the velocity, too, that is derived from it."""
+    found = []
+    for j, encoder in encoders(twin).items():
+        for name in _DERIVED:
+            own = [c for c in candidates if c.name == name and c.slot == "channel"]
+            if encoder.velocity is None or not {*encoder.channels} <= {c.index for c in own}:
+                continue
+            (first,) = (c for c in own if c.index == encoder.position)
+            place = twin.joints[j].name
+            names = tuple(f"{name}.{place}.{p.rpartition('.')[2]}" for p in first.parameters)
+            found.append(
+                dataclasses.replace(first, slot="joint", place=place, index=j, parameters=names)
+            )
+    return found
+
+
+class Encoder(NamedTuple):
+    """
+    :param position: index of the channel that reports a joint's position
+    :param velocity: of the one that reports its velocity; None if there is none
+    """
+
+    position: int
+    velocity: int | None
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """Indices of all channels that it feeds."""
+        return (self.position,) if self.velocity is None else (self.position, self.velocity)
+
+
+def encoders(twin: Twin) -> dict[int, Encoder]:
+    """:return: by joint, where channels are positions and velocities themselves"""
+    twin = plant_of(twin)
+    dof = len(twin.joints)
+    state = twin.initial(jax.random.key(0), twin.params)
+    if state.q.shape != (dof,):
+        return {}
+
+    def seen(x: jax.Array) -> jax.Array:
+        return twin.observe(state._replace(q=x[:dof], v=x[dof:]), twin.params)
+
+    here = jnp.concatenate([0.3 + 0.1 * jnp.arange(dof), 0.7 - 0.1 * jnp.arange(dof)])
+    slopes, values = np.asarray(jax.jacfwd(seen)(here)), np.asarray(seen(here))
+    unit = np.abs(np.abs(slopes).sum(1) - 1.0) < 1e-6
+    found = {}
+    for j in range(dof):
+        places = [
+            [
+                i
+                for i in np.flatnonzero(unit)
+                if np.isclose(slopes[i, k], 1.0) and np.isclose(values[i], here[k], atol=1e-5)
+            ]
+            for k in (j, dof + j)
+        ]
+        if len(places[0]) == 1 and len(places[1]) <= 1:
+            velocity = int(places[1][0]) if places[1] else None
+            found[j] = Encoder(int(places[0][0]), velocity)
+    return found
+
+
+def ties_of(
+    twin: Twin, candidates: Sequence[Candidate], single: Sequence[Candidate]
+) -> dict[str, tuple[str, ...]]:
+    """:return: by the name of a shared number, the parameters that take it"""
+    found = {}
+    for shared in candidates:
+        if shared.place == EVERY:
+            own = [c for c in single if c.name == shared.name and c.slot == "actuator"]
+            own = [c for c in own if c.place != EVERY]
+        elif shared.slot == "joint" and shared.name in _DERIVED:
+            channels = encoders(twin)[shared.index].channels
+            own = [c for c in single if c.name == shared.name and c.slot == "channel"]
+            own = [c for c in own if c.index in channels]
+        else:
+            continue
+        for name in shared.parameters:
+            short = name.rpartition(".")[2]
+            found[name] = tuple(f"{c.key}.{short}" for c in own)
+    return found
+
+
+def _reversed_joints(twin: Twin) -> list[Candidate]:
+    """Joints whose direction may be wrong: several channels have the wrong sign together."""
+    found = []
+    for i, joint in enumerate(twin.joints):
+        try:
+            flips = reversed_joint(twin, i)
+        except EffectError:
+            continue
+        if len(flips) > 1:
+            names = tuple(f"{SignFlip.name}.{flip.where}.flipped" for flip in flips)
+            found.append(Candidate(SignFlip.name, "joint", joint.name, i, names, _OF_DIRECTION))
+    return found
+
+
+def has_memory(effect: Effect, twin: Twin) -> bool:
+    if isinstance(effect, SensorEffect):
+        return bool(jax.tree.leaves(effect.memory(jnp.zeros(()), twin)))
+    return isinstance(effect, ForceEffect | ActionEffect) and bool(
+        jax.tree.leaves(effect.memory(twin))
+    )
+
+
+def attached_of(twin: Twin) -> tuple:
+    layer = extended_of(twin)
+    return layer.attached if layer else ()
+
+
+def extended_of(twin: Twin) -> ExtendedTwin | None:
+    return next((layer for layer in layers_of(twin) if isinstance(layer, ExtendedTwin)), None)
+
+
+def native_targets(twin: Twin, candidates: Sequence[Candidate]) -> dict[str, str]:
+    """Full name of an effect's parameter -> the twin's own parameter that it adds to."""
+    plant = plant_of(twin)
+    return {
+        f"{c.key}.{name}": target
+        for c in candidates
+        for name, target in plant.native_effects.get((c.name, c.index), {}).items()
+    }
