@@ -288,17 +288,19 @@ def named(frame: Any, worst: Any) -> Any:
 
 
 def gaps(chosen: dict[str, Any]) -> str:
-    """:return: share of the gap from the worst member to the truth that the belief closes, ..."""
+    """:return: share of the gap from worst member to truth that the belief closes, and more"""
     means = {m: frame.mean() for m, frame in chosen.items()}
     worst = means["worst"]
     gap = worst["truth"] - worst["worst member"]
     closed = (worst["belief"] - worst["worst member"]) / gap if gap > 0.0 else np.nan
+    told = f"the belief closes {closed:.0%} of the gap ({gap:.1f})"
+    told = told if gap > 0.0 else "the worst member is no worse than the truth"
     beside = ", ".join(
         f"{box}: {means['real']['belief'] - means['real'][box]:+.1f} mean, "
         f"{means['decile']['belief'] - means['decile'][box]:+.1f} lowest decile"
         for box in BOXES
     )
-    return f"the belief closes {closed:.0%} of the gap ({gap:.1f}); beside {beside}"
+    return f"{told}; the belief beside {beside}"
 
 
 def _told(values: Any) -> str:
