@@ -2,25 +2,35 @@
 Whether one more recording settles what was ambiguous: designed, or a chirp, a random smooth signal
 or a pseudo-random binary sequence of the same length, within the same limits.
 
-    python benchmarks/next_experiment.py --systems pendulum linear_axis --cases 8
+    python benchmarks/next_experiment.py --systems pendulum linear_axis --cases 40
     python benchmarks/next_experiment.py --report-only
 
-Cases are those of `hidden_effects.py` that ended ambiguous there, with one planted cause that has a
-name, in the order of their numbers. Each is diagnosed again; then one recording is made on the
-engine for each kind of command, from rest, and the answers are weighed by it
-(`Diagnosis.decided_by`). Limits are what the case's own recordings took, and a quarter more, and
-the rig's typical command; the three other signals are made as large as the limits allow under every
-answer.
+Cases have one planted cause, drawn as `hidden_effects.py` draws them, but so that data leave more
+open: twice as large as would just show, with sensors' errors of 5 % and six recordings at most.
+Only causes that have near relatives are taken, and the diagnosis is asked about these: friction and
+drag; what is late; gain, scale and, as always, the twin's own parameters. Where it ends ambiguous,
+one recording is made on the engine for each kind of command, from rest, and the answers are weighed
+by it (`Diagnosis.decided_by`). Limits are what the case's own recordings took, and a quarter more,
+and the rig's typical command; the three other signals are made as large as the limits allow under
+every answer.
 
-`settled`: after the recording, the planted cause, or names that mean the same in these recordings
-(`same_cause.py`), have 95 % of the weight; `wrong`: others have; `open`: the planted cause was
-among the answers at all. `broken`: the largest share of a limit that the real
-rig took.
+`open`: the planted cause, or a name that means the same in these recordings (`same_cause.py`), is
+among the answers. `needed`: designed recordings that tell it from every other answer with a chance
+of 90 %, by the tool's own account; `tellable`: a hundred at most. `settled`: after one recording it
+has 95 % of the weight; `wrong`: other names have. `broken`: the largest share of a limit that the
+real rig took.
+
+`inside`: of every case that is diagnosed, ambiguous or not, another recording of the rig is held
+out: the share of its instants within the central 90 % of what the draws of `Diagnosis.belief`
+predict from its start on, with the errors that the best answer leaves added.
 """
 
 import argparse
 import dataclasses
+import functools
+import itertools
 import json
+import math
 import sys
 import time
 import traceback
@@ -29,14 +39,31 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from hidden_cases import N_STEPS, RIGS, believed, draw, sensed, spread
+from hidden_cases import N_STEPS, RIGS, believed, dealt, draw, plantable, recorded, sensed, spread
 from hidden_effects import key
 from independent_rigs import Loop, simulate
-from runs import RESULTS
+from runs import RESULTS, save
 from same_cause import equals
+from scipy.special import ndtr
 
 _TABLE = RESULTS / "next_experiment.csv"
 SIGNALS = ("designed", "chirp", "random smooth", "PRBS")
+# What makes data leave more open.
+_NOISE, _RECORDINGS = "5 %", 6
+_FACTOR, _FACTORS = 2.0, (2.0, 4.0, 8.0)
+_FAMILIES = (
+    (
+        *("viscous_friction", "directional_viscous_friction", "concave_friction"),
+        *("coulomb_friction", "directional_coulomb_friction", "stribeck_friction"),
+        *("load_dependent_friction", "quadratic_drag"),
+    ),
+    ("action_delay", "motor_lag", "sensor_delay"),
+    ("torque_gain", "directional_gain", "sensor_scale", "parameter"),
+)
+# Recordings that are held out, what numbers them apart, and the tails beyond the band.
+_HELD_OUT, _SEED, _TAIL = 2, 1_000_000, 0.05
+# Recordings beyond which the tool says that commands do not tell.
+_MOST_RECORDINGS = 100
 # What a machine may do beyond what its recordings show.
 _ROOM = 1.25
 # Share of a limit that other signals take at most, as the designed one does, and how finely their
@@ -59,41 +86,42 @@ class Played(Loop):
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").strip().splitlines()[0])
     parser.add_argument("--systems", nargs="*", default=["pendulum", "linear_axis"])
-    parser.add_argument("--cases", type=int, default=8, help="of each system")
-    parser.add_argument("--budget", default="full", choices=("full", "quick"))
+    parser.add_argument("--cases", type=int, default=40, help="of each system")
+    parser.add_argument("--budget", default="quick", choices=("full", "quick"))
     parser.add_argument("--report-only", action="store_true")
     arguments = parser.parse_args()
     if not arguments.report_only:
-        for system in arguments.systems:
-            for number in ambiguous(system)[: arguments.cases]:
-                if (system, number) in done():
-                    continue
-                try:
-                    rows = run(system, number, arguments.budget)
-                except Exception:  # one case that fails must not take the others with it
-                    print(f"{system} {number}:\n{traceback.format_exc()}", file=sys.stderr)
-                    continue
+        # Systems take turns, so that the table is at any time like the whole.
+        turns = itertools.product(range(arguments.cases), list[str](arguments.systems))
+        for number, system in turns:
+            deal = functools.partial(dealt, number, system, "effect")
+            large = deal("factor", _FACTORS) != _FACTOR
+            lonely = not family_of(deal("effect", plantable(RIGS[system])))
+            if large or lonely or (system, number) in done():
+                continue
+            try:
+                rows = run(system, number, arguments.budget)
+            except Exception:  # one case that fails must not take the others with it
+                print(f"{system} {number}:\n{traceback.format_exc()}", file=sys.stderr)
+                continue
+            if rows:
                 keep(rows)
     report()
 
 
-def ambiguous(system: str) -> list[int]:
-    """:return: numbers of cases with one planted cause that ended ambiguous"""
-    table = pd.read_csv(RESULTS / "hidden_effects.csv")
-    own = table[
-        (table.system == system) & (table.verdict == "ambiguous") & (table.kind == "effect")
-    ]
-    return sorted(own.case.tolist())
+def family_of(effect: str) -> tuple[str, ...]:
+    """:return: names of effects that act much like this one; none: it has no relatives"""
+    name = effect.partition(".")[0]
+    return next((family for family in _FAMILIES if name in family), ())
 
 
 def done() -> set[tuple[str, int]]:
-    return (
-        set(zip(*map(pd.read_csv(_TABLE).get, ("system", "case")), strict=True))
-        if (_TABLE.exists())
-        else set()
-    )
+    if not _TABLE.exists():
+        return set()
+    table = pd.read_csv(_TABLE)
+    return set(zip(table.system, table.case, strict=True))
 
 
 def keep(rows: list[dict[str, Any]]) -> None:
@@ -104,35 +132,39 @@ def keep(rows: list[dict[str, Any]]) -> None:
 
 
 def run(system: str, number: int, budget: str) -> list[dict[str, Any]]:
-    """:return: a row for each signal; one row without a signal where it is not ambiguous now"""
+    """:return: a row for each signal; one row without a signal where the verdict is another"""
     from sb3_hds import Trajectories, diagnose
+    from sb3_hds.effects import ALL
     from sb3_hds.sysid.design.excitation import Excitation
     from sb3_hds.sysid.design.experiment import question
     from sb3_hds.sysid.design.limits import Limits
 
-    case, data, motion = draw(system, number)
-    if len(case.truths) != 1:
-        return [{"system": system, "case": number, "signal": ""}]
+    began = time.time()
+    case, data, motion = draw(system, number, kind="effect", noise=_NOISE, most=_RECORDINGS)
     twin, rig = believed(system, case.seen), RIGS[system]
+    family = family_of(case.planted[0].effect)
+    if not family:  # what was dealt cannot be planted here, and something else was
+        return []
     asked: dict[str, Any] = {
+        "effects": [effect for effect in ALL if effect.name in family],
         "calibrate": case.nuisances,
         "seed": number,
         "budget": budget,
         "progress": False,
     }
     found = diagnose(twin, data, **asked)
-    common = {"system": system, "case": number, "truth": case.truths[0], "noise": case.noise}
-    common["set"] = told(found)
+    common = {"system": system, "case": number, "truth": case.truths[0], "set": told(found)}
+    common |= {"verdict": found.verdict, "inside": inside_band(found, case)}
+    common["seconds"] = time.time() - began
     if found.verdict != "ambiguous":
-        return [common | {"signal": "", "verdict": found.verdict}]
-    limits = limits_of(rig, motion)
+        print(json.dumps(common, default=str), flush=True)
+        return [common | {"signal": ""}]
+    limits = limits_of(system, motion)
     start = rig.seen(np.concatenate([rig.around, np.zeros(rig.dof)])[None])[0]
     seconds, rows = N_STEPS * rig.dt, []
     union, numbers, _ = question(found.answers, start)
     excitation = Excitation(union, Limits.of(limits).at(union), N_STEPS, found.answers.window)
-    began = time.time()
     designed = found.next_experiment(limits, seconds=seconds, start=start, progress=False)
-    took = time.time() - began
     rng = np.random.default_rng([number, zlib.crc32(system.encode())])
     for signal in SIGNALS:
         commands = designed.commands.actions[0]
@@ -146,28 +178,65 @@ def run(system: str, number: int, budget: str) -> list[dict[str, Any]]:
         every = np.concatenate([motion, true[:-1]])
         pressed = np.concatenate([*(data.episode(i)[1] for i in range(len(data))), commands])
         same = {case.truths[0], *equals(case, every, pressed, names, values)[case.truths[0]]}
-        right = [name in same for name in names]
+        right = np.array([name in same for name in names])
+        weight = float(after.weights[right].sum())
         rows.append(
             common
             | {
                 "signal": signal,
-                "verdict": found.verdict,
                 "set after": ";".join(
                     f"{name} {weight:.3f}"
                     for name, weight in zip(names, after.weights, strict=True)
                 ),
-                "open": any(right),
-                "settled": float(after.weights[right].sum()) >= _SURE,
-                "wrong": float(after.weights[right].sum()) <= 1.0 - _SURE,
+                "open": bool(right.any()),
+                "tellable": recordings_for(designed, same) <= _MOST_RECORDINGS,
+                "settled": weight >= _SURE,
+                "wrong": weight <= 1.0 - _SURE,
                 "broken": largest_share(limits, true, rig),
-                "expected": designed.chance if signal == "designed" else np.nan,
-                "needed": designed.needed if signal == "designed" else np.nan,
-                "decides": designed.decides if signal == "designed" else np.nan,
-                "seconds": took if signal == "designed" else np.nan,
+                "needed": recordings_for(designed, same),
             }
         )
         print(json.dumps(rows[-1], default=str), flush=True)
     return rows
+
+
+def recordings_for(designed: Any, same: set[str]) -> float:
+    """:return: designed recordings that tell the planted cause from names that mean another"""
+    own = [p.needed for p in designed.pairs if p.true in same and p.other not in same]
+    return max(own, default=math.inf)
+
+
+def inside_band(found: Any, case: Any) -> float:
+    """:return: share of instants of held-out motion in the 90 % band; nan: there is no belief"""
+    if found.opened is None:
+        return math.nan
+    data, motion = recorded(dataclasses.replace(case, recordings=_HELD_OUT), _SEED + case.number)
+    belief, noise, rig = found.belief, found.answers.noise, RIGS[case.system]
+    starts = motion.reshape(_HELD_OUT, -1, motion.shape[1])[:, 0]
+    seen = np.stack([rig.seen(start[None])[0] for start in starts])
+    own = [predicted(belief, i, seen, data.actions) for i in range(belief.n_draws)]
+    below = np.mean([ndtr((data.obs[:, 1:] - one[:, 1:]) / noise) for one in own], 0)
+    return float(np.mean((below > _TAIL) & (below < 1.0 - _TAIL)))
+
+
+def predicted(belief: Any, draw: int, starts: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """:return: channels under one draw, shape ``(n, steps + 1, n_obs)``"""
+    import jax
+
+    base, params = belief.base, belief.member(draw).params
+    return np.asarray(_simulated(base)(params, jax.numpy.asarray(starts), actions))
+
+
+@functools.lru_cache(2)
+def _simulated(base: Any) -> Any:
+    import jax
+
+    from sb3_hds.core import rollout
+
+    def one(params: Any, start: Any, actions: Any) -> Any:
+        return rollout(base, params, base.infer(start, params), actions).obs
+
+    return jax.jit(jax.vmap(one, (None, 0, 0)))
 
 
 def told(found: Any) -> str:
@@ -182,24 +251,19 @@ def values_of(answer: Any) -> dict[str, float]:
     return {name.rpartition(".")[2]: answer.twin.values[name] for name in answer.factor}
 
 
-def limits_of(rig: Any, motion: np.ndarray) -> dict[str, Any]:
+def limits_of(system: str, motion: np.ndarray) -> dict[str, Any]:
     """:param motion: positions and velocities that the recordings took"""
-    twin = believed_names(rig)
+    rig, twin = RIGS[system], believed(system)
+    joints, actuators = [j.name for j in twin.joints], [a.name for a in twin.actuators]
     q, v = motion[:, : rig.dof], motion[:, rig.dof :]
     middle, half = 0.5 * (q.max(0) + q.min(0)), 0.5 * np.ptp(q, 0)
     ends = np.stack([middle - _ROOM * half, middle + _ROOM * half], 1)
     largest = _ROOM * np.abs(v).max(0)
     return {
-        "position": dict(zip(twin[0], ends.tolist(), strict=True)),
-        "velocity": dict(zip(twin[0], largest.tolist(), strict=True)),
-        "command": dict(zip(twin[1], ([-t, t] for t in rig.torque), strict=True)),
+        "position": dict(zip(joints, ends.tolist(), strict=True)),
+        "velocity": dict(zip(joints, largest.tolist(), strict=True)),
+        "command": dict(zip(actuators, ([-t, t] for t in rig.torque), strict=True)),
     }
-
-
-def believed_names(rig: Any) -> tuple[list[str], list[str]]:
-    system = next(name for name, one in RIGS.items() if one is rig)
-    twin = believed(system)
-    return [j.name for j in twin.joints], [a.name for a in twin.actuators]
 
 
 def largest_share(limits: dict[str, Any], true: np.ndarray, rig: Any) -> float:
@@ -266,15 +330,41 @@ def played(
 
 
 def report() -> None:
-    """Print how often each signal settled the question, of the same cases."""
-    table = pd.read_csv(_TABLE)
-    table = table[table.signal.notna() & (table.signal != "")]
-    print(f"{table[['system', 'case']].drop_duplicates().shape[0]} cases")
-    for signal, own in table.groupby("signal"):
-        print(
-            f"{signal:14s} settled {own.settled.astype(bool).sum()} of {len(own)}, wrong "
-            f"{own.wrong.astype(bool).sum()}, largest share of a limit {own.broken.max():.2f}"
-        )
+    """Print and keep how often each signal settled the question, of the same cases."""
+    table: Any = pd.read_csv(_TABLE)
+    one_each = table.groupby(["system", "case"]).head(1)
+    print(f"{len(one_each)} cases: {one_each.verdict.value_counts().to_dict()}")
+    bands = [
+        {
+            "verdict": verdict,
+            "cases": len(own),
+            "inside, mean": own.inside.mean(),
+            "inside, lowest decile": own.inside.quantile(0.1),
+        }
+        for verdict, own in (("all", one_each), *one_each.groupby("verdict"))
+    ]
+    print(save(bands, "next_experiment_bands").to_string(index=False))
+    played = table[table.signal.isin(SIGNALS)].copy()
+    flags = ["open", "tellable", "settled", "wrong"]
+    played[flags] = played[flags].astype(bool)
+    one = played.open & (played.needed <= 1.0)
+    several = played.open & played.tellable & ~one
+    classes = {
+        "settled, where one designed recording should do": one,
+        "settled, where several should": several,
+        "settled, where the tool says none can": played.open & ~played.tellable,
+    }
+    rows = []
+    for signal in SIGNALS:
+        mine = played.signal == signal
+        row: dict[str, Any] = {"commands": signal}
+        for title, inside in classes.items():
+            row[title] = f"{played[mine & inside].settled.sum()} of {(mine & inside).sum()}"
+        wrong = played[mine & played.open].wrong
+        row["another name settled"] = f"{wrong.sum()} of {len(wrong)}"
+        row["planted cause not among the answers"] = f"{(mine & ~played.open).sum()}"
+        rows.append(row | {"largest share of a limit": played[mine].broken.max()})
+    print(save(rows, "next_experiment_settled").to_string(index=False))
 
 
 if __name__ == "__main__":

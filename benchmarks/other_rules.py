@@ -120,8 +120,11 @@ def by_regression(inquiry, start) -> Answer:
         return Answer()
     # What it names is then fitted as everything else is.
     name, h = max(found)[1], inquiry.hypotheses
-    (chosen,) = (h.indices(c) for c in h.candidates if c.key == name)
-    fitted = inquiry.search.base(start.point.theta, [*start.free, *chosen])
+    chosen = [h.indices(c) for c in h.candidates if c.key == name]
+    if not chosen:
+        # The equation of motion left it out of what is simulated.
+        return Answer(name)
+    fitted = inquiry.search.base(start.point.theta, [*start.free, *chosen[0]])
     return Answer(name, gain(inquiry.search, start, fitted.kept))
 
 

@@ -183,9 +183,31 @@ def report() -> None:
         least[f"own{kind}_s"] = least[parts[1]] + least[parts[2]]
         least[f"total{kind}_s"] = least[parts].sum(axis=1, min_count=len(parts))
     print(least.T.to_string(float_format="%.3f"))
+    save(summary(least), "start_up_summary")
     if {"ours", "before"} <= set(least.index.levels[0]):
         print("\nours, as a share of before:")
         print((least.loc["ours"] / least.loc["before"]).T.to_string(float_format="%.2f"))
+
+
+def summary(least: pd.DataFrame) -> list[dict[str, Any]]:
+    """:return: what the docs show of starts, one row each"""
+    starts = {"before": "before", "ours": "now", "sbx": "SBX SAC"}
+    return [
+        {
+            "": name,
+            "start": state,
+            "own imports and construction [s]": row["own_s"],
+            "first plan or update after construction [s]": row["first_plan_s"],
+            "in all [s]": row["total_s"],
+            "processor [s]": row["total_cpu_s"],
+            "programs compiled": row["compiled"],
+            "epoch [ms]": row["epoch_ms"],
+        }
+        for who, name in starts.items()
+        for state in ("cold", "warm")
+        if (who, state) in least.index
+        for row in [least.loc[(who, state)]]
+    ]
 
 
 if __name__ == "__main__":

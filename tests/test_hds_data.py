@@ -415,3 +415,26 @@ def test_diagnoses_come_as_often_as_asked_for(no_planning):
     model.extend_model = lambda: asked.append(model.num_timesteps)
     model.learn(60)
     assert asked == [20, 40, 60]
+
+
+def test_the_first_episode_plays_what_was_asked_for_and_no_other_does(no_planning, tmp_path):
+    commands = np.linspace(-1.5, 1.5, 12)[:, None]
+    asked = Trajectories.from_arrays([np.zeros((13, 3))], [commands], dt=0.05)
+    env = gymnasium.make(REAL, max_episode_steps=20)
+    file = str(asked.save(tmp_path / "next.npz"))
+
+    model = real(env, first_commands=file, refit_freq=0, train_freq=10).learn(40)
+    first, second = (model.measured.trajectories().episode(i)[1] for i in (0, 1))
+    again = reloaded(model, env=env).learn(20, reset_num_timesteps=True)
+
+    assert first[:12] == pytest.approx(commands, abs=1e-6)
+    assert not np.allclose(first[12:], 1.5) and not np.allclose(second[:12], commands, atol=0.1)
+    assert not np.allclose(again.measured.trajectories().episode(2)[1][:12], commands, atol=0.1)
+
+
+def test_first_commands_are_of_the_environment(no_planning):
+    asked = Trajectories.from_arrays([np.zeros((13, 3))], [np.zeros((12, 2))], dt=0.05)
+    with pytest.raises(TrajectoryError, match=r"shape \(2,\), and the environment takes \(1,\)"):
+        real(first_commands=asked)
+    with pytest.raises(TrajectoryError, match="first_commands takes"):
+        real(first_commands=3)

@@ -23,6 +23,7 @@ from sb3_hds.sysid.belief.updated import updated
 from sb3_hds.sysid.design import Limits
 from sb3_hds.sysid.design.excitation import Excitation
 from sb3_hds.sysid.design.experiment import next_experiment, question
+from sb3_hds.sysid.design.result import Pair
 
 TWIN = twins.make("PendulumReal")
 HANGING = np.array([-1.0, 0.0, 0.0])
@@ -263,6 +264,17 @@ def test_mass_and_gain_are_one_without_a_force_sensor():
     assert not told.decides and told.needed > 100
     assert "No recording within these limits" in told.sentence
     assert any("sensor of the actuator's force" in words for words in told.would_tell)
+
+
+def test_where_one_pair_cannot_be_told_the_others_are_counted(told):
+    pair = lambda a, b, chance: Pair(a, b, 1.0, chance, 1.0 if chance > 0.5 else np.inf)  # noqa: E731
+    pairs = [pair(a, b, 0.0) for a, b in (("mass", "gain"), ("gain", "mass"))]
+    pairs += [pair(a, b, 1.0) for x in ("mass", "gain") for a, b in ((x, "lag"), ("lag", x))]
+    some = dataclasses.replace(told, pairs=tuple(pairs), decides=False)
+
+    assert "No recording within these limits tells mass from gain" in some.sentence
+    assert some.sentence.endswith("Of 3 pairs of answers, it tells 2 apart.")
+    assert "pairs of answers" not in dataclasses.replace(some, pairs=some.pairs[:2]).sentence
 
 
 def test_one_answer_asks_for_narrower_parameters():

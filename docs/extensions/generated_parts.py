@@ -100,11 +100,15 @@ PARTS: dict[str, Callable[[], str]] = {
     "policy_gain_picture": summaries.picture(
         "policy_gain", "return on the real system of policies from each twin, a line for each seed"
     ),
+    "next_experiment_settled": summaries.whole("next_experiment_settled"),
+    "next_experiment_bands": summaries.whole("next_experiment_bands"),
+    "uncertain_verdicts": summaries.whole("uncertain_verdicts_intervals"),
     "diagnosis_cost": summaries.whole(
         "diagnosis_cost", "seconds of a diagnosis against the number of recordings"
     ),
     "model_files": summaries.whole("model_files"),
     "joints_cost": summaries.whole("joints_cost"),
+    "start_up": summaries.whole("start_up_summary"),
     "diagnosis_cost_lines": summaries.whole("diagnosis_cost_lines"),
     **{f"learned_{method}": summaries.learned(method, *peers) for method, peers in LEARNED.items()},
     "learned": summaries.learned(),

@@ -102,7 +102,7 @@ def _check_targets(given: argparse.Namespace) -> None:
 def _check_next(given: argparse.Namespace) -> None:
     from sb3_hds.errors import ParameterError
     from sb3_hds.sysid.design import Limits
-    from sb3_hds.sysid.design.experiment import check_file
+    from sb3_hds.sysid.design.result import check_file
 
     check_file(given.next)
     if not given.limits:

@@ -14,8 +14,9 @@ from sb3_hds.errors import CalibrationError, ParameterError
 from sb3_hds.sysid.belief.answers import Answers
 from sb3_hds.sysid.belief.belief import belief_of
 from sb3_hds.sysid.belief.updated import updated
-from sb3_hds.sysid.design.experiment import NextExperiment, next_experiment
+from sb3_hds.sysid.design.experiment import next_experiment
 from sb3_hds.sysid.design.limits import Limits
+from sb3_hds.sysid.design.result import NextExperiment
 from sb3_hds.sysid.estimation.results import plain
 from sb3_hds.sysid.reporting import wording
 from sb3_hds.sysid.reporting.finding import Finding, HorizonGain, Rejected

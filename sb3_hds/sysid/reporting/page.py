@@ -11,8 +11,8 @@ import numpy as np
 
 from sb3_hds.core.trajectories.storage import check_target, write_bytes
 from sb3_hds.errors import ParameterError
-from sb3_hds.sysid.design.experiment import NextExperiment
 from sb3_hds.sysid.design.plots import plot_next
+from sb3_hds.sysid.design.result import NextExperiment
 from sb3_hds.sysid.reporting import figures as plots
 from sb3_hds.sysid.reporting import wording
 from sb3_hds.sysid.reporting.diagnosis import Diagnosis

@@ -9,6 +9,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_hds.algos.base.config import between, takes
@@ -71,6 +72,10 @@ class HDSConfig(TwinConfig):
         the effects that the data name; 0: never
     :param pretrain_data: ``Trajectories``, or a file of them, from which the model is corrected
         before the first plan. The HDS project: random motion.
+    :param first_commands: actions of the first steps of the first episode, in the place of the
+        policy's: such as what a diagnosis asked for next, ``found.next_experiment(...).commands``
+        (of several recordings the first), or a file that its ``save`` wrote as ``.npz``; None: the
+        policy acts from the first step on
     :param max_saved_steps: how many of the measured steps are saved with the model, the latest;
         those of ``pretrain_data`` where there is room left; 0: none
     """
@@ -87,6 +92,7 @@ class HDSConfig(TwinConfig):
     refit_freq: int = 1
     diagnose_freq: int = 0
     pretrain_data: Trajectories | str | None = None
+    first_commands: Trajectories | str | None = None
     max_saved_steps: int = 100_000
 
     def __post_init__(self) -> None:
@@ -125,6 +131,8 @@ class HDS(TwinAlgorithm):
         self.model_beta = 0.0
         self.nominal: dict[str, float] = {}
         self.measured = RecordedSteps(self._source, data_from(config.pretrain_data))
+        asked = data_from(config.first_commands, "first_commands")
+        self._commands_asked = None if asked is None else asked.episode(0)[1].tolist()
         # Blocks of real steps; real steps at the last correction, and when the force was learned.
         self._n_blocks, self._refitted_at, self._steps_at_force = 0, 0, 0
         # Real step and recording since which the system is another one; None: it never changed.
@@ -139,8 +147,10 @@ class HDS(TwinAlgorithm):
             "effects": [e if isinstance(e, str) else e.to_spec() for e in several],
             "suspected": tuple(as_list("suspected", config.suspected, str)),
             "pretrain_data": None,
+            "first_commands": None,
         }
         super().construct(dataclasses.replace(config, **plain), **more)
+        self._check_first_commands()
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """Correct the model where a correction is due, then plan."""
@@ -152,6 +162,29 @@ class HDS(TwinAlgorithm):
         if refit_freq and self._n_blocks % refit_freq == 0:
             self.correct_model(gradient_steps)
         super().train(gradient_steps, batch_size)
+
+    def _sample_action(
+        self,
+        learning_starts: int,
+        action_noise: ActionNoise | None = None,
+        n_envs: int = 1,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        step, asked = self.real_timesteps // n_envs, self._commands_asked or ()
+        if self._episode_num or step >= len(asked):
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        space: Any = self.action_space
+        action = np.tile(np.array(asked[step], space.dtype), (n_envs, 1))
+        action = np.clip(action, space.low, space.high)
+        return action, self.policy.scale_action(action)
+
+    def _check_first_commands(self) -> None:
+        shape = None if self.action_space is None else self.action_space.shape
+        given = np.shape(self._commands_asked or ())[1:]
+        if given and shape and given != shape:
+            raise TrajectoryError(
+                f"first_commands are actions of shape {given}, and the environment takes {shape}. "
+                "Design them for the twin of this environment."
+            )
 
     def remedies(self, updates_per_step: float) -> list[str]:
         freq = self.config.refit_freq

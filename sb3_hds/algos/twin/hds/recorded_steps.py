@@ -151,9 +151,10 @@ class RecordedSteps:
             self._recordings.load_state_dict(_part(tensors, "recordings"), buffer, n_saved)
 
 
-def data_from(source: Any) -> Trajectories | None:
+def data_from(source: Any, argument: str = "pretrain_data") -> Trajectories | None:
     """
     :param source: trajectories, the path of a file that ``Trajectories.save`` wrote, or None
+    :param argument: for which it is given
     :raises TrajectoryError: for anything else, or a file that cannot be read
     """
     if source is None or isinstance(source, Trajectories):
@@ -161,7 +162,7 @@ def data_from(source: Any) -> Trajectories | None:
     if isinstance(source, str | os.PathLike):
         return Trajectories.load(source)
     raise TrajectoryError(
-        f"pretrain_data takes Trajectories or the path of a file, got {source!r}. "
+        f"{argument} takes Trajectories or the path of a file, got {source!r}. "
         "Use Trajectories.from_arrays."
     )
 

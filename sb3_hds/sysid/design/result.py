@@ -1,0 +1,206 @@
+"""What a designed experiment says of itself, and how its commands are written."""
+
+import dataclasses
+import io
+import math
+import os
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sb3_hds.core import Trajectories
+from sb3_hds.core.trajectories.storage import check_target, write_bytes
+from sb3_hds.errors import ParameterError
+
+_WIDTH = 80
+# Chance with which a question is decided.
+SURE = 0.9
+
+
+class Pair(NamedTuple):
+    """
+    Two answers, and what the recordings would say of them.
+
+    :param true: the answer that is right
+    :param other: the answer that is to be ruled out
+    :param ratio: expected logarithm of the likelihood ratio
+    :param chance: that the odds are beyond 19 to 1 for the right one
+    :param needed: as many recordings as these, over and over, for a chance of 90 %
+    """
+
+    true: str
+    other: str
+    ratio: float
+    chance: float
+    needed: float
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class NextExperiment:
+    """
+    What to record next, from ``Diagnosis.next_experiment``. Prints itself.
+
+    :param commands: one trajectory for each recording: its actions are the commands, its
+        observations what the likeliest answer predicts
+    :param answers: names of the answers, the likeliest first
+    :param predicted: channels as each answer predicts them, shape ``(m, n, steps + 1, n_obs)``
+    :param channels: name and unit of each
+    :param actuators: name and unit of each
+    :param pairs: of answers, those that are hardest to tell first; none where there is one answer
+    :param information: gained about the parameters of the likeliest answer [nats]
+    :param narrower: by its parameters, their standard deviation now and after the recordings
+    :param usage: by limit and joint, the largest share that any answer takes
+    :param decides: whether a number of such recordings that one can make would tell
+    :param would_tell: what would, where they do not, in words
+    """
+
+    commands: Trajectories
+    answers: tuple[str, ...]
+    predicted: Float[np.ndarray, "m n rows obs"]
+    channels: tuple[tuple[str, str], ...]
+    actuators: tuple[tuple[str, str], ...]
+    pairs: tuple[Pair, ...]
+    information: float
+    narrower: Mapping[str, tuple[float, float]]
+    usage: Mapping[str, float]
+    decides: bool
+    would_tell: tuple[str, ...] = ()
+
+    @property
+    def chance(self) -> float:
+        """That the recordings decide between the two answers that are hardest to tell."""
+        return self.pairs[0].chance if self.pairs else math.nan
+
+    @property
+    def needed(self) -> float:
+        """Recordings that would decide between these with a chance of 90 %."""
+        return self.pairs[0].needed if self.pairs else math.nan
+
+    @property
+    def sentence(self) -> str:
+        """What to do, in one sentence."""
+        n, seconds = len(self.commands), self.commands.n_steps / len(self.commands)
+        what = "this recording" if n == 1 else f"these {n} recordings"
+        what += f" of {seconds * self.commands.dt:.3g} s"
+        if not self.pairs:
+            return f"Play {what}: it is worth {self.information:.1f} nats about the parameters."
+        worst = self.pairs[0]
+        if not self.decides:
+            return (
+                f"No recording within these limits tells {worst.true} from {worst.other}: the best "
+                f"that was found would have to be made {_number(worst.needed)} times."
+                f"{self._at_least()}"
+            )
+        if worst.chance >= SURE:
+            return f"Play {what}: the answers are told apart with a chance of {worst.chance:.0%}."
+        return (
+            f"Play {what}, {math.ceil(worst.needed)} times in all: one of them tells "
+            f"{worst.true} from {worst.other} with a chance of {worst.chance:.0%}."
+        )
+
+    def _at_least(self) -> str:
+        """What the recordings tell where they do not tell all."""
+        unsure = {frozenset(p[:2]) for p in self.pairs if p.chance < SURE}
+        every = {frozenset(p[:2]) for p in self.pairs}
+        if unsure == every:
+            return ""
+        return f" Of {len(every)} pairs of answers, it tells {len(every - unsure)} apart."
+
+    def summary(self) -> str:
+        """:return: all of it in 80 columns"""
+        lines = [*textwrap.wrap(self.sentence, _WIDTH), "=" * _WIDTH]
+        lines += [f"Answers that the data leave open: {len(self.answers)}"]
+        lines += [f"  {name}" for name in self.answers]
+        if self.pairs:
+            lines.append("   chance, and recordings for one of 90 %, to find")
+            for name, chance, needed in self.told_apart():
+                told = f"  {chance:>7} {needed:>8}   {name}"
+                lines += textwrap.wrap(told, _WIDTH, subsequent_indent=" " * 21)
+        for name, (now, then) in self.narrower.items():
+            lines.append(f"  {name}: standard deviation {now:.3g} -> {then:.3g}")
+        lines.append("Most of each limit that any answer takes:")
+        lines += [f"  {name}: {share:.0%}" for name, share in self.usage.items()]
+        for words in self.would_tell:
+            lines += textwrap.wrap(words, _WIDTH)
+        return "\n".join(lines)
+
+    __str__ = __repr__ = summary
+
+    def told_apart(self) -> list[tuple[str, str, str]]:
+        """:return: of each pair its answers, the chance to decide, and recordings for 90 %"""
+        return [
+            (f"{p.true}, not {p.other}", f"{p.chance:.0%}", _number(p.needed)) for p in self.pairs
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """:return: plain data for JSON"""
+        return {
+            "sentence": self.sentence,
+            "decides": self.decides,
+            "answers": list(self.answers),
+            "pairs": [pair._asdict() for pair in self.pairs],
+            "information": self.information,
+            "narrower": {name: list(pair) for name, pair in self.narrower.items()},
+            "usage": dict(self.usage),
+            "would_tell": list(self.would_tell),
+            "dt": self.commands.dt,
+            "commands": self.commands.actions.tolist(),
+            "start": self.commands.obs[:, 0].tolist(),
+        }
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """
+        Write the commands.
+
+        :param path: ``.csv``: time, recording, commands and predicted channels by name, a row for
+            each step; ``.npz``: ``commands``, for ``Trajectories.load``. A file of that name is
+            replaced as a whole.
+        :return: its path
+        :raises ParameterError: for another ending
+        :raises OSError: if there is no folder to write it in
+        """
+        check_file(path)
+        if Path(path).suffix == ".npz":
+            return self.commands.save(path)
+        import pandas
+
+        data = self.commands
+        parts = []
+        for i in range(len(data)):
+            obs, actions = data.episode(i)
+            columns = {"recording": np.full(len(actions), i)}
+            columns["time"] = data.dt * np.arange(len(actions))
+            columns |= {n: actions[:, j] for j, (n, _) in enumerate(self.actuators)}
+            columns |= {f"predicted {n}": obs[:-1, j] for j, (n, _) in enumerate(self.channels)}
+            parts.append(pandas.DataFrame(columns))
+        text = io.StringIO()
+        pandas.concat(parts).to_csv(text, index=False, float_format="%.8g")
+        return write_bytes(path, text.getvalue().encode())
+
+    def plot(self, path: str | os.PathLike[str]) -> None:
+        """
+        Draw the commands and what each answer predicts.
+
+        :param path: of the picture, for example ``"next.png"``
+        """
+        from sb3_hds.sysid.design.plots import plot_next
+
+        plot_next(self).savefig(path, dpi=150)
+
+
+def check_file(path: str | os.PathLike[str]) -> None:
+    """
+    :raises ParameterError: for an ending other than ``.csv`` and ``.npz``
+    :raises OSError: if there is no folder to write the file in
+    """
+    if Path(path).suffix not in (".csv", ".npz"):
+        raise ParameterError(f"Commands are written as .csv or .npz, got {path}.")
+    check_target(path)
+
+
+def _number(recordings: float) -> str:
+    return "1,000 or more" if recordings >= 1000 else f"{math.ceil(recordings):d}"
