@@ -25,7 +25,7 @@ from sb3_hds.sysid.estimation.evidence import Evidence, Point
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.shooting import shots_of
 from sb3_hds.sysid.reporting.finding import HorizonGain
-from sb3_hds.sysid.reporting.sentence import several_in_words
+from sb3_hds.sysid.reporting.printed import several_in_words
 
 KINDS = ["ViscousFriction", "CoulombFriction", "TorqueGain", "ActionDelay"]
 TWIN = twins.make("PendulumReal")

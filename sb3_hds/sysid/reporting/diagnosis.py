@@ -26,11 +26,12 @@ from sb3_hds.sysid.reporting.printed import (
     choice,
     finding_in_lines,
     not_accepted,
+    several_in_words,
+    spoken,
     table_of,
     would_have_shown,
     wrapped,
 )
-from sb3_hds.sysid.reporting.sentence import several_in_words, spoken
 from sb3_hds.sysid.reporting.wording import with_unit
 
 Verdict = Literal["named", "ambiguous", "none", "unknown", "not_identifiable"]

@@ -1,18 +1,177 @@
-"""A diagnosis in 80 columns, part by part."""
+"""A diagnosis in words: causes in one sentence, and all of it in 80 columns."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
 
 from sb3_hds.core import Twin
+from sb3_hds.sysid.estimation.candidates import EVERY
 from sb3_hds.sysid.reporting import wording
 from sb3_hds.sysid.reporting.finding import Finding, Rejected
-from sb3_hds.sysid.reporting.sentence import spoken
+from sb3_hds.sysid.reporting.wording import with_unit
 
 WIDTH = 80
 # Candidates whose smallest sizes are printed; all are in the report.
 _MOST_SHOWN = 12
 # Rejected candidates that get a line of their own.
 _MOST_IN_TABLE = 5
+_NUMBERS = (
+    *("no", "one", "two", "three", "four", "five", "six"),
+    *("seven", "eight", "nine", "ten", "eleven", "twelve"),
+)
+# Effects that are told of the machine as a whole before anything else, in the order of their words.
+_FRICTION = (
+    *("viscous_friction", "directional_viscous_friction", "concave_friction"),
+    *("coulomb_friction", "directional_coulomb_friction"),
+    *("stribeck_friction", "load_dependent_friction"),
+)
+_SHARED = {
+    "action_delay": "commands arrive {} late at all actuators",
+    "motor_lag": "all motors lag by {}",
+}
+# Words without an article, and from how many doubts on they are counted.
+_UNCOUNTED = ("stiffness", "cogging", "drag", "friction", "elasticity", "backlash", "saturation")
+_MANY_DOUBTS = 3
+
+
+def spoken(key: str) -> str:
+    """A candidate, for people: ``"coulomb_friction.hinge"`` is Coulomb friction at hinge."""
+    name, _, place = key.partition(".")
+    if name == "parameter":
+        return place
+    return f"{_plain(name)} at {'all actuators' if place == EVERY else place}"
+
+
+def _plain(effect: str) -> str:
+    for person in ("coulomb", "stribeck"):
+        effect = effect.replace(person, person.title())
+    return effect.replace("load_dependent", "load-dependent").replace("_", " ")
+
+
+def several_in_words(findings: Sequence[Finding], joints: Sequence[str]) -> str:
+    """
+    :param findings: more than a few
+    :param joints: names of all joints of the machine
+    :return: a sentence: friction of the machine as a whole first, and what there is besides; and
+        one on what the data cannot tell from other causes
+    """
+    friction, rest = [], []
+    for f in findings:
+        (friction if f.effect in _FRICTION and f.where["slot"] == "joint" else rest).append(f)
+    besides = _listed([*_common(rest), *_offsets(rest), *map(_one, _others(rest))])
+    head = _friction_of(friction, joints)
+    told = f"{head}; {besides} besides." if head and rest else f"{head or besides}."
+    return f"{told[:1].upper()}{told[1:]}{_doubts(findings)}"
+
+
+def _friction_of(findings: Sequence[Finding], joints: Sequence[str]) -> str:
+    """Of the machine as a whole, and by kind where joints differ."""
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for joint in joints:
+        own = {f.effect for f in findings if f.where["name"] == joint}
+        if own:
+            groups.setdefault(tuple(n for n in _FRICTION if n in own), []).append(joint)
+    if not groups:
+        return ""
+    where = [joint for joint in joints if any(joint in own for own in groups.values())]
+    subject = f"{_places(where, joints)} {_verb(where)}"
+    if len(groups) == 1:
+        (kinds,) = groups
+        carried = _carried(findings, "they carry" if len(kinds) > 1 else "it carries")
+        return f"{subject} {_kinds(kinds)} that the model lacks{carried}"
+    carried = _carried(findings, "it carries")
+    largest = sorted(groups.items(), key=lambda group: -len(group[1]))
+    by_kind = "; ".join(f"{_kinds(kinds)} at {_listed(own)}" for kinds, own in largest)
+    return f"{subject} friction that the model lacks{carried}: {by_kind}"
+
+
+def _common(findings: Sequence[Finding]) -> list[str]:
+    """What all actuators share."""
+    said = []
+    for f in findings:
+        if f.where["name"] == EVERY:
+            how = _SHARED.get(f.effect, f"all actuators have {_article(_plain(f.effect))} of {{}}")
+            said.append(how.format(_size(f)))
+    return said
+
+
+def _offsets(findings: Sequence[Finding]) -> list[str]:
+    own = [f for f in findings if f.effect == "constant_force"]
+    if not own:
+        return []
+    where, sizes = [f.where["name"] for f in own], [_size(f) for f in own]
+    what = "an offset" if len(own) == 1 else "offsets"
+    return [f"{_listed(where)} {_verb(where)} {what} of {_listed(sizes)}"]
+
+
+def _others(findings: Sequence[Finding]) -> list[Finding]:
+    return [f for f in findings if f.where["name"] != EVERY and f.effect != "constant_force"]
+
+
+def _one(finding: Finding) -> str:
+    name = finding.where["name"]
+    if finding.where["slot"] == "parameter":
+        first = next(iter(finding.parameters.values()))
+        return f"{name} is {_size(finding)}, not {first.before:.2g}"
+    return f"{name} has {_article(_plain(finding.effect))} of {_size(finding)}"
+
+
+def _size(finding: Finding) -> str:
+    """The first of its parameters that is not nothing."""
+    every = list(finding.parameters.values())
+    told = next((e for e in every if e.estimate != 0.0), every[0])
+    return with_unit(f"{told.estimate:.2g}", told.unit)
+
+
+def _article(name: str) -> str:
+    if name.endswith(_UNCOUNTED):
+        return name
+    return f"{'an' if name[:1] in 'aeiou' else 'a'} {name}"
+
+
+def _doubts(findings: Sequence[Finding]) -> str:
+    doubtful = [f for f in findings if f.alternatives]
+    if len(doubtful) > _MANY_DOUBTS:
+        n = _number(len(doubtful))
+        return f" Of {n} causes the data leave open which of several names is right."
+    doubt = [f"{spoken(f.key)} from {' or '.join(map(spoken, f.alternatives))}" for f in doubtful]
+    return f" The data cannot tell {'; '.join(doubt)}." if doubt else ""
+
+
+def _places(where: Sequence[str], joints: Sequence[str]) -> str:
+    if len(where) == len(joints) and len(joints) > 1:
+        return "both joints" if len(joints) == 2 else f"all {_number(len(joints))} joints"
+    return _listed(list(where))
+
+
+def _number(n: int) -> str:
+    return _NUMBERS[n] if n < len(_NUMBERS) else str(n)
+
+
+def _verb(where: Sequence[str]) -> str:
+    return "have" if len(where) > 1 else "has"
+
+
+def _kinds(names: Sequence[str]) -> str:
+    return f"{' and '.join(_plain(name).removesuffix(' friction') for name in names)} friction"
+
+
+def _carried(own: Sequence[Finding], verb: str) -> str:
+    by_joint: dict[str, float] = {}
+    for f in own:
+        if f.share is None:
+            return ""
+        by_joint[f.where["name"]] = by_joint.get(f.where["name"], 0.0) + f.share**2
+    shares = [min(total**0.5, 1.0) for total in by_joint.values()]
+    low, high = f"{min(shares):.0%}"[:-1], f"{max(shares):.0%}"[:-1]
+    units = [e.unit for f in own for e in f.parameters.values()]
+    what = "torque" if any("N m" in unit for unit in units) else "force"
+    return f" ({verb} {high if low == high else f'{low} to {high}'} % of the {what})"
+
+
+def _listed(items: Sequence[str]) -> str:
+    return (
+        items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}" if items else ""
+    )
 
 
 def table_of(findings: Sequence[Finding]) -> list[str]:
