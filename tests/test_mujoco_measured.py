@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sb3_hds import cli, twins
+from sb3_hds import cli, effects, twins
 from sb3_hds.core import rollout
 from sb3_hds.data.columns import Columns
 from sb3_hds.data.reading import read_log
@@ -215,6 +215,6 @@ def test_a_diagnosis_of_a_quadruped_names_delay_and_friction_from_positions_alon
     late = [f for f in told["findings"] if f["effect"] in ("action_delay", "motor_lag")]
     rubbing = {f["where"]["name"] for f in told["findings"] if "friction" in f["effect"]}
     assert [f["where"]["name"] for f in late] == ["all"] and rubbing == set(LEGS)
-    nominal, found = (twins.from_spec(told[name]) for name in ("believed", "twin"))
+    nominal, found = (twins.from_spec(told[name], effects.KNOWN) for name in ("believed", "twin"))
     assert half_second_errors(nominal, log["position"], log["target"]) > 28.0
     assert half_second_errors(found, log["position"], log["target"]) < 11.0

@@ -178,9 +178,9 @@ class HDS(TwinAlgorithm):
         return action, self.policy.scale_action(action)
 
     def _check_first_commands(self) -> None:
-        shape = None if self.action_space is None else self.action_space.shape
         given = np.shape(self._commands_asked or ())[1:]
-        if given and shape and given != shape:
+        # A model that is being loaded has no spaces yet, and nothing to ask for.
+        if given and self.env is not None and given != (shape := self.action_space.shape):
             raise TrajectoryError(
                 f"first_commands are actions of shape {given}, and the environment takes {shape}. "
                 "Design them for the twin of this environment."
@@ -363,7 +363,7 @@ class HDS(TwinAlgorithm):
         return [*names, "measured"], variables
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "measured"]
+        return [*super()._excluded_save_params(), "measured", "_commands_asked"]
 
 
 def _native_of(finding: Finding, found: Twin) -> dict[str, float]:
