@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import html
 import json
 import pickle
 
@@ -310,7 +311,7 @@ def test_a_diagnosis_asks_for_what_would_decide_and_believes_in_all_of_it(tmp_pa
 
     assert {"parameter.mass", "torque_gain.torque"} <= {*asked.answers}
     assert not asked.decides and any("force" in words for words in asked.would_tell)
-    page = found.to_html(tmp_path / "page.html", experiment=asked).read_text()
+    page = html.unescape(found.to_html(tmp_path / "page.html", experiment=asked).read_text())
     assert "What to record next" in page and asked.would_tell[0] in page
     assert asked.answers == belief.answers and sum(belief.weights) == pytest.approx(1.0)
     mass, gain = belief.answers.index("parameter.mass"), belief.answers.index("torque_gain.torque")
@@ -324,3 +325,8 @@ def test_a_diagnosis_asks_for_what_would_decide_and_believes_in_all_of_it(tmp_pa
         assert values[name][own].mean() == pytest.approx(truth, abs=0.03)
         assert values[name][own].std() < 0.03
     assert np.all(values["mass"][weak] == TWIN.values["mass"])
+    first = found.findings[0]
+    (own,) = (a for a in found.answers.answers if a.causes == (first.key,))
+    for name, told in first.parameters.items():
+        full = name if first.key.startswith("parameter") else f"{first.key}.{name}"
+        assert np.linalg.norm(own.factor[full]) == pytest.approx(told.stderr, rel=0.01)
