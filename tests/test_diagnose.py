@@ -439,7 +439,8 @@ def test_a_guess_stays_within_its_room():
 
 def test_no_size_is_certain_where_simulations_blow_up_nearby():
     slopes = SimpleNamespace(curvature=np.full((4, 1, 1), np.nan), scores=np.ones((4, 1)))
-    evidence = SimpleNamespace(slopes=lambda *_: slopes)
+    hypotheses = SimpleNamespace(scale=np.ones(1))
+    evidence = SimpleNamespace(slopes=lambda *_: slopes, hypotheses=hypotheses)
     half = SimpleNamespace(evidence=evidence, unit=np.arange(4))
 
     errors = standard_errors(half, SimpleNamespace(theta=np.zeros(1)), [0])

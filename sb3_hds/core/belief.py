@@ -14,15 +14,15 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from sb3_hds.core.effect import Effect
 from sb3_hds.core.effect_chain import NO_EFFECTS, EffectChain
 from sb3_hds.core.trajectories.storage import check_target, write_bytes
-from sb3_hds.core.twin import State, Twin
-from sb3_hds.core.types import Action, Coordinates, Flag, Obs, Params, Position, Scalar, Tangent
+from sb3_hds.core.twin import Layer, State, Twin
+from sb3_hds.core.types import Action, Flag, Obs, Params, Scalar
 from sb3_hds.errors import ParameterError
 
 #: under which the state remembers its draw, and the tensor that holds all of them
 _DRAW, _DRAWS = "belief", "belief.draws"
 
 
-class BeliefTwin(Twin):
+class BeliefTwin(Layer):
     """
     Equally likely parameter vectors of one twin. Each episode has its own: it is drawn where the
     episode begins (:meth:`initial`), and stays in the state's memory. Planning, learning and
@@ -166,15 +166,6 @@ class BeliefTwin(Twin):
 
     def terminated(self, state: State, params: Params) -> Flag:
         return self.base.terminated(*self._of(state, params))
-
-    def coordinates(self, q: Position) -> Coordinates:
-        return self.base.coordinates(q)
-
-    def difference(self, state: State, reference: State) -> Tangent:
-        return self.base.difference(state, reference)
-
-    def retract(self, state: State, tangent: Tangent) -> State:
-        return self.base.retract(state, tangent)
 
     def sketch(self, state: State, params: Params) -> Any:
         return self.base.sketch(*self._of(state, params))

@@ -15,12 +15,12 @@ from sb3_hds.core.effect import ActionEffect, Effect, ForceEffect, SensorEffect
 from sb3_hds.core.effect_chain import NO_EFFECTS, Attached, Chosen, EffectChain
 from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.transformed import TransformedTwin
-from sb3_hds.core.twin import State, Twin
-from sb3_hds.core.types import Action, Coordinates, Flag, Obs, Params, Position, Scalar, Tangent
+from sb3_hds.core.twin import Layer, State, Twin
+from sb3_hds.core.types import Action, Flag, Obs, Params, Scalar
 from sb3_hds.errors import EffectError
 
 
-class ExtendedTwin(Twin):
+class ExtendedTwin(Layer):
     """
     A twin plus effects. Parameters of an effect are named ``effect.place.parameter``, for example
     ``"viscous_friction.hinge.b"``.
@@ -132,15 +132,6 @@ class ExtendedTwin(Twin):
 
     def terminated(self, state: State, params: Params) -> Flag:
         return self.base.terminated(state, self.base_params(params))
-
-    def coordinates(self, q: Position) -> Coordinates:
-        return self.base.coordinates(q)
-
-    def difference(self, state: State, reference: State) -> Tangent:
-        return self.base.difference(state, reference)
-
-    def retract(self, state: State, tangent: Tangent) -> State:
-        return self.base.retract(state, tangent)
 
     def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
         return self.base.sketch(state, self.base_params(params))

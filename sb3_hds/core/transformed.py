@@ -20,22 +20,19 @@ from sb3_hds.core.transforms.registry import (
     transform_from_spec,
     transform_to_spec,
 )
-from sb3_hds.core.twin import State, Twin
+from sb3_hds.core.twin import Layer, State, Twin
 from sb3_hds.core.types import (
     Action,
-    Coordinates,
     Flag,
     Memory,
     Obs,
     Params,
-    Position,
     Scalar,
-    Tangent,
 )
 from sb3_hds.errors import ParameterError
 
 
-class TransformedTwin(Twin):
+class TransformedTwin(Layer):
     """
     A twin whose observations or actions pass through a wrapper. Parameters, states and rewards are
     those of the wrapped twin; a stateful wrapper adds its memory and its penalty.
@@ -134,15 +131,6 @@ class TransformedTwin(Twin):
 
     def terminated(self, state: State, params: Params) -> Flag:
         return self.base.terminated(state, params)
-
-    def coordinates(self, q: Position) -> Coordinates:
-        return self.base.coordinates(q)
-
-    def difference(self, state: State, reference: State) -> Tangent:
-        return self.base.difference(state, reference)
-
-    def retract(self, state: State, tangent: Tangent) -> State:
-        return self.base.retract(state, tangent)
 
     def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
         return self.base.sketch(state, params)

@@ -321,6 +321,21 @@ class Twin(abc.ABC):
             self.values[name] = self.parameters[name].check(name, value)
 
 
+class Layer(Twin):
+    """A twin around another one, whose positions and tangents are those of the inner one."""
+
+    base: Twin
+
+    def coordinates(self, q: Position) -> Coordinates:
+        return self.base.coordinates(q)
+
+    def difference(self, state: State, reference: State) -> Tangent:
+        return self.base.difference(state, reference)
+
+    def retract(self, state: State, tangent: Tangent) -> State:
+        return self.base.retract(state, tangent)
+
+
 def layers_of(twin: Twin) -> Iterator[Twin]:
     """:return: the twin, the twin inside it, and so on down to the plant"""
     layer: Any = twin

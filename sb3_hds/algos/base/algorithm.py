@@ -68,40 +68,35 @@ def executed(
     return stored
 
 
-class ExecutedReplayBuffer(ReplayBuffer):
+class _StoresExecuted:
+    """Adds the actions that were executed (see :func:`executed`)."""
+
+    action_space: spaces.Space
+
+    def add(
+        self,
+        obs: Any,
+        next_obs: Any,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        buffer: Any = super()
+        stored = executed(self.action_space, action, infos)
+        buffer.add(obs, next_obs, stored, reward, done, infos)
+
+
+class ExecutedReplayBuffer(_StoresExecuted, ReplayBuffer):
     """
     SB3's replay buffer, with the actions that were executed (see :func:`executed`), for learners of
     Stable-Baselines3 and SBX: ``SAC(..., replay_buffer_class=ExecutedReplayBuffer)``. The
     model-free algorithms of this package need none: they look themselves.
     """
 
-    def add(
-        self,
-        obs: np.ndarray,
-        next_obs: np.ndarray,
-        action: np.ndarray,
-        reward: np.ndarray,
-        done: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        stored = executed(self.action_space, action, infos)
-        super().add(obs, next_obs, stored, reward, done, infos)
 
-
-class ExecutedDictReplayBuffer(DictReplayBuffer):
+class ExecutedDictReplayBuffer(_StoresExecuted, DictReplayBuffer):
     """The same for Dict observations."""
-
-    def add(  # type: ignore[override]
-        self,
-        obs: dict[str, np.ndarray],
-        next_obs: dict[str, np.ndarray],
-        action: np.ndarray,
-        reward: np.ndarray,
-        done: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        stored = executed(self.action_space, action, infos)
-        super().add(obs, next_obs, stored, reward, done, infos)
 
 
 def _check_reached(space: spaces.Box, chosen: np.ndarray, info: Mapping[str, Any]) -> None:

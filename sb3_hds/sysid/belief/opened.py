@@ -11,9 +11,10 @@ from sb3_hds.core import Trajectories, Twin
 from sb3_hds.sysid.belief.answers import Answer, Answers, everything_open, factor_of
 from sb3_hds.sysid.comparison.halves import Base, Half
 from sb3_hds.sysid.comparison.held_out import effective_size
+from sb3_hds.sysid.comparison.inference import jackknife
 from sb3_hds.sysid.comparison.search import Search
 from sb3_hds.sysid.diagnosis.findings import Accepted
-from sb3_hds.sysid.equation.plausibility import rarity
+from sb3_hds.sysid.equation.plausibility import rarity_of
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point
 
@@ -80,7 +81,7 @@ def open_answers(
     answers = []
     for candidates, one in sets:
         likelihood = -0.5 * n_effective * np.log(search.confirm.total(one.kept) / least)
-        odds = -sum(_rarity(c, h.twin) for c in candidates)
+        odds = -sum(rarity_of(c, h.twin) for c in candidates)
         answers.append((likelihood + odds, candidates, one))
     answers = sorted(answers, key=lambda answer: -answer[0])[:MOST]
     return Answers(
@@ -140,33 +141,18 @@ def _typical(search: Search, theta: np.ndarray) -> np.ndarray:
 
 def joint_covariance(half: Half, point: Point, free: Sequence[int]) -> np.ndarray:
     """
-    As :func:`~sb3_hds.sysid.comparison.inference.standard_errors`: the jackknife over units, one
-    Newton step for each that is left out.
-
     :param free: indices of what was fitted
-    :return: their covariance, shape ``(k, k)``; infinite where slopes are not finite
+    :return: their covariance, by the jackknife over units, shape ``(k, k)``; infinite where slopes
+        are not finite
     """
     scale = half.evidence.hypotheses.scale[list(free)]
-    slopes, labels = half.evidence.slopes(point, free), np.unique(half.unit)
-    total, covariance = slopes.curvature.sum(0), np.zeros((len(free), len(free)))
-    if not (np.isfinite(slopes.curvature).all() and np.isfinite(slopes.scores).all()):
-        return np.full_like(covariance, np.inf)
-    for label in labels:
-        own = half.unit == label
-        rest = np.linalg.pinv(total - slopes.curvature[own].sum(0), rcond=_RANK, hermitian=True)
-        step = rest @ slopes.scores[own].sum(0)
-        covariance += np.outer(step, step)
+    slopes = half.evidence.slopes(point, free)
+    covariance = jackknife(slopes, half.unit)
     # Fewer units than parameters leave directions in which nothing was left out.
-    covariance *= (len(labels) - 1) / len(labels)
-    floor = np.linalg.pinv(total, rcond=_RANK, hermitian=True)
-    if len(labels) <= len(free):
-        covariance = covariance + floor
+    if np.isfinite(covariance).all() and len(np.unique(half.unit)) <= len(free):
+        total = slopes.curvature.sum(0)
+        covariance = covariance + np.linalg.pinv(total, rcond=_RANK, hermitian=True)
     return covariance * np.outer(scale, scale)
-
-
-def _rarity(candidate: Candidate, twin: Twin) -> float:
-    command = twin.actuators[candidate.index].unit if candidate.slot == "actuator" else ""
-    return rarity(candidate.name, command)
 
 
 def _slowest(twin: Twin, data: Trajectories) -> np.ndarray:

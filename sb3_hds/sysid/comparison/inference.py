@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from sb3_hds.sysid.comparison.halves import Half
 from sb3_hds.sysid.comparison.held_out import LEAST_GAIN
@@ -26,13 +26,36 @@ _N_DRAWS, _AT_A_TIME = 999, 250
 _WEAK = 1e-9
 
 
-def standard_errors(half: Half, point: Point, free: Sequence[int]) -> Float[np.ndarray, " p"]:
+def jackknife(slopes: Slopes, unit: Int[np.ndarray, " n"]) -> Float[np.ndarray, "p p"]:
     """
-    Jackknife over clusters, by one Newton step for each that is left out. With few clusters, the
-    sandwich estimator is too narrow, because the fit has shrunk their scores.
+    Over clusters, by one Newton step for each that is left out. With few clusters, the sandwich
+    estimator is too narrow, because the fit has shrunk their scores.
 
     Source: MacKinnon, Nielsen, Webb, *Fast and reliable jackknife and bootstrap methods for
     cluster-robust inference*, J. Applied Econometrics 38, 2023 (CV3).
+
+    :param unit: cluster of each window
+    :return: covariance of the parameters, in units of their scale; infinite if derivatives are not
+        finite
+    """
+    labels, total = np.unique(unit), slopes.curvature.sum(0)
+    if not (np.isfinite(slopes.curvature).all() and np.isfinite(slopes.scores).all()):
+        # Simulations blow up nearby: nobody knows how well the size is known.
+        return np.full_like(total, np.inf)
+    covariance = np.zeros_like(total)
+    for label in labels:
+        own = unit == label
+        rest = np.linalg.pinv(total - slopes.curvature[own].sum(0), rcond=_RANK, hermitian=True)
+        step = rest @ slopes.scores[own].sum(0)
+        # Infinite is right: one unit alone knows of it.
+        with np.errstate(over="ignore", invalid="ignore"):
+            covariance += np.outer(step, step)
+    return covariance * (len(labels) - 1) / len(labels)
+
+
+def standard_errors(half: Half, point: Point, free: Sequence[int]) -> Float[np.ndarray, " p"]:
+    """
+    By the :func:`jackknife`.
 
     :param free: indices of what was fitted
     :return: of all parameters; infinite for parameters that were not fitted, or if derivatives are
@@ -41,17 +64,7 @@ def standard_errors(half: Half, point: Point, free: Sequence[int]) -> Float[np.n
     result = np.full(len(point.theta), np.inf)
     if not free:
         return result
-    slopes, labels = half.evidence.slopes(point, free), np.unique(half.unit)
-    total, variance = slopes.curvature.sum(0), np.zeros(len(free))
-    if not (np.isfinite(slopes.curvature).all() and np.isfinite(slopes.scores).all()):
-        # Simulations blow up nearby: nobody knows how well the size is known.
-        return result
-    for label in labels:
-        own = half.unit == label
-        rest = np.linalg.pinv(total - slopes.curvature[own].sum(0), rcond=_RANK, hermitian=True)
-        with np.errstate(over="ignore"):  # infinite is right: one unit alone knows of it
-            variance += (rest @ slopes.scores[own].sum(0)) ** 2
-    variance *= (len(labels) - 1) / len(labels)
+    variance = np.diag(jackknife(half.evidence.slopes(point, free), half.unit))
     result[list(free)] = np.sqrt(variance) * half.evidence.hypotheses.scale[list(free)]
     return result
 

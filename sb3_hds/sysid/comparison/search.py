@@ -1,6 +1,6 @@
 """The search for causes: proposed on half of the recordings, confirmed on the others."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -186,17 +186,13 @@ class Search:
         tried = self._each(finish, candidates)
         return sorted(tried, key=lambda t: -t.criterion)
 
-    def nameless(
-        self, base: Base, joints: Collection[int] | None = None, rival: float = np.inf
-    ) -> list[Tried]:
+    def nameless(self, base: Base, rival: float = np.inf) -> list[Tried]:
         """
-        :param joints: where a force may act; default: anywhere
         :param rival: cost to come below; fits that are far from it are given up
         :return: flexible forces beside the model, fitted to the end, best first
         """
-        forces = [c for c in self.hypotheses.nameless if joints is None or c.index in joints]
-        self._guess(forces, base)
-        return self.finished(forces, base, rival)
+        self._guess(self.hypotheses.nameless, base)
+        return self.finished(self.hypotheses.nameless, base, rival)
 
     def _guess(self, candidates: Sequence[Candidate], base: Base) -> None:
         """Where fits of candidates begin."""

@@ -131,30 +131,16 @@ class Naming:
         if not found or not self.search.hypotheses.nameless:
             return list(found), base, None
         for place in (tuple(found), *((one,) for one in found if len(found) > 1)):
-            if not (joints := self._joints_of(place)):
-                continue
             without = base
             for one in place:
                 without = self.search.without(one.tried.candidate, without)
-            tried = self.search.nameless(without, joints, base.point.cost)
-            if not tried:
-                continue
-            best = tried[0]
+            best = self.search.nameless(without, base.point.cost)[0]
             better = self.search.better(best.kept, base.kept)
             if best.point.cost < base.point.cost and not as_good(better):
                 self.turned_down |= dict.fromkeys(keys_of(place), NAMELESS)
                 rest = [one for one in found if one not in place]
                 return rest, without, Nameless(best, better, tuple(keys_of(place)))
         return list(found), base, None
-
-    def _joints_of(self, place: Sequence[Accepted]) -> set[int]:
-        """:return: joints at which one force could stand for all of these causes"""
-        h = self.search.hypotheses
-        joints = {c.index for c in h.nameless}
-        for one in place:
-            if (candidate := one.tried.candidate).slot == "joint":
-                joints &= {candidate.index}
-        return joints
 
     def nameless(self, base: Base, known: Sequence[str]) -> Nameless | None:
         """

@@ -10,6 +10,9 @@ cannot tell apart, and a cause with poor odds has to explain more before it is n
 import math
 from typing import NamedTuple
 
+from sb3_hds.core import Twin
+from sb3_hds.sysid.estimation.candidates import Candidate
+
 
 class Plausibility(NamedTuple):
     """
@@ -87,3 +90,9 @@ def rarity(effect: str, command: str = "") -> float:
     own = plausibility(effect).rarity
     set_point = effect in _OF_AMPLIFIERS and command in SET_POINTS
     return own + _SET_POINT if set_point else own
+
+
+def rarity_of(candidate: Candidate, twin: Twin) -> float:
+    """:return: :func:`rarity` of a candidate at its place in a twin"""
+    command = twin.actuators[candidate.index].unit if candidate.slot == "actuator" else ""
+    return rarity(candidate.name, command)

@@ -18,7 +18,7 @@ from sb3_hds.sysid.equation.confirmation import (
     what_is_left,
 )
 from sb3_hds.sysid.equation.motion import Motion
-from sb3_hds.sysid.equation.plausibility import plausibility, rarity
+from sb3_hds.sysid.equation.plausibility import plausibility, rarity_of
 from sb3_hds.sysid.equation.problem import Problem
 from sb3_hds.sysid.equation.regression import Equation, Item
 from sb3_hds.sysid.equation.selection import propose
@@ -261,7 +261,7 @@ def problem(hypotheses: Hypotheses, equation: Equation, made: Grams) -> Problem:
         drives=equation.drives,
         rests=_rests(equation, items),
         always=tuple(always),
-        rarity=tuple(_rarity(hypotheses, item) for item in items),
+        rarity=tuple(rarity_of(item.candidate, hypotheses.believed) for item in items),
         total=total,
         cost=float(np.log(made.effective.mean())),
     )
@@ -280,12 +280,6 @@ def _rests(equation: Equation, items: Sequence[Item]) -> dict[int, tuple[float, 
         low, high = ((end - first) / (second - first) for end in ends)
         found[number] = (low, high)
     return found
-
-
-def _rarity(h: Hypotheses, item: Item) -> float:
-    actuators = h.believed.actuators
-    command = actuators[item.candidate.index].unit if item.candidate.slot == "actuator" else ""
-    return rarity(item.candidate.name, command)
 
 
 def _bounds(h: Hypotheses, item: Item, name: str) -> tuple[float, float]:
