@@ -20,7 +20,7 @@ from sb3_hds.sysid.comparison.held_out import (
     passes,
 )
 from sb3_hds.sysid.comparison.inference import aliased_with
-from sb3_hds.sysid.comparison.starts import Here, Places, guesses
+from sb3_hds.sysid.comparison.starts import Here, Places, guesses, promise
 from sb3_hds.sysid.diagnosis.progress import Bar
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point, in_threads
@@ -31,6 +31,9 @@ from sb3_hds.sysid.estimation.shooting import Shots
 _MOST_LOOKS, _MOST_FIRSTS = 3, 4
 # Steps of fits to the end, and of start states alone: to the end, and for a rough comparison.
 _ALL_STEPS, _KEPT_STEPS, _ROUGH_STEPS = 25, 6, 1
+# Of what the first step of a fit promises by a cause, the share that a force in its place has to
+# promise: errors that are not squared hide no factor so large.
+_LEAST_PROMISE = 0.5
 _Given = TypeVar("_Given")
 _Told = TypeVar("_Told")
 
@@ -96,14 +99,14 @@ class Search:
         own = self.hypotheses.indices(tried.candidate)
         return Base(tried.point, tried.kept, (*base.free, *own))
 
-    def without(self, base: Base, *candidates: Candidate, near: Base | None = None) -> Base:
+    def without(self, candidate: Candidate, base: Base, near: Base | None = None) -> Base:
         """
         :param near: from whose start states to begin; default: as measured
-        :return: the model without these candidates; the rest refitted
+        :return: the model without this candidate; the rest refitted
         """
-        own = [i for candidate in candidates for i in self.hypotheses.indices(candidate)]
+        own = self.hypotheses.indices(candidate)
         theta = base.point.theta.copy()
-        theta[own] = self.hypotheses.null[own]
+        theta[list(own)] = self.hypotheses.null[list(own)]
         return self.base(theta, [i for i in base.free if i not in own], near)
 
     def again(self, base: Base) -> Base:
@@ -191,25 +194,33 @@ class Search:
         self._guess(self.hypotheses.nameless, base)
         return self.finished(self.hypotheses.nameless, base)
 
-    def in_place(self, beside: Sequence[Tried], without: Base, rival: float) -> list[Tried]:
+    def stand_ins(self, causes: Sequence[Candidate], without: Base, cost: float) -> list[Tried]:
         """
-        :param beside: fitted beside a model
-        :param without: that model without some of its causes
-        :param rival: cost to come below; fits that are far from it are given up
-        :return: the same candidates in the place of these causes, fitted to the end, best first
+        :param without: the model without these causes
+        :param cost: of the model with them: fits that stay far above it are given up
+        :return: flexible forces in the place of the causes, fitted to the end, best first; those
+            that promise far less than the causes do are left out
         """
-        for tried in beside:
-            theta, offsets = tried.point.theta, tried.point.offsets
-            self._reached[tried.candidate.key] = _Reached(theta, offsets, ())
-        return self.finished([tried.candidate for tried in beside], without, rival)
+        least = _LEAST_PROMISE * promise(self._on_a_sample(without), causes)
+        likely = self._guess(self.hypotheses.nameless, without, least)
+        return self.finished(likely, without, cost)
 
-    def _guess(self, candidates: Sequence[Candidate], base: Base) -> None:
-        """Where fits of candidates begin."""
+    def _guess(
+        self, candidates: Sequence[Candidate], base: Base, least: float = 0.0
+    ) -> list[Candidate]:
+        """
+        Where fits of candidates begin.
+
+        :param least: by which the cost has to fall
+        :return: the candidates that promise as much
+        """
         if not candidates:
-            return
-        guessed = guesses(self._on_a_sample(base), candidates, {})
+            return []
+        guessed = guesses(self._on_a_sample(base), candidates, {}, least)
         for candidate, guess in zip(candidates, guessed, strict=True):
             self._reached[candidate.key] = _Reached(guess.theta, guess.offsets, base.free)
+        pairs = zip(candidates, guessed, strict=True)
+        return [candidate for candidate, guess in pairs if guess.gain >= least]
 
     def relatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> list[Tried]:
         """
@@ -318,7 +329,7 @@ class Search:
 
     def needed(self, candidate: Candidate, base: Base) -> bool:
         """:return: whether the model is significantly worse without this candidate"""
-        return passes(self.confirmed(base.kept, self.without(base, candidate).kept))
+        return passes(self.confirmed(base.kept, self.without(candidate, base).kept))
 
     def criterion(self, candidates: Sequence[Candidate], point: Point, base: Point) -> float:
         """:return: by which the information criterion is lower with these candidates"""

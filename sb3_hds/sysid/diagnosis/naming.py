@@ -123,29 +123,27 @@ class Naming:
     ) -> tuple[list[Accepted], Base, Nameless | None]:
         """
         One of the named causes is always the best, right or wrong. If a flexible force predicts
-        significantly better in the place of all of them, or of one, that one is not named. Beside
-        all of them it does better still, and is fitted from closer by: so this is asked first.
+        significantly better in the place of all of them, or of one, that one is not named.
 
         :return: the remaining causes, the model with them, and the flexible force; None if none is
             better
         """
         if not found or not self.search.hypotheses.nameless:
             return list(found), base, None
-        forces = [force for force in self.search.nameless(base) if self._outdoes(force, base)]
-        places = (tuple(found), *((one,) for one in found if len(found) > 1))
-        for place in places if forces else ():
-            without = self.search.without(base, *(one.tried.candidate for one in place))
-            best = self.search.in_place(forces, without, base.point.cost)[0]
-            if self._outdoes(best, base):
+        for place in (tuple(found), *((one,) for one in found if len(found) > 1)):
+            without = base
+            for one in place:
+                without = self.search.without(one.tried.candidate, without)
+            causes = [one.tried.candidate for one in place]
+            forces = self.search.stand_ins(causes, without, base.point.cost)
+            if not forces:
+                continue
+            best, better = forces[0], self.search.better(forces[0].kept, base.kept)
+            if best.point.cost < base.point.cost and not as_good(better):
                 self.turned_down |= dict.fromkeys(keys_of(place), NAMELESS)
                 rest = [one for one in found if one not in place]
-                better = self.search.better(best.kept, base.kept)
                 return rest, without, Nameless(best, better, tuple(keys_of(place)))
         return list(found), base, None
-
-    def _outdoes(self, force: Tried, base: Base) -> bool:
-        better = self.search.better(force.kept, base.kept)
-        return force.point.cost < base.point.cost and not as_good(better)
 
     def nameless(self, base: Base, known: Sequence[str]) -> Nameless | None:
         """
@@ -220,7 +218,7 @@ class Naming:
 
     def _asked_again(self, one: Accepted, base: Base) -> Accepted:
         """A cause beside what looks like it, now that the other causes are known."""
-        without = self.search.without(base, one.tried.candidate)
+        without = self.search.without(one.tried.candidate, base)
         names = (one.tried.candidate.key, *one.alternatives)
         named = [c for c in self.search.hypotheses.candidates if c.key in names]
         named = [c for c in named if not self.search.part_of(c, without)]
@@ -266,7 +264,7 @@ class Naming:
         """Without causes that later ones have made superfluous."""
         for one in found[:-1]:
             if not self.search.needed(one.tried.candidate, base):
-                base = self.search.without(base, one.tried.candidate)
+                base = self.search.without(one.tried.candidate, base)
                 found = [other for other in found if other is not one]
         return found, base
 
