@@ -20,7 +20,7 @@ from sb3_hds.sysid.comparison.held_out import (
     passes,
 )
 from sb3_hds.sysid.comparison.inference import aliased_with
-from sb3_hds.sysid.comparison.starts import Here, Places, guesses, promise
+from sb3_hds.sysid.comparison.starts import Here, Places, guesses
 from sb3_hds.sysid.diagnosis.progress import Bar
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point, in_threads
@@ -31,9 +31,6 @@ from sb3_hds.sysid.estimation.shooting import Shots
 _MOST_LOOKS, _MOST_FIRSTS = 3, 4
 # Steps of fits to the end, and of start states alone: to the end, and for a rough comparison.
 _ALL_STEPS, _KEPT_STEPS, _ROUGH_STEPS = 25, 6, 1
-# Of what the first step of a fit promises by a cause, the share that a force in its place has to
-# promise: errors that are not squared hide no factor so large.
-_LEAST_PROMISE = 0.5
 _Given = TypeVar("_Given")
 _Told = TypeVar("_Told")
 
@@ -189,38 +186,21 @@ class Search:
         tried = self._each(finish, candidates)
         return sorted(tried, key=lambda t: -t.criterion)
 
-    def nameless(self, base: Base) -> list[Tried]:
-        """:return: flexible forces beside the model, fitted to the end, best first"""
+    def nameless(self, base: Base, rival: float = np.inf) -> list[Tried]:
+        """
+        :param rival: cost to come below; fits that are far from it are given up
+        :return: flexible forces beside the model, fitted to the end, best first
+        """
         self._guess(self.hypotheses.nameless, base)
-        return self.finished(self.hypotheses.nameless, base)
+        return self.finished(self.hypotheses.nameless, base, rival)
 
-    def stand_ins(self, causes: Sequence[Candidate], without: Base, cost: float) -> list[Tried]:
-        """
-        :param without: the model without these causes
-        :param cost: of the model with them: fits that stay far above it are given up
-        :return: flexible forces in the place of the causes, fitted to the end, best first; those
-            that promise far less than the causes do are left out
-        """
-        least = _LEAST_PROMISE * promise(self._on_a_sample(without), causes)
-        likely = self._guess(self.hypotheses.nameless, without, least)
-        return self.finished(likely, without, cost)
-
-    def _guess(
-        self, candidates: Sequence[Candidate], base: Base, least: float = 0.0
-    ) -> list[Candidate]:
-        """
-        Where fits of candidates begin.
-
-        :param least: by which the cost has to fall
-        :return: the candidates that promise as much
-        """
+    def _guess(self, candidates: Sequence[Candidate], base: Base) -> None:
+        """Where fits of candidates begin."""
         if not candidates:
-            return []
-        guessed = guesses(self._on_a_sample(base), candidates, {}, least)
+            return
+        guessed = guesses(self._on_a_sample(base), candidates, {})
         for candidate, guess in zip(candidates, guessed, strict=True):
             self._reached[candidate.key] = _Reached(guess.theta, guess.offsets, base.free)
-        pairs = zip(candidates, guessed, strict=True)
-        return [candidate for candidate, guess in pairs if guess.gain >= least]
 
     def relatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> list[Tried]:
         """

@@ -56,14 +56,11 @@ class Here(NamedTuple):
     steps: int
 
 
-def guesses(
-    here: Here, candidates: Sequence[Candidate], known: Places, least: float = 0.0
-) -> list[Guess]:
+def guesses(here: Here, candidates: Sequence[Candidate], known: Places) -> list[Guess]:
     """
     What one Newton step promises, and where it leads; elsewhere if that is no guide.
 
     :param known: starts that were best before; those found now are added
-    :param least: starts of which a Newton step promises less are not tried
     """
     h, point = here.evidence.hypotheses, here.point
     slopes = here.evidence.slopes(point)
@@ -74,7 +71,7 @@ def guesses(
     def guess(candidate: Candidate) -> Guess:
         if candidate.key in h.starts:
             starts = known.get(candidate.key, h.starts[candidate.key])
-            best, found = _from_starts(here, candidate, starts, least)
+            best, found = _from_starts(here, candidate, starts)
             known[candidate.key] = (best,)
             return found
         own = list(h.indices(candidate))
@@ -131,15 +128,8 @@ def _farther(here: Here, candidate: Candidate, gain: float) -> Float[np.ndarray,
     return places[int(np.argmin(costs))] if min(costs) < point.cost - gain else None
 
 
-def promise(here: Here, candidates: Sequence[Candidate]) -> float:
-    """:return: by how much the cost would fall by one Newton step of all of these together"""
-    h = here.evidence.hypotheses
-    index = [*here.free, *(i for c in candidates for i in h.indices(c))]
-    return _promised(here, here.point.theta, index)
-
-
 def _from_starts(
-    here: Here, candidate: Candidate, starts: Sequence[Mapping[str, float]], least: float
+    here: Here, candidate: Candidate, starts: Sequence[Mapping[str, float]]
 ) -> tuple[Mapping[str, float], Guess]:
     """
     What fits of the others promise where some parameters stay at one of several values.
@@ -150,14 +140,9 @@ def _from_starts(
     fixed = {h.names.index(name) for name in starts[0]}
     index = [*here.free, *(i for i in h.indices(candidate) if i not in fixed)]
     promising = starts
-    if len(starts) > _FITTED or least:
-        gains = [_promised(here, _at(here, start), index) for start in starts]
-        ranked = sorted(range(len(starts)), key=lambda i: -gains[i])[:_FITTED]
-        best = ranked[0]
-        if gains[best] < least:
-            there = _at(here, starts[best])
-            return starts[best], Guess(gains[best], there, here.point.offsets, False)
-        promising = [starts[i] for i in ranked if gains[i] >= least]
+    if len(starts) > _FITTED:
+        ranked = sorted(starts, key=lambda start: -_promised(here, _at(here, start), index))
+        promising = ranked[:_FITTED]
     fits = [
         here.evidence.fit(_at(here, start), index, here.point.offsets, here.steps)
         for start in promising

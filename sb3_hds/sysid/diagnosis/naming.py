@@ -134,11 +134,8 @@ class Naming:
             without = base
             for one in place:
                 without = self.search.without(one.tried.candidate, without)
-            causes = [one.tried.candidate for one in place]
-            forces = self.search.stand_ins(causes, without, base.point.cost)
-            if not forces:
-                continue
-            best, better = forces[0], self.search.better(forces[0].kept, base.kept)
+            best = self.search.nameless(without, base.point.cost)[0]
+            better = self.search.better(best.kept, base.kept)
             if best.point.cost < base.point.cost and not as_good(better):
                 self.turned_down |= dict.fromkeys(keys_of(place), NAMELESS)
                 rest = [one for one in found if one not in place]
