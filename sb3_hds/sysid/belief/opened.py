@@ -64,7 +64,7 @@ def open_answers(
     for n, one in enumerate(found):
         alternatives = [by_key[key] for key in one.alternatives if key in by_key]
         if alternatives:
-            without = search.without(one.tried.candidate, base)
+            without = search.without(base, one.tried.candidate)
             alternatives = [c for c in alternatives if not search.part_of(c, without)]
             sets += [
                 ([*own[:n], tried.candidate, *own[n + 1 :]], search.believing(tried, without))

@@ -96,14 +96,14 @@ class Search:
         own = self.hypotheses.indices(tried.candidate)
         return Base(tried.point, tried.kept, (*base.free, *own))
 
-    def without(self, candidate: Candidate, base: Base, near: Base | None = None) -> Base:
+    def without(self, base: Base, *candidates: Candidate, near: Base | None = None) -> Base:
         """
         :param near: from whose start states to begin; default: as measured
-        :return: the model without this candidate; the rest refitted
+        :return: the model without these candidates; the rest refitted
         """
-        own = self.hypotheses.indices(candidate)
+        own = [i for candidate in candidates for i in self.hypotheses.indices(candidate)]
         theta = base.point.theta.copy()
-        theta[list(own)] = self.hypotheses.null[list(own)]
+        theta[own] = self.hypotheses.null[own]
         return self.base(theta, [i for i in base.free if i not in own], near)
 
     def again(self, base: Base) -> Base:
@@ -186,13 +186,22 @@ class Search:
         tried = self._each(finish, candidates)
         return sorted(tried, key=lambda t: -t.criterion)
 
-    def nameless(self, base: Base, rival: float = np.inf) -> list[Tried]:
-        """
-        :param rival: cost to come below; fits that are far from it are given up
-        :return: flexible forces beside the model, fitted to the end, best first
-        """
+    def nameless(self, base: Base) -> list[Tried]:
+        """:return: flexible forces beside the model, fitted to the end, best first"""
         self._guess(self.hypotheses.nameless, base)
-        return self.finished(self.hypotheses.nameless, base, rival)
+        return self.finished(self.hypotheses.nameless, base)
+
+    def in_place(self, beside: Sequence[Tried], without: Base, rival: float) -> list[Tried]:
+        """
+        :param beside: fitted beside a model
+        :param without: that model without some of its causes
+        :param rival: cost to come below; fits that are far from it are given up
+        :return: the same candidates in the place of these causes, fitted to the end, best first
+        """
+        for tried in beside:
+            theta, offsets = tried.point.theta, tried.point.offsets
+            self._reached[tried.candidate.key] = _Reached(theta, offsets, ())
+        return self.finished([tried.candidate for tried in beside], without, rival)
 
     def _guess(self, candidates: Sequence[Candidate], base: Base) -> None:
         """Where fits of candidates begin."""
@@ -309,7 +318,7 @@ class Search:
 
     def needed(self, candidate: Candidate, base: Base) -> bool:
         """:return: whether the model is significantly worse without this candidate"""
-        return passes(self.confirmed(base.kept, self.without(candidate, base).kept))
+        return passes(self.confirmed(base.kept, self.without(base, candidate).kept))
 
     def criterion(self, candidates: Sequence[Candidate], point: Point, base: Point) -> float:
         """:return: by which the information criterion is lower with these candidates"""

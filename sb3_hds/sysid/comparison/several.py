@@ -65,7 +65,7 @@ def confirmed_set(
             new = [key for key in members if key not in verdicts]
             verdicts |= _each_left_out(search, screened, start, base, members, new)
     while members and not many:
-        lost = {key: search.without(c, base, near=base) for key, (c, _) in members.items()}
+        lost = {key: search.without(base, c, near=base) for key, (c, _) in members.items()}
         verdicts = {
             key: _at_own_joint(search.confirm, members[key][0], base.kept, rest.kept)
             for key, rest in lost.items()
@@ -148,7 +148,7 @@ def _accepted(
     # Of a large set, what may stand for a member is told as the equation says it.
     simulated = [] if len(members) > _MANY else [known[k] for k in others if k in known]
     tried = (
-        search.finished(simulated, search.without(candidate, base, near=base)) if simulated else []
+        search.finished(simulated, search.without(base, candidate, near=base)) if simulated else []
     )
     worse = {t.candidate.key for t in tried if not as_good(search.better(base.kept, t.kept))}
     equal = [k for k in others if k not in worse]

@@ -67,8 +67,19 @@ class Naming:
         :param firsts: candidates beside the model at the start, best first
         :return: causes, each confirmed beside those before it, and the model with them
         """
-        found: list[Accepted] = []
-        tried, base = firsts, self.start
+        return self._grown([], self.start, firsts)
+
+    def beside(self, found: Sequence[Accepted], base: Base) -> tuple[list[Accepted], Base]:
+        """
+        :param found: causes that are confirmed already
+        :param base: the model with them
+        :return: these and more, each confirmed beside those before it, and the model with them
+        """
+        return self._grown(list(found), base, self.search.finalists(base, keys_of(found)))
+
+    def _grown(
+        self, found: list[Accepted], base: Base, tried: Sequence[Tried]
+    ) -> tuple[list[Accepted], Base]:
         while (one := self._next(tried, base, keys_of(found))) is not None:
             found.append(one)
             base = self.search.believing(one.tried, base)
@@ -123,24 +134,29 @@ class Naming:
     ) -> tuple[list[Accepted], Base, Nameless | None]:
         """
         One of the named causes is always the best, right or wrong. If a flexible force predicts
-        significantly better in the place of all of them, or of one, that one is not named.
+        significantly better in the place of all of them, or of one, that one is not named. Beside
+        all of them it does better still, and is fitted from closer by: so this is asked first.
 
         :return: the remaining causes, the model with them, and the flexible force; None if none is
             better
         """
         if not found or not self.search.hypotheses.nameless:
             return list(found), base, None
-        for place in (tuple(found), *((one,) for one in found if len(found) > 1)):
-            without = base
-            for one in place:
-                without = self.search.without(one.tried.candidate, without)
-            best = self.search.nameless(without, base.point.cost)[0]
-            better = self.search.better(best.kept, base.kept)
-            if best.point.cost < base.point.cost and not as_good(better):
+        forces = [force for force in self.search.nameless(base) if self._outdoes(force, base)]
+        places = (tuple(found), *((one,) for one in found if len(found) > 1))
+        for place in places if forces else ():
+            without = self.search.without(base, *(one.tried.candidate for one in place))
+            best = self.search.in_place(forces, without, base.point.cost)[0]
+            if self._outdoes(best, base):
                 self.turned_down |= dict.fromkeys(keys_of(place), NAMELESS)
                 rest = [one for one in found if one not in place]
+                better = self.search.better(best.kept, base.kept)
                 return rest, without, Nameless(best, better, tuple(keys_of(place)))
         return list(found), base, None
+
+    def _outdoes(self, force: Tried, base: Base) -> bool:
+        better = self.search.better(force.kept, base.kept)
+        return force.point.cost < base.point.cost and not as_good(better)
 
     def nameless(self, base: Base, known: Sequence[str]) -> Nameless | None:
         """
@@ -215,7 +231,7 @@ class Naming:
 
     def _asked_again(self, one: Accepted, base: Base) -> Accepted:
         """A cause beside what looks like it, now that the other causes are known."""
-        without = self.search.without(one.tried.candidate, base)
+        without = self.search.without(base, one.tried.candidate)
         names = (one.tried.candidate.key, *one.alternatives)
         named = [c for c in self.search.hypotheses.candidates if c.key in names]
         named = [c for c in named if not self.search.part_of(c, without)]
@@ -261,7 +277,7 @@ class Naming:
         """Without causes that later ones have made superfluous."""
         for one in found[:-1]:
             if not self.search.needed(one.tried.candidate, base):
-                base = self.search.without(one.tried.candidate, base)
+                base = self.search.without(base, one.tried.candidate)
                 found = [other for other in found if other is not one]
         return found, base
 

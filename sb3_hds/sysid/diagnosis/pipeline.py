@@ -156,6 +156,9 @@ class Inquiry:
         start, whole = map(self.search.again, (start, whole))
         self.bar.stage("confirming causes")
         found, base = confirmed_set(self.search, screened, start, whole)
+        naming = Naming(self.search, start, self.seed, family=self._family())
+        if len(found) == 1:
+            found, base = naming.beside(found, base)
         if len(found) < 2 or self._outdone_by_a_candidate(start, base):
             return None
         self.bar.stage("what is left")
@@ -163,7 +166,6 @@ class Inquiry:
         if self.residuals.explained(found, start, base, before, left) < _LEAST_OF_SEVERAL:
             return None
         nearest = ""
-        naming = Naming(self.search, start, self.seed, family=self._family())
         confirmed = found
         found, base, force = naming.outdone(found, base)
         if force is not None:

@@ -90,7 +90,7 @@ class Residuals:
             key = one.tried.candidate.key
             self.turned_down[key] = NO_CONSTANT
             for later in found[n:]:
-                base = self.search.without(later.tried.candidate, base)
+                base = self.search.without(base, later.tried.candidate)
             return found[:n], base, self.left(base), nearest_in_words(key, changes)
         return found, base, left, ""
 
@@ -136,7 +136,7 @@ class Residuals:
 
     def _gone(self, one: Accepted, base: Base, left: Left) -> float:
         """:return: by which a cause lowers the cost of short windows"""
-        theta = self.search.without(one.tried.candidate, base).point.theta
+        theta = self.search.without(base, one.tried.candidate).point.theta
         without = self._short(theta)
         return without.point.cost - left.short.point.cost
 

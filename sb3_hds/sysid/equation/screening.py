@@ -27,8 +27,9 @@ from sb3_hds.sysid.estimation.candidates import PARAMETER, Candidate
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.parameters import Belief
 
-# Single candidates that are simulated, besides those of the set and what may stand for them.
-_SINGLES = 10
+# Single candidates that are simulated, besides those of the set and what may stand for them, and at
+# least of each joint.
+_SINGLES, _OF_A_JOINT = 10, 5
 # Share of what the nominal model leaves that a cause explains at least, and by how much it has to
 # exceed its price, in -2 log likelihood.
 _TOLD, _SURELY = 0.05, 6.0
@@ -199,9 +200,17 @@ def _members_of(h: Hypotheses, p: Problem, items: Sequence[int]) -> tuple[Member
     return tuple(m for m in found if m.item not in p.always)
 
 
-def _singles(p: Problem) -> list[str]:
-    """Keys of what explains most beside nothing, best first."""
-    return list(dict.fromkeys(p.items[i].key for i in p.ranking(list(p.always))))[:_SINGLES]
+def _singles(p: Problem) -> set[str]:
+    """Keys of what explains most beside nothing, of all and at each joint."""
+
+    def best(items: Sequence[int], most: int) -> list[str]:
+        return list(dict.fromkeys(p.items[i].key for i in p.ranking(p.always, items)))[:most]
+
+    every = range(len(p.items))
+    found = {*best(every, _SINGLES)}
+    for joint in range(p.dof):
+        found |= {*best([i for i in every if p.place(i) == ("joint", joint)], _OF_A_JOINT)}
+    return found
 
 
 def _without_column(h: Hypotheses, p: Problem, moved: Motion, where: Sequence[str]) -> set[str]:
