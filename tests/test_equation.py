@@ -24,12 +24,21 @@ def proposed(twin, data, calibrate=()):
     return {m.key: m.sizes for m in found.members}
 
 
-def rubbing_axis(length=1.0, time=1.0, force=1.0, cut=None, noise=1.0, pull=lambda q, v: -3.0 * v):
+def rubbing_axis(
+    length=1.0,
+    time=1.0,
+    force=1.0,
+    cut=None,
+    noise=1.0,
+    pull=lambda q, v: -3.0 * v,
+    dry=1.5,
+    every=100,
+):
     """
     A mass of 2 kg with dry and viscous friction (or another force), stepped finely; in other units
     of length, time and force, or with recordings cut at another place.
     """
-    rng, fine, n, every = np.random.default_rng(1), 1e-4, 60_000, 100
+    rng, fine, n = np.random.default_rng(1), 1e-4, 60_000
     obs, actions = [], []
     for _ in range(4):
         frequencies, phases = rng.uniform(0.3, 1.0, 3), rng.uniform(0.0, 6.0, 3)
@@ -41,7 +50,7 @@ def rubbing_axis(length=1.0, time=1.0, force=1.0, cut=None, noise=1.0, pull=lamb
                 rows.append((q, v))
             push = u[k // every] + pull(q, v)
             slide = v + fine * push / 2.0
-            v = np.sign(slide) * max(abs(slide) - fine * 1.5 / 2.0, 0.0)
+            v = np.sign(slide) * max(abs(slide) - fine * dry / 2.0, 0.0)
             q += fine * v
         errors = noise * rng.standard_normal((n // every + 1, 2)) * [1e-4, 2e-3]
         rows = np.array([*rows, (q, v)]) + errors
@@ -121,6 +130,16 @@ def test_members_of_a_set_have_other_sizes_where_one_of_them_is_left_out():
     assert both.sizes_of({alone.key}) == {name: pytest.approx(alone.sizes["b"])}
     value, low, high = both.intervals_of(both.members[0])[name]
     assert low < value == both.members[0].sizes["b"] < high
+
+
+@pytest.mark.parametrize("dry, every", [(4.0, 400), (8.0, 200), (10.0, 400), (8.0, 600)])
+def test_friction_that_mostly_holds_an_axis_is_dry_and_no_dead_zone(dry, every):
+    found = proposed(*rubbing_axis(dry=dry, every=every))
+
+    assert found == {
+        "viscous_friction.axis": {"b": pytest.approx(3.0, rel=0.05)},
+        "coulomb_friction.axis": {"tau_c": pytest.approx(dry, rel=0.02)},
+    }
 
 
 @pytest.mark.parametrize("believed, calibrate", [(5.0, []), (8.0, ["mass"])])

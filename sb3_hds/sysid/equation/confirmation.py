@@ -8,6 +8,7 @@ import scipy
 
 from sb3_hds.core import Effect
 from sb3_hds.sysid.equation.problem import SHARED, Problem, Solution
+from sb3_hds.sysid.equation.regression import TINY
 from sb3_hds.sysid.equation.weak_form import rich_columns
 
 # A member carries at least this share of a joint's force, and lowers held-out errors by a t of at
@@ -35,6 +36,8 @@ _SIMPLER = {
     "directional_gain": "torque_gain",
 }
 _NO_MATTER = 0.02
+# Share of a column that the other folds contain at least, or ridge regression takes it for more.
+_SOME = 0.02
 
 
 class Member(NamedTuple):
@@ -265,7 +268,8 @@ def _predictable(p: Problem, weights: np.ndarray, j: int, diagonal: np.ndarray) 
     base = predicted = 0.0
     for fold in (fold[np.ix_(on, on)] for fold in p.grams.folds[:, j]):
         train = every - fold
-        size = np.sqrt(np.abs(np.diag(train)[rich])) + 1e-300
+        # Of what only this fold excites, the others say nothing.
+        size = np.sqrt(np.maximum(np.diag(train)[rich], _SOME * diagonal[rich])) + TINY
         inner = train[np.ix_(rich, rich)] / np.outer(size, size)
         x = np.linalg.solve(inner + 0.02 * np.eye(len(rich)), (train[rich] @ weights) / size)
         then = weights.copy()

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array
 
 from sb3_hds.core import ActionEffect, JointEffect, JointMoment, SensorEffect, State, Twin
@@ -22,6 +23,10 @@ from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 
 # Places of a normal distribution, in standard deviations, and their weights (Gauss-Hermite).
 _PLACES, _WEIGHTS = np.array([0.0, -np.sqrt(3.0), np.sqrt(3.0)]), np.array([4.0, 1.0, 1.0]) / 6.0
+# Places in an interval from 0 to 1, of equal weight (Gauss-Legendre).
+_GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
+# Braking below this in an interval is none: Lambert's W has a branch point there.
+_NO_BRAKE = 1e-6
 
 #: by effect, its parameter and the force per unit of it at a velocity
 CLOSED_FORMS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
@@ -88,41 +93,63 @@ def nodes_of(
     made: Equation, rows: Rows, bias: np.ndarray, inertia: np.ndarray, joint: int
 ) -> dict[str, np.ndarray]:
     """
-    Quadrature nodes: three points of each interval (Simpson's rule, over the part that the twin's
-    integrator evaluates), each at three velocities (Gauss-Hermite, for the uncertainty of its
-    sign).
+    Quadrature nodes of each interval, over the part that the twin's integrator evaluates: two
+    points (Gauss-Legendre) before and after the velocity changes its sign, so that the mean of dry
+    friction is exact; each at three velocities (Gauss-Hermite, for the uncertainty of that moment).
+    Where the model brakes what a force sets in motion, a force counts the more, the later it acts.
     """
     motion, dt = made.motion, made.motion.dt
-    places, shares = motion.seen * np.array([0.0, 0.5, 1.0]), np.array([1.0, 4.0, 1.0]) / 6.0
-    if motion.seen == 0.0:
-        places, shares = np.array([0.0]), np.array([1.0])
-    q, v, next_q, next_v = (x[:, joint, None] for x in (rows.q, rows.v, rows.next_q, rows.next_v))
+    q, v, next_q, next_v = (
+        x[:, joint, None, None] for x in (rows.q, rows.v, rows.next_q, rows.next_v)
+    )
+    first = v + motion.error_v[joint] * _PLACES
+    change = motion.seen * (next_v - v)
+    turns = first * (first + change) < 0.0
+    before = np.where(turns, -first / np.where(turns, change, 1.0), 0.5)
+    half = _GAUSS[:, None]
+    inside = np.concatenate([before * half, before + (1.0 - before) * half], axis=1)
+    shares = np.concatenate([before, before, 1.0 - before, 1.0 - before], axis=1)
+    shares = shares * _lasting(made, joint, inside)
+    s = motion.seen * inside
     # A cubic through both ends, of velocities a line.
-    s = places
     position = (2 * s**3 - 3 * s**2 + 1) * q + dt * (s**3 - 2 * s**2 + s) * v
     position = position + (3 * s**2 - 2 * s**3) * next_q + dt * (s**3 - s**2) * next_v
-    speed = (v * (1 - s) + next_v * s)[..., None] + motion.error_v[joint] * _PLACES
     return {
-        "q": np.broadcast_to(position[..., None], speed.shape),
-        "v": speed,
+        "q": position,
+        "v": first + change * inside,
+        "weights": 0.5 * shares * _WEIGHTS,
         "actuator": made.load[:, joint],
         "load": bias[:, joint],
         "inertia": inertia[:, joint],
-        "weights": shares[:, None] * _WEIGHTS,
     }
+
+
+def _lasting(made: Equation, joint: int, places: np.ndarray) -> np.ndarray:
+    r"""
+    With a braking rate :math:`r`, a force at the time :math:`s` of an interval :math:`h` leaves
+    :math:`e^{-r (h - s)}` of its impulse, and a constant one meets the mass times
+    :math:`x / (1 - e^{-x})`, :math:`x = r h`.
+
+    :param places: in the interval, from 0 to 1, shape ``(n, ...)``
+    :return: by what a force there counts more than a constant one does on average
+    """
+    met = np.diagonal(np.linalg.inv(made.mass) @ made.effective, axis1=1, axis2=2)[:, joint]
+    more = np.maximum(met, 1.0 + _NO_BRAKE)
+    x = more + np.real(scipy.special.lambertw(-more * np.exp(-more)))
+    x = x.reshape(-1, *(1,) * (places.ndim - 1))
+    return np.exp(-x * (1.0 - places)) * x / -np.expm1(-x)
 
 
 def _force_slopes(
     effect: JointEffect, settings: np.ndarray, nodes: Mapping[str, np.ndarray], h: float
 ) -> np.ndarray:
     """:return: derivative of the mean force by each parameter, ``(settings, parameters, n)``"""
-    weights, found = nodes["weights"], []
+    found = []
     effect, standstill = _for_any_joint(effect)
-    rows = {name: x for name, x in nodes.items() if name != "weights"}
     with jax.enable_x64(True):
-        for index, n in portions(len(rows["load"])):
-            given = {name: jnp.asarray(x[index], jnp.float64) for name, x in rows.items()}
-            slopes = [_slopes_of(effect, standstill, each, given, weights, h) for each in settings]
+        for index, n in portions(len(nodes["load"])):
+            given = {name: jnp.asarray(x[index], jnp.float64) for name, x in nodes.items()}
+            slopes = [_slopes_of(effect, standstill, each, given, h) for each in settings]
             found.append(np.stack(slopes)[..., :n])
     return np.concatenate(found, -1)
 
@@ -146,26 +173,21 @@ def _slopes_of(
     standstill: Array,
     values: Array,
     nodes: dict[str, Array],
-    weights: Array,
     h: float,
 ) -> Array:
     names = tuple(effect.parameters)
     if isinstance(effect, DryFriction):
         effect = _standing_still_at(effect, standstill)
 
-    def mean(values: Array, q: Array, v: Array, actuator: Array, load: Array, inertia: Array):
+    def mean(values: Array, row: dict[str, Array]) -> Array:
         params = dict(zip(names, values, strict=True))
         one = lambda q, v: effect.torque(  # noqa: E731
-            JointMoment(q, v, actuator, load, inertia, h), (), params
+            JointMoment(q, v, row["actuator"], row["load"], row["inertia"], h), (), params
         )
-        return jnp.sum(weights * jax.vmap(jax.vmap(one))(q, v))
+        return jnp.sum(row["weights"] * jax.vmap(jax.vmap(one))(row["q"], row["v"]))
 
     along = lambda way: jax.jvp(  # noqa: E731
-        lambda x: jax.vmap(partial(mean, x))(
-            nodes["q"], nodes["v"], nodes["actuator"], nodes["load"], nodes["inertia"]
-        ),
-        (values,),
-        (way,),
+        lambda x: jax.vmap(partial(mean, x))(nodes), (values,), (way,)
     )[1]
     return jax.vmap(along)(jnp.eye(len(names), dtype=values.dtype))
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sb3_hds.sysid.equation.plausibility import plausibility
-from sb3_hds.sysid.equation.regression import Item
+from sb3_hds.sysid.equation.regression import TINY, Item
 from sb3_hds.sysid.equation.weak_form import Grams
 from sb3_hds.sysid.estimation.candidates import PARAMETER
 
@@ -68,6 +68,7 @@ class Problem:
     :param slopes: of these by inertial parameters, by key
     :param drives: share of each joint's actuator force by parameters, by key
     :param rests: of springs, shares of their second column that are admissible
+    :param least: of what makes commands late, the smallest admissible coefficient
     :param always: items of every set: the nuisance parameters
     :param rarity: of each item, minus the logarithm of its prior odds
     :param total: normal matrix over all joints, shape ``(columns + 1, columns + 1)``
@@ -86,6 +87,7 @@ class Problem:
     slopes: dict[str, np.ndarray]
     drives: dict[str, np.ndarray]
     rests: dict[int, tuple[float, float]]
+    least: dict[int, float]
     always: tuple[int, ...]
     rarity: tuple[float, ...]
     total: np.ndarray
@@ -203,7 +205,7 @@ class Problem:
         fixed = weights.copy()
         fixed[free] = 0.0
         inner = gram[np.ix_(free, free)] + np.diag(prior)
-        size = np.sqrt(np.diag(inner)) + 1e-300
+        size = np.sqrt(np.diag(inner)) + TINY
         scaled = inner / np.outer(size, size) + _RIDGE * np.eye(len(free))
         try:
             inverse = np.linalg.inv(scaled)
@@ -256,7 +258,7 @@ class Problem:
             return True
         if item.rule == "chain":
             (c,) = item.free
-            return 0.0 <= value[c] <= 1.0
+            return self.least.get(i, 0.0) <= value[c] <= 1.0
         if item.rule == "blend":
             one, two = (value[c] for c in item.free)
             low, high = self.rests.get(i, (-np.inf, np.inf))

@@ -11,6 +11,8 @@ from sb3_hds.core import Effect, Ranges
 from sb3_hds.sysid.equation.motion import Motion
 from sb3_hds.sysid.estimation.candidates import Candidate
 
+#: Added to sizes that columns are divided by; its square is not zero.
+TINY = 1e-100
 # Finite differences by a parameter or a sensor, in shares of its scale.
 STEP = 1e-3
 

@@ -21,7 +21,7 @@ from sb3_hds.sysid.equation.motion import Motion
 from sb3_hds.sysid.equation.plausibility import plausibility, rarity_of
 from sb3_hds.sysid.equation.problem import Problem
 from sb3_hds.sysid.equation.regression import Equation, Item
-from sb3_hds.sysid.equation.selection import propose
+from sb3_hds.sysid.equation.selection import LATE, propose
 from sb3_hds.sysid.equation.weak_form import Grams, grams, weak_rows
 from sb3_hds.sysid.estimation.candidates import PARAMETER, Candidate
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
@@ -38,6 +38,9 @@ _TYPICAL = 0.05
 # Machines of more joints are not asked about what has no column at every joint, but where much is
 # left that can be predicted; where they have several causes, only these are simulated.
 SMALL_MACHINE, _LEFT = 2, 0.2
+# Share of an interval below which a command is not late: how the motion goes on between two samples
+# matters as much.
+_LATE = 0.03
 # Ranges of the motion by which a spring may rest outside of it: farther away, it is an offset.
 _BEYOND = 0.5
 
@@ -269,6 +272,7 @@ def problem(hypotheses: Hypotheses, equation: Equation, made: Grams) -> Problem:
         slopes={key: slope[some] for key, slope in equation.slopes.items()},
         drives=equation.drives,
         rests=_rests(equation, items),
+        least=_least_late(equation, items),
         always=tuple(always),
         rarity=tuple(rarity_of(item.candidate, hypotheses.believed) for item in items),
         total=total,
@@ -288,6 +292,15 @@ def _rests(equation: Equation, items: Sequence[Item]) -> dict[int, tuple[float, 
         ends = (float(q.min()) - beyond, float(q.max()) + beyond)
         low, high = ((end - first) / (second - first) for end in ends)
         found[number] = (low, high)
+    return found
+
+
+def _least_late(equation: Equation, items: Sequence[Item]) -> dict[int, float]:
+    found = {}
+    for number, item in enumerate(items):
+        if item.candidate.name in LATE:
+            low, high = (at[name] for at, name in zip(item.settings, item.names, strict=True))
+            found[number] = max((_LATE * equation.motion.dt - low) / (high - low), 0.0)
     return found
 
 

@@ -20,7 +20,8 @@ _ADDED, _SWAPPED, _MOST_MOVES = 12, 5, 80
 # Members of which so rare ones are doubted, and how many.
 _DOUBTFUL, _MOST_SHAKEN = 1.5, 4
 _VISCOUS, _DRY = "viscous_friction", "coulomb_friction"
-_LATE = ("action_delay", "motor_lag")
+#: effects that make commands late
+LATE = ("action_delay", "motor_lag")
 # Joints at which the same effect may stand for something that all share.
 _MANY_JOINTS = 3
 
@@ -57,7 +58,7 @@ def _starts(p: Problem) -> list[list[int]]:
     starts = [friction]
     if p.dof < 3 or not friction:
         starts.append(list(p.always))
-    for name in _LATE:
+    for name in LATE:
         options = [
             i
             for i, item in enumerate(p.items)

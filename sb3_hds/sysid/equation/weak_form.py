@@ -7,13 +7,14 @@ their noise. Overlapping bumps are the rows; Huber weights and blocks of data fo
 """
 
 import itertools
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy.lib.stride_tricks import sliding_window_view
 
-from sb3_hds.sysid.equation.regression import Equation, Item
+from sb3_hds.sysid.equation.regression import TINY, Equation, Item
 from sb3_hds.sysid.estimation.candidates import PARAMETER
 
 # Width of a bump, in periods of the joint's motion, and its least number of intervals.
@@ -24,8 +25,13 @@ _NARROWEST = 5
 # friction is then whatever it has to be, and says nothing. Intervals around a reversal, which
 # smoothing blurs, likewise.
 _REST, _ERRORS = 0.02, 3.0
-# Rows per column of the rich model that must be left, or bumps become narrower, or rest stays in.
-_ENOUGH = 4.0
+# Where a velocity is below this multiple of what it changes by in an interval, the joint may have
+# stopped in between.
+_STOPS = 1.0
+# Rows per column of the rich model that should be left, and what has to do where a joint rests for
+# this share of the time. Where even that is too much, more stays in (around reversals, then where a
+# joint may have stopped, rest at last) or bumps become shorter than the least.
+_ENOUGH, _OFTEN, _SHORTEST = (4.0, 2.0, 1.0), 0.1, (2, 1)
 # Wider bumps average the noise of the velocities, and cost rows around reversals: so they are wide
 # where this share of what is left is such noise, and narrower by more than the factor only where
 # there is next to none.
@@ -89,7 +95,6 @@ def _joint(equation: Equation, j: int) -> Rows:
     pairs = [(i, values) for i, values in pairs if np.abs(values).max() > 0.0]
     used = np.array([i for i, _ in pairs], int)
     table = np.stack([equation.missing[:, j], *(values for _, values in pairs)], 1)
-    still = _at_rest(equation, j)
     rich = rich_columns(equation.items, used)
     period = motion.period[j] if np.isfinite(motion.period[j]) else 1.0
     widest = max(_WIDTH * period, _LEAST * motion.dt) / (2.0 * motion.dt)
@@ -113,23 +118,45 @@ def _joint(equation: Equation, j: int) -> Rows:
             halves[0] / half,
         )
 
-    made: Rows | None = None
-    for half in halves:
-        rows = against(half, still)
-        if len(rows.y) <= _ENOUGH * len(rich):
-            continue
-        made = rows
-        if rows.floor > (_AVERAGED if rows.narrowed < _NARROW else _NO_NOISE):
-            break
-    return against(halves[0], np.zeros_like(still)) if made is None else made
+    def averaged(left_out: np.ndarray, wide: list[int], enough: float) -> Rows | None:
+        made = None
+        for half in wide:
+            rows = against(half, left_out)
+            if len(rows.y) <= enough * len(rich):
+                continue
+            made = rows
+            if rows.floor > (_AVERAGED if rows.narrowed < _NARROW else _NO_NOISE):
+                break
+        return made
+
+    for left_out, wide, enough in _choices(equation, j, halves):
+        if (rows := averaged(left_out, wide, enough)) is not None:
+            return rows
+    return against(halves[0], np.zeros(len(table), bool))
 
 
-def _at_rest(equation: Equation, j: int) -> np.ndarray:
+def _choices(
+    equation: Equation, j: int, halves: list[int]
+) -> Iterator[tuple[np.ndarray, list[int], float]]:
+    """
+    :return: intervals to leave out, half widths of bumps, and rows per column that must be left:
+        what is taken first, and what where that leaves too few rows
+    """
     v, motion = equation.v[:, j], equation.motion
     slow = np.abs(v) < max(_ERRORS * motion.error_v[j], _REST * motion.speed[j])
+    change = np.abs(np.diff(v, append=v[-1:]))
+    stops = np.abs(v) < _STOPS * np.maximum(change, np.roll(change, 1))
     turns = np.abs(np.diff(np.sign(v), prepend=np.sign(v[:1]))) > 0
     around = np.ones(2 * int(motion.blurred[j]) + 1)
-    return np.convolve(slow | turns, around, "same") > 0
+    blurred = np.convolve(slow | turns, around, "same") > 0
+    careful, careless = (stops | blurred, stops | slow), (slow | turns, slow)
+    shortest = [n for n in _SHORTEST if n < halves[-1]]
+    first = _ENOUGH if slow.mean() > _OFTEN else _ENOUGH[:1]
+    for enough in first:
+        yield from itertools.product(careful, [halves], [enough])
+    yield from itertools.product(careless, [halves], _ENOUGH[:1])
+    for some, enough in itertools.product((careful, careless), _ENOUGH):
+        yield from itertools.product(some, [shortest], [enough])
 
 
 def _bump(half: int) -> np.ndarray:
@@ -182,7 +209,7 @@ def _huber(y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _least_squares(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    size = np.sqrt(np.mean(x**2, axis=0)) + 1e-300
+    size = np.sqrt(np.mean(x**2, axis=0)) + TINY
     return np.linalg.lstsq(x / size, y, rcond=_RANK)[0] / size
 
 
@@ -259,10 +286,11 @@ def grams(equation: Equation, rows: list[Rows]) -> Grams:
 
 
 def _deflation(local: np.ndarray, rich: np.ndarray, most: float) -> float:
+    total = local.sum(0)
+    rich = rich[np.diag(total)[rich] > 0.0]
     if not len(rich):
         return 1.0
-    total = local.sum(0)
-    size = np.sqrt(np.diag(total)[rich]) + 1e-300
+    size = np.sqrt(np.diag(total)[rich])
     values, vectors = np.linalg.eigh(total[np.ix_(rich, rich)] / np.outer(size, size))
     well = values > 1e-6 * values[-1]
     inverse = (vectors[:, well] / values[well]) @ vectors[:, well].T
