@@ -121,10 +121,9 @@ def _joint(equation: Equation, j: int) -> Rows:
     def averaged(left_out: np.ndarray, wide: list[int], enough: float) -> Rows | None:
         made = None
         for half in wide:
-            rows = against(half, left_out)
-            if len(rows.y) <= enough * len(rich):
+            if _n_rows(equation.recording, left_out, half) <= enough * len(rich):
                 continue
-            made = rows
+            rows = made = against(half, left_out)
             if rows.floor > (_AVERAGED if rows.narrowed < _NARROW else _NO_NOISE):
                 break
         return made
@@ -181,6 +180,11 @@ def _against_bumps(
     if not rows:
         return np.zeros((0, table.shape[1])), np.zeros(0, int)
     return np.concatenate(rows), np.concatenate(middles)
+
+
+def _n_rows(recording: np.ndarray, left_out: np.ndarray, half: int) -> int:
+    runs = _runs(recording, left_out)
+    return sum(max((end - begin - 2 * half - 1) // half + 1, 0) for begin, end in runs)
 
 
 def _runs(recording: np.ndarray, left_out: np.ndarray) -> list[tuple[int, int]]:
