@@ -25,7 +25,7 @@ from sb3_hds.sysid.estimation.evidence import Evidence, Point
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.shooting import shots_of
 from sb3_hds.sysid.reporting.finding import HorizonGain
-from sb3_hds.sysid.reporting.printed import several_in_words
+from sb3_hds.sysid.reporting.printed import doubts_in_words, several_in_words
 
 KINDS = ["ViscousFriction", "CoulombFriction", "TorqueGain", "ActionDelay"]
 TWIN = twins.make("PendulumReal")
@@ -475,6 +475,12 @@ def test_several_causes_are_told_as_those_of_a_machine():
     doubtful = finding("stiffness", "lift", 3.0, "N m/rad", others=("cogging.lift",))
     assert several_in_words([viscous, late, doubtful], joints).replace(space, " ") == (
         "Pan has viscous friction that the model lacks (it carries 30 % of the torque); commands "
-        "arrive 0.012 s late at all actuators and lift has stiffness of 3 N m/rad besides. The "
-        "data cannot tell stiffness at lift from cogging at lift."
+        "arrive 0.012 s late at all actuators and lift has stiffness of 3 N m/rad besides."
     )
+    assert doubts_in_words([viscous, late, doubtful]) == (
+        "The data cannot tell stiffness at lift from cogging at lift."
+    )
+    assert doubts_in_words([viscous, *[doubtful] * 4]) == (
+        "Of four causes the data leave open which of several names is right."
+    )
+    assert doubts_in_words([viscous, late]) == ""

@@ -98,6 +98,22 @@ def screened(**changes):
     return screen(twin, motion(twin, data), effects.ALL, ())
 
 
+def test_friction_against_velocity_is_what_rubs_with_other_causes_taken_off():
+    """Viscous 3 N s/m and dry 1.5 N, beside an offset of 2 N, in which no friction is."""
+    twin, data = rubbing_axis(pull=lambda q, v: 2.0 - 3.0 * v)
+    found = screen(twin, motion(twin, data), effects.ALL, ())
+    (curve,) = found.friction_curves([m.key for m in found.members])
+
+    assert curve.joint == 0 and np.all(np.diff(curve.velocity) > 0.0)
+    moving = np.abs(curve.velocity) > 0.1
+    true = 3.0 * curve.velocity + 1.5 * np.sign(curve.velocity)
+    np.testing.assert_allclose(curve.found[moving], true[moving], atol=0.1)
+    # Each dot is a mean over fifty intervals, uncertain by the noise of the velocities.
+    misses = (curve.measured - true)[moving]
+    assert abs(misses.mean()) < 0.05 and misses.std() < 0.3
+    assert found.friction_curves(["constant_force.axis"]) == ()
+
+
 def test_bumps_are_wide_where_velocities_are_noisy_and_narrow_where_something_else_is_left():
     def narrowed(unknown, noise):
         pull = lambda q, v: -3.0 * v + unknown * np.sin(6.0 * q)  # noqa: E731

@@ -14,8 +14,11 @@ from measuring import measured
 from sb3_hds import diagnose, effects, twins
 from sb3_hds.errors import ParameterError
 from sb3_hds.sysid.diagnosis import findings as telling
+from sb3_hds.sysid.equation.friction import FrictionCurve
+from sb3_hds.sysid.reporting import figures as plots
 from sb3_hds.sysid.reporting.diagnosis import SENTENCES
 from sb3_hds.sysid.reporting.finding import Rejected
+from sb3_hds.sysid.reporting.printed import rows_of
 
 TWIN = twins.make("PendulumReal")
 KINDS = (effects.CoulombFriction, effects.ViscousFriction)
@@ -112,6 +115,62 @@ def test_print_and_page_say_the_same_and_print_has_80_columns(crowded, page):
     assert f"coulomb_friction.hinge: tau_c {limit:.2g} N m" in str(nothing).replace("\xa0", " ")
 
 
+@pytest.fixture(scope="module")
+def many(rubbing):
+    """Viscous and Coulomb friction and an offset at both joints of an arm, told in a table."""
+    arm = twins.make("DoublePendulum")
+    (first,) = rubbing.findings
+    size = first.parameters["tau_c"]
+
+    def at(index, effect, name, others=()):
+        where = {"slot": "joint", "index": index, "name": arm.joints[index].name}
+        own = {name: dataclasses.replace(size, name=f"{effect}.{where['name']}.{name}")}
+        return dataclasses.replace(
+            first, effect=effect, where=where, parameters=own, alternatives=others, share=0.25
+        )
+
+    causes = {"viscous_friction": "b", "coulomb_friction": "tau_c", "constant_force": "tau_0"}
+    found = [at(1 - index, *cause) for cause in causes.items() for index in range(2)]
+    found[2] = dataclasses.replace(found[2], alternatives=("stiffness.elbow",))
+    curve = FrictionCurve(0, *(np.linspace(-1.0, 1.0, 40) for _ in range(3)))
+    pictures = rubbing.pictures._replace(friction=(curve,))
+    return dataclasses.replace(
+        rubbing, findings=tuple(found), believed=arm, twin=arm, pictures=pictures
+    )
+
+
+def test_many_causes_are_a_table_by_joint_and_friction_is_drawn(many, tmp_path):
+    names = [joint.name for joint in many.believed.joints]
+    rows = rows_of(many.findings, names)
+    assert [row[0] for row in rows] == [names[0]] * 3 + [names[1]] * 3
+    assert [row[1] for row in rows[:3]] == [
+        "viscous friction",
+        "Coulomb friction",
+        "constant force",
+    ]
+    assert all(row[-1] == "25%" for row in rows)
+    text = str(many)
+    assert text.startswith("named: Both joints have viscous and Coulomb friction")
+    assert "Refitted" not in text and text.count("cannot tell") == 1
+    assert many.sentence.endswith("from stiffness at elbow.") and many.headline in many.sentence
+
+    text = plots.as_png(plots.plot_friction(many.pictures))
+    assert text.startswith(b"\x89PNG")
+    (panel,) = plots.plot_friction(many.pictures).axes
+    dots, line, _ = panel.lines
+    assert panel.get_title() == "hinge" and len(dots.get_xdata()) == len(line.get_xdata()) == 40
+
+
+def test_a_model_that_runs_away_leaves_the_measurements_in_sight(rubbing):
+    seen = rubbing.pictures.replay
+    away = dataclasses.replace(rubbing).pictures._replace(
+        replay=seen._replace(before=1e6 * seen.before)
+    )
+    for j, (left, right) in enumerate(np.reshape(plots.plot_rollouts(away).axes, (-1, 2))):
+        span = np.ptp(seen.measured[np.isfinite(seen.measured[:, j]), j])
+        assert np.ptp(left.get_ylim()) <= 2.5 * span and np.ptp(right.get_ylim()) <= 2.5 * span
+
+
 def test_the_verdict_is_one_sentence(rubbing, crowded):
     (first,) = rubbing.findings
     size = first.parameters["tau_c"]
@@ -168,7 +227,7 @@ def test_the_report_needs_no_network_and_its_pictures_are_files_too(rubbing, pag
 
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in saved)
     # Each for wide and for narrow pages, and the gain in policy.
-    assert len(saved) == 4 and page.count("data:image/png;base64,") == 2 * 5
+    assert len(saved) == 5 and page.count("data:image/png;base64,") == 2 * 6
     written = re.sub('base64,[^"]*', "", page)
     assert "http" not in written and "<script src" not in written and "<link" not in written
     with pytest.raises(ParameterError, match=r"r\.html in place of"):
@@ -195,8 +254,12 @@ LOOK = """(page, done) => {
 
 
 @needs_chromium
-def test_the_report_fits_a_narrow_browser(page, tmp_path):
+def test_the_report_fits_a_narrow_browser(page, many, rubbing, tmp_path):
     found, console = in_chromium(page, LOOK, 400, tmp_path)
     assert found["laid_out"] <= found["shown"] <= 400 and not found["overrun"]
+    table = dataclasses.replace(many, believed=rubbing.believed, twin=rubbing.twin)
+    table = table.to_html(tmp_path / "many.html").read_text()
+    tabled, _ = in_chromium(table, LOOK, 400, tmp_path)
+    assert tabled["laid_out"] <= tabled["shown"] <= 400
     # A picture has at least as many pixels as it is shown with.
-    assert len(found["pictures"]) == 5 and min(found["pictures"]) >= 1.0 and console == []
+    assert len(found["pictures"]) == 6 and min(found["pictures"]) >= 1.0 and console == []

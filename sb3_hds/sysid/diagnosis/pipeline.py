@@ -326,7 +326,13 @@ class Inquiry:
             data_hash=self.data_hash,
             seed=self.seed,
             pictures=pictures_of(
-                confirm, start.kept, base.kept, self.given.every, before.missing, left.missing
+                confirm,
+                start.kept,
+                base.kept,
+                self.given.every,
+                before.missing,
+                left.missing,
+                self.screened.friction_curves(keys_of(found)) if self.screened else (),
             ),
             opened=partial(
                 open_answers,

@@ -17,6 +17,12 @@ from sb3_hds.sysid.equation.confirmation import (
     simpler,
     what_is_left,
 )
+from sb3_hds.sysid.equation.friction import (
+    ByVelocity,
+    FrictionCurve,
+    by_velocity,
+    friction_curves,
+)
 from sb3_hds.sysid.equation.motion import Motion
 from sb3_hds.sysid.equation.plausibility import plausibility, rarity_of
 from sb3_hds.sysid.equation.problem import Problem
@@ -55,6 +61,7 @@ class Screened(NamedTuple):
     :param left: what the set leaves at each joint
     :param keys: of the candidates that are worth a simulation
     :param nameless_at: joints at which flexible forces are tried
+    :param by_velocity: the equation of each joint, averaged over intervals of similar velocity
     """
 
     hypotheses: Hypotheses
@@ -65,6 +72,7 @@ class Screened(NamedTuple):
     left: tuple[Left, ...]
     keys: frozenset[str]
     nameless_at: tuple[str, ...]
+    by_velocity: tuple[ByVelocity, ...]
 
     def among(self, keys: Collection[str]) -> "Screened":
         """:return: the same with some members, solved and judged anew without the others"""
@@ -98,6 +106,15 @@ class Screened(NamedTuple):
         parts = [self._by_full_name(candidate, x) for x in (member.sizes, member.low, member.high)]
         value, low, high = parts
         return {n: (value[n], min(low[n], high[n]), max(low[n], high[n])) for n in value}
+
+    def friction_curves(self, keys: Collection[str]) -> tuple[FrictionCurve, ...]:
+        """:return: friction against velocity at each joint where causes with these keys have it"""
+        p, at = self.problem, {}
+        for i, item in enumerate(p.items):
+            at.setdefault(item.key, i)
+        at |= {m.key: m.item for m in self.members}
+        items = [at[key] for key in keys if key in at]
+        return friction_curves(p, self.by_velocity, retuned(p, [*p.always, *items]))
 
     def _by_full_name(self, candidate: Candidate, sizes: Mapping[str, float]) -> dict[str, float]:
         if candidate.slot == "parameter":
@@ -196,6 +213,7 @@ def screen(
         left=tuple(left),
         keys=frozenset(keys),
         nameless_at=tuple(where),
+        by_velocity=by_velocity(made),
     )
 
 

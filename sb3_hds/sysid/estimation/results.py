@@ -139,20 +139,22 @@ class Fit:
     def __repr__(self) -> str:
         share = f"{100.0 * self.level:g} %"
         of = "the forces of " if self.errors == "force" else ""
+        names = ["parameter", "channel", *(e.name for e in self.estimates)]
+        w = max(map(len, [*names, *(name for name, _ in self.channels)])) + 1
         lines = [
             f"Fit of {self.twin.name} to {of}{self.n_windows} windows of {self.window} steps",
             "",
-            f"{'parameter':<26}{'before':>10}{'estimate':>11}{'+-':>9}   {share} interval",
+            f"{'parameter':<{w}}{'before':>10}{'estimate':>11}{'+-':>9}   {share} interval",
         ]
         for e in self.estimates:
             numbers = f"{e.before:>10.4g}{e.estimate:>11.4g}{e.stderr:>9.2g}"
             interval = f"[{e.low:.4g}, {e.high:.4g}] {e.unit}"
-            lines.append(f"{e.name[-26:]:<26}{numbers}   {interval}")
-        lines += ["", f"{'channel':<26}{'error before':>16}{'after':>12}{'noise':>12}"]
+            lines.append(f"{e.name:<{w}}{numbers}   {interval}")
+        lines += ["", f"{'channel':<{w}}{'error before':>16}{'after':>12}{'noise':>12}"]
         for (name, unit), b, a, n in zip(
             self.channels, self.error_before, self.error_after, self.noise, strict=True
         ):
-            lines.append(f"{name[-26:]:<26}{b:>16.3g}{a:>12.3g}{n:>12.3g} {unit}")
+            lines.append(f"{name:<{w}}{b:>16.3g}{a:>12.3g}{n:>12.3g} {unit}")
         for caveat in self.caveats:
             lines += ["", *_wrapped(caveat)]
         return "\n".join(lines)

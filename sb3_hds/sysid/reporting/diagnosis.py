@@ -24,6 +24,7 @@ from sb3_hds.sysid.reporting.pictures import Pictures
 from sb3_hds.sysid.reporting.printed import (
     WIDTH,
     choice,
+    doubts_in_words,
     finding_in_lines,
     not_accepted,
     several_in_words,
@@ -112,8 +113,23 @@ class Diagnosis:
 
     @property
     def sentence(self) -> str:
+        """The verdict in one sentence; of several causes, with one on what stays open."""
+        doubts = doubts_in_words(self.findings) if self._tells_several else ""
+        return f"{self.headline} {doubts}".rstrip()
+
+    @property
+    def _tells_several(self) -> bool:
+        return self.verdict in ("named", "ambiguous") and len(self.findings) > MANY
+
+    @property
+    def tabled(self) -> bool:
+        """Whether the causes are so many that they are told in a table."""
+        return len(self.findings) > _TABLE
+
+    @property
+    def headline(self) -> str:
         """The verdict in one sentence."""
-        if self.verdict in ("named", "ambiguous") and len(self.findings) > MANY:
+        if self._tells_several:
             return several_in_words(self.findings, [j.name for j in self.believed.joints])
         if self.verdict == "ambiguous":
             first, *others = self.findings
@@ -138,9 +154,9 @@ class Diagnosis:
 
     def summary(self) -> str:
         """:return: all of it in 80 columns"""
-        lines = [*wrapped(f"{self.verdict}: {self.sentence}"), "=" * WIDTH]
-        if len(self.findings) > _TABLE:
-            lines += table_of(self.findings)
+        lines = [*wrapped(f"{self.verdict}: {self.headline}"), "=" * WIDTH]
+        if self.tabled:
+            lines += table_of(self.findings, [joint.name for joint in self.believed.joints])
         else:
             for finding in self.findings:
                 lines += finding_in_lines(finding)
@@ -171,6 +187,9 @@ class Diagnosis:
         """What was calibrated on the way: name, value as believed, and value in the end."""
         known = self.believed.values
         found = {e.name for finding in self.findings for e in finding.parameters.values()}
+        for finding in self.findings:
+            place = finding.effect, finding.where["index"]
+            found |= {*self.believed.native_effects.get(place, {}).values()}
         return tuple(
             (name, f"{known[name]:.4g}", with_unit(f"{value:.4g}", self.twin.parameters[name].unit))
             for name, value in self.twin.values.items()

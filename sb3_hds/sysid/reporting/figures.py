@@ -1,7 +1,7 @@
 """Pictures of results; matplotlib is imported only here, and only when one is drawn."""
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +19,11 @@ _WIDE, _NARROW = 9.0, 4.4
 _DPI = 150
 # A candidate that makes predictions worse than this is drawn as if it did so by this much.
 _WORST = -0.05
+# How far a panel reaches beyond what was measured, in shares of its range, where the nominal model
+# runs away; and from which ratio on errors are drawn on a logarithmic scale.
+_AROUND, _DECADE = 0.5, 10.0
+# Letters of a line of a label.
+_LINE = 16
 
 
 def as_png(figure: Any) -> bytes:
@@ -58,13 +63,17 @@ def plot_rollouts(p: "Pictures", narrow: bool = False) -> Any:
             ends = [centre[:, j] + side * seen.margin[:, j] for side in (-1.0, 1.0)]
             axes.fill_between(seen.time, *ends, color=_AFTER, alpha=0.15, lw=0.0)
         right.axhline(0.0, color=_MEASURED, lw=0.6)
-        left.set_ylabel(f"{name} [{unit}]", fontsize=8)
+        measured, after = seen.measured[:, j], seen.after[:, j]
+        around = _AROUND * np.ptp(measured[np.isfinite(measured)])
+        _cut(left, np.concatenate([measured, after]), around)
+        _cut(right, np.append(after - measured, 0.0), around)
+        left.set_ylabel(_label(name, unit), fontsize=8)
         if j == 0 or narrow:
             left.set_title("simulated and measured", fontsize=9)
             right.set_title("simulated minus measured", fontsize=9)
     if narrow:
         for row, (name, unit) in zip(panels, p.channels, strict=True):
-            row[1].set_ylabel(f"{name} [{unit}]", fontsize=8)
+            row[1].set_ylabel(_label(name, unit), fontsize=8)
     figure.legend(
         *panels[0, 0].get_legend_handles_labels(),
         fontsize=8,
@@ -87,7 +96,10 @@ def plot_horizons(d: Any, p: "Pictures", narrow: bool = False) -> Any:
         ends = [gain.before * np.sqrt(max(1.0 - end, 0.0)) for end in (gain.low, gain.high)]
         axes.plot([gain.steps] * 2, ends, color=_AFTER, lw=4.0, alpha=0.3)
     axes.axhline(1.0, color=_QUIET, lw=1.0, ls="--", label="what the best fit leaves")
-    axes.set_ylim(bottom=0.0)
+    if np.nanmax(p.errors[0]) > _DECADE * np.nanmax(p.errors[1]):
+        axes.set_yscale("log")
+    else:
+        axes.set_ylim(bottom=0.0)
     axes.set_xlabel("steps from the start of a window", fontsize=8)
     axes.set_ylabel("error / what the best fit leaves", fontsize=8)
     axes.legend(fontsize=8, frameon=False)
@@ -120,7 +132,32 @@ def plot_missing_force(p: "Pictures", narrow: bool = False) -> Any:
             axes.set_ylim(low - margin, high + margin)
             axes.set_xlabel(label, fontsize=8)
             if k == 0 or narrow:
-                axes.set_ylabel(f"{name} [{unit}]", fontsize=8)
+                axes.set_ylabel(_label(name, unit), fontsize=8)
+    return figure
+
+
+def plot_friction(p: "Pictures", narrow: bool = False) -> Any:
+    """Resistance against velocity, of each joint at which friction was found."""
+    columns = min(3, len(p.friction))
+    rows = -(-len(p.friction) // columns)
+    figure, panels = _figure(rows, columns, 2.4, narrow)
+    for axes, curve in zip(panels.ravel(), p.friction, strict=False):
+        name, unit = p.joints[curve.joint]
+        axes.plot(curve.velocity, curve.measured, ".", color=_MEASURED, ms=5, label="measured")
+        axes.plot(curve.velocity, curve.found, color=_AFTER, lw=1.5, label="found")
+        axes.axhline(0.0, color=_MEASURED, lw=0.6)
+        axes.set_title(name, fontsize=9)
+        axes.set_xlabel(f"velocity [{'m' if unit == 'N' else 'rad'}/s]", fontsize=8)
+        axes.set_ylabel(f"friction [{unit}]", fontsize=8)
+    for axes in panels.ravel()[len(p.friction) :]:
+        axes.remove()
+    figure.legend(
+        *panels[0, 0].get_legend_handles_labels(),
+        fontsize=8,
+        frameon=False,
+        ncols=2,
+        loc="outside upper center",
+    )
     return figure
 
 
@@ -188,6 +225,25 @@ def plot_policy_gain(gain: Mapping[str, Any], narrow: bool = False) -> Any:
     return figure
 
 
+def _cut(axes: Any, shown: np.ndarray, around: float) -> None:
+    """End a panel not far beyond what has to be seen in it."""
+    shown = shown[np.isfinite(shown)]
+    ends, whole = (shown.min() - around, shown.max() + around), axes.get_ylim()
+    if around > 0.0:
+        axes.set_ylim(max(ends[0], whole[0]), min(ends[1], whole[1]))
+
+
+def _label(name: str, unit: str) -> str:
+    """Broken between words where it is long."""
+    lines = [""]
+    for word in name.replace("_", "_ ").split():
+        if lines[-1] and len(lines[-1] + word) > _LINE:
+            lines.append("")
+        lines[-1] += word
+    last = lines[-1] if len(lines[-1]) + len(unit) < _LINE else f"{lines[-1]}\n"
+    return "\n".join([*lines[:-1], f"{last} [{unit}]".replace("\n ", "\n")])
+
+
 def _figure(rows: int, columns: int, height: float, narrow: bool) -> tuple[Any, np.ndarray]:
     """
     :param height: of a row [in]
@@ -244,21 +300,24 @@ def _draw_errors(axes: Any, fit: "Fit") -> None:
     axes.legend(fontsize=8, frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.06))
 
 
-def film_frames(
-    moving: "Moving", players: Sequence[tuple[str, str]], frames: np.ndarray
-) -> Iterator[np.ndarray]:
+def draw_film(
+    moving: "Moving",
+    players: Sequence[tuple[str, str]],
+    frames: np.ndarray,
+    path: Any,
+    per_second: int,
+) -> None:
     """
     :param players: label and colour of each
     :param frames: indices of those that are drawn
-    :return: pictures of 1,280 x 720 points, shape ``(720, 1280, 3)``
+    :param path: of the film, of 1,280 x 720 points
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.animation import FFMpegWriter
     from matplotlib.figure import Figure
     from matplotlib.patches import Polygon
 
     n = len(moving.names)
     figure = Figure(figsize=(12.8, 7.2), dpi=100)
-    canvas = FigureCanvasAgg(figure)
     grid = figure.add_gridspec(max(n, 1), 2, width_ratios=(3, 2), left=0.02, right=0.98)
     stage = figure.add_subplot(grid[:, 0])
     stage.set(xlim=(0, 100), ylim=(100, 0), aspect="equal")
@@ -286,14 +345,15 @@ def film_frames(
         axes.set_ylabel(name, rotation=0, ha="right", fontsize=7)
         axes.tick_params(labelsize=6, labelbottom=j == n - 1)
         cursors.append(axes.axvline(0.0, color="#2b2a27", lw=0.8))
-    for frame in frames.tolist():
-        for lines, places in zip(drawn, moving.lines[:, frame], strict=True):
-            for line, ends in zip(lines, places, strict=True):
-                line.set_data(ends[:, 0], ends[:, 1])
-        for patches, places in zip(shapes, moving.outlines[:, frame], strict=True):
-            for patch, corners in zip(patches, places, strict=True):
-                patch.set_xy(corners)
-        for cursor in cursors:
-            cursor.set_xdata([moving.time[frame]] * 2)
-        canvas.draw()
-        yield np.asarray(canvas.buffer_rgba())[..., :3]
+    writer = FFMpegWriter(fps=per_second)
+    with writer.saving(figure, str(path), dpi=100):
+        for frame in frames.tolist():
+            for lines, places in zip(drawn, moving.lines[:, frame], strict=True):
+                for line, ends in zip(lines, places, strict=True):
+                    line.set_data(ends[:, 0], ends[:, 1])
+            for patches, places in zip(shapes, moving.outlines[:, frame], strict=True):
+                for patch, corners in zip(patches, places, strict=True):
+                    patch.set_xy(corners)
+            for cursor in cursors:
+                cursor.set_xdata([moving.time[frame]] * 2)
+            writer.grab_frame()

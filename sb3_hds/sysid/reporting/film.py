@@ -3,7 +3,6 @@
 import os
 import secrets
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -177,19 +176,13 @@ def write_film(moving: Moving, path: str | os.PathLike[str]) -> Path:
     """
     check_film(path)
     import imageio_ffmpeg
+    import matplotlib
 
-    target = Path(path)
+    target, encoder = Path(path), imageio_ffmpeg.get_ffmpeg_exe()
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(8)}.mp4")
-    frames = _at_pace(moving)
     try:
-        writer: Any = None
-        for picture in plots.film_frames(moving, PLAYERS, frames):
-            if writer is None:
-                size = picture.shape[1], picture.shape[0]
-                writer = imageio_ffmpeg.write_frames(str(temporary), size, fps=_PER_SECOND)
-                writer.send(None)
-            writer.send(np.ascontiguousarray(picture))
-        writer.close()
+        with matplotlib.rc_context({"animation.ffmpeg_path": encoder}):
+            plots.draw_film(moving, PLAYERS, _at_pace(moving), temporary, _PER_SECOND)
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)

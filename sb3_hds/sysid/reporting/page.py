@@ -18,6 +18,7 @@ from sb3_hds.sysid.reporting import wording
 from sb3_hds.sysid.reporting.diagnosis import Diagnosis
 from sb3_hds.sysid.reporting.film import STYLE, section_of
 from sb3_hds.sysid.reporting.moving import moving_of
+from sb3_hds.sysid.reporting.printed import COLUMNS, alike_in_words, rows_of
 from sb3_hds.sysid.reporting.wording import sizes_in_words, with_unit
 
 _INSTALL = "A report needs matplotlib and jinja2: pip install 'sb3-hds[report]'."
@@ -34,6 +35,7 @@ _PAGE = """<!DOCTYPE html>
 body { margin: 0 auto; max-width: 60rem; padding: 1.5rem 1rem 3rem; color: #2b2a27;
   background: #fff; font: 16px/1.5 system-ui, "Segoe UI", "Liberation Sans", sans-serif; }
 h1 { font-size: 1.7rem; line-height: 1.25; margin: 0 0 .4rem; overflow-wrap: anywhere; }
+h1.long { font-size: 1.25rem; }
 h2 { font-size: 1.15rem; margin: 0 0 .5rem; border-bottom: 1px solid #dcd9d0;
   break-after: avoid; }
 section { margin: 2.2rem 0 0; }
@@ -47,10 +49,12 @@ figcaption, .quiet { color: #6b6860; font-size: .9rem; }
 table { border-collapse: collapse; width: 100%; font-size: .95rem; }
 th, td { text-align: left; padding: .25rem .8rem .25rem 0; border-bottom: 1px solid #eceae3;
   vertical-align: top; font-variant-numeric: tabular-nums; overflow-wrap: anywhere; }
+.causes { overflow-x: auto; } .causes td { overflow-wrap: break-word; }
 th { font-weight: 600; font-size: .9rem; overflow-wrap: normal; }
 {{ style | safe }}
 td.short { white-space: nowrap; }
-@media screen and (max-width: 40rem) { h1 { font-size: 1.35rem; } table { font-size: .8rem; }
+@media screen and (max-width: 40rem) { h1 { font-size: 1.35rem; }
+  h1.long { font-size: 1.1rem; } table { font-size: .8rem; }
   th, td { padding-right: .4rem; } th { font-size: .8rem; } }
 @media print { @page { margin: 1.6cm; }
   body { font-size: 10pt; max-width: none; padding: 0; }
@@ -72,15 +76,17 @@ td.short { white-space: nowrap; }
 </picture><figcaption>{{ picture.caption }}</figcaption></figure>
 {%- endmacro %}
 <p class="quiet">{{ d.twin.name }} and {{ n_recordings }}</p>
-<h1>{{ d.sentence }}</h1>
+<h1{% if d.headline | length > 160 %} class="long"{% endif %}>{{ d.headline }}</h1>
 <p><span class="badge">{{ d.verdict }}</span></p>
-{% for f in findings %}<div class="finding">
+{% if d.tabled %}<div class="causes">{{ table(COLUMNS, causes) }}</div>
+{% for words in alike %}<p class="quiet">{{ words }}</p>{% endfor %}
+{% else %}{% for f in findings %}<div class="finding">
 <p><strong>{{ f.effect }}</strong>{% if f.place %} at {{ f.slot }}
 <strong>{{ f.place }}</strong>{% endif %}. {{ f.explanation }}</p>
 {{ table(("parameter", "estimate", "standard error", "90 % interval"), f.rows) }}
 <p>{{ f.evidence }}{% if f.alternatives %} <strong>{{ wording.ALIKE }}</strong>
 {{ f.alternatives }}.{% endif %}</p>
-</div>{% endfor %}
+</div>{% endfor %}{% endif %}
 {% if findings %}<p>{{ explained }}</p>{% endif %}
 {% if d.unexplained %}<p><strong>Unexplained:</strong> {{ d.unexplained }}</p>{% endif %}
 {% for caveat in d.caveats %}<p><strong>Caveat:</strong> {{ caveat }}</p>{% endfor %}
@@ -229,6 +235,9 @@ def _content(d: Diagnosis) -> dict[str, Any]:
         "n_recordings": f"{n} recordings" if n > 1 else "its recording",
         "colour": _COLOURS.get(d.verdict, _NO_NAME),
         "findings": findings,
+        "COLUMNS": COLUMNS,
+        "causes": rows_of(d.findings, [joint.name for joint in d.believed.joints]),
+        "alike": alike_in_words(d.findings),
         "explained": wording.explained_in_words(d.explained),
         "rejected": [
             (r.name, wording.share_in_words(r.gain), wording.p_value_in_words(r.p_value), r.why)
@@ -298,7 +307,8 @@ def _pictures(d: Diagnosis) -> list[_Picture]:
         _Picture(
             "Before and after",
             "A held-out recording, in windows that are simulated from a start state of their own. "
-            "Shaded: 90 % interval of the extended twin, by what it misses in all such windows.",
+            "Shaded: 90 % interval of the extended twin, by what it misses in all such windows. "
+            "Where the nominal model runs away, its curve is cut off.",
             lambda narrow: plots.plot_rollouts(p, narrow),
         ),
         _Picture(
@@ -312,13 +322,25 @@ def _pictures(d: Diagnosis) -> list[_Picture]:
                 for g in d.gain.values()
             ),
         ),
+    ]
+    if p.friction:
+        found.append(
+            _Picture(
+                "Friction against velocity",
+                "Dots: the mean resistance while a joint moves at about that velocity, by the "
+                "equation of motion, with all other causes taken off. Line: the friction that was "
+                "found.",
+                lambda narrow: plots.plot_friction(p, narrow),
+            )
+        )
+    found.append(
         _Picture(
             "The missing force",
             "What each short window asks for beyond the twin: grey as measured, blue what the "
             "causes that were found put there.",
             lambda narrow: plots.plot_missing_force(p, narrow),
-        ),
-    ]
+        )
+    )
     if d.rejected or d.findings:
         caption = (
             "By how much each candidate lowers the mean square error of held-out recordings; "

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from sb3_hds.sysid.comparison.halves import NOT_FINITE, Half
 from sb3_hds.sysid.comparison.unexplained import MissingForce
+from sb3_hds.sysid.equation.friction import FrictionCurve
 from sb3_hds.sysid.estimation.evidence import Point
 
 # Of a normal distribution, 90 % lie within so many standard deviations.
@@ -42,6 +43,7 @@ class Pictures(NamedTuple):
         after, shape ``(2, k)``
     :param missing: residual force of the nominal model
     :param left: residual force of the extended model
+    :param friction: against velocity, of joints at which friction was found
     """
 
     channels: tuple[tuple[str, str], ...]
@@ -52,6 +54,7 @@ class Pictures(NamedTuple):
     errors: np.ndarray
     missing: MissingForce
     left: MissingForce
+    friction: tuple[FrictionCurve, ...] = ()
 
 
 def replay_of(
@@ -90,11 +93,13 @@ def pictures_of(
     every: int,
     missing: MissingForce,
     left: MissingForce,
+    friction: tuple[FrictionCurve, ...],
 ) -> Pictures:
     """
     :param every: steps of the data in one of the windows
     :param missing: residual force of the nominal model
     :param left: residual force of the extended model
+    :param friction: against velocity
     """
     evidence, twin = half.evidence, half.evidence.hypotheses.twin
     rows = np.flatnonzero(half.unit == half.unit[0])
@@ -113,4 +118,5 @@ def pictures_of(
         errors=np.stack(errors),
         missing=missing,
         left=left,
+        friction=friction,
     )

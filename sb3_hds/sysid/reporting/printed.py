@@ -28,6 +28,8 @@ _SHARED = {
     "action_delay": "commands arrive {} late at all actuators",
     "motor_lag": "all motors lag by {}",
 }
+#: of the table of causes
+COLUMNS = ("joint", "cause", "size", "90 % interval", "of force")
 # Words without an article, and from how many doubts on they are counted.
 _UNCOUNTED = ("stiffness", "cogging", "drag", "friction", "elasticity", "backlash", "saturation")
 _MANY_DOUBTS = 3
@@ -51,8 +53,7 @@ def several_in_words(findings: Sequence[Finding], joints: Sequence[str]) -> str:
     """
     :param findings: more than a few
     :param joints: names of all joints of the machine
-    :return: a sentence: friction of the machine as a whole first, and what there is besides; and
-        one on what the data cannot tell from other causes
+    :return: a sentence: friction of the machine as a whole first, and what there is besides
     """
     friction, rest = [], []
     for f in findings:
@@ -60,7 +61,7 @@ def several_in_words(findings: Sequence[Finding], joints: Sequence[str]) -> str:
     besides = _listed([*_common(rest), *_offsets(rest), *map(_one, _others(rest))])
     head = _friction_of(friction, joints)
     told = f"{head}; {besides} besides." if head and rest else f"{head or besides}."
-    return f"{told[:1].upper()}{told[1:]}{_doubts(findings)}"
+    return f"{told[:1].upper()}{told[1:]}"
 
 
 def _friction_of(findings: Sequence[Finding], joints: Sequence[str]) -> str:
@@ -128,13 +129,14 @@ def _article(name: str) -> str:
     return f"{'an' if name[:1] in 'aeiou' else 'a'} {name}"
 
 
-def _doubts(findings: Sequence[Finding]) -> str:
+def doubts_in_words(findings: Sequence[Finding]) -> str:
+    """:return: a sentence on what the data cannot tell from other causes; empty if there is none"""
     doubtful = [f for f in findings if f.alternatives]
     if len(doubtful) > _MANY_DOUBTS:
         n = _number(len(doubtful))
-        return f" Of {n} causes the data leave open which of several names is right."
+        return f"Of {n} causes the data leave open which of several names is right."
     doubt = [f"{spoken(f.key)} from {' or '.join(map(spoken, f.alternatives))}" for f in doubtful]
-    return f" The data cannot tell {'; '.join(doubt)}." if doubt else ""
+    return f"The data cannot tell {'; '.join(doubt)}." if doubt else ""
 
 
 def _places(where: Sequence[str], joints: Sequence[str]) -> str:
@@ -174,10 +176,14 @@ def _listed(items: Sequence[str]) -> str:
     )
 
 
-def table_of(findings: Sequence[Finding]) -> list[str]:
-    """Many causes, one line for each size."""
+def rows_of(findings: Sequence[Finding], joints: Sequence[str]) -> list[tuple[str, ...]]:
+    """
+    :param joints: names of all joints, in whose order causes are told; others come after them
+    :return: of each size of each cause its :data:`COLUMNS`
+    """
+    order = dict(zip(joints, range(len(joints)), strict=True))
     rows = []
-    for finding in findings:
+    for finding in sorted(findings, key=lambda f: order.get(f.where["name"], len(order))):
         name = spoken(finding.key).replace(f" at {finding.where['name']}", "")
         own = finding.where["slot"] == "parameter"
         place = "" if own else finding.where["name"]
@@ -186,18 +192,27 @@ def table_of(findings: Sequence[Finding]) -> list[str]:
             rows.append(
                 (place, name, wording.size_in_words(e), wording.interval_in_words(e), share)
             )
-    head = ("joint", "cause", "size", "90 % interval", "of force")
-    widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
+    return rows
+
+
+def table_of(findings: Sequence[Finding], joints: Sequence[str]) -> list[str]:
+    """Many causes, one line for each size."""
+    rows = [COLUMNS, *rows_of(findings, joints)]
+    widths = [max(len(row[k]) for row in rows) for k in range(len(COLUMNS))]
     lines = [
         "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in [head, *rows]
+        for row in rows
     ]
-    alike = [
+    return [*lines, *(line for text in alike_in_words(findings) for line in wrapped(text))]
+
+
+def alike_in_words(findings: Sequence[Finding]) -> list[str]:
+    """:return: a sentence on each cause that the data cannot tell from others"""
+    return [
         f"{spoken(f.key)}: the data cannot tell it from {' or '.join(map(spoken, f.alternatives))}."
         for f in findings
         if f.alternatives
     ]
-    return [*lines, *(line for text in alike for line in wrapped(text))]
 
 
 def finding_in_lines(finding: Finding) -> list[str]:
