@@ -9,6 +9,7 @@ from sb3_hds.sysid.comparison.halves import Half
 from sb3_hds.sysid.comparison.held_out import LEAST_GAIN
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point, Slopes
+from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 
 # Directions below this share of the largest curvature do not move.
 _RANK = 1e-10
@@ -92,17 +93,17 @@ def detectable(half: Half, point: Point) -> dict[str, dict[str, float]]:
 
 
 def aliased_with(
-    evidence: Evidence, point: Point, found: Candidate, nuisances: Sequence[int]
+    h: Hypotheses, point: Point, slopes: Slopes, found: Candidate, nuisances: Sequence[int]
 ) -> list[str]:
     """
     :param point: the fit with this cause
+    :param slopes: there, of all parameters
     :param found: the cause
     :param nuisances: indices of what else is refitted
     :return: keys of aliased candidates: after projecting out the nuisances, the cosine between what
         they and the cause change in these windows exceeds 0.95, to first order
     """
-    h, total = evidence.hypotheses, evidence.slopes(point).curvature.sum(0)
-    rest = list(nuisances)
+    total, rest = slopes.curvature.sum(0), list(nuisances)
     inner = np.linalg.pinv(total[np.ix_(rest, rest)], rcond=_RANK, hermitian=True)
     total = total - total[:, rest] @ inner @ total[rest]
     own = list(h.indices(found))

@@ -29,8 +29,9 @@ from sb3_hds.sysid.estimation.shooting import Shots
 
 # Candidates that may be confirmed, one after the other, and that others are tried beside.
 _MOST_LOOKS, _MOST_FIRSTS = 3, 4
-# Steps of fits to the end, and of start states alone: to the end, and for a rough comparison.
-_ALL_STEPS, _KEPT_STEPS, _ROUGH_STEPS = 25, 6, 1
+# Steps of fits to the end and of rough ones, and of start states alone: to the end, and for a rough
+# comparison.
+_ALL_STEPS, _FEW_STEPS, _KEPT_STEPS, _ROUGH_STEPS = 25, 8, 6, 1
 _Given = TypeVar("_Given")
 _Told = TypeVar("_Told")
 
@@ -81,30 +82,44 @@ class Search:
         )
 
     def base(
-        self, theta: Float[np.ndarray, " p"], free: Sequence[int], near: Base | None = None
+        self,
+        theta: Float[np.ndarray, " p"],
+        free: Sequence[int],
+        near: Base | None = None,
+        rival: Base | None = None,
     ) -> Base:
         """
         :param near: from whose start states to begin; default: as measured
+        :param rival: fits that are far from it are given up
         :return: a model, ``free`` refitted from ``theta``
         """
         begin = (None, None) if near is None else (near.point.offsets, near.kept.offsets)
-        point = self.select.evidence.fit(theta, free, begin[0])
-        return Base(point, self.confirm.evidence.fit(point.theta, (), begin[1]), tuple(free))
+        most = (np.inf, np.inf) if rival is None else (rival.point.cost, rival.kept.cost)
+        point = self.select.evidence.fit(theta, free, begin[0], rival=most[0])
+        kept = self.confirm.evidence.fit(point.theta, (), begin[1], rival=most[1])
+        return Base(point, kept, tuple(free))
 
     def believing(self, tried: Tried, base: Base) -> Base:
         """:return: the model with this candidate"""
         own = self.hypotheses.indices(tried.candidate)
         return Base(tried.point, tried.kept, (*base.free, *own))
 
-    def without(self, base: Base, *candidates: Candidate, near: Base | None = None) -> Base:
+    def without(
+        self,
+        base: Base,
+        *candidates: Candidate,
+        near: Base | None = None,
+        rival: Base | None = None,
+    ) -> Base:
         """
         :param near: from whose start states to begin; default: as measured
+        :param rival: fits that are far from it are given up
         :return: the model without these candidates; the rest refitted
         """
         own = [i for candidate in candidates for i in self.hypotheses.indices(candidate)]
         theta = base.point.theta.copy()
         theta[own] = self.hypotheses.null[own]
-        return self.base(theta, [i for i in base.free if i not in own], near)
+        return self.base(theta, [i for i in base.free if i not in own], near, rival)
 
     def again(self, base: Base) -> Base:
         """:return: the same model, refitted with the current noise"""
@@ -168,16 +183,23 @@ class Search:
         return self.finished([candidate for candidate, _ in ranked[: self.effort.finalists]], base)
 
     def finished(
-        self, candidates: Sequence[Candidate], base: Base, rival: float = np.inf
+        self,
+        candidates: Sequence[Candidate],
+        base: Base,
+        rival: float = np.inf,
+        n_steps: int = _ALL_STEPS,
     ) -> list[Tried]:
         """
-        :param rival: cost to come below; fits that are far from it are given up
+        :param rival: cost to come below; what does not is given up
+        :param n_steps: at most
         :return: these candidates, fitted to the end, best first
         """
         self._guess([c for c in candidates if c.key not in self._reached], base)
 
         def finish(candidate: Candidate) -> Tried:
-            point = self._continued(candidate, base, rival)
+            point = self._continued(candidate, base, rival, n_steps)
+            if point.cost >= rival:
+                return Tried(candidate, point, base.kept, -np.inf)
             half = self.confirm.evidence
             offsets = self._starts(candidate, point.theta, base.kept.offsets, half)
             kept = half.fit(point.theta, (), offsets, _KEPT_STEPS)
@@ -186,16 +208,17 @@ class Search:
         tried = self._each(finish, candidates)
         return sorted(tried, key=lambda t: -t.criterion)
 
-    def nameless(self, base: Base) -> list[Tried]:
-        """:return: flexible forces beside the model, fitted to the end, best first"""
+    def nameless(self, base: Base, roughly: bool = False) -> list[Tried]:
+        """:return: flexible forces beside the model, fitted to the end or roughly, best first"""
         self._guess(self.hypotheses.nameless, base)
-        return self.finished(self.hypotheses.nameless, base)
+        n_steps = _FEW_STEPS if roughly else _ALL_STEPS
+        return self.finished(self.hypotheses.nameless, base, n_steps=n_steps)
 
     def in_place(self, beside: Sequence[Tried], without: Base, rival: float) -> list[Tried]:
         """
         :param beside: fitted beside a model
         :param without: that model without some of its causes
-        :param rival: cost to come below; fits that are far from it are given up
+        :param rival: cost to come below; what does not is given up
         :return: the same candidates in the place of these causes, fitted to the end, best first
         """
         for tried in beside:
@@ -217,7 +240,8 @@ class Search:
             and were not fitted to the end yet
         """
         done = {t.candidate.key for t in tried}
-        alike = aliased_with(self.select.evidence, best.point, best.candidate, base.free)
+        slopes = self.select.evidence.slopes(best.point)
+        alike = aliased_with(self.hypotheses, best.point, slopes, best.candidate, base.free)
         names = {c.key for c in self.hypotheses.related(best.candidate)} | set(alike)
         left = [c for c in self.hypotheses.candidates if c.key in names - done]
         return self.finished([c for c in left if not self.part_of(c, base)], base)
@@ -347,12 +371,12 @@ class Search:
         by_score = by_scores(new.raw / self.noise, old.raw / self.noise, self.confirm.unit)
         return verdict._replace(p_value=min(verdict.p_value, by_score))
 
-    def _continued(self, candidate: Candidate, base: Base, rival: float) -> Point:
+    def _continued(self, candidate: Candidate, base: Base, rival: float, n_steps: int) -> Point:
         evidence = self.select.evidence
         moving = [*base.free, *self.hypotheses.indices(candidate)]
         places = [self._reached[candidate.key]]
         theta, offsets = self._begin(candidate, base.point, base.free, evidence, places)
-        point = evidence.fit(theta, moving, offsets, _ALL_STEPS, rival)
+        point = evidence.fit(theta, moving, offsets, n_steps, rival)
         return min(base.point, point, key=lambda p: p.cost)
 
     def _begin(

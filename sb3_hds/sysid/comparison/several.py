@@ -54,6 +54,7 @@ def confirmed_set(
         return [], start
     many = len(members) > _MANY
     verdicts: dict[str, Comparison] = {}
+    lost: dict[str, Base] = {}
     if many:
         verdicts = _each_left_out(search, screened, start, base, members, list(members))
         harmful = {key for key, v in verdicts.items() if v.p_value >= 1.0 - _LEVEL}
@@ -65,7 +66,7 @@ def confirmed_set(
             new = [key for key in members if key not in verdicts]
             verdicts |= _each_left_out(search, screened, start, base, members, new)
     while members and not many:
-        lost = {key: search.without(base, c, near=base) for key, (c, _) in members.items()}
+        lost = _without_each(search, base, members)
         verdicts = {
             key: _at_own_joint(search.confirm, members[key][0], base.kept, rest.kept)
             for key, rest in lost.items()
@@ -82,13 +83,25 @@ def confirmed_set(
     p, every = screened.problem, [m.item for m in screened.members]
     carried = dict(zip(every, map(float, p.carried(every)), strict=True))
     found = [
-        _accepted(search, candidate, member, members, verdicts[key], base)._replace(
+        _accepted(search, candidate, member, members, verdicts[key], base, lost.get(key))._replace(
             share=carried[member.item], sizes=screened.intervals_of(member) if many else {}
         )
         for key, (candidate, member) in members.items()
         if key in verdicts
     ]
     return found, base
+
+
+def _without_each(
+    search: Search, base: Base, members: Mapping[str, tuple[Candidate, Member]]
+) -> dict[str, Base]:
+    """:return: the model without each of the members of a small set"""
+
+    def lost(candidate: Candidate) -> Base:
+        return search.without(base, candidate, near=base, rival=base)
+
+    found = search.bar.over(in_threads(lost, [c for c, _ in members.values()]), len(members))
+    return dict(zip(members, found, strict=True))
 
 
 def _members(search: Search, screened: Screened) -> dict[str, tuple[Candidate, Member]]:
@@ -142,14 +155,14 @@ def _accepted(
     members: Collection[str],
     verdict: Comparison,
     base: Base,
+    lost: Base | None,
 ) -> Accepted:
+    """:param lost: the model without the member"""
     known = {c.key: c for c in search.hypotheses.candidates}
     others = [k for k in member.others if k not in members]
     # Of a large set, what may stand for a member is told as the equation says it.
-    simulated = [] if len(members) > _MANY else [known[k] for k in others if k in known]
-    tried = (
-        search.finished(simulated, search.without(base, candidate, near=base)) if simulated else []
-    )
+    simulated = [known[k] for k in others if k in known]
+    tried = search.finished(simulated, lost) if lost and simulated else []
     worse = {t.candidate.key for t in tried if not as_good(search.better(base.kept, t.kept))}
     equal = [k for k in others if k not in worse]
     chance = float(scipy.stats.t.sf(member.t, _FREEDOM)) * len(known)

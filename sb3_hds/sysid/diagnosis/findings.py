@@ -132,11 +132,13 @@ def look_alike(found: Sequence[Accepted], half: Half, base: Base) -> list[str]:
     :return: sentences on candidates that are aliased with a cause in these windows, though held-out
         recordings prefer the cause
     """
-    sentences = []
+    if not found:
+        return []
+    sentences, h, slopes = [], half.evidence.hypotheses, half.evidence.slopes(base.point)
     for one in found:
-        own = half.evidence.hypotheses.indices(one.tried.candidate)
+        own = h.indices(one.tried.candidate)
         rest = [i for i in base.free if i not in own]
-        alike = aliased_with(half.evidence, base.point, one.tried.candidate, rest)
+        alike = aliased_with(h, base.point, slopes, one.tried.candidate, rest)
         alike = [name for name in alike if name not in one.alternatives]
         if alike:
             sentences.append(

@@ -142,16 +142,21 @@ class Naming:
         """
         if not found or not self.search.hypotheses.nameless:
             return list(found), base, None
-        forces = [force for force in self.search.nameless(base) if self._outdoes(force, base)]
+        forces = [f for f in self.search.nameless(base, roughly=True) if self._outdoes(f, base)]
         places = (tuple(found), *((one,) for one in found if len(found) > 1))
         for place in places if forces else ():
-            without = self.search.without(base, *(one.tried.candidate for one in place))
+            taken = [one.tried.candidate for one in place]
+            without = self.search.without(base, *taken, rival=base)
             best = self.search.in_place(forces, without, base.point.cost)[0]
             if self._outdoes(best, base):
                 self.turned_down |= dict.fromkeys(keys_of(place), NAMELESS)
                 rest = [one for one in found if one not in place]
                 better = self.search.better(best.kept, base.kept)
-                return rest, without, Nameless(best, better, tuple(keys_of(place)))
+                return (
+                    rest,
+                    self.search.again(without),
+                    Nameless(best, better, tuple(keys_of(place))),
+                )
         return list(found), base, None
 
     def _outdoes(self, force: Tried, base: Base) -> bool:
