@@ -140,6 +140,17 @@ def test_friction_that_grows_ever_slower_is_concave_and_does_not_fall_to_nothing
     assert "stribeck_friction.axis" not in {m.key for m in found.members}
 
 
+def test_intervals_allow_for_a_cause_that_may_be_there_too():
+    """Dry friction of 1.5 N alone is estimated wrong, and its interval says that it may be."""
+    found = screened()
+    (alone,) = found.among(["coulomb_friction.axis"]).members
+    both = {m.key: m for m in found.members}["coulomb_friction.axis"]
+
+    assert both.doubt["tau_c"] < 0.05 and both.low["tau_c"] < 1.5 < both.high["tau_c"]
+    assert abs(alone.sizes["tau_c"] - 1.5) > 0.5 and alone.low["tau_c"] < 1.5 < alone.high["tau_c"]
+    assert found.doubts_of(alone) == {"coulomb_friction.axis.tau_c": alone.doubt["tau_c"]}
+
+
 def test_members_of_a_set_have_other_sizes_where_one_of_them_is_left_out():
     both = screened()
     [alone] = both.among({"viscous_friction.axis"}).members

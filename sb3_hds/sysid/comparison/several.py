@@ -9,7 +9,7 @@ from sb3_hds.sysid.comparison.halves import NOT_FINITE, Base, Half, Tried
 from sb3_hds.sysid.comparison.held_out import LEAST_GAIN, Comparison, as_good, confirm, passes
 from sb3_hds.sysid.comparison.search import Search
 from sb3_hds.sysid.diagnosis.findings import Accepted
-from sb3_hds.sysid.equation.confirmation import Member
+from sb3_hds.sysid.equation.members import Member
 from sb3_hds.sysid.equation.screening import Screened
 from sb3_hds.sysid.estimation.candidates import Candidate, encoders
 from sb3_hds.sysid.estimation.evidence import Point, in_threads
@@ -84,7 +84,10 @@ def confirmed_set(
     carried = dict(zip(every, map(float, p.carried(every)), strict=True))
     found = [
         _accepted(search, candidate, member, members, verdicts[key], base, lost.get(key))._replace(
-            share=carried[member.item], sizes=screened.intervals_of(member) if many else {}
+            share=carried[member.item],
+            sizes=screened.intervals_of(member),
+            of_equation=many,
+            doubts=screened.doubts_of(member),
         )
         for key, (candidate, member) in members.items()
         if key in verdicts

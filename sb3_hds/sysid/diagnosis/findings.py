@@ -40,8 +40,10 @@ class Accepted(NamedTuple):
     :param chance: family-wise p-value: that the best of all candidates gains as much if nothing is
         wrong
     :param share: of the force at its joint that it carries; None where that is not known
-    :param sizes: estimate and interval by parameter, if they come from the equation of motion
-        rather than from simulation
+    :param sizes: estimate and interval of the equation of motion by parameter, where there are any
+    :param of_equation: whether these are told, rather than those of a simulation
+    :param doubts: by parameter, half the width of an interval that comes from not knowing whether
+        there is one cause more
     """
 
     tried: Tried
@@ -50,6 +52,8 @@ class Accepted(NamedTuple):
     chance: float
     share: float | None = None
     sizes: Mapping[str, tuple[float, float, float]] = {}
+    of_equation: bool = False
+    doubts: Mapping[str, float] = {}
 
 
 def finding(
@@ -68,12 +72,16 @@ def finding(
     candidate, parameters = one.tried.candidate, {}
     shorts = [name.rpartition(".")[2] for name in candidate.parameters]
     for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
-        if name in one.sizes:
+        if name in one.sizes and one.of_equation:
             estimate, low, high = one.sizes[name]
             error = float((high - low) / (2.0 * unit))
         else:
             low, high = _interval(half, point, free, i, float(reach[i]), profiles)
-            estimate, error = float(theta[i]), float(stderr[i])
+            estimate = float(theta[i])
+            off = np.hypot(one.doubts.get(name, 0.0), _systematic(estimate, one.sizes.get(name)))
+            low = max(estimate - float(np.hypot(estimate - low, off)), float(h.lower[i]))
+            high = min(estimate + float(np.hypot(high - estimate, off)), float(h.upper[i]))
+            error = float(np.hypot(stderr[i], off / unit))
         short = name.rpartition(".")[2]
         # Of several places, each has its own.
         own = short if shorts.count(short) == 1 else name.partition(".")[2]
@@ -99,6 +107,19 @@ def finding(
         candidate.explanation,
         one.share,
     )
+
+
+def _systematic(estimate: float, other: tuple[float, float, float] | None) -> float:
+    """
+    :param other: estimate of the equation of motion, with its interval
+    :return: by how much the two differ beyond that: smoothing spoils the one and integration the
+        other, and the noise of either says nothing of it
+    """
+    if other is None:
+        return 0.0
+    value, low, high = other
+    reach = high - value if estimate > value else value - low
+    return float(np.sqrt(max((estimate - value) ** 2 - reach**2, 0.0)))
 
 
 def margin(n_units: int, stderr: np.ndarray) -> np.ndarray:

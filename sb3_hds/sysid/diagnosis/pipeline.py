@@ -1,5 +1,6 @@
 """The course of a diagnosis: propose on half of the recordings, confirm on the others."""
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 
@@ -255,7 +256,25 @@ class Inquiry:
         plant, own = plant_of(twin), plant_of(self.believed)
         if isinstance(own, AnalyticTwin) and plant.structure()[-1] != own.structure()[-1]:
             twin = stepping_by(twin, own.integrator)
-        return twin.at_interval(self.believed.dt, self.believed.substeps)
+        return twin.at_interval(self.believed.dt, self._substeps)
+
+    @property
+    def _substeps(self) -> int:
+        """Of the extended twin: its own, or as short ones as dry friction needs."""
+        own, simulated = self.believed, self.hypotheses.believed
+        if not self.screened or simulated.substeps <= self.given.least_substeps:
+            return own.substeps
+        inner = simulated.dt / simulated.substeps
+        return max(own.substeps, math.ceil(own.dt / inner - 1e-9))
+
+    def _finer(self) -> list[str]:
+        more, own = self._substeps, self.believed.substeps
+        if more == own:
+            return []
+        return [
+            f"Dry friction is so strong that the twin's own sub-steps smooth it: the extended one "
+            f"takes {more} in an interval, not {own}."
+        ]
 
     def _stuck(self, base: Base) -> str:
         """:return: a sentence on nuisances that end at a bound, if any does"""
@@ -317,8 +336,9 @@ class Inquiry:
             caveats=(
                 *map(str, self.given.audit.findings),
                 *self.given.corrected,
+                *self._finer(),
                 *to_tell_apart(found, self.hypotheses),
-                *look_alike([one for one in found if not one.sizes], select, base),
+                *look_alike([one for one in found if not one.of_equation], select, base),
                 *out_of_reach(confirm, base.kept, self.given.origin[self.given.parts.confirm]),
                 *(errs_more(gain) if findings else ()),
             ),

@@ -48,6 +48,9 @@ _FIRST_NOISE = 0.05
 _WIDEST, _FEWEST_CLUSTERS = 3, 6
 # Samples and sub-steps of Runge-Kutta that a period of the motion needs.
 _SAMPLES, _SUBSTEPS = 100, 200
+# Longest sub-step of Runge-Kutta, in shares of the time in which dry friction stops a joint: the
+# longer it is, the more the twin smooths it. And by how many times there may be more of them.
+_OF_STOP, _MOST_FINER = 0.02, 16
 # Rows at which the twin is linearised, and finite differences in shares of the motion.
 _SOME, _STEP = 64, 1e-5
 
@@ -106,6 +109,7 @@ class Prepared:
     :param origin: recording of each window
     :param most_windows: that are simulated of each half
     :param parts: which windows propose, and which confirm
+    :param least_substeps: of simulations, before dry friction was found
     """
 
     audit: Audit
@@ -122,6 +126,7 @@ class Prepared:
     origin: np.ndarray
     most_windows: int
     parts: Split
+    least_substeps: int
 
     @property
     def poor(self) -> str:
@@ -192,13 +197,14 @@ def prepare(
     moved = motion(twin, data)
     period = moved.typical_period
     coarse, data, every = thinned(twin, data, moved.fastest)
-    convention = screened = None
+    convention, screened, least_substeps = None, None, coarse.substeps
     if not audited.reason:
         bar.stage("trying conventions")
         convention = other_convention(twin, moved, tuple(calibrate))
     if not audited.reason and convention is None:
         bar.stage("equation of motion")
         screened = screen(twin, moved, effects, calibrate)
+        coarse = fine_enough(coarse, screened) if screened else coarse
     only = screened and screened.keys
     where = screened and screened.nameless_at
     hypotheses = Hypotheses.about(
@@ -226,6 +232,7 @@ def prepare(
         origin=origin,
         most_windows=most_windows,
         parts=split(data, origin, seed),
+        least_substeps=least_substeps,
     )
 
 
@@ -291,6 +298,18 @@ def thinned(twin: Twin, data: Trajectories, period: float) -> Thinned:
     coarse = Trajectories.from_arrays(obs, actions, dt=dt, conditions=data.conditions)
     coarse = dataclasses.replace(coarse, origin=data.origin, report=data.report)
     return Thinned(twin.at_interval(dt, math.ceil(dt / inner - 1e-9)), coarse, every)
+
+
+def fine_enough(twin: Twin, screened: Screened) -> Twin:
+    """
+    :return: where the twin integrates by Runge-Kutta, with so many sub-steps that dry friction of
+        the proposed set, which stops a joint within one at most, is not smoothed
+    """
+    if getattr(plant_of(twin), "integrator", None) is not rk4:
+        return twin
+    least = twin.dt / (_OF_STOP * float(np.min(screened.stops_within)))
+    wanted = min(math.ceil(least), _MOST_FINER * twin.substeps)
+    return twin.at_interval(twin.dt, max(wanted, twin.substeps))
 
 
 def _every(obs: np.ndarray, actions: np.ndarray, every: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,13 +1,11 @@
-"""Which members of a set held-out data confirm, their sizes, and what the set leaves."""
+"""Which members of a set held-out data confirm, what stands for them, and what they leave."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 
-from sb3_hds.core import Effect
-from sb3_hds.sysid.equation.problem import SHARED, Problem, Solution
+from sb3_hds.sysid.equation.problem import SHARED, Problem
 from sb3_hds.sysid.equation.regression import TINY
 from sb3_hds.sysid.equation.weak_form import rich_columns
 
@@ -24,7 +22,6 @@ _CLOSE, _WORSE, _SAME = 8.0, 2.0, 0.2
 # Whatever its t, a loss below this share of what the place gains may come from any misfit.
 _EQUIVALENT = 0.05
 _MOST_ALTERNATIVES = 12
-_CONFIDENCE = 0.9
 # Members of a family that are another one with more parameters, and the gain in the logarithm of
 # held-out errors that is not worth these.
 _SIMPLER = {
@@ -38,31 +35,6 @@ _SIMPLER = {
 _NO_MATTER = 0.02
 # Share of a column that the other folds contain at least, or ridge regression takes it for more.
 _SOME = 0.02
-
-
-class Member(NamedTuple):
-    """
-    One cause of a set.
-
-    :param item: index
-    :param key: of the candidate
-    :param sizes: by short name; of a parameter of the twin, its change
-    :param low: ends of 90 % intervals, by short name; of what was tried at a few values only, the
-        ones next to it
-    :param high: likewise
-    :param gain: increase of -2 log likelihood without it
-    :param t: t statistic of the held-out gain over folds
-    :param others: keys of candidates that predict held-out data as well in its place
-    """
-
-    item: int
-    key: str
-    sizes: dict[str, float]
-    low: dict[str, float]
-    high: dict[str, float]
-    gain: float
-    t: float
-    others: tuple[str, ...]
 
 
 class Left(NamedTuple):
@@ -83,7 +55,6 @@ class Left(NamedTuple):
     gain: float
 
 
-# ------------------------------------------------------------------------------ what stays
 def material(p: Problem, keys: list[int]) -> list[int]:
     """Remove members with a negligible force, unless they explain most of what the others leave."""
     held = p.held_out(keys)
@@ -178,7 +149,7 @@ def plausible_first(p: Problem, keys: list[int]) -> list[int]:
             continue
         rest, held = [m for m in keys if m != i], p.held_out(keys)
         gained, _ = worth(p, p.held_out(rest), held, i)
-        others = [o for o in _equals(p, keys, i, held, gained) if p.rarity[o] < p.rarity[i]]
+        others = [o for o in equals(p, keys, i, held, gained) if p.rarity[o] < p.rarity[i]]
         if others:
             keys = [*rest, min(others, key=lambda o: (p.rarity[o], p.score([*rest, o])))]
     return keys
@@ -279,78 +250,7 @@ def _predictable(p: Problem, weights: np.ndarray, j: int, diagonal: np.ndarray) 
     return float(1.0 - predicted / base) if base > 0.0 else 0.0
 
 
-# ------------------------------------------------------------------------------ what is told
-def members(p: Problem, keys: Sequence[int], effects: Mapping[str, Effect | None]) -> list[Member]:
-    """
-    :param effects: by key of the candidate; None for parameters
-    :return: sizes with cluster-robust intervals, and alternatives
-    """
-    found = p.solve(keys)
-    covariance = _covariance(p, keys, found)
-    quantile = scipy.stats.t.ppf(0.5 + _CONFIDENCE / 2.0, max(p.grams.n_blocks - 1, 5))
-    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    stderr = dict(zip(found.free, errors, strict=True))
-    base, held, out = p.score(keys, priced=False), p.held_out(keys), []
-    for i in keys:
-        rest = [m for m in keys if m != i]
-        item = p.items[i]
-        if not set(item.free) <= {*found.free, *found.held}:
-            continue
-        value = found.value
-        coefficients = np.array([value[c] for c in item.free])
-        spread = np.array([quantile * stderr.get(c, 0.0) for c in item.free])
-        effect = effects.get(item.key)
-        sizes, low, high = (
-            item.sizes(effect, coefficients + side * spread) for side in (0.0, -1.0, 1.0)
-        )
-        for name, (below, above) in _tried_beside(p, i).items():
-            low[name], high[name] = below, above
-        gained, t = worth(p, p.held_out(rest), held, i)
-        cost = p.score(rest, priced=False) - base
-        out.append(
-            Member(
-                i,
-                item.key,
-                sizes,
-                low,
-                high,
-                float(cost) if np.isfinite(cost) else 1e6,
-                t,
-                tuple(dict.fromkeys(p.items[o].key for o in _equals(p, keys, i, held, gained))),
-            )
-        )
-    return out
-
-
-def _tried_beside(p: Problem, i: int) -> dict[str, tuple[float, float]]:
-    """:return: of what stands at one of several values, such as a speed, the values next to it"""
-    item = p.items[i]
-    if item.rule != "linear" or not item.settings:
-        return {}
-    found = {}
-    for name, value in item.settings[0].items():
-        tried = {
-            o.settings[0][name] for o in p.items if o.key == item.key and name in o.settings[0]
-        }
-        below = max((x for x in tried if x < value), default=value)
-        above = min((x for x in tried if x > value), default=value)
-        found[name] = (float(below), float(above))
-    return found
-
-
-def _covariance(p: Problem, keys: Sequence[int], found: Solution) -> np.ndarray:
-    """Blocks of data as clusters, never narrower than rows alone would have it."""
-    if not found.free:
-        return np.zeros((0, 0))
-    scores = p.grams.blocks[:, found.free] @ found.weights
-    n = len(scores)
-    robust = found.inverse @ (scores.T @ scores) @ found.inverse
-    robust *= n / max(n - len(found.free) / max(p.dof, 1), n / 2)
-    own = np.eye(len(found.free), dtype=bool)
-    return np.where(own, np.maximum(robust, found.inverse), robust)
-
-
-def _equals(
+def equals(
     p: Problem, keys: Sequence[int], i: int, held: np.ndarray, gained: float
 ) -> Iterator[int]:
     """

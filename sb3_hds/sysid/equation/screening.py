@@ -10,9 +10,7 @@ from sb3_hds.core.twin import plant_of
 from sb3_hds.sysid.equation.columns import equation, refuted_by_kinematics
 from sb3_hds.sysid.equation.confirmation import (
     Left,
-    Member,
     admitted,
-    members,
     retuned,
     simpler,
     what_is_left,
@@ -23,6 +21,7 @@ from sb3_hds.sysid.equation.friction import (
     by_velocity,
     friction_curves,
 )
+from sb3_hds.sysid.equation.members import Member, members
 from sb3_hds.sysid.equation.motion import Motion
 from sb3_hds.sysid.equation.plausibility import plausibility, rarity_of
 from sb3_hds.sysid.equation.problem import Problem
@@ -116,6 +115,12 @@ class Screened(NamedTuple):
         items = [at[key] for key in keys if key in at]
         return friction_curves(p, self.by_velocity, retuned(p, [*p.always, *items]))
 
+    def doubts_of(self, member: Member) -> dict[str, float]:
+        """:return: by full name, how much wider intervals are for causes that may be there, too"""
+        candidate = self.problem.items[member.item].candidate
+        names = {name.rpartition(".")[2]: name for name in candidate.parameters}
+        return {names[short]: doubt for short, doubt in member.doubt.items()}
+
     def _by_full_name(self, candidate: Candidate, sizes: Mapping[str, float]) -> dict[str, float]:
         if candidate.slot == "parameter":
             (name,) = sizes
@@ -148,6 +153,18 @@ class Screened(NamedTuple):
                         size = max(size, low + p.least[i] * (high - low))
                 sizes[name] = float(size)
         return found
+
+    @property
+    def stops_within(self) -> np.ndarray:
+        """In which time the dry friction of the set stops each joint [s]."""
+        p, dof = self.problem, len(self.motion.speed)
+        dry = [m.item for m in self.members if p.family(m.item)[0] == "dry"]
+        solution = p.solve([*p.always, *(m.item for m in self.members)])
+        force = sum((p.force_of(i, solution) for i in dry), np.zeros(dof))
+        inertia = np.median(1.0 / np.diagonal(np.linalg.inv(p.mass), axis1=1, axis2=2), axis=0)
+        return np.divide(
+            self.motion.speed * inertia, force, out=np.full(dof, np.inf), where=force > 0.0
+        )
 
     @property
     def scales(self) -> dict[str, float]:
