@@ -306,12 +306,15 @@ def draw_film(
     frames: np.ndarray,
     path: Any,
     per_second: int,
+    encoder: str,
 ) -> None:
     """
     :param players: label and colour of each
     :param frames: indices of those that are drawn
     :param path: of the film, of 1,280 x 720 points
+    :param encoder: path of ffmpeg
     """
+    from matplotlib import rc_context
     from matplotlib.animation import FFMpegWriter
     from matplotlib.figure import Figure
     from matplotlib.patches import Polygon
@@ -346,7 +349,10 @@ def draw_film(
         axes.tick_params(labelsize=6, labelbottom=j == n - 1)
         cursors.append(axes.axvline(0.0, color="#2b2a27", lw=0.8))
     writer = FFMpegWriter(fps=per_second)
-    with writer.saving(figure, str(path), dpi=100):
+    with (
+        rc_context({"animation.ffmpeg_path": encoder}),
+        writer.saving(figure, str(path), dpi=100),
+    ):
         for frame in frames.tolist():
             for lines, places in zip(drawn, moving.lines[:, frame], strict=True):
                 for line, ends in zip(lines, places, strict=True):

@@ -176,13 +176,11 @@ def write_film(moving: Moving, path: str | os.PathLike[str]) -> Path:
     """
     check_film(path)
     import imageio_ffmpeg
-    import matplotlib
 
     target, encoder = Path(path), imageio_ffmpeg.get_ffmpeg_exe()
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(8)}.mp4")
     try:
-        with matplotlib.rc_context({"animation.ffmpeg_path": encoder}):
-            plots.draw_film(moving, PLAYERS, _at_pace(moving), temporary, _PER_SECOND)
+        plots.draw_film(moving, PLAYERS, _at_pace(moving), temporary, _PER_SECOND, encoder)
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
