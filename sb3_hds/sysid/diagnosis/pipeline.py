@@ -267,6 +267,16 @@ class Inquiry:
         inner = simulated.dt / simulated.substeps
         return max(own.substeps, math.ceil(own.dt / inner - 1e-9))
 
+    def _beside_the_equation(self, found: Sequence[Accepted]) -> list[Accepted]:
+        """:return: causes with what the equation of motion says of their sizes, where it does"""
+        told = self.screened.estimates(keys_of(found)) if self.screened else {}
+        return [
+            one
+            if one.sizes or one.tried.candidate.key not in told
+            else one._replace(**told[one.tried.candidate.key]._asdict())
+            for one in found
+        ]
+
     def _finer(self) -> list[str]:
         more, own = self._substeps, self.believed.substeps
         if more == own:
@@ -307,7 +317,8 @@ class Inquiry:
         select, confirm = self.search.select, self.search.confirm
         every, point = self.search.whole(base)
         findings = tuple(
-            finding(one, every, point, base.free, self.effort.profiles) for one in found
+            finding(one, every, point, base.free, self.effort.profiles)
+            for one in self._beside_the_equation(found)
         )
         remains = "" if left.remainder is None else in_words(left.remainder)
         unexplained = " ".join(filter(None, (nearest, remains)))

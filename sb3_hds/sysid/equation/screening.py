@@ -50,6 +50,19 @@ _LEAST_LATE = 0.03
 _BEYOND = 0.5
 
 
+class Estimates(NamedTuple):
+    """
+    Sizes of one cause by the equation of motion.
+
+    :param sizes: estimate and ends of the interval, by full name
+    :param doubts: of that interval, half the width that comes from not knowing whether there is one
+        cause more
+    """
+
+    sizes: dict[str, tuple[float, float, float]]
+    doubts: dict[str, float]
+
+
 class Screened(NamedTuple):
     """
     :param hypotheses: all candidates
@@ -108,15 +121,26 @@ class Screened(NamedTuple):
 
     def friction_curves(self, keys: Collection[str]) -> tuple[FrictionCurve, ...]:
         """:return: friction against velocity at each joint where causes with these keys have it"""
-        p, at = self.problem, {}
-        for i, item in enumerate(p.items):
+        p = self.problem
+        return friction_curves(p, self.by_velocity, retuned(p, [*p.always, *self._items_of(keys)]))
+
+    def estimates(self, keys: Collection[str]) -> dict[str, Estimates]:
+        """:return: by key of these causes; none where one of them has no column"""
+        items = self._items_of(keys)
+        if len(items) < len(keys):
+            return {}
+        told = _members_of(self.hypotheses, self.problem, retuned(self.problem, items))
+        return {m.key: Estimates(self.intervals_of(m), self.doubts_of(m)) for m in told}
+
+    def _items_of(self, keys: Collection[str]) -> list[int]:
+        at: dict[str, int] = {}
+        for i, item in enumerate(self.problem.items):
             at.setdefault(item.key, i)
         at |= {m.key: m.item for m in self.members}
-        items = [at[key] for key in keys if key in at]
-        return friction_curves(p, self.by_velocity, retuned(p, [*p.always, *items]))
+        return [at[key] for key in keys if key in at]
 
     def doubts_of(self, member: Member) -> dict[str, float]:
-        """:return: by full name, how much wider intervals are for causes that may be there, too"""
+        """:return: by full name, as in :class:`Estimates`"""
         candidate = self.problem.items[member.item].candidate
         names = {name.rpartition(".")[2]: name for name in candidate.parameters}
         return {names[short]: doubt for short, doubt in member.doubt.items()}
