@@ -101,20 +101,25 @@ def _with_one_more(p: Problem, keys: Sequence[int]) -> list[tuple[float, dict[in
     Source: Buckland, Burnham, Augustin, *Model selection: an integral part of inference*,
     Biometrics 53, 1997: estimates of several models, weighed by an information criterion.
 
-    :return: weight of each, and its coefficients by column
+    :return: of those within physical bounds that predict held-out data better, the weight of each,
+        and its coefficients by column
     """
-    taken = {p.family(i) for i in keys}
+    taken, held = {p.family(i) for i in keys}, p.held_out(keys)
     others = [o for o in p.ranking(keys)[:_TRIED_SETS] if p.family(o) not in taken]
     sets = [[*keys, o] for o in others if not p.clashes([*keys, o])]
     scored = sorted(((p.score(more), more) for more in sets), key=lambda pair: pair[0])
-    scored = [(score, more) for score, more in scored[:_MORE_SETS] if np.isfinite(score)]
-    own = p.score(keys)
-    if not scored or not np.isfinite(own):
+    own, found = p.score(keys), []
+    for score, more in scored[:_MORE_SETS]:
+        solution = p.solve(more)
+        possible = np.isfinite(score) and not set(p.items[more[-1]].free) & {*solution.held}
+        if possible and worth(p, held, p.held_out(more), more[-1])[0] > 0.0:
+            found.append((score, solution.value))
+    if not found or not np.isfinite(own):
         return []
-    best = min(own, scored[0][0])
-    weights = [float(np.exp(0.5 * (best - score))) for score, _ in scored]
+    best = min(own, found[0][0])
+    weights = [float(np.exp(0.5 * (best - score))) for score, _ in found]
     total = sum(weights) + float(np.exp(0.5 * (best - own)))
-    return [(w / total, p.solve(more).value) for w, (_, more) in zip(weights, scored, strict=True)]
+    return [(weight / total, value) for weight, (_, value) in zip(weights, found, strict=True)]
 
 
 def _doubt(
