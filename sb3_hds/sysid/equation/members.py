@@ -12,7 +12,6 @@ from sb3_hds.sysid.equation.problem import Problem, Solution
 from sb3_hds.sysid.equation.regression import Item
 
 _CONFIDENCE = 0.9
-_NORMAL = float(scipy.stats.norm.ppf(0.5 + _CONFIDENCE / 2.0))
 # Sets with one more member that count in intervals, at most, and those that are tried.
 _MORE_SETS, _TRIED_SETS = 12, 60
 
@@ -135,7 +134,8 @@ def _doubt(
             there = item.sizes(effect, [value[c] for c in item.free])
             for name in squares:
                 squares[name] += weight * (there[name] - sizes[name]) ** 2
-    return {name: float(_NORMAL * np.sqrt(square)) for name, square in squares.items()}
+    quantile = scipy.stats.norm.ppf(0.5 + _CONFIDENCE / 2.0)
+    return {name: float(quantile * np.sqrt(square)) for name, square in squares.items()}
 
 
 def _tried_beside(p: Problem, i: int) -> dict[str, tuple[float, float]]:
