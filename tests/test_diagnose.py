@@ -18,7 +18,13 @@ from sb3_hds.sysid.comparison.search import Search
 from sb3_hds.sysid.comparison.starts import newton
 from sb3_hds.sysid.comparison.unexplained import MissingForce, remainder
 from sb3_hds.sysid.diagnosis import residuals
-from sb3_hds.sysid.diagnosis.findings import NAMELESS, contradiction, errs_more, out_of_reach
+from sb3_hds.sysid.diagnosis.findings import (
+    NAMELESS,
+    _systematic,
+    contradiction,
+    errs_more,
+    out_of_reach,
+)
 from sb3_hds.sysid.diagnosis.progress import Bar
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point
@@ -484,3 +490,9 @@ def test_several_causes_are_told_as_those_of_a_machine():
         "Of four causes the data leave open which of several names is right."
     )
     assert doubts_in_words([viscous, late]) == ""
+
+
+def test_sizes_of_two_stages_that_differ_make_an_interval_wide():
+    assert _systematic(2.0, None) == _systematic(2.0, (1.5, 1.0, 2.5)) == 0.0
+    assert _systematic(2.0, (1.5, 1.2, 1.8)) == pytest.approx(np.sqrt(0.5**2 - 0.3**2))
+    assert _systematic(1.0, (1.5, 1.2, 1.6)) == pytest.approx(np.sqrt(0.5**2 - 0.3**2))

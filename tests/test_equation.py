@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import servo_leg
 
-from sb3_hds import Trajectories, effects, twins
+from sb3_hds import Trajectories, diagnose, effects, twins
 from sb3_hds.core import rollout
 from sb3_hds.sysid.checks.conventions import other_convention
 from sb3_hds.sysid.checks.timing import in_step_with_the_log
@@ -304,3 +304,15 @@ def test_smoothing_takes_noise_away_and_no_motion():
     assert found.noise_v == pytest.approx(0.05, rel=0.1)
     assert np.std(found.v - v) < 2.0 * found.error_v < 0.02
     assert np.std(found.a + 4.0 * q) < 0.2
+
+
+def test_dry_friction_that_carries_the_torque_is_not_smoothed_by_sub_steps():
+    """A mass of 2 kg against 9 N of dry and 4 N s/m of viscous friction, logged at 50 Hz."""
+    twin, data = rubbing_axis(pull=lambda q, v: -4.0 * v, dry=9.0, every=200)
+    found = diagnose(twin, data, budget="quick", progress=False)
+
+    sizes = {f.key: f.parameters for f in found.findings}
+    assert sizes["coulomb_friction.axis"]["tau_c"].estimate == pytest.approx(9.0, rel=0.02)
+    assert sizes["viscous_friction.axis"]["b"].estimate == pytest.approx(4.0, rel=0.1)
+    assert found.twin.substeps > twin.substeps
+    assert any("sub-steps" in caveat for caveat in found.caveats)
