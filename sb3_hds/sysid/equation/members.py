@@ -12,8 +12,9 @@ from sb3_hds.sysid.equation.problem import Problem, Solution
 from sb3_hds.sysid.equation.regression import Item
 
 _CONFIDENCE = 0.9
-# Sets with one more member that count in intervals, at most, and those that are tried.
-_MORE_SETS, _TRIED_SETS = 12, 60
+# Sets with one more member that count in intervals, at most, and those that are tried; and those in
+# which something else is in the place of a member.
+_MORE_SETS, _TRIED_SETS, _SWAPPED = 12, 60, 4
 
 
 class Member(NamedTuple):
@@ -27,7 +28,7 @@ class Member(NamedTuple):
         ones next to it
     :param high: likewise
     :param doubt: by short name, half the width of the interval that comes from not knowing whether
-        there is one cause more
+        there is one cause more, or another in the place of a member
     :param gain: increase of -2 log likelihood without it
     :param t: t statistic of the held-out gain over folds
     :param others: keys of candidates that predict held-out data as well in its place
@@ -55,12 +56,14 @@ def members(p: Problem, keys: Sequence[int], effects: Mapping[str, Effect | None
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     stderr = dict(zip(found.free, errors, strict=True))
     base, held, out = p.score(keys, priced=False), p.held_out(keys), []
-    larger = _with_one_more(p, keys)
-    for i in keys:
-        rest = [m for m in keys if m != i]
-        item = p.items[i]
-        if not set(item.free) <= {*found.free, *found.held}:
-            continue
+    own = [i for i in keys if {*p.items[i].free} <= {*found.free, *found.held}]
+    beside = {i: [m for m in keys if m != i] for i in own}
+    worths = {i: worth(p, p.held_out(rest), held, i) for i, rest in beside.items()}
+    equal = {i: list(equals(p, keys, i, held, worths[i][0])) for i in own}
+    swapped = [[*beside[i], o] for i in own for o in equal[i][:_SWAPPED]]
+    others = _weighed(p, keys, [*swapped, *_with_one_more(p, keys, held)])
+    for i in own:
+        item, (_, t) = p.items[i], worths[i]
         value = found.value
         coefficients = np.array([value[c] for c in item.free])
         spread = np.array([quantile * stderr.get(c, 0.0) for c in item.free])
@@ -68,15 +71,14 @@ def members(p: Problem, keys: Sequence[int], effects: Mapping[str, Effect | None
         sizes, low, high = (
             item.sizes(effect, coefficients + side * spread) for side in (0.0, -1.0, 1.0)
         )
-        doubt = _doubt(item, effect, sizes, larger)
+        doubt = _doubt(item, effect, sizes, others)
         for name, least in doubt.items():
             for ends in (low, high):
                 away = ends[name] - sizes[name]
                 ends[name] = sizes[name] + np.copysign(np.hypot(away, least), away)
         for name, (below, above) in _tried_beside(p, i).items():
             low[name], high[name] = below, above
-        gained, t = worth(p, p.held_out(rest), held, i)
-        cost = p.score(rest, priced=False) - base
+        cost = p.score(beside[i], priced=False) - base
         out.append(
             Member(
                 i,
@@ -87,49 +89,62 @@ def members(p: Problem, keys: Sequence[int], effects: Mapping[str, Effect | None
                 doubt,
                 float(cost) if np.isfinite(cost) else 1e6,
                 t,
-                tuple(dict.fromkeys(p.items[o].key for o in equals(p, keys, i, held, gained))),
+                tuple(dict.fromkeys(p.items[o].key for o in equal[i])),
             )
         )
     return out
 
 
-def _with_one_more(p: Problem, keys: Sequence[int]) -> list[tuple[float, dict[int, float]]]:
+def _with_one_more(p: Problem, keys: Sequence[int], held: np.ndarray) -> list[list[int]]:
     """
-    Sets in which a further cause is, that was not confirmed.
-
-    Source: Buckland, Burnham, Augustin, *Model selection: an integral part of inference*,
-    Biometrics 53, 1997: estimates of several models, weighed by an information criterion.
-
-    :return: of those within physical bounds that predict held-out data better, the weight of each,
-        and its coefficients by column
+    :param held: held-out errors of the set
+    :return: sets in which a further cause is, that was not confirmed, but is within physical bounds
+        and predicts held-out data better
     """
-    taken, held = {p.family(i) for i in keys}, p.held_out(keys)
+    taken = {p.family(i) for i in keys}
     others = [o for o in p.ranking(keys)[:_TRIED_SETS] if p.family(o) not in taken]
     sets = [[*keys, o] for o in others if not p.clashes([*keys, o])]
     scored = sorted(((p.score(more), more) for more in sets), key=lambda pair: pair[0])
-    own, found = p.score(keys), []
-    for score, more in scored[:_MORE_SETS]:
-        solution = p.solve(more)
-        possible = np.isfinite(score) and not set(p.items[more[-1]].free) & {*solution.held}
-        if possible and worth(p, held, p.held_out(more), more[-1])[0] > 0.0:
-            found.append((score, solution.value))
-    if not found or not np.isfinite(own):
+    likely = [more for score, more in scored[:_MORE_SETS] if np.isfinite(score)]
+    return [
+        more
+        for more in likely
+        if not {*p.items[more[-1]].free} & {*p.solve(more).held}
+        and worth(p, held, p.held_out(more), more[-1])[0] > 0.0
+    ]
+
+
+def _weighed(
+    p: Problem, keys: Sequence[int], sets: Sequence[Sequence[int]]
+) -> list[tuple[float, dict[int, float]]]:
+    """
+    Source: Buckland, Burnham, Augustin, *Model selection: an integral part of inference*,
+    Biometrics 53, 1997: estimates of several models, weighed by an information criterion.
+
+    :param sets: what may be there instead of a set
+    :return: the weight of each, and its coefficients by column
+    """
+    scores = np.array([p.score(keys), *(p.score(each) for each in sets)])
+    if not np.isfinite(scores[0]):
         return []
-    best = min(own, found[0][0])
-    weights = [float(np.exp(0.5 * (best - score))) for score, _ in found]
-    total = sum(weights) + float(np.exp(0.5 * (best - own)))
-    return [(weight / total, value) for weight, (_, value) in zip(weights, found, strict=True)]
+    weights = np.exp(0.5 * (scores.min() - scores))
+    weights /= weights.sum()
+    return [
+        (float(weight), p.solve(each).value)
+        for weight, each in zip(weights[1:], sets, strict=True)
+        if weight > 0.0
+    ]
 
 
 def _doubt(
     item: Item,
     effect: Effect | None,
     sizes: Mapping[str, float],
-    larger: Sequence[tuple[float, Mapping[int, float]]],
+    others: Sequence[tuple[float, Mapping[int, float]]],
 ) -> dict[str, float]:
-    """:return: by short name, half the width of an interval over what larger sets estimate"""
+    """:return: by short name, half the width of an interval over what other sets estimate"""
     squares = dict.fromkeys(sizes, 0.0)
-    for weight, value in larger:
+    for weight, value in others:
         if set(item.free) <= value.keys():
             there = item.sizes(effect, [value[c] for c in item.free])
             for name in squares:
