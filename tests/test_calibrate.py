@@ -1,5 +1,6 @@
 """Estimates: right, as sure as they say, and honest where the data cannot tell."""
 
+import dataclasses
 import json
 
 import jax
@@ -48,6 +49,15 @@ def test_planted_parameters_are_found_within_three_standard_errors(fit):
     assert fit.error_before[2] > 5.0 * fit.error_after[2]
     exact = calibrate(BELIEVED, measured(TRUE), **PADDED)
     assert [exact[name].estimate for name in FREE] == pytest.approx([*TRUTH.values()], rel=1e-6)
+
+
+def test_names_are_printed_in_full_and_what_diverges_is_said(fit):
+    name = "a_joint_with_a_rather_long_name_damping"
+    (first, *rest), before = fit.estimates, np.array([np.nan, *fit.error_before[1:]])
+    long = (dataclasses.replace(first, name=name), *rest)
+    text = repr(dataclasses.replace(fit, estimates=long, error_before=before))
+
+    assert f"\n{name} " in text and text.count("diverges") == 1 and "nan" not in text
 
 
 def test_what_happened_before_a_window_counts():

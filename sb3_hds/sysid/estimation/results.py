@@ -154,7 +154,8 @@ class Fit:
         for (name, unit), b, a, n in zip(
             self.channels, self.error_before, self.error_after, self.noise, strict=True
         ):
-            lines.append(f"{name:<{w}}{b:>16.3g}{a:>12.3g}{n:>12.3g} {unit}")
+            before = f"{b:.3g}" if math.isfinite(b) else "diverges"
+            lines.append(f"{name:<{w}}{before:>16}{a:>12.3g}{n:>12.3g} {unit}")
         for caveat in self.caveats:
             lines += ["", *_wrapped(caveat)]
         return "\n".join(lines)
