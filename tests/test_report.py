@@ -139,7 +139,7 @@ def many(rubbing):
     )
 
 
-def test_many_causes_are_a_table_by_joint_and_friction_is_drawn(many, tmp_path):
+def test_many_causes_are_a_table_by_joint_and_friction_is_drawn(many):
     names = [joint.name for joint in many.believed.joints]
     rows = rows_of(many.findings, names)
     assert [row[0] for row in rows] == [names[0]] * 3 + [names[1]] * 3
@@ -154,8 +154,6 @@ def test_many_causes_are_a_table_by_joint_and_friction_is_drawn(many, tmp_path):
     assert "Refitted" not in text and text.count("cannot tell") == 1
     assert many.sentence.endswith("from stiffness at elbow.") and many.headline in many.sentence
 
-    text = plots.as_png(plots.plot_friction(many.pictures))
-    assert text.startswith(b"\x89PNG")
     (panel,) = plots.plot_friction(many.pictures).axes
     dots, line, _ = panel.lines
     assert panel.get_title() == "hinge" and len(dots.get_xdata()) == len(line.get_xdata()) == 40
@@ -163,9 +161,7 @@ def test_many_causes_are_a_table_by_joint_and_friction_is_drawn(many, tmp_path):
 
 def test_a_model_that_runs_away_leaves_the_measurements_in_sight(rubbing):
     seen = rubbing.pictures.replay
-    away = dataclasses.replace(rubbing).pictures._replace(
-        replay=seen._replace(before=1e6 * seen.before)
-    )
+    away = rubbing.pictures._replace(replay=seen._replace(before=1e6 * seen.before))
     for j, (left, right) in enumerate(np.reshape(plots.plot_rollouts(away).axes, (-1, 2))):
         span = np.ptp(seen.measured[np.isfinite(seen.measured[:, j]), j])
         assert np.ptp(left.get_ylim()) <= 2.5 * span and np.ptp(right.get_ylim()) <= 2.5 * span

@@ -272,7 +272,7 @@ class Inquiry:
         :return: several causes with what the equation of motion says of their sizes, where it does;
             a single one is known by simulation to a fraction of what that is off by
         """
-        if not self.screened or len(found) < 2:
+        if not self.screened or len(found) < 2 or all(one.sizes for one in found):
             return list(found)
         told = self.screened.estimates(keys_of(found))
         return [

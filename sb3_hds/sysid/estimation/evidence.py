@@ -39,7 +39,7 @@ _HUBER = 3.0
 _DAMPING, _LESS, _MORE, _MOST_DAMPING = 1e-3, 0.2, 8.0, 1e6
 # A step that lowers the cost by a smaller share than this is the last.
 _ENOUGH = 1e-4
-# Steps after which a fit that has to beat another ends if its cost is so many times as large. Of 45
+# Steps after which a fit that has to beat another ends if its cost is so many times as large. Of 49
 # such fits on two machines of two joints, none came closer by more than a factor of 3.6 after its
 # third step, and those that did better than the other had 1.2 times its cost by then, or less.
 _HOPELESS = ((3, 30.0), (8, 5.0))
