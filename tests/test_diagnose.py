@@ -136,7 +136,8 @@ def swinging(*hidden, n=8, n_steps=120, strength=0.05):
     pushed = twins.make("FreePendulum", driven=True, dt=0.02)
     wander = np.random.default_rng(0).standard_normal((n, n_steps, 1)).cumsum(1)
     actions = strength * np.sin(0.7 * wander)
-    return pushed, measured(pushed.extend(*hidden), n, n_steps, 0.005, commands=actions)
+    finely = pushed.at_interval(pushed.dt, 16).extend(*hidden)
+    return pushed, measured(finely, n, n_steps, 0.005, commands=actions)
 
 
 def test_a_joint_that_is_counted_the_other_way_round_is_a_matter_of_convention():

@@ -198,6 +198,7 @@ class Search:
 
         def finish(candidate: Candidate) -> Tried:
             point = self._continued(candidate, base, rival, n_steps)
+            self._reached[candidate.key] = _Reached(point.theta, point.offsets, base.free)
             if point.cost >= rival:
                 return Tried(candidate, point, base.kept, -np.inf)
             half = self.confirm.evidence

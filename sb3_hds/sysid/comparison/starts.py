@@ -13,8 +13,9 @@ from sb3_hds.sysid.estimation.evidence import Evidence, Point, in_threads
 _AWAY = 3.0
 # Where else it may be better, in the same units.
 _DISTANCES = (0.1, 0.3, 1.0, 3.0)
-# Of several starts, so many that promise most are fitted.
-_FITTED = 3
+# Of several starts, so many that promise most are fitted, in at least so many steps: after a few, a
+# start that leads nowhere may be ahead.
+_FITTED, _LEAST_STEPS = 3, 8
 # A Newton step promises nothing beyond, in the same units.
 _FARTHEST = 10.0
 # Curvature, per measurement, below which there is no slope; directions below this share of the
@@ -143,9 +144,9 @@ def _from_starts(
     if len(starts) > _FITTED:
         ranked = sorted(starts, key=lambda start: -_promised(here, _at(here, start), index))
         promising = ranked[:_FITTED]
+    steps = max(here.steps, _LEAST_STEPS)
     fits = [
-        here.evidence.fit(_at(here, start), index, here.point.offsets, here.steps)
-        for start in promising
+        here.evidence.fit(_at(here, start), index, here.point.offsets, steps) for start in promising
     ]
     best = int(np.argmin([fitted.cost for fitted in fits]))
     there = fits[best]
