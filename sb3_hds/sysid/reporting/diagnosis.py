@@ -321,7 +321,7 @@ class Diagnosis:
 
     def to_film(self, path: str | os.PathLike[str]) -> Path:
         """
-        Write the machine's motion over a held-out recording, measured and as both twins predict it.
+        Write the machine's motion over held-out stretches, measured and as both twins predict it.
 
         :param path: of the film, which ends in ``.mp4``; a file of that name is replaced as a whole
         :return: its path

@@ -88,7 +88,7 @@ def section_of(moving: Moving) -> str:
     key = "".join(f'<span style="background:{colour}"></span>{name}' for name, colour in PLAYERS)
     time = moving.time[moving.still]
     return f"""<section><h2>See it move</h2>
-<p class="quiet">A held-out recording: as it was measured, and as both models predict it from the
+<p class="quiet">Held-out stretches: as they were measured, and as both models predict them from the
 same starts, window by window. The picture is that of {time:.2f} s, where the predictions are
 farthest apart.</p>
 <p class="key">{key}</p>

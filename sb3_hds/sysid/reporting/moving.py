@@ -76,7 +76,7 @@ def moving_of(believed: Twin, extended: Twin, replay: Replay) -> Moving:
     """
     :param believed: nominal model, which reads positions from observations
     :param extended: the corrected one
-    :param replay: a held-out recording
+    :param replay: held-out stretches
     """
     rows = np.flatnonzero(np.isfinite(replay.time))
     rows = rows[:: max(1, -(-len(rows) // _MOST_FRAMES))]

@@ -306,7 +306,7 @@ def _pictures(d: Diagnosis) -> list[_Picture]:
     found = [
         _Picture(
             "Before and after",
-            "A held-out recording, in windows that are simulated from a start state of their own. "
+            "Held-out stretches, in windows that are simulated from a start state of their own. "
             "Shaded: 90 % interval of the extended twin, by what it misses in all such windows. "
             "Where the nominal model runs away, its curve is cut off.",
             lambda narrow: plots.plot_rollouts(p, narrow),

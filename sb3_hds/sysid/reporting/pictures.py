@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from sb3_hds.sysid.comparison.halves import NOT_FINITE, Half
 from sb3_hds.sysid.comparison.unexplained import MissingForce
@@ -12,11 +12,13 @@ from sb3_hds.sysid.estimation.evidence import Point
 
 # Of a normal distribution, 90 % lie within so many standard deviations.
 _NORMAL_90 = 1.645
+# Windows that are shown, at least.
+_LEAST_SHOWN = 16
 
 
 class Replay(NamedTuple):
     """
-    One held-out recording, simulated in windows from start states of their own.
+    Held-out stretches, simulated in windows from start states of their own.
 
     :param time: since its first window [s], shape ``(rows,)``; not a number between windows
     :param measured: shape ``(rows, n_obs)``
@@ -65,7 +67,7 @@ def replay_of(
     dt: float,
 ) -> Replay:
     """
-    :param measured: windows of one recording, one after the other
+    :param measured: windows, one after the other
     :param before: simulated minus measured
     :param after: simulated minus measured
     :param rms: what the extended twin misses in any window, root mean square
@@ -86,6 +88,19 @@ def bounded(errors: np.ndarray) -> np.ndarray:
     return np.nan_to_num(np.minimum(errors, NOT_FINITE), nan=NOT_FINITE)
 
 
+def _shown(unit: Int[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
+    """
+    :param unit: recording, or piece of one, of each window
+    :return: indices of the windows of the first ones that have enough
+    """
+    shown = np.zeros(len(unit), bool)
+    for one in dict.fromkeys(unit.tolist()):
+        shown |= unit == one
+        if shown.sum() >= _LEAST_SHOWN:
+            break
+    return np.flatnonzero(shown)
+
+
 def pictures_of(
     half: Half,
     before: Point,
@@ -102,7 +117,7 @@ def pictures_of(
     :param friction: against velocity
     """
     evidence, twin = half.evidence, half.evidence.hypotheses.twin
-    rows = np.flatnonzero(half.unit == half.unit[0])
+    rows = _shown(half.unit)
     measured = np.asarray(evidence.shots.obs)[rows]
     errors = [
         np.sqrt(np.mean(bounded((point.raw / evidence.noise) ** 2), (0, 2)))
