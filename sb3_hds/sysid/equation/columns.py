@@ -52,6 +52,7 @@ def equation(hypotheses: Hypotheses, motion: Motion, quick: bool = False) -> Equ
         mass=found.mass,
         effective=effective,
         slopes={},
+        noisy={},
         drives={},
         motion=motion,
     )
@@ -130,8 +131,12 @@ def _add_parameter(
     step = -step if value + step > parameter.upper else step
     there = terms(twin, {**twin.params, name: value + step}, rows.q, rows.v, rows.actions)
     effective = made.effective + there.mass - made.mass
-    moved = np.einsum("nij,nj->ni", effective, rows.change - there.change) / made.motion.dt
-    column = -(moved - smooth) / step
+
+    def column_of(change: np.ndarray, before: np.ndarray) -> np.ndarray:
+        moved = np.einsum("nij,nj->ni", effective, change - there.change) / made.motion.dt
+        return -(moved - before) / step
+
+    column = column_of(rows.change, smooth)
     if (
         not np.isfinite(column).all()
         or np.sqrt(np.mean(column**2)) * parameter.scale < _NOTHING * typical
@@ -142,6 +147,7 @@ def _add_parameter(
     slope = (there.mass - made.mass) / step
     if np.abs(slope).max() > 0.0:
         made.slopes[candidate.key] = slope
+        made.noisy[index] = put(made, None, column_of(rows.measured, made.missing))
     drive = np.sum((there.actuator - made.actuator) * made.actuator, axis=0) / step
     power = np.sum(made.actuator**2, axis=0)
     drive = np.divide(drive, power, out=np.zeros_like(drive), where=power > 0.0)

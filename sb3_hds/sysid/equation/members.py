@@ -156,10 +156,11 @@ def _doubt(
 def _tried_beside(p: Problem, i: int) -> dict[str, tuple[float, float]]:
     """:return: of what stands at one of several values, such as a speed, the values next to it"""
     item = p.items[i]
-    if item.rule != "linear" or not item.settings:
+    if item.rule not in ("linear", "blend") or not item.settings:
         return {}
-    found = {}
-    for name, value in item.settings[0].items():
+    found, first = {}, item.settings[0]
+    for name in (n for n in first if all(at[n] == first[n] for at in item.settings)):
+        value = first[name]
         tried = {
             o.settings[0][name] for o in p.items if o.key == item.key and name in o.settings[0]
         }

@@ -65,6 +65,9 @@ class Problem:
     :param shares: of each column, its root mean square at each joint, shape ``(dof, columns)``
     :param passes: of saturations and dead zones, the share of commands that still pass
     :param mass: some mass matrices, shape ``(n, dof, dof)``
+    :param noisy: of columns that contain the smoothed acceleration, the one with the measured one
+    :param effective: likewise, effective inertia over an interval
+    :param noise: of each joint's acceleration, in any unit, shape ``(dof,)``
     :param slopes: of these by inertial parameters, by key
     :param drives: share of each joint's actuator force by parameters, by key
     :param rests: of springs, shares of their second column that are admissible
@@ -84,6 +87,9 @@ class Problem:
     shares: np.ndarray
     passes: dict[int, float]
     mass: np.ndarray
+    effective: np.ndarray
+    noise: np.ndarray
+    noisy: dict[int, int]
     slopes: dict[str, np.ndarray]
     drives: dict[str, np.ndarray]
     rests: dict[int, tuple[float, float]]
@@ -142,10 +148,6 @@ class Problem:
     def _beside(self) -> list[np.ndarray]:
         """Normal equations of all data but one fold."""
         return [self.total - fold.sum(0) for fold in self.grams.folds]
-
-    @cached_property
-    def _inertia(self) -> float:
-        return float(np.linalg.slogdet(self.mass)[1].mean())
 
     def price(self, i: int) -> float:
         """:return: penalty of an item in the criterion: its parameters and its prior odds"""
@@ -278,12 +280,23 @@ class Problem:
         found = self.solve(keys)
         if not self.admissible(keys, found):
             return np.inf
-        rss = self.by_joint(found.weights, self.grams.by_joint)
+        rss = self.by_joint(self._judged(found.weights), self.grams.by_joint)
         n = self.grams.effective
         left = np.log(np.maximum(rss, 1e-9) / n) - self.taken_away(keys, found)
         prior = float(np.sum(self.prior[found.free] * found.theta**2))
         prices = sum(map(self.price, keys)) if priced else 0.0
         return float(np.sum(n * left)) + prior + prices
+
+    def _judged(self, weights: np.ndarray) -> np.ndarray:
+        """
+        Coefficients come from smoothed accelerations, or noise would make inertias smaller.
+        Residuals come from measured ones: twice the inertia is twice the noise, as half the torque
+        is half of it, and neither explains more than the other.
+        """
+        judged = weights.copy()
+        for smooth, noisy in self.noisy.items():
+            judged[noisy], judged[smooth] = weights[smooth], 0.0
+        return judged
 
     @staticmethod
     def by_joint(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
@@ -311,26 +324,35 @@ class Problem:
             elif item.key in self.drives:
                 change = value.get(item.columns[0], 0.0) * self.drives[item.key]
                 out += 2.0 * np.minimum(0.0, np.log(np.maximum(1.0 + change, _LEAST_LEFT)))
-        return out + min(0.0, 2.0 * self._inertia_left(keys, value) / self.dof)
+        return out + np.minimum(0.0, self._quieter(keys, value))
 
-    def _inertia_left(self, keys: Sequence[int], value: dict[int, float]) -> float:
-        """:return: by how much the logarithm of the determinant of the mass matrix changes"""
+    def _quieter(self, keys: Sequence[int], value: dict[int, float]) -> np.ndarray:
+        """
+        :return: twice the logarithm of how large the force of the accelerations' noise is at each
+            joint with another inertia, compared with the nominal one
+        """
         changes = [
             value.get(self.items[i].columns[0], 0.0) * self.slopes[self.items[i].key]
             for i in keys
             if self.items[i].key in self.slopes
         ]
         if not changes:
-            return 0.0
-        sign, now = np.linalg.slogdet(self.mass + sum(changes))
-        return float(now.mean()) - self._inertia if (sign > 0).all() else -np.inf
+            return np.zeros(self.dof)
+        change = sum(changes)
+        if (np.linalg.det(self.mass + change) <= 0.0).any():
+            return np.full(self.dof, -np.inf)
+        before, after = (
+            np.mean(np.square(inertia * self.noise).sum(-1), axis=0)
+            for inertia in (self.effective, self.effective + change)
+        )
+        return np.log(after / before)
 
     def held_out(self, keys: Sequence[int]) -> Float[np.ndarray, "folds dof"]:
         """:return: residual sum of squares of each fold, coefficients from the others"""
         out = []
         for fold, beside in zip(self.grams.folds, self._beside, strict=True):
             found = self.solve(keys, beside)
-            rss = self.by_joint(found.weights, fold)
+            rss = self.by_joint(self._judged(found.weights), fold)
             taken = np.maximum(self.taken_away(keys, found), -6.0)
             out.append(rss * np.exp(-taken))
         return np.array(out)

@@ -104,6 +104,8 @@ class Equation:
     :param mass: mass matrix, shape ``(n, dof, dof)``
     :param effective: effective inertia over an interval, likewise: force over change of velocity,
         with damping
+    :param noisy: of columns that contain the acceleration, smoothed, the index of the same column
+        with the measured one
     :param slopes: of the mass matrix by inertial parameters, by key of the candidate
     :param drives: by which share of the actuators' force that changes with a unit of a parameter,
         at each joint, likewise
@@ -120,6 +122,7 @@ class Equation:
     actuator: np.ndarray
     mass: np.ndarray
     effective: np.ndarray
+    noisy: dict[int, int]
     slopes: dict[str, np.ndarray]
     drives: dict[str, np.ndarray]
     motion: Motion

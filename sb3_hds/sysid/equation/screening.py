@@ -48,6 +48,8 @@ SMALL_MACHINE, _LEFT = 2, 0.2
 _LEAST_LATE = 0.03
 # Ranges of the motion by which a spring may rest outside of it: farther away, it is an offset.
 _BEYOND = 0.5
+# Least noise of a velocity, in shares of the fastest joint's speed.
+_QUIETEST = 1e-6
 
 
 class Estimates(NamedTuple):
@@ -330,6 +332,9 @@ def problem(hypotheses: Hypotheses, equation: Equation, made: Grams) -> Problem:
         shares=shares,
         passes=_passing(hypotheses, equation, items),
         mass=equation.mass[some],
+        effective=equation.effective[some],
+        noise=np.maximum(equation.motion.noise_v, _QUIETEST * equation.motion.speed.max()),
+        noisy=equation.noisy,
         slopes={key: slope[some] for key, slope in equation.slopes.items()},
         drives=equation.drives,
         rests=_rests(equation, items),
