@@ -12,6 +12,10 @@ from sb3_hds.sysid.equation.problem import Problem, Solution
 from sb3_hds.sysid.equation.regression import Item
 
 _CONFIDENCE = 0.9
+# A set is hardly ever complete, and sizes shift to make up for what is missing. On 167 sizes of 53
+# simulated machines, cluster-robust 90 % intervals held the truth in 74 % of cases, in 89 % where
+# the set was exactly right; twice as wide, in 84 %.
+_INCOMPLETE = 2.0
 # Sets with one more member that count in intervals, at most, and those that are tried; and those in
 # which something else is in the place of a member.
 _MORE_SETS, _TRIED_SETS, _SWAPPED = 12, 60, 4
@@ -66,7 +70,7 @@ def members(p: Problem, keys: Sequence[int], effects: Mapping[str, Effect | None
         item, (_, t) = p.items[i], worths[i]
         value = found.value
         coefficients = np.array([value[c] for c in item.free])
-        spread = np.array([quantile * stderr.get(c, 0.0) for c in item.free])
+        spread = np.array([_INCOMPLETE * quantile * stderr.get(c, 0.0) for c in item.free])
         effect = effects.get(item.key)
         sizes, low, high = (
             item.sizes(effect, coefficients + side * spread) for side in (0.0, -1.0, 1.0)
