@@ -14,7 +14,7 @@ from sb3_hds.sysid.checks.parameter_stability import Change
 from sb3_hds.sysid.comparison.halves import Half
 from sb3_hds.sysid.comparison.held_out import Comparison, compare, confirm, split
 from sb3_hds.sysid.comparison.inference import standard_errors
-from sb3_hds.sysid.comparison.search import Search
+from sb3_hds.sysid.comparison.ranking import Ranking
 from sb3_hds.sysid.comparison.starts import newton
 from sb3_hds.sysid.comparison.unexplained import MissingForce, remainder
 from sb3_hds.sysid.diagnosis import residuals
@@ -25,7 +25,6 @@ from sb3_hds.sysid.diagnosis.findings import (
     errs_more,
     out_of_reach,
 )
-from sb3_hds.sysid.diagnosis.progress import Bar
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
@@ -305,9 +304,9 @@ def test_what_is_confirmed_is_given_up_only_for_something_simpler_that_is_as_goo
             return Comparison(0.5, p_values[new], 0.2, 0.7, 6)
         return Comparison(gain_over_simple, p_over_simple, 0.0, 0.3, 6)
 
-    search = SimpleNamespace(confirmed=confirmed, better=confirmed)
+    ranking = SimpleNamespace(compare_nested=confirmed, compare=confirmed)
 
-    best = Search.best(search, [*map(tried, p_values)], SimpleNamespace(kept="base"))
+    best = Ranking.best(ranking, [*map(tried, p_values)], SimpleNamespace(kept="base"))
 
     assert best.kept == chosen
 
@@ -325,12 +324,14 @@ def test_of_what_is_confirmed_all_the_data_choose_but_more_freedom_has_to_be_sur
     other, ahead, error, p_value, chosen
 ):
     first, second, p_values = tried("tau_c"), tried(other), {"tau_c": 0.01, other: p_value}
-    search = SimpleNamespace(
-        confirmed=lambda new, _: Comparison(0.5, p_values[new], 0.2, 0.7, 6),
+    ranking = SimpleNamespace(
+        compare_nested=lambda new, _: Comparison(0.5, p_values[new], 0.2, 0.7, 6),
         _of_all=lambda one, _: (error, 50.0 + ahead) if one is second else (1.0, 50.0),
     )
 
-    best = Search.preferred(search, first, [first, second], SimpleNamespace(kept="base"))
+    best = Ranking.best_on_pooled_data(
+        ranking, first, [first, second], SimpleNamespace(kept="base")
+    )
 
     assert best.kept == chosen
 
@@ -344,10 +345,10 @@ def test_windows_of_both_halves_count_alike_where_all_the_data_choose():
     )
 
     def chosen(a, b, parameters=("tau_c",)):
-        search = Search(halves[a], halves[b], effort=None, bar=Bar(False))
+        ranking = Ranking(halves[a], halves[b])
         tried = SimpleNamespace(point=after[a], kept=after[b])
         tried.candidate = SimpleNamespace(parameters=parameters)
-        return search._of_all(tried, SimpleNamespace(point=before[a], kept=before[b]))
+        return ranking._of_all(tried, SimpleNamespace(point=before[a], kept=before[b]))
 
     def summed(points):
         windows = np.concatenate([(point.raw / noise) ** 2 for point in points])

@@ -68,13 +68,13 @@ def open_answers(
             alternatives = [c for c in alternatives if not search.part_of(c, without)]
             sets += [
                 ([*own[:n], tried.candidate, *own[n + 1 :]], search.believing(tried, without))
-                for tried in search.finished(alternatives, without)
+                for tried in search.fit(alternatives, without)
             ]
     if unexplained:
         nearest = [c for c in rejected if not search.part_of(c, base)][:_NEAREST]
         sets += [
             ([*own, tried.candidate], search.believing(tried, base))
-            for tried in search.finished(nearest, base)
+            for tried in search.fit(nearest, base)
         ]
     n_effective = effective_size(base.kept.raw / search.noise)
     least = min(search.confirm.total(one.kept) for _, one in sets)
@@ -110,7 +110,7 @@ def _answer(
     extended: Extended,
 ) -> Answer:
     h, keys = search.hypotheses, tuple(c.key for c in candidates)
-    every, point = search.whole(base)
+    every, point = search.pooled(base)
     twin = extended(keys, point.theta)
     if not base.free:
         return Answer(keys, twin, {}, float(log_weight))

@@ -6,20 +6,10 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.sysid.comparison.halves import Base, Effort, Half, Tried, has_more_freedom
-from sb3_hds.sysid.comparison.held_out import (
-    LEAST_BIC,
-    LEAST_GAIN,
-    LEVEL,
-    Comparison,
-    as_good,
-    by_scores,
-    confirm,
-    effective_size,
-    information_gain,
-    passes,
-)
+from sb3_hds.sysid.comparison.halves import Base, Effort, Half, Tried
+from sb3_hds.sysid.comparison.held_out import LEAST_BIC, Comparison, passes
 from sb3_hds.sysid.comparison.inference import aliased_with
+from sb3_hds.sysid.comparison.ranking import Ranking
 from sb3_hds.sysid.comparison.starts import Here, Places, guesses
 from sb3_hds.sysid.diagnosis.progress import Bar
 from sb3_hds.sysid.estimation.candidates import Candidate
@@ -27,8 +17,8 @@ from sb3_hds.sysid.estimation.evidence import Evidence, Point, in_threads
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.shooting import Shots
 
-# Candidates that may be confirmed, one after the other, and that others are tried beside.
-_MOST_LOOKS, _MOST_FIRSTS = 3, 4
+# Candidates that others are tried beside.
+_MOST_FIRSTS = 4
 # Steps of fits to the end and of rough ones, and of start states alone: to the end, and for a rough
 # comparison.
 _ALL_STEPS, _FEW_STEPS, _KEPT_STEPS, _ROUGH_STEPS = 25, 8, 6, 1
@@ -74,6 +64,10 @@ class Search:
     @property
     def noise(self) -> Float[np.ndarray, " obs"]:
         return self.select.evidence.noise
+
+    @property
+    def ranking(self) -> Ranking:
+        return Ranking(self.select, self.confirm)
 
     def set_noise(self, noise: Float[np.ndarray, " obs"]) -> None:
         self.select, self.confirm = (
@@ -121,14 +115,14 @@ class Search:
         theta[own] = self.hypotheses.null[own]
         return self.base(theta, [i for i in base.free if i not in own], near, rival)
 
-    def again(self, base: Base) -> Base:
+    def refit(self, base: Base) -> Base:
         """:return: the same model, refitted with the current noise"""
         point, kept = base.point, base.kept
         point = self.select.evidence.fit(point.theta, base.free, point.offsets)
         kept = self.confirm.evidence.fit(point.theta, (), kept.offsets)
         return Base(point, kept, base.free)
 
-    def whole(self, base: Base) -> tuple[Half, Point]:
+    def pooled(self, base: Base) -> tuple[Half, Point]:
         """:return: all windows, and the model fitted to them"""
         pair = self.select, self.confirm
         shots = (half.evidence.shots for half in pair)
@@ -138,7 +132,7 @@ class Search:
         offsets = np.concatenate([base.point.offsets, base.kept.offsets])
         return every, every.evidence.fit(base.point.theta, base.free, offsets)
 
-    def glances(self, base: Base, accepted: Sequence[str]) -> list[tuple[Candidate, Point]]:
+    def screen(self, base: Base, accepted: Sequence[str]) -> list[tuple[Candidate, Point]]:
         """
         :param accepted: keys of candidates that the model contains
         :return: promising candidates, fitted roughly on a sample of windows, best first
@@ -179,10 +173,10 @@ class Search:
         :param accepted: keys of candidates that the model contains
         :return: the most promising candidates, fitted to the end, best first
         """
-        ranked = self.glances(base, accepted)
-        return self.finished([candidate for candidate, _ in ranked[: self.effort.finalists]], base)
+        ranked = self.screen(base, accepted)
+        return self.fit([candidate for candidate, _ in ranked[: self.effort.finalists]], base)
 
-    def finished(
+    def fit(
         self,
         candidates: Sequence[Candidate],
         base: Base,
@@ -204,18 +198,20 @@ class Search:
             half = self.confirm.evidence
             offsets = self._starts(candidate, point.theta, base.kept.offsets, half)
             kept = half.fit(point.theta, (), offsets, _KEPT_STEPS)
-            return Tried(candidate, point, kept, self.criterion([candidate], point, base.point))
+            return Tried(
+                candidate, point, kept, self.ranking.criterion([candidate], point, base.point)
+            )
 
         tried = self._each(finish, candidates)
         return sorted(tried, key=lambda t: -t.criterion)
 
-    def nameless(self, base: Base, roughly: bool = False) -> list[Tried]:
+    def fit_nameless(self, base: Base, roughly: bool = False) -> list[Tried]:
         """:return: flexible forces beside the model, fitted to the end or roughly, best first"""
         self._guess(self.hypotheses.nameless, base)
         n_steps = _FEW_STEPS if roughly else _ALL_STEPS
-        return self.finished(self.hypotheses.nameless, base, n_steps=n_steps)
+        return self.fit(self.hypotheses.nameless, base, n_steps=n_steps)
 
-    def in_place(self, beside: Sequence[Tried], without: Base, rival: float) -> list[Tried]:
+    def fit_in_place(self, beside: Sequence[Tried], without: Base, rival: float) -> list[Tried]:
         """
         :param beside: fitted beside a model
         :param without: that model without some of its causes
@@ -225,7 +221,7 @@ class Search:
         for tried in beside:
             theta, offsets = tried.point.theta, tried.point.offsets
             self._reached[tried.candidate.key] = _Reached(theta, offsets, ())
-        return self.finished([tried.candidate for tried in beside], without, rival)
+        return self.fit([tried.candidate for tried in beside], without, rival)
 
     def _guess(self, candidates: Sequence[Candidate], base: Base) -> None:
         """Where fits of candidates begin."""
@@ -235,7 +231,7 @@ class Search:
         for candidate, guess in zip(candidates, guessed, strict=True):
             self._reached[candidate.key] = _Reached(guess.theta, guess.offsets, base.free)
 
-    def relatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> list[Tried]:
+    def fit_aliased(self, best: Tried, tried: Sequence[Tried], base: Base) -> list[Tried]:
         """
         :return: candidates that are aliased with the best one, by declaration or in these windows,
             and were not fitted to the end yet
@@ -245,13 +241,15 @@ class Search:
         alike = aliased_with(self.hypotheses, best.point, slopes, best.candidate, base.free)
         names = {c.key for c in self.hypotheses.related(best.candidate)} | set(alike)
         left = [c for c in self.hypotheses.candidates if c.key in names - done]
-        return self.finished([c for c in left if not self.part_of(c, base)], base)
+        return self.fit([c for c in left if not self.part_of(c, base)], base)
 
     def part_of(self, candidate: Candidate, base: Base) -> bool:
         """:return: whether the model has this candidate already"""
         return set(self.hypotheses.indices(candidate)) <= set(base.free)
 
-    def others(self, base: Base, tried: Sequence[Tried]) -> list[tuple[Candidate, Comparison]]:
+    def compare_rest(
+        self, base: Base, tried: Sequence[Tried]
+    ) -> list[tuple[Candidate, Comparison]]:
         """
         :return: candidates that were no finalists, with their rough fits, compared on the other
             half
@@ -263,7 +261,7 @@ class Search:
             theta, half = self._reached[candidate.key].theta, self.confirm.evidence
             offsets = self._starts(candidate, theta, base.kept.offsets, half)
             kept = half.fit(theta, (), offsets, _ROUGH_STEPS)
-            return self.confirmed(kept, base.kept)
+            return self.ranking.compare_nested(kept, base.kept)
 
         return list(zip(rest, self._each(verdict, rest), strict=True))
 
@@ -283,94 +281,15 @@ class Search:
             if not seconds:
                 continue
             both = [first.candidate, seconds[0].candidate]
-            pairs.append((self.criterion(both, seconds[0].point, base.point), first, seconds))
+            pairs.append(
+                (self.ranking.criterion(both, seconds[0].point, base.point), first, seconds)
+            )
         pairs.sort(key=lambda pair: -pair[0])
         return [(first, seconds) for _, first, seconds in pairs]
 
-    def best(self, tried: Sequence[Tried], base: Base, n_found: int = 0) -> Tried | None:
-        """
-        :param tried: best first
-        :param n_found: causes and comparisons before this one: each makes the level stricter
-        :return: the candidate that selection prefers, if the other recordings confirm it; of two
-            that they confirm and that predict equally well, the one with fewer parameters. Where
-            they do not, the next ones may be confirmed, each at half the level of the one before.
-        """
-        likely = [t for t in tried if t.criterion >= LEAST_BIC]
-        if not likely:
-            return None
-        simplest = likely[0]
-        for other in likely[1:]:
-            if has_more_freedom(simplest, other):
-                simplest = other if as_good(self.better(simplest.kept, other.kept)) else simplest
-        level = LEVEL / (1 + n_found)
-        for one in [simplest, *(t for t in likely if t is not simplest)][:_MOST_LOOKS]:
-            if passes(self.confirmed(one.kept, base.kept), level):
-                return one
-            level *= 0.5
-        return None
-
-    def preferred(self, first: Tried, tried: Sequence[Tried], base: Base) -> Tried:
-        """
-        :param first: confirmed
-        :param tried: it, and what else may be
-        :return: of all that are confirmed and have no fewer parameters, the one that both halves
-            together prefer; what has more has to be as far ahead as a cause has to be of none
-        """
-        error_of_first, ahead_of_first = self._of_all(first, base)
-        best, most = first, ahead_of_first
-        for other in (t for t in tried if t.criterion >= LEAST_BIC):
-            error, ahead = self._of_all(other, base)
-            surely = (
-                error <= (1.0 - LEAST_GAIN) * error_of_first and ahead >= ahead_of_first + LEAST_BIC
-            )
-            if (
-                ahead > most
-                and not has_more_freedom(first, other)
-                and (surely or not has_more_freedom(other, first))
-                and passes(self.confirmed(other.kept, base.kept))
-            ):
-                best, most = other, ahead
-        return best
-
-    def alternatives(self, best: Tried, tried: Sequence[Tried], base: Base) -> tuple[str, ...]:
-        """
-        :return: candidates that are not significantly worse than the best and have no more
-            parameters
-        """
-        others = [t for t in tried if t is not best and not has_more_freedom(t, best)]
-        equal = [t for t in others if as_good(self.better(best.kept, t.kept))]
-        return tuple(t.candidate.key for t in equal if passes(self.confirmed(t.kept, base.kept)))
-
     def needed(self, candidate: Candidate, base: Base) -> bool:
         """:return: whether the model is significantly worse without this candidate"""
-        return passes(self.confirmed(base.kept, self.without(base, candidate).kept))
-
-    def criterion(self, candidates: Sequence[Candidate], point: Point, base: Point) -> float:
-        """:return: by which the information criterion is lower with these candidates"""
-        n = effective_size(base.raw / self.noise)
-        before, after = map(self.select.total, (base, point))
-        return information_gain(before, after, n, sum(len(c.parameters) for c in candidates))
-
-    def _of_all(self, tried: Tried, base: Base) -> tuple[float, float]:
-        """
-        :return: error on both halves, with the parameters fitted to the first; and the criterion
-        """
-        n = sum(effective_size(point.raw / self.noise) for point in (base.point, base.kept))
-        before, after = (
-            self.select.total(one.point) + self.confirm.total(one.kept) for one in (base, tried)
-        )
-        return after, information_gain(before, after, n, len(tried.candidate.parameters))
-
-    def better(self, new: Point, old: Point) -> Comparison:
-        """:return: comparison of two models on the half that confirms"""
-        half = self.confirm
-        return confirm(half.errors(new), half.errors(old), half.unit)
-
-    def confirmed(self, new: Point, old: Point) -> Comparison:
-        """:return: as :meth:`better`, of nested models"""
-        verdict = self.better(new, old)
-        by_score = by_scores(new.raw / self.noise, old.raw / self.noise, self.confirm.unit)
-        return verdict._replace(p_value=min(verdict.p_value, by_score))
+        return passes(self.ranking.compare_nested(base.kept, self.without(base, candidate).kept))
 
     def _continued(self, candidate: Candidate, base: Base, rival: float, n_steps: int) -> Point:
         evidence = self.select.evidence

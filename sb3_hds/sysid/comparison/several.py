@@ -50,7 +50,7 @@ def confirmed_set(
         none where the set as a whole does not predict better
     """
     members = _members(search, screened)
-    if not members or not passes(search.better(base.kept, start.kept)):
+    if not members or not passes(search.ranking.compare(base.kept, start.kept)):
         return [], start
     many = len(members) > _MANY
     verdicts: dict[str, Comparison] = {}
@@ -165,8 +165,10 @@ def _accepted(
     others = [k for k in member.others if k not in members]
     # Of a large set, what may stand for a member is told as the equation says it.
     simulated = [known[k] for k in others if k in known]
-    tried = search.finished(simulated, lost) if lost and simulated else []
-    worse = {t.candidate.key for t in tried if not as_good(search.better(base.kept, t.kept))}
+    tried = search.fit(simulated, lost) if lost and simulated else []
+    worse = {
+        t.candidate.key for t in tried if not as_good(search.ranking.compare(base.kept, t.kept))
+    }
     equal = [k for k in others if k not in worse]
     chance = float(scipy.stats.t.sf(member.t, _FREEDOM)) * len(known)
     same = Tried(candidate, base.point, base.kept, member.gain)

@@ -142,25 +142,25 @@ class Naming:
         """
         if not found or not self.search.hypotheses.nameless:
             return list(found), base, None
-        forces = [f for f in self.search.nameless(base, roughly=True) if self._outdoes(f, base)]
+        forces = [f for f in self.search.fit_nameless(base, roughly=True) if self._outdoes(f, base)]
         places = (tuple(found), *((one,) for one in found if len(found) > 1))
         for place in places if forces else ():
             taken = [one.tried.candidate for one in place]
             without = self.search.without(base, *taken, rival=base)
-            best = self.search.in_place(forces, without, base.point.cost)[0]
+            best = self.search.fit_in_place(forces, without, base.point.cost)[0]
             if self._outdoes(best, base):
                 self.turned_down |= dict.fromkeys(keys_of(place), NAMELESS)
                 rest = [one for one in found if one not in place]
-                better = self.search.better(best.kept, base.kept)
+                better = self.search.ranking.compare(best.kept, base.kept)
                 return (
                     rest,
-                    self.search.again(without),
+                    self.search.refit(without),
                     Nameless(best, better, tuple(keys_of(place))),
                 )
         return list(found), base, None
 
     def _outdoes(self, force: Tried, base: Base) -> bool:
-        better = self.search.better(force.kept, base.kept)
+        better = self.search.ranking.compare(force.kept, base.kept)
         return force.point.cost < base.point.cost and not as_good(better)
 
     def nameless(self, base: Base, known: Sequence[str]) -> Nameless | None:
@@ -168,12 +168,12 @@ class Naming:
         :param known: keys of causes that the model contains
         :return: a flexible force beside the model, as significant as a cause has to be
         """
-        tried = self.search.nameless(base)
+        tried = self.search.fit_nameless(base)
         sure = [t for t in tried if self._determined(t, base)]
         best = self._best(sure, base, len(known))
         if best is None or self._chance(best, base, known) >= _FAMILY_LEVEL / (1 + len(known)):
             return None
-        return Nameless(best, self.search.confirmed(best.kept, base.kept), ())
+        return Nameless(best, self.search.ranking.compare_nested(best.kept, base.kept), ())
 
     def _confirmed(
         self, first: Tried, tried: Sequence[Tried], looks: int, base: Base, firsts: Sequence[Tried]
@@ -188,7 +188,7 @@ class Naming:
         if second is None:
             return None
         both = self.search.believing(second.tried, belief)
-        if not passes(self.search.better(both.kept, base.kept)):
+        if not passes(self.search.ranking.compare(both.kept, base.kept)):
             return None
         chance = self._chance(first, self.start, [])
         found, both = self._pruned(
@@ -220,18 +220,18 @@ class Naming:
 
     def _best(self, sure: Sequence[Tried], base: Base, looks: int) -> Tried | None:
         """:return: what is confirmed, or what all the data prefer to that"""
-        first = self.search.best(sure, base, looks)
+        first = self.search.ranking.best(sure, base, looks)
         if first is None or not self.by_all:
             return first
-        best = self.search.preferred(first, sure, base)
+        best = self.search.ranking.best_on_pooled_data(first, sure, base)
         self._overruled |= best is not first
         return best
 
     def _accepted(self, best: Tried, tried: Sequence[Tried], base: Base, chance: float) -> Accepted:
         """:param base: what is believed without it"""
-        rivals = [*tried, *self.search.relatives(best, tried, base)]
-        others = self.search.alternatives(best, rivals, base)
-        verdict = self.search.confirmed(best.kept, base.kept)
+        rivals = [*tried, *self.search.fit_aliased(best, tried, base)]
+        others = self.search.ranking.alternatives(best, rivals, base)
+        verdict = self.search.ranking.compare_nested(best.kept, base.kept)
         return Accepted(best, verdict, others, chance)
 
     def _asked_again(self, one: Accepted, base: Base) -> Accepted:
@@ -240,7 +240,7 @@ class Naming:
         names = (one.tried.candidate.key, *one.alternatives)
         named = [c for c in self.search.hypotheses.candidates if c.key in names]
         named = [c for c in named if not self.search.part_of(c, without)]
-        tried = self.search.finished(named, without)
+        tried = self.search.fit(named, without)
         same = next(t for t in tried if t.candidate is one.tried.candidate)
         return self._accepted(same, tried, without, one.chance)
 

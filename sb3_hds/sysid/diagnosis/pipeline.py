@@ -134,7 +134,7 @@ class Inquiry:
         if not (found or nearest) and left.remainder is None:
             nearest = contradiction(rejected)
         self._set_noise(base.point)
-        start, base = map(self.search.again, (start, base))
+        start, base = map(self.search.refit, (start, base))
         if stuck := self._stuck(base):
             found, base, left, nearest = [], start, before, stuck
         elif not (found or nearest) and left.remainder is None:
@@ -154,7 +154,7 @@ class Inquiry:
         self._set_noise(start.point)
         whole = proposed_set(self.search, screened, start)
         self._set_noise(min((start.point, whole.point), key=lambda point: point.cost))
-        start, whole = map(self.search.again, (start, whole))
+        start, whole = map(self.search.refit, (start, whole))
         self.bar.stage("confirming causes")
         found, base = confirmed_set(self.search, screened, start, whole)
         naming = Naming(self.search, start, self.seed, family=self._family())
@@ -173,7 +173,7 @@ class Inquiry:
             left, nearest = self.residuals.left(base), nameless_in_words(*force, self.hypotheses)
         beaten = [(c.tried.candidate, c.verdict) for c in confirmed if c not in found]
         self._set_noise(base.point)
-        start, base = map(self.search.again, (start, base))
+        start, base = map(self.search.refit, (start, base))
         if stuck := self._stuck(base):
             found, base, left, nearest = [], start, before, stuck
         self.turned_down = naming.turned_down | {key: SMALL for key in screened.hints}
@@ -184,14 +184,17 @@ class Inquiry:
         names = {kind.name for kind in NAMELESS_EFFECTS}
         asked = [c for c in self.hypotheses.candidates if c.name in names]
         return any(
-            t.point.cost < base.point.cost and not as_good(self.search.better(t.kept, base.kept))
-            for t in self.search.finished(asked, start)
+            t.point.cost < base.point.cost
+            and not as_good(self.search.ranking.compare(t.kept, base.kept))
+            for t in self.search.fit(asked, start)
         )
 
     def _weighed(self, firsts: Sequence[Tried], start: Base) -> list[tuple[Candidate, Comparison]]:
         """:return: every candidate alone, on the half that confirms"""
-        weighed = [(t.candidate, self.search.confirmed(t.kept, start.kept)) for t in firsts]
-        return weighed + self.search.others(start, firsts)
+        weighed = [
+            (t.candidate, self.search.ranking.compare_nested(t.kept, start.kept)) for t in firsts
+        ]
+        return weighed + self.search.compare_rest(start, firsts)
 
     def refused(self, reason: str) -> Diagnosis:
         return Diagnosis(
@@ -235,8 +238,8 @@ class Inquiry:
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
         self._set_noise(base.point)
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
-        likely = [candidate for candidate, _ in self.search.glances(base, [])[:_FOR_NOISE]]
-        tried = self.search.finished(likely, base)
+        likely = [candidate for candidate, _ in self.search.screen(base, [])[:_FOR_NOISE]]
+        tried = self.search.fit(likely, base)
         self._set_noise(min((base.point, *(t.point for t in tried)), key=lambda p: p.cost))
 
     def _set_noise(self, point: Point) -> None:
@@ -293,7 +296,7 @@ class Inquiry:
 
     def _stuck(self, base: Base) -> str:
         """:return: a sentence on nuisances that end at a bound, if any does"""
-        h, (_, point) = self.hypotheses, self.search.whole(base)
+        h, (_, point) = self.hypotheses, self.search.pooled(base)
         ends = [
             i for i in h.nuisances if at_limit(point.theta[i], h.lower[i], h.upper[i], h.null[i])
         ]
@@ -320,7 +323,7 @@ class Inquiry:
     ) -> Diagnosis:
         self.bar.stage("sizes and intervals")
         select, confirm = self.search.select, self.search.confirm
-        every, point = self.search.whole(base)
+        every, point = self.search.pooled(base)
         findings = tuple(
             finding(one, every, point, base.free, self.effort.profiles)
             for one in self._beside_the_equation(found)

@@ -289,13 +289,11 @@ class Problem:
 
     def _judged(self, weights: np.ndarray) -> np.ndarray:
         """
-        Coefficients come from smoothed accelerations, or noise would make inertias smaller.
-        Residuals come from measured ones: twice the inertia is twice the noise, as half the torque
-        is half of it, and neither explains more than the other.
+        Coefficients come from smoothed accelerations, or noise would make inertias smaller;
+        residuals from measured ones: twice the inertia is twice the noise.
         """
-        judged = weights.copy()
-        for smooth, noisy in self.noisy.items():
-            judged[noisy], judged[smooth] = weights[smooth], 0.0
+        smooth, noisy, judged = list(self.noisy), list(self.noisy.values()), weights.copy()
+        judged[noisy], judged[smooth] = weights[smooth], 0.0
         return judged
 
     @staticmethod
