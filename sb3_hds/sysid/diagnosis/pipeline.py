@@ -249,9 +249,15 @@ class Inquiry:
         self.search.set_noise(np.sqrt(noise))
 
     def _detectable(self, start: Base) -> dict[str, dict[str, float]]:
-        """:return: by candidate; where there is no equation of motion, by simulation"""
-        simulated = detectable(self.search.select, start.point)
-        return {**simulated, **(self.screened.detectable if self.screened else {})}
+        """
+        :return: by candidate, where the equation of motion proposes it and a simulation confirms
+            it; what has no slope where nothing is wrong, by the equation alone
+        """
+        found = detectable(self.search.select, start.point)
+        for key, sizes in self.screened.detectable.items() if self.screened else ():
+            simulated = {n: x for n, x in found.get(key, {}).items() if np.isfinite(x)}
+            found[key] = {name: max(size, simulated.get(name, 0.0)) for name, size in sizes.items()}
+        return found
 
     def _extended(self, causes: Sequence[str], theta: np.ndarray) -> Twin:
         """:return: the twin as it came, at its own interval, with these causes in it"""
