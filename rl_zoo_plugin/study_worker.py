@@ -1,73 +1,56 @@
 """
-One run of a study: the zoo's ``train``, with a clock.
+One run of a study: the zoo's ``train``, with a clock and checkpoints.
 
-    python -m rl_zoo_plugin.study_worker CLOCK.csv MINUTES --algo hds --env Pendulum-v1 ...
+    python -m rl_zoo_plugin.study_worker CLOCK.csv MINUTES CHECKPOINT EVERY --algo hds --env ...
 
-It ends when its standard input does, so that no run outlives the study that started it.
+It ends when its standard input does, so that no run outlives the study that started it. Where there
+is a checkpoint, it goes on from that.
 """
 
 import os
+import shutil
 import sys
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
-from stable_baselines3.common.callbacks import BaseCallback
-
 from rl_zoo_plugin import hook
-
-# Between two lines of the clock [s].
-_EVERY = 1.0
-
-
-class Clock(BaseCallback):
-    """
-    Writes how many steps were made by when, and ends the training when its time is up.
-
-    :param path: of a table to write: ``timesteps``, ``seconds`` since the training began
-    :param minutes: that a training may take, evaluations included; None: any
-    """
-
-    def __init__(self, path: Path, minutes: float | None) -> None:
-        super().__init__()
-        self.path, self.limit = path, None if minutes is None else 60.0 * minutes
-
-    def _on_training_start(self) -> None:
-        self._begin = self._written = time.monotonic()
-        self.path.write_text("timesteps,seconds\n0,0.0\n")
-
-    def _on_step(self) -> bool:
-        now = time.monotonic()
-        if now - self._written >= _EVERY:
-            self._write(now)
-        return self.limit is None or now - self._begin < self.limit
-
-    def _on_training_end(self) -> None:
-        self._write(time.monotonic())
-
-    def _write(self, now: float) -> None:
-        self._written = now
-        with self.path.open("a") as file:
-            file.write(f"{self.num_timesteps},{now - self._begin:.3f}\n")
 
 
 def main() -> None:
     """Train as the arguments say."""
-    path, minutes = Path(sys.argv[1]), float(sys.argv[2]) or None
-    del sys.argv[1:3]
+    clock, minutes = Path(sys.argv[1]), float(sys.argv[2]) or None
+    folder, every = Path(sys.argv[3]), float(sys.argv[4])
+    del sys.argv[1:5]
     threading.Thread(target=_end_with_input, daemon=True).start()
     hook.install()
     from rl_zoo3.exp_manager import ExperimentManager
     from rl_zoo3.train import train
 
+    from rl_zoo_plugin.checkpoints import Checkpoints, Clock, Continued, go_on, last_checkpoint
+
+    before = last_checkpoint(folder)
+    if before is not None:
+        sys.argv += ["-i", str(before)]
+        if (folder / clock.name).exists():
+            shutil.copy(folder / clock.name, clock)
     create: Any = ExperimentManager.create_callbacks
+    learn: Any = ExperimentManager.learn
 
     def with_clock(self: Any) -> None:
         create(self)
-        self.callbacks.append(Clock(path, minutes))
+        if before is not None:
+            go_on(self, folder)
+        watch, logs = Clock(clock, minutes), Path(self.save_path)
+        self.callbacks.append(watch)
+        if every:
+            self.callbacks.append(Checkpoints(folder, every, logs, str(self.env_name), watch))
+
+    def go_on_learning(self: Any, model: Any) -> None:
+        learn(self, model if before is None else Continued(model))
 
     ExperimentManager.create_callbacks = with_clock
+    ExperimentManager.learn = go_on_learning
     train()
 
 

@@ -63,7 +63,7 @@ def study_of(folder: Path, **changes) -> Study:
 
 
 def writer(ledger: Path, moment: float = 0.0):
-    def command(run, logs, clock):
+    def command(run, logs, clock, checkpoint):
         told = [logs, clock, run.algo, run.env, run.seed, ledger, moment]
         return [sys.executable, "-c", WRITER, *map(str, told)]
 
@@ -103,12 +103,14 @@ def test_what_a_study_cannot_be_is_refused(changes, why, tmp_path):
 def test_the_zoo_is_told_everything(tmp_path):
     study = study_of(tmp_path, budget={"steps": 400, "minutes": 0.5})
 
-    words = zoo_command(study)(study.runs[-1], tmp_path / "logs", tmp_path / "clock.csv")
+    words = zoo_command(study)(
+        study.runs[-1], *map(tmp_path.joinpath, ("logs", "clock.csv", "last"))
+    )
 
     text = " ".join(words)
     assert "--algo droq --env sb3_hds/PayloadPendulum-v0 --seed 1 -n 400" in text
     assert "--eval-freq 100 --eval-episodes 3 -params tau:0.1 --env-kwargs mass:2.0" in text
-    assert words[4] == "0.5"
+    assert words[4] == "0.5" and words[5].endswith("last") and words[6] == "5.0"
 
 
 def test_runs_are_complete_or_not_there_and_none_is_run_twice(tmp_path):
@@ -131,7 +133,7 @@ def test_a_study_that_is_killed_at_any_moment_goes_on(tmp_path):
         "import pathlib\n"
         "from sb3_hds.experiments.study import Study, run_study\n"
         f"WRITER = {WRITER!r}\n"
-        "def command(run, logs, clock):\n"
+        "def command(run, logs, clock, checkpoint):\n"
         f"    told = [logs, clock, run.algo, run.env, run.seed, {str(ledger)!r}, 0.15]\n"
         "    return [sys.executable, '-c', WRITER, *map(str, told)]\n"
         "print('ready', flush=True)\n"

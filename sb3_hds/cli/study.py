@@ -28,6 +28,22 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
             part.add_argument(
                 "--memory", type=float, default=2.0, help="that a run may need [GiB]; default: 2"
             )
+            part.add_argument(
+                "--checkpoint",
+                type=float,
+                default=5.0,
+                metavar="MINUTES",
+                help="from one checkpoint of a run to the next; 0: none; default: 5",
+            )
+            part.add_argument(
+                "--ray", metavar="ADDRESS", help="run on a Ray cluster: its address, or auto"
+            )
+            part.add_argument(
+                "--cpus", type=float, default=1.0, help="of a run, with --ray; default: 1"
+            )
+            part.add_argument(
+                "--gpus", type=float, default=0.0, help="of a run, with --ray; may be a fraction"
+            )
         if name == "report":
             part.add_argument("--html", help="page to write; default: report.html in the folder")
 
@@ -42,9 +58,18 @@ def run(given: argparse.Namespace) -> int:
 
 
 def _run(study: "Study", folder: Path, given: argparse.Namespace) -> int:
-    from sb3_hds.experiments.study import run_study
+    from sb3_hds.experiments.study import run_study, zoo_command
 
-    done = run_study(study, folder, jobs=given.jobs, memory=given.memory)
+    done = run_study(
+        study,
+        folder,
+        jobs=given.jobs,
+        memory=given.memory,
+        command=zoo_command(study, given.checkpoint),
+        ray=given.ray,
+        cpus=given.cpus,
+        gpus=given.gpus,
+    )
     print(f"{len(done.complete)} of {len(study.runs)} runs are complete in {folder}")
     return 1 if done.failed else 0
 

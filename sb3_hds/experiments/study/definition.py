@@ -45,7 +45,8 @@ class Run(NamedTuple):
         return f"{self.label} on {self.env}, seed {self.seed}"
 
 
-Command = Callable[[Run, Path, Path], Sequence[str]]
+#: what starts a run, given it, its folder of logs, its clock and the folder of its checkpoint
+Command = Callable[[Run, Path, Path, Path], Sequence[str]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,13 +103,17 @@ class Study:
         return json.loads(json.dumps(told))
 
 
-def zoo_command(study: Study) -> Command:
-    """:return: what starts a run, by the zoo's ``train``"""
+def zoo_command(study: Study, every: float = 5.0) -> Command:
+    """
+    :param every: minutes from one checkpoint to the next; 0: none
+    :return: what starts a run, by the zoo's ``train``
+    """
 
-    def command(run: Run, logs: Path, clock: Path) -> list[str]:
+    def command(run: Run, logs: Path, clock: Path, checkpoint: Path) -> list[str]:
         steps = study.steps or 2**31 - 1
         found = [sys.executable, "-m", "rl_zoo_plugin.study_worker", str(clock)]
-        found += [repr(float(study.minutes or 0.0)), "--algo", run.algo, "--env", run.env]
+        found += [repr(float(study.minutes or 0.0)), str(checkpoint), repr(float(every))]
+        found += ["--algo", run.algo, "--env", run.env]
         found += ["--seed", str(run.seed), "-n", str(steps), "-f", str(logs), "--verbose", "0"]
         found += ["--eval-freq", str(study.every), "--eval-episodes", str(study.episodes)]
         for option, given in (("-params", run.hyperparams), ("--env-kwargs", run.env_kwargs)):

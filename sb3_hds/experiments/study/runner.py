@@ -2,7 +2,8 @@
 Studies: algorithms, environments and seeds, each run by RL Zoo in a process of its own.
 
 A run is written in a folder of its own and moved, when it is complete, to where the zoo would have
-put it. What is there is complete; what is not is run, however often a study is killed.
+put it. What is there is complete; what is not is run, from its last checkpoint on, however often a
+study is killed.
 """
 
 import contextlib
@@ -12,15 +13,16 @@ import platform
 import secrets
 import shutil
 import subprocess
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from sb3_hds.core.trajectories.storage import write_bytes
 from sb3_hds.errors import StudyError
+from sb3_hds.experiments.cluster import Share, on_cluster
 from sb3_hds.experiments.study.definition import Command, Run, Study, zoo_command
 
 #: file that marks a complete run, and says what it was
@@ -28,7 +30,7 @@ MARK = "study.json"
 
 #: table of steps and seconds in the folder of a run
 CLOCK = "clock.csv"
-_RUNNING, _FAILED, _LOCK = ".running", ".failed", ".lock"
+_RUNNING, _FAILED, _LOCK, _CHECKPOINTS = ".running", ".failed", ".lock", ".checkpoints"
 # Characters of an error that are shown.
 _SHOWN = 600
 
@@ -64,43 +66,56 @@ def run_study(
     memory: float = 2.0,
     command: Command | None = None,
     tell: Callable[[str], None] = print,
+    ray: str | None = None,
+    cpus: float = 1.0,
+    gpus: float = 0.0,
 ) -> Done:
     """
     Run what is not complete. Called again after it was killed, it goes on.
 
-    :param folder: the zoo's folder of logs, made where there is none
-    :param jobs: runs at a time; default: as many as there are cores
+    :param folder: the zoo's folder of logs, made where there is none; with Ray, one that all nodes
+        share
+    :param jobs: runs at a time; default: as many as there are cores, or as the cluster has room for
     :param memory: that a run may need [GiB]: no more run at a time than fit into what is free
     :param command: starts a run; default: :func:`zoo_command`
     :param tell: is called with a line for each run that ends
-    :raises StudyError: if another study is at work in that folder, or if it has a run of the same
-        name with other settings
+    :param ray: address of a Ray cluster that runs them, or ``"auto"``; default: this machine
+    :param cpus: of a run, where Ray runs it
+    :param gpus: of a run, likewise; may be a fraction
+    :raises StudyError: if another study is at work in that folder, if it has a run of the same
+        name with other settings, or if there is no such cluster
     """
-    root = Path(folder)
+    root = Path(folder).resolve()
     root.mkdir(parents=True, exist_ok=True)
-    make = command or zoo_command(study)
+    one = partial(_executed, study=study, root=root, command=command or zoo_command(study))
     with _alone(root):
         waiting = [run for run in study.runs if not is_complete(study, run, root)]
         shutil.rmtree(root / _RUNNING, ignore_errors=True)
-        complete = [run for run in study.runs if run not in waiting]
+        complete = {run.place for run in study.runs} - {run.place for run in waiting}
         failed: list[tuple[Run, str]] = []
-        lock, left = threading.Lock(), len(waiting)
+        ended = (
+            _on_this_machine(one, waiting, _at_a_time(jobs, memory))
+            if ray is None
+            else on_cluster(one, waiting, ray, Share(cpus, gpus, memory), jobs)
+        )
+        for left, (run, error) in zip(reversed(range(len(waiting))), ended, strict=True):
+            if error is None:
+                complete.add(run.place)
+            else:
+                failed.append((run, error))
+            what = "complete" if error is None else f"failed: {error[-_SHOWN:]}"
+            tell(f"{time.strftime('%H:%M:%S')} {run}: {what} ({left} to go)")
+    return Done(tuple(run for run in study.runs if run.place in complete), tuple(failed))
 
-        def one(run: Run) -> None:
-            nonlocal left
-            error = _executed(study, run, root, make)
-            with lock:
-                left -= 1
-                if error is None:
-                    complete.append(run)
-                else:
-                    failed.append((run, error))
-                what = "complete" if error is None else f"failed: {error[-_SHOWN:]}"
-                tell(f"{time.strftime('%H:%M:%S')} {run}: {what} ({left} to go)")
 
-        with ThreadPoolExecutor(_at_a_time(jobs, memory)) as pool:
-            list(pool.map(one, waiting))
-    return Done(tuple(run for run in study.runs if run in complete), tuple(failed))
+def _on_this_machine(
+    one: Callable[[Run], str | None], runs: Sequence[Run], at_a_time: int
+) -> Iterator[tuple[Run, str | None]]:
+    """:return: runs as they end, and their errors"""
+    with ThreadPoolExecutor(at_a_time) as pool:
+        waited = {pool.submit(one, run): run for run in runs}
+        for future in as_completed(waited):
+            yield waited[future], future.result()
 
 
 def is_complete(study: Study, run: Run, folder: Path) -> bool:
@@ -192,13 +207,21 @@ def _alone(folder: Path) -> Iterator[None]:
         yield
 
 
-def _executed(study: Study, run: Run, root: Path, command: Command) -> str | None:
+def _executed(run: Run, study: Study, root: Path, command: Command) -> str | None:
     """:return: None, or the last lines of an error"""
+    if not (root / _LOCK).exists():
+        return (
+            f"{platform.node()} does not see '{root}': a cluster needs a folder that all of its "
+            "nodes share."
+        )
+    if is_complete(study, run, root):
+        return None
     # A name of its own: the process of a study that was killed may take a moment to end.
     scratch = _scratch(root, run).with_name(f"{_scratch(root, run).name}.{secrets.token_hex(4)}")
     logs, clock = scratch / "logs", scratch / CLOCK
     logs.mkdir(parents=True)
-    words = list(command(run, logs, clock))
+    checkpoint = root / _CHECKPOINTS / _name_of(run)
+    words = list(command(run, logs, clock, checkpoint))
     begun = time.time()
     # It ends when this process does: its standard input is a pipe from here.
     pipe, said = subprocess.PIPE, subprocess.STDOUT
@@ -229,16 +252,21 @@ def _executed(study: Study, run: Run, root: Path, command: Command) -> str | Non
     target.parent.mkdir(parents=True, exist_ok=True)
     found[0].rename(target)
     shutil.rmtree(scratch, ignore_errors=True)
+    shutil.rmtree(checkpoint, ignore_errors=True)
     _error_file(root, run).unlink(missing_ok=True)
     return None
 
 
+def _name_of(run: Run) -> str:
+    return f"{run.label}-{run.env_name}_{run.seed + 1}"
+
+
 def _scratch(root: Path, run: Run) -> Path:
-    return root / _RUNNING / f"{run.label}-{run.env_name}_{run.seed + 1}"
+    return root / _RUNNING / _name_of(run)
 
 
 def _error_file(root: Path, run: Run) -> Path:
-    return root / _FAILED / f"{run.label}-{run.env_name}_{run.seed + 1}.txt"
+    return root / _FAILED / f"{_name_of(run)}.txt"
 
 
 def _last_of(clock: Path) -> tuple[int, float]:

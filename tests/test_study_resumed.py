@@ -1,0 +1,163 @@
+"""Runs of a study that go on from a checkpoint, and studies on a Ray cluster of two nodes."""
+
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from test_study import WRITER
+
+from sb3_hds.errors import StudyError
+from sb3_hds.experiments.study import Study, progress_of, run_study, zoo_command
+
+PLAN = {
+    "algorithms": ["sac"],
+    "envs": ["Pendulum-v1"],
+    "seeds": 1,
+    "budget": {"steps": 400},
+    "evaluation": {"every": 100, "episodes": 1},
+}
+
+
+def study_of(folder, **changes):
+    (folder / "study.yml").write_text(yaml.safe_dump(PLAN | changes))
+    return Study.load(folder / "study.yml")
+
+
+def steps_in(clock):
+    lines = clock.read_text().split()[1:] if clock.exists() else []
+    return [0, *(int(line.partition(",")[0]) for line in lines)]
+
+
+@pytest.mark.expensive
+@pytest.mark.parametrize("algo", ["sac", "hds"])
+def test_a_run_that_is_killed_goes_on_from_its_checkpoint(algo, tmp_path):
+    study, folder = study_of(tmp_path, algorithms=[algo]), tmp_path / "logs"
+    code = (
+        "from sb3_hds.experiments.study import Study, run_study, zoo_command\n"
+        f"study = Study.load({str(tmp_path / 'study.yml')!r})\n"
+        f"run_study(study, {str(folder)!r}, command=zoo_command(study, 0.02))\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL) as process:
+        written, deadline = (
+            folder / ".checkpoints" / f"{algo}-Pendulum-v1_1",
+            time.monotonic() + 120.0,
+        )
+        while time.monotonic() < deadline and steps_in(written / "clock.csv")[-1] < 100:
+            time.sleep(0.05)
+        process.kill()
+    time.sleep(1.0)
+    with np.load(written / "evaluations.npz") as before:
+        returns = before["results"]
+    reached = steps_in(written / "clock.csv")[-1]
+    assert 100 <= reached < 400
+
+    done = run_study(study, folder, command=zoo_command(study, 0.5), tell=lambda _: None)
+
+    assert done.complete == study.runs and not written.exists()
+    place = folder / study.runs[0].place
+    with np.load(place / "evaluations.npz") as after:
+        # Those at step 0 are of planning before the first step.
+        assert [t for t in after["timesteps"].tolist() if t] == [100, 200, 300, 400]
+        # What had been evaluated is not evaluated again.
+        np.testing.assert_array_equal(after["results"][: len(returns)], returns)
+    steps = steps_in(place / "clock.csv")
+    assert steps == sorted(steps) and reached in steps and steps[-1] >= 400
+    assert (place / "before_0.monitor.csv").exists()
+
+
+# ------------------------------------------------------------------------------ Ray
+def test_without_a_cluster_it_is_said_how_to_start_one(tmp_path):
+    pytest.importorskip("ray")
+    with pytest.raises(StudyError, match="ray start --head"):
+        run_study(study_of(tmp_path), tmp_path / "logs", ray="127.0.0.1:1")
+
+
+class Cluster:
+    """Two nodes on this machine, each with two cores to give."""
+
+    def __init__(self, folder: Path) -> None:
+        from ray.cluster_utils import Cluster as Nodes
+
+        self.nodes = Nodes(initialize_head=True, head_node_args=self._node(folder, "head"))
+        self.second = self.nodes.add_node(**self._node(folder, "second"))
+        self.nodes.wait_for_nodes()
+
+    @staticmethod
+    def _node(folder, name):
+        return {"num_cpus": 2, "memory": 4 * 2**30, "object_store_memory": 80 * 2**20}
+
+    @property
+    def address(self):
+        return self.nodes.address
+
+    def lose_one(self):
+        self.nodes.remove_node(self.second, allow_graceful=False)
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    pytest.importorskip("ray")
+    made = Cluster(tmp_path)
+    yield made
+    made.nodes.shutdown()
+
+
+def writer(ledger, moment):
+    def command(run, logs, clock, checkpoint):
+        told = [logs, clock, run.algo, run.env, run.seed, ledger, moment]
+        return [sys.executable, "-c", WRITER, *map(str, told)]
+
+    return command
+
+
+@pytest.mark.expensive
+def test_a_node_is_lost_and_no_run_is(cluster, tmp_path):
+    study = study_of(tmp_path, algorithms=["hds", "droq"], seeds=100)
+    ledger, folder, said = tmp_path / "ledger", tmp_path / "logs", []
+
+    def tell(line):
+        said.append(line)
+        if len(said) == 60:
+            cluster.lose_one()
+
+    done = run_study(
+        study,
+        folder,
+        command=writer(ledger, 0.1),
+        tell=tell,
+        ray=cluster.address,
+        memory=0.2,
+    )
+
+    assert len(study.runs) == 200 and done.complete == study.runs and not done.failed
+    assert len(said) == 200
+    for run in study.runs:
+        assert (folder / run.place / "progress").read_text() == "0\n1\n2\n3\n4\n"
+    # Only what was at work on the node that was lost is made again.
+    assert 200 <= ledger.read_text().count("begun") <= 202
+    assert {one.state for one in progress_of(study, folder)} == {"complete"}
+
+
+@pytest.mark.expensive
+def test_what_no_node_has_is_refused_and_what_fails_is_told(cluster, tmp_path):
+    study = study_of(tmp_path, algorithms=["fails", "hds"])
+    with pytest.raises(StudyError, match="No node has 64 cores"):
+        run_study(study, tmp_path / "logs", ray=cluster.address, cpus=64)
+
+    done = run_study(
+        study,
+        tmp_path / "logs",
+        command=writer(tmp_path / "ledger", 0.0),
+        tell=lambda _: None,
+        ray=cluster.address,
+        memory=0.2,
+    )
+
+    assert [run.label for run in done.complete] == ["hds"]
+    assert [error for _, error in done.failed] == ["the learner broke"]
+    shutil.rmtree(tmp_path / "logs")
