@@ -49,10 +49,10 @@ LIBRARIES = {
     "wrappers/vec_env.py": {"stable_baselines3.common.monitor"},
     "algos": LEARNING,
     "deploy": LEARNING | {"jax2onnx", "onnx", "onnxruntime"},
-    "experiments": LEARNING | TABLES | {"scipy", "jinja2", "rliable"},
+    "experiments": LEARNING | TABLES | {"scipy", "jinja2", "rliable", "ray"},
     "cli": LEARNING | TABLES,
     "rl_zoo_plugin": {"rl_zoo3", "optuna"},
-    "rl_zoo_plugin/study_worker.py": {"stable_baselines3"},
+    "rl_zoo_plugin/checkpoints.py": {"stable_baselines3", "numpy"},
     "rl_zoo_plugin/trial_progress.py": {"stable_baselines3"},
 }
 """What a layer, or one file of it, imports from outside; the standard library is free."""

@@ -108,6 +108,7 @@ PARTS: dict[str, Callable[[], str]] = {
     ),
     "model_files": summaries.whole("model_files"),
     "joints_cost": summaries.whole("joints_cost"),
+    "cluster_overhead": summaries.whole("cluster_overhead"),
     "start_up": summaries.whole("start_up_summary"),
     "diagnosis_cost_lines": summaries.whole("diagnosis_cost_lines"),
     **{f"learned_{method}": summaries.learned(method, *peers) for method, peers in LEARNED.items()},

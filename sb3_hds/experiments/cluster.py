@@ -1,5 +1,6 @@
 """Work on the machines of a Ray cluster."""
 
+import logging
 import os
 import socket
 from collections.abc import Callable, Iterator, Sequence
@@ -58,7 +59,7 @@ def on_cluster(
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         try:
             _check_answers(address)
-            ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
         except (OSError, ValueError, RuntimeError) as error:
             raise StudyError(
                 f"There is no Ray cluster at '{address}' ({error}). Start one: ray start --head."
