@@ -234,6 +234,10 @@ def objection(words: list[str]) -> str | None:
             return _missing("option", _options(options), _declared_options(ROOT / script))
         case ["git", "clone" | "checkout", *_] | ["cd", _] | ["pip", "install", *_]:
             return None
+        case ["kubectl", "exec", *before] if "--" in before:
+            return objection(before[before.index("--") + 1 :])
+        case ["ray", "start" | "stop", *_]:
+            return None
     return f"unknown command {words[0]}"
 
 
