@@ -251,12 +251,18 @@ class Inquiry:
     def _detectable(self, start: Base) -> dict[str, dict[str, float]]:
         """
         :return: by candidate, where the equation of motion proposes it and a simulation confirms
-            it; what has no slope where nothing is wrong, by the equation alone
+            it. Of what is not simulated, or has no slope where nothing is wrong, by the equation:
+            as much larger as errors that are too small to matter make what is left.
         """
-        found = detectable(self.search.select, start.point)
+        half, point = self.search.select, start.point
+        found = detectable(half, point)
+        left = float(np.mean((point.raw / half.evidence.noise) ** 2, (1, 2)).sum())
+        larger = np.sqrt(half.total(point) / left) if left > 0.0 else 1.0
         for key, sizes in self.screened.detectable.items() if self.screened else ():
             simulated = {n: x for n, x in found.get(key, {}).items() if np.isfinite(x)}
-            found[key] = {name: max(size, simulated.get(name, 0.0)) for name, size in sizes.items()}
+            found[key] = {
+                name: max(size, simulated.get(name, larger * size)) for name, size in sizes.items()
+            }
         return found
 
     def _extended(self, causes: Sequence[str], theta: np.ndarray) -> Twin:
