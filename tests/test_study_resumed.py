@@ -1,10 +1,8 @@
 """Runs of a study that go on from a checkpoint, and studies on a Ray cluster of two nodes."""
 
-import shutil
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -45,7 +43,7 @@ def test_a_run_that_is_killed_goes_on_from_its_checkpoint(algo, tmp_path):
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL) as process:
         written, deadline = (
             folder / ".checkpoints" / f"{algo}-Pendulum-v1_1",
-            time.monotonic() + 120.0,
+            time.monotonic() + 300.0,
         )
         while time.monotonic() < deadline and steps_in(written / "clock.csv")[-1] < 100:
             time.sleep(0.05)
@@ -80,16 +78,13 @@ def test_without_a_cluster_it_is_said_how_to_start_one(tmp_path):
 class Cluster:
     """Two nodes on this machine, each with two cores to give."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self) -> None:
         from ray.cluster_utils import Cluster as Nodes
 
-        self.nodes = Nodes(initialize_head=True, head_node_args=self._node(folder, "head"))
-        self.second = self.nodes.add_node(**self._node(folder, "second"))
+        node = {"num_cpus": 2, "memory": 4 * 2**30, "object_store_memory": 80 * 2**20}
+        self.nodes = Nodes(initialize_head=True, head_node_args=node)
+        self.second = self.nodes.add_node(**node)
         self.nodes.wait_for_nodes()
-
-    @staticmethod
-    def _node(folder, name):
-        return {"num_cpus": 2, "memory": 4 * 2**30, "object_store_memory": 80 * 2**20}
 
     @property
     def address(self):
@@ -100,9 +95,12 @@ class Cluster:
 
 
 @pytest.fixture
-def cluster(tmp_path):
+def cluster():
     pytest.importorskip("ray")
-    made = Cluster(tmp_path)
+    try:
+        made = Cluster()
+    except (OSError, RuntimeError) as error:
+        pytest.skip(f"Ray does not start on this machine: {error}")
     yield made
     made.nodes.shutdown()
 
@@ -160,4 +158,3 @@ def test_what_no_node_has_is_refused_and_what_fails_is_told(cluster, tmp_path):
 
     assert [run.label for run in done.complete] == ["hds"]
     assert [error for _, error in done.failed] == ["the learner broke"]
-    shutil.rmtree(tmp_path / "logs")

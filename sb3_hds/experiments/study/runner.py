@@ -250,7 +250,9 @@ def _executed(run: Run, study: Study, root: Path, command: Command) -> str | Non
     write_bytes(found[0] / MARK, json.dumps(told, indent=1).encode())
     target = root / run.place
     target.parent.mkdir(parents=True, exist_ok=True)
-    found[0].rename(target)
+    # On a cluster, a node that was given up for lost may have been faster.
+    if not (target / MARK).exists():
+        found[0].rename(target)
     shutil.rmtree(scratch, ignore_errors=True)
     shutil.rmtree(checkpoint, ignore_errors=True)
     _error_file(root, run).unlink(missing_ok=True)
