@@ -113,6 +113,11 @@ def test_the_zoo_is_told_everything(tmp_path):
     assert words[4] == "0.5" and words[5].endswith("last") and words[6] == "5.0"
 
 
+def test_checkpoints_are_not_less_than_nothing_apart(tmp_path):
+    with pytest.raises(StudyError, match="must be 0 or more, got -1"):
+        zoo_command(study_of(tmp_path), -1.0)
+
+
 def test_runs_are_complete_or_not_there_and_none_is_run_twice(tmp_path):
     study, folder, ledger = study_of(tmp_path), tmp_path / "logs", tmp_path / "ledger"
 

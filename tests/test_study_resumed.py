@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 import yaml
-from test_study import WRITER
+from test_study import writer
 
 from sb3_hds.errors import StudyError
 from sb3_hds.experiments.study import Study, progress_of, run_study, zoo_command
@@ -41,10 +41,8 @@ def test_a_run_that_is_killed_goes_on_from_its_checkpoint(algo, tmp_path):
         f"run_study(study, {str(folder)!r}, command=zoo_command(study, 0.02))\n"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL) as process:
-        written, deadline = (
-            folder / ".checkpoints" / f"{algo}-Pendulum-v1_1",
-            time.monotonic() + 300.0,
-        )
+        written = folder / ".checkpoints" / f"{algo}-Pendulum-v1_1"
+        deadline = time.monotonic() + 300.0
         while time.monotonic() < deadline and steps_in(written / "clock.csv")[-1] < 100:
             time.sleep(0.05)
         process.kill()
@@ -105,14 +103,6 @@ def cluster():
     made.nodes.shutdown()
 
 
-def writer(ledger, moment):
-    def command(run, logs, clock, checkpoint):
-        told = [logs, clock, run.algo, run.env, run.seed, ledger, moment]
-        return [sys.executable, "-c", WRITER, *map(str, told)]
-
-    return command
-
-
 @pytest.mark.expensive
 def test_a_node_is_lost_and_no_run_is(cluster, tmp_path):
     study = study_of(tmp_path, algorithms=["hds", "droq"], seeds=100)
@@ -136,6 +126,7 @@ def test_a_node_is_lost_and_no_run_is(cluster, tmp_path):
     assert len(said) == 200
     for run in study.runs:
         assert (folder / run.place / "progress").read_text() == "0\n1\n2\n3\n4\n"
+    # Only what was at work on the node that was lost is made again.
     # Only what was at work on the node that was lost is made again.
     assert 200 <= ledger.read_text().count("begun") <= 202
     assert {one.state for one in progress_of(study, folder)} == {"complete"}

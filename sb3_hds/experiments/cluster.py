@@ -75,6 +75,7 @@ def on_cluster(
             num_gpus=share.gpus,
             memory=int(share.memory * 2**30),
             max_retries=-1,
+            scheduling_strategy="SPREAD",
         )
         waiting, running = list(reversed(given)), {}
         while waiting or running:

@@ -107,7 +107,10 @@ def zoo_command(study: Study, every: float = 5.0) -> Command:
     """
     :param every: minutes from one checkpoint to the next; 0: none
     :return: what starts a run, by the zoo's ``train``
+    :raises StudyError: if checkpoints are less than nothing apart
     """
+    if not every >= 0.0:
+        raise StudyError(f"Minutes between checkpoints must be 0 or more, got {every:g}.")
 
     def command(run: Run, logs: Path, clock: Path, checkpoint: Path) -> list[str]:
         steps = study.steps or 2**31 - 1
