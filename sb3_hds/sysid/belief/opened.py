@@ -12,7 +12,7 @@ from sb3_hds.sysid.belief.answers import Answer, Answers, everything_open, facto
 from sb3_hds.sysid.comparison.halves import Base, Half
 from sb3_hds.sysid.comparison.held_out import effective_size
 from sb3_hds.sysid.comparison.inference import jackknife
-from sb3_hds.sysid.comparison.search import Search
+from sb3_hds.sysid.comparison.search import Search, places_of
 from sb3_hds.sysid.diagnosis.findings import Accepted
 from sb3_hds.sysid.equation.plausibility import rarity_of
 from sb3_hds.sysid.estimation.candidates import Candidate
@@ -68,7 +68,7 @@ def open_answers(
             alternatives = [c for c in alternatives if not search.part_of(c, without)]
             sets += [
                 ([*own[:n], tried.candidate, *own[n + 1 :]], search.believing(tried, without))
-                for tried in search.fit(alternatives, without)
+                for tried in search.fit(alternatives, without, places_of(one.rivals))
             ]
     if unexplained:
         nearest = [c for c in rejected if not search.part_of(c, base)][:_NEAREST]

@@ -1,6 +1,6 @@
 """The search for causes: proposed on half of the recordings, confirmed on the others."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -10,7 +10,7 @@ from sb3_hds.sysid.comparison.halves import Base, Effort, Half, Tried
 from sb3_hds.sysid.comparison.held_out import LEAST_BIC, Comparison, passes
 from sb3_hds.sysid.comparison.inference import aliased_with
 from sb3_hds.sysid.comparison.ranking import Ranking
-from sb3_hds.sysid.comparison.starts import Here, Places, guesses
+from sb3_hds.sysid.comparison.starts import Here, guesses
 from sb3_hds.sysid.diagnosis.progress import Bar
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point, in_threads
@@ -26,36 +26,53 @@ _Given = TypeVar("_Given")
 _Told = TypeVar("_Told")
 
 
-class _Reached(NamedTuple):
+class Place(NamedTuple):
     """
-    How far the fit of a candidate has come.
+    Where a fit of a candidate ended, or may begin.
 
     :param theta: all parameters, shape ``(p,)``
     :param offsets: of the start states of the windows that it was fitted to, shape ``(n, free)``
-    :param free: what was believed beside it
+    :param free: what was refitted beside it; beside another model, only its own values count
+    :param blind: whether the slope at the null is no guide to the candidate
+    :param start: of several starts, the best one
     """
 
     theta: np.ndarray
     offsets: np.ndarray
     free: tuple[int, ...]
+    blind: bool = False
+    start: Mapping[str, float] | None = None
 
 
-class Search:
+class Rough(NamedTuple):
     """
-    Candidates on two halves of the evidence.
+    A candidate beside a model, fitted roughly on a sample of windows, or guessed only.
+
+    :param cost: of the sample; infinite where it was only guessed
+    """
+
+    candidate: Candidate
+    place: Place
+    cost: float
+
+
+class Search(NamedTuple):
+    """
+    Candidates on two halves of the evidence. What it answers depends on nothing that it was asked
+    before: where fits begin is an argument.
 
     :param select: on which candidates are fitted and ranked
     :param confirm: on which the best is confirmed
     :param effort: how long to search
     :param bar: shows how far it is
+    :param places: of candidates by key, where fits beside the nominal model ended
     """
 
-    def __init__(self, select: Half, confirm: Half, effort: Effort, bar: Bar) -> None:
-        self.select, self.confirm, self.effort, self.bar = select, confirm, effort, bar
-        self._reached: dict[str, _Reached] = {}
-        self._far: set[str] = set()
-        # Of searches with several starts, the best one, by what is believed.
-        self._known: dict[tuple[str, ...], Places] = {}
+    select: Half
+    confirm: Half
+    effort: Effort
+    bar: Bar
+    places: Mapping[str, Place] = {}
 
     @property
     def hypotheses(self) -> Hypotheses:
@@ -69,11 +86,24 @@ class Search:
     def ranking(self) -> Ranking:
         return Ranking(self.select, self.confirm)
 
-    def set_noise(self, noise: Float[np.ndarray, " obs"]) -> None:
-        self.select, self.confirm = (
+    def with_noise(self, noise: Float[np.ndarray, " obs"]) -> "Search":
+        select, confirm = (
             half._replace(evidence=half.evidence.with_noise(noise))
             for half in (self.select, self.confirm)
         )
+        return self._replace(select=select, confirm=confirm)
+
+    def from_places(self, screened: Sequence[Rough], fitted: Sequence[Tried]) -> "Search":
+        """
+        :param screened: candidates beside the nominal model
+        :param fitted: those of them that were fitted to the end
+        :return: a search whose fits begin there
+        """
+        places = {rough.candidate.key: rough.place for rough in screened}
+        for tried in fitted:
+            key, point = tried.candidate.key, tried.point
+            places[key] = places[key]._replace(theta=point.theta, offsets=point.offsets)
+        return self._replace(places=places)
 
     def base(
         self,
@@ -132,72 +162,78 @@ class Search:
         offsets = np.concatenate([base.point.offsets, base.kept.offsets])
         return every, every.evidence.fit(base.point.theta, base.free, offsets)
 
-    def screen(self, base: Base, accepted: Sequence[str]) -> list[tuple[Candidate, Point]]:
+    def screen(self, base: Base, accepted: Sequence[str]) -> list[Rough]:
         """
         :param accepted: keys of candidates that the model contains
-        :return: promising candidates, fitted roughly on a sample of windows, best first
+        :return: promising candidates, fitted roughly on a sample of windows, best first; then the
+            others
         """
         left = [c for c in self.hypotheses.candidates if c.key not in accepted]
         here = self._on_a_sample(base)
-        evidence, first = here.evidence, here.point
-        guessed = guesses(here, left, self._known.setdefault(tuple(accepted), {}))
-        begin = {}
-        for candidate, guess in zip(left, guessed, strict=True):
-            begin[candidate.key] = _Reached(guess.theta, guess.offsets, base.free)
-            self._reached.setdefault(candidate.key, begin[candidate.key])
-            if guess.blind:
-                self._far.add(candidate.key)
-        blind = [c for c, guess in zip(left, guessed, strict=True) if guess.blind]
+        same = {k: p.start for k, p in self.places.items() if p.start and p.free == base.free}
+        guessed = guesses(here, left, same)
+        places = {
+            c.key: Place(guess.theta, guess.offsets, base.free, guess.blind, guess.start)
+            for c, guess in zip(left, guessed, strict=True)
+        }
+        blind = [c for c in left if places[c.key].blind]
         seen = [(guess.gain, c) for c, guess in zip(left, guessed, strict=True) if not guess.blind]
         seen = sorted(seen, key=lambda pair: -pair[0])[: self.effort.guessed]
         likely = [*blind, *(candidate for _, candidate in seen)]
 
-        def glance(candidate: Candidate) -> Point:
-            own = self.hypotheses.indices(candidate)
-            places = [begin[candidate.key]]
-            if self._reached[candidate.key] is not places[0]:
-                places.append(self._reached[candidate.key])
-            theta, offsets = self._begin(candidate, first, base.free, evidence, places)
+        def fit_roughly(candidate: Candidate) -> Rough:
+            place, earlier = places[candidate.key], self.places.get(candidate.key)
+            blind = place.blind or (earlier is not None and earlier.blind)
+            nearby = [place] if earlier is None else [place, earlier]
+            theta, offsets = self._begin(candidate, here.point, base.free, here.evidence, nearby)
+            moving = [*base.free, *self.hypotheses.indices(candidate)]
             # The way is longer for what began elsewhere.
-            steps = self.effort.steps * (2 if candidate.key in self._far else 1)
-            return evidence.fit(theta, [*base.free, *own], offsets, steps)
+            steps = self.effort.steps * (2 if blind else 1)
+            point = here.evidence.fit(theta, moving, offsets, steps)
+            place = place._replace(theta=point.theta, offsets=point.offsets, blind=blind)
+            return Rough(candidate, place, point.cost)
 
-        points = self._each(glance, likely)
-        ranked = sorted(zip(likely, points, strict=True), key=lambda pair: pair[1].cost)
-        for candidate, point in ranked:
-            self._reached[candidate.key] = _Reached(point.theta, point.offsets, base.free)
-        return ranked
+        ranked = sorted(self._each(fit_roughly, likely), key=lambda rough: rough.cost)
+        rest = [c for c in left if c not in likely]
+        return ranked + [Rough(c, self.places.get(c.key, places[c.key]), np.inf) for c in rest]
 
-    def finalists(self, base: Base, accepted: Sequence[str]) -> list[Tried]:
+    def finalists(
+        self, base: Base, accepted: Sequence[str], screened: Sequence[Rough] | None = None
+    ) -> list[Tried]:
         """
         :param accepted: keys of candidates that the model contains
+        :param screened: candidates beside this model, if that was asked already
         :return: the most promising candidates, fitted to the end, best first
         """
-        ranked = self.screen(base, accepted)
-        return self.fit([candidate for candidate, _ in ranked[: self.effort.finalists]], base)
+        screened = self.screen(base, accepted) if screened is None else screened
+        best = [r for r in screened[: self.effort.finalists] if np.isfinite(r.cost)]
+        near = {rough.candidate.key: rough.place for rough in best}
+        return self.fit([rough.candidate for rough in best], base, near)
 
     def fit(
         self,
         candidates: Sequence[Candidate],
         base: Base,
+        near: Mapping[str, Place] | None = None,
         rival: float = np.inf,
         n_steps: int = _ALL_STEPS,
     ) -> list[Tried]:
         """
+        :param near: where fits begin, of candidates by key; default: where those beside the nominal
+            model ended, and of others where a Newton step leads
         :param rival: cost to come below; what does not is given up
         :param n_steps: at most
         :return: these candidates, fitted to the end, best first
         """
-        self._guess([c for c in candidates if c.key not in self._reached], base)
+        places = {**self.places, **(near or {})}
+        places |= self._guessed([c for c in candidates if c.key not in places], base)
 
         def finish(candidate: Candidate) -> Tried:
-            point = self._continued(candidate, base, rival, n_steps)
-            self._reached[candidate.key] = _Reached(point.theta, point.offsets, base.free)
+            place = places[candidate.key]
+            point = self._continued(candidate, base, place, rival, n_steps)
             if point.cost >= rival:
                 return Tried(candidate, point, base.kept, -np.inf)
-            half = self.confirm.evidence
-            offsets = self._starts(candidate, point.theta, base.kept.offsets, half)
-            kept = half.fit(point.theta, (), offsets, _KEPT_STEPS)
+            kept = self._kept(place, point.theta, base.kept.offsets, _KEPT_STEPS)
             return Tried(
                 candidate, point, kept, self.ranking.criterion([candidate], point, base.point)
             )
@@ -207,7 +243,6 @@ class Search:
 
     def fit_nameless(self, base: Base, roughly: bool = False) -> list[Tried]:
         """:return: flexible forces beside the model, fitted to the end or roughly, best first"""
-        self._guess(self.hypotheses.nameless, base)
         n_steps = _FEW_STEPS if roughly else _ALL_STEPS
         return self.fit(self.hypotheses.nameless, base, n_steps=n_steps)
 
@@ -218,18 +253,17 @@ class Search:
         :param rival: cost to come below; what does not is given up
         :return: the same candidates in the place of these causes, fitted to the end, best first
         """
-        for tried in beside:
-            theta, offsets = tried.point.theta, tried.point.offsets
-            self._reached[tried.candidate.key] = _Reached(theta, offsets, ())
-        return self.fit([tried.candidate for tried in beside], without, rival)
+        return self.fit([t.candidate for t in beside], without, places_of(beside), rival)
 
-    def _guess(self, candidates: Sequence[Candidate], base: Base) -> None:
+    def _guessed(self, candidates: Sequence[Candidate], base: Base) -> dict[str, Place]:
         """Where fits of candidates begin."""
         if not candidates:
-            return
+            return {}
         guessed = guesses(self._on_a_sample(base), candidates, {})
-        for candidate, guess in zip(candidates, guessed, strict=True):
-            self._reached[candidate.key] = _Reached(guess.theta, guess.offsets, base.free)
+        return {
+            c.key: Place(guess.theta, guess.offsets, base.free)
+            for c, guess in zip(candidates, guessed, strict=True)
+        }
 
     def fit_aliased(self, best: Tried, tried: Sequence[Tried], base: Base) -> list[Tried]:
         """
@@ -251,16 +285,15 @@ class Search:
         self, base: Base, tried: Sequence[Tried]
     ) -> list[tuple[Candidate, Comparison]]:
         """
-        :return: candidates that were no finalists, with their rough fits, compared on the other
-            half
+        :param tried: finalists beside the nominal model
+        :return: candidates that were none, with their rough fits, compared on the other half
         """
         done = [t.candidate.key for t in tried]
         rest = [c for c in self.hypotheses.candidates if c.key not in done]
 
         def verdict(candidate: Candidate) -> Comparison:
-            theta, half = self._reached[candidate.key].theta, self.confirm.evidence
-            offsets = self._starts(candidate, theta, base.kept.offsets, half)
-            kept = half.fit(theta, (), offsets, _ROUGH_STEPS)
+            place = self.places[candidate.key]
+            kept = self._kept(place, place.theta, base.kept.offsets, _ROUGH_STEPS)
             return self.ranking.compare_nested(kept, base.kept)
 
         return list(zip(rest, self._each(verdict, rest), strict=True))
@@ -291,11 +324,12 @@ class Search:
         """:return: whether the model is significantly worse without this candidate"""
         return passes(self.ranking.compare_nested(base.kept, self.without(base, candidate).kept))
 
-    def _continued(self, candidate: Candidate, base: Base, rival: float, n_steps: int) -> Point:
+    def _continued(
+        self, candidate: Candidate, base: Base, place: Place, rival: float, n_steps: int
+    ) -> Point:
         evidence = self.select.evidence
         moving = [*base.free, *self.hypotheses.indices(candidate)]
-        places = [self._reached[candidate.key]]
-        theta, offsets = self._begin(candidate, base.point, base.free, evidence, places)
+        theta, offsets = self._begin(candidate, base.point, base.free, evidence, [place])
         point = evidence.fit(theta, moving, offsets, n_steps, rival)
         return min(base.point, point, key=lambda p: p.cost)
 
@@ -305,13 +339,13 @@ class Search:
         believed: Point,
         free: tuple[int, ...],
         evidence: Evidence,
-        places: Sequence[_Reached],
+        places: Sequence[Place],
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        :param places: where the candidate is now; beside another belief, only its own values count
-        :return: the one of them that explains most, with the start states that explain each window
-            best there
+        :return: the one of several places that explains most, with the start states that explain
+            each window best there
         """
+        blind = any(place.blind for place in places)
         tried = []
         for place in places:
             theta, moving = believed.theta.copy(), list(self.hypotheses.indices(candidate))
@@ -321,18 +355,19 @@ class Search:
                 if len(place.offsets) == evidence.shots.n:
                     offsets.append(place.offsets)
             theta[moving] = place.theta[moving]
-            far = candidate.key in self._far
-            tried.append((theta, *evidence.nearest(theta, offsets, measured=far)))
+            tried.append((theta, *evidence.nearest(theta, offsets, measured=blind)))
         theta, offsets, _ = min(tried, key=lambda one: one[2])
         return theta, offsets
 
-    def _starts(
-        self, candidate: Candidate, theta: np.ndarray, offsets: np.ndarray, evidence: Evidence
-    ) -> np.ndarray:
-        """Far from what is believed, its start states may be those of another motion."""
-        if candidate.key not in self._far:
-            return offsets
-        return evidence.nearest(theta, [offsets], measured=True)[0]
+    def _kept(self, place: Place, theta: np.ndarray, offsets: np.ndarray, n_steps: int) -> Point:
+        """
+        The start states of the half that confirms. Far from the model, they may be those of another
+        motion.
+        """
+        half = self.confirm.evidence
+        if place.blind:
+            offsets = half.nearest(theta, [offsets], measured=True)[0]
+        return half.fit(theta, (), offsets, n_steps)
 
     def _on_a_sample(self, base: Base) -> Here:
         """Of the windows that select, at most so many as the effort allows."""
@@ -346,3 +381,8 @@ class Search:
 
     def _each(self, work: Callable[[_Given], _Told], given: Sequence[_Given]) -> list[_Told]:
         return list(self.bar.over(in_threads(work, given), len(given)))
+
+
+def places_of(fitted: Sequence[Tried]) -> dict[str, Place]:
+    """:return: where fits of these candidates ended, by key"""
+    return {t.candidate.key: Place(t.point.theta, t.point.offsets, ()) for t in fitted}

@@ -172,7 +172,8 @@ def _accepted(
     equal = [k for k in others if k not in worse]
     chance = float(scipy.stats.t.sf(member.t, _FREEDOM)) * len(known)
     same = Tried(candidate, base.point, base.kept, member.gain)
-    return Accepted(same, verdict, tuple(equal), min(chance, 1.0))
+    rivals = tuple(t for t in tried if t.candidate.key in equal)
+    return Accepted(same, verdict, tuple(equal), min(chance, 1.0), rivals=rivals)
 
 
 def _at_own_joint(half: Half, candidate: Candidate, new: Point, old: Point) -> Comparison:

@@ -1,7 +1,7 @@
 """Where fits of candidates begin, and which of them are worth one."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -22,9 +22,6 @@ _FARTHEST = 10.0
 # largest curvature do not move.
 _FLAT, _RANK = 1e-15, 1e-9
 
-#: values of parameters by full name, of candidates by key
-Places: TypeAlias = dict[str, tuple[Mapping[str, float], ...]]
-
 
 class Guess(NamedTuple):
     """
@@ -33,12 +30,14 @@ class Guess(NamedTuple):
     :param offsets: and with which start states, shape ``(n, free)``
     :param blind: what the slope says where nothing is wrong is no guide: it is none, or it leads
         nowhere although things are better farther away
+    :param start: of several starts, the best one: values of parameters by full name
     """
 
     gain: float
     theta: Float[np.ndarray, " p"]
     offsets: Float[np.ndarray, "n free"]
     blind: bool
+    start: Mapping[str, float] | None = None
 
 
 class Here(NamedTuple):
@@ -57,11 +56,13 @@ class Here(NamedTuple):
     steps: int
 
 
-def guesses(here: Here, candidates: Sequence[Candidate], known: Places) -> list[Guess]:
+def guesses(
+    here: Here, candidates: Sequence[Candidate], known: Mapping[str, Mapping[str, float]]
+) -> list[Guess]:
     """
     What one Newton step promises, and where it leads; elsewhere if that is no guide.
 
-    :param known: starts that were best before; those found now are added
+    :param known: of candidates with several starts, by key, the one that is known to be best
     """
     h, point = here.evidence.hypotheses, here.point
     slopes = here.evidence.slopes(point)
@@ -71,10 +72,10 @@ def guesses(here: Here, candidates: Sequence[Candidate], known: Places) -> list[
 
     def guess(candidate: Candidate) -> Guess:
         if candidate.key in h.starts:
-            starts = known.get(candidate.key, h.starts[candidate.key])
-            best, found = _from_starts(here, candidate, starts)
-            known[candidate.key] = (best,)
-            return found
+            best = known.get(candidate.key)
+            return _from_starts(
+                here, candidate, h.starts[candidate.key] if best is None else [best]
+            )
         own = list(h.indices(candidate))
         step, gain = newton(curvature, score, [*here.free, *own], room)
         theta, blind = point.theta + h.scale * step, bool(flat[own].any())
@@ -129,13 +130,11 @@ def _farther(here: Here, candidate: Candidate, gain: float) -> Float[np.ndarray,
     return places[int(np.argmin(costs))] if min(costs) < point.cost - gain else None
 
 
-def _from_starts(
-    here: Here, candidate: Candidate, starts: Sequence[Mapping[str, float]]
-) -> tuple[Mapping[str, float], Guess]:
+def _from_starts(here: Here, candidate: Candidate, starts: Sequence[Mapping[str, float]]) -> Guess:
     """
     What fits of the others promise where some parameters stay at one of several values.
 
-    :return: the best of these, and where a fit of all may begin
+    :return: at the best of these, where a fit of all may begin
     """
     h = here.evidence.hypotheses
     fixed = {h.names.index(name) for name in starts[0]}
@@ -150,7 +149,8 @@ def _from_starts(
     ]
     best = int(np.argmin([fitted.cost for fitted in fits]))
     there = fits[best]
-    return promising[best], Guess(here.point.cost - there.cost, there.theta, there.offsets, False)
+    gain = here.point.cost - there.cost
+    return Guess(gain, there.theta, there.offsets, False, promising[best])
 
 
 def _at(here: Here, start: Mapping[str, float]) -> Float[np.ndarray, " p"]:

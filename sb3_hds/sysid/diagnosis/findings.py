@@ -44,6 +44,7 @@ class Accepted(NamedTuple):
     :param of_equation: whether these are told, rather than those of a simulation
     :param doubts: by parameter, half the width of an interval that comes from not knowing whether
         there is one cause more
+    :param rivals: the alternatives as they were fitted, those that were simulated
     """
 
     tried: Tried
@@ -54,6 +55,7 @@ class Accepted(NamedTuple):
     sizes: Mapping[str, tuple[float, float, float]] = {}
     of_equation: bool = False
     doubts: Mapping[str, float] = {}
+    rivals: tuple[Tried, ...] = ()
 
 
 def finding(

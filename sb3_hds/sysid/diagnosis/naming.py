@@ -8,7 +8,7 @@ import numpy as np
 from sb3_hds.sysid.comparison.halves import Base, Tried
 from sb3_hds.sysid.comparison.held_out import Comparison, as_good, passes
 from sb3_hds.sysid.comparison.inference import family_p_value, standard_errors
-from sb3_hds.sysid.comparison.search import Search
+from sb3_hds.sysid.comparison.search import Search, places_of
 from sb3_hds.sysid.diagnosis.findings import (
     ANOTHER,
     CHANCE,
@@ -232,7 +232,8 @@ class Naming:
         rivals = [*tried, *self.search.fit_aliased(best, tried, base)]
         others = self.search.ranking.alternatives(best, rivals, base)
         verdict = self.search.ranking.compare_nested(best.kept, base.kept)
-        return Accepted(best, verdict, others, chance)
+        fitted = tuple(t for t in rivals if t.candidate.key in others)
+        return Accepted(best, verdict, others, chance, rivals=fitted)
 
     def _asked_again(self, one: Accepted, base: Base) -> Accepted:
         """A cause beside what looks like it, now that the other causes are known."""
@@ -240,7 +241,7 @@ class Naming:
         names = (one.tried.candidate.key, *one.alternatives)
         named = [c for c in self.search.hypotheses.candidates if c.key in names]
         named = [c for c in named if not self.search.part_of(c, without)]
-        tried = self.search.fit(named, without)
+        tried = self.search.fit(named, without, places_of([one.tried, *one.rivals]))
         same = next(t for t in tried if t.candidate is one.tried.candidate)
         return self._accepted(same, tried, without, one.chance)
 

@@ -89,8 +89,10 @@ class Inquiry:
         """Set up both halves of the data, and typical sizes of the parameters on this machine."""
         select, confirm = self.given.halves()
         self.hypotheses = select.evidence.hypotheses
-        self.search = Search(select, confirm, self.effort, self.bar)
-        self.residuals = Residuals(self.given, self.search, self.seed)
+        self._use(Search(select, confirm, self.effort, self.bar))
+
+    def _use(self, search: Search) -> None:
+        self.search, self.residuals = search, Residuals(self.given, search, self.seed)
 
     def run(self) -> Diagnosis:
         if self.given.convention is not None:
@@ -103,8 +105,10 @@ class Inquiry:
         self.settle_noise()
         start = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
         self.bar.stage("comparing causes")
+        screened = self.search.screen(start, [])
+        firsts = self.search.finalists(start, [], screened)
+        self._use(self.search.from_places(screened, firsts))
         naming = Naming(self.search, start, self.seed, family=self._family())
-        firsts = self.search.finalists(start, [])
         rejected = self._weighed(firsts, start)
         found, base = naming.one_by_one(firsts)
         self.bar.stage("confirming causes")
@@ -238,15 +242,18 @@ class Inquiry:
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
         self._set_noise(base.point)
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
-        likely = [candidate for candidate, _ in self.search.screen(base, [])[:_FOR_NOISE]]
-        tried = self.search.fit(likely, base)
+        screened = self.search.screen(base, [])
+        likely = screened[:_FOR_NOISE]
+        near = {rough.candidate.key: rough.place for rough in likely}
+        tried = self.search.fit([rough.candidate for rough in likely], base, near)
+        self._use(self.search.from_places(screened, tried))
         self._set_noise(min((base.point, *(t.point for t in tried)), key=lambda p: p.cost))
 
     def _set_noise(self, point: Point) -> None:
         most = _WORST * self.given.spread
         error = np.minimum(np.where(np.isfinite(point.raw), np.abs(point.raw), np.inf), most)
         noise = np.mean(error**2, (0, 1)) + (IRRELEVANT * self.given.spread) ** 2
-        self.search.set_noise(np.sqrt(noise))
+        self._use(self.search.with_noise(np.sqrt(noise)))
 
     def _detectable(self, start: Base) -> dict[str, dict[str, float]]:
         """
