@@ -3,10 +3,11 @@ The cost of a diagnosis against the number of joints.
 
     python benchmarks/joints_cost.py
     python benchmarks/joints_cost.py --joints 1 6 --budgets quick
+    python benchmarks/joints_cost.py --joints 6 --budgets quick --seconds 3600 --rate 1000
     python benchmarks/joints_cost.py --report-only
 
-Arms of 1 to 12 hinges on MuJoCo's engine, 30 s at 125 Hz of smooth random torques, positions and
-velocities with noise. Every joint has viscous and dry friction that the model file lacks. Each row
+Arms of 1 to 12 hinges on MuJoCo's engine, 30 s at 125 Hz (or as asked) of smooth random torques,
+positions and velocities with noise. Every joint has viscous and dry friction that the model file lacks. Each row
 is a fresh process with nothing compiled beforehand; starting Python and making the data do not
 count. Processor seconds are those of all cores, and hardly depend on what else the machine does.
 Proposals are done when the whole set of causes is known by the equation of motion; the verdict,
@@ -27,7 +28,8 @@ from runs import RESULTS, fresh_process, resume, seconds_since_start
 
 JOINTS = (1, 2, 3, 6, 12)
 BUDGETS = ("quick", "full")
-_RATE, _SECONDS, _SUBSTEPS = 125, 30, 8
+_RATE, _SECONDS = 125, 30
+_ENGINE_RATE = 1000  # [Hz]
 # Standard deviation of noise in units of what each channel does, of commands [N m] at the first
 # joint, and the share of these that is left from joint to joint.
 _NOISE, _COMMAND, _LESS = 2e-3, 6.0, 0.8
@@ -38,24 +40,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument("--joints", nargs="*", type=int, default=list(JOINTS))
     parser.add_argument("--budgets", nargs="*", default=list(BUDGETS), choices=BUDGETS)
+    parser.add_argument("--seconds", type=int, default=_SECONDS)
+    parser.add_argument("--rate", type=int, default=_RATE, choices=(125, 250, 500, 1000))
     parser.add_argument("--report-only", action="store_true")
-    parser.add_argument("--worker", nargs=2, metavar=("JOINTS", "BUDGET"))
+    parser.add_argument("--worker", nargs=4, metavar=("JOINTS", "SECONDS", "RATE", "BUDGET"))
     arguments = parser.parse_args()
     if arguments.worker:
-        joints, budget = arguments.worker
-        print(json.dumps(worker(int(joints), budget)))
+        *numbers, budget = arguments.worker
+        print(json.dumps(worker(*map(int, numbers), budget)))
         return
     if not arguments.report_only:
-        wanted = [(n, budget) for n in arguments.joints for budget in arguments.budgets]
-        resume("joints_cost", ("joints", "budget"), wanted, measured, jobs=1)
+        given = arguments.seconds, arguments.rate
+        wanted = [(n, *given, budget) for n in arguments.joints for budget in arguments.budgets]
+        resume(
+            "joints_cost", ("joints", "seconds", "rate [Hz]", "budget"), wanted, measured, jobs=1
+        )
     print(pd.read_csv(RESULTS / "joints_cost.csv").to_string(index=False, float_format="%.3g"))
 
 
-def measured(joints: int, budget: str) -> list[dict]:
-    return [fresh_process(__file__, joints, budget)]
+def measured(joints: int, seconds: int, rate: int, budget: str) -> list[dict]:
+    return [fresh_process(__file__, joints, seconds, rate, budget)]
 
 
-def recorded(joints: int) -> Any:
+def recorded(joints: int, seconds: int, rate: int) -> Any:
     """:return: one recording of an arm with friction that its file lacks"""
     import mujoco
 
@@ -64,31 +71,32 @@ def recorded(joints: int) -> Any:
     rng = np.random.default_rng(joints)
     torque = _COMMAND * _LESS ** np.arange(joints)
     model = mujoco.MjModel.from_xml_string(arm(joints))
-    model.opt.timestep = 1.0 / (_RATE * _SUBSTEPS)
+    model.opt.timestep = 1.0 / _ENGINE_RATE
     model.dof_damping[:] += _VISCOUS * torque
     model.dof_frictionloss[:] = _DRY * torque
     data = mujoco.MjData(model)
-    n = _RATE * _SECONDS
-    time_ = np.arange(n) / _RATE
+    n = rate * seconds
+    time_ = np.arange(n) / rate
     waves = 2.0 * np.pi * rng.uniform(0.2, 2.0, (8, joints))
     phases = rng.uniform(0.0, 2.0 * np.pi, (8, joints))
-    commands = np.sin(time_[:, None, None] * waves + phases).sum(1) / 2.0 * torque
+    waving = (np.sin(time_[:, None] * w + p) for w, p in zip(waves, phases, strict=True))
+    commands = sum(waving) / 2.0 * torque
     seen = [np.concatenate([data.qpos, data.qvel])]
     for command in commands:
         data.ctrl[:] = command
-        for _ in range(_SUBSTEPS):
+        for _ in range(_ENGINE_RATE // rate):
             mujoco.mj_step(model, data)
         seen.append(np.concatenate([data.qpos, data.qvel]))
     obs = np.array(seen)
     obs += _NOISE * obs.std(0) * rng.normal(size=obs.shape)
-    return Trajectories.from_arrays([obs], [commands], dt=1.0 / _RATE)
+    return Trajectories.from_arrays([obs], [commands], dt=1.0 / rate)
 
 
-def worker(joints: int, budget: str) -> dict:
+def worker(joints: int, seconds: int, rate: int, budget: str) -> dict:
     from sb3_hds import diagnose, twins
     from sb3_hds.sysid.diagnosis import preparation
 
-    data = recorded(joints)
+    data = recorded(joints, seconds, rate)
     twin = twins.from_mujoco(arm(joints), dt=data.dt)
     proposed: dict[str, float] = {}
     screen = preparation.screen
