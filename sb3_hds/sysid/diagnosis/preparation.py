@@ -51,6 +51,13 @@ _SAMPLES, _SUBSTEPS = 100, 200
 # Longest sub-step of Runge-Kutta, in shares of the time in which dry friction stops a joint: the
 # longer it is, the more the twin smooths it. And by how many times there may be more of them.
 _OF_STOP, _MOST_FINER = 0.02, 16
+# Rows of an equation of motion, at most: of one joint, and of several, divided by their number
+# squared, since each joint adds columns that every joint's equation has. An hour of six joints, a
+# thousand times a second, fits 8 GiB then.
+_MOST_ROWS, _MOST_ROWS_OF_JOINTS = 100_000, 1_000_000
+# Of longer recordings, stretches of so many periods are used, and at least so many of them; a few
+# of this number of rows tell the period.
+_STRETCH, _FEWEST_STRETCHES, _LOOK = 10, 16, 10_000
 # Rows at which the twin is linearised, and finite differences in shares of the motion.
 _SOME, _STEP = 64, 1e-5
 
@@ -191,6 +198,7 @@ def prepare(
     """
     bar.stage("reading the log")
     data, audited, corrected = _without_glitches(twin, data)
+    data, shortened = shortened_to(twin, data)
     data, in_time = in_step(twin, data)
     sensor_noise = noise_of(data)
     twin, data, as_logged = in_step_with_the_log(twin, data)
@@ -219,7 +227,7 @@ def prepare(
         shots, origin = _rows_of(shots, some), origin[some]
     return Prepared(
         audit=audited,
-        corrected=(*corrected, *in_time, *as_logged),
+        corrected=(*corrected, *shortened, *in_time, *as_logged),
         sensor_noise=sensor_noise,
         data=data,
         every=every,
@@ -262,6 +270,42 @@ def _audited(twin: Twin, data: Trajectories) -> Audit:
     found = audit(data, twin=twin)
     left = tuple(one for one in found.findings if not isinstance(one, BackwardDifference))
     return dataclasses.replace(found, findings=left)
+
+
+def shortened_to(twin: Twin, data: Trajectories) -> tuple[Trajectories, tuple[str, ...]]:
+    """
+    :param data: sampled at the twin's ``dt``
+    :return: of recordings that are too long for memory, stretches from all over them, and a
+        sentence on that; others as they are
+    """
+    most = min(_MOST_ROWS, _MOST_ROWS_OF_JOINTS // len(twin.joints) ** 2)
+    if data.n_steps <= most:
+        return data, ()
+    sample = _stretches(data, _LOOK, _LOOK * _FEWEST_STRETCHES)
+    moved = motion(twin, sample)
+    most *= max(1, int(moved.fastest / (_SAMPLES * data.dt)))
+    if data.n_steps <= most:
+        return data, ()
+    length = max(round(_STRETCH * moved.typical_period / data.dt), 1)
+    cut = _stretches(data, min(length, most // _FEWEST_STRETCHES), most)
+    return cut, (
+        f"Of {data.n_steps * data.dt:.4g} s, {cut.n_steps * data.dt:.4g} s are used: {len(cut)} "
+        f"stretches of {cut.lengths[0] * data.dt:.3g} s from all over the recordings.",
+    )
+
+
+def _stretches(data: Trajectories, length: int, most: int) -> Trajectories:
+    """
+    :param length: of a stretch [steps]; all are shorter where recordings are
+    :param most: steps of all stretches together, unless a single one is longer
+    :return: stretches without overlap, one at random out of each of as many equal parts of the data
+    """
+    shortest, longest = int(data.lengths.min()), int(data.lengths.max())
+    length = min(length, shortest if 10 * shortest > length else longest)
+    every = data.windows(length)
+    parts = np.array_split(np.arange(len(every)), min(max(most // length, 1), len(every)))
+    rng = np.random.default_rng(0)
+    return every[[int(rng.choice(part)) for part in parts]]
 
 
 class Thinned(NamedTuple):
