@@ -7,9 +7,10 @@ The cost of a diagnosis against the number of joints.
     python benchmarks/joints_cost.py --report-only
 
 Arms of 1 to 12 hinges on MuJoCo's engine, 30 s at 125 Hz (or as asked) of smooth random torques,
-positions and velocities with noise. Every joint has viscous and dry friction that the model file lacks. Each row
-is a fresh process with nothing compiled beforehand; starting Python and making the data do not
-count. Processor seconds are those of all cores, and hardly depend on what else the machine does.
+positions and velocities with noise. Every joint has viscous and dry friction that the model file
+lacks. Each row is a fresh process with nothing compiled beforehand; starting Python and making the
+data do not count. Processor seconds are those of all cores, and hardly depend on what else the
+machine does.
 Proposals are done when the whole set of causes is known by the equation of motion; the verdict,
 when it has been judged by simulation.
 """
