@@ -247,6 +247,7 @@ def screen(
     if small or len(set_of) < 2:
         keys |= {*(k for m in set_of for k in m.others), *_singles(p), *hints}
         keys |= _without_column(hypotheses, p, moved, where)
+        keys |= _of_one_scale(p, keys)
     return Screened(
         hypotheses=hypotheses,
         problem=p,
@@ -264,6 +265,16 @@ def _members_of(h: Hypotheses, p: Problem, items: Sequence[int]) -> tuple[Member
     effects = {c.key: h.effect_of(c) for c in h.candidates}
     found = members(p, [*p.always, *items], effects)
     return tuple(m for m in found if m.item not in p.always)
+
+
+def _of_one_scale(p: Problem, keys: Collection[str]) -> set[str]:
+    """Where a gain is tried, the masses: the equation is homogeneous in both together."""
+    names = {key.partition(".")[0] for key in keys}
+    if not names & {"torque_gain", "directional_gain"}:
+        return set()
+    return {
+        item.key for item in p.items if item.candidate.slot == PARAMETER and item.key in p.slopes
+    }
 
 
 def _singles(p: Problem) -> set[str]:
