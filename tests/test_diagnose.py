@@ -257,7 +257,7 @@ def test_the_gain_is_the_geometric_mean_over_units():
     found = compare(new, old, unit)
 
     assert found.gain == pytest.approx(1.0 - 0.5)
-    assert found.n_units == 2 and found.low <= found.gain <= found.high
+    assert found.n_clusters == 2 and found.low <= found.gain <= found.high
 
 
 # Binomial(1000, rate) is above the last number once in 1000 cases. Of the 5 units' 2.5 %, the test

@@ -142,14 +142,14 @@ def _typical(search: Search, theta: np.ndarray) -> np.ndarray:
 def joint_covariance(half: Half, point: Point, free: Sequence[int]) -> np.ndarray:
     """
     :param free: indices of what was fitted
-    :return: their covariance, by the jackknife over units, shape ``(k, k)``; infinite where slopes
-        are not finite
+    :return: their covariance, by the jackknife over clusters, shape ``(k, k)``; infinite where
+        slopes are not finite
     """
     scale = half.evidence.hypotheses.scale[list(free)]
     slopes = half.evidence.slopes(point, free)
-    covariance = jackknife(slopes, half.unit)
+    covariance = jackknife(slopes, half.cluster)
     # Fewer units than parameters leave directions in which nothing was left out.
-    if np.isfinite(covariance).all() and len(np.unique(half.unit)) <= len(free):
+    if np.isfinite(covariance).all() and len(np.unique(half.cluster)) <= len(free):
         total = slopes.curvature.sum(0)
         covariance = covariance + np.linalg.pinv(total, rcond=_RANK, hermitian=True)
     return covariance * np.outer(scale, scale)

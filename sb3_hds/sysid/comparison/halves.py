@@ -15,13 +15,13 @@ NOT_FINITE = 1e8
 class Half(NamedTuple):
     """
     :param evidence: windows of one half of the recordings
-    :param unit: piece of evidence of each window, shape ``(n,)``
+    :param cluster: cluster of correlated errors that each window belongs to, shape ``(n,)``
     :param irrelevant: region of practical equivalence: error of each channel that is too small to
         matter, shape ``(n_obs,)``
     """
 
     evidence: Evidence
-    unit: Int[np.ndarray, " n"]
+    cluster: Int[np.ndarray, " n"]
     irrelevant: Float[np.ndarray, " obs"]
 
     def errors(self, point: Point) -> Float[np.ndarray, " n"]:

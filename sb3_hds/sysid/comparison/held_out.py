@@ -8,11 +8,11 @@ from jaxtyping import Float, Int
 
 from sb3_hds.core import Trajectories
 
-# With fewer recordings, stretches of them are the units, about so many.
-_FEWEST_UNITS, _N_STRETCHES = 8, 16
+# With fewer recordings, stretches of them are the clusters, about so many.
+_FEWEST_CLUSTERS, _N_STRETCHES = 8, 16
 # Ratios of errors beyond this say no more.
 _MOST_RATIO = 1e6
-# By which factor the level of the test on windows is stricter than that on units.
+# By which factor the level of the test on windows is stricter than that on clusters.
 _STRICTER = 25.0
 # Errors beyond this, in units of the noise, say no more.
 _MOST_ERROR = 1e4
@@ -33,28 +33,28 @@ class Comparison(NamedTuple):
     :param p_value: one-sided p-value of the hypothesis that there is no gain
     :param low: lower end of the 90 % interval of the gain
     :param high: upper end
-    :param n_units: clusters
+    :param n_clusters: clusters
     """
 
     gain: float
     p_value: float
     low: float
     high: float
-    n_units: int
+    n_clusters: int
 
 
 class Split(NamedTuple):
     """
-    :param unit: cluster of each window, -1 for padding, shape ``(n,)``
+    :param cluster: cluster of each window, -1 for padding, shape ``(n,)``
     :param confirm: whether the window is kept from selection, shape ``(n,)``
     """
 
-    unit: Int[np.ndarray, " n"]
+    cluster: Int[np.ndarray, " n"]
     confirm: np.ndarray
 
 
 def compare(
-    new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], unit: Int[np.ndarray, " n"]
+    new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], cluster: Int[np.ndarray, " n"]
 ) -> Comparison:
     """
     A t test on the logarithms of error ratios, one for each cluster: ratios of single windows, or
@@ -62,10 +62,10 @@ def compare(
 
     :param new: mean square error of each window
     :param old: the same of the model that is to be beaten
-    :param unit: cluster of each window; negative: does not count
+    :param cluster: cluster of each window; negative: does not count
     """
-    labels = np.unique(unit[unit >= 0])
-    sums = [[errors[unit == label].sum() for label in labels] for errors in (new, old)]
+    labels = np.unique(cluster[cluster >= 0])
+    sums = [[errors[cluster == label].sum() for label in labels] for errors in (new, old)]
     after, before = (np.maximum(np.array(s), 1e-300) for s in sums)
     ratio = np.clip(np.log(before / after), -np.log(_MOST_RATIO), np.log(_MOST_RATIO))
     n = len(ratio)
@@ -79,7 +79,7 @@ def compare(
 
 
 def confirm(
-    new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], unit: Int[np.ndarray, " n"]
+    new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], cluster: Int[np.ndarray, " n"]
 ) -> Comparison:
     """
     As ``compare``, with a second chance. Four or five clusters of which some gain a little and
@@ -87,8 +87,8 @@ def confirm(
     signed rank test on windows, which has no tails to fear, counts too, at a much stricter level,
     because windows of one recording are not independent.
     """
-    verdict = compare(new, old, unit)
-    before, after = (np.maximum(errors[unit >= 0], 1e-300) for errors in (old, new))
+    verdict = compare(new, old, cluster)
+    before, after = (np.maximum(errors[cluster >= 0], 1e-300) for errors in (old, new))
     ratio = np.log(before / after)
     if not np.any(ratio):
         return verdict
@@ -99,7 +99,7 @@ def confirm(
 def by_scores(
     new: Float[np.ndarray, "n rows obs"],
     old: Float[np.ndarray, "n rows obs"],
-    unit: Int[np.ndarray, " n"],
+    cluster: Int[np.ndarray, " n"],
 ) -> float:
     r"""
     One-sided score test: are the residuals of a model correlated with the change that another one
@@ -118,22 +118,24 @@ def by_scores(
 
     :param new: errors of windows in units of the noise
     :param old: the same of the model that is to be beaten
-    :param unit: cluster of each window; negative: does not count
+    :param cluster: cluster of each window; negative: does not count
     :return: one-sided p-value
     """
-    labels = np.unique(unit[unit >= 0])
+    labels = np.unique(cluster[cluster >= 0])
     if len(labels) < 2:
         return 1.0
     before, after = (
         np.clip(np.nan_to_num(r, nan=_MOST_ERROR), -_MOST_ERROR, _MOST_ERROR) for r in (old, new)
     )
     leans, noise = (np.sum((before - after) * r, (1, 2)) for r in (before, after))
-    by_unit = np.array([noise[unit == label].sum() for label in labels])
+    by_cluster = np.array([noise[cluster == label].sum() for label in labels])
     correction = len(labels) / (len(labels) - 1)
-    variance = max(float(np.sum(noise[unit >= 0] ** 2)), correction * float(np.sum(by_unit**2)))
+    variance = max(
+        float(np.sum(noise[cluster >= 0] ** 2)), correction * float(np.sum(by_cluster**2))
+    )
     if not variance:
         return 1.0
-    return float(scipy.stats.t.sf(leans[unit >= 0].sum() / np.sqrt(variance), len(labels) - 1))
+    return float(scipy.stats.t.sf(leans[cluster >= 0].sum() / np.sqrt(variance), len(labels) - 1))
 
 
 def split(data: Trajectories, origin: Int[np.ndarray, " n"], seed: int) -> Split:
@@ -145,22 +147,22 @@ def split(data: Trajectories, origin: Int[np.ndarray, " n"], seed: int) -> Split
     :param origin: recording of each window, -1 for padding, in order of time
     """
     recordings = np.unique(origin[origin >= 0])
-    unit = origin.copy()
-    if len(recordings) < _FEWEST_UNITS:
-        unit = _in_blocks(origin, recordings)
+    cluster = origin.copy()
+    if len(recordings) < _FEWEST_CLUSTERS:
+        cluster = _in_blocks(origin, recordings)
     rng, confirm = np.random.default_rng(seed), np.zeros(len(origin), bool)
-    labels = np.unique(unit[unit >= 0])
+    labels = np.unique(cluster[cluster >= 0])
     condition = {
-        label: data.conditions[int(np.flatnonzero(data.origin == origin[unit == label][0])[0])]
+        label: data.conditions[int(np.flatnonzero(data.origin == origin[cluster == label][0])[0])]
         for label in labels
     }
     turn = 0
     for name in dict.fromkeys(condition.values()):
         own = rng.permutation([label for label in labels if condition[label] == name])
         for label in own:
-            confirm |= (unit == label) & bool(turn % 2)
+            confirm |= (cluster == label) & bool(turn % 2)
             turn += 1
-    return Split(unit, confirm)
+    return Split(cluster, confirm)
 
 
 def effective_size(raw: Float[np.ndarray, "n rows obs"]) -> float:
@@ -173,13 +175,13 @@ def effective_size(raw: Float[np.ndarray, "n rows obs"]) -> float:
 
 def _in_blocks(origin: np.ndarray, recordings: np.ndarray) -> np.ndarray:
     """Stretches of recordings, about as many windows each."""
-    unit, label = np.full(len(origin), -1), 0
+    cluster, label = np.full(len(origin), -1), 0
     n_blocks = -(-_N_STRETCHES // max(len(recordings), 1))
     for recording in recordings:
         for rows in np.array_split(np.flatnonzero(origin == recording), n_blocks):
             if len(rows):
-                unit[rows], label = label, label + 1
-    return unit
+                cluster[rows], label = label, label + 1
+    return cluster
 
 
 def as_good(better: Comparison) -> bool:

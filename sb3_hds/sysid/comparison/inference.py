@@ -27,7 +27,7 @@ _N_DRAWS, _AT_A_TIME = 999, 250
 _WEAK = 1e-9
 
 
-def jackknife(slopes: Slopes, unit: Int[np.ndarray, " n"]) -> Float[np.ndarray, "p p"]:
+def jackknife(slopes: Slopes, cluster: Int[np.ndarray, " n"]) -> Float[np.ndarray, "p p"]:
     """
     Over clusters, by one Newton step for each that is left out. With few clusters, the sandwich
     estimator is too narrow, because the fit has shrunk their scores.
@@ -35,20 +35,20 @@ def jackknife(slopes: Slopes, unit: Int[np.ndarray, " n"]) -> Float[np.ndarray, 
     Source: MacKinnon, Nielsen, Webb, *Fast and reliable jackknife and bootstrap methods for
     cluster-robust inference*, J. Applied Econometrics 38, 2023 (CV3).
 
-    :param unit: cluster of each window
+    :param cluster: cluster of each window
     :return: covariance of the parameters, in units of their scale; infinite if derivatives are not
         finite
     """
-    labels, total = np.unique(unit), slopes.curvature.sum(0)
+    labels, total = np.unique(cluster), slopes.curvature.sum(0)
     if not (np.isfinite(slopes.curvature).all() and np.isfinite(slopes.scores).all()):
         # Simulations blow up nearby: nobody knows how well the size is known.
         return np.full_like(total, np.inf)
     covariance = np.zeros_like(total)
     for label in labels:
-        own = unit == label
+        own = cluster == label
         rest = np.linalg.pinv(total - slopes.curvature[own].sum(0), rcond=_RANK, hermitian=True)
         step = rest @ slopes.scores[own].sum(0)
-        # Infinite is right: one unit alone knows of it.
+        # Infinite is right: one cluster alone knows of it.
         with np.errstate(over="ignore", invalid="ignore"):
             covariance += np.outer(step, step)
     return covariance * (len(labels) - 1) / len(labels)
@@ -65,7 +65,7 @@ def standard_errors(half: Half, point: Point, free: Sequence[int]) -> Float[np.n
     result = np.full(len(point.theta), np.inf)
     if not free:
         return result
-    variance = np.diag(jackknife(half.evidence.slopes(point, free), half.unit))
+    variance = np.diag(jackknife(half.evidence.slopes(point, free), half.cluster))
     result[list(free)] = np.sqrt(variance) * half.evidence.hypotheses.scale[list(free)]
     return result
 

@@ -97,7 +97,7 @@ class Ranking(NamedTuple):
     def compare(self, new: Point, old: Point) -> Comparison:
         """:return: comparison of two models on the half that confirms"""
         half = self.confirm
-        return confirm(half.errors(new), half.errors(old), half.unit)
+        return confirm(half.errors(new), half.errors(old), half.cluster)
 
     def compare_nested(self, new: Point, old: Point) -> Comparison:
         """:return: as :meth:`compare`, of nested models"""
@@ -105,7 +105,7 @@ class Ranking(NamedTuple):
         by_score = by_scores(
             new.raw / self.select.evidence.noise,
             old.raw / self.select.evidence.noise,
-            self.confirm.unit,
+            self.confirm.cluster,
         )
         return verdict._replace(p_value=min(verdict.p_value, by_score))
 

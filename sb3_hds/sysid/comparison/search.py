@@ -157,8 +157,8 @@ class Search(NamedTuple):
         pair = self.select, self.confirm
         shots = (half.evidence.shots for half in pair)
         shots = Shots(*map(np.concatenate, zip(*shots, strict=True)))
-        unit = np.concatenate([half.unit for half in pair])
-        every = Half(self.select.evidence.on(shots), unit, self.select.irrelevant)
+        cluster = np.concatenate([half.cluster for half in pair])
+        every = Half(self.select.evidence.on(shots), cluster, self.select.irrelevant)
         offsets = np.concatenate([base.point.offsets, base.kept.offsets])
         return every, every.evidence.fit(base.point.theta, base.free, offsets)
 

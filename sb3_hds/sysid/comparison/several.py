@@ -123,7 +123,7 @@ def _each_left_out(
     """:return: of some members of a large set, held-out errors with each beside those without it"""
     half, some = search.confirm, evenly(search.confirm.evidence.shots.n, _SOME_WINDOWS)
     shots = Shots(*(np.asarray(leaf)[some] for leaf in half.evidence.shots))
-    half = half._replace(evidence=half.evidence.on(shots), unit=half.unit[some])
+    half = half._replace(evidence=half.evidence.on(shots), cluster=half.cluster[some])
     kept = base.kept._replace(offsets=base.kept.offsets[some], raw=base.kept.raw[some])
 
     def left_out(key: str) -> Comparison:
@@ -179,7 +179,7 @@ def _accepted(
 def _at_own_joint(half: Half, candidate: Candidate, new: Point, old: Point) -> Comparison:
     """Held-out errors of the channels of the joint where a cause acts, or of all."""
     channels = own_channels(half, candidate)
-    return confirm(_errors(half, new, channels), _errors(half, old, channels), half.unit)
+    return confirm(_errors(half, new, channels), _errors(half, old, channels), half.cluster)
 
 
 def own_channels(half: Half, candidate: Candidate) -> Sequence[int]:

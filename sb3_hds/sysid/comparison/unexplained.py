@@ -22,9 +22,9 @@ _MOST_WINDOWS = 1500
 _RIDGES = (0.1, 1.0, 10.0, 100.0)
 # What counts as something: share of the force's variance that others' windows predict, and level.
 _LEAST_GAIN, _LEVEL = 0.05, 0.01
-# Patterns of signs: all of so many units, or so many drawn.
+# Patterns of signs: all of so many clusters, or so many drawn.
 _ALL_SIGNS_OF, _N_FLIPS = 12, 4096
-# By which factor the level of the test on windows is stricter than that on units.
+# By which factor the level of the test on windows is stricter than that on clusters.
 _STRICTER = 25.0
 # A smaller set of quantities that explains this share of what all explain tells where it lives.
 _MOST_OF_IT = 0.8
@@ -215,7 +215,7 @@ def remainder(
             for k in (1, 2, len(quantities))
             for names in combinations(quantities, k)
         }
-        p_values = _by_chance(np.stack([one.agreement for one in told.values()]), parts.unit)
+        p_values = _by_chance(np.stack([one.agreement for one in told.values()]), parts.cluster)
         chance = {
             name: min(float(p) * len(joints), 1.0) for name, p in zip(told, p_values, strict=True)
         }
@@ -258,7 +258,7 @@ def _scaled(values: np.ndarray) -> np.ndarray:
 
 
 def _predicted(quantities: list[np.ndarray], force: np.ndarray, parts: Split) -> _Predicted:
-    """Each half of the units is predicted from the other."""
+    """Each half of the clusters is predicted from the other."""
     features = _scaled(np.concatenate(quantities, 1))
     guess = np.zeros_like(force)
     for learn, check in ((~parts.confirm, parts.confirm), (parts.confirm, ~parts.confirm)):
@@ -271,22 +271,24 @@ def _predicted(quantities: list[np.ndarray], force: np.ndarray, parts: Split) ->
 
 
 def _by_chance(
-    agreement: Float[np.ndarray, "sets n"], unit: Int[np.ndarray, " n"]
+    agreement: Float[np.ndarray, "sets n"], cluster: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, " sets"]:
     """
-    Chance that some set of quantities predicts so well where there is nothing to predict: then what
-    was predicted agrees in sign with what was measured as often as not, whichever the set, so signs
-    are flipped for all sets together. Those of whole units are, as windows of one recording are not
-    independent; but what is met in a few recordings only, such as a wall, is seen there again and
-    again, so those of windows count too, at a much stricter level.
+    P-value: how often some set of quantities predicts as well where nothing can be predicted. Then
+    predictions agree in sign with measurements as often as not, whichever the set, so signs are
+    flipped for all sets together: those of whole clusters, because windows of one recording are not
+    independent. What happens in a few recordings only, such as hitting a wall, shows there many
+    times, so flips of single windows count too, at a much stricter level.
 
     Source: Westfall and Young, *Resampling-based multiple testing*, Wiley 1993 (the largest
     statistic of a family).
 
     :return: for each set, shape ``(sets,)``
     """
-    by_unit = np.stack([agreement[:, unit == label].sum(1) for label in np.unique(unit)], 1)
-    return np.minimum(_by_flips(by_unit), _STRICTER * _by_flips(agreement))
+    by_cluster = np.stack(
+        [agreement[:, cluster == label].sum(1) for label in np.unique(cluster)], 1
+    )
+    return np.minimum(_by_flips(by_cluster), _STRICTER * _by_flips(agreement))
 
 
 def _by_flips(agreement: Float[np.ndarray, "sets n"]) -> Float[np.ndarray, " sets"]:

@@ -20,7 +20,7 @@ from sb3_hds.sysid.reporting.finding import Finding, HorizonGain
 from sb3_hds.sysid.reporting.pictures import bounded
 from sb3_hds.sysid.reporting.wording import TOO_LITTLE
 
-#: why a candidate was turned down that predicts better
+#: why a candidate that predicts better is not named
 UNCERTAIN, SMALL, CHANCE = "its size is uncertain", "it is small beside the others", "may be chance"
 NO_CONSTANT = "it comes near, but its size is not constant"
 NAMELESS = "a force without a name predicts better"
@@ -37,8 +37,8 @@ class Accepted(NamedTuple):
     A cause that was confirmed.
 
     :param alternatives: keys of candidates that the data cannot distinguish from it
-    :param chance: family-wise p-value: that the best of all candidates gains as much if nothing is
-        wrong
+    :param family_p_value: family-wise p-value: that the best of all candidates gains as much if
+        nothing is wrong
     :param share: of the force at its joint that it carries; None where that is not known
     :param sizes: estimate and interval of the equation of motion by parameter, where there are any
     :param of_equation: whether these are told, rather than those of a simulation
@@ -50,7 +50,7 @@ class Accepted(NamedTuple):
     tried: Tried
     verdict: Comparison
     alternatives: tuple[str, ...]
-    chance: float
+    family_p_value: float
     share: float | None = None
     sizes: Mapping[str, tuple[float, float, float]] = {}
     of_equation: bool = False
@@ -69,7 +69,7 @@ def finding(
     """
     h, theta = half.evidence.hypotheses, point.theta
     stderr = standard_errors(half, point, free)
-    unit = margin(len(np.unique(half.unit)), np.ones(()))
+    unit = margin(len(np.unique(half.cluster)), np.ones(()))
     reach = unit * stderr
     candidate, parameters = one.tried.candidate, {}
     shorts = [name.rpartition(".")[2] for name in candidate.parameters]
@@ -104,7 +104,7 @@ def finding(
         parameters,
         one.alternatives,
         one.verdict.p_value,
-        one.chance,
+        one.family_p_value,
         one.verdict.gain,
         candidate.explanation,
         one.share,
@@ -124,9 +124,9 @@ def _systematic(estimate: float, other: tuple[float, float, float] | None) -> fl
     return float(np.sqrt(max((estimate - value) ** 2 - reach**2, 0.0)))
 
 
-def margin(n_units: int, stderr: np.ndarray) -> np.ndarray:
+def margin(n_clusters: int, stderr: np.ndarray) -> np.ndarray:
     """:return: half the width of a symmetric interval"""
-    return scipy.stats.t.ppf(0.5 + 0.5 * _CONFIDENCE, max(n_units - 1, 1)) * stderr
+    return scipy.stats.t.ppf(0.5 + 0.5 * _CONFIDENCE, max(n_clusters - 1, 1)) * stderr
 
 
 def to_tell_apart(found: Sequence[Accepted], hypotheses: Hypotheses) -> list[str]:
@@ -206,17 +206,17 @@ def errs_more(gain: Mapping[int, HorizonGain]) -> list[str]:
     ]
 
 
-def why(verdict: Comparison, turned_down: str | None) -> str:
+def why(verdict: Comparison, rejected_for: str | None) -> str:
     """
     :param verdict: the comparison of a candidate that is not named
-    :param turned_down: why it was rejected, if it was ever the best
+    :param rejected_for: why it was rejected, if it was ever the best
     """
     if verdict.gain < LEAST_GAIN:
         return TOO_LITTLE
-    return turned_down or (CHANCE if verdict.p_value >= LEVEL else "others gain more")
+    return rejected_for or (CHANCE if verdict.p_value >= LEVEL else "others gain more")
 
 
-def stuck_in_words(ends: Sequence[tuple[str, float, float, str]]) -> str:
+def bounds_in_words(ends: Sequence[tuple[str, float, float, str]]) -> str:
     """
     :param ends: of each nuisance at a bound, its name, its value there, the nominal value, and unit
     :return: why nothing is named; empty if there is none
@@ -308,7 +308,7 @@ def by_horizon(half: Half, before: Point, after: Point, every: int) -> dict[int,
             bounded(np.mean((point.raw[:, ahead] / half.evidence.noise) ** 2, 1))
             for point in (before, after)
         )
-        gained = compare(new, old, half.unit)
+        gained = compare(new, old, half.cluster)
         rms = [float(np.sqrt(np.mean(errors))) for errors in (old, new)]
         found[ahead * every] = HorizonGain(ahead * every, rms[0], rms[1], gained.low, gained.high)
     return found

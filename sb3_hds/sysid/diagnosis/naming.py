@@ -58,9 +58,9 @@ class Naming:
     ) -> None:
         self.search, self.start, self.seed, self.by_all = search, start, seed, by_all
         self.family = family
-        self.turned_down: dict[str, str] = {}
-        # Whether all the data ever said something else than what was confirmed first.
-        self._overruled = False
+        self.rejected_for: dict[str, str] = {}
+        # Whether re-ranking on all data ever replaced the candidate that was confirmed first.
+        self._reranked = False
 
     def one_by_one(self, firsts: Sequence[Tried]) -> tuple[list[Accepted], Base]:
         """
@@ -88,7 +88,7 @@ class Naming:
                 break
             tried = self.search.finalists(base, keys_of(found))
         if len(found) > 1:
-            again = [self._asked_again(one, base) for one in found]
+            again = [self._beside_the_others(one, base) for one in found]
             pairs = zip(found, again, strict=True)
             found = [new if passes(new.verdict) else old for old, new in pairs]
         return found, base
@@ -107,13 +107,13 @@ class Naming:
             beside each other and predict better than the one alone, and the model with it
         """
         chosen = self.search.pairs(firsts, self.start, alone.tried.candidate)
-        for looks, (first, tried) in enumerate(chosen):
-            confirmed = self._confirmed(first, tried, looks, base, firsts)
+        for n_tests, (first, tried) in enumerate(chosen):
+            confirmed = self._confirmed(first, tried, n_tests, base, firsts)
             if confirmed is not None:
                 return confirmed
         return None
 
-    def several_as_confirmed(self, firsts: Sequence[Tried]) -> tuple[list[Accepted], Base] | None:
+    def without_reranking(self, firsts: Sequence[Tried]) -> tuple[list[Accepted], Base] | None:
         """
         Re-ranking on all data can absorb a second cause into the first, so that no pair is
         significantly better: repeat without re-ranking.
@@ -121,7 +121,7 @@ class Naming:
         :param firsts: candidates beside the model at the start, best first
         :return: causes, if that makes them several, and the model with them
         """
-        if not self._overruled:
+        if not self._reranked:
             return None
         plain = Naming(self.search, self.start, self.seed, False, self.family)
         found, base = plain.one_by_one(firsts)
@@ -129,27 +129,31 @@ class Naming:
             return plain.pair(found[0], base, firsts)
         return (found, base) if found else None
 
-    def outdone(
+    def replaced_by_forces(
         self, found: Sequence[Accepted], base: Base
     ) -> tuple[list[Accepted], Base, Nameless | None]:
         """
-        One of the named causes is always the best, right or wrong. If a flexible force predicts
-        significantly better in the place of all of them, or of one, that one is not named. Beside
-        all of them it does better still, and is fitted from closer by: so this is asked first.
+        The best of the named candidates may still be wrong. If a flexible force predicts
+        significantly better in the place of all causes, or of one, these are not named. A force
+        that gains nothing beside all causes cannot replace one, so that is fitted first.
 
         :return: the remaining causes, the model with them, and the flexible force; None if none is
             better
         """
         if not found or not self.search.hypotheses.nameless:
             return list(found), base, None
-        forces = [f for f in self.search.fit_nameless(base, roughly=True) if self._outdoes(f, base)]
+        forces = [
+            f
+            for f in self.search.fit_nameless(base, roughly=True)
+            if self._predicts_better(f, base)
+        ]
         places = (tuple(found), *((one,) for one in found if len(found) > 1))
         for place in places if forces else ():
             taken = [one.tried.candidate for one in place]
             without = self.search.without(base, *taken, rival=base)
             best = self.search.fit_in_place(forces, without, base.point.cost)[0]
-            if self._outdoes(best, base):
-                self.turned_down |= dict.fromkeys(keys_of(place), NAMELESS)
+            if self._predicts_better(best, base):
+                self.rejected_for |= dict.fromkeys(keys_of(place), NAMELESS)
                 rest = [one for one in found if one not in place]
                 better = self.search.ranking.compare(best.kept, base.kept)
                 return (
@@ -159,7 +163,7 @@ class Naming:
                 )
         return list(found), base, None
 
-    def _outdoes(self, force: Tried, base: Base) -> bool:
+    def _predicts_better(self, force: Tried, base: Base) -> bool:
         better = self.search.ranking.compare(force.kept, base.kept)
         return force.point.cost < base.point.cost and not as_good(better)
 
@@ -171,104 +175,115 @@ class Naming:
         tried = self.search.fit_nameless(base)
         sure = [t for t in tried if self._determined(t, base)]
         best = self._best(sure, base, len(known))
-        if best is None or self._chance(best, base, known) >= _FAMILY_LEVEL / (1 + len(known)):
+        if best is None or self._family_p_value(best, base, known) >= _FAMILY_LEVEL / (
+            1 + len(known)
+        ):
             return None
         return Nameless(best, self.search.ranking.compare_nested(best.kept, base.kept), ())
 
     def _confirmed(
-        self, first: Tried, tried: Sequence[Tried], looks: int, base: Base, firsts: Sequence[Tried]
+        self,
+        first: Tried,
+        tried: Sequence[Tried],
+        n_tests: int,
+        base: Base,
+        firsts: Sequence[Tried],
     ) -> tuple[list[Accepted], Base] | None:
         """
         :param first: of a pair
         :param tried: beside it, best first
-        :param looks: at pairs that were not confirmed: each makes the next harder to confirm
+        :param n_tests: pairs that were not confirmed: each makes the level stricter
         """
         belief = self.search.believing(first, self.start)
-        second = self._next(tried, belief, [first.candidate.key], looks)
+        second = self._next(tried, belief, [first.candidate.key], n_tests)
         if second is None:
             return None
         both = self.search.believing(second.tried, belief)
         if not passes(self.search.ranking.compare(both.kept, base.kept)):
             return None
-        chance = self._chance(first, self.start, [])
+        p_value = self._family_p_value(first, self.start, [])
         found, both = self._pruned(
-            [self._accepted(first, firsts, self.start, chance), second], both
+            [self._accepted(first, firsts, self.start, p_value), second], both
         )
-        found = [self._asked_again(one, both) for one in found]
+        found = [self._beside_the_others(one, both) for one in found]
         if len(found) < 2 or not all(passes(one.verdict) for one in found):
             return None
         return found, both
 
     def _next(
-        self, tried: Sequence[Tried], base: Base, known: Sequence[str], looks: int = 0
+        self, tried: Sequence[Tried], base: Base, known: Sequence[str], n_tests: int = 0
     ) -> Accepted | None:
         """
-        :param looks: at pairs that were not confirmed
+        :param n_tests: pairs that were not confirmed
         :return: the best of what was tried, if it is a cause beside those that are known
         """
-        sure = [t for t in tried if self._is_meant(t) and self._determined(t, base)]
-        best = self._best(sure, base, len(known) + looks)
+        sure = [t for t in tried if self._fits_its_name(t) and self._determined(t, base)]
+        best = self._best(sure, base, len(known) + n_tests)
         if best is None:
             return None
-        if self._is_leftover(best, base):
-            self.turned_down[best.candidate.key] = SMALL
+        if self._is_small(best, base):
+            self.rejected_for[best.candidate.key] = SMALL
             return None
-        if (chance := self._chance(best, base, known)) >= _FAMILY_LEVEL / (1 + len(known) + looks):
-            self.turned_down[best.candidate.key] = CHANCE
+        if (p_value := self._family_p_value(best, base, known)) >= _FAMILY_LEVEL / (
+            1 + len(known) + n_tests
+        ):
+            self.rejected_for[best.candidate.key] = CHANCE
             return None
-        return self._accepted(best, tried, base, chance)
+        return self._accepted(best, tried, base, p_value)
 
-    def _best(self, sure: Sequence[Tried], base: Base, looks: int) -> Tried | None:
+    def _best(self, sure: Sequence[Tried], base: Base, n_tests: int) -> Tried | None:
         """:return: what is confirmed, or what all the data prefer to that"""
-        first = self.search.ranking.best(sure, base, looks)
+        first = self.search.ranking.best(sure, base, n_tests)
         if first is None or not self.by_all:
             return first
         best = self.search.ranking.best_on_pooled_data(first, sure, base)
-        self._overruled |= best is not first
+        self._reranked |= best is not first
         return best
 
-    def _accepted(self, best: Tried, tried: Sequence[Tried], base: Base, chance: float) -> Accepted:
+    def _accepted(
+        self, best: Tried, tried: Sequence[Tried], base: Base, p_value: float
+    ) -> Accepted:
         """:param base: what is believed without it"""
         rivals = [*tried, *self.search.fit_aliased(best, tried, base)]
         others = self.search.ranking.alternatives(best, rivals, base)
         verdict = self.search.ranking.compare_nested(best.kept, base.kept)
         fitted = tuple(t for t in rivals if t.candidate.key in others)
-        return Accepted(best, verdict, others, chance, rivals=fitted)
+        return Accepted(best, verdict, others, p_value, rivals=fitted)
 
-    def _asked_again(self, one: Accepted, base: Base) -> Accepted:
-        """A cause beside what looks like it, now that the other causes are known."""
+    def _beside_the_others(self, one: Accepted, base: Base) -> Accepted:
+        """Refit a cause and its alternatives beside all other causes."""
         without = self.search.without(base, one.tried.candidate)
         names = (one.tried.candidate.key, *one.alternatives)
         named = [c for c in self.search.hypotheses.candidates if c.key in names]
         named = [c for c in named if not self.search.part_of(c, without)]
         tried = self.search.fit(named, without, places_of([one.tried, *one.rivals]))
         same = next(t for t in tried if t.candidate is one.tried.candidate)
-        return self._accepted(same, tried, without, one.chance)
+        return self._accepted(same, tried, without, one.family_p_value)
 
     def _determined(self, tried: Tried, base: Base) -> bool:
-        """Whether the interval of some parameter leaves out the value at which nothing changes."""
+        """Whether the interval of some parameter excludes its null."""
         half, own = self.search.select, list(self.search.hypotheses.indices(tried.candidate))
         free = [*base.free, *own]
         stderr = standard_errors(half, tried.point, free)[own]
         moved = np.abs(tried.point.theta - self.search.hypotheses.null)[own]
-        if not (sure := bool((moved > margin(len(np.unique(half.unit)), stderr)).any())):
-            self.turned_down[tried.candidate.key] = UNCERTAIN
+        if not (sure := bool((moved > margin(len(np.unique(half.cluster)), stderr)).any())):
+            self.rejected_for[tried.candidate.key] = UNCERTAIN
         return sure
 
-    def _is_meant(self, tried: Tried) -> bool:
-        """Whether what was fitted is what its name says."""
+    def _fits_its_name(self, tried: Tried) -> bool:
+        """Whether the fitted sizes are in the order that the name implies."""
         names = self.search.hypotheses.names
         sizes = tried.point.theta[[names.index(name) for name in tried.candidate.ascending]]
         if not (meant := bool(np.all(np.diff(sizes) >= 0.0))):
-            self.turned_down[tried.candidate.key] = ANOTHER
+            self.rejected_for[tried.candidate.key] = ANOTHER
         return meant
 
-    def _is_leftover(self, best: Tried, base: Base) -> bool:
-        """Whether an imperfect model of the causes before explains as much as this one."""
+    def _is_small(self, best: Tried, base: Base) -> bool:
+        """Whether the cause is negligible beside the earlier ones, whose model is not exact."""
         first, now, then = map(self.search.confirm.total, (self.start.kept, base.kept, best.kept))
         return now - then < _LEAST_OF_EARLIER * (first - now)
 
-    def _chance(self, best: Tried, base: Base, known: Sequence[str]) -> float:
+    def _family_p_value(self, best: Tried, base: Base, known: Sequence[str]) -> float:
         """:return: family-wise p-value on the half that selects"""
         h = self.search.hypotheses
         left = [c for c in (*h.candidates, *h.nameless) if c.key not in known]
@@ -276,11 +291,11 @@ class Naming:
         own = [h.indices(c) for c in left]
         fitted = (*base.free, *h.indices(best.candidate))
         gain = base.point.cost - best.point.cost
-        chance = family_p_value(slopes, own, base.free, fitted, gain, self.seed)
-        return min(1.0, self.family * chance)
+        p_value = family_p_value(slopes, own, base.free, fitted, gain, self.seed)
+        return min(1.0, self.family * p_value)
 
     def _pruned(self, found: list[Accepted], base: Base) -> tuple[list[Accepted], Base]:
-        """Without causes that later ones have made superfluous."""
+        """Remove causes that later ones have made superfluous."""
         for one in found[:-1]:
             if not self.search.needed(one.tried.candidate, base):
                 base = self.search.without(base, one.tried.candidate)

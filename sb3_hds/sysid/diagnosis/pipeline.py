@@ -21,6 +21,7 @@ from sb3_hds.sysid.comparison.several import confirmed_set, proposed_set
 from sb3_hds.sysid.diagnosis.findings import (
     SMALL,
     Accepted,
+    bounds_in_words,
     by_horizon,
     contradiction,
     errs_more,
@@ -29,7 +30,6 @@ from sb3_hds.sysid.diagnosis.findings import (
     look_alike,
     nameless_in_words,
     out_of_reach,
-    stuck_in_words,
     to_tell_apart,
     why,
 )
@@ -96,7 +96,7 @@ class Inquiry:
 
     def run(self) -> Diagnosis:
         if self.given.convention is not None:
-            return self.in_other_words(self.given.convention)
+            return self.wrong_convention(self.given.convention)
         self.prepare()
         if self.screened and len(self.screened.members) > 1:
             several = self._several(self.screened)
@@ -109,7 +109,7 @@ class Inquiry:
         firsts = self.search.finalists(start, [], screened)
         self._use(self.search.from_places(screened, firsts))
         naming = Naming(self.search, start, self.seed, family=self._family())
-        rejected = self._weighed(firsts, start)
+        rejected = self._each_alone(firsts, start)
         found, base = naming.one_by_one(firsts)
         self.bar.stage("confirming causes")
         before = left = self.residuals.left(start)
@@ -117,11 +117,11 @@ class Inquiry:
         if found:
             found, base, left, nearest = self.residuals.constant(found, base)
         if len(found) == 1 and left.remainder is not None and self.screened is None:
-            pair = naming.pair(found[0], base, firsts) or naming.several_as_confirmed(firsts)
+            pair = naming.pair(found[0], base, firsts) or naming.without_reranking(firsts)
             if pair is not None and (rest := self.residuals.left_by(*pair)) is not None:
                 found, base, left = *pair, rest
         self.bar.stage("what is left")
-        found, base, force = naming.outdone(found, base)
+        found, base, force = naming.replaced_by_forces(found, base)
         if force is not None:
             left = self.residuals.left(base)
         elif not found or left.remainder is not None:
@@ -129,7 +129,7 @@ class Inquiry:
         if force is not None:
             words = nameless_in_words(*force, self.hypotheses)
             nearest = " ".join(filter(None, (nearest, words)))
-        self.turned_down = naming.turned_down | self.residuals.turned_down
+        self.rejected_for = naming.rejected_for | self.residuals.rejected_for
         if found and self.residuals.explained(found, start, base, before, left) < LEAST_SHARE:
             # Something is there, and this is not it.
             found, base = [], start
@@ -139,11 +139,11 @@ class Inquiry:
             nearest = contradiction(rejected)
         self._set_noise(base.point)
         start, base = map(self.search.refit, (start, base))
-        if stuck := self._stuck(base):
-            found, base, left, nearest = [], start, before, stuck
+        if at_bounds := self._at_bounds(base):
+            found, base, left, nearest = [], start, before, at_bounds
         elif not (found or nearest) and left.remainder is None:
             nearest = self._far_off(base)
-        return self._told(found, rejected, start, base, before, left, nearest)
+        return self._result(found, rejected, start, base, before, left, nearest)
 
     def _family(self) -> float:
         """:return: candidates that there were, for each that is simulated"""
@@ -164,7 +164,7 @@ class Inquiry:
         naming = Naming(self.search, start, self.seed, family=self._family())
         if len(found) == 1:
             found, base = naming.beside(found, base)
-        if len(found) < 2 or self._outdone_by_a_candidate(start, base):
+        if len(found) < 2 or self._worse_than_a_flexible_candidate(start, base):
             return None
         self.bar.stage("what is left")
         before, left = self.residuals.left(start), self.residuals.left(base)
@@ -172,18 +172,18 @@ class Inquiry:
             return None
         nearest = ""
         confirmed = found
-        found, base, force = naming.outdone(found, base)
+        found, base, force = naming.replaced_by_forces(found, base)
         if force is not None:
             left, nearest = self.residuals.left(base), nameless_in_words(*force, self.hypotheses)
         beaten = [(c.tried.candidate, c.verdict) for c in confirmed if c not in found]
         self._set_noise(base.point)
         start, base = map(self.search.refit, (start, base))
-        if stuck := self._stuck(base):
-            found, base, left, nearest = [], start, before, stuck
-        self.turned_down = naming.turned_down | {key: SMALL for key in screened.hints}
-        return self._told(found, beaten, start, base, before, left, nearest)
+        if at_bounds := self._at_bounds(base):
+            found, base, left, nearest = [], start, before, at_bounds
+        self.rejected_for = naming.rejected_for | {key: SMALL for key in screened.hints}
+        return self._result(found, beaten, start, base, before, left, nearest)
 
-    def _outdone_by_a_candidate(self, start: Base, base: Base) -> bool:
+    def _worse_than_a_flexible_candidate(self, start: Base, base: Base) -> bool:
         """Whether a flexible force that somebody asked for does better than the set."""
         names = {kind.name for kind in NAMELESS_EFFECTS}
         asked = [c for c in self.hypotheses.candidates if c.name in names]
@@ -193,7 +193,9 @@ class Inquiry:
             for t in self.search.fit(asked, start)
         )
 
-    def _weighed(self, firsts: Sequence[Tried], start: Base) -> list[tuple[Candidate, Comparison]]:
+    def _each_alone(
+        self, firsts: Sequence[Tried], start: Base
+    ) -> list[tuple[Candidate, Comparison]]:
         """:return: every candidate alone, on the half that confirms"""
         weighed = [
             (t.candidate, self.search.ranking.compare_nested(t.kept, start.kept)) for t in firsts
@@ -220,7 +222,7 @@ class Inquiry:
         least = np.maximum(IRRELEVANT * self.given.spread, self.given.sensor_noise)
         return np.maximum(least, IRRELEVANT)
 
-    def in_other_words(self, convention: Convention) -> Diagnosis:
+    def wrong_convention(self, convention: Convention) -> Diagnosis:
         """:return: the verdict that the log does not follow the conventions of the model"""
         return Diagnosis(
             verdict="unknown",
@@ -313,14 +315,14 @@ class Inquiry:
             f"takes {more} in an interval, not {own}."
         ]
 
-    def _stuck(self, base: Base) -> str:
+    def _at_bounds(self, base: Base) -> str:
         """:return: a sentence on nuisances that end at a bound, if any does"""
         h, (_, point) = self.hypotheses, self.search.pooled(base)
         ends = [
             i for i in h.nuisances if at_limit(point.theta[i], h.lower[i], h.upper[i], h.null[i])
         ]
         units = {name: p.unit for name, p in h.twin.parameters.items()}
-        return stuck_in_words(
+        return bounds_in_words(
             [(h.names[i], point.theta[i], h.null[i], units[h.names[i]]) for i in ends]
         )
 
@@ -330,7 +332,7 @@ class Inquiry:
         found = distances(self.believed.channels, raw, self.given.sensor_noise, self.given.spread)
         return far_in_words(found)
 
-    def _told(
+    def _result(
         self,
         found: Sequence[Accepted],
         rejected: Sequence[tuple[Candidate, Comparison]],
@@ -368,7 +370,7 @@ class Inquiry:
             else 0.0,
             detectable=self._detectable(start),
             rejected=tuple(
-                Rejected(one.key, c.gain, c.p_value, why(c, self.turned_down.get(one.key)))
+                Rejected(one.key, c.gain, c.p_value, why(c, self.rejected_for.get(one.key)))
                 for one, c in sorted(rejected, key=lambda pair: -pair[1].gain)
             ),
             caveats=(

@@ -141,10 +141,10 @@ class Prepared:
         if self.audit.reason:
             return self.audit.reason
         rows = ~self.parts.confirm, self.parts.confirm
-        units = [len(np.unique(self.parts.unit[own])) for own in rows]
-        if min(units) < _FEWEST_CLUSTERS // 2:
+        clusters = [len(np.unique(self.parts.cluster[own])) for own in rows]
+        if min(clusters) < _FEWEST_CLUSTERS // 2:
             return (
-                f"{sum(units)} pieces of evidence are too few to propose on some and confirm on "
+                f"{sum(clusters)} pieces of evidence are too few to propose on some and confirm on "
                 "others. Record at least four times as long, or several recordings."
             )
         return ""
@@ -168,7 +168,7 @@ class Prepared:
             evidence, hypotheses=sized(evidence, self.data), noise=_FIRST_NOISE * self.spread
         )
         select, confirm = (
-            Half(evidence.on(own), self.parts.unit[chosen], IRRELEVANT * self.spread)
+            Half(evidence.on(own), self.parts.cluster[chosen], IRRELEVANT * self.spread)
             for own, chosen in zip(shots, rows, strict=True)
         )
         return select, confirm

@@ -59,7 +59,7 @@ class Residuals:
         self.given, self.search, self.seed = given, search, seed
         self.hypotheses = search.hypotheses
         #: why causes were turned down, by key
-        self.turned_down: dict[str, str] = {}
+        self.rejected_for: dict[str, str] = {}
 
     def left(self, base: Base) -> Left:
         """:return: what the current model leaves"""
@@ -88,7 +88,7 @@ class Residuals:
             if (changes := self._varies(one, base, left)) is None:
                 continue
             key = one.tried.candidate.key
-            self.turned_down[key] = NO_CONSTANT
+            self.rejected_for[key] = NO_CONSTANT
             for later in found[n:]:
                 base = self.search.without(base, later.tried.candidate)
             return found[:n], base, self.left(base), nearest_in_words(key, changes)
