@@ -117,7 +117,7 @@ def pictures_of(
     :param friction: against velocity
     """
     evidence, twin = half.evidence, half.evidence.hypotheses.twin
-    rows = _shown(half.unit)
+    rows = _shown(half.cluster)
     measured = np.asarray(evidence.shots.obs)[rows]
     errors = [
         np.sqrt(np.mean(bounded((point.raw / evidence.noise) ** 2), (0, 2)))
