@@ -243,18 +243,18 @@ def test_both_halves_see_every_condition_and_few_recordings_are_cut_into_stretch
     one = Trajectories.from_arrays([np.zeros((401, 1))], [np.zeros((400, 1))], dt=0.1)
 
     parts = split(data, np.repeat(np.arange(12), 2), seed=0)
-    stretches = split(one, np.zeros(40, int), seed=0).unit
+    stretches = split(one, np.zeros(40, int), seed=0).cluster
 
     assert [parts.confirm[rows].mean() for rows in (slice(8), slice(8, 24))] == [0.5, 0.5]
-    assert all(len(set(parts.confirm[parts.unit == u])) == 1 for u in range(12))
+    assert all(len(set(parts.confirm[parts.cluster == u])) == 1 for u in range(12))
     assert len(np.unique(stretches)) == 16 and (np.diff(stretches) >= 0).all()
 
 
-def test_the_gain_is_the_geometric_mean_over_units():
-    unit = np.array([0, 0, 1, 1, -1])
+def test_the_gain_is_the_geometric_mean_over_clusters():
+    cluster = np.array([0, 0, 1, 1, -1])
     old, new = np.array([1.0, 3.0, 2.0, 2.0, 9.0]), np.array([1.0, 1.0, 1.0, 1.0, 99.0])
 
-    found = compare(new, old, unit)
+    found = compare(new, old, cluster)
 
     assert found.gain == pytest.approx(1.0 - 0.5)
     assert found.n_clusters == 2 and found.low <= found.gain <= found.high
@@ -272,7 +272,7 @@ def test_a_level_is_kept_where_errors_differ_by_chance(judge, n_units, level, mo
     assert alarms <= most
 
 
-def test_every_window_may_confirm_where_few_units_gain_unequally():
+def test_every_window_may_confirm_where_few_clusters_gain_unequally():
     unit = np.repeat(np.arange(5), 4)
     old, gain = np.full(20, 100.0), np.repeat([1.02, 1.05, 2.0, 50.0, 9000.0], 4)
 
@@ -449,7 +449,7 @@ def test_no_size_is_certain_where_simulations_blow_up_nearby():
     slopes = SimpleNamespace(curvature=np.full((4, 1, 1), np.nan), scores=np.ones((4, 1)))
     hypotheses = SimpleNamespace(scale=np.ones(1))
     evidence = SimpleNamespace(slopes=lambda *_: slopes, hypotheses=hypotheses)
-    half = SimpleNamespace(evidence=evidence, unit=np.arange(4))
+    half = SimpleNamespace(evidence=evidence, cluster=np.arange(4))
 
     errors = standard_errors(half, SimpleNamespace(theta=np.zeros(1)), [0])
 
