@@ -11,8 +11,8 @@ from sb3_hds.effects import (
     TorqueGain,
     ViscousFriction,
 )
-from sb3_hds.envs.inverted_pendulum_friction import InvertedPendulumFriction
-from sb3_hds.envs.pendulum_real import PendulumReal
+from sb3_hds.envs.tasks.inverted_pendulum_friction import InvertedPendulumFriction
+from sb3_hds.envs.tasks.pendulum_real import PendulumReal
 from sb3_hds.twins import registry
 
 

@@ -12,16 +12,16 @@ STEP_LIMITS = {
 #: Stand-ins for hardware, stepped by MuJoCo's engine: id -> class and step limit.
 HARDWARE = {
     "sb3_hds/InvertedPendulumFriction-v5": (
-        "sb3_hds.envs.inverted_pendulum_friction:InvertedPendulumFriction",
+        "sb3_hds.envs.tasks.inverted_pendulum_friction:InvertedPendulumFriction",
         1000,
     ),
-    "sb3_hds/PendulumReal-v1": ("sb3_hds.envs.pendulum_real:PendulumReal", 200),
+    "sb3_hds/PendulumReal-v1": ("sb3_hds.envs.tasks.pendulum_real:PendulumReal", 200),
 }
 
 #: Tasks without a twin: id -> class and step limit.
 TASKS = {
-    "sb3_hds/ConstantReward-v0": ("sb3_hds.envs.constant_reward:ConstantReward", 4),
-    "sb3_hds/ElasticQuadruped-v0": ("sb3_hds.envs.elastic_quadruped:ElasticQuadruped", 500),
+    "sb3_hds/ConstantReward-v0": ("sb3_hds.envs.tasks.constant_reward:ConstantReward", 4),
+    "sb3_hds/ElasticQuadruped-v0": ("sb3_hds.envs.tasks.elastic_quadruped:ElasticQuadruped", 500),
 }
 
 _ENTRY_POINT = "sb3_hds.envs.twin_env:TwinEnv"

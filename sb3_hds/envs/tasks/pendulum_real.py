@@ -5,14 +5,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from sb3_hds.envs.quantities import checked
-
-# Its functions are not in its type stubs.
-_engine: Any = mujoco
+from sb3_hds.envs.tasks.engine import check_quantity, engine
 
 _MODEL = """
 <mujoco>
@@ -77,21 +73,21 @@ class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}.")
         self.render_mode = render_mode
-        self.mass = checked("mass", mass, positive=True)
-        self.length = checked("length", length, positive=True)
-        self.gravity = checked("gravity", gravity)
-        self.damping = checked("damping", damping)
-        self.friction = checked("friction", friction)
-        self.drag = checked("drag", drag)
-        self.gain = checked("gain", gain)
-        self.delay = checked("delay", delay, most=_LONGEST_DELAY)
-        self.lag = checked("lag", lag)
-        self.noise = checked("noise", noise)
-        self.payload = checked("payload", payload)
-        self.dt = checked("dt", dt, positive=True)
+        self.mass = check_quantity("mass", mass, positive=True)
+        self.length = check_quantity("length", length, positive=True)
+        self.gravity = check_quantity("gravity", gravity)
+        self.damping = check_quantity("damping", damping)
+        self.friction = check_quantity("friction", friction)
+        self.drag = check_quantity("drag", drag)
+        self.gain = check_quantity("gain", gain)
+        self.delay = check_quantity("delay", delay, maximum=_LONGEST_DELAY)
+        self.lag = check_quantity("lag", lag)
+        self.noise = check_quantity("noise", noise)
+        self.payload = check_quantity("payload", payload)
+        self.dt = check_quantity("dt", dt, positive=True)
         self.frame_skip = max(1, round(self.dt / _ENGINE_STEP))
         self.model = self._compiled()
-        self.data = _engine.MjData(self.model)
+        self.data = engine.MjData(self.model)
         self.action_space = spaces.Box(-_MAX_TORQUE, _MAX_TORQUE, (1,), np.float32)
         self.observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
         self._commands: list[tuple[float, float]] = []
@@ -100,9 +96,9 @@ class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def set_payload(self, payload: float) -> None:
         """Hang another point mass on the tip, between two steps. The state stays as it is."""
-        self.payload = checked("payload", payload)
+        self.payload = check_quantity("payload", payload)
         before, self.model = self.data, self._compiled()
-        self.data = _engine.MjData(self.model)
+        self.data = engine.MjData(self.model)
         self.data.time, self.data.qpos[:], self.data.qvel[:] = before.time, before.qpos, before.qvel
 
     def reset(
@@ -114,7 +110,7 @@ class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
         :raises ValueError: for another option, or a state that is not two finite numbers
         """
         super().reset(seed=seed)
-        _engine.mj_resetData(self.model, self.data)
+        engine.mj_resetData(self.model, self.data)
         start = self.np_random.uniform([-np.pi, -1.0], [np.pi, 1.0])
         if options:
             start = _state_in(options)
@@ -139,7 +135,7 @@ class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
         for _ in range(self.frame_skip):
             drag = self.drag * self.data.qvel[0] * abs(self.data.qvel[0])
             self.data.qfrc_applied[0] = self.gain * self._driven() - drag
-            _engine.mj_step(self.model, self.data)
+            engine.mj_step(self.model, self.data)
         return self._observation(), reward, False, False, {}
 
     def render(self) -> np.ndarray | None:
@@ -173,7 +169,7 @@ class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
             inertia=inertia,
             about_rod=_THIN * inertia,
         )
-        return _engine.MjModel.from_xml_string(text)
+        return engine.MjModel.from_xml_string(text)
 
     def _driven(self) -> float:
         """Torque of the drive in the next engine step [N m]."""

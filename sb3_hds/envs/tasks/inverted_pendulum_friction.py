@@ -3,16 +3,12 @@
 from types import SimpleNamespace
 from typing import Any
 
-import mujoco
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from gymnasium.utils import EzPickle
 
-from sb3_hds.envs.quantities import checked
-
-# Its functions are not in its type stubs.
-_engine: Any = mujoco
+from sb3_hds.envs.tasks.engine import check_quantity, engine
 
 _SLIDER, _HINGE = 0, 1
 
@@ -48,11 +44,11 @@ class InvertedPendulumFriction(InvertedPendulumEnv):
         reset_noise_scale: float = 0.01,
         **settings: Any,
     ) -> None:
-        self.slider_damping = checked("slider_damping", slider_damping)
-        self.hinge_damping = checked("hinge_damping", hinge_damping)
-        self.slider_friction = checked("slider_friction", slider_friction)
-        self.hinge_friction = checked("hinge_friction", hinge_friction)
-        self.noise = checked("noise", noise)
+        self.slider_damping = check_quantity("slider_damping", slider_damping)
+        self.hinge_damping = check_quantity("hinge_damping", hinge_damping)
+        self.slider_friction = check_quantity("slider_friction", slider_friction)
+        self.hinge_friction = check_quantity("hinge_friction", hinge_friction)
+        self.noise = check_quantity("noise", noise)
         self.swing_up, self.rail_ends = bool(swing_up), bool(rail_ends)
         super().__init__(reset_noise_scale=reset_noise_scale, **settings)
         EzPickle.__init__(
@@ -83,7 +79,7 @@ class InvertedPendulumFriction(InvertedPendulumEnv):
         )
 
     def _initialize_simulation(self) -> tuple[Any, Any]:
-        self._shipped = _engine.MjModel.from_xml_path(self.fullpath)
+        self._shipped = engine.MjModel.from_xml_path(self.fullpath)
         model, data = super()._initialize_simulation()
         model.dof_damping[_SLIDER] += self.slider_damping
         model.dof_damping[_HINGE] += self.hinge_damping

@@ -3,14 +3,10 @@
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from sb3_hds.envs.quantities import checked
-
-# Its functions are not in its type stubs.
-_engine: Any = mujoco
+from sb3_hds.envs.tasks.engine import check_quantity, engine
 
 #: legs in the order of the actuators: front left, front right, hind left, hind right
 LEGS = ("FL", "FR", "HL", "HR")
@@ -130,12 +126,12 @@ class ElasticQuadruped(gymnasium.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}.")
         self.control, self.render_mode = control, render_mode
         self.commands_positions = control == "position"
-        self.stiffness = checked("stiffness", stiffness, positive=True)
-        self.damping = checked("damping", damping)
-        self.noise = checked("noise", noise)
+        self.stiffness = check_quantity("stiffness", stiffness, positive=True)
+        self.damping = check_quantity("damping", damping)
+        self.noise = check_quantity("noise", noise)
         self.dt, self.frame_skip = _DT, round(_DT / _ENGINE_STEP)
-        self.model = _engine.MjModel.from_xml_string(_written(self.stiffness, self.damping))
-        self.data = _engine.MjData(self.model)
+        self.model = engine.MjModel.from_xml_string(_written(self.stiffness, self.damping))
+        self.data = engine.MjData(self.model)
         names = [f"{leg}_{part}" for leg in LEGS for part in ("hip", "knee")]
         joints = [self.model.joint(name) for name in names]
         motors = [self.model.joint(f"{name}_motor") for name in names]
@@ -160,11 +156,11 @@ class ElasticQuadruped(gymnasium.Env[np.ndarray, np.ndarray]):
         :param seed: restarts the sequence of start states and of the noise
         """
         super().reset(seed=seed)
-        _engine.mj_resetData(self.model, self.data)
+        engine.mj_resetData(self.model, self.data)
         joints = self.np_random.uniform(-0.05, 0.05, len(self._q))
         self.data.qpos[self._q] = self.data.qpos[self._motor_q] = joints
         self.data.qpos[2] = _height(joints)
-        _engine.mj_forward(self.model, self.data)
+        engine.mj_forward(self.model, self.data)
         return self._observation(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -183,7 +179,7 @@ class ElasticQuadruped(gymnasium.Env[np.ndarray, np.ndarray]):
             torque = np.clip(self._torque(action), -_MAX_TORQUE, _MAX_TORQUE)
             self.data.ctrl[:] = torque / _MAX_TORQUE
             power += float(np.abs(torque * self.data.qvel[self._motor_v]).sum()) / self.frame_skip
-            _engine.mj_step(self.model, self.data)
+            engine.mj_step(self.model, self.data)
         forwards, sideways = (self.data.qpos[:2] - before) / self.dt
         turning = abs(float(self.data.qvel[5]))
         reward = forwards - 0.2 * abs(sideways) - 0.1 * turning - 0.005 * power
@@ -195,8 +191,8 @@ class ElasticQuadruped(gymnasium.Env[np.ndarray, np.ndarray]):
         if self.render_mode is None:
             return None
         if self._renderer is None:
-            self._renderer = _engine.Renderer(self.model, 240, 320)
-        camera = _engine.MjvCamera()
+            self._renderer = engine.Renderer(self.model, 240, 320)
+        camera = engine.MjvCamera()
         camera.lookat[:] = self.data.qpos[0], self.data.qpos[1], 0.1
         camera.distance, camera.azimuth, camera.elevation = 0.9, 120.0, -15.0
         self._renderer.update_scene(self.data, camera)
