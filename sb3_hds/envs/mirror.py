@@ -65,7 +65,11 @@ def twin_of(env: gymnasium.Env | VecEnv) -> Twin:
     :raises NoTwinError: if no twin is registered for it
     """
     if isinstance(env, VecEnv):
-        bare = _without_vec_wrappers(env)
+        bare = env
+        while isinstance(bare, VecEnvWrapper):
+            if type(bare) not in _NEUTRAL_VEC:
+                raise _refused(type(bare).__name__, "VecEnv wrapper")
+            bare = bare.venv
         twin = bare.twin if isinstance(bare, TwinVecEnv) else _agreed(_twins_of_copies(bare))
     elif isinstance(env, gymnasium.Env):
         twin = _twin_of_one(env)
@@ -123,14 +127,6 @@ def _action_limits(space: spaces.Space) -> tuple[np.ndarray, np.ndarray]:
     return space.low.astype(np.float64), space.high.astype(np.float64)
 
 
-def _without_vec_wrappers(env: VecEnv) -> VecEnv:
-    while isinstance(env, VecEnvWrapper):
-        if type(env) not in _NEUTRAL_VEC:
-            raise _refused(type(env).__name__, "VecEnv wrapper")
-        env = env.venv
-    return env
-
-
 def _twin_of_one(env: gymnasium.Env) -> Twin:
     layer, transforms = env, []
     while isinstance(layer, gymnasium.Wrapper):
@@ -176,19 +172,16 @@ def _layers_of(env: VecEnv) -> list[list[tuple[str, StatefulTransform]]]:
     """
     with _telling(env):
         named = [_wrappers_in(text) for text in env.env_method("__str__")]
-        if not env.has_attr("twin_transforms"):
-            layers_of_copies: list[list[tuple[str, StatefulTransform]]] = [[] for _ in named]
-        else:
-            layers_of_copies = env.get_attr("twin_transforms")
-    for names, layers in zip(named, layers_of_copies, strict=True):
-        left = iter([name for name, _ in layers] + [None])
-        following = next(left)
+        has_transforms = env.has_attr("twin_transforms")
+        copies = env.get_attr("twin_transforms") if has_transforms else [[] for _ in named]
+    for names, layers in zip(named, copies, strict=True):
+        expected = [name for name, _ in layers]
         for name in names:
-            if name == following:
-                following = next(left)
+            if expected[:1] == [name]:
+                del expected[0]
             else:
                 _refuse_unless_neutral(name)
-    return layers_of_copies
+    return copies
 
 
 def _specs_of(env: VecEnv, transformed: set[str]) -> list[EnvSpec | None]:
@@ -252,23 +245,20 @@ def _agreed(copies: Sequence[Twin]) -> Twin:
     """
     first = copies[0]
     for i, other in enumerate(copies[1:], 1):
-        if other != first:
-            raise _differing(i, [f"{first!r} and {other!r}"])
-        differing = [
-            f"{name} is {value:g} and {other.values[name]:g} {first.parameters[name].unit}"
-            for name, value in first.values.items()
-            if other.values[name] != value
-        ]
-        if differing:
-            raise _differing(i, differing)
+        differences = [f"{first!r} and {other!r}"]
+        if other == first:
+            differences = [
+                f"{name} is {value:g} and {other.values[name]:g} {first.parameters[name].unit}"
+                for name, value in first.values.items()
+                if other.values[name] != value
+            ]
+        if differences:
+            raise EnvironmentMismatchError(
+                f"The copies 0 and {i} of the vectorised environment differ: "
+                f"{', '.join(differences)}. One twin cannot mirror both: make all copies with the "
+                "same arguments, or pass twin=."
+            )
     return first
-
-
-def _differing(index: int, differences: Iterable[str]) -> EnvironmentMismatchError:
-    return EnvironmentMismatchError(
-        f"The copies 0 and {index} of the vectorised environment differ: {', '.join(differences)}. "
-        "One twin cannot mirror both: make all copies with the same arguments, or pass twin=."
-    )
 
 
 def _refuse_unless_neutral(name: str, origin: str | None = None) -> None:

@@ -47,8 +47,8 @@ class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.twin = twin_from(twin, settings)
         self.render_mode = check_render_mode(render_mode)
         self.metadata = metadata_of(self.twin)
-        self.observation_space = observation_space(self.twin)
-        self.action_space = action_space(self.twin)
+        self.observation_space = box_of(self.twin.channels)
+        self.action_space = box_of(self.twin.actuators)
         self._state: State | None = None
         self._canvas: Any = None
 
@@ -82,7 +82,7 @@ class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         with _host():
             drawn = run.draw(draw_seed(self.np_random), params)
             state = jax.device_get(start_of(self.twin, drawn, options))
-            obs = _as_observation(run.observe(state, params))
+            obs = np.array(run.observe(state, params), np.float32)
         check_start(self.twin, self.observation_space, obs, options)
         self._state = state
         return obs, {}
@@ -99,7 +99,7 @@ class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         with _host():
             after = programs.for_one(self.twin).step(self.state, action, self.twin.params)
             self._state, obs, reward, terminated = jax.device_get(after)
-        return _as_observation(obs), float(reward), bool(terminated), False, {}
+        return np.array(obs, np.float32), float(reward), bool(terminated), False, {}
 
     def render(self) -> np.ndarray | None:
         """:return: an RGB image, uint8, shape ``(400, 400, 3)``; None without a render mode"""
@@ -156,28 +156,15 @@ def metadata_of(twin: Twin) -> dict[str, Any]:
     return {"render_modes": list(_RENDER_MODES), "render_fps": max(1, round(1.0 / twin.dt))}
 
 
-def observation_space(twin: Twin) -> spaces.Box:
-    """:return: the bounds of the twin's channels"""
-    return _box(twin.channels)
-
-
-def action_space(twin: Twin) -> spaces.Box:
-    """:return: the bounds of the twin's actuators"""
-    return _box(twin.actuators)
+def box_of(signals: Sequence[Actuator | Channel]) -> spaces.Box:
+    """:return: the space of a twin's observations or actions, with the bounds of its signals"""
+    low, high = np.array([(signal.low, signal.high) for signal in signals], np.float32).T
+    return spaces.Box(low, high)
 
 
 def draw_seed(generator: np.random.Generator) -> np.uint32:
     """:return: the seed of the next episode's start state"""
     return generator.integers(2**32, dtype=np.uint32)
-
-
-def _box(signals: Sequence[Actuator | Channel]) -> spaces.Box:
-    low, high = np.array([(signal.low, signal.high) for signal in signals], np.float32).T
-    return spaces.Box(low, high)
-
-
-def _as_observation(obs: Any) -> np.ndarray:
-    return np.array(obs, np.float32)
 
 
 def _host() -> contextlib.AbstractContextManager[None]:

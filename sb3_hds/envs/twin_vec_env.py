@@ -8,20 +8,12 @@ import gymnasium
 import jax
 import numpy as np
 from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 
 from sb3_hds.core import State, Twin
 from sb3_hds.envs import programs
-from sb3_hds.envs.twin_env import (
-    action_space,
-    check_render_mode,
-    draw_seed,
-    metadata_of,
-    observation_space,
-    twin_from,
-)
+from sb3_hds.envs.twin_env import box_of, check_render_mode, draw_seed, metadata_of, twin_from
 from sb3_hds.envs.validation import check_action, check_start, start_of
 
 _NO_LIMIT = np.iinfo(np.int32).max
@@ -64,14 +56,14 @@ class TwinVecEnv(VecEnv):
         **settings: Any,
     ) -> None:
         self.twin = twin_from(twin, settings)
-        self.spec = _spec_of(self.twin)
+        self.spec = gymnasium.registry.get(self.twin.env_id) if self.twin.env_id else None
         self.max_episode_steps = _limit(self.twin, max_episode_steps)
         if n_envs < 1:
             raise ValueError(
                 f"A vectorised environment needs at least one copy, got n_envs={n_envs}."
             )
         self.render_mode = check_render_mode(render_mode)
-        super().__init__(n_envs, observation_space(self.twin), action_space(self.twin))
+        super().__init__(n_envs, box_of(self.twin.channels), box_of(self.twin.actuators))
         self.metadata = metadata_of(self.twin)
         self._generators = [seeding.np_random(None)[0] for _ in range(n_envs)]
         self._next_seeds = np.zeros(n_envs, np.uint32)
@@ -145,9 +137,8 @@ class TwinVecEnv(VecEnv):
         self._states, self._elapsed = after.state, after.elapsed
         only_truncated = after.truncated & ~after.ended.terminated
         dones = after.truncated | after.ended.terminated
-        infos: list[dict[str, Any]] = [
-            {"TimeLimit.truncated": cut} for cut in only_truncated.tolist()
-        ]
+        infos: list[dict[str, Any]]
+        infos = [{"TimeLimit.truncated": truncated} for truncated in only_truncated.tolist()]
         ended = np.flatnonzero(dones).tolist()
         for i in ended:
             infos[i]["terminal_observation"] = np.array(after.ended.obs[i], np.float32)
@@ -231,7 +222,3 @@ def _limit(twin: Twin, max_episode_steps: int | None) -> int:
             f"({twin.max_episode_steps}); got {max_episode_steps}."
         )
     return limit
-
-
-def _spec_of(twin: Twin) -> EnvSpec | None:
-    return gymnasium.registry.get(twin.env_id) if twin.env_id else None
