@@ -15,12 +15,12 @@ from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.data import recording
 from sb3_hds.data.columns import Columns, Entry, columns_from
 from sb3_hds.data.reading import READERS, Log, Table, read_log
-from sb3_hds.data.reading.log import listed
 from sb3_hds.data.reading.minari import PREFIX, read_minari
 from sb3_hds.data.reading.ros import is_bag
 from sb3_hds.data.resampling.report import Reading
 from sb3_hds.data.resampling.resample import at_one_interval
 from sb3_hds.data.resampling.rows import Rows, rows_of
+from sb3_hds.data.wording import listed
 from sb3_hds.errors import TrajectoryError
 
 _SUFFIX = ".npz"  # of what Trajectories.save writes

@@ -9,17 +9,15 @@ from sb3_hds.core.signals import Channel
 from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.core.trajectories.episodes import same_interval
 from sb3_hds.core.twin import Twin
-from sb3_hds.data.audit import continuity
-from sb3_hds.data.audit.differences import backward_differences
 from sb3_hds.data.audit.excitation import StandingStill, WithinNoise, excitation, stillness_of
 from sb3_hds.data.audit.finding import Finding
-from sb3_hds.data.audit.limits import reached_limits
-from sb3_hds.data.audit.outliers import Outliers, glitches, outliers
+from sb3_hds.data.audit.jumps import Outliers, glitches, outliers, reinitialised
+from sb3_hds.data.audit.plateaus import reached_limits, repeated_samples, saturated, stuck
 from sb3_hds.data.audit.results import Audit, ChannelSummary
-from sb3_hds.data.audit.stretches import Stretch, joined, stretches_of
+from sb3_hds.data.audit.stretches import joined, stretches_of
 from sb3_hds.data.audit.timing import timing
 from sb3_hds.data.audit.units import mistaken_units, other_units, swapped
-from sb3_hds.data.audit.velocity import matches_of, velocity_shifts
+from sb3_hds.data.audit.velocity import backward_differences, matches_of, velocity_shifts
 from sb3_hds.data.resampling.report import Reading
 from sb3_hds.data.resampling.values import resolutions
 from sb3_hds.errors import TrajectoryError
@@ -65,7 +63,9 @@ def audit(
     resolution = resolutions([stretch.obs for stretch in rows]) if known is None else known
     still = stillness_of(rows, resolution)
     # Outliers inflate the standard deviations that the other checks are relative to.
-    found: list[Finding] = _beyond(rows, names, resolution)
+    found: list[Finding] = [*outliers(rows, names)]
+    far = {finding.channel for finding in found}
+    found += [f for f in glitches(rows, names, resolution) if f.channel not in far]
     if not found:
         found += excitation(data, still, names, actions)
     unfit = any(isinstance(finding, Outliers | StandingStill | WithinNoise) for finding in found)
@@ -75,14 +75,14 @@ def audit(
         found += [
             *(mistaken_units(data, twin, named, columns) if twin else ()),
             *(reached_limits(rows, twin) if twin else ()),
-            *continuity.reinitialised(rows, names, resolution),
+            *reinitialised(rows, names, resolution),
             *other_units(data, named, matches),
             *swapped(data, named, matches),
             *velocity_shifts(data, names, matches),
             *backward_differences(data, names, matches, twin),
-            *continuity.stuck(rows, names, resolution),
-            *continuity.saturated(rows, names, resolution),
-            *continuity.repeated_samples(rows, names, resolution),
+            *stuck(rows, names, resolution),
+            *saturated(rows, names, resolution),
+            *repeated_samples(rows, names, resolution),
         ]
     values = joined(rows)
     summaries = tuple(
@@ -137,10 +137,3 @@ def _channels(
     if misfit:
         raise TrajectoryError(misfit)
     return named
-
-
-def _beyond(rows: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray) -> list[Finding]:
-    """Outliers, and glitches of channels without any."""
-    found: list[Finding] = [*outliers(rows, names)]
-    far = {finding.channel for finding in found}
-    return [*found, *(f for f in glitches(rows, names, resolution) if f.channel not in far)]

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from sb3_hds.core.trajectories import Trajectories
-from sb3_hds.data.audit.finding import Finding, counted, percent, recordings
+from sb3_hds.data.audit.finding import Finding
 from sb3_hds.data.audit.stretches import Stretch, all_samples, joined
+from sb3_hds.data.wording import counted, percent
 
 _SECONDS, _FEWEST, _MOST = 0.1, 12, 100  # length of a window, and its limits in rows
 _WHITE = 0.5  # mean squared step by variance: 2 for white noise, 0 for smooth motion
@@ -28,7 +29,7 @@ class StandingStill(Finding):
     def sentence(self) -> str:
         return (
             f"The system stands still {percent(self.share)} of the time "
-            f"({recordings(self.places)}): this tells the noise of its sensors and nothing about "
+            f"({self.recordings}): this tells the noise of its sensors and nothing about "
             "its motion."
         )
 
@@ -62,8 +63,7 @@ class WeakMotion(Finding):
     @property
     def sentence(self) -> str:
         return (
-            f"'{self.channel}' moves by only {self.ratio:.1f} times its noise "
-            f"({recordings(self.places)})."
+            f"'{self.channel}' moves by only {self.ratio:.1f} times its noise ({self.recordings})."
         )
 
     remedy = "Move it further: what acts on it cannot be estimated from this."
@@ -79,8 +79,7 @@ class WithinNoise(Finding):
     @property
     def sentence(self) -> str:
         return (
-            f"No channel moves by more than {self.ratio:.1f} times its noise "
-            f"({recordings(self.places)})."
+            f"No channel moves by more than {self.ratio:.1f} times its noise ({self.recordings})."
         )
 
     remedy = "Record larger motion: nothing can be estimated from this."
@@ -94,10 +93,7 @@ class MostlyStill(Finding):
 
     @property
     def sentence(self) -> str:
-        return (
-            f"The system stands still {percent(self.share)} of the time "
-            f"({recordings(self.places)})."
-        )
+        return f"The system stands still {percent(self.share)} of the time ({self.recordings})."
 
     remedy = "Only the rest tells anything about its motion: record more of it."
 
@@ -118,7 +114,7 @@ class PoorExcitation(Finding):
         return (
             f"Excitation is poor: no channel goes to and fro more often than '{self.channel}', "
             f"{counted(self.n_strokes, 'stroke')} in {counted(len(self.places), 'recording')} "
-            f"under {counted(self.n_conditions, 'condition')} ({recordings(self.places)})."
+            f"under {counted(self.n_conditions, 'condition')} ({self.recordings})."
         )
 
     remedy = (
@@ -142,7 +138,7 @@ class ConstantCommand(Finding):
     def sentence(self) -> str:
         span = f"between {self.low:.5g} and {self.high:.5g}"
         value = span if f"{self.low:.4g}" != f"{self.high:.4g}" else f"{self.high:.4g}"
-        return f"The command '{self.channel}' is {value} throughout ({recordings(self.places)})."
+        return f"The command '{self.channel}' is {value} throughout ({self.recordings})."
 
     remedy = (
         "Gain, delay and lag of this actuator cannot be estimated from this. If it is meant to do "
@@ -160,7 +156,7 @@ class DependentCommand(Finding):
     def sentence(self) -> str:
         return (
             f"The command '{self.channel}' follows from the observations of the same moment "
-            f"(R2 = {self.r2:.5f}), as under linear feedback ({recordings(self.places)})."
+            f"(R2 = {self.r2:.5f}), as under linear feedback ({self.recordings})."
         )
 
     remedy = (
@@ -191,17 +187,18 @@ def stillness_of(stretches: list[Stretch], resolution: Float64[np.ndarray, " n_o
     :param stretches: at least one
     :param resolution: smallest step of each channel, 0 where it has none
     """
-    windows = [_windows(stretch) for stretch in stretches]
-    if not any(len(part) for part in windows):
+    parts = [part for part in map(_windows, stretches) if len(part)]
+    if not parts:
         return Stillness(0.0, np.full(len(resolution), np.nan), 0)
     # Deviations, steps, ranges: one array per window and channel, whatever its number of rows.
-    parts = [part for part in windows if len(part)]
     std = np.concatenate([part.std(axis=1, ddof=1) for part in parts])
     step = np.concatenate([np.sqrt(np.mean(np.diff(p, axis=1) ** 2, axis=1)) for p in parts])
     width = np.concatenate([np.ptp(part, axis=1) for part in parts])
     overall = joined(stretches).std(axis=0)
     jitters = step**2 >= _WHITE * std**2
-    floor = np.array([_median(s[j]) for s, j in zip(std.T, jitters.T, strict=True)])
+    floor = np.array(
+        [np.median(s[j]) if j.any() else 0.0 for s, j in zip(std.T, jitters.T, strict=True)]
+    )
     small = (std <= _SMALL * overall) | (overall <= _ALL_NOISE * floor)
     still = ((width <= 2.01 * resolution) | (jitters & small)).all(axis=1)
     noise = (
@@ -215,10 +212,6 @@ def _windows(stretch: Stretch) -> np.ndarray:
     length = int(np.clip(round(_SECONDS / stretch.dt), _FEWEST, _MOST))
     n = len(stretch.obs) // length
     return stretch.obs[: n * length].reshape(n, length, stretch.obs.shape[1])
-
-
-def _median(values: np.ndarray) -> float:
-    return float(np.median(values)) if len(values) else 0.0
 
 
 NEEDED = 100  # steps: with fewer, hardly any effect is significant

@@ -2,10 +2,11 @@
 
 import abc
 import dataclasses
-from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
-_PLACES = 2  # that a sentence names
+from sb3_hds.data.wording import counted
+
+_SHOWN = 2  # places or recordings that a sentence names
 
 
 class Place(NamedTuple):
@@ -57,6 +58,20 @@ class Finding(abc.ABC):
     def sentence(self) -> str:
         """The defect, in one sentence."""
 
+    @property
+    def where(self) -> str:
+        """The first places, and how many more there are."""
+        shown = "; ".join(map(str, self.places[:_SHOWN]))
+        more = len(self.places) - _SHOWN
+        return f"{shown}; and {counted(more, 'more place')}" if more > 0 else shown
+
+    @property
+    def recordings(self) -> str:
+        """The first recordings that have the defect throughout, and how many more there are."""
+        sources = list(dict.fromkeys(place.source for place in self.places))
+        more = f" and {len(sources) - _SHOWN} more" if len(sources) > _SHOWN else ""
+        return f"all samples of {', '.join(sources[:_SHOWN])}{more}"
+
     def __str__(self) -> str:
         return f"{self.sentence} {self.remedy}"
 
@@ -66,28 +81,3 @@ class Finding(abc.ABC):
         places = [place._asdict() for place in self.places]
         kind = {"kind": type(self).__name__, "blocks": self.blocks, "text": str(self)}
         return kind | fields | {"places": places}
-
-
-def percent(share: float) -> str:
-    """:return: a share in per cent, for people"""
-    return f"{100.0 * share:.2g} %" if share < 0.995 else "100 %"
-
-
-def counted(n: int, noun: str) -> str:
-    """:return: a number with its noun, for people"""
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
-
-
-def listed(places: Sequence[Place]) -> str:
-    """:return: the first places, and how many more there are"""
-    shown = "; ".join(map(str, places[:_PLACES]))
-    more = len(places) - _PLACES
-    return f"{shown}; and {counted(more, 'more place')}" if more > 0 else shown
-
-
-def recordings(places: Sequence[Place]) -> str:
-    """:return: the first affected recordings, and how many more there are"""
-    sources = list(dict.fromkeys(place.source for place in places))
-    names = ", ".join(sources[:_PLACES])
-    more = len(sources) - _PLACES
-    return f"all samples of {names}" + (f" and {more} more" if more > 0 else "")

@@ -5,18 +5,19 @@ import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import accumulate
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from sb3_hds.core.trajectories import Trajectories
-from sb3_hds.data.audit.continuity import ReinitialisedState
-from sb3_hds.data.audit.finding import Finding, counted, percent
-from sb3_hds.data.audit.outliers import Outliers
+from sb3_hds.data.audit.finding import Finding
+from sb3_hds.data.audit.jumps import Outliers, ReinitialisedState
 from sb3_hds.data.audit.velocity import VelocityShift
+from sb3_hds.data.wording import counted, percent
 from sb3_hds.errors import TrajectoryError
 
 _WIDTH = 80
+_Kind = TypeVar("_Kind", bound=Finding)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,8 +74,7 @@ class Audit:
     @property
     def velocity_shift(self) -> dict[str, float]:
         """Delay of each shifted velocity channel [s]; negative: early."""
-        shifts = [f for f in self.findings if isinstance(f, VelocityShift)]
-        return {shift.channel: shift.seconds for shift in shifts}
+        return {shift.channel: shift.seconds for shift in self._of_kind(VelocityShift)}
 
     @property
     def noise(self) -> dict[str, float | None]:
@@ -92,28 +92,29 @@ class Audit:
         """
         if tuple(data.lengths.tolist()) != self.lengths or data.dt != self.dt:
             raise TrajectoryError("These are not the data of this audit: call audit(data) first.")
-        jumps = [f for f in self.findings if isinstance(f, ReinitialisedState)]
+        jumps, far = self._of_kind(ReinitialisedState), self._of_kind(Outliers)
         places = [(p.trajectory, p.before, p.time) for jump in jumps for p in jump.places]
-        far = [f for f in self.findings if isinstance(f, Outliers)]
         places += [(p.trajectory, p.before, p.after) for outlier in far for p in outlier.places]
         if places:
             data = cut(data, places)
         names = [channel.name for channel in self.channels]
-        shifts = [f for f in self.findings if isinstance(f, VelocityShift)]
-        lags = {names.index(shift.channel): shift.samples for shift in shifts}
+        lags = {names.index(s.channel): s.samples for s in self._of_kind(VelocityShift)}
         return shifted(data, lags) if lags else data
 
     @property
     def corrections(self) -> tuple[str, ...]:
         """Sentences on what :meth:`corrected` does to the data."""
-        jumps = sum(len(f.places) for f in self.findings if isinstance(f, ReinitialisedState))
+        jumps = sum(len(jump.places) for jump in self._of_kind(ReinitialisedState))
         cuts = (f"The data were cut at {counted(jumps, 'jump')} of the state.",) if jumps else ()
-        far = sum(len(f.places) for f in self.findings if isinstance(f, Outliers))
+        far = sum(len(outlier.places) for outlier in self._of_kind(Outliers))
         cuts += (f"Samples were cut out at {counted(far, 'place')} with outliers.",) if far else ()
         return cuts + tuple(
             f"'{channel}' was shifted by {-1e3 * seconds:+.3g} ms."
             for channel, seconds in self.velocity_shift.items()
         )
+
+    def _of_kind(self, kind: type[_Kind]) -> list[_Kind]:
+        return [finding for finding in self.findings if isinstance(finding, kind)]
 
     def to_dict(self) -> dict[str, Any]:
         """:return: plain data for JSON"""
@@ -134,9 +135,9 @@ class Audit:
         n, steps, labels = len(self.lengths), sum(self.lengths), len(set(self.conditions))
         verdict = "yes" if self.usable else f"NO. {self.reason}"
         head = (
-            f"Audit of {n} {'trajectory' if n == 1 else 'trajectories'}, "
-            f"{labels} {'condition' if labels == 1 else 'conditions'}: {steps} steps, "
-            f"{steps * self.dt:.4g} s at dt = {self.dt:g} s"
+            f"Audit of {counted(n, 'trajectory', 'trajectories')}, "
+            f"{counted(labels, 'condition')}: {steps} steps, {steps * self.dt:.4g} s at dt = "
+            f"{self.dt:g} s"
         )
         lines = [head, *_wrapped(f"usable: {verdict}", "", "  "), "", *_table(self.channels)]
         lines += ["", f"It stands still {percent(self.stands_still)} of the time."]

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float64, Int
 
 from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.data.audit.finding import Place
-from sb3_hds.data.resampling.report import Part
 
 
 class Stretch(NamedTuple):
@@ -48,8 +47,11 @@ class Stretch(NamedTuple):
 
 def stretches_of(data: Trajectories) -> list[Stretch]:
     """:return: the rows of the log that each trajectory was read from, or else its samples"""
-    parts = _parts_of(data)
-    if parts:
+    chosen = set(data.origin.tolist())
+    parts = [part for part in data.report.parts if part.recording in chosen] if data.report else []
+    samples = list(zip(data.origin.tolist(), data.lengths.tolist(), strict=True))
+    # Trajectories that were cut or selected no longer match the recordings one to one.
+    if parts and [(part.recording, part.n_steps) for part in parts] == samples:
         return [
             Stretch(p.rows.source, i, p.rows.numbers, p.rows.times - p.begin, p.rows.obs)
             for i, p in enumerate(parts)
@@ -71,6 +73,11 @@ def joined(stretches: Sequence[Stretch]) -> Float64[np.ndarray, "rows n_obs"]:
     return np.concatenate([stretch.obs for stretch in stretches])
 
 
+def steps_of(stretches: Sequence[Stretch]) -> Float64[np.ndarray, "steps n_obs"]:
+    """:return: the differences of successive rows of all of them"""
+    return np.concatenate([np.diff(stretch.obs, axis=0) for stretch in stretches])
+
+
 def runs(flags: Bool[np.ndarray, " steps"]) -> Iterator[tuple[int, int]]:
     """
     :param flags: of rows, or of the steps between rows
@@ -78,17 +85,3 @@ def runs(flags: Bool[np.ndarray, " steps"]) -> Iterator[tuple[int, int]]:
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
-
-
-def _parts_of(data: Trajectories) -> list[Part]:
-    """
-    The log rows of each trajectory; empty unless trajectories match the recordings one to one.
-    """
-    if data.report is None:
-        return []
-    chosen = set(data.origin.tolist())
-    parts = [part for part in data.report.parts if part.recording in chosen]
-    same = [part.recording for part in parts] == data.origin.tolist() and [
-        part.n_steps for part in parts
-    ] == data.lengths.tolist()
-    return parts if same else []

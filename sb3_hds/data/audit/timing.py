@@ -1,16 +1,14 @@
 """Defects of time stamps: uneven, jittered, repeated, missing."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
 from sb3_hds.core.trajectories import Trajectories
-from sb3_hds.data.audit.finding import Finding, Place, counted, listed, percent, recordings
-from sb3_hds.data.resampling.report import Reading
-
-
-def _are(n: int) -> str:
-    return "is" if n == 1 else "are"
+from sb3_hds.data.audit.finding import Finding, Place
+from sb3_hds.data.resampling.report import Reading, Sampling
+from sb3_hds.data.wording import counted, percent
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +30,7 @@ class UnevenSampling(Finding):
         return (
             f"Time stamps jitter: rows are {1e3 * self.shortest:.3g} to "
             f"{1e3 * self.longest:.3g} ms apart, the median is {1e3 * self.median:.3g} ms and "
-            f"{percent(self.share)} differ from it by more than 10 % ({recordings(self.places)})."
+            f"{percent(self.share)} differ from it by more than 10 % ({self.recordings})."
         )
 
     remedy = (
@@ -60,12 +58,12 @@ class JitteredStamps(Finding):
         far = f"up to {1e3 * self.longest:.3g} ms"
         if self.n_rows:
             return (
-                f"{counted(self.n_rows, 'time stamp')} {_are(self.n_rows)} off by {far} in an "
-                f"otherwise regular clock ({listed(self.places)})."
+                f"{counted(self.n_rows, 'time stamp is', 'time stamps are')} off by {far} in an "
+                f"otherwise regular clock ({self.where})."
             )
         return (
             f"Time stamps jitter by {1e3 * self.rms:.3g} ms (rms), {far}, around the ticks of a "
-            f"regular clock ({recordings(self.places)})."
+            f"regular clock ({self.recordings})."
         )
 
     remedy = (
@@ -83,8 +81,8 @@ class MissingRows(Finding):
     @property
     def sentence(self) -> str:
         return (
-            f"{counted(self.n_rows, 'row')} of a regular clock {_are(self.n_rows)} missing, before "
-            f"{listed(self.places)}."
+            f"{counted(self.n_rows, 'row of a regular clock is', 'rows of a regular clock are')} "
+            f"missing, before {self.where}."
         )
 
     remedy = "Interpolated. A longer gap ends the trajectory: gap: SECONDS in columns says when."
@@ -100,7 +98,7 @@ class RepeatedStamps(Finding):
     def sentence(self) -> str:
         return (
             f"{counted(self.n_rows, 'row')} with the time stamp of the row before "
-            f"{'was' if self.n_rows == 1 else 'were'} left out ({listed(self.places)})."
+            f"{'was' if self.n_rows == 1 else 'were'} left out ({self.where})."
         )
 
     remedy = "Find out whether the logger writes twice or the clock is too coarse."
@@ -116,7 +114,7 @@ class Gaps(Finding):
     def sentence(self) -> str:
         return (
             f"The recording has {counted(len(self.places), 'gap')} of up to {self.longest:.3g} s "
-            f"({listed(self.places)})."
+            f"({self.where})."
         )
 
     remedy = "It was cut there. Look for what held up the logger."
@@ -129,51 +127,45 @@ def timing(data: Trajectories, report: Reading | None) -> list[Finding]:
     """
     if report is None:
         return []
-    chosen = {o: i for i, o in reversed(list(enumerate(data.origin.tolist())))}
-    recordings = [(chosen[o], r) for o, r in enumerate(report.recordings) if o in chosen]
+    trajectory_of = {o: i for i, o in reversed(list(enumerate(data.origin.tolist())))}
+    read = [(trajectory_of[o], r) for o, r in enumerate(report.recordings) if o in trajectory_of]
     found: list[Finding] = []
-    uneven = [(i, r) for i, r in recordings if r.resampled and r.uneven]
+    uneven = [(i, r) for i, r in read if r.resampled and r.uneven]
     if uneven:
-        n = sum(r.rows - 1 for _, r in uneven)
         found.append(
             UnevenSampling(
                 "time",
-                tuple(Place(r.source, 0, r.rows - 1, i) for i, r in uneven),
+                _all_rows(uneven),
                 min(r.intervals[0] for _, r in uneven),
                 float(np.median([r.intervals[1] for _, r in uneven])),
                 max(r.intervals[2] for _, r in uneven),
-                sum(r.uneven for _, r in uneven) / n,
+                sum(r.uneven for _, r in uneven) / sum(r.rows - 1 for _, r in uneven),
             )
         )
-    late = [(i, r) for i, r in recordings if r.clock == "late" and not r.resampled]
-    if late:
-        found.append(
-            JitteredStamps(
-                "time",
-                tuple(Place(r.source, k, k, i) for i, r in late for k in r.late),
-                sum(len(r.late) for _, r in late),
-                max(r.off for _, r in late),
-                max(r.jitter for _, r in late),
+    for kind in ("late", "jittered"):
+        some = [(i, r) for i, r in read if r.clock == kind and not r.resampled]
+        if some:
+            late = tuple(Place(r.source, k, k, i) for i, r in some for k in r.late)
+            found.append(
+                JitteredStamps(
+                    "time",
+                    late if kind == "late" else _all_rows(some),
+                    len(late) if kind == "late" else 0,
+                    max(r.off for _, r in some),
+                    max(r.jitter for _, r in some),
+                )
             )
-        )
-    jittered = [(i, r) for i, r in recordings if r.clock == "jittered" and not r.resampled]
-    if jittered:
-        found.append(
-            JitteredStamps(
-                "time",
-                tuple(Place(r.source, 0, r.rows - 1, i) for i, r in jittered),
-                0,
-                max(r.off for _, r in jittered),
-                max(r.jitter for _, r in jittered),
-            )
-        )
-    holes = [(Place(r.source, k, k, i), n) for i, r in recordings for k, n in r.missing]
+    holes = [(Place(r.source, k, k, i), n) for i, r in read for k, n in r.missing]
     if holes:
         found.append(MissingRows("time", tuple(p for p, _ in holes), sum(n for _, n in holes)))
-    stamps = tuple(Place(r.source, k, k, i) for i, r in recordings for k in r.repeated)
+    stamps = tuple(Place(r.source, k, k, i) for i, r in read for k in r.repeated)
     if stamps:
         found.append(RepeatedStamps("time", stamps, len(stamps)))
-    gaps = [(Place(r.source, k, k, i), seconds) for i, r in recordings for k, seconds in r.gaps]
+    gaps = [(Place(r.source, k, k, i), seconds) for i, r in read for k, seconds in r.gaps]
     if gaps:
         found.append(Gaps("time", tuple(place for place, _ in gaps), max(s for _, s in gaps)))
     return found
+
+
+def _all_rows(read: Sequence[tuple[int, Sampling]]) -> tuple[Place, ...]:
+    return tuple(Place(r.source, 0, r.rows - 1, i) for i, r in read)

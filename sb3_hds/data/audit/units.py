@@ -10,10 +10,11 @@ import numpy as np
 from sb3_hds.core.signals import Channel
 from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.core.twin import Twin
-from sb3_hds.data.audit.finding import Finding, percent, recordings
+from sb3_hds.data.audit.finding import Finding
 from sb3_hds.data.audit.replay import position_channels, replayed, stretches_in
 from sb3_hds.data.audit.stretches import all_samples
 from sb3_hds.data.audit.velocity import Match
+from sb3_hds.data.wording import percent
 
 # Factor: up to here `effects.SensorScale`, which is bounded to 0.1 to 10, gives it a name.
 _BEYOND = 10.0
@@ -47,7 +48,7 @@ class OtherUnits(Finding):
     def sentence(self) -> str:
         fast = f"changes {self.factor:.3g} times as fast as '{self.channel}' says"
         return (
-            f"'{self.position}' {fast} ({recordings(self.places)}): one of them is in other units"
+            f"'{self.position}' {fast} ({self.recordings}): one of them is in other units"
             f"{self._likely}."
         )
 
@@ -97,7 +98,7 @@ class MistakenUnits(Finding):
     def sentence(self) -> str:
         return (
             f"'{self.channel}' spans {self.span:.3g} {self.unit}, and {self._why} "
-            f"({recordings(self.places)}). Write {{column: {self.column}, unit: {self.symbol}}}, "
+            f"({self.recordings}). Write {{column: {self.column}, unit: {self.symbol}}}, "
             f"or scale it by {self.factor:.6g}."
         )
 
@@ -136,7 +137,7 @@ class Swapped(Finding):
     def sentence(self) -> str:
         return (
             f"'{self.channel}' should be a position and is the derivative of "
-            f"'{self.derivative_of}', which should be its velocity ({recordings(self.places)})."
+            f"'{self.derivative_of}', which should be its velocity ({self.recordings})."
         )
 
     remedy = "They are swapped: name the columns of obs in the order of the twin's channels."
@@ -163,7 +164,7 @@ def other_units(
         for match in matches
         if not taken & {match.velocity, *match.parts}
         and _known(match, channels) is not False
-        and _far(match, data.dt)
+        and _far(match)
     ]
     # Of each velocity, the position that it follows best comes last.
     far.sort(key=lambda match: match.scores.highest)
@@ -198,7 +199,7 @@ def swapped(
     ]
 
 
-def _far(match: Match, dt: float) -> bool:
+def _far(match: Match) -> bool:
     """Whether the factor is large, beyond doubt, and about the same everywhere."""
     scores = match.scores
     known = abs(scores.slope_there / RPM - 1.0) < _RPM_NEAR
@@ -206,7 +207,7 @@ def _far(match: Match, dt: float) -> bool:
     if usual or abs(scores.lag) > _LATEST:
         return False
     v = np.concatenate([v - v.mean() for _, v in match.pairs])
-    slopes = match.slopes(dt)
+    slopes = match.slopes()
     alike = np.median(np.abs(slopes / scores.slope_there - 1.0)) < _ALIKE
     return bool(len(slopes) >= _FEWEST and alike and v[1:] @ v[:-1] > _SMOOTH * (v @ v))
 

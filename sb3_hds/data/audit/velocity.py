@@ -2,14 +2,16 @@
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
 from sb3_hds.core.trajectories import Trajectories
-from sb3_hds.data.audit.finding import Finding, recordings
+from sb3_hds.core.twin import Twin
+from sb3_hds.data.audit.finding import Finding
+from sb3_hds.data.audit.replay import replayed, stretches_in
 from sb3_hds.data.audit.stretches import all_samples
 from sb3_hds.data.resampling.values import unwrapped
 
@@ -57,12 +59,29 @@ class VelocityShift(Finding):
         return (
             f"'{self.channel}' {verb} the derivative of '{self.position}' by "
             f"{abs(self.samples):.2f} +- {self.stderr:.2f} samples, "
-            f"{1e3 * abs(self.seconds):.3g} ms ({recordings(self.places)})."
+            f"{1e3 * abs(self.seconds):.3g} ms ({self.recordings})."
         )
 
     remedy = (
         "Shift it: audit.corrected(data). A filter in the drive is the usual cause; uncorrected, "
         "it passes for a delay or for friction."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class BackwardDifference(VelocityShift):
+    """A velocity that is the backward difference of its position, and so half a sample late."""
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' is the backward difference of '{self.position}', which belongs half "
+            f"a sample, {1e3 * self.seconds:.3g} ms, earlier ({self.recordings})."
+        )
+
+    remedy = (
+        "Shift it: audit.corrected(data). No sensor is late, unless the twin computes its velocity "
+        "in the same way."
     )
 
 
@@ -92,6 +111,7 @@ class Match(NamedTuple):
     :param position: name of the position
     :param parts: channels of the position: one, or a cosine and a sine
     :param pairs: position and velocity of each episode
+    :param dt: sampling interval [s]
     :param scores: of the pairs
     :param width: of the moving average [samples]
     """
@@ -100,6 +120,7 @@ class Match(NamedTuple):
     position: str
     parts: tuple[int, ...]
     pairs: Pairs
+    dt: float
     scores: "_Scores"
     width: int
 
@@ -108,11 +129,31 @@ class Match(NamedTuple):
         """Whether both are in the same unit."""
         return abs(self.scores.slope_there - 1.0) < _SAME
 
-    def slopes(self, dt: float) -> Float64[np.ndarray, " blocks"]:
+    def slopes(self) -> Float64[np.ndarray, " blocks"]:
         """:return: of the velocity on the derivative, in blocks of the data, at the same lag"""
-        reach, there = len(self.scores.slope) // 2, int(self.scores.correlation.argmax())
-        blocks = _blocks(self.pairs, reach, self.width)
-        return np.array([_Scores.of([b], dt, reach, self.width).slope[there] for b in blocks])
+        there = self.scores.correlation.argmax()
+        return np.array([block.slope[there] for block in self._scores_of_blocks()])
+
+    def stderr(self) -> float:
+        """:return: standard error of the lag, from its scatter over blocks [samples]"""
+        lags = np.array([s.lag for s in self._scores_of_blocks() if s.highest > 0.5 * _CLEAR])
+        if len(lags) < 3:
+            return 0.0 if len(lags) else np.inf
+        # Robust, because a block in which hardly anything moves says little.
+        sigma = 1.4826 * np.median(np.abs(lags - np.median(lags)))
+        return float(sigma / np.sqrt(len(lags)))
+
+    def _scores_of_blocks(self) -> list["_Scores"]:
+        """Of parts of the episodes, or of these if parts are too short."""
+        n_blocks = max(1, _BLOCKS // len(self.pairs))
+        reach = len(self.scores.slope) // 2
+        blocks = [
+            block
+            for q, v in self.pairs
+            for block in zip(np.array_split(q, n_blocks), np.array_split(v, n_blocks), strict=True)
+            if len(block[0]) > 4 * reach + self.width
+        ]
+        return [_Scores.of([b], self.dt, reach, self.width) for b in blocks or self.pairs]
 
 
 def velocity_shifts(
@@ -135,13 +176,63 @@ def velocity_shifts(
             seconds=lag.samples * data.dt,
             stderr=lag.stderr,
         )
-        for lag in _lags(matches, data.dt)
+        for lag in _lags(matches)
         if abs(lag.samples) >= max(_VISIBLE, _SIGMAS * lag.stderr)
         and (lag.better >= _BETTER or abs(lag.samples) >= _LONG)
     ]
 
 
-class Difference(NamedTuple):
+def backward_differences(
+    data: Trajectories, names: Sequence[str], matches: Sequence[Match], twin: Twin | None
+) -> list[BackwardDifference]:
+    """
+    :param data: at one interval
+    :param names: of the observation channels
+    :param matches: of the data
+    :param twin: if its own velocities are backward differences (semi-implicit Euler), they are not
+        reported; without a twin, only differences that carry the noise of the position are
+    """
+    found: dict[int, tuple[Match, bool]] = {
+        match.velocity: (match, difference.rough)
+        for match in matches
+        if match.agrees and (difference := _difference_of(match.pairs, data.dt)).backward
+    }
+    simulated = _simulated_differences(data, twin, found) if twin and found else None
+    return [
+        BackwardDifference(
+            names[v],
+            all_samples(data),
+            position=match.position,
+            samples=0.5,
+            seconds=0.5 * data.dt,
+            stderr=0.0,
+        )
+        for v, (match, rough) in found.items()
+        if (rough if simulated is None else v not in simulated)
+    ]
+
+
+def _simulated_differences(
+    data: Trajectories, twin: Twin, found: Mapping[int, tuple[Match, bool]]
+) -> set[int] | None:
+    """Velocity channels that are backward differences in a simulation; None: it says nothing."""
+    stretches = stretches_in(data)
+    if stretches is None:
+        return None
+    obs = replayed(twin, stretches, np.ones(data.n_obs)).obs
+    obs = obs[np.isfinite(obs).all((1, 2))]
+    if not len(obs):
+        return None
+    own = set()
+    for v, (match, _) in found.items():
+        first, *second = (obs[..., part] for part in match.parts)
+        position = np.unwrap(np.arctan2(second[0], first), axis=1) if second else first
+        if _difference_of(list(zip(position, obs[..., v], strict=True)), data.dt).backward:
+            own.add(v)
+    return own
+
+
+class _Difference(NamedTuple):
     """
     :param backward: whether a velocity is the backward difference of its position: it carries the
         same noise, or is the same number
@@ -152,7 +243,7 @@ class Difference(NamedTuple):
     rough: bool
 
 
-def difference_of(pairs: Pairs, dt: float) -> Difference:
+def _difference_of(pairs: Pairs, dt: float) -> _Difference:
     """
     Compare a velocity with the backward difference, and with a smoother one of equal delay.
 
@@ -168,7 +259,7 @@ def difference_of(pairs: Pairs, dt: float) -> Difference:
     products = sum(float(x[1:] @ x[:-1]) for x in bends)
     rough = bool(products < _ALTERNATES * sum(float(x @ x) for x in bends))
     share = _SAME_NOISE if rough else _SAME_NUMBER
-    return Difference(ours < share * others, rough)
+    return _Difference(ours < share * others, rough)
 
 
 def lags_of(data: Trajectories, names: Sequence[str]) -> list[Lag]:
@@ -178,7 +269,7 @@ def lags_of(data: Trajectories, names: Sequence[str]) -> list[Lag]:
     :param data: at one interval
     :param names: of the observation channels
     """
-    return _lags(matches_of(data, names), data.dt)
+    return _lags(matches_of(data, names))
 
 
 def matches_of(data: Trajectories, names: Sequence[str]) -> list[Match]:
@@ -207,22 +298,29 @@ def matches_of(data: Trajectories, names: Sequence[str]) -> list[Match]:
                 scores = _Scores.of(pairs, data.dt, reach, width)
                 if scores.highest > _CLEAR:
                     name = ", ".join(names[j] for j in parts)
-                    found.append(Match(v, name, parts, pairs, scores, width))
+                    found.append(Match(v, name, parts, pairs, data.dt, scores, width))
                     break
     return found
 
 
-def _lags(matches: Sequence[Match], dt: float) -> list[Lag]:
+def _lags(matches: Sequence[Match]) -> list[Lag]:
     """The lag of each velocity to its best matching position."""
-    found = []
-    for v in dict.fromkeys(match.velocity for match in matches if match.agrees):
-        own = [match for match in matches if match.velocity == v and match.agrees]
-        best = max(own, key=lambda match: match.scores.highest)
-        scores = best.scores
-        stderr = _stderr(best.pairs, dt, len(scores.slope) // 2, best.width)
-        backward = difference_of(best.pairs, dt).backward
-        found.append(Lag(v, best.position, scores.lag, stderr, scores.better, backward))
-    return found
+    best: dict[int, Match] = {}
+    for match in matches:
+        v = match.velocity
+        if match.agrees and (v not in best or match.scores.highest > best[v].scores.highest):
+            best[v] = match
+    return [
+        Lag(
+            v,
+            match.position,
+            match.scores.lag,
+            match.stderr(),
+            match.scores.better,
+            _difference_of(match.pairs, match.dt).backward,
+        )
+        for v, match in best.items()
+    ]
 
 
 def _positions(
@@ -238,29 +336,6 @@ def _positions(
             angles = [np.unwrap(np.arctan2(x[:, s], x[:, c])) for x in episodes]
             found.append(((c, s), angles))
     return found
-
-
-def _stderr(pairs: Pairs, dt: float, reach: int, width: int) -> float:
-    blocks = _blocks(pairs, reach, width)
-    scores = [_Scores.of([block], dt, reach, width) for block in blocks]
-    lags = np.array([s.lag for s in scores if s.highest > 0.5 * _CLEAR])
-    if len(lags) < 3:
-        return 0.0 if len(lags) else np.inf
-    # Robust, because a block in which hardly anything moves says little.
-    spread = 1.4826 * float(np.median(np.abs(lags - np.median(lags))))
-    return float(spread / np.sqrt(len(lags)))
-
-
-def _blocks(pairs: Pairs, reach: int, width: int) -> Pairs:
-    """Parts of the episodes, or these if parts are too short."""
-    n_blocks = max(1, _BLOCKS // len(pairs))
-    blocks = [
-        block
-        for q, v in pairs
-        for block in zip(np.array_split(q, n_blocks), np.array_split(v, n_blocks), strict=True)
-        if len(block[0]) > 4 * reach + width
-    ]
-    return blocks or pairs
 
 
 class _Scores(NamedTuple):

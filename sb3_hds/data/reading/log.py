@@ -15,7 +15,6 @@ from sb3_hds.errors import TrajectoryError
 Table = Mapping[str, np.ndarray]
 """Columns by name, each of shape ``(rows,)``; a value that holds for all rows has shape ``()``."""
 
-_LISTED = 40
 _OF_THE_SYSTEM = (errno.EACCES, errno.EPERM, errno.EIO, errno.ENOENT, errno.EISDIR, errno.EMFILE)
 
 _CONTENTS = {
@@ -91,13 +90,6 @@ def _other_kind(path: Path) -> str:
                 f"'{path.stem}{suffixes[0]}'; otherwise export it again."
             )
     return ""
-
-
-def listed(names: Iterable[str]) -> str:
-    """:return: names for a message, not all of very many"""
-    every = [str(name) for name in names]
-    more = f", and {len(every) - _LISTED} more" if len(every) > _LISTED else ""
-    return ", ".join(every[:_LISTED]) + more or "none"
 
 
 def base_of(name: str) -> str:

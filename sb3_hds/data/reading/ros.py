@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Int64
 
 from sb3_hds.data.columns import Columns, Entry
-from sb3_hds.data.reading.log import Log, foreign, listed
+from sb3_hds.data.reading.log import Log, foreign
+from sb3_hds.data.wording import listed
 from sb3_hds.errors import TrajectoryError
 
 _GAP = 5.0  # intervals

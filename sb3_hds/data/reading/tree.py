@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_hds.data.columns import Columns
-from sb3_hds.data.reading.log import Table, aliases, base_of, columns_of, listed
+from sb3_hds.data.reading.log import Table, aliases, base_of, columns_of
+from sb3_hds.data.wording import listed
 from sb3_hds.errors import TrajectoryError
 
 _EPISODES = re.compile(

@@ -3,14 +3,15 @@
 import dataclasses
 import math
 import textwrap
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, get_args
 
 from sb3_hds.core.signals import Actuator, Channel
 from sb3_hds.core.trajectories.episodes import SAME_RATE
 from sb3_hds.data.conversion import same_quantity
 from sb3_hds.data.resampling.clock import Kind
 from sb3_hds.data.resampling.rows import Rows
+from sb3_hds.data.wording import counted
 
 _LISTED = 20
 _DRIFT = 1e-4  # relative change of a rate that is reported
@@ -121,11 +122,11 @@ class Reading:
     def clocks(self) -> str:
         """:return: the clocks that paced the rows, one sentence for each kind"""
         said = []
-        for kind, say in _CLOCKS.items():
+        for kind in get_args(Kind):
             for kept in (True, False):
                 some = [r for r in self.recordings if (r.clock, not r.resampled) == (kind, kept)]
                 if some:
-                    said.append(f"{_place(some)}: {say(some, kept)}")
+                    said.append(f"{_place(some)}: {_clock(kind, some, kept)}")
         rates = [1.0 / r.interval for r in self.recordings if r.clock != "irregular"]
         if rates and max(rates) > (1.0 + _DRIFT) * min(rates):
             said.append(
@@ -157,21 +158,21 @@ class Reading:
         if filled:
             n = sum(rows for r in filled for _, rows in r.missing)
             said.append(
-                f"In {_place(filled)}, {_counted(n, 'missing row')} "
-                f"{'was' if n == 1 else 'were'} filled in by interpolation"
+                f"In {_place(filled)}, {counted(n, 'missing row was', 'missing rows were')} "
+                "filled in by interpolation"
             )
         if repeated:
             n = sum(len(r.repeated) for r in repeated)
             said.append(
-                f"In {_place(repeated)}, {_counted(n, 'row')} with the stamp of the row before "
+                f"In {_place(repeated)}, {counted(n, 'row')} with the stamp of the row before "
                 f"{'was' if n == 1 else 'were'} left out"
             )
         if gaps:
             n, unused = sum(len(r.gaps) for r in gaps), sum(r.unused for r in gaps)
             longest = max(length for r in gaps for _, length in r.gaps)
-            left_out = f"; {_counted(unused, 'row')} in shorter pieces left out" if unused else ""
+            left_out = f"; {counted(unused, 'row')} in shorter pieces left out" if unused else ""
             said.append(
-                f"{_subject(gaps)} cut at {_counted(n, 'gap')} of up to {longest:.3g} s{left_out}"
+                f"{_subject(gaps)} cut at {counted(n, 'gap')} of up to {longest:.3g} s{left_out}"
             )
         return ". ".join(said) + "." if said else "Nothing was changed."
 
@@ -201,10 +202,9 @@ class Reading:
 
     def __str__(self) -> str:
         shown = self.recordings[:_LISTED]
-        width = max(9, *(len(r.source) for r in shown))
-        width = min(width, 34)
+        width = min(max(9, *(len(r.source) for r in shown)), 34)
         lines = [
-            f"Read {_counted(len(self.recordings), 'recording')} at dt = {self.dt:g} s",
+            f"Read {counted(len(self.recordings), 'recording')} at dt = {self.dt:g} s",
             _row(width, "recording", "rows", "interval [ms]", "repeated", "gaps"),
         ]
         for r in shown:
@@ -214,56 +214,40 @@ class Reading:
             lines.append(_row(width, name, r.rows, interval, len(r.repeated), len(r.gaps)))
         if len(self.recordings) > _LISTED:
             lines.append(f"  and {len(self.recordings) - _LISTED} more")
-        paragraphs = [self.clocks(), self.summary(), *self.notes]
-        return "\n".join([*lines, *(line for text in paragraphs for line in _wrapped(text))])
+        for text in (self.clocks(), self.summary(), *self.notes):
+            lines += textwrap.wrap(text, 78, initial_indent="  ", subsequent_indent="  ")
+        return "\n".join(lines)
 
 
-def _regular(some: list[Sampling], kept: bool) -> str:
-    return f"regular clock of {_hertz(some)}" + ("" if kept else ", resampled to another interval")
-
-
-def _rounded(some: list[Sampling], kept: bool) -> str:
-    return f"{_regular(some, kept)}, stamps rounded to {_ms(max(r.rounding for r in some))}"
-
-
-def _late(some: list[Sampling], kept: bool) -> str:
-    n, rows = sum(len(r.late) for r in some), sum(r.rows for r in some)
-    return (
-        f"clock of {_hertz(some)}, regular but for {n} of {_counted(rows, 'stamp')}, off by up to "
-        f"{_ms(max(r.off for r in some))}; {_whether(kept, 'rows stay at their ticks')}"
-    )
-
-
-def _jittered(some: list[Sampling], kept: bool) -> str:
-    return (
-        f"clock of {_hertz(some)}, regular with stamps that jitter by "
-        f"{_ms(max(r.jitter for r in some))} (rms); {_whether(kept, 'rows are kept')}"
-    )
-
-
-def _whether(kept: bool, said: str) -> str:
-    values = f"{said}: their values fit these no worse"
-    return values if kept else "rows were measured when the stamps say, as their values show"
-
-
-def _irregular(some: list[Sampling], kept: bool) -> str:
-    shortest, longest = min(r.intervals[0] for r in some), max(r.intervals[2] for r in some)
-    return f"no regular clock, rows are {_ms(shortest)} to {_ms(longest)} apart"
-
-
-_CLOCKS: dict[Kind, Callable[[list[Sampling], bool], str]] = {
-    "regular": _regular,
-    "rounded": _rounded,
-    "late": _late,
-    "jittered": _jittered,
-    "irregular": _irregular,
-}
-
-
-def _hertz(some: list[Sampling]) -> str:
+def _clock(kind: Kind, some: list[Sampling], kept: bool) -> str:
+    """The clock of some recordings in words, and whether their rows were kept."""
     rates = sorted(1.0 / r.interval for r in some)
     low, high = f"{rates[0]:.5g}", f"{rates[-1]:.5g}"
-    return f"{low} Hz" if low == high else f"{low} to {high} Hz"
+    clock = f"clock of {low} Hz" if low == high else f"clock of {low} to {high} Hz"
+    regular = f"regular {clock}" + ("" if kept else ", resampled to another interval")
+    fit = "their values fit these no worse"
+    follow = "rows were measured when the stamps say, as their values show"
+    match kind:
+        case "regular":
+            return regular
+        case "rounded":
+            return f"{regular}, stamps rounded to {_ms(max(r.rounding for r in some))}"
+        case "late":
+            n, stamps = sum(len(r.late) for r in some), sum(r.rows for r in some)
+            return (
+                f"{clock}, regular but for {n} of {counted(stamps, 'stamp')}, off by up to "
+                f"{_ms(max(r.off for r in some))}; "
+                f"{f'rows stay at their ticks: {fit}' if kept else follow}"
+            )
+        case "jittered":
+            return (
+                f"{clock}, regular with stamps that jitter by "
+                f"{_ms(max(r.jitter for r in some))} (rms); "
+                f"{f'rows are kept: {fit}' if kept else follow}"
+            )
+        case "irregular":
+            shortest, longest = min(r.intervals[0] for r in some), max(r.intervals[2] for r in some)
+            return f"no regular clock, rows are {_ms(shortest)} to {_ms(longest)} apart"
 
 
 def _finite(value: Any) -> Any:
@@ -287,13 +271,5 @@ def _subject(recordings: list[Sampling]) -> str:
     return f"{_place(recordings)} {'was' if len(recordings) == 1 else 'were'}"
 
 
-def _counted(n: int, noun: str) -> str:
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
-
-
 def _ms(seconds: float) -> str:
     return "?" if math.isnan(seconds) else f"{1e3 * seconds:.3g} ms"
-
-
-def _wrapped(text: str) -> list[str]:
-    return textwrap.wrap(text, 78, initial_indent="  ", subsequent_indent="  ")

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float64, Int
 
 from sb3_hds.data.columns import Columns, Entry
-from sb3_hds.data.reading.log import Table, base_of, listed
+from sb3_hds.data.reading.log import Table, base_of
+from sb3_hds.data.wording import listed
 from sb3_hds.errors import TrajectoryError, did_you_mean
 
 _EXACT = 2**53  # whole numbers beyond are no double

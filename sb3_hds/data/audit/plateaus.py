@@ -1,14 +1,20 @@
-"""Implausible values: repeated, stuck, saturated, or reset within a recording."""
+"""Values that do not change although the system moves: repeated, stuck, saturated, at a stop."""
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from functools import partial
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from sb3_hds.data.audit.finding import Finding, Place, listed, percent
-from sb3_hds.data.audit.stretches import Stretch, joined, runs
-from sb3_hds.data.resampling.values import whole_turns
+from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
+from sb3_hds.core.twin import Twin
+from sb3_hds.core.types import Params
+from sb3_hds.data.audit.finding import Finding, Place
+from sb3_hds.data.audit.stretches import Stretch, joined, runs, steps_of
+from sb3_hds.data.wording import percent
 
 _STEPS = 8.0  # smallest steps per sample: slower motion repeats values because of quantisation
 _ROUGH = 3.0  # typical changes of the step from sample to sample: slower motion does so by chance
@@ -18,11 +24,8 @@ _LONGEST_REPEAT = 5  # samples
 _STEADY = (0.5, 1.6)  # of the speed: steps around a repeated value, or it may be a coincidence
 _STUCK = 20  # samples
 _PLATEAU = 5  # samples
-_MOVES, _CREEPS = 0.3, 0.05  # of the usual step of a channel
-_LARGE = 0.2  # of the standard deviation of a channel: what a jump exceeds
-_ISOLATED = 6.0  # times the steps around it
-_NEAR_START = 0.05  # of the standard deviation of a channel
-_AT_START = 1e-6  # of the standard deviation of a channel
+_MOVES, _CREEPS = 0.3, 0.05  # of the rms step of a channel
+_MARGIN = 0.002  # of a joint's range: stops are soft, and sensors noisy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +38,7 @@ class RepeatedSamples(Finding):
     def sentence(self) -> str:
         return (
             f"'{self.channel}' repeats its last value while it moves, in {percent(self.share)} of "
-            f"its moving samples ({listed(self.places)})."
+            f"its moving samples ({self.where})."
         )
 
     remedy = "The sensor is read more often than it measures: log at its rate, or resample to it."
@@ -51,7 +54,7 @@ class StuckChannel(Finding):
     def sentence(self) -> str:
         return (
             f"'{self.channel}' stays at exactly {self.value:.4g} while other channels move "
-            f"({listed(self.places)})."
+            f"({self.where})."
         )
 
     remedy = "Check cable and driver of this sensor; leave the channel or these samples out."
@@ -79,7 +82,7 @@ class SaturatedChannel(Finding):
     def sentence(self) -> str:
         return (
             f"'{self.channel}' is cut off at {self.value:.4g}: {percent(self.share)} of its "
-            f"samples are exactly there ({listed(self.places)})."
+            f"samples are exactly there ({self.where})."
         )
 
     remedy = (
@@ -89,26 +92,27 @@ class SaturatedChannel(Finding):
 
 
 @dataclasses.dataclass(frozen=True)
-class ReinitialisedState(Finding):
+class ReachedLimit(Finding):
     """
-    :param to_start: whether the state jumps to where a recording begins
-    :param size: of the largest jump, in the unit of its channel
+    :param value: end of the range of the joint
+    :param unit: of the value
+    :param share: of the samples that are at that end
     """
 
-    to_start: bool
-    size: float
+    value: float
+    unit: str
+    share: float
 
     @property
     def sentence(self) -> str:
-        target = "to where a recording begins" if self.to_start else "as no motion does"
         return (
-            f"'{self.channel}' jumps by up to {self.size:.3g} from one sample to the next, "
-            f"{target} ({listed(self.places)})."
+            f"Joint '{self.channel}' is at its limit of {self.value:.4g} {self.unit} in "
+            f"{percent(self.share)} of the samples ({self.where})."
         )
 
     remedy = (
-        "The system was put back inside the recording: audit.corrected(data) cuts there. Or name "
-        "the column that counts episodes when loading."
+        "The twin has no stops, so what happens there is none of its forces: leave these samples "
+        "out, or correct the range in the model file."
     )
 
 
@@ -136,8 +140,8 @@ def repeated_samples(
 
 def _repeats(stretches: Sequence[Stretch], j: int, resolution: float) -> tuple[list[Place], float]:
     """Where channel j repeats a value, and the share of its moving samples that do."""
-    x = np.concatenate([stretch.obs[:, j] for stretch in stretches])
-    natural = {0.0, float(x.min()), float(x.max())}
+    everything = joined(stretches)[:, j]
+    natural = {0.0, float(everything.min()), float(everything.max())}
     bends = np.abs(np.concatenate([np.diff(s.obs[:, j], 2) for s in stretches]))
     fast = max(_STEPS * resolution, _ROUGH * float(np.median(bends)) if len(bends) else 0.0)
     places, moving = [], 0
@@ -152,6 +156,21 @@ def _repeats(stretches: Sequence[Stretch], j: int, resolution: float) -> tuple[l
     return places, n / max(moving + n, 1)
 
 
+def _moves_on(x: np.ndarray, a: int, b: int, fast: float) -> bool:
+    """Whether x moves fast and steadily up to row a and from row b on."""
+    reach = 2 * _LONGEST_REPEAT
+    before, after = np.diff(x[max(a - reach, 0) : a + 1]), np.diff(x[b : b + reach])
+    steps = np.concatenate([before[before != 0.0][-2:], after[after != 0.0][:2]])
+    if len(steps) < 4:
+        return False
+    speed = float(np.median(steps))
+    low, high = _STEADY
+    # The first step afterwards may make up for what was missed.
+    most = np.array([high, high, high * (b - a + 1), high])
+    ratios = steps / speed if speed else np.zeros(4)
+    return bool(abs(speed) > fast and (ratios > low).all() and (ratios < most).all())
+
+
 def saturated(
     stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
 ) -> list[SaturatedChannel]:
@@ -161,7 +180,7 @@ def saturated(
     They must reach it at speed: turning points are flat, too, in particular after quantisation.
     """
     found = []
-    usual = _usual_steps(stretches)
+    usual = _rms_steps(stretches)
     everything = joined(stretches)
     for j, name in enumerate(names):
         quantised = resolution[j] > 0.0
@@ -189,14 +208,14 @@ def stuck(
     or jump afterwards. A system that comes to rest does neither.
     """
     found = []
-    usual = _usual_steps(stretches)
+    usual = _rms_steps(stretches)
     everything = joined(stretches)
     for j, name in enumerate(names):
         extremes = everything[:, j].min(), everything[:, j].max()
         if extremes[0] == extremes[1]:
             if np.ptp(np.delete(everything, j, axis=1), axis=0).any():
-                whole = tuple(s.place(0, len(s.obs) - 1) for s in stretches)
-                found.append(DeadChannel(name, whole, float(extremes[0])))
+                places = tuple(s.place(0, len(s.obs) - 1) for s in stretches)
+                found.append(DeadChannel(name, places, float(extremes[0])))
             continue
         fast = max(_MOVES * usual[j], 3.0 * resolution[j])
         for stretch in stretches:
@@ -210,97 +229,6 @@ def stuck(
     return found
 
 
-def reinitialised(
-    stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
-) -> list[ReinitialisedState]:
-    """
-    Resets of the state: steps many times larger than their neighbours, in several channels at once
-    or back to the start of a recording; and steps of any size that lead exactly to that start.
-    Quantised channels are exempt from the latter, because they return there by chance.
-
-    A jump of a single channel has other explanations (an impact, an outlier), and whole turns of an
-    angle are not jumps.
-    """
-    usual = _Usual.of(stretches)
-    if usual is None:
-        return []
-    at_start = _AT_START * usual.std if (resolution == 0.0).any() else np.full(len(names), -1.0)
-    places: dict[bool, list[Place]] = {True: [], False: []}
-    sizes = {True: np.zeros(len(names)), False: np.zeros(len(names))}
-    for stretch in stretches:
-        jumps = np.diff(stretch.obs, axis=0)
-        large = np.abs(jumps) > np.maximum(_LARGE * usual.std, 10.0 * resolution)
-        large &= ~whole_turns(jumps, usual.step)
-        isolated = large & _isolated(jumps, usual.step)
-        sharp = np.pad(_bends(stretch.obs, usual.std) > usual.bend, (1, 0))
-        goes_on = np.append(jumps[1:].any(axis=1), True)
-        for k in np.flatnonzero(large.any(axis=1)):
-            away = np.abs(stretch.obs[k + 1] - usual.starts)
-            back = bool((away <= _NEAR_START * usual.std + 2.0 * usual.step).all(1).any())
-            exactly = bool((away <= at_start).all(1).any() and sharp[k] and goes_on[k])
-            if exactly or isolated[k].sum() > (not back and len(names) > 1):
-                to_start = back or exactly
-                places[to_start].append(stretch.place(int(k) + 1, int(k) + 1))
-                sizes[to_start] = np.maximum(sizes[to_start], np.abs(jumps[k]) * large[k])
-    return [
-        ReinitialisedState(
-            ", ".join(n for n, size in zip(names, sizes[to_start], strict=True) if size),
-            tuple(places[to_start]),
-            to_start,
-            float(sizes[to_start].max()),
-        )
-        for to_start in (True, False)
-        if places[to_start]
-    ]
-
-
-class _Usual(NamedTuple):
-    """
-    Typical motion over all recordings.
-
-    :param step: 90 % quantile of the step from sample to sample, for each channel
-    :param bend: 90 % quantile of the change of the step, in units of ``std``
-    :param std: standard deviation of each channel
-    :param starts: first sample of each recording
-    """
-
-    step: np.ndarray
-    bend: float
-    std: np.ndarray
-    starts: np.ndarray
-
-    @classmethod
-    def of(cls, stretches: Sequence[Stretch]) -> "_Usual | None":
-        steps = np.abs(np.concatenate([np.diff(stretch.obs, axis=0) for stretch in stretches]))
-        moving = steps[steps.any(axis=1)]
-        std = joined(stretches).std(axis=0)
-        bends = np.concatenate([_bends(stretch.obs, std) for stretch in stretches])
-        if not len(moving) or not len(bends):
-            return None
-        starts = np.array([stretch.obs[0] for stretch in stretches])
-        return cls(np.quantile(moving, 0.9, 0), float(np.quantile(bends, 0.9)), std, starts)
-
-
-def _bends(x: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """Largest change of the step at each inner row, in units of the standard deviation."""
-    return np.max(np.abs(np.diff(x, 2, axis=0)) / np.where(std > 0.0, std, np.inf), axis=1)
-
-
-def _moves_on(x: np.ndarray, a: int, b: int, fast: float) -> bool:
-    """Whether x moves fast and steadily up to row a and from row b on."""
-    reach = 2 * _LONGEST_REPEAT
-    before, after = np.diff(x[max(a - reach, 0) : a + 1]), np.diff(x[b : b + reach])
-    before, after = before[before != 0.0][-2:], after[after != 0.0][:2]
-    if len(before) < 2 or len(after) < 2:
-        return False
-    speed = float(np.median([*before, *after]))
-    low, high = _STEADY
-    # The first step afterwards may make up for what was missed.
-    most = np.array([high, high, high * (b - a + 1), high])
-    ratios = np.array([*before, *after]) / speed if speed else np.zeros(4)
-    return bool(abs(speed) > fast and (ratios > low).all() and (ratios < most).all())
-
-
 def _abrupt(x: np.ndarray, a: int, b: int, fast: float) -> bool:
     """Whether x stops at row a while it is fast, or jumps after row b."""
     stops = a >= 2 and min(abs(x[a] - x[a - 1]) * 2, abs(x[a - 1] - x[a - 2])) > fast
@@ -309,20 +237,49 @@ def _abrupt(x: np.ndarray, a: int, b: int, fast: float) -> bool:
 
 
 def _others_move(rows: np.ndarray, j: int, usual: np.ndarray) -> bool:
+    """Whether any channel but j moves in these rows; True if there is no other."""
     steps = np.abs(np.diff(np.delete(rows, j, axis=1), axis=0))
-    return not steps.shape[1] or bool(
-        (np.median(steps, axis=0) > _MOVES * np.delete(usual, j)).any()
-    )
+    moving = np.median(steps, axis=0) > _MOVES * np.delete(usual, j)
+    return bool(moving.any()) or not len(moving)
 
 
-def _usual_steps(stretches: Sequence[Stretch]) -> np.ndarray:
-    steps = np.concatenate([np.diff(stretch.obs, axis=0) for stretch in stretches])
-    return np.sqrt(np.mean(np.square(steps), axis=0))
+def _rms_steps(stretches: Sequence[Stretch]) -> np.ndarray:
+    return np.sqrt(np.mean(np.square(steps_of(stretches)), axis=0))
 
 
-def _isolated(jumps: np.ndarray, usual: np.ndarray) -> np.ndarray:
-    """Which steps are large beside the two before, the two after, and the usual one."""
-    size = np.abs(jumps)
-    padded = np.pad(size, ((2, 2), (0, 0)))
-    around = np.max([padded[i : i + len(size)] for i in (0, 1, 3, 4)], axis=0)
-    return size > _ISOLATED * np.maximum(around, usual)
+def reached_limits(stretches: Sequence[Stretch], twin: Twin) -> list[ReachedLimit]:
+    """:return: one for each joint that reaches an end of the range that the twin declares"""
+    limited = [
+        (j, joint)
+        for j, joint in enumerate(twin.joints)
+        if np.isfinite(joint.low) and np.isfinite(joint.high)
+    ]
+    if not limited:
+        return []
+    with jax.enable_x64(True):
+        coordinates = [
+            np.asarray(_coordinates(twin, jnp.asarray(stretch.obs), twin.params))
+            for stretch in stretches
+        ]
+    n_rows = sum(map(len, coordinates))
+    found = []
+    for j, joint in limited:
+        margin = _MARGIN * (joint.high - joint.low)
+        for end, sign in ((joint.low, -1.0), (joint.high, 1.0)):
+            there = [sign * (q[:, j] - end) >= -margin for q in coordinates]
+            places = tuple(
+                stretch.place(a, b - 1)
+                for stretch, flags in zip(stretches, there, strict=True)
+                for a, b in runs(flags)
+            )
+            if places:
+                share = sum(int(flags.sum()) for flags in there) / n_rows
+                found.append(ReachedLimit(joint.name, places, float(end), joint.unit, share))
+    return found
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
+def _coordinates(
+    twin: Twin, obs: Float[Array, "rows n_obs"], params: Params
+) -> Float[Array, "rows dof"]:
+    return jax.vmap(lambda row: twin.coordinates(twin.infer(row, params).q))(obs)

@@ -1,0 +1,271 @@
+"""Values that jump: outliers, glitches, and resets of the state within a recording."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from sb3_hds.data.audit.finding import Finding, Place
+from sb3_hds.data.audit.stretches import Stretch, joined, runs, steps_of
+from sb3_hds.data.resampling.values import whole_turns
+
+_USUAL = 0.98  # of the samples: the range that they fill is the usual one
+_FAR = 20.0  # usual ranges from the median
+_AT_ONCE = 0.5  # of the way there, and of the way back, in one sample
+
+_SPIKE_FAR = 10.0  # largest other steps of the recording
+_NEIGHBOURS_APART = 0.2  # of the way there: how far the neighbours may be apart
+_RARE = 0.01  # of the samples of a recording, but at least one: what is frequent is noise
+_USUAL_STEPS = 0.98  # of the steps of all recordings: the range that is usual
+_SMALLEST_SPIKE = 0.2  # of the range that 98 % of a channel's samples fill
+# Turns that a wrapped angle fills with its noise, and how far a step may be from one.
+_ONE_TURN, _NEAR_TURN = 1.05, 0.16
+
+_LARGE = 0.2  # of the standard deviation of a channel: what a reset exceeds
+_ISOLATED = 6.0  # times the steps around it
+_NEAR_START = 0.05  # of the standard deviation of a channel
+_AT_START = 1e-6  # of the standard deviation of a channel
+
+
+@dataclasses.dataclass(frozen=True)
+class Outliers(Finding):
+    """
+    Excursions far beyond the usual range, which would dominate a mean squared error.
+
+    :param value: the most extreme outlier, in the unit of the channel
+    :param low: lower end of the range that 98 % of the channel's samples fill
+    :param high: upper end
+    """
+
+    blocks = True
+    value: float
+    low: float
+    high: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' jumps to {self.value:.4g} and back, where 98 % of its samples are "
+            f"between {self.low:.4g} and {self.high:.4g} ({self.where})."
+        )
+
+    remedy = "Look at sensor and cable. audit.corrected(data) cuts these samples out."
+
+
+@dataclasses.dataclass(frozen=True)
+class Glitches(Outliers):
+    """
+    Single samples far from their neighbours.
+
+    :param step: largest other step from sample to sample in these recordings
+    """
+
+    step: float
+
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' jumps to {self.value:.4g} and back in a single sample, where it "
+            f"moves by {self.step:.3g} at most from one sample to the next "
+            f"({self.where})."
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class ReinitialisedState(Finding):
+    """
+    :param to_start: whether the state jumps to where a recording begins
+    :param size: of the largest jump, in the unit of its channel
+    """
+
+    to_start: bool
+    size: float
+
+    @property
+    def sentence(self) -> str:
+        target = "to where a recording begins" if self.to_start else "as no motion does"
+        return (
+            f"'{self.channel}' jumps by up to {self.size:.3g} from one sample to the next, "
+            f"{target} ({self.where})."
+        )
+
+    remedy = (
+        "The system was put back inside the recording: audit.corrected(data) cuts there. Or name "
+        "the column that counts episodes when loading."
+    )
+
+
+def outliers(stretches: Sequence[Stretch], names: Sequence[str]) -> list[Outliers]:
+    """
+    Runs of samples far beyond the usual range that begin and end with a single step.
+
+    The response to an impact decays, and an unstable system does not return: neither matches.
+    """
+    found = []
+    tail = 0.5 * (1.0 - _USUAL)
+    low, middle, high = np.quantile(joined(stretches), (tail, 0.5, 1.0 - tail), axis=0)
+    for j, name in enumerate(names):
+        farthest = _FAR * (high[j] - low[j])
+        if farthest == 0.0:
+            continue
+        places, values = [], []
+        for stretch in stretches:
+            x = stretch.obs[:, j] - middle[j]
+            steps = np.abs(np.diff(x))
+            for a, end in runs(np.abs(x) > farthest):
+                goes = a == 0 or steps[a - 1] > _AT_ONCE * abs(x[a])
+                comes = end == len(x) or steps[end - 1] > _AT_ONCE * abs(x[end - 1])
+                if goes and comes and end - a < len(x):
+                    places.append(stretch.place(a, end - 1))
+                    values.append(stretch.obs[a:end, j][np.abs(x[a:end]).argmax()])
+        if places:
+            worst = max(values, key=lambda value: abs(value - middle[j]))
+            found.append(Outliers(name, tuple(places), float(worst), float(low[j]), float(high[j])))
+    return found
+
+
+def glitches(
+    stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
+) -> list[Glitches]:
+    """
+    Single samples between two opposite steps, both many times larger than any other step.
+
+    Neither an impact nor a decaying response returns within one sample. A wrapping angle and the
+    tick of an encoder at rest are not glitches.
+    """
+    found = []
+    low, high = np.quantile(joined(stretches), (0.01, 0.99), axis=0)
+    steps = np.abs(steps_of(stretches))
+    usual = np.quantile(steps, _USUAL_STEPS, axis=0) if len(steps) else np.zeros(len(names))
+    least = np.maximum(usual, 2.0 * resolution)
+    least = np.maximum(least, _SMALLEST_SPIKE / _SPIKE_FAR * (high - low))
+    for j, name in enumerate(names):
+        places, values, largest = [], [], 0.0
+        for stretch in stretches:
+            x = stretch.obs[:, j]
+            rows, step = _spikes(x, float(least[j]))
+            places += [stretch.place(int(k), int(k)) for k in rows]
+            values += x[rows].tolist()
+            largest = max(largest, step if len(rows) else 0.0)
+        if places:
+            middle = 0.5 * (low[j] + high[j])
+            worst = max(values, key=lambda value: abs(value - middle))
+            span = float(low[j]), float(high[j])
+            found.append(Glitches(name, tuple(places), worst, *span, largest))
+    return found
+
+
+def _spikes(x: np.ndarray, least: float) -> tuple[Int[np.ndarray, " rows"], float]:
+    """
+    :param least: lower bound of the step that spikes are compared with
+    :return: rows of the spikes, and the largest other step
+    """
+    steps = np.diff(x)
+    none = np.array([], dtype=int), 0.0
+    if len(steps) < 4 or least == 0.0:
+        return none
+    size = np.minimum(np.abs(steps[:-1]), np.abs(steps[1:]))
+    returns = np.abs(x[2:] - x[:-2]) < _NEIGHBOURS_APART * size
+    candidates = np.flatnonzero(returns & (size > _SPIKE_FAR * least) & ~_turns(x, size))
+    candidates = candidates[np.argsort(-size[candidates])]
+    most = max(1, int(_RARE * len(x)))
+    for n in range(min(len(candidates), most), 0, -1):
+        chosen = candidates[:n]
+        rest = np.delete(np.abs(steps), np.union1d(chosen, chosen + 1))
+        largest = float(rest.max(initial=0.0))
+        if size[chosen[-1]] > _SPIKE_FAR * max(largest, least):
+            return np.sort(chosen) + 1, largest
+    return none
+
+
+def _turns(x: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Whether a step is one turn of a wrapped angle [rad] or [deg], which fills one turn."""
+    turns = [turn for turn in (2.0 * np.pi, 360.0) if np.ptp(x) < _ONE_TURN * turn]
+    return np.any([np.abs(size / turn - 1.0) < _NEAR_TURN for turn in turns], axis=0) & bool(turns)
+
+
+def reinitialised(
+    stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
+) -> list[ReinitialisedState]:
+    """
+    Resets of the state: steps many times larger than their neighbours, in several channels at once
+    or back to the start of a recording; and steps of any size that lead exactly to that start.
+    Quantised channels are exempt from the latter, because they return there by chance.
+
+    A jump of a single channel has other explanations (an impact, an outlier), and whole turns of an
+    angle are not jumps.
+    """
+    usual = _Usual.of(stretches)
+    if usual is None:
+        return []
+    at_start = _AT_START * usual.std if (resolution == 0.0).any() else np.full(len(names), -1.0)
+    places: dict[bool, list[Place]] = {True: [], False: []}
+    sizes = {True: np.zeros(len(names)), False: np.zeros(len(names))}
+    for stretch in stretches:
+        jumps = np.diff(stretch.obs, axis=0)
+        large = np.abs(jumps) > np.maximum(_LARGE * usual.std, 10.0 * resolution)
+        large &= ~whole_turns(jumps, usual.step)
+        isolated = large & _isolated(jumps, usual.step)
+        sharp = np.pad(_bends(stretch.obs, usual.std) > usual.bend, (1, 0))
+        goes_on = np.append(jumps[1:].any(axis=1), True)
+        for k in np.flatnonzero(large.any(axis=1)):
+            away = np.abs(stretch.obs[k + 1] - usual.starts)
+            back = bool((away <= _NEAR_START * usual.std + 2.0 * usual.step).all(1).any())
+            exactly = bool((away <= at_start).all(1).any() and sharp[k] and goes_on[k])
+            if exactly or isolated[k].sum() > (not back and len(names) > 1):
+                to_start = back or exactly
+                places[to_start].append(stretch.place(int(k) + 1, int(k) + 1))
+                sizes[to_start] = np.maximum(sizes[to_start], np.abs(jumps[k]) * large[k])
+    return [
+        ReinitialisedState(
+            ", ".join(n for n, size in zip(names, sizes[to_start], strict=True) if size),
+            tuple(places[to_start]),
+            to_start,
+            float(sizes[to_start].max()),
+        )
+        for to_start in (True, False)
+        if places[to_start]
+    ]
+
+
+class _Usual(NamedTuple):
+    """
+    Typical motion over all recordings.
+
+    :param step: 90 % quantile of the step from sample to sample, for each channel
+    :param bend: 90 % quantile of the change of the step, in units of ``std``
+    :param std: standard deviation of each channel
+    :param starts: first sample of each recording
+    """
+
+    step: np.ndarray
+    bend: float
+    std: np.ndarray
+    starts: np.ndarray
+
+    @classmethod
+    def of(cls, stretches: Sequence[Stretch]) -> "_Usual | None":
+        """:return: None where nothing moves, or recordings are too short"""
+        steps = np.abs(steps_of(stretches))
+        moving = steps[steps.any(axis=1)]
+        std = joined(stretches).std(axis=0)
+        bends = np.concatenate([_bends(stretch.obs, std) for stretch in stretches])
+        if not len(moving) or not len(bends):
+            return None
+        starts = np.array([stretch.obs[0] for stretch in stretches])
+        return cls(np.quantile(moving, 0.9, 0), float(np.quantile(bends, 0.9)), std, starts)
+
+
+def _bends(x: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Largest change of the step at each inner row, in units of the standard deviation."""
+    return np.max(np.abs(np.diff(x, 2, axis=0)) / np.where(std > 0.0, std, np.inf), axis=1)
+
+
+def _isolated(jumps: np.ndarray, usual: np.ndarray) -> np.ndarray:
+    """Which steps are large beside the two before, the two after, and the usual one."""
+    size = np.abs(jumps)
+    padded = np.pad(size, ((2, 2), (0, 0)))
+    around = np.max([padded[i : i + len(size)] for i in (0, 1, 3, 4)], axis=0)
+    return size > _ISOLATED * np.maximum(around, usual)
