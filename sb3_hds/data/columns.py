@@ -99,17 +99,19 @@ class Columns:
         names = [*(entry.column for entry in entries), *labels, self.episode]
         return frozenset(name for name in names if name is not None)
 
+    def completed_by(self, other: "Columns") -> "Columns":
+        """:return: these columns, with what they leave out taken from others"""
+        names = [field.name for field in dataclasses.fields(self)]
+        missing = {name: getattr(other, name) for name in names if getattr(self, name) is None}
+        return dataclasses.replace(self, **missing)
+
     def over(self, own: "Columns | None") -> "Columns":
         """
         :param own: columns that the file itself declares
         :return: these columns, completed by those of the file
         :raises TrajectoryError: if neither declares observations or actions
         """
-        merged = self
-        if own is not None:
-            names = [field.name for field in dataclasses.fields(self)]
-            left = {name: getattr(own, name) for name in names if getattr(self, name) is None}
-            merged = dataclasses.replace(self, **left)
+        merged = self.completed_by(own or Columns())
         missing = [name for name in ("obs", "actions") if getattr(merged, name) is None]
         if missing:
             raise TrajectoryError(f"columns does not say which are the {missing[0]}. {FORM}")

@@ -5,7 +5,7 @@ import glob
 import os
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.data import recording
 from sb3_hds.data.columns import Columns, Entry, columns_from
 from sb3_hds.data.reading import READERS, Log, Table, read_log
-from sb3_hds.data.reading.minari import PREFIX, read_minari
+from sb3_hds.data.reading.minari import PREFIX
 from sb3_hds.data.reading.ros import is_bag
 from sb3_hds.data.resampling.report import Reading
 from sb3_hds.data.resampling.resample import at_one_interval
@@ -69,17 +69,31 @@ def load(files: Files, columns: Any = None) -> Trajectories:
     return data
 
 
-def _loaded(files: Files, columns: Any) -> Trajectories:
-    said = None if columns is None else columns_from(columns)
+def _loaded(files: Files, map_of_columns: Any) -> Trajectories:
+    said = None if map_of_columns is None else columns_from(map_of_columns)
     paths = _paths(files)
     if said is None and all(_is_own(path) for path in paths):
         return Trajectories.concatenate([Trajectories.load(path) for path in paths])
-    read = _read(paths, said)
-    steps, report = at_one_interval(read.episodes, read.columns)
-    channels = (read.columns.obs or (), read.columns.actions or ())
-    units, action_units = (tuple(e.si_unit for e in entries) for entries in channels)
+    # One file after another, of which only the columns that are used are kept.
+    episodes, notes = list[Rows](), dict[str, None]()
+    first: _First | None = None
+    for path in paths:
+        log = _log(path, said)
+        columns, remarks = _understood((said or Columns()).over(log.columns), log)
+        first = first or _First(path, columns, frozenset(log.tables[0]))
+        _check_same(first, columns, log.tables[0], path)
+        notes |= dict.fromkeys(remarks)
+        for i, table in enumerate(log.tables):
+            name = path if path.startswith(PREFIX) else Path(path).name
+            source = name if len(log.tables) == 1 else f"{name}, episode {i}"
+            episodes += rows_of(table, columns, source, Path(path).stem)
+    columns = first.columns if first else Columns()
+    steps, report = at_one_interval(episodes, columns)
     report = dataclasses.replace(
-        report, units=units, action_units=action_units, notes=tuple(read.notes)
+        report,
+        units=tuple(entry.si_unit for entry in columns.obs or ()),
+        action_units=tuple(entry.si_unit for entry in columns.actions or ()),
+        notes=tuple(notes),
     )
     data = Trajectories.from_arrays(
         steps.obs, steps.actions, dt=report.dt, conditions=steps.conditions
@@ -96,40 +110,7 @@ def first_log(files: Files, said: Columns | None) -> Log | None:
     path = _paths(files)[0]
     if said is None and _is_own(path):
         return None
-    if path.startswith(PREFIX):
-        return Log(*read_minari(path.removeprefix(PREFIX)))
-    return read_log(Path(path), said or Columns())
-
-
-class _Read(NamedTuple):
-    """
-    The content of all files.
-
-    :param columns: as the first file has them; the others agree
-    :param notes: sentences, each once
-    """
-
-    episodes: list[Rows]
-    columns: Columns
-    notes: dict[str, None]
-
-
-def _read(paths: Sequence[str], said: Columns | None) -> _Read:
-    """Read one file after another, and keep only the columns that are used."""
-    episodes, notes = list[Rows](), dict[str, None]()
-    first: _First | None = None
-    for path in paths:
-        log = _log(path, said)
-        here, remarks = _understood((said or Columns()).over(log.columns), log)
-        first = first or _First(path, here, frozenset(log.tables[0]))
-        _check_same(first, here, path)
-        _check_columns(first, here, log.tables[0], path)
-        notes |= dict.fromkeys(remarks)
-        for i, table in enumerate(log.tables):
-            name = path if path.startswith(PREFIX) else Path(path).name
-            source = name if len(log.tables) == 1 else f"{name}, episode {i}"
-            episodes += rows_of(table, here, source, Path(path).stem)
-    return _Read(episodes, first.columns if first else Columns(), notes)
+    return read_log(path, said or Columns())
 
 
 class _First(NamedTuple):
@@ -153,7 +134,9 @@ def _paths(files: Any) -> list[str]:
         if path.startswith(PREFIX) or not glob.has_magic(path) or Path(path).exists():
             found.append(path)
             continue
-        matching = sorted(p for p in glob.glob(path, recursive=True) if _is_log(Path(p)))
+        matching = sorted(
+            p for p in glob.glob(path, recursive=True) if Path(p).is_file() or is_bag(Path(p))
+        )
         if not matching:
             raise TrajectoryError(f"No file matches '{path}' (in {Path.cwd()}).")
         found += matching
@@ -170,18 +153,12 @@ def _is_own(path: str) -> bool:
     return Path(path).suffix == _SUFFIX or Path(path + _SUFFIX).is_file()
 
 
-def _is_log(path: Path) -> bool:
-    return path.is_file() or is_bag(path)
-
-
 def _log(path: str, said: Columns | None) -> Log:
-    if path.startswith(PREFIX):
-        return Log(*read_minari(path.removeprefix(PREFIX)))
     suffix = Path(path).suffix
     known = suffix.lower() in READERS or is_bag(Path(path))
     log = None
     if said is not None or not known or suffix.lower() == recording.SUFFIX:
-        log = read_log(Path(path), said or Columns())
+        log = read_log(path, said or Columns())
     if log is None or (said is None and (log.columns is None or log.columns.obs is None)):
         raise TrajectoryError(
             f"'{path}' cannot be read without columns: files that end in {_SUFFIX} can, and "
@@ -222,18 +199,8 @@ def epoch_unit(table: Table, entry: Entry) -> str:
     return units[0] if units and units[0] != "s" else ""
 
 
-def _check_columns(first: _First, columns: Columns, table: Table, path: str) -> None:
-    lacking = sorted((columns.wanted & first.names) - set(table))
-    if lacking:
-        raise TrajectoryError(
-            f"The files have different columns: '{first.path}' has '{lacking[0]}', '{path}' has "
-            f"not; it has: {listed(table)}. Load them with a map of columns for each, "
-            "then join them: Trajectories.concatenate."
-        )
-
-
-def _check_same(first: _First, here: Columns, path: str) -> None:
-    """Channels and units that files declare must agree."""
+def _check_same(first: _First, here: Columns, table: Table, path: str) -> None:
+    """:raises TrajectoryError: if channels, units, interval or columns differ between files"""
     for name in ("obs", "actions"):
         one, other = (getattr(c, name) or () for c in (first.columns, here))
         ours, theirs = ([e.name for e in entries] for entries in (one, other))
@@ -253,4 +220,11 @@ def _check_same(first: _First, here: Columns, path: str) -> None:
         raise TrajectoryError(
             f"'{first.path}' is sampled every {first.columns.dt} s and '{path}' every {here.dt} s. "
             "Say which interval you want: columns={'dt': SECONDS}."
+        )
+    lacking = sorted((here.wanted & first.names) - set(table))
+    if lacking:
+        raise TrajectoryError(
+            f"The files have different columns: '{first.path}' has '{lacking[0]}', '{path}' has "
+            f"not; it has: {listed(table)}. Load them with a map of columns for each, "
+            "then join them: Trajectories.concatenate."
         )

@@ -71,7 +71,7 @@ def describe(path: Path, records: str | None = None, skip: int | None = None) ->
     :raises TrajectoryError: if the file cannot be read
     """
     log = read_log(path, Columns(records=records, skip=skip))
-    columns = [_column(name, log) for name in _names(log)]
+    columns = _columns_in(log)
     lines = [*_listing(path, log, columns), ""]
     if log.columns is not None and log.columns.obs is not None:
         return "\n".join([*lines, "# It says itself what its columns are, and needs no map.", ""])
@@ -81,8 +81,8 @@ def describe(path: Path, records: str | None = None, skip: int | None = None) ->
     return "\n".join([*lines, *_map(log, columns), ""])
 
 
-def _names(log: Log) -> Iterable[str]:
-    return dict.fromkeys(name for table in log.tables for name in table)
+def _columns_in(log: Log) -> list[_Column]:
+    return [_column(name, log) for name in dict.fromkeys(n for table in log.tables for n in table)]
 
 
 def _column(name: str, log: Log) -> _Column:
@@ -145,14 +145,9 @@ def _map(log: Log, columns: Sequence[_Column]) -> list[str]:
 
 def guessed_time(log: Log) -> Entry | None:
     """:return: what looks like the time stamps of a log, with their unit"""
-    columns = [_column(name, log) for name in _names(log)]
+    columns = _columns_in(log)
     found = _guessed_time([c for c in columns if not np.isnan(c.lowest)])
-    if found is None:
-        return None
-    said = unit_of(log.units.get(found.name, ""))
-    named = said is not None and said.name == "s"
-    unit = None if named else _time_unit(log.tables[0], found)
-    return Entry(found.name, found.name, unit=None if unit in (None, "s") else unit)
+    return found and Entry(found.name, found.name, unit=_time_unit(log, found)[1] or None)
 
 
 def _guessed_time(columns: Sequence[_Column]) -> _Column | None:
@@ -167,26 +162,27 @@ def _guessed_time(columns: Sequence[_Column]) -> _Column | None:
 def _time_lines(log: Log, time: _Column | None) -> list[str]:
     if time is None:
         return ["dt: 0.01  # seconds between two rows: nothing here looks like time stamps"]
-    entry: dict[str, str] = {"column": time.name}
-    said = unit_of(log.units.get(time.name, ""))
-    step, unit = time.step, ""
-    if said is not None and said.name == "s":
-        step *= said.factor
-    else:
-        unit = _time_unit(log.tables[0], time)
-        step *= Entry("", "", unit=unit).factor
-        entry |= {"unit": unit} if unit != "s" else {}
+    factor, unit = _time_unit(log, time)
+    entry = {"column": time.name} | ({"unit": unit} if unit else {})
+    step = time.step * factor
     return [f"time: {_flow(entry)}  # a row every {step:.4g} s, {1.0 / step:.4g} Hz"]
 
 
-def _time_unit(table: Mapping[str, np.ndarray], time: _Column) -> str:
-    """From the size, the name or the steps of the stamps, in that order."""
-    named = [word for word in _words(time.name) if word in ("ms", "us", "ns", "millis", "micros")]
-    words = {"millis": "ms", "micros": "us"}
-    epoch = epoch_unit(table, Entry(time.name, time.name))
+def _time_unit(log: Log, time: _Column) -> tuple[float, str]:
+    """
+    From the file, or the size, the name or the steps of the stamps, in that order.
+
+    :return: the unit in seconds; and its symbol, empty where the file names it and for seconds
+    """
+    declared = unit_of(log.units.get(time.name, ""))
+    if declared is not None and declared.name == "s":
+        return declared.factor, ""
+    abbreviated = {"ms": "ms", "us": "us", "ns": "ns", "millis": "ms", "micros": "us"}
+    named = [abbreviated[word] for word in _words(time.name) if word in abbreviated]
     by_step = "ns" if time.step >= 1e5 else "us" if time.step >= 500.0 else "ms"
     by_step = by_step if time.step >= 1.0 else "s"
-    return epoch or next((words.get(word, word) for word in named), by_step)
+    unit = epoch_unit(log.tables[0], Entry(time.name, time.name)) or next(iter(named), by_step)
+    return Entry("", "", unit=unit).factor, "" if unit == "s" else unit
 
 
 def _entries(key: str, columns: Sequence[_Column], units: Mapping[str, str]) -> list[str]:
@@ -254,14 +250,11 @@ def names_in(files: Files, columns: str | os.PathLike[str] | dict | None = None)
     :return: None for a file that ``Trajectories.save`` wrote, which has no names
     :raises TrajectoryError: if it cannot be read
     """
-    said = Columns() if columns is None else columns_from(columns)
-    log = first_log(files, None if columns is None else said)
+    said = None if columns is None else columns_from(columns)
+    log = first_log(files, said)
     if log is None:
         return None
-    own = log.columns or Columns()
-    fields = [field.name for field in dataclasses.fields(Columns)]
-    unsaid = {name: getattr(own, name) for name in fields if getattr(said, name) is None}
-    merged = dataclasses.replace(said, **unsaid)
+    merged = (said or Columns()).completed_by(log.columns or Columns())
     guessed = []
     if merged.time is None and merged.dt is None:
         entry = guessed_time(log)

@@ -216,12 +216,12 @@ def _table(rows: list[dict[str, Any]], header: dict[str, Any], path: Path) -> di
     n_act = len(header["actions"])
     try:
         obs = np.array([row["obs"] for row in rows], float).reshape(len(rows), len(header["obs"]))
-        actions = [row["action"] for row in rows[1:]]
-        actions = np.array(actions, float).reshape(len(rows) - 1, n_act)
-        columns = dict(zip(header["obs"], obs.T, strict=True))
-        columns |= dict(
-            zip(header["actions"], np.vstack([actions, np.full(n_act, np.nan)]).T, strict=True)
+        actions = np.full((len(rows), n_act), np.nan)
+        actions[:-1] = np.array([row["action"] for row in rows[1:]], float).reshape(
+            len(rows) - 1, n_act
         )
+        names = [*header["obs"], *header["actions"]]
+        columns = dict(zip(names, np.hstack([obs, actions]).T, strict=True))
         times = np.array([row["time"] for row in rows], float)
         return columns | {"time": times, "condition": np.array(str(rows[0]["condition"]))}
     except (KeyError, ValueError, TypeError) as error:

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Int
 
 from sb3_hds.data.audit.finding import Finding, Place
-from sb3_hds.data.audit.stretches import Stretch, joined, runs, steps_of
-from sb3_hds.data.resampling.values import whole_turns
+from sb3_hds.data.audit.stretches import Stretch, joined, steps_of
+from sb3_hds.data.resampling.values import runs, whole_turns
 
 _USUAL = 0.98  # of the samples: the range that they fill is the usual one
 _FAR = 20.0  # usual ranges from the median

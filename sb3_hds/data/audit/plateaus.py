@@ -13,7 +13,8 @@ from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.twin import Twin
 from sb3_hds.core.types import Params
 from sb3_hds.data.audit.finding import Finding, Place
-from sb3_hds.data.audit.stretches import Stretch, joined, runs, steps_of
+from sb3_hds.data.audit.stretches import Stretch, joined, steps_of
+from sb3_hds.data.resampling.values import runs
 from sb3_hds.data.wording import percent
 
 _STEPS = 8.0  # smallest steps per sample: slower motion repeats values because of quantisation

@@ -1,10 +1,10 @@
 """Stretches of uninterrupted rows as they were measured, the input of all checks."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int
+from jaxtyping import Float64, Int
 
 from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.data.audit.finding import Place
@@ -76,12 +76,3 @@ def joined(stretches: Sequence[Stretch]) -> Float64[np.ndarray, "rows n_obs"]:
 def steps_of(stretches: Sequence[Stretch]) -> Float64[np.ndarray, "steps n_obs"]:
     """:return: the differences of successive rows of all of them"""
     return np.concatenate([np.diff(stretch.obs, axis=0) for stretch in stretches])
-
-
-def runs(flags: Bool[np.ndarray, " steps"]) -> Iterator[tuple[int, int]]:
-    """
-    :param flags: of rows, or of the steps between rows
-    :return: start (inclusive) and end (exclusive) of each run of set flags
-    """
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)

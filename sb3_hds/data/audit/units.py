@@ -25,10 +25,24 @@ _FEWEST = 3  # blocks
 _SMOOTH = 0.2  # correlation of successive velocities: below, differences of positions are too small
 
 
-_FACTORS = {"degrees": 57.29578, "millimetres": 1000.0, "centimetres": 100.0}
-RPM = 30.0 / 3.1415926536
+RPM = 30.0 / np.pi
 """Revolutions per minute of one radian per second."""
 _NEAR = 0.15  # what a central difference and noise may change of the factor
+
+
+class _Unit(NamedTuple):
+    name: str
+    symbol: str
+    of: str  # unit of the twin
+    factor: float
+    span: float  # of the measurements from which the other unit comes to mind
+
+
+_UNITS = (
+    _Unit("degrees", "deg", "rad", np.pi / 180.0, 2.0 * np.pi),
+    _Unit("millimetres", "mm", "m", 1e-3, 5.0),
+    _Unit("centimetres", "cm", "m", 1e-2, 5.0),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,10 +68,10 @@ class OtherUnits(Finding):
 
     @property
     def _likely(self) -> str:
-        for unit, factor in _FACTORS.items():
-            for name, ratio in ((self.position, factor), (self.channel, 1.0 / factor)):
+        for unit in _UNITS:
+            for name, ratio in ((self.position, 1.0 / unit.factor), (self.channel, unit.factor)):
                 if abs(self.factor / ratio - 1.0) < _NEAR:
-                    return f", as if '{name}' were in {unit}"
+                    return f", as if '{name}' were in {unit.name}"
         if abs(self.factor * RPM - 1.0) < _NEAR:
             return f", as if '{self.channel}' were in revolutions per minute"
         return ""
@@ -231,21 +245,6 @@ _NOTHING, _MOST = 0.6, 0.3
 # The twin's acceleration by the measured one, for a suspicion: as it is at most, in the other unit
 # within these bounds.
 _TOO_SMALL, _ABOUT_RIGHT = 0.1, (0.4, 2.5)
-
-
-class _Unit(NamedTuple):
-    name: str
-    symbol: str
-    of: str  # unit of the twin
-    factor: float
-    span: float  # of the measurements from which the other unit comes to mind
-
-
-_UNITS = (
-    _Unit("degrees", "deg", "rad", np.pi / 180.0, 2.0 * np.pi),
-    _Unit("millimetres", "mm", "m", 1e-3, 5.0),
-    _Unit("centimetres", "cm", "m", 1e-2, 5.0),
-)
 
 
 def mistaken_units(

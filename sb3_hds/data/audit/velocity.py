@@ -1,6 +1,7 @@
 """Time shifts of velocity channels relative to the derivatives of their positions."""
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -85,25 +86,8 @@ class BackwardDifference(VelocityShift):
     )
 
 
-class Lag(NamedTuple):
-    """
-    :param velocity: channel
-    :param position: name of the position whose derivative it is
-    :param samples: delay of the velocity [samples]; negative: early
-    :param stderr: standard error of ``samples``, from blocks of the data
-    :param better: ratio of the unexplained variances without and with the shift
-    :param backward: whether it is the backward difference of the position
-    """
-
-    velocity: int
-    position: str
-    samples: float
-    stderr: float
-    better: float
-    backward: bool = False
-
-
-class Match(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Match:
     """
     A channel that is proportional to the derivative of another one.
 
@@ -129,19 +113,30 @@ class Match(NamedTuple):
         """Whether both are in the same unit."""
         return abs(self.scores.slope_there - 1.0) < _SAME
 
-    def slopes(self) -> Float64[np.ndarray, " blocks"]:
-        """:return: of the velocity on the derivative, in blocks of the data, at the same lag"""
-        there = self.scores.correlation.argmax()
-        return np.array([block.slope[there] for block in self._scores_of_blocks()])
+    @property
+    def samples(self) -> float:
+        """Delay of the velocity [samples]; negative: early."""
+        return self.scores.lag
 
+    @functools.cached_property
     def stderr(self) -> float:
-        """:return: standard error of the lag, from its scatter over blocks [samples]"""
+        """Standard error of ``samples``, from the scatter over blocks of the data."""
         lags = np.array([s.lag for s in self._scores_of_blocks() if s.highest > 0.5 * _CLEAR])
         if len(lags) < 3:
             return 0.0 if len(lags) else np.inf
         # Robust, because a block in which hardly anything moves says little.
         sigma = 1.4826 * np.median(np.abs(lags - np.median(lags)))
         return float(sigma / np.sqrt(len(lags)))
+
+    @functools.cached_property
+    def difference(self) -> "_Difference":
+        """How the velocity compares with the backward difference of the position."""
+        return _difference_of(self.pairs, self.dt)
+
+    def slopes(self) -> Float64[np.ndarray, " blocks"]:
+        """:return: of the velocity on the derivative, in blocks of the data, at the same lag"""
+        there = self.scores.correlation.argmax()
+        return np.array([block.slope[there] for block in self._scores_of_blocks()])
 
     def _scores_of_blocks(self) -> list["_Scores"]:
         """Of parts of the episodes, or of these if parts are too short."""
@@ -166,19 +161,18 @@ def velocity_shifts(
     :return: the significant lags beyond that of a backward difference that are either long or
         explain half of the residual variance
     """
-    whole = all_samples(data)
     return [
         VelocityShift(
-            names[lag.velocity],
-            whole,
-            position=lag.position,
-            samples=lag.samples,
-            seconds=lag.samples * data.dt,
-            stderr=lag.stderr,
+            names[match.velocity],
+            all_samples(data),
+            position=match.position,
+            samples=match.samples,
+            seconds=match.samples * data.dt,
+            stderr=match.stderr,
         )
-        for lag in _lags(matches)
-        if abs(lag.samples) >= max(_VISIBLE, _SIGMAS * lag.stderr)
-        and (lag.better >= _BETTER or abs(lag.samples) >= _LONG)
+        for match in best_of(matches)
+        if abs(match.samples) >= max(_VISIBLE, _SIGMAS * match.stderr)
+        and (match.scores.better >= _BETTER or abs(match.samples) >= _LONG)
     ]
 
 
@@ -192,11 +186,7 @@ def backward_differences(
     :param twin: if its own velocities are backward differences (semi-implicit Euler), they are not
         reported; without a twin, only differences that carry the noise of the position are
     """
-    found: dict[int, tuple[Match, bool]] = {
-        match.velocity: (match, difference.rough)
-        for match in matches
-        if match.agrees and (difference := _difference_of(match.pairs, data.dt)).backward
-    }
+    found = {m.velocity: m for m in matches if m.agrees and m.difference.backward}
     simulated = _simulated_differences(data, twin, found) if twin and found else None
     return [
         BackwardDifference(
@@ -207,13 +197,13 @@ def backward_differences(
             seconds=0.5 * data.dt,
             stderr=0.0,
         )
-        for v, (match, rough) in found.items()
-        if (rough if simulated is None else v not in simulated)
+        for v, match in found.items()
+        if (match.difference.rough if simulated is None else v not in simulated)
     ]
 
 
 def _simulated_differences(
-    data: Trajectories, twin: Twin, found: Mapping[int, tuple[Match, bool]]
+    data: Trajectories, twin: Twin, found: Mapping[int, Match]
 ) -> set[int] | None:
     """Velocity channels that are backward differences in a simulation; None: it says nothing."""
     stretches = stretches_in(data)
@@ -224,7 +214,7 @@ def _simulated_differences(
     if not len(obs):
         return None
     own = set()
-    for v, (match, _) in found.items():
+    for v, match in found.items():
         first, *second = (obs[..., part] for part in match.parts)
         position = np.unwrap(np.arctan2(second[0], first), axis=1) if second else first
         if _difference_of(list(zip(position, obs[..., v], strict=True)), data.dt).backward:
@@ -262,14 +252,14 @@ def _difference_of(pairs: Pairs, dt: float) -> _Difference:
     return _Difference(ours < share * others, rough)
 
 
-def lags_of(data: Trajectories, names: Sequence[str]) -> list[Lag]:
-    """
-    Pairs of a position and its velocity in the same unit, and the lag between them.
-
-    :param data: at one interval
-    :param names: of the observation channels
-    """
-    return _lags(matches_of(data, names))
+def best_of(matches: Sequence[Match]) -> list[Match]:
+    """:return: for each velocity, the position in the same unit that it matches best"""
+    best: dict[int, Match] = {}
+    for match in matches:
+        v = match.velocity
+        if match.agrees and (v not in best or match.scores.highest > best[v].scores.highest):
+            best[v] = match
+    return list(best.values())
 
 
 def matches_of(data: Trajectories, names: Sequence[str]) -> list[Match]:
@@ -301,26 +291,6 @@ def matches_of(data: Trajectories, names: Sequence[str]) -> list[Match]:
                     found.append(Match(v, name, parts, pairs, data.dt, scores, width))
                     break
     return found
-
-
-def _lags(matches: Sequence[Match]) -> list[Lag]:
-    """The lag of each velocity to its best matching position."""
-    best: dict[int, Match] = {}
-    for match in matches:
-        v = match.velocity
-        if match.agrees and (v not in best or match.scores.highest > best[v].scores.highest):
-            best[v] = match
-    return [
-        Lag(
-            v,
-            match.position,
-            match.scores.lag,
-            match.stderr(),
-            match.scores.better,
-            _difference_of(match.pairs, match.dt).backward,
-        )
-        for v, match in best.items()
-    ]
 
 
 def _positions(

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from sb3_hds.data.columns import Columns, Entry
+from sb3_hds.data.reading.log import Log
 from sb3_hds.errors import TrajectoryError
 
 PREFIX = "minari:"
 
 
-def read_minari(name: str) -> tuple[list[dict[str, np.ndarray]], Columns]:
+def read_minari(name: str) -> Log:
     """
     Episodes of a data set that is on this machine, as ``minari download`` leaves it there.
 
@@ -42,16 +43,12 @@ def read_minari(name: str) -> tuple[list[dict[str, np.ndarray]], Columns]:
     for episode in dataset.iterate_episodes():
         obs = _flat("observations", episode.observations)
         actions = _flat("actions", episode.actions)
-        own = Columns(obs=_entries(obs), actions=_entries(actions))
+        own = Columns(*(tuple(Entry(name, name) for name in part) for part in (obs, actions)))
         # Row k has the action that followed it; the last row has none.
         tables.append(obs | {n: np.append(column, np.nan) for n, column in actions.items()})
     if not tables:
         raise TrajectoryError(f"Minari's data set '{name}' has no episodes.")
-    return tables, own
-
-
-def _entries(columns: Mapping[str, np.ndarray]) -> tuple[Entry, ...]:
-    return tuple(Entry(name, name) for name in columns)
+    return Log(tables, own)
 
 
 def _flat(name: str, values: Any) -> dict[str, np.ndarray]:

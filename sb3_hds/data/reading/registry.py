@@ -8,6 +8,7 @@ from sb3_hds.data.reading.arrays import read_npy, read_npz
 from sb3_hds.data.reading.hdf5 import read_hdf5
 from sb3_hds.data.reading.log import Log, aliases
 from sb3_hds.data.reading.matlab import read_mat
+from sb3_hds.data.reading.minari import PREFIX, read_minari
 from sb3_hds.data.reading.objects import read_json
 from sb3_hds.data.reading.parquet import read_parquet
 from sb3_hds.data.reading.ros import is_bag, read_bag
@@ -37,12 +38,16 @@ READERS: dict[str, Callable[[Path, Columns], Log]] = {
 """The reader of each suffix. A reader of your own goes in here."""
 
 
-def read_log(path: Path, columns: Columns) -> Log:
+def read_log(source: str | Path, columns: Columns) -> Log:
     """
-    :param path: its suffix says how to read it; a folder may be a bag of ROS 2
+    :param source: path, whose suffix says how to read it; a folder may be a bag of ROS 2; or
+        ``minari:`` and the name of a data set
     :param columns: what will be used; nothing for all there is
     :raises TrajectoryError: if there is no such file, if it is damaged, or for another suffix
     """
+    if str(source).startswith(PREFIX):
+        return read_minari(str(source).removeprefix(PREFIX))
+    path = Path(source)
     folder = is_bag(path)
     reader = read_bag if folder else READERS.get(path.suffix.lower())
     if not folder and not path.is_file():

@@ -30,16 +30,7 @@ class Series(NamedTuple):
     values: np.ndarray
 
 
-def in_order(stamps: np.ndarray) -> np.ndarray:
-    """
-    :param stamps: of messages in the order in which they arrived [ns]
-    :return: sorted, if they only overtook each other; a clock that was set back stays as it is
-    """
-    back = np.diff(stamps, prepend=stamps[:1])
-    return np.sort(stamps) if back.min(initial=0) > -_LATE else stamps
-
-
-def aligned(
+def _aligned(
     series: Mapping[str, Series],
     stamps: np.ndarray,
     observed: Mapping[str | None, Entry],
@@ -59,7 +50,7 @@ def aligned(
     """
     kept = np.ones(len(stamps), bool)
     columns: dict[str, np.ndarray] = {}
-    interpolated, held = list[str](), list[str]()
+    done: dict[str, list[str]] = {"interpolated": [], "held": []}
     for name, (times, values) in series.items():
         order = np.argsort(times, kind="stable")
         times, values = times[order], values[order]
@@ -70,17 +61,16 @@ def aligned(
         kept &= before >= 0
         if name not in observed or values.dtype.kind not in "fiub":
             columns[name] = values[np.maximum(before, 0)]
-            held.append(name)
+            done["held"].append(name)
             continue
         columns[name] = _interpolated(times, values, stamps, observed[name])
         after = np.minimum(np.searchsorted(times, stamps, side="left"), len(times) - 1)
         usual = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
         longest = 1e9 * gap if gap else _GAP * usual
         kept &= (stamps <= times[-1]) & (times[after] - times[np.maximum(before, 0)] <= longest)
-        interpolated.append(name)
+        done["interpolated"].append(name)
     columns[""] = stamps
-    done = ((interpolated, "interpolated"), (held, "held"))
-    words = tuple(f"{listed(names)} {word}" for names, word in done if names)
+    words = tuple(f"{listed(names)} {word}" for word, names in done.items() if names)
     return {name: column[kept] for name, column in columns.items()}, words
 
 
@@ -88,15 +78,13 @@ def _interpolated(
     times: np.ndarray, values: np.ndarray, stamps: np.ndarray, entry: Entry
 ) -> np.ndarray:
     values = values.astype(float)
-    if entry.angle and entry.factor:
-        values = np.unwrap(values * entry.factor) / entry.factor
+    turn = 2.0 * np.pi / entry.factor if entry.angle and entry.factor else None
+    if turn:
+        values = np.unwrap(values, period=abs(turn))
     # Nanoseconds since 1970 do not fit into a double.
     begin = times[0]
     at = np.interp((stamps - begin).astype(float), (times - begin).astype(float), values)
-    if entry.angle and entry.factor:
-        turn = 2.0 * np.pi / entry.factor
-        at = (at + 0.5 * turn) % turn - 0.5 * turn
-    return at
+    return (at + 0.5 * turn) % turn - 0.5 * turn if turn else at
 
 
 STORAGE = (".db3", ".mcap")
@@ -128,19 +116,17 @@ def read_bag(path: Path, columns: Columns) -> Log:
     :raises TrajectoryError: if rosbags is not installed, a message is of an unknown type, or topics
         have no clock in common
     """
+    wanted = sorted(columns.wanted - {_TIME.name})
     with _opened(path) as bag:
-        fields = _fields_of(sorted(columns.wanted - {_TIME.name}))
-        if fields and set(fields) <= {connection.topic for connection in bag.connections}:
-            topics = {t: _read(bag, t, names, path) for t, names in fields.items()}
-            lacking = [f"{t}:{n}" for t, topic in topics.items() for n in topic.lacking]
-        else:
-            topics, lacking = {}, ["all"]
-        if lacking or not fields:
-            found = _discovered(bag)
-            if fields:
-                return Log([dict.fromkeys([*found, "time"], np.zeros(0))], Columns(time=(_TIME,)))
-            topics = {t: _read(bag, t, n, path) for t, n in _fields_of(found).items()}
+        if not wanted:
+            topics = _read(bag, _discovered(bag), path)
             return Log([{k: v for t in topics.values() for k, v in t.columns().items()}])
+        in_bag = {connection.topic for connection in bag.connections}
+        known = {name.partition(":")[0] for name in wanted} <= in_bag
+        topics = _read(bag, wanted, path) if known else {}
+        if not known or any(topic.lacking for topic in topics.values()):
+            names = [*_discovered(bag), "time"]
+            return Log([dict.fromkeys(names, np.zeros(0))], Columns(time=(_TIME,)))
     return _rows(topics, columns, path)
 
 
@@ -159,11 +145,12 @@ class _Topic:
         self._values: dict[str, Any] = {}
         self._at: dict[str, array[int]] = {field: array("q") for field in self._paths}
         # Arrays whose entries are chosen by number, and the names of the entries.
-        self._numbered: dict[str, list[str] | None] = {}
-        for path in self._paths.values():
-            for i, (index, _) in enumerate(path):
-                if index.isdigit():
-                    self._numbered[_written(path[:i])] = None
+        self._numbered: dict[str, list[str] | None] = {
+            field[: token.start()]: None
+            for field in self._paths
+            for token in _TOKEN.finditer(field)
+            if (token[1] or "").isdigit()
+        }
 
     def add(self, message: Any, received: int) -> None:
         """
@@ -194,9 +181,9 @@ class _Topic:
                 )
 
     @property
-    def lacking(self) -> list[str]:
-        """Fields that no message has."""
-        return [field for field, at in self._at.items() if not at and field != _STAMP]
+    def lacking(self) -> bool:
+        """Whether no message has one of the fields."""
+        return not all(at or field == _STAMP for field, at in self._at.items())
 
     def stamps(self, clock: str) -> np.ndarray:
         """:return: of all messages [ns]"""
@@ -209,28 +196,11 @@ class _Topic:
 
     def columns(self) -> dict[str, np.ndarray]:
         """:return: all fields, with their full names; times in seconds, from the first message"""
-        found = {}
-        for field, values in self._values.items():
-            column = np.array(values)
-            if field in (_STAMP, _RECEIVED):
-                stamps = self.stamps(field)
-                column = 1e-9 * (stamps - stamps[0])
-            found[f"{self.name}:{field}"] = column
+        found = {f"{self.name}:{field}": np.array(v) for field, v in self._values.items()}
+        for field in {_STAMP, _RECEIVED} & self._values.keys():
+            stamps = self.stamps(field)
+            found[f"{self.name}:{field}"] = 1e-9 * (stamps - stamps[0])
         return found
-
-
-def _written(path: Sequence[tuple[str, str]]) -> str:
-    """The reverse of the split into tokens."""
-    return "".join(f".{name}" if name else f"[{index}]" for index, name in path).lstrip(".")
-
-
-def _fields_of(names: Iterable[str]) -> dict[str, list[str]]:
-    """Fields by topic."""
-    found: dict[str, list[str]] = {}
-    for name in names:
-        topic, _, field = name.partition(":")
-        found.setdefault(topic, []).append(field)
-    return found
 
 
 def _rows(topics: Mapping[str, _Topic], columns: Columns, path: Path) -> Log:
@@ -247,9 +217,12 @@ def _rows(topics: Mapping[str, _Topic], columns: Columns, path: Path) -> Log:
         if field not in (_STAMP, _RECEIVED)
     }
     main = f"{leading}:{first}"
-    stamps = in_order(series[main].stamps if main in series else topics[leading].stamps(clock))
+    stamps = series[main].stamps if main in series else topics[leading].stamps(clock)
+    # Messages that only overtook each other are sorted; a clock that was set back stays as it is.
+    if np.diff(stamps).min(initial=0) > -_LATE:
+        stamps = np.sort(stamps)
     entries = {entry.column: entry for entry in columns.obs or ()}
-    table, done = aligned(series, stamps, entries, columns.gap)
+    table, done = _aligned(series, stamps, entries, columns.gap)
     left = table.pop("")
     if not len(left):
         others = listed(sorted(set(topics) - {leading}))
@@ -314,13 +287,19 @@ def _messages(bag: Any, topic: str) -> Iterator[tuple[Any, int]]:
             ) from error
 
 
-def _read(bag: Any, name: str, fields: Iterable[str], path: Path) -> _Topic:
-    topic = _Topic(name, fields)
-    for message, received in _messages(bag, name):
-        topic.add(message, received)
-    if not topic.received:
-        raise TrajectoryError(f"'{path}' has no message of '{name}'.")
-    return topic
+def _read(bag: Any, names: Iterable[str], path: Path) -> dict[str, _Topic]:
+    """The topics of these columns, with the fields that the columns name."""
+    fields: dict[str, list[str]] = {}
+    for name in names:
+        topic, _, field = name.partition(":")
+        fields.setdefault(topic, []).append(field)
+    topics = {name: _Topic(name, of_topic) for name, of_topic in fields.items()}
+    for name, topic in topics.items():
+        for message, received in _messages(bag, name):
+            topic.add(message, received)
+        if not topic.received:
+            raise TrajectoryError(f"'{path}' has no message of '{name}'.")
+    return topics
 
 
 def _value(message: Any, path: Sequence[tuple[str, str]]) -> Any:

@@ -42,11 +42,17 @@ class _Dialect(NamedTuple):
         return fields
 
     def is_number(self, field: str) -> bool:
+        """:return: whether a field is a number"""
         if self.decimal == ",":
             field = field.replace(".", "?").replace(",", ".")
-        return is_number(field)
+        try:
+            float(field)
+        except ValueError:
+            return False
+        return True
 
     def is_text(self, field: str) -> bool:
+        """:return: whether a field is neither a number nor a missing value"""
         return not self.is_number(field) and field.lower() not in _MISSING
 
 
@@ -151,15 +157,6 @@ def _has_decimal_commas(frame: Any) -> bool:
     return any(text.astype(str).str.fullmatch(r"-?\d+,\d+").any() for text in texts)
 
 
-def is_number(text: str) -> bool:
-    """:return: whether a field of a text file is one"""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 def _encoding(path: Path) -> str:
     """UTF-8, UTF-16 where it begins with that mark, otherwise that of western Windows."""
     with foreign(path), path.open("rb") as file:
@@ -207,9 +204,9 @@ def _layout(path: Path, lines: Sequence[str], columns: Columns) -> _Layout:
         at = 2 if has_units else 1
         before = body[at][0] if len(body) > at else len(lines)
     units = [*units, *[""] * (len(names) - len(units))]
-    for i, name in enumerate(names):
+    for i, name in enumerate(names if named else []):
         match = _UNIT_IN_NAME.fullmatch(name)
-        units[i] = units[i] or (match[1] if named and match else "")
+        units[i] = units[i] or (match[1] if match else "")
     return _Layout(_distinct(names), units, before, dialect, not named)
 
 
@@ -237,12 +234,11 @@ def _is_row(dialect: _Dialect, rows: Sequence[Sequence[str]]) -> bool:
     if not any(numbers) or (below and len(below) != len(head)):
         return all(numbers)
     # Values stand above their like; names, of which some may be numbers, do not.
-    kinds = ({_kind(dialect, x), _kind(dialect, y)} for x, y in zip(head, below, strict=False))
-    return {"number", "text"} not in kinds
-
-
-def _kind(dialect: _Dialect, field: str) -> str:
-    return "number" if dialect.is_number(field) else "text" if dialect.is_text(field) else ""
+    number, text = dialect.is_number, dialect.is_text
+    return not any(
+        (number(x) and text(y)) or (text(x) and number(y))
+        for x, y in zip(head, below, strict=False)
+    )
 
 
 def _are_units(
@@ -286,10 +282,8 @@ def _check_names(
 def _first_names(dialect: _Dialect, rows: Sequence[Sequence[str]]) -> int:
     """:return: number of the first line of text above as many numbers; 0 if there is none"""
     for i, (line, below) in enumerate(itertools.pairwise(rows)):
-        texts, numbers = (
-            sum(map(f, x)) for f, x in ((dialect.is_text, line), (dialect.is_number, below))
-        )
-        if texts == len(line) == len(below) == numbers:
+        alike = len(line) == len(below)
+        if alike and all(map(dialect.is_text, line)) and all(map(dialect.is_number, below)):
             return i
     return 0
 

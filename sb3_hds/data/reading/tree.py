@@ -131,14 +131,13 @@ def _tables_of_object(node: Mapping[str, Any], search: _Search) -> list[Table]:
             f"{listed([*cells, *lists])}. Say where the rows are: records: NAME."
         )
     n = numbers.pop() if numbers else 1
-    return [_joined(plain, [part[i % len(part)] for part in parts if part]) for i in range(n)]
-
-
-def _joined(plain: Table, parts: Iterable[Table]) -> Table:
-    joined = dict(plain)
-    for part in parts:
-        joined |= part
-    return joined
+    tables = []
+    for i in range(n):
+        table = dict(plain)
+        for part in filter(None, parts):
+            table |= part[i % len(part)]
+        tables.append(table)
+    return tables
 
 
 def _walk(node: Mapping[str, Any], search: _Search, prefix: str = "") -> Iterable[tuple[str, Any]]:
@@ -313,17 +312,13 @@ def plain_of(value: Any) -> Any:
     if not isinstance(value, list):
         return np.array(value)
     if value and all(isinstance(item, dict) for item in value):
-        return value if _are_flat(value) else [plain_of(item) for item in value]
+        flat = not any(_nests(item.values()) for item in value)
+        return value if flat else [plain_of(item) for item in value]
     try:
         array = np.array([np.nan if item is None else item for item in value])
     except (ValueError, OverflowError):
         return Cells(map(plain_of, value))
     return array if array.dtype != object else array_of(value)
-
-
-def _are_flat(items: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether they are records, which are taken as they are."""
-    return not any(_nests(item.values()) for item in items)
 
 
 def _nests(values: Iterable[Any]) -> bool:

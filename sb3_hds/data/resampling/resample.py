@@ -68,8 +68,7 @@ def at_one_interval(episodes: Sequence[Rows], columns: Columns) -> tuple[Steps, 
     dt = columns.dt or _interval(clocks)
     _check_interval(dt, clocks)
     angles = [i for i, entry in enumerate(columns.obs or ()) if entry.angle]
-    steps, samplings = Steps([], [], [], []), []
-    parts = []
+    steps, samplings, parts = Steps([], [], [], []), [], []
     for number, (rows, cut) in enumerate(zip(episodes, cuts, strict=True)):
         made = [
             _at_steps(part, _agreeing(clock, part, cut.rounding, dt), cut.rounding, dt, angles)
@@ -112,11 +111,11 @@ class _Piece(NamedTuple):
     :param begin: time of the first sample, on the clock of the rows [s]
     :param rows: with times that fit the samples
     :param kept: whether rows are samples as they were measured
-    :param off: how far stamps are from their ticks [s]
-    :param late: which of them are farther than rounding explains
     :param missing: row before which rows are missing, and how many; samples were interpolated
     :param moved: longest time from a sample to the row closest to it [s]
     :param error: of the rows, read back from the steps
+    :param off: how far stamps are from their ticks [s]
+    :param late: which of them are farther than rounding explains
     """
 
     begin: float
@@ -125,11 +124,11 @@ class _Piece(NamedTuple):
     rows: Rows
     clock: Clock
     kept: bool
-    off: np.ndarray
-    late: np.ndarray
     missing: tuple[tuple[int, int], ...]
     moved: float
     error: np.ndarray
+    off: np.ndarray = np.zeros(0)
+    late: np.ndarray = np.zeros(0, bool)
 
 
 def _cut(rows: Rows, gap: float | None) -> _Cut:
@@ -245,11 +244,9 @@ def _kept(part: Rows, clock: Clock, dt: float, angles: Sequence[int]) -> _Piece:
         _wrap(obs, angles)
         held = np.repeat(held, 1 + skipped, axis=0)
     rows = part._replace(times=begin + dt * slots)
-    nothing = np.zeros(0)
-    error = np.zeros(part.obs.shape)
     missing = tuple((int(part.numbers[k + 1]), int(skipped[k])) for k in np.flatnonzero(skipped))
     moved = dt * _farthest(slots, every)
-    return _Piece(begin, obs, held, rows, clock, True, nothing, nothing, missing, moved, error)
+    return _Piece(begin, obs, held, rows, clock, True, missing, moved, np.zeros(part.obs.shape))
 
 
 def _resampled(
@@ -277,10 +274,8 @@ def _resampled(
     actions = np.diff(_at(grid, times, impulse), axis=0) / np.diff(grid)[:, None]
     inside = (times >= grid[0]) & (times <= grid[-1])
     begin = float(rows.times[0]) + start
-    nothing, moved = np.zeros(0), _farthest(times, grid)
-    return _Piece(
-        begin, new, actions, rows, clock, False, nothing, nothing, (), moved, error[inside]
-    )
+    moved = _farthest(times, grid)
+    return _Piece(begin, new, actions, rows, clock, False, (), moved, error[inside])
 
 
 def _turning(obs: np.ndarray, angles: Sequence[int]) -> np.ndarray:
@@ -341,11 +336,12 @@ def _described(rows: Rows, cut: _Cut, made: Sequence[_Piece | None]) -> Sampling
     errors = [piece.error for piece in kept] or [np.zeros_like(rows.obs)]
     longest = max(kept, key=lambda piece: len(piece.rows.times), default=None)
     clock = longest.clock if longest else cut.clocks[0]
-    off = np.concatenate([piece.off for piece in kept if piece.clock.ticks] or [np.zeros(0)])
+    off = np.concatenate([np.zeros(0), *(piece.off for piece in kept if piece.clock.ticks)])
     late = [
-        part.numbers[piece.late]
+        number
         for part, piece in zip(cut.parts, made, strict=True)
         if piece is not None and piece.clock.kind == "late"
+        for number in part.numbers[piece.late].tolist()
     ]
     return Sampling(
         source=rows.source,
@@ -363,7 +359,7 @@ def _described(rows: Rows, cut: _Cut, made: Sequence[_Piece | None]) -> Sampling
         rounding=cut.rounding,
         off=float(off.max(initial=0.0)),
         jitter=float(np.sqrt(np.mean(off**2))) if len(off) else 0.0,
-        late=tuple(np.concatenate(late).tolist()) if late else (),
+        late=tuple(late),
         drift=clock.drift,
         missing=tuple(hole for piece in kept for hole in piece.missing),
     )

@@ -37,9 +37,12 @@ class Rows(NamedTuple):
 
     def part(self, chosen: np.ndarray | slice) -> "Rows":
         """:return: some of the rows"""
-        numbers, times = self.numbers[chosen], self.times[chosen]
-        obs, actions = self.obs[chosen], self.actions[chosen]
-        return Rows(self.source, numbers, times, obs, actions, self.condition)
+        return self._replace(
+            numbers=self.numbers[chosen],
+            times=self.times[chosen],
+            obs=self.obs[chosen],
+            actions=self.actions[chosen],
+        )
 
 
 def rows_of(table: Table, columns: Columns, source: str, filename: str) -> list[Rows]:

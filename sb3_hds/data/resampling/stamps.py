@@ -5,7 +5,7 @@ from jaxtyping import Bool
 
 from sb3_hds.data.resampling.clock import Clock, shares_stamps
 from sb3_hds.data.resampling.rows import Rows
-from sb3_hds.data.resampling.values import unwrapped
+from sb3_hds.data.resampling.values import runs, unwrapped
 from sb3_hds.errors import TrajectoryError
 
 _NEIGHBOURS = 5  # rows before and after a repeated stamp that say whether there is a row too many
@@ -65,8 +65,7 @@ def written_twice(rows: Rows, interval: float) -> Bool[np.ndarray, " rows"]:
         return again if copied else np.zeros_like(again)
     ahead = rows.times / interval - np.arange(len(again))
     found = np.zeros_like(again)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], again, [0]])))
-    for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+    for first, end in runs(again):
         before, after = ahead[max(first - _NEIGHBOURS, 0) : first], ahead[end : end + _NEIGHBOURS]
         behind = np.median(before) - np.median(after) if len(after) else end - first
         found[end - int(np.clip(np.round(behind), 0, end - first)) : end] = True

@@ -1,9 +1,9 @@
-"""What values alone tell: wrapped angles, and the smallest step of what is quantised."""
+"""Properties of values: wrapped angles, runs of flags, and the smallest step if quantised."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 # Usual steps around a whole turn.
 _AROUND = 5.0
@@ -28,6 +28,15 @@ def unwrapped(x: np.ndarray) -> np.ndarray:
         if wraps.any() and np.ptp(x) < 1.05 * turn:
             return np.unwrap(x, period=turn)
     return x
+
+
+def runs(flags: Bool[np.ndarray, " steps"]) -> Iterator[tuple[int, int]]:
+    """
+    :param flags: of rows, or of the steps between rows
+    :return: start (inclusive) and end (exclusive) of each run of set flags
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
 
 
 def resolutions(rows: Sequence[np.ndarray]) -> Float64[np.ndarray, " n_obs"]:
