@@ -132,7 +132,7 @@ def _map(log: Log, columns: Sequence[_Column]) -> list[str]:
     actions = [c for c in rest if _is(c, _ACTION)]
     sensed = [c for c in rest if c not in actions and c.varies]
     obs = [c for c in sensed if _is(c, _OBSERVED)] or sensed
-    lines = [] if own.time else _time_lines(log, time)
+    lines = [] if own.time else [_time_line(log, time)]
     lines += _entries("obs", obs, log.units) if obs else ["obs: []  # nothing changes: name them"]
     lines += _entries("actions", actions, log.units) if actions else ["actions: []"]
     if episodes and not own.episode:
@@ -159,13 +159,13 @@ def _guessed_time(columns: Sequence[_Column]) -> _Column | None:
     return next(iter([*called, *steady]), None)
 
 
-def _time_lines(log: Log, time: _Column | None) -> list[str]:
+def _time_line(log: Log, time: _Column | None) -> str:
     if time is None:
-        return ["dt: 0.01  # seconds between two rows: nothing here looks like time stamps"]
+        return "dt: 0.01  # seconds between two rows: nothing here looks like time stamps"
     factor, unit = _time_unit(log, time)
     entry = {"column": time.name} | ({"unit": unit} if unit else {})
     step = time.step * factor
-    return [f"time: {_flow(entry)}  # a row every {step:.4g} s, {1.0 / step:.4g} Hz"]
+    return f"time: {_flow(entry)}  # a row every {step:.4g} s, {1.0 / step:.4g} Hz"
 
 
 def _time_unit(log: Log, time: _Column) -> tuple[float, str]:

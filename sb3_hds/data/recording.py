@@ -213,13 +213,11 @@ def _check_header(header: dict[str, Any], path: Path) -> None:
 
 def _table(rows: list[dict[str, Any]], header: dict[str, Any], path: Path) -> dict[str, np.ndarray]:
     """Columns of one episode. Row k has the action that followed it; the last row has none."""
-    n_act = len(header["actions"])
+    n, n_act = len(rows), len(header["actions"])
     try:
-        obs = np.array([row["obs"] for row in rows], float).reshape(len(rows), len(header["obs"]))
-        actions = np.full((len(rows), n_act), np.nan)
-        actions[:-1] = np.array([row["action"] for row in rows[1:]], float).reshape(
-            len(rows) - 1, n_act
-        )
+        obs = np.array([row["obs"] for row in rows], float).reshape(n, len(header["obs"]))
+        actions = np.full((n, n_act), np.nan)
+        actions[:-1] = np.array([row["action"] for row in rows[1:]], float).reshape(n - 1, n_act)
         names = [*header["obs"], *header["actions"]]
         columns = dict(zip(names, np.hstack([obs, actions]).T, strict=True))
         times = np.array([row["time"] for row in rows], float)

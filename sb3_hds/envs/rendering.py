@@ -59,7 +59,8 @@ def view_of(twin: Twin) -> View:
     poses = _turned(twin, np.array(start.q))
     low, high = _outline(twin, start._replace(q=poses))
     extent = float((high - low).max())
-    shifted = _outline(twin, start._replace(q=_slid(twin, poses, 0.01 * extent)))
+    # Whether sliders move the drawing.
+    shifted = _outline(twin, start._replace(q=poses + 0.01 * extent * _are(twin, "m", poses)))
     roams = not np.allclose((low, high), shifted, rtol=0.0, atol=1e-3 * extent)
     x, y = (low + high) / 2.0
     half = 0.5 * extent * _MARGIN * (_ROOM_TO_TRAVEL if roams else 1.0)
@@ -119,11 +120,6 @@ def _turned(twin: Twin, q: np.ndarray) -> np.ndarray:
     """Turn every hinge through the full circle, each at a different rate over the poses."""
     turn = 2.0 * np.pi * np.arange(len(q))[:, None] / len(q)
     return np.where(_are(twin, "rad", q), turn * np.arange(1, q.shape[1] + 1), q)
-
-
-def _slid(twin: Twin, q: np.ndarray, shift: float) -> np.ndarray:
-    """Move every slider by ``shift`` [m]."""
-    return q + shift * _are(twin, "m", q)
 
 
 def _are(twin: Twin, unit: str, q: np.ndarray) -> np.ndarray:

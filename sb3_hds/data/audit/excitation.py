@@ -170,12 +170,10 @@ class Stillness(NamedTuple):
     :param share: of the time, in [0, 1]
     :param noise: standard deviation of each channel while standing still, in its unit; nan where
         the system never does
-    :param n_windows: number of windows that were looked at
     """
 
     share: float
     noise: Float64[np.ndarray, " n_obs"]
-    n_windows: int
 
 
 def stillness_of(stretches: list[Stretch], resolution: Float64[np.ndarray, " n_obs"]) -> Stillness:
@@ -189,7 +187,7 @@ def stillness_of(stretches: list[Stretch], resolution: Float64[np.ndarray, " n_o
     """
     parts = [part for part in map(_windows, stretches) if len(part)]
     if not parts:
-        return Stillness(0.0, np.full(len(resolution), np.nan), 0)
+        return Stillness(0.0, np.full(len(resolution), np.nan))
     # Deviations, steps, ranges: one array per window and channel, whatever its number of rows.
     std = np.concatenate([part.std(axis=1, ddof=1) for part in parts])
     step = np.concatenate([np.sqrt(np.mean(np.diff(p, axis=1) ** 2, axis=1)) for p in parts])
@@ -204,7 +202,7 @@ def stillness_of(stretches: list[Stretch], resolution: Float64[np.ndarray, " n_o
     noise = (
         np.sqrt(np.mean(std[still] ** 2, axis=0)) if still.any() else np.full_like(floor, np.nan)
     )
-    return Stillness(float(still.mean()), noise, len(still))
+    return Stillness(float(still.mean()), noise)
 
 
 def _windows(stretch: Stretch) -> np.ndarray:

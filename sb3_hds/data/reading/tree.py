@@ -123,7 +123,9 @@ def _tables_of_object(node: Mapping[str, Any], search: _Search) -> list[Table]:
             arrays[name] = value.read() if isinstance(value, Stored) else value
     cells |= _split_by_first_axis(arrays)
     plain = _columns(arrays)
-    parts = [_tables_of_cells(cells, search), *_tables_of_lists(lists, search)]
+    parts = [_tables(value, search) for value in lists.values() if value]
+    wanted = [p for p in parts if any(search.wanted & set(table) for table in p)]
+    parts = [_tables_of_cells(cells, search), *(wanted or parts)]
     numbers = {len(part) for part in parts if len(part) > 1}
     if len(numbers) > 1:
         raise TrajectoryError(
@@ -225,13 +227,6 @@ def _array_in(cell: Any) -> np.ndarray:
     if isinstance(cell, list):
         return array_of(cell)
     return np.array(np.nan) if isinstance(cell, Mapping) else np.asarray(cell)
-
-
-def _tables_of_lists(lists: Mapping[str, Any], search: _Search) -> list[list[Table]]:
-    """Of each list of objects that holds anything wanted; of all where none does."""
-    found = {name: _tables(value, search) for name, value in lists.items() if value}
-    wanting = [t for t in found.values() if any(search.wanted & set(table) for table in t)]
-    return wanting or list(found.values())
 
 
 def _are_records(items: Sequence[Any], search: _Search) -> bool:

@@ -84,7 +84,9 @@ def clock_of(
     if not _holds(line, rounding):
         found = _trend(line) if dt is None else None
         if found is None:
-            return _irregular(stamps)
+            intervals = np.diff(stamps)
+            middle = float(np.median(intervals[intervals > 0.0]))
+            return Clock("irregular", middle, np.inf, np.arange(n), stamps.copy())
         trend, drift = found
         line = line._replace(off=line.off - trend)
     kind = _kind(line, rounding)
@@ -307,12 +309,6 @@ def _kind(line: _Line, rounding: float) -> Kind:
 
 def _tolerance(dt: float, rounding: float) -> float:
     return max(ON_GRID * dt, _ROUNDED * rounding)
-
-
-def _irregular(stamps: np.ndarray) -> Clock:
-    intervals = np.diff(stamps)
-    middle = float(np.median(intervals[intervals > 0.0]))
-    return Clock("irregular", middle, np.inf, np.arange(len(stamps)), stamps.copy())
 
 
 def _nominal(interval: float, far: float) -> float:
