@@ -25,8 +25,9 @@ def read(*stamps, values=None, **more):
         q = motion(t) if values is None else values[i]
         k = np.arange(len(t))
         episodes.append(Rows(f"log {i}", k, np.asarray(t, float), q[:, None], 1.0 * k[:, None], ""))
-    steps, report = at_one_interval(episodes, columns_from(COLUMNS | more))
-    return [x[:, 0] for x in steps.obs], [u[:, 0] for u in steps.actions], report
+    data = at_one_interval(episodes, columns_from(COLUMNS | more))
+    obs, actions = zip(*(data.episode(i) for i in range(len(data))), strict=True)
+    return [x[:, 0] for x in obs], [u[:, 0] for u in actions], data.report
 
 
 def regular(hz=100.0, n=3000):

@@ -87,18 +87,7 @@ def _loaded(files: Files, map_of_columns: Any) -> Trajectories:
             name = path if path.startswith(PREFIX) else Path(path).name
             source = name if len(log.tables) == 1 else f"{name}, episode {i}"
             episodes += rows_of(table, columns, source, Path(path).stem)
-    columns = first.columns if first else Columns()
-    steps, report = at_one_interval(episodes, columns)
-    report = dataclasses.replace(
-        report,
-        units=tuple(entry.si_unit for entry in columns.obs or ()),
-        action_units=tuple(entry.si_unit for entry in columns.actions or ()),
-        notes=tuple(notes),
-    )
-    data = Trajectories.from_arrays(
-        steps.obs, steps.actions, dt=report.dt, conditions=steps.conditions
-    )
-    return dataclasses.replace(data, origin=np.array(steps.origin), report=report)
+    return at_one_interval(episodes, first.columns if first else Columns(), tuple(notes))
 
 
 def first_log(files: Files, said: Columns | None) -> Log | None:

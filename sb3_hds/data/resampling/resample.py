@@ -1,5 +1,6 @@
 """Resampling of rows with time stamps to one constant interval, with a report of the changes."""
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -7,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.core.trajectories.episodes import same_interval
 from sb3_hds.data.columns import Columns
 from sb3_hds.data.resampling.clock import (
@@ -34,20 +36,9 @@ _SIGMAS = 3.0  # standard errors by which an interval may differ from the common
 _FAR = 10.0  # intervals between two measurements that cannot be interpolated
 
 
-class Steps(NamedTuple):
-    """
-    Trajectories at one interval, as arguments of ``Trajectories.from_arrays``.
-
-    :param origin: number of the episode that each is a part of
-    """
-
-    obs: list[np.ndarray]
-    actions: list[np.ndarray]
-    conditions: list[str]
-    origin: list[int]
-
-
-def at_one_interval(episodes: Sequence[Rows], columns: Columns) -> tuple[Steps, Reading]:
+def at_one_interval(
+    episodes: Sequence[Rows], columns: Columns, notes: Sequence[str] = ()
+) -> Trajectories:
     """
     Identify the clock of each episode, drop duplicated rows, cut at gaps, and resample rows of
     irregular clocks or of clocks with another rate.
@@ -58,8 +49,9 @@ def at_one_interval(episodes: Sequence[Rows], columns: Columns) -> tuple[Steps, 
     the impulse.
 
     :param episodes: at least one
-    :param columns: for ``dt``, ``gap``, names, and which channels are angles
-    :return: the steps, and what was changed
+    :param columns: for ``dt``, ``gap``, names, units, and which channels are angles
+    :param notes: for the report
+    :return: the samples, with a report of what was changed
     :raises TrajectoryError: if nothing is left that is as long as one step, for stamps too coarse
         to tell an interval, or for steps that are far shorter than the intervals of the log
     """
@@ -67,21 +59,18 @@ def at_one_interval(episodes: Sequence[Rows], columns: Columns) -> tuple[Steps, 
     clocks = [clock for cut in cuts for clock in cut.clocks]
     dt = columns.dt or _interval(clocks)
     _check_interval(dt, clocks)
-    angles = [i for i, entry in enumerate(columns.obs or ()) if entry.angle]
-    steps, samplings, parts = Steps([], [], [], []), [], []
+    obs, actions = columns.obs or (), columns.actions or ()
+    angles = [i for i, entry in enumerate(obs) if entry.angle]
+    samplings: list[Sampling] = []
+    found: list[tuple[int, _Piece]] = []
     for number, (rows, cut) in enumerate(zip(episodes, cuts, strict=True)):
         made = [
             _at_steps(part, _agreeing(clock, part, cut.rounding, dt), cut.rounding, dt, angles)
             for part, clock in zip(cut.parts, cut.clocks, strict=True)
         ]
         samplings.append(_described(rows, cut, made))
-        for piece in filter(None, made):
-            steps.obs.append(piece.obs)
-            steps.actions.append(piece.actions)
-            steps.conditions.append(rows.condition)
-            steps.origin.append(number)
-            parts.append(Part(number, piece.rows, piece.begin, len(piece.actions)))
-    if not steps.obs:
+        found += [(number, piece) for piece in made if piece is not None]
+    if not found:
         raise TrajectoryError(
             f"No episode lasts one step of {dt:g} s: the longest has "
             f"{max(len(rows.times) for rows in episodes)} rows. Choose a smaller dt or a longer "
@@ -89,13 +78,22 @@ def at_one_interval(episodes: Sequence[Rows], columns: Columns) -> tuple[Steps, 
         )
     report = Reading(
         dt=dt,
-        obs=tuple(entry.name for entry in columns.obs or ()),
-        actions=tuple(entry.name for entry in columns.actions or ()),
-        resolution=tuple(resolutions([part.rows.obs for part in parts]).tolist()),
+        obs=tuple(entry.name for entry in obs),
+        actions=tuple(entry.name for entry in actions),
+        resolution=tuple(resolutions([piece.rows.obs for _, piece in found]).tolist()),
         recordings=tuple(samplings),
-        parts=tuple(parts),
+        parts=tuple(Part(i, piece.rows, piece.begin, len(piece.actions)) for i, piece in found),
+        units=tuple(entry.si_unit for entry in obs),
+        action_units=tuple(entry.si_unit for entry in actions),
+        notes=tuple(notes),
     )
-    return steps, report
+    data = Trajectories.from_arrays(
+        [piece.obs for _, piece in found],
+        [piece.actions for _, piece in found],
+        dt=dt,
+        conditions=[piece.rows.condition for _, piece in found],
+    )
+    return dataclasses.replace(data, origin=np.array([i for i, _ in found]), report=report)
 
 
 class _Cut(NamedTuple):
