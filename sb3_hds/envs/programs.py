@@ -2,7 +2,7 @@
 The compiled programs of the environments.
 
 Values of parameters are arguments, so all environments of equal twins share one compilation. States
-travel as numpy arrays: they pickle, they copy, and they belong to no device.
+are returned as numpy arrays, which can be pickled and copied and belong to no device.
 """
 
 import functools
@@ -17,12 +17,12 @@ from sb3_hds.core import Params, State, Twin
 
 class Transition(NamedTuple):
     """
-    The result of one step of a twin; with a leading axis for several copies.
+    The result of one step of a twin, with a leading axis for several copies.
 
     :param state: after the step
     :param obs: observation of that state
     :param reward: of this step
-    :param terminated: whether the task ends in that state
+    :param terminated: whether that state is terminal
     """
 
     state: State
@@ -33,12 +33,12 @@ class Transition(NamedTuple):
 
 class BatchTransition(NamedTuple):
     """
-    The result of one step of many copies; those that ended have restarted.
+    The result of one step of many copies; those whose episode ended have been reset.
 
     :param state: at the start of the next step, leading axis ``n_envs``
     :param obs: observation of that state, ``(n_envs, n_obs)``
     :param elapsed: steps since the start of each episode, ``(n_envs,)``
-    :param ended: the step itself, before any restart
+    :param ended: the step itself, before any reset
     :param truncated: whether the step limit was reached, ``(n_envs,)``
     """
 
@@ -88,7 +88,7 @@ def for_many(twin: Twin) -> Programs:
         truncated = elapsed >= limit
         done = ended.terminated | truncated
 
-        def restart() -> tuple[State, Any]:
+        def reset() -> tuple[State, Any]:
             def where_done(new: Any, old: Any) -> Any:
                 return jnp.where(done.reshape(done.shape + (1,) * (new.ndim - 1)), new, old)
 
@@ -97,7 +97,7 @@ def for_many(twin: Twin) -> Programs:
             return jax.tree.map(where_done, start, (ended.state, ended.obs))
 
         # Outside vmap, so drawing costs nothing in the many steps in which no copy ends.
-        state, obs = jax.lax.cond(jnp.any(done), restart, lambda: (ended.state, ended.obs))
+        state, obs = jax.lax.cond(jnp.any(done), reset, lambda: (ended.state, ended.obs))
         return BatchTransition(state, obs, jnp.where(done, 0, elapsed), ended, truncated)
 
     return Programs(*map(jax.jit, (draw, observe, sketch, step)))

@@ -15,17 +15,17 @@ _SLIDER, _HINGE = 0, 1
 
 class InvertedPendulumFriction(InvertedPendulumEnv):
     """
-    ``InvertedPendulum-v5`` with joints that resist more than its XML says. It stands in for
-    hardware: nothing of it is computed by a twin.
+    ``InvertedPendulum-v5`` with additional joint friction. It stands in for hardware: no twin takes
+    part in its simulation.
 
-    :param slider_damping: viscous friction of the rail, beyond the XML's [N s/m]
-    :param hinge_damping: viscous friction of the hinge, beyond the XML's [N m s/rad]
+    :param slider_damping: viscous friction of the rail, in addition to the XML's [N s/m]
+    :param hinge_damping: viscous friction of the hinge, in addition to the XML's [N m s/rad]
     :param slider_friction: dry friction of the rail [N]
     :param hinge_friction: dry friction of the hinge [N m]
-    :param swing_up: the pole starts hanging and is free to turn, nothing terminates, observations
-        are (position, cos, sin, speed, rate), and the reward is best upright in the middle: see the
-        twin of the same name
-    :param rail_ends: whether the cart is stopped at 1 m
+    :param swing_up: the pole starts hanging and turns freely, episodes do not terminate,
+        observations are (position, cos, sin, speed, rate), and the reward is largest upright in the
+        middle: see the twin of the same name
+    :param rail_ends: whether stops limit the cart to 1 m
     :param noise: standard deviation of each observation, in its own unit
     :param reset_noise_scale: as in ``InvertedPendulum-v5``
     :param settings: further arguments of ``InvertedPendulum-v5``
@@ -68,7 +68,7 @@ class InvertedPendulumFriction(InvertedPendulumEnv):
 
     @property
     def nominal(self) -> Any:
-        """The nominal model of the XML, in the form that twins read."""
+        """The model of the XML without the additional friction, as twins read it."""
         return SimpleNamespace(
             unwrapped=SimpleNamespace(
                 model=self._shipped,
@@ -98,7 +98,7 @@ class InvertedPendulumFriction(InvertedPendulumEnv):
         """
         if not self.swing_up:
             obs, _, _, truncated, info = super().step(action)
-            # By the true angle: noise tells nothing about whether the pole has fallen.
+            # By the true angle: noise does not make the pole fall.
             fallen = bool(abs(self.data.qpos[_HINGE]) > 0.2) or not np.isfinite(obs).all()
             return obs, float(not fallen), fallen, truncated, info | {"reward_survive": not fallen}
         self.do_simulation(action, self.frame_skip)
