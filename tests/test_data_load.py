@@ -78,7 +78,7 @@ def test_patterns_give_files_in_alphabetical_order_and_lists_keep_theirs(tmp_pat
 
     assert found.conditions == ("a", "b", "run[1]") and found.origin.tolist() == [0, 1, 2]
     assert listed.conditions == ("run[1]", "a")
-    with pytest.raises(TrajectoryError, match="a recording is evidence only once"):
+    with pytest.raises(TrajectoryError, match="use each recording once"):
         Trajectories.load([tmp_path / "a.csv", str(tmp_path / "*.csv")], columns=COLUMNS)
 
 
@@ -193,13 +193,13 @@ def test_a_gap_ends_the_episode_and_both_parts_are_one_recording(tmp_path):
 @each(
     ({"tiem": "t"}, "Did you mean 'time'"),
     ({"obs": "q"}, "obs must be a list of columns, got 'q'."),
-    ({"obs": [{"colum": "q"}]}, "obs[0] has the key 'colum'"),
+    ({"obs": [{"colum": "q"}]}, "obs[0] has the unknown key 'colum'"),
     ({"obs": [{"column": "q", "constant": 1.0}]}, "obs[0] needs either 'column'"),
     ({"obs": [{"column": "q", "scale": "big"}]}, "scale must be a finite number, got 'big'"),
     ({"obs": ["q", "q"]}, "two channels of obs are called 'q'"),
     ({"time": None}, "time: NAME"),
     ({"condition": "load"}, "condition must be {column: NAME} or {from: filename}"),
-    ({"obs": None}, "columns does not say which are the obs."),
+    ({"obs": None}, "columns does not name the obs."),
     ({"obs": ["Q"]}, "'log.csv' has no column 'Q'. It has: t, q, v, u."),
     # Its stamps are milliseconds, of which a thousand fit into this dt.
     ({"time": {"column": "t", "scale": 1e3}, "dt": 0.01}, "scale: 0.001"),

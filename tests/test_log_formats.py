@@ -121,10 +121,10 @@ def test_a_unit_has_a_factor_to_a_name_in_the_si(unit, factor, name):
 
 
 @each(
-    ({"obs": [{"column": "q", "unit": "furlong"}]}, "'furlong' is not known. Known are rad"),
-    ({"obs": [{"column": "q", "unit": "counts"}]}, "mean nothing without a scale"),
-    ({"obs": [{"column": "q", "unit": "mm", "angle": True}]}, "an angle is in rad, deg or"),
-    ({"time": {"column": "t", "unit": "deg"}}, "time is in one of s, ms, us"),
+    ({"obs": [{"column": "q", "unit": "furlong"}]}, "unknown unit 'furlong'. Known are rad"),
+    ({"obs": [{"column": "q", "unit": "counts"}]}, "counts need a scale"),
+    ({"obs": [{"column": "q", "unit": "mm", "angle": True}]}, "an angle must be in rad, deg or"),
+    ({"time": {"column": "t", "unit": "deg"}}, "time must be in one of s, ms, us"),
 )
 def test_a_unit_that_cannot_be_converted_is_refused(change, says):
     with pytest.raises(TrajectoryError, match=says):
@@ -421,7 +421,7 @@ def test_what_is_printed_of_a_log_is_a_map_that_reads_it(tmp_path, capsys):
     data = load(log, tmp_path / "map.yml")
 
     assert f"{N} rows, 4 columns" in shown and "time: {column: ms, unit: ms}" in shown
-    assert "degrees? Then write unit: deg" in shown and "# not used: run" in shown
+    assert "degrees? Then add unit: deg" in shown and "# not used: run" in shown
     assert data.report.obs == ("joint angle",) and data.report.actions == ("tau_cmd",)
     assert data.dt == 0.01
 

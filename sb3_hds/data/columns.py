@@ -15,23 +15,23 @@ from sb3_hds.data.conversion import KNOWN, TIMES, Unit, unit_of
 from sb3_hds.errors import TrajectoryError, did_you_mean
 
 FORM = (
-    "columns names what a log holds: {'time': NAME, 'obs': [{'column': NAME, 'unit': 'deg'}, ...], "
-    "'actions': [{'column': NAME}, ...]}, or is the path of a yml file with that."
+    "columns maps what a log holds: {'time': NAME, 'obs': [{'column': NAME, 'unit': 'deg'}, ...], "
+    "'actions': [{'column': NAME}, ...]}, or is the path of a yml file with such a map."
 )
 
 
 class Entry(NamedTuple):
     """
-    One channel: ``factor * column + offset``, or ``offset`` alone where nothing was recorded.
+    One channel: ``factor * column + offset``, or ``offset`` alone if it was not recorded.
 
     :param name: of the channel; default: that of its column
-    :param column: in the log; None for a channel that is constant
-    :param scale: of the column, besides the factor of its unit
+    :param column: in the log; None for a constant channel
+    :param scale: applied to the column in addition to the factor of its unit
     :param offset: added after scaling, in the unit of the twin
-    :param angle: whether the result wraps to [-pi, pi) [rad]: it then turns the shorter way
-    :param unit: that the column, once scaled, is in, as ``"deg"``: it is converted to the SI unit.
-        Empty if ``scale`` leads to the unit of the twin; None if nothing is said, so that a file
-        which names its units may
+    :param angle: whether the result wraps to [-pi, pi) [rad], so that it is interpolated the
+        shorter way
+    :param unit: of the scaled column, such as ``"deg"``: it is converted to the SI unit. Empty if
+        ``scale`` converts to the unit of the twin; None if undeclared: the file's own unit applies
     """
 
     name: str
@@ -43,13 +43,13 @@ class Entry(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """From the column to the unit of the twin."""
+        """Factor from the column to the unit of the twin."""
         unit = unit_of(self.unit) if self.unit else None
         return self.scale * (unit.factor if unit else 1.0)
 
     @property
     def si_unit(self) -> str:
-        """Unit of the channel; empty where it is not known."""
+        """Unit of the channel; empty if unknown."""
         unit = unit_of(self.unit) if self.unit else None
         return unit.name if unit else ""
 
@@ -58,7 +58,7 @@ class Label(NamedTuple):
     """
     The source of a trajectory's label.
 
-    :param column: in the log; None: the name of the file, without folder and suffix
+    :param column: in the log; None: the file name without folder and suffix
     """
 
     column: str | None
@@ -71,14 +71,14 @@ class Columns:
 
     :param obs: observation channels, in the order of the twin; None: as declared in the file
     :param actions: action channels, in the order of the twin; None: as declared in the file
-    :param time: stamps, scaled to seconds, the sum of several columns where seconds and nanoseconds
-        stand apart; None where rows are exactly ``dt`` apart
-    :param condition: where the label is from; default: all trajectories have the same one
-    :param episode: the column that changes where a new episode begins
-    :param dt: sampling interval of the result [s]; default: the one in the log
+    :param time: stamps, scaled to seconds; the sum of several columns if seconds and nanoseconds
+        are separate; None if rows are exactly ``dt`` apart
+    :param condition: source of the label; default: all trajectories have the same label
+    :param episode: column whose value changes at the start of an episode
+    :param dt: sampling interval of the result [s]; default: that of the log
     :param gap: a longer time between two rows ends the episode [s]; default: five intervals
-    :param records: where the rows are in a file that nests them, as ``"data"`` or ``"run.rows"``
-    :param skip: number of lines of a text file before its names, or its first row
+    :param records: path to the rows in a nested file, such as ``"data"`` or ``"run.rows"``
+    :param skip: number of lines of a text file before the names, or before the first row
     """
 
     obs: tuple[Entry, ...] | None = None
@@ -100,7 +100,7 @@ class Columns:
         return frozenset(name for name in names if name is not None)
 
     def completed_by(self, other: "Columns") -> "Columns":
-        """:return: these columns, with what they leave out taken from others"""
+        """:return: these columns, with missing fields taken from the others"""
         names = [field.name for field in dataclasses.fields(self)]
         missing = {name: getattr(other, name) for name in names if getattr(self, name) is None}
         return dataclasses.replace(self, **missing)
@@ -114,18 +114,18 @@ class Columns:
         merged = self.completed_by(own or Columns())
         missing = [name for name in ("obs", "actions") if getattr(merged, name) is None]
         if missing:
-            raise TrajectoryError(f"columns does not say which are the {missing[0]}. {FORM}")
+            raise TrajectoryError(f"columns does not name the {missing[0]}. {FORM}")
         if merged.time is None and merged.dt is None:
             raise TrajectoryError(
-                "columns must name the column of time stamps, as time: NAME, or say how far rows "
-                "are apart, as dt: SECONDS."
+                "columns must name the column of time stamps, as time: NAME, or give the interval "
+                "between rows, as dt: SECONDS."
             )
         return merged
 
     def in_units(self, units: Mapping[str, str]) -> "Columns":
         """
-        :param units: of columns, as a file names them
-        :return: with these units where the map has none and they are known
+        :param units: of columns, as a file declares them
+        :return: the map with these units, if known, for entries without a unit
         """
 
         si = {name: unit_of(unit) for name, unit in units.items()}
@@ -149,7 +149,7 @@ class Columns:
 def columns_from(source: Any) -> Columns:
     """
     :param source: a dict as in the guide, the path of a yml file with one, or ``Columns``
-    :raises TrajectoryError: if it cannot be read, or for a key or a value that is not known
+    :raises TrajectoryError: if it cannot be read, or for an unknown key or an invalid value
     """
     if isinstance(source, Columns):
         return source
@@ -158,7 +158,7 @@ def columns_from(source: Any) -> Columns:
         where = f"'{source}'"
         source = _read_yml(Path(source).expanduser())
     if not isinstance(source, Mapping):
-        raise TrajectoryError(f"{where} holds a {type(source).__name__}. {FORM}")
+        raise TrajectoryError(f"{where} contains a {type(source).__name__}. {FORM}")
     _check_keys(where, source, [field.name for field in dataclasses.fields(Columns)])
     seconds = {key: source[key] for key in ("dt", "gap") if source.get(key) is not None}
     return Columns(
@@ -192,8 +192,8 @@ def _check_keys(where: str, given: Mapping[Any, Any], known: Sequence[str]) -> N
     for key in given:
         if key not in known:
             raise TrajectoryError(
-                f"{where} has the key '{key}', which is not known. "
-                f"Known are: {', '.join(known)}.{did_you_mean(str(key), known)}"
+                f"{where} has the unknown key '{key}'. "
+                f"Known keys: {', '.join(known)}.{did_you_mean(str(key), known)}"
             )
 
 
@@ -208,7 +208,7 @@ def _entries(where: str, key: str, given: Any) -> tuple[Entry, ...] | None:
     twice = [name for name, n in Counter(entry.name for entry in entries).items() if n > 1]
     if twice:
         raise TrajectoryError(
-            f"{where}: two channels of {key} are called '{twice[0]}'. Give one another name: "
+            f"{where}: two channels of {key} are called '{twice[0]}'. Rename one of them: "
             "{column: NAME, name: OTHER}."
         )
     if key == "obs" and not entries:
@@ -249,18 +249,18 @@ def _unit(where: str, given: Mapping[str, Any]) -> Unit | None:
     unit = unit_of(str(given["unit"]))
     if unit is None:
         raise TrajectoryError(
-            f"{where}: the unit '{given['unit']}' is not known. Known are {KNOWN}, and what is "
-            "made of them, as 'deg/s' or 'N mm'. For another one, give the factor to the unit of "
-            "the twin: scale: NUMBER."
+            f"{where}: unknown unit '{given['unit']}'. Known are {KNOWN}, and their products and "
+            "quotients, as 'deg/s' or 'N mm'. For another unit, give the factor to the unit of the "
+            "twin: scale: NUMBER."
         )
     if not unit.name and "scale" not in given:
         raise TrajectoryError(
-            f"{where}: {given['unit']} mean nothing without a scale. Say what one of them is, in "
-            "the unit of the twin: scale: NUMBER."
+            f"{where}: {given['unit']} need a scale. Give the size of one, in the unit of the "
+            "twin: scale: NUMBER."
         )
     if given.get("angle") and unit.name not in ("rad", ""):
         raise TrajectoryError(
-            f"{where}: an angle is in rad, deg or turns, not in '{given['unit']}'. Leave out "
+            f"{where}: an angle must be in rad, deg or turns, got '{given['unit']}'. Remove "
             "angle: true, or correct the unit."
         )
     return unit
@@ -276,7 +276,7 @@ def _time(where: str, given: Any) -> tuple[Entry, ...] | None:
     for entry in entries:
         if entry.unit and entry.si_unit not in ("s", ""):
             raise TrajectoryError(
-                f"{where}: time is in one of {', '.join(TIMES)}, got unit: '{entry.unit}'."
+                f"{where}: time must be in one of {', '.join(TIMES)}, got unit: '{entry.unit}'."
             )
     return entries
 
@@ -285,7 +285,8 @@ def _skip(where: str, given: Any) -> int | None:
     if given is None or (isinstance(given, int) and not isinstance(given, bool) and given >= 0):
         return given
     raise TrajectoryError(
-        f"{where}: skip is the number of lines before the names, or the first row, got {given!r}."
+        f"{where}: skip must be the number of lines before the names, or before the first row, "
+        f"got {given!r}."
     )
 
 
@@ -316,7 +317,7 @@ def _column_name(where: str, given: Any) -> str:
     if isinstance(given, bool) or not isinstance(given, str | int | float):
         raise TrajectoryError(
             f"{where} must be the name of a column, got {given!r}. "
-            "Names that yml takes for something else (on, off, yes, no) need quotes."
+            "Names with another meaning in yml (on, off, yes, no) need quotes."
         )
     return str(given)
 
