@@ -233,7 +233,7 @@ LINES = "0.0,1,2,3\n0.1,1,2,3\n"
     ("log.csv", "t,q,v,u\n2024-05-01 12:00:00.1,1,0,0\n", "to seconds before"),
     ("log.csv", f"t,q,v,u\n{LINES}0.2,nan,6,0\n", "must be finite, got nan in row 2"),
     ("log.csv", f"t,q,v,u\n{LINES}0.05,0,6,0\n", "from 0.1 to 0.05 s at row 2"),
-    ("log.csv", b"\x89HDF\r\n\x1a\n" + bytes(99), "is an HDF5 file, in spite of its name"),
+    ("log.csv", b"\x89HDF\r\n\x1a\n" + bytes(99), "looks like an HDF5 file, in spite of its name"),
     ("log.mat", b"PAR1" + bytes(99), "rename it to 'log.parquet'"),
     ("log.db3", b"nothing", "'ros2 bag reindex' or 'rosbag reindex'"),
     ("log.csv", bytes(range(256)), "is damaged or not a .csv file"),
@@ -263,7 +263,9 @@ def test_nothing_is_unpickled(tmp_path):
     np.savez(tmp_path / "log.npz", t=np.array([Evil()], dtype=object))
 
     for columns in (COLUMNS, None):
-        with pytest.raises(TrajectoryError, match=r"holds Python objects.* have to be unpickled"):
+        with pytest.raises(
+            TrajectoryError, match=r"contains Python objects.* have to be unpickled"
+        ):
             Trajectories.load(tmp_path / "log.npz", columns=columns)
     assert not (tmp_path / "owned").exists()
 

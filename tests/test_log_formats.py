@@ -197,7 +197,7 @@ def test_episodes_are_found_wherever_json_nests_them(content, more, lengths, tmp
 
     assert data.lengths.tolist() == lengths and data.dt == 0.1
     assert data.obs[0, :, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
-    with pytest.raises(TrajectoryError, match="on the way to records"):
+    with pytest.raises(TrajectoryError, match="on the path records"):
         load(tmp_path / "log.json", COLUMNS | {"records": "data.x.y"})
 
 
@@ -391,7 +391,7 @@ def test_topics_are_put_on_one_clock_observations_interpolated_and_actions_held(
     assert "/command:data held" in data.report.notes[0]
     with pytest.raises(TrajectoryError, match=r"/command has no header stamps.*/joints:received"):
         load(tmp_path / "log", columns | {"time": "/joints:header.stamp"})
-    with pytest.raises(TrajectoryError, match="several topics are put on one clock"):
+    with pytest.raises(TrajectoryError, match="several topics need a common clock"):
         load(tmp_path / "log", columns | {"time": "/joints:position[0]"})
 
 

@@ -14,7 +14,7 @@ from sb3_hds.data.columns import Columns, Entry, columns_from
 from sb3_hds.data.conversion import unit_of
 from sb3_hds.data.load import Files, epoch_unit, first_log
 from sb3_hds.data.reading import Log, read_log
-from sb3_hds.data.reading.log import base_of
+from sb3_hds.data.reading.log import base_name
 
 _SHOWN = 200  # columns
 _MAX_RADIANS = 7.0  # [rad]
@@ -191,7 +191,9 @@ def _entry_lines(key: str, columns: Sequence[_Column], units: Mapping[str, str])
     lines = [f"{key}:" + ("  # in the order of the twin: sb3-hds twins" if key == "obs" else "")]
     for column in columns[:_SHOWN]:
         unit = unit_of(units.get(column.name, ""))
-        comment = f"  # {units[column.name]}, converted to {unit.name}" if unit and unit.name else ""
+        comment = (
+            f"  # {units[column.name]}, converted to {unit.name}" if unit and unit.name else ""
+        )
         largest = max(abs(column.lowest), abs(column.highest))
         if not comment and _has_word(column, _ANGLE) and largest > _MAX_RADIANS:
             comment = "  # degrees? Then add unit: deg"
@@ -206,7 +208,7 @@ def _has_word(column: _Column, words: str) -> bool:
 
 def _words(name: str) -> list[str]:
     """The words of the last part of a name: ``["pos", "meas"]`` of ``"arm/pos_meas1"``."""
-    last = re.split(r"[/:.]", base_of(name))[-1] or name
+    last = re.split(r"[/:.]", base_name(name))[-1] or name
     split = re.sub(r"([a-z])([A-Z])", r"\1 \2", last)
     return [word for word in re.split(r"[\W\d_]+", split.lower()) if word]
 

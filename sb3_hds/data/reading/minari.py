@@ -1,4 +1,4 @@
-"""Data sets of Minari."""
+"""Minari data sets."""
 
 import importlib
 from collections.abc import Mapping
@@ -15,13 +15,13 @@ PREFIX = "minari:"
 
 def read_minari(name: str) -> Log:
     """
-    Episodes of a data set that is on this machine, as ``minari download`` leaves it there.
+    Episodes of a local data set, as installed by ``minari download``.
 
-    Minari's convention is ours: T actions and T + 1 observations. It knows no sampling interval, so
-    ``columns`` must give ``dt``. Channels are called ``observations[0]``, ``actions[0]``; those of
-    spaces with parts ``observations.arm[0]``.
+    Minari's convention is ours: T actions and T + 1 observations. It stores no sampling interval,
+    so ``columns`` must give ``dt``. Channels are called ``observations[0]``, ``actions[0]``, or
+    ``observations.arm[0]`` for nested spaces.
 
-    :param name: of the data set, as ``"D4RL/pen/human-v2"``
+    :param name: of the data set, such as ``"D4RL/pen/human-v2"``
     :return: one table per episode, and all channels
     :raises TrajectoryError: if Minari is not installed or has no such data set
     """
@@ -29,14 +29,14 @@ def read_minari(name: str) -> Log:
         minari = importlib.import_module("minari")
     except ImportError as error:
         raise TrajectoryError(
-            "Data sets of Minari need the extra 'minari': pip install sb3-hds[minari]."
+            "Minari data sets need the extra 'minari': pip install sb3-hds[minari]."
         ) from error
     try:
         dataset = minari.load_dataset(name)
     except (OSError, ValueError) as error:  # it raises these for an unknown name
         local = ", ".join(minari.list_local_datasets()) or "none"
         raise TrajectoryError(
-            f"Minari has no data set '{name}' on this machine ({error}). There are: {local}. "
+            f"Minari has no data set '{name}' on this machine ({error}). Local data sets: {local}. "
             f"Download it first: minari download {name}."
         ) from error
     tables, own = [], Columns()
@@ -44,7 +44,7 @@ def read_minari(name: str) -> Log:
         obs = _flat("observations", episode.observations)
         actions = _flat("actions", episode.actions)
         own = Columns(*(tuple(Entry(name, name) for name in part) for part in (obs, actions)))
-        # Row k has the action that followed it; the last row has none.
+        # Row k has the action that follows it; the last row has none.
         tables.append(obs | {n: np.append(column, np.nan) for n, column in actions.items()})
     if not tables:
         raise TrajectoryError(f"Minari's data set '{name}' has no episodes.")
@@ -52,7 +52,7 @@ def read_minari(name: str) -> Log:
 
 
 def _flat(name: str, values: Any) -> dict[str, np.ndarray]:
-    """Arrays of any depth of dicts and tuples, as columns of shape ``(rows,)``."""
+    """Nested dicts and tuples of arrays, as columns of shape ``(rows,)``."""
     if isinstance(values, tuple):
         values = {str(i): part for i, part in enumerate(values)}
     if isinstance(values, Mapping):

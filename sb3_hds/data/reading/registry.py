@@ -35,15 +35,15 @@ READERS: dict[str, Callable[[Path, Columns], Log]] = {
     ".db3": read_bag,
     ".mcap": read_bag,
 }
-"""The reader of each suffix. A reader of your own goes in here."""
+"""The reader of each suffix. Add your own readers here."""
 
 
 def read_log(source: str | Path, columns: Columns) -> Log:
     """
-    :param source: path, whose suffix says how to read it; a folder may be a bag of ROS 2; or
+    :param source: path, whose suffix selects the reader; a folder may be a bag of ROS 2; or
         ``minari:`` and the name of a data set
-    :param columns: what will be used; nothing for all there is
-    :raises TrajectoryError: if there is no such file, if it is damaged, or for another suffix
+    :param columns: that will be used; if empty, all are read
+    :raises TrajectoryError: if the file does not exist, is damaged, or has an unknown suffix
     """
     if str(source).startswith(PREFIX):
         return read_minari(str(source).removeprefix(PREFIX))
@@ -56,7 +56,7 @@ def read_log(source: str | Path, columns: Columns) -> Log:
         raise TrajectoryError(f"'{path}' {what} {rest}")
     if reader is None:
         raise TrajectoryError(
-            f"'{path}' cannot be read: there are readers for {', '.join(READERS)}, not for "
+            f"'{path}' cannot be read: there are readers for {', '.join(READERS)}, but not for "
             f"'{path.suffix}'. Read it yourself and use Trajectories.from_arrays."
         )
     log = reader(path, columns)

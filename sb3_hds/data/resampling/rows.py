@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int
 
 from sb3_hds.data.columns import Columns, Entry
-from sb3_hds.data.reading.log import Table, base_of
+from sb3_hds.data.reading.log import Table, base_name
 from sb3_hds.data.wording import listed
 from sb3_hds.errors import TrajectoryError, did_you_mean
 
@@ -94,7 +94,7 @@ def _length(table: Table, columns: Columns, source: str) -> int:
 
 def _lacks(table: Table, missing: Sequence[str], source: str) -> str:
     """What is missing, and what there is instead."""
-    parts = [name for name in table if base_of(name) == missing[0] != name]
+    parts = [name for name in table if base_name(name) == missing[0] != name]
     if parts:
         return (
             f"'{source}' holds several numbers of '{missing[0]}' in each row. Name them one by "
