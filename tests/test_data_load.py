@@ -230,7 +230,7 @@ LINES = "0.0,1,2,3\n0.1,1,2,3\n"
     ("log.csv", "t,q,v,u\n0,1,2,3\n3,4,5,6,7\n", "has 5 fields in line 3 and 4 before"),
     ("log.csv", "t,q,v,u\n0,00,1,5,0,0,0,0\n", "4 names in its first line and 8 fields"),
     ("log.csv", f"t,q,v,u\n{LINES}0.2,off?,6,0\n", "must hold numbers, got 'off?' in row 2"),
-    ("log.csv", "t,q,v,u\n2024-05-01 12:00:00.1,1,0,0\n", "to seconds before"),
+    ("log.csv", "t,q,v,u\n2024-05-01 12:00:00.1,1,0,0\n", "to seconds first"),
     ("log.csv", f"t,q,v,u\n{LINES}0.2,nan,6,0\n", "must be finite, got nan in row 2"),
     ("log.csv", f"t,q,v,u\n{LINES}0.05,0,6,0\n", "from 0.1 to 0.05 s at row 2"),
     ("log.csv", b"\x89HDF\r\n\x1a\n" + bytes(99), "looks like an HDF5 file, in spite of its name"),

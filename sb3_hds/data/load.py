@@ -18,7 +18,7 @@ from sb3_hds.data.reading import READERS, Log, Table, read_log
 from sb3_hds.data.reading.minari import PREFIX
 from sb3_hds.data.reading.ros import is_bag
 from sb3_hds.data.resampling.report import Reading
-from sb3_hds.data.resampling.resample import at_one_interval
+from sb3_hds.data.resampling.resample import resample
 from sb3_hds.data.resampling.rows import Rows, rows_of
 from sb3_hds.data.wording import listed
 from sb3_hds.errors import TrajectoryError
@@ -87,7 +87,7 @@ def _loaded(files: Files, column_map: Any) -> Trajectories:
             name = path if path.startswith(PREFIX) else Path(path).name
             source = name if len(log.tables) == 1 else f"{name}, episode {i}"
             episodes += rows_of(table, columns, source, Path(path).stem)
-    return at_one_interval(episodes, first.columns if first else Columns(), tuple(notes))
+    return resample(episodes, first.columns if first else Columns(), tuple(notes))
 
 
 def first_log(files: Files, given: Columns | None) -> Log | None:

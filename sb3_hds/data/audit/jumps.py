@@ -9,7 +9,7 @@ from jaxtyping import Int
 
 from sb3_hds.data.audit.finding import Finding, Place
 from sb3_hds.data.audit.stretches import Stretch, joined, steps_of
-from sb3_hds.data.resampling.values import runs, whole_turns
+from sb3_hds.data.resampling.values import angle_wraps, runs
 
 _USUAL = 0.98  # of the samples: the range that they fill is the usual one
 _FAR = 20.0  # usual ranges from the median
@@ -206,7 +206,7 @@ def reinitialised(
     for stretch in stretches:
         jumps = np.diff(stretch.obs, axis=0)
         large = np.abs(jumps) > np.maximum(_LARGE * usual.std, 10.0 * resolution)
-        large &= ~whole_turns(jumps, usual.step)
+        large &= ~angle_wraps(jumps, usual.step)
         isolated = large & _isolated(jumps, usual.step)
         sharp = np.pad(_bends(stretch.obs, usual.std) > usual.bend, (1, 0))
         goes_on = np.append(jumps[1:].any(axis=1), True)

@@ -1,6 +1,7 @@
-"""The report of what reading a log changed."""
+"""The report of how logs were read and resampled."""
 
 import dataclasses
+import itertools
 import math
 import textwrap
 from collections.abc import Sequence
@@ -20,30 +21,30 @@ _DRIFT = 1e-4  # relative change of a rate that is reported
 @dataclasses.dataclass(frozen=True)
 class Sampling:
     """
-    The time stamps of one recording, and what was done to its rows.
+    The time stamps of one recording, and how its rows were processed.
 
     :param source: file, and episode where it holds several
     :param rows: number of rows
     :param intervals: shortest, median and longest time between two rows, without gaps [s]
     :param uneven: number of intervals that differ from the median by more than 10 %
-    :param repeated: rows left out because they have the stamp of the row before
-    :param gaps: row before which a gap lies, and its length [s]; the recording is cut there
-    :param unused: number of rows left out because a piece between gaps is shorter than a step
+    :param repeated: rows dropped because they have the stamp of the previous row
+    :param gaps: row after each gap, and its length [s]; the recording is cut there
+    :param unused: number of rows dropped because a part between gaps is shorter than a step
     :param resampled: whether observations were interpolated
-    :param moved: longest time from a sample to the row closest to it [s]
-    :param error: of the rows, when they are interpolated back from the samples: root mean square,
-        one per observation channel, in its unit
+    :param moved: longest time from a sample to the closest row [s]
+    :param error: root-mean-square difference of the rows from the samples interpolated back to
+        them, for each observation channel in its unit
     :param clock: the kind of clock that paced the rows: ``"regular"``; ``"rounded"``, regular with
-        stamps of few digits; ``"late"``, regular but for a few stamps; ``"jittered"``, regular with
-        stamps whose errors do not add up; or ``"irregular"``
+        stamps of few digits; ``"late"``, regular except for a few stamps; ``"jittered"``, regular
+        with stamp errors that do not accumulate; or ``"irregular"``
     :param interval: of that clock, or the median one [s]
-    :param rounding: what all stamps are multiples of, otherwise 0 [s]
+    :param rounding: resolution of the stamps, 0 if they are not rounded [s]
     :param off: largest distance of a stamp from its tick [s]
     :param jitter: root mean square of these distances [s]
-    :param late: rows whose stamps are off, where these are few
+    :param late: rows whose stamps are off, if these are few
     :param drift: relative change of the clock's rate
-    :param missing: row before which rows are missing between two gaps, and how many; these samples
-        were interpolated
+    :param missing: row before which rows are missing between two gaps, and how many; these were
+        interpolated
     """
 
     source: str
@@ -73,7 +74,7 @@ class Sampling:
 
 class Part(NamedTuple):
     """
-    The rows that one trajectory was made of.
+    The rows of a log from which one trajectory was made.
 
     :param recording: number of the recording
     :param rows: without gaps and repeated stamps
@@ -90,18 +91,17 @@ class Part(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class Reading:
     """
-    What reading logs into ``Trajectories`` changed; prints itself.
+    How logs were processed into ``Trajectories``; prints itself.
 
     :param dt: sampling interval of the result [s]
     :param obs: names of the observation channels
     :param actions: names of the action channels
-    :param resolution: smallest step of each observation channel whose rows are multiples of one,
-        otherwise 0
-    :param recordings: one for each that was read, in order; ``Trajectories.origin`` counts them
-    :param parts: the rows as measured that each trajectory was made of, in order
-    :param units: of the observation channels, as they are now; empty where unknown
-    :param action_units: of the action channels, likewise
-    :param notes: sentences on what was understood of the files themselves
+    :param resolution: smallest step of each quantised observation channel, otherwise 0
+    :param recordings: in the order of the files; ``Trajectories.origin`` counts them
+    :param parts: the measured rows of each trajectory, in order
+    :param units: of the observation channels after conversion; empty if unknown
+    :param action_units: of the action channels after conversion; empty if unknown
+    :param notes: sentences on what the files declare, such as units
     """
 
     dt: float
@@ -121,22 +121,21 @@ class Reading:
 
     def clocks(self) -> str:
         """:return: the clocks that paced the rows, one sentence for each kind"""
-        said = []
-        for kind in get_args(Kind):
-            for kept in (True, False):
-                some = [r for r in self.recordings if (r.clock, not r.resampled) == (kind, kept)]
-                if some:
-                    said.append(f"{_place(some)}: {_clock(kind, some, kept)}")
+        found = []
+        for kind, kept in itertools.product(get_args(Kind), (True, False)):
+            group = [r for r in self.recordings if (r.clock, not r.resampled) == (kind, kept)]
+            if group:
+                found.append(f"{_names(group)}: {_clock(kind, group, kept)}")
         rates = [1.0 / r.interval for r in self.recordings if r.clock != "irregular"]
         if rates and max(rates) > (1.0 + _DRIFT) * min(rates):
-            said.append(
+            found.append(
                 f"Rates are {min(rates):.6g} to {max(rates):.6g} Hz; rows of those within "
                 f"{100.0 * SAME_RATE:g} % of {1.0 / self.dt:.6g} Hz are kept"
             )
         drifts = [r.drift for r in self.recordings]
         if max(drifts) > _DRIFT:
-            said.append(f"Within a recording, the rate changes by up to {100 * max(drifts):.2g} %")
-        return ". ".join(said) + "."
+            found.append(f"Within a recording, the rate changes by up to {100 * max(drifts):.2g} %")
+        return ". ".join(found) + "."
 
     def summary(self) -> str:
         """:return: what was changed, in one sentence for each kind of change"""
@@ -144,12 +143,12 @@ class Reading:
         repeated = [r for r in self.recordings if r.repeated]
         gaps = [r for r in self.recordings if r.gaps]
         filled = [r for r in self.recordings if r.missing]
-        said = []
+        found = []
         if uneven:
             errors = [max(values) for values in zip(*(r.error for r in uneven), strict=True)]
             pairs = ", ".join(f"{n} {e:.2g}" for n, e in zip(self.obs, errors, strict=True))
-            said.append(
-                f"{_subject(uneven)} resampled to dt = {self.dt:g} s: rows were "
+            found.append(
+                f"{_names_were(uneven)} resampled to dt = {self.dt:g} s: rows were "
                 f"{_ms(min(r.intervals[0] for r in uneven))} to "
                 f"{_ms(max(r.intervals[2] for r in uneven))} apart, samples are up to "
                 f"{_ms(max(r.moved for r in uneven))} from the closest row; interpolated back, "
@@ -157,31 +156,31 @@ class Reading:
             )
         if filled:
             n = sum(rows for r in filled for _, rows in r.missing)
-            said.append(
-                f"In {_place(filled)}, {counted(n, 'missing row was', 'missing rows were')} "
+            found.append(
+                f"In {_names(filled)}, {counted(n, 'missing row was', 'missing rows were')} "
                 "filled in by interpolation"
             )
         if repeated:
             n = sum(len(r.repeated) for r in repeated)
-            said.append(
-                f"In {_place(repeated)}, {counted(n, 'row')} with the stamp of the row before "
+            found.append(
+                f"In {_names(repeated)}, {counted(n, 'row')} with the stamp of the row before "
                 f"{'was' if n == 1 else 'were'} left out"
             )
         if gaps:
             n, unused = sum(len(r.gaps) for r in gaps), sum(r.unused for r in gaps)
             longest = max(length for r in gaps for _, length in r.gaps)
             left_out = f"; {counted(unused, 'row')} in shorter pieces left out" if unused else ""
-            said.append(
-                f"{_subject(gaps)} cut at {counted(n, 'gap')} of up to {longest:.3g} s{left_out}"
+            found.append(
+                f"{_names_were(gaps)} cut at {counted(n, 'gap')} of up to {longest:.3g} s{left_out}"
             )
-        return ". ".join(said) + "." if said else "Nothing was changed."
+        return ". ".join(found) + "." if found else "Nothing was changed."
 
     def misfit(self, channels: Sequence[Channel], actuators: Sequence[Actuator] = ()) -> str:
         """
         :param channels: of a twin
         :param actuators: of a twin
-        :return: which channel was read in a unit of something else than the twin's, and the line
-            to write; empty if there is none. What has no unit that is understood fits
+        :return: an error message if a channel was read in a unit of another quantity than the
+            twin's; empty if there is none. Unknown units are accepted
         """
         read = (("obs", self.obs, self.units), ("actions", self.actions, self.action_units))
         for (key, names, units), wanted in zip(read, (channels, actuators), strict=True):
@@ -189,14 +188,14 @@ class Reading:
                 if same_quantity(unit, target.unit) is False:
                     return (
                         f"'{name}' was read in {unit}, and '{target.name}' is in {target.unit}. "
-                        "Either the columns are in another order than the channels, or their units "
-                        f"are others: in the map of columns, {key}: [{{column: {name}, unit: "
+                        "Either the columns are not in the order of the channels, or their units "
+                        f"are wrong: in the map of columns, {key}: [{{column: {name}, unit: "
                         f"{target.unit}}}]."
                     )
         return ""
 
     def to_dict(self) -> dict[str, Any]:
-        """:return: plain data for JSON; what is not finite is None"""
+        """:return: plain data for JSON; non-finite numbers are None"""
         plain = dataclasses.asdict(dataclasses.replace(self, parts=()))
         return {name: _finite(value) for name, value in plain.items() if name != "parts"}
 
@@ -219,9 +218,9 @@ class Reading:
         return "\n".join(lines)
 
 
-def _clock(kind: Kind, some: list[Sampling], kept: bool) -> str:
-    """The clock of some recordings in words, and whether their rows were kept."""
-    rates = sorted(1.0 / r.interval for r in some)
+def _clock(kind: Kind, group: list[Sampling], kept: bool) -> str:
+    """The clock of group recordings in words, and whether their rows were kept."""
+    rates = sorted(1.0 / r.interval for r in group)
     low, high = f"{rates[0]:.5g}", f"{rates[-1]:.5g}"
     clock = f"clock of {low} Hz" if low == high else f"clock of {low} to {high} Hz"
     regular = f"regular {clock}" + ("" if kept else ", resampled to another interval")
@@ -231,22 +230,28 @@ def _clock(kind: Kind, some: list[Sampling], kept: bool) -> str:
         case "regular":
             return regular
         case "rounded":
-            return f"{regular}, stamps rounded to {_ms(max(r.rounding for r in some))}"
+            return f"{regular}, stamps rounded to {_ms(max(r.rounding for r in group))}"
         case "late":
-            n, stamps = sum(len(r.late) for r in some), sum(r.rows for r in some)
+            n, stamps = (
+                sum(len(r.late) for r in group),
+                sum(r.rows for r in group),
+            )
             return (
                 f"{clock}, regular but for {n} of {counted(stamps, 'stamp')}, off by up to "
-                f"{_ms(max(r.off for r in some))}; "
+                f"{_ms(max(r.off for r in group))}; "
                 f"{f'rows stay at their ticks: {fit}' if kept else follow}"
             )
         case "jittered":
             return (
                 f"{clock}, regular with stamps that jitter by "
-                f"{_ms(max(r.jitter for r in some))} (rms); "
+                f"{_ms(max(r.jitter for r in group))} (rms); "
                 f"{f'rows are kept: {fit}' if kept else follow}"
             )
         case "irregular":
-            shortest, longest = min(r.intervals[0] for r in some), max(r.intervals[2] for r in some)
+            shortest, longest = (
+                min(r.intervals[0] for r in group),
+                max(r.intervals[2] for r in group),
+            )
             return f"no regular clock, rows are {_ms(shortest)} to {_ms(longest)} apart"
 
 
@@ -263,12 +268,12 @@ def _row(width: int, name: str, *values: Any) -> str:
     return f"  {name:<{width}} {rows:>7} {interval:>21} {repeated:>8} {gaps:>4}"
 
 
-def _place(recordings: list[Sampling]) -> str:
+def _names(recordings: list[Sampling]) -> str:
     return recordings[0].source if len(recordings) == 1 else f"{len(recordings)} recordings"
 
 
-def _subject(recordings: list[Sampling]) -> str:
-    return f"{_place(recordings)} {'was' if len(recordings) == 1 else 'were'}"
+def _names_were(recordings: list[Sampling]) -> str:
+    return f"{_names(recordings)} {'was' if len(recordings) == 1 else 'were'}"
 
 
 def _ms(seconds: float) -> str:
