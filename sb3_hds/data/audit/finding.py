@@ -11,11 +11,11 @@ _SHOWN = 2  # places or recordings that a sentence names
 
 class Place(NamedTuple):
     """
-    Samples of one recording.
+    Consecutive samples of one recording.
 
     :param source: trajectory, or file
     :param first: first sample, or row of the file, from 0
-    :param last: last one
+    :param last: last sample, or row of the file
     :param trajectory: its number in the data
     :param time: of the first sample, since the beginning of the trajectory [s]
     :param before: time of the sample before the first one [s]
@@ -31,8 +31,9 @@ class Place(NamedTuple):
     after: float = 0.0
 
     def __str__(self) -> str:
-        samples = f"sample {self.first}" if self.first == self.last else f"samples {self.first}"
-        return f"{self.source}, {samples}" + ("" if self.first == self.last else f" to {self.last}")
+        if self.first == self.last:
+            return f"{self.source}, sample {self.first}"
+        return f"{self.source}, samples {self.first} to {self.last}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,15 +41,15 @@ class Finding(abc.ABC):
     """
     One defect of the data.
 
-    :param channel: name of the channel, or of what has the defect
-    :param places: where it was seen
+    :param channel: name of the channel, joint or command with the defect
+    :param places: where it was found
     """
 
     blocks: ClassVar[bool] = False
     """Whether data with this defect cannot support a verdict."""
 
     remedy: ClassVar[str]
-    """What to do about it."""
+    """How to correct or avoid it."""
 
     channel: str
     places: tuple[Place, ...]

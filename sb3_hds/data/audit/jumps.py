@@ -8,22 +8,22 @@ import numpy as np
 from jaxtyping import Int
 
 from sb3_hds.data.audit.finding import Finding, Place
-from sb3_hds.data.audit.stretches import Stretch, joined, steps_of
+from sb3_hds.data.audit.segments import Segment, joined, steps_of
 from sb3_hds.data.resampling.values import angle_wraps, runs
 
-_USUAL = 0.98  # of the samples: the range that they fill is the usual one
-_FAR = 20.0  # usual ranges from the median
-_AT_ONCE = 0.5  # of the way there, and of the way back, in one sample
+_TYPICAL = 0.98  # of the samples are within the typical range
+_FAR = 20.0  # typical ranges from the median
+_AT_ONCE = 0.5  # of the excursion, in the first and in the last step
 
 _SPIKE_FAR = 10.0  # largest other steps of the recording
-_NEIGHBOURS_APART = 0.2  # of the way there: how far the neighbours may be apart
-_RARE = 0.01  # of the samples of a recording, but at least one: what is frequent is noise
-_USUAL_STEPS = 0.98  # of the steps of all recordings: the range that is usual
+_NEIGHBOURS_APART = 0.2  # of the excursion: largest difference of the neighbours
+_RARE = 0.01  # of the samples of a recording, but at least one: frequent spikes are noise
+_TYPICAL_STEPS = 0.98  # of the steps of all recordings are within the typical range
 _SMALLEST_SPIKE = 0.2  # of the range that 98 % of a channel's samples fill
-# Turns that a wrapped angle fills with its noise, and how far a step may be from one.
+# Turns: range of a wrapped angle with noise, and deviation of a wrap from one turn.
 _ONE_TURN, _NEAR_TURN = 1.05, 0.16
 
-_LARGE = 0.2  # of the standard deviation of a channel: what a reset exceeds
+_LARGE = 0.2  # of the standard deviation of a channel: smallest reset
 _ISOLATED = 6.0  # times the steps around it
 _NEAR_START = 0.05  # of the standard deviation of a channel
 _AT_START = 1e-6  # of the standard deviation of a channel
@@ -32,7 +32,7 @@ _AT_START = 1e-6  # of the standard deviation of a channel
 @dataclasses.dataclass(frozen=True)
 class Outliers(Finding):
     """
-    Excursions far beyond the usual range, which would dominate a mean squared error.
+    Excursions far beyond the typical range, which would dominate a mean squared error.
 
     :param value: the most extreme outlier, in the unit of the channel
     :param low: lower end of the range that 98 % of the channel's samples fill
@@ -76,7 +76,7 @@ class Glitches(Outliers):
 @dataclasses.dataclass(frozen=True)
 class ReinitialisedState(Finding):
     """
-    :param to_start: whether the state jumps to where a recording begins
+    :param to_start: whether the state jumps to the start of a recording
     :param size: of the largest jump, in the unit of its channel
     """
 
@@ -85,41 +85,41 @@ class ReinitialisedState(Finding):
 
     @property
     def sentence(self) -> str:
-        target = "to where a recording begins" if self.to_start else "as no motion does"
+        target = "to the start of a recording" if self.to_start else "unlike any motion"
         return (
             f"'{self.channel}' jumps by up to {self.size:.3g} from one sample to the next, "
             f"{target} ({self.where})."
         )
 
     remedy = (
-        "The system was put back inside the recording: audit.corrected(data) cuts there. Or name "
-        "the column that counts episodes when loading."
+        "The state was reset within the recording: audit.corrected(data) cuts there. Or name the "
+        "column that counts episodes when loading."
     )
 
 
-def outliers(stretches: Sequence[Stretch], names: Sequence[str]) -> list[Outliers]:
+def outliers(segments: Sequence[Segment], names: Sequence[str]) -> list[Outliers]:
     """
-    Runs of samples far beyond the usual range that begin and end with a single step.
+    Runs of samples far outside the typical range that begin and end with a single step.
 
     The response to an impact decays, and an unstable system does not return: neither matches.
     """
     found = []
-    tail = 0.5 * (1.0 - _USUAL)
-    low, middle, high = np.quantile(joined(stretches), (tail, 0.5, 1.0 - tail), axis=0)
+    tail = 0.5 * (1.0 - _TYPICAL)
+    low, middle, high = np.quantile(joined(segments), (tail, 0.5, 1.0 - tail), axis=0)
     for j, name in enumerate(names):
         farthest = _FAR * (high[j] - low[j])
         if farthest == 0.0:
             continue
         places, values = [], []
-        for stretch in stretches:
-            x = stretch.obs[:, j] - middle[j]
+        for segment in segments:
+            x = segment.obs[:, j] - middle[j]
             steps = np.abs(np.diff(x))
             for a, end in runs(np.abs(x) > farthest):
-                goes = a == 0 or steps[a - 1] > _AT_ONCE * abs(x[a])
-                comes = end == len(x) or steps[end - 1] > _AT_ONCE * abs(x[end - 1])
-                if goes and comes and end - a < len(x):
-                    places.append(stretch.place(a, end - 1))
-                    values.append(stretch.obs[a:end, j][np.abs(x[a:end]).argmax()])
+                leaves = a == 0 or steps[a - 1] > _AT_ONCE * abs(x[a])
+                returns_at_once = end == len(x) or steps[end - 1] > _AT_ONCE * abs(x[end - 1])
+                if leaves and returns_at_once and end - a < len(x):
+                    places.append(segment.place(a, end - 1))
+                    values.append(segment.obs[a:end, j][np.abs(x[a:end]).argmax()])
         if places:
             worst = max(values, key=lambda value: abs(value - middle[j]))
             found.append(Outliers(name, tuple(places), float(worst), float(low[j]), float(high[j])))
@@ -127,7 +127,7 @@ def outliers(stretches: Sequence[Stretch], names: Sequence[str]) -> list[Outlier
 
 
 def glitches(
-    stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
+    segments: Sequence[Segment], names: Sequence[str], resolution: np.ndarray
 ) -> list[Glitches]:
     """
     Single samples between two opposite steps, both many times larger than any other step.
@@ -136,17 +136,17 @@ def glitches(
     tick of an encoder at rest are not glitches.
     """
     found = []
-    low, high = np.quantile(joined(stretches), (0.01, 0.99), axis=0)
-    steps = np.abs(steps_of(stretches))
-    usual = np.quantile(steps, _USUAL_STEPS, axis=0) if len(steps) else np.zeros(len(names))
-    least = np.maximum(usual, 2.0 * resolution)
+    low, high = np.quantile(joined(segments), (0.01, 0.99), axis=0)
+    steps = np.abs(steps_of(segments))
+    typical = np.quantile(steps, _TYPICAL_STEPS, axis=0) if len(steps) else np.zeros(len(names))
+    least = np.maximum(typical, 2.0 * resolution)
     least = np.maximum(least, _SMALLEST_SPIKE / _SPIKE_FAR * (high - low))
     for j, name in enumerate(names):
         places, values, largest = [], [], 0.0
-        for stretch in stretches:
-            x = stretch.obs[:, j]
+        for segment in segments:
+            x = segment.obs[:, j]
             rows, step = _spikes(x, float(least[j]))
-            places += [stretch.place(int(k), int(k)) for k in rows]
+            places += [segment.place(int(k), int(k)) for k in rows]
             values += x[rows].tolist()
             largest = max(largest, step if len(rows) else 0.0)
         if places:
@@ -168,7 +168,7 @@ def _spikes(x: np.ndarray, least: float) -> tuple[Int[np.ndarray, " rows"], floa
         return none
     size = np.minimum(np.abs(steps[:-1]), np.abs(steps[1:]))
     returns = np.abs(x[2:] - x[:-2]) < _NEIGHBOURS_APART * size
-    candidates = np.flatnonzero(returns & (size > _SPIKE_FAR * least) & ~_turns(x, size))
+    candidates = np.flatnonzero(returns & (size > _SPIKE_FAR * least) & ~_is_wrap(x, size))
     candidates = candidates[np.argsort(-size[candidates])]
     most = max(1, int(_RARE * len(x)))
     for n in range(min(len(candidates), most), 0, -1):
@@ -180,43 +180,45 @@ def _spikes(x: np.ndarray, least: float) -> tuple[Int[np.ndarray, " rows"], floa
     return none
 
 
-def _turns(x: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Whether a step is one turn of a wrapped angle [rad] or [deg], which fills one turn."""
+def _is_wrap(x: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Whether a step is a wrap of an angle whose range is one turn [rad] or [deg]."""
     turns = [turn for turn in (2.0 * np.pi, 360.0) if np.ptp(x) < _ONE_TURN * turn]
     return np.any([np.abs(size / turn - 1.0) < _NEAR_TURN for turn in turns], axis=0) & bool(turns)
 
 
 def reinitialised(
-    stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
+    segments: Sequence[Segment], names: Sequence[str], resolution: np.ndarray
 ) -> list[ReinitialisedState]:
     """
     Resets of the state: steps many times larger than their neighbours, in several channels at once
     or back to the start of a recording; and steps of any size that lead exactly to that start.
     Quantised channels are exempt from the latter, because they return there by chance.
 
-    A jump of a single channel has other explanations (an impact, an outlier), and whole turns of an
+    A jump of a single channel has other explanations (an impact, an outlier), and full turns of an
     angle are not jumps.
     """
-    usual = _Usual.of(stretches)
-    if usual is None:
+    typical = _TypicalMotion.of(segments)
+    if typical is None:
         return []
-    at_start = _AT_START * usual.std if (resolution == 0.0).any() else np.full(len(names), -1.0)
+    at_start = _AT_START * typical.std if (resolution == 0.0).any() else np.full(len(names), -1.0)
     places: dict[bool, list[Place]] = {True: [], False: []}
     sizes = {True: np.zeros(len(names)), False: np.zeros(len(names))}
-    for stretch in stretches:
-        jumps = np.diff(stretch.obs, axis=0)
-        large = np.abs(jumps) > np.maximum(_LARGE * usual.std, 10.0 * resolution)
-        large &= ~angle_wraps(jumps, usual.step)
-        isolated = large & _isolated(jumps, usual.step)
-        sharp = np.pad(_bends(stretch.obs, usual.std) > usual.bend, (1, 0))
+    for segment in segments:
+        jumps = np.diff(segment.obs, axis=0)
+        large = np.abs(jumps) > np.maximum(_LARGE * typical.std, 10.0 * resolution)
+        large &= ~angle_wraps(jumps, typical.step)
+        isolated = large & _isolated(jumps, typical.step)
+        sharp = np.pad(_curvatures(segment.obs, typical.std) > typical.curvature, (1, 0))
         goes_on = np.append(jumps[1:].any(axis=1), True)
         for k in np.flatnonzero(large.any(axis=1)):
-            away = np.abs(stretch.obs[k + 1] - usual.starts)
-            back = bool((away <= _NEAR_START * usual.std + 2.0 * usual.step).all(1).any())
-            exactly = bool((away <= at_start).all(1).any() and sharp[k] and goes_on[k])
-            if exactly or isolated[k].sum() > (not back and len(names) > 1):
-                to_start = back or exactly
-                places[to_start].append(stretch.place(int(k) + 1, int(k) + 1))
+            distance = np.abs(segment.obs[k + 1] - typical.starts)
+            near_start = bool(
+                (distance <= _NEAR_START * typical.std + 2.0 * typical.step).all(1).any()
+            )
+            at_a_start = bool((distance <= at_start).all(1).any() and sharp[k] and goes_on[k])
+            if at_a_start or isolated[k].sum() > (not near_start and len(names) > 1):
+                to_start = near_start or at_a_start
+                places[to_start].append(segment.place(int(k) + 1, int(k) + 1))
                 sizes[to_start] = np.maximum(sizes[to_start], np.abs(jumps[k]) * large[k])
     return [
         ReinitialisedState(
@@ -230,42 +232,42 @@ def reinitialised(
     ]
 
 
-class _Usual(NamedTuple):
+class _TypicalMotion(NamedTuple):
     """
     Typical motion over all recordings.
 
     :param step: 90 % quantile of the step from sample to sample, for each channel
-    :param bend: 90 % quantile of the change of the step, in units of ``std``
+    :param curvature: 90 % quantile of the change of the step, relative to ``std``
     :param std: standard deviation of each channel
     :param starts: first sample of each recording
     """
 
     step: np.ndarray
-    bend: float
+    curvature: float
     std: np.ndarray
     starts: np.ndarray
 
     @classmethod
-    def of(cls, stretches: Sequence[Stretch]) -> "_Usual | None":
+    def of(cls, segments: Sequence[Segment]) -> "_TypicalMotion | None":
         """:return: None where nothing moves, or recordings are too short"""
-        steps = np.abs(steps_of(stretches))
+        steps = np.abs(steps_of(segments))
         moving = steps[steps.any(axis=1)]
-        std = joined(stretches).std(axis=0)
-        bends = np.concatenate([_bends(stretch.obs, std) for stretch in stretches])
+        std = joined(segments).std(axis=0)
+        bends = np.concatenate([_curvatures(segment.obs, std) for segment in segments])
         if not len(moving) or not len(bends):
             return None
-        starts = np.array([stretch.obs[0] for stretch in stretches])
+        starts = np.array([segment.obs[0] for segment in segments])
         return cls(np.quantile(moving, 0.9, 0), float(np.quantile(bends, 0.9)), std, starts)
 
 
-def _bends(x: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """Largest change of the step at each inner row, in units of the standard deviation."""
+def _curvatures(x: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Largest change of the step at each inner row, relative to the standard deviation."""
     return np.max(np.abs(np.diff(x, 2, axis=0)) / np.where(std > 0.0, std, np.inf), axis=1)
 
 
-def _isolated(jumps: np.ndarray, usual: np.ndarray) -> np.ndarray:
-    """Which steps are large beside the two before, the two after, and the usual one."""
+def _isolated(jumps: np.ndarray, typical: np.ndarray) -> np.ndarray:
+    """Which steps are large relative to the two before, the two after, and the typical one."""
     size = np.abs(jumps)
     padded = np.pad(size, ((2, 2), (0, 0)))
     around = np.max([padded[i : i + len(size)] for i in (0, 1, 3, 4)], axis=0)
-    return size > _ISOLATED * np.maximum(around, usual)
+    return size > _ISOLATED * np.maximum(around, typical)

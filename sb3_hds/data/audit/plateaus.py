@@ -13,16 +13,16 @@ from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.twin import Twin
 from sb3_hds.core.types import Params
 from sb3_hds.data.audit.finding import Finding, Place
-from sb3_hds.data.audit.stretches import Stretch, joined, steps_of
+from sb3_hds.data.audit.segments import Segment, joined, steps_of
 from sb3_hds.data.resampling.values import runs
 from sb3_hds.data.wording import percent
 
 _STEPS = 8.0  # smallest steps per sample: slower motion repeats values because of quantisation
-_ROUGH = 3.0  # typical changes of the step from sample to sample: slower motion does so by chance
+_ROUGH = 3.0  # typical changes of the step: slower motion repeats values by chance
 _REPEATED = 0.01  # of the moving samples
 _FEWEST_REPEATED = 3
 _LONGEST_REPEAT = 5  # samples
-_STEADY = (0.5, 1.6)  # of the speed: steps around a repeated value, or it may be a coincidence
+_STEADY = (0.5, 1.6)  # of the speed: range of the steps around a repeated value
 _STUCK = 20  # samples
 _PLATEAU = 5  # samples
 _MOVES, _CREEPS = 0.3, 0.05  # of the rms step of a channel
@@ -82,13 +82,13 @@ class SaturatedChannel(Finding):
     @property
     def sentence(self) -> str:
         return (
-            f"'{self.channel}' is cut off at {self.value:.4g}: {percent(self.share)} of its "
-            f"samples are exactly there ({self.where})."
+            f"'{self.channel}' is clipped at {self.value:.4g}: {percent(self.share)} of its "
+            f"samples have exactly this value ({self.where})."
         )
 
     remedy = (
         "Choose a larger range of the sensor, or leave these samples out. A mechanical stop looks "
-        "the same: then the twin needs one."
+        "the same; if there is one, the twin needs it, too."
     )
 
 
@@ -112,21 +112,21 @@ class ReachedLimit(Finding):
         )
 
     remedy = (
-        "The twin has no stops, so what happens there is none of its forces: leave these samples "
-        "out, or correct the range in the model file."
+        "The twin has no stops and cannot explain forces there: leave these samples out, or "
+        "correct the range in the model file."
     )
 
 
 def repeated_samples(
-    stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
+    segments: Sequence[Segment], names: Sequence[str], resolution: np.ndarray
 ) -> list[RepeatedSamples]:
     """
     Short runs of equal values in a moving channel.
 
     A channel without quantisation repeats a value only at rest or in saturation. A quantised
-    channel also does in slow motion, so there only fast and steady motion counts.
+    channel also does so in slow motion, so only fast and steady motion counts there.
     """
-    repeats = [_repeats(stretches, j, step) for j, step in enumerate(resolution)]
+    repeats = [_repeats(segments, j, step) for j, step in enumerate(resolution)]
     found = [
         RepeatedSamples(name, tuple(places), share)
         for name, (places, share) in zip(names, repeats, strict=True)
@@ -139,20 +139,20 @@ def repeated_samples(
     return found
 
 
-def _repeats(stretches: Sequence[Stretch], j: int, resolution: float) -> tuple[list[Place], float]:
+def _repeats(segments: Sequence[Segment], j: int, resolution: float) -> tuple[list[Place], float]:
     """Where channel j repeats a value, and the share of its moving samples that do."""
-    everything = joined(stretches)[:, j]
+    everything = joined(segments)[:, j]
     natural = {0.0, float(everything.min()), float(everything.max())}
-    bends = np.abs(np.concatenate([np.diff(s.obs[:, j], 2) for s in stretches]))
+    bends = np.abs(np.concatenate([np.diff(s.obs[:, j], 2) for s in segments]))
     fast = max(_STEPS * resolution, _ROUGH * float(np.median(bends)) if len(bends) else 0.0)
     places, moving = [], 0
-    for stretch in stretches:
-        x = stretch.obs[:, j]
+    for segment in segments:
+        x = segment.obs[:, j]
         moving += int((np.abs(np.diff(x)) > (fast if resolution else 0.0)).sum())
         for a, b in runs(np.diff(x) == 0.0):
             inside = a >= 1 and b < len(x) - 1 and b - a <= _LONGEST_REPEAT
             if inside and (_moves_on(x, a, b, fast) if resolution else x[a] not in natural):
-                places.append(stretch.place(a + 1, b))
+                places.append(segment.place(a + 1, b))
     n = sum(place.last - place.first + 1 for place in places)
     return places, n / max(moving + n, 1)
 
@@ -166,35 +166,36 @@ def _moves_on(x: np.ndarray, a: int, b: int, fast: float) -> bool:
         return False
     speed = float(np.median(steps))
     low, high = _STEADY
-    # The first step afterwards may make up for what was missed.
+    # The first step afterwards may include the missed motion.
     most = np.array([high, high, high * (b - a + 1), high])
     ratios = steps / speed if speed else np.zeros(4)
     return bool(abs(speed) > fast and (ratios > low).all() and (ratios < most).all())
 
 
 def saturated(
-    stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
+    segments: Sequence[Segment], names: Sequence[str], resolution: np.ndarray
 ) -> list[SaturatedChannel]:
     """
     Channels that stay exactly at their extreme value while others move.
 
-    They must reach it at speed: turning points are flat, too, in particular after quantisation.
+    They must reach it at speed, because turning points are flat, too, in particular after
+    quantisation.
     """
     found = []
-    usual = _rms_steps(stretches)
-    everything = joined(stretches)
+    rms_step = _rms_steps(segments)
+    everything = joined(segments)
     for j, name in enumerate(names):
         quantised = resolution[j] > 0.0
         shortest = _PLATEAU if quantised else 2
-        fast = max((_MOVES if quantised else _CREEPS) * usual[j], 3.0 * resolution[j])
+        fast = max((_MOVES if quantised else _CREEPS) * rms_step[j], 3.0 * resolution[j])
         for value in {float(everything[:, j].min()), float(everything[:, j].max())}:
             places, n = [], 0
-            for stretch in stretches:
-                x = stretch.obs[:, j]
+            for segment in segments:
+                x = segment.obs[:, j]
                 for a, b in runs((x[1:] == value) & (x[:-1] == value)):
                     arrives = b - a + 1 >= shortest and _abrupt(x, a, b, fast)
-                    if arrives and _others_move(stretch.obs[a : b + 1], j, usual):
-                        places.append(stretch.place(a, b))
+                    if arrives and _others_move(segment.obs[a : b + 1], j, rms_step):
+                        places.append(segment.place(a, b))
                         n += b - a + 1
             if n >= _PLATEAU and np.ptp(everything[:, j]) > 0.0:
                 found.append(SaturatedChannel(name, tuple(places), value, n / len(everything)))
@@ -202,31 +203,31 @@ def saturated(
 
 
 def stuck(
-    stretches: Sequence[Stretch], names: Sequence[str], resolution: np.ndarray
+    segments: Sequence[Segment], names: Sequence[str], resolution: np.ndarray
 ) -> list[StuckChannel]:
     """
     Channels that are constant while others move, in one recording or in all, or that stop abruptly
     or jump afterwards. A system that comes to rest does neither.
     """
     found = []
-    usual = _rms_steps(stretches)
-    everything = joined(stretches)
+    rms_step = _rms_steps(segments)
+    everything = joined(segments)
     for j, name in enumerate(names):
         extremes = everything[:, j].min(), everything[:, j].max()
         if extremes[0] == extremes[1]:
             if np.ptp(np.delete(everything, j, axis=1), axis=0).any():
-                places = tuple(s.place(0, len(s.obs) - 1) for s in stretches)
+                places = tuple(s.place(0, len(s.obs) - 1) for s in segments)
                 found.append(DeadChannel(name, places, float(extremes[0])))
             continue
-        fast = max(_MOVES * usual[j], 3.0 * resolution[j])
-        for stretch in stretches:
-            x = stretch.obs[:, j]
+        fast = max(_MOVES * rms_step[j], 3.0 * resolution[j])
+        for segment in segments:
+            x = segment.obs[:, j]
             for a, b in runs(np.diff(x) == 0.0):
-                throughout = b - a == len(x) - 1 and usual[j] > 3.0 * resolution[j]
+                throughout = b - a == len(x) - 1 and rms_step[j] > 3.0 * resolution[j]
                 abrupt = x[a] not in extremes and _abrupt(x, a, b, fast)
                 long = b - a >= _STUCK and (throughout or abrupt)
-                if long and _others_move(stretch.obs[a : b + 1], j, usual):
-                    found.append(StuckChannel(name, (stretch.place(a, b),), float(x[a])))
+                if long and _others_move(segment.obs[a : b + 1], j, rms_step):
+                    found.append(StuckChannel(name, (segment.place(a, b),), float(x[a])))
     return found
 
 
@@ -237,18 +238,18 @@ def _abrupt(x: np.ndarray, a: int, b: int, fast: float) -> bool:
     return bool(stops or jumps)
 
 
-def _others_move(rows: np.ndarray, j: int, usual: np.ndarray) -> bool:
+def _others_move(rows: np.ndarray, j: int, rms_step: np.ndarray) -> bool:
     """Whether any channel but j moves in these rows; True if there is no other."""
     steps = np.abs(np.diff(np.delete(rows, j, axis=1), axis=0))
-    moving = np.median(steps, axis=0) > _MOVES * np.delete(usual, j)
+    moving = np.median(steps, axis=0) > _MOVES * np.delete(rms_step, j)
     return bool(moving.any()) or not len(moving)
 
 
-def _rms_steps(stretches: Sequence[Stretch]) -> np.ndarray:
-    return np.sqrt(np.mean(np.square(steps_of(stretches)), axis=0))
+def _rms_steps(segments: Sequence[Segment]) -> np.ndarray:
+    return np.sqrt(np.mean(np.square(steps_of(segments)), axis=0))
 
 
-def reached_limits(stretches: Sequence[Stretch], twin: Twin) -> list[ReachedLimit]:
+def reached_limits(segments: Sequence[Segment], twin: Twin) -> list[ReachedLimit]:
     """:return: one for each joint that reaches an end of the range that the twin declares"""
     limited = [
         (j, joint)
@@ -259,8 +260,8 @@ def reached_limits(stretches: Sequence[Stretch], twin: Twin) -> list[ReachedLimi
         return []
     with jax.enable_x64(True):
         coordinates = [
-            np.asarray(_coordinates(twin, jnp.asarray(stretch.obs), twin.params))
-            for stretch in stretches
+            np.asarray(_coordinates(twin, jnp.asarray(segment.obs), twin.params))
+            for segment in segments
         ]
     n_rows = sum(map(len, coordinates))
     found = []
@@ -269,8 +270,8 @@ def reached_limits(stretches: Sequence[Stretch], twin: Twin) -> list[ReachedLimi
         for end, sign in ((joint.low, -1.0), (joint.high, 1.0)):
             there = [sign * (q[:, j] - end) >= -margin for q in coordinates]
             places = tuple(
-                stretch.place(a, b - 1)
-                for stretch, flags in zip(stretches, there, strict=True)
+                segment.place(a, b - 1)
+                for segment, flags in zip(segments, there, strict=True)
                 for a, b in runs(flags)
             )
             if places:

@@ -24,10 +24,10 @@ _Kind = TypeVar("_Kind", bound=Finding)
 class ChannelSummary:
     """
     :param name: of the observation channel
-    :param unit: empty where it is not known
+    :param unit: empty if unknown
     :param lowest: measured value
     :param highest: measured value
-    :param noise: standard deviation while the system stands still; None where it never does
+    :param noise: standard deviation at rest; None if the system never rests
     :param resolution: smallest step of a quantised channel, otherwise 0
     """
 
@@ -44,8 +44,8 @@ class Audit:
     """
     The result of an audit. Prints itself.
 
-    :param findings: what was found, the most serious first
-    :param channels: of the observation
+    :param findings: defects, the most serious first
+    :param channels: summaries of the observation channels
     :param stands_still: share of the time during which nothing moves beyond noise
     :param conditions: labels of the data
     :param lengths: number of steps of each trajectory
@@ -78,7 +78,7 @@ class Audit:
 
     @property
     def noise(self) -> dict[str, float | None]:
-        """Standard deviation of each channel at rest, in its unit; None where it never rests."""
+        """Standard deviation of each channel at rest, in its unit; None if it never rests."""
         return {channel.name: channel.noise for channel in self.channels}
 
     def corrected(self, data: Trajectories) -> Trajectories:
@@ -86,7 +86,7 @@ class Audit:
         Cut at resets of the state, cut out outliers, and undo shifts of velocities. Audit the
         result again: outliers may have hidden other defects.
 
-        :param data: those that were audited
+        :param data: the audited data
         :return: new trajectories; the same ones if there is nothing to correct
         :raises TrajectoryError: for other data, or if an episode is shorter than the shifts
         """
@@ -103,7 +103,7 @@ class Audit:
 
     @property
     def corrections(self) -> tuple[str, ...]:
-        """Sentences on what :meth:`corrected` does to the data."""
+        """Sentences on the corrections of :meth:`corrected`."""
         jumps = sum(len(jump.places) for jump in self._of_kind(ReinitialisedState))
         cuts = (f"The data were cut at {counted(jumps, 'jump')} of the state.",) if jumps else ()
         far = sum(len(outlier.places) for outlier in self._of_kind(Outliers))
@@ -140,13 +140,13 @@ class Audit:
             f"{self.dt:g} s"
         )
         lines = [head, *_wrapped(f"usable: {verdict}", "", "  "), "", *_table(self.channels)]
-        lines += ["", f"It stands still {percent(self.stands_still)} of the time."]
-        lines += ["", "Findings:" if self.findings else "Nothing else was found."]
+        lines += ["", f"The system stands still {percent(self.stands_still)} of the time."]
+        lines += ["", "Findings:" if self.findings else "No defects were found."]
         for number, finding in enumerate(self.findings, start=1):
             lines += _wrapped(f"{number}. {finding.sentence}", "  ", "     ")
             lines += _wrapped(f"-> {finding.remedy}", "     ", "        ")
         if not self.stamps:
-            lines += ["", "Time stamps were not looked at: these data do not come with any."]
+            lines += ["", "Time stamps were not checked: these data have none."]
         return "\n".join(lines)
 
 
@@ -161,7 +161,7 @@ def _table(channels: Sequence[ChannelSummary]) -> list[str]:
         lines.append(
             f"  {shown:<{width}} {c.lowest:>10.4g} {c.highest:>10.4g} {noise:>10} {step:>10}"
         )
-    lines.append("  noise: standard deviation while standing still; step: of quantised values")
+    lines.append("  noise: standard deviation at rest; step: of quantised values")
     return lines
 
 
@@ -174,8 +174,8 @@ _ON_GRID = 0.02  # samples
 
 def shifted(data: Trajectories, shifts: Mapping[int, float]) -> Trajectories:
     """
-    Shift channels in time, by linear interpolation; samples at the ends of an episode that then
-    lack a channel are left out.
+    Shift channels in time by linear interpolation; samples at the ends of an episode that then
+    lack a channel are dropped.
 
     :param data: at one interval
     :param shifts: delay of each observation channel, by index [samples]; negative: early
@@ -187,8 +187,7 @@ def shifted(data: Trajectories, shifts: Mapping[int, float]) -> Trajectories:
         shortest = int(data.lengths.argmin())
         raise TrajectoryError(
             f"Trajectory {shortest} has {data.lengths[shortest]} steps, too few for shifts that "
-            f"leave out {before + after} of them. Leave it out: data[data.lengths > "
-            f"{before + after}]."
+            f"drop {before + after} of them. Remove it: data[data.lengths > {before + after}]."
         )
     obs, actions = [], []
     for i, n in enumerate(data.lengths):
@@ -198,16 +197,16 @@ def shifted(data: Trajectories, shifts: Mapping[int, float]) -> Trajectories:
             moved[:, channel] = np.interp(rows + lag, rows, x[:, channel])
         obs.append(moved[before : len(x) - after])
         actions.append(u[before : n - after])
-    return _rebuilt(data, obs, actions, range(len(data)))
+    return _with_labels_of(data, obs, actions, range(len(data)))
 
 
 def cut(data: Trajectories, places: Sequence[tuple[int, float, float]]) -> Trajectories:
     """
-    Cut episodes at resets, and cut samples out; pieces without a step are dropped.
+    Cut episodes at resets, and cut samples out; parts without a step are dropped.
 
     :param data: at one interval
-    :param places: trajectory, and the times of the last sample before and the first one after [s],
-        since its beginning
+    :param places: trajectory, and the times of the last sample before and the first one after the
+        cut, since its beginning [s]
     """
     obs, actions, sources = [], [], []
     for i, n in enumerate(data.lengths):
@@ -216,16 +215,16 @@ def cut(data: Trajectories, places: Sequence[tuple[int, float, float]]) -> Traje
         ends = [math.floor(last / data.dt + _ON_GRID) + 1 for last, _ in here]
         begins = list(accumulate((math.ceil(first / data.dt - _ON_GRID) for _, first in here), max))
         for a, b in zip([0, *begins], [*ends, int(n) + 1], strict=True):
-            if b - a > 1:  # the action before the cut led nowhere that was measured
+            if b - a > 1:  # the result of the action before the cut was not measured
                 obs.append(x[a:b])
                 actions.append(u[a : b - 1])
                 sources.append(i)
     if not obs:
-        raise TrajectoryError("No piece between the cuts has a step. Look at the recording itself.")
-    return _rebuilt(data, obs, actions, sources)
+        raise TrajectoryError("No part between the cuts has a step. Inspect the recording.")
+    return _with_labels_of(data, obs, actions, sources)
 
 
-def _rebuilt(
+def _with_labels_of(
     data: Trajectories,
     obs: Sequence[np.ndarray],
     actions: Sequence[np.ndarray],

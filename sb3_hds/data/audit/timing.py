@@ -14,9 +14,9 @@ from sb3_hds.data.wording import counted, percent
 @dataclasses.dataclass(frozen=True)
 class UnevenSampling(Finding):
     """
-    :param shortest: interval between two rows [s]
-    :param median: [s]
-    :param longest: [s]
+    :param shortest: shortest interval between two rows [s]
+    :param median: median interval [s]
+    :param longest: longest interval [s]
     :param share: of the intervals that differ from the median by more than 10 %
     """
 
@@ -34,19 +34,19 @@ class UnevenSampling(Finding):
         )
 
     remedy = (
-        "The rows were resampled; compare the error of that (print data.report) with the noise. "
-        "Next time, let one clock trigger command and measurement."
+        "The rows were resampled; compare the interpolation error (print data.report) with the "
+        "noise. In future recordings, trigger command and measurement by one clock."
     )
 
 
 @dataclasses.dataclass(frozen=True)
 class JitteredStamps(Finding):
     """
-    Of a regular clock.
+    Stamps that deviate from the ticks of a regular clock.
 
-    :param n_rows: whose stamps are off, where these are few; otherwise 0
-    :param longest: farthest that a stamp is off [s]
-    :param rms: root mean square of how far stamps are off [s]
+    :param n_rows: number of rows whose stamps deviate, if these are few; otherwise 0
+    :param longest: largest deviation [s]
+    :param rms: root mean square of the deviations [s]
     """
 
     n_rows: int
@@ -67,14 +67,14 @@ class JitteredStamps(Finding):
         )
 
     remedy = (
-        "The rows were kept at their ticks, which their values fit no worse. Next time, let the "
-        "sensor's own clock stamp them."
+        "The rows were assigned to the ticks, with which their values are consistent. In future "
+        "recordings, use time stamps of the sensor's own clock."
     )
 
 
 @dataclasses.dataclass(frozen=True)
 class MissingRows(Finding):
-    """:param n_rows: that are missing between rows of a regular clock"""
+    """:param n_rows: number of rows that are missing between rows of a regular clock"""
 
     n_rows: int
 
@@ -85,28 +85,28 @@ class MissingRows(Finding):
             f"missing, before {self.where}."
         )
 
-    remedy = "Interpolated. A longer gap ends the trajectory: gap: SECONDS in columns says when."
+    remedy = "They were interpolated. Longer gaps end the trajectory: set gap: SECONDS in columns."
 
 
 @dataclasses.dataclass(frozen=True)
 class RepeatedStamps(Finding):
-    """:param n_rows: rows that were left out"""
+    """:param n_rows: number of rows that were dropped"""
 
     n_rows: int
 
     @property
     def sentence(self) -> str:
         return (
-            f"{counted(self.n_rows, 'row')} with the time stamp of the row before "
-            f"{'was' if self.n_rows == 1 else 'were'} left out ({self.where})."
+            f"{counted(self.n_rows, 'row')} with the time stamp of the previous row "
+            f"{'was' if self.n_rows == 1 else 'were'} dropped ({self.where})."
         )
 
-    remedy = "Find out whether the logger writes twice or the clock is too coarse."
+    remedy = "Check whether the logger writes rows twice or its clock is too coarse."
 
 
 @dataclasses.dataclass(frozen=True)
 class Gaps(Finding):
-    """:param longest: [s]"""
+    """:param longest: longest gap [s]"""
 
     longest: float
 
@@ -117,13 +117,13 @@ class Gaps(Finding):
             f"({self.where})."
         )
 
-    remedy = "It was cut there. Look for what held up the logger."
+    remedy = "It was cut there. Find out what delayed the logger."
 
 
 def timing(data: Trajectories, report: Reading | None) -> list[Finding]:
     """
-    :param data: some of the recordings that were read, or all
-    :param report: of how they were read; None: nothing is known of time stamps
+    :param data: some or all of the recordings that were read
+    :param report: of how they were read; None: without time stamps
     """
     if report is None:
         return []

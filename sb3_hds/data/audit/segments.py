@@ -1,4 +1,4 @@
-"""Stretches of uninterrupted rows as they were measured, the input of all checks."""
+"""Segments of uninterrupted rows as they were measured, the input of all checks."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,12 +10,12 @@ from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.data.audit.finding import Place
 
 
-class Stretch(NamedTuple):
+class Segment(NamedTuple):
     """
     Consecutive rows without a gap.
 
-    :param source: recording, for people
-    :param trajectory: number of the trajectory that was made of them
+    :param source: recording, for messages
+    :param trajectory: number of the trajectory made from them
     :param numbers: of the rows in the recording, from 0
     :param times: since the first sample of the trajectory [s]
     :param obs: shape ``(rows, n_obs)``
@@ -45,20 +45,20 @@ class Stretch(NamedTuple):
         )
 
 
-def stretches_of(data: Trajectories) -> list[Stretch]:
-    """:return: the rows of the log that each trajectory was read from, or else its samples"""
+def segments_of(data: Trajectories) -> list[Segment]:
+    """:return: for each trajectory, the rows of its log, or else its samples"""
     chosen = set(data.origin.tolist())
     parts = [part for part in data.report.parts if part.recording in chosen] if data.report else []
     samples = list(zip(data.origin.tolist(), data.lengths.tolist(), strict=True))
     # Trajectories that were cut or selected no longer match the recordings one to one.
     if parts and [(part.recording, part.n_steps) for part in parts] == samples:
         return [
-            Stretch(p.rows.source, i, p.rows.numbers, p.rows.times - p.begin, p.rows.obs)
+            Segment(p.rows.source, i, p.rows.numbers, p.rows.times - p.begin, p.rows.obs)
             for i, p in enumerate(parts)
         ]
     numbers = [np.arange(n + 1) for n in data.lengths]
     return [
-        Stretch(f"trajectory {i}", i, k, data.dt * k, data.obs[i, : len(k)])
+        Segment(f"trajectory {i}", i, k, data.dt * k, data.obs[i, : len(k)])
         for i, k in enumerate(numbers)
     ]
 
@@ -68,11 +68,11 @@ def all_samples(data: Trajectories) -> tuple[Place, ...]:
     return tuple(Place(f"trajectory {i}", 0, int(n), i) for i, n in enumerate(data.lengths))
 
 
-def joined(stretches: Sequence[Stretch]) -> Float64[np.ndarray, "rows n_obs"]:
-    """:return: the rows of all of them"""
-    return np.concatenate([stretch.obs for stretch in stretches])
+def joined(segments: Sequence[Segment]) -> Float64[np.ndarray, "rows n_obs"]:
+    """:return: the rows of all segments"""
+    return np.concatenate([segment.obs for segment in segments])
 
 
-def steps_of(stretches: Sequence[Stretch]) -> Float64[np.ndarray, "steps n_obs"]:
-    """:return: the differences of successive rows of all of them"""
-    return np.concatenate([np.diff(stretch.obs, axis=0) for stretch in stretches])
+def steps_of(segments: Sequence[Segment]) -> Float64[np.ndarray, "steps n_obs"]:
+    """:return: the differences of successive rows within all segments"""
+    return np.concatenate([np.diff(segment.obs, axis=0) for segment in segments])
