@@ -240,7 +240,7 @@ LINES = "0.0,1,2,3\n0.1,1,2,3\n"
     ("nowhere.csv", None, "does not exist"),
     ("log.npz", None, "must have the same length, got q 50, t 50, u 50, v 49"),
     ("", None, "is a folder; name the files in it"),
-    ("[ab].csv", None, "b.csv' has not; it has: t, q, u"),
+    ("[ab].csv", None, "b.csv' does not; it has: t, q, u"),
     ("*.hdf", None, "No file matches"),
 )
 def test_a_file_that_cannot_be_read_says_why(name, content, says, tmp_path):
@@ -264,7 +264,7 @@ def test_nothing_is_unpickled(tmp_path):
 
     for columns in (COLUMNS, None):
         with pytest.raises(
-            TrajectoryError, match=r"contains Python objects.* have to be unpickled"
+            TrajectoryError, match=r"holds Python objects.* have to be unpickled"
         ):
             Trajectories.load(tmp_path / "log.npz", columns=columns)
     assert not (tmp_path / "owned").exists()

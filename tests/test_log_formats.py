@@ -349,7 +349,7 @@ def test_joints_keep_their_names_whatever_their_order(tmp_path):
     np.testing.assert_array_equal(read("/joints:position[elbow]").obs[0, :, 0], TABLE["q"])
     sparse = read("/joints:position[wrist]")
     assert sparse.lengths.tolist() == [N // 2 - 1] and sparse.dt == pytest.approx(0.02)
-    with pytest.raises(TrajectoryError, match=r"Choose them by name, as /joints:position\[elbow\]"):
+    with pytest.raises(TrajectoryError, match=r"Select them by name, as /joints:position\[elbow\]"):
         read("/joints:position[1]")
     for column in ("/joints:position[hand]", "/arm:position[elbow]"):
         with pytest.raises(TrajectoryError, match=f"has no column '{re.escape(column)}'"):

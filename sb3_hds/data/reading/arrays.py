@@ -28,7 +28,7 @@ def read_npz(path: Path, columns: Columns) -> Log:
     wanted = sorted(objects & {base_name(name) for name in columns.wanted})
     if wanted:
         raise TrajectoryError(
-            f"'{path}' contains Python objects in {', '.join(wanted)}, as NumPy saves lists of "
+            f"'{path}' holds Python objects in {', '.join(wanted)}, as NumPy saves lists of "
             "unequal arrays. They would have to be unpickled, which is unsafe. Save numbers: "
             "Trajectories.from_arrays(obs, actions, dt=SECONDS).save(PATH)."
         )
