@@ -263,9 +263,7 @@ def test_nothing_is_unpickled(tmp_path):
     np.savez(tmp_path / "log.npz", t=np.array([Evil()], dtype=object))
 
     for columns in (COLUMNS, None):
-        with pytest.raises(
-            TrajectoryError, match=r"holds Python objects.* have to be unpickled"
-        ):
+        with pytest.raises(TrajectoryError, match=r"holds Python objects.* have to be unpickled"):
             Trajectories.load(tmp_path / "log.npz", columns=columns)
     assert not (tmp_path / "owned").exists()
 

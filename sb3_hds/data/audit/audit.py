@@ -71,15 +71,15 @@ def audit(
     skip = any(isinstance(finding, Outliers | StandingStill | WithinNoise) for finding in found)
     found += timing(data, report)
     if not skip:
-        matches = velocity_pairs(data, names)
+        pairs = velocity_pairs(data, names)
         found += [
             *(mistaken_units(data, twin, named, columns) if twin else ()),
             *(reached_limits(rows, twin) if twin else ()),
             *reinitialised(rows, names, resolution),
-            *other_units(data, named, matches),
-            *swapped(data, named, matches),
-            *velocity_shifts(data, names, matches),
-            *backward_differences(data, names, matches, twin),
+            *other_units(named, pairs),
+            *swapped(named, pairs),
+            *velocity_shifts(pairs),
+            *backward_differences(data, pairs, twin),
             *stuck(rows, names, resolution),
             *saturated(rows, names, resolution),
             *repeated_samples(rows, names, resolution),

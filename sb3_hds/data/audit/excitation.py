@@ -16,6 +16,17 @@ _SECONDS, _FEWEST, _MOST = 0.1, 12, 100  # length of a window, and its limits in
 _WHITE_NOISE = 0.5  # mean squared step over variance: 2 for white noise, 0 for smooth motion
 _SMALL = 0.3  # of the standard deviation of a channel: larger deviations are motion
 _ONLY_NOISE = 3.0  # times the noise: a channel with a smaller standard deviation does not move
+NEEDED = 100  # steps: with fewer, hardly any effect is significant
+_THROUGHOUT = 0.95  # share of the time
+_MOSTLY = 0.8  # share of the time
+_WEAK = 5.0  # noise
+_DEPENDENT = 0.999  # share of the variance
+_CONSTANT = 0.01  # of its largest value: a command that varies less does not excite its drive
+_STROKE = 0.1  # of a channel's range, from one turning point to the next
+# Half of the strokes propose causes and half confirm them. The logarithm of the mean squared error
+# of a stroke has a standard deviation of about 0.5, so the mean over twenty has a standard error of
+# 0.11, and a reduction by a fifth (0.22) is just significant at 2.5 %.
+_STROKES = 40
 
 
 @dataclasses.dataclass(frozen=True)
@@ -210,19 +221,6 @@ def _windows(segment: Segment) -> np.ndarray:
     length = int(np.clip(round(_SECONDS / segment.dt), _FEWEST, _MOST))
     n = len(segment.obs) // length
     return segment.obs[: n * length].reshape(n, length, segment.obs.shape[1])
-
-
-NEEDED = 100  # steps: with fewer, hardly any effect is significant
-_THROUGHOUT = 0.95  # share of the time
-_MOSTLY = 0.8  # share of the time
-_WEAK = 5.0  # noise
-_DEPENDENT = 0.999  # share of the variance
-_CONSTANT = 0.01  # of its largest value: a command that varies less does not excite its drive
-_STROKE = 0.1  # of a channel's range, from one turning point to the next
-# Half of the strokes propose causes and half confirm them. The logarithm of the mean squared error
-# of a stroke has a standard deviation of about 0.5, so the mean over twenty has a standard error of
-# 0.11, and a reduction by a fifth (0.22) is just significant at 2.5 %.
-_STROKES = 40
 
 
 def excitation(

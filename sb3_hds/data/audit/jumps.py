@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Int
@@ -197,24 +196,26 @@ def reinitialised(
     A jump of a single channel has other explanations (an impact, an outlier), and full turns of an
     angle are not jumps.
     """
-    typical = _TypicalMotion.of(segments)
-    if typical is None:
+    steps, std = np.abs(steps_of(segments)), joined(segments).std(axis=0)
+    curvatures = np.concatenate([_curvatures(segment.obs, std) for segment in segments])
+    if not steps.any() or not len(curvatures):
         return []
-    at_start = _AT_START * typical.std if (resolution == 0.0).any() else np.full(len(names), -1.0)
+    typical_step = np.quantile(steps[steps.any(axis=1)], 0.9, axis=0)
+    sharp_curvature = np.quantile(curvatures, 0.9)
+    starts = np.array([segment.obs[0] for segment in segments])
+    at_start = _AT_START * std if (resolution == 0.0).any() else np.full(len(names), -1.0)
     places: dict[bool, list[Place]] = {True: [], False: []}
     sizes = {True: np.zeros(len(names)), False: np.zeros(len(names))}
     for segment in segments:
         jumps = np.diff(segment.obs, axis=0)
-        large = np.abs(jumps) > np.maximum(_LARGE * typical.std, 10.0 * resolution)
-        large &= ~angle_wraps(jumps, typical.step)
-        isolated = large & _isolated(jumps, typical.step)
-        sharp = np.pad(_curvatures(segment.obs, typical.std) > typical.curvature, (1, 0))
+        large = np.abs(jumps) > np.maximum(_LARGE * std, 10.0 * resolution)
+        large &= ~angle_wraps(jumps, typical_step)
+        isolated = large & _isolated(jumps, typical_step)
+        sharp = np.pad(_curvatures(segment.obs, std) > sharp_curvature, (1, 0))
         goes_on = np.append(jumps[1:].any(axis=1), True)
         for k in np.flatnonzero(large.any(axis=1)):
-            distance = np.abs(segment.obs[k + 1] - typical.starts)
-            near_start = bool(
-                (distance <= _NEAR_START * typical.std + 2.0 * typical.step).all(1).any()
-            )
+            distance = np.abs(segment.obs[k + 1] - starts)
+            near_start = bool((distance <= _NEAR_START * std + 2.0 * typical_step).all(1).any())
             at_a_start = bool((distance <= at_start).all(1).any() and sharp[k] and goes_on[k])
             if at_a_start or isolated[k].sum() > (not near_start and len(names) > 1):
                 to_start = near_start or at_a_start
@@ -230,34 +231,6 @@ def reinitialised(
         for to_start in (True, False)
         if places[to_start]
     ]
-
-
-class _TypicalMotion(NamedTuple):
-    """
-    Typical motion over all recordings.
-
-    :param step: 90 % quantile of the step from sample to sample, for each channel
-    :param curvature: 90 % quantile of the change of the step, relative to ``std``
-    :param std: standard deviation of each channel
-    :param starts: first sample of each recording
-    """
-
-    step: np.ndarray
-    curvature: float
-    std: np.ndarray
-    starts: np.ndarray
-
-    @classmethod
-    def of(cls, segments: Sequence[Segment]) -> "_TypicalMotion | None":
-        """:return: None where nothing moves, or recordings are too short"""
-        steps = np.abs(steps_of(segments))
-        moving = steps[steps.any(axis=1)]
-        std = joined(segments).std(axis=0)
-        bends = np.concatenate([_curvatures(segment.obs, std) for segment in segments])
-        if not len(moving) or not len(bends):
-            return None
-        starts = np.array([segment.obs[0] for segment in segments])
-        return cls(np.quantile(moving, 0.9, 0), float(np.quantile(bends, 0.9)), std, starts)
 
 
 def _curvatures(x: np.ndarray, std: np.ndarray) -> np.ndarray:

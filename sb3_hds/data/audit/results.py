@@ -17,6 +17,7 @@ from sb3_hds.data.wording import counted, percent
 from sb3_hds.errors import TrajectoryError
 
 _WIDTH = 80
+_ON_GRID = 0.02  # samples
 _Kind = TypeVar("_Kind", bound=Finding)
 
 
@@ -167,9 +168,6 @@ def _table(channels: Sequence[ChannelSummary]) -> list[str]:
 
 def _wrapped(text: str, first: str, rest: str) -> list[str]:
     return textwrap.wrap(text, _WIDTH, initial_indent=first, subsequent_indent=rest)
-
-
-_ON_GRID = 0.02  # samples
 
 
 def shifted(data: Trajectories, shifts: Mapping[int, float]) -> Trajectories:

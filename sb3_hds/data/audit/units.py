@@ -162,9 +162,7 @@ class Swapped(Finding):
     remedy = "They are swapped: name the columns of obs in the order of the twin's channels."
 
 
-def other_units(
-    data: Trajectories, channels: Sequence[Channel], pairs: Sequence[VelocityPair]
-) -> list[OtherUnits]:
+def other_units(channels: Sequence[Channel], pairs: Sequence[VelocityPair]) -> list[OtherUnits]:
     """
     Velocities that equal the derivative of a position times a large factor, or the factor of
     revolutions per minute.
@@ -173,54 +171,36 @@ def other_units(
     oscillation, every channel is proportional to the derivative of another one. Declared units
     restrict the pairs.
 
-    :param data: at one interval
     :param channels: of the observation
     :param pairs: of the data
     """
-    own = [
-        pair for pair in pairs if pair.same_unit and _is_declared_pair(pair, channels) is not False
-    ]
-    taken = {j for pair in own for j in (pair.velocity, *pair.parts)}
-    far = [
-        pair
-        for pair in pairs
-        if not taken & {pair.velocity, *pair.parts}
-        and _is_declared_pair(pair, channels) is not False
-        and _has_large_factor(pair)
-    ]
-    # For each velocity, the position with the peak correlation comes last.
+    possible = [pair for pair in pairs if _is_declared_pair(pair, channels) is not False]
+    taken = {j for pair in possible if pair.same_unit for j in pair.channels}
+    far = [p for p in possible if not taken & p.channels and _has_large_factor(p)]
+    # For each velocity, the position with the highest correlation comes last.
     far.sort(key=lambda pair: pair.scores.peak)
-    found = {pair.velocity: pair for pair in far}
     return [
-        OtherUnits(channels[v].name, all_samples(data), pair.position, 1.0 / pair.scores.peak_slope)
-        for v, pair in found.items()
+        OtherUnits(pair.name, pair.places, pair.position, 1.0 / pair.scores.peak_slope)
+        for pair in {pair.velocity: pair for pair in far}.values()
     ]
 
 
-def swapped(
-    data: Trajectories, channels: Sequence[Channel], pairs: Sequence[VelocityPair]
-) -> list[Swapped]:
+def swapped(channels: Sequence[Channel], pairs: Sequence[VelocityPair]) -> list[Swapped]:
     """
-    Signals in which the channel with the unit of a position is the derivative of the other.
+    Pairs in which the channel with the unit of a position is the derivative of the other.
 
-    :param data: at one interval
     :param channels: of the observation; those without units are ignored
     :param pairs: of the data
     """
-    right = {
-        j
-        for m in pairs
-        if m.same_unit and _is_declared_pair(m, channels)
-        for j in (m.velocity, *m.parts)
-    }
+    same = [pair for pair in pairs if pair.same_unit]
+    right = {j for pair in same if _is_declared_pair(pair, channels) for j in pair.channels}
     return [
-        Swapped(channels[m.velocity].name, all_samples(data), channels[m.parts[0]].name)
-        for m in pairs
-        if m.same_unit
-        and abs(m.scores.lag) <= _LONGEST_LAG
-        and len(m.parts) == 1
-        and _is_rate(channels[m.parts[0]].unit, channels[m.velocity].unit)
-        and not right & {m.velocity, *m.parts}
+        Swapped(pair.name, pair.places, pair.position)
+        for pair in same
+        if abs(pair.scores.lag) <= _LONGEST_LAG
+        and len(pair.parts) == 1
+        and _is_rate(channels[pair.parts[0]].unit, channels[pair.velocity].unit)
+        and not right & pair.channels
     ]
 
 

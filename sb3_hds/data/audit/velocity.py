@@ -11,7 +11,7 @@ from jaxtyping import Float64
 
 from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.core.twin import Twin
-from sb3_hds.data.audit.finding import Finding
+from sb3_hds.data.audit.finding import Finding, Place
 from sb3_hds.data.audit.replay import replay, windows_of
 from sb3_hds.data.audit.segments import all_samples
 from sb3_hds.data.resampling.values import unwrapped
@@ -93,26 +93,35 @@ class VelocityPair:
     A channel that is proportional to the derivative of another one.
 
     :param velocity: channel
+    :param name: of the velocity
     :param position: name of the position
     :param parts: channels of the position: one, or a cosine and a sine
     :param signals: position and velocity of each episode
     :param dt: sampling interval [s]
     :param scores: of the signals
     :param width: of the moving average [samples]
+    :param places: all samples of the data
     """
 
     velocity: int
+    name: str
     position: str
     parts: tuple[int, ...]
     signals: Signals
     dt: float
     scores: "_CrossCorrelation"
     width: int
+    places: tuple[Place, ...]
 
     @property
     def same_unit(self) -> bool:
         """Whether both are in the same unit."""
         return abs(self.scores.peak_slope - 1.0) < _SAME_SCALE
+
+    @property
+    def channels(self) -> set[int]:
+        """All channels of the pair."""
+        return {self.velocity, *self.parts}
 
     @property
     def samples(self) -> float:
@@ -154,23 +163,18 @@ class VelocityPair:
         ]
 
 
-def velocity_shifts(
-    data: Trajectories, names: Sequence[str], pairs: Sequence[VelocityPair]
-) -> list[VelocityShift]:
+def velocity_shifts(pairs: Sequence[VelocityPair]) -> list[VelocityShift]:
     """
-    :param data: at one interval
-    :param names: of the observation channels
-    :param pairs: of the data
     :return: the significant lags beyond that of a backward difference that are either long or
         explain half of the residual variance
     """
     return [
         VelocityShift(
-            names[pair.velocity],
-            all_samples(data),
+            pair.name,
+            pair.places,
             position=pair.position,
             samples=pair.samples,
-            seconds=pair.samples * data.dt,
+            seconds=pair.samples * pair.dt,
             stderr=pair.stderr,
         )
         for pair in best_pairs(pairs)
@@ -180,11 +184,10 @@ def velocity_shifts(
 
 
 def backward_differences(
-    data: Trajectories, names: Sequence[str], pairs: Sequence[VelocityPair], twin: Twin | None
+    data: Trajectories, pairs: Sequence[VelocityPair], twin: Twin | None
 ) -> list[BackwardDifference]:
     """
     :param data: at one interval
-    :param names: of the observation channels
     :param pairs: of the data
     :param twin: if its own velocities are backward differences (semi-implicit Euler), they are not
         reported; without a twin, only differences that carry the noise of the position are
@@ -193,11 +196,11 @@ def backward_differences(
     simulated = _backward_in_simulation(data, twin, found) if twin and found else None
     return [
         BackwardDifference(
-            names[v],
-            all_samples(data),
+            pair.name,
+            pair.places,
             position=pair.position,
             samples=0.5,
-            seconds=0.5 * data.dt,
+            seconds=0.5 * pair.dt,
             stderr=0.0,
         )
         for v, pair in found.items()
@@ -290,8 +293,9 @@ def velocity_pairs(data: Trajectories, names: Sequence[str]) -> list[VelocityPai
                     continue
                 scores = _CrossCorrelation.of(signals, data.dt, reach, width)
                 if scores.peak > _CLEAR:
-                    name = ", ".join(names[j] for j in parts)
-                    found.append(VelocityPair(v, name, parts, signals, data.dt, scores, width))
+                    position = ", ".join(names[j] for j in parts)
+                    about = (names[v], position, parts, signals, data.dt, scores, width)
+                    found.append(VelocityPair(v, *about, all_samples(data)))
                     break
     return found
 

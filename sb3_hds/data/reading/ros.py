@@ -6,10 +6,9 @@ import re
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Int64
 
 from sb3_hds.data.columns import Columns, Entry
 from sb3_hds.data.reading.log import Log, library_errors
@@ -18,78 +17,7 @@ from sb3_hds.errors import TrajectoryError
 
 _GAP = 5.0  # intervals
 _MAX_OVERTAKING = 1_000_000_000  # [ns]: by which messages may arrive out of order
-
-
-class Series(NamedTuple):
-    """
-    A field of the messages of a topic.
-
-    :param stamps: time of each message [ns]
-    :param values: numbers, or texts
-    """
-
-    stamps: Int64[np.ndarray, " n"]
-    values: np.ndarray
-
-
-def _aligned(
-    series: Mapping[str, Series],
-    stamps: np.ndarray,
-    observed: Mapping[str | None, Entry],
-    gap: float | None,
-) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """
-    All series at given stamps: observations interpolated linearly, actions and labels held.
-
-    Rows before the first value of a series are dropped, and so are those where an observation
-    would have to be interpolated across a gap, or beyond its last value.
-
-    :param series: by name
-    :param stamps: of the rows [ns]
-    :param observed: the observation channels among them; angles are interpolated the shorter way
-    :param gap: a longer time between two values is a gap [s]; default: five intervals
-    :return: columns by name, the stamps of their rows as ``""``; and phrases for the report
-    """
-    kept = np.ones(len(stamps), bool)
-    columns: dict[str, np.ndarray] = {}
-    done: dict[str, list[str]] = {"interpolated": [], "held": []}
-    for name, (times, values) in series.items():
-        order = np.argsort(times, kind="stable")
-        times, values = times[order], values[order]
-        if np.array_equal(times, stamps):
-            columns[name] = values
-            continue
-        before = np.searchsorted(times, stamps, side="right") - 1
-        kept &= before >= 0
-        if name not in observed or values.dtype.kind not in "fiub":
-            columns[name] = values[np.maximum(before, 0)]
-            done["held"].append(name)
-            continue
-        columns[name] = _interpolated(times, values, stamps, observed[name])
-        after = np.minimum(np.searchsorted(times, stamps, side="left"), len(times) - 1)
-        interval = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
-        longest = 1e9 * gap if gap else _GAP * interval
-        kept &= (stamps <= times[-1]) & (times[after] - times[np.maximum(before, 0)] <= longest)
-        done["interpolated"].append(name)
-    columns[""] = stamps
-    words = tuple(f"{listed(names)} {word}" for word, names in done.items() if names)
-    return {name: column[kept] for name, column in columns.items()}, words
-
-
-def _interpolated(
-    times: np.ndarray, values: np.ndarray, stamps: np.ndarray, entry: Entry
-) -> np.ndarray:
-    values = values.astype(float)
-    turn = 2.0 * np.pi / entry.factor if entry.angle and entry.factor else None
-    if turn:
-        values = np.unwrap(values, period=abs(turn))
-    # A double cannot represent nanoseconds since 1970 exactly.
-    begin = times[0]
-    at = np.interp((stamps - begin).astype(float), (times - begin).astype(float), values)
-    return (at + 0.5 * turn) % turn - 0.5 * turn if turn else at
-
-
-STORAGE = (".db3", ".mcap")
+_STORAGE = (".db3", ".mcap")
 _REMEDY = "Repair an interrupted recording with 'ros2 bag reindex' or 'rosbag reindex'."
 _TIME = Entry("time", "time")
 _RECEIVED, _STAMP = "received", "header.stamp"
@@ -130,7 +58,7 @@ def read_bag(path: Path, columns: Columns) -> Log:
         if not known or any(topic.lacks_field for topic in topics.values()):
             names = [*_all_columns(bag), "time"]
             return Log([dict.fromkeys(names, np.zeros(0))], Columns(time=(_TIME,)))
-    return _aligned_to(topics, columns, path)
+    return _log_at_stamps(topics, columns, path)
 
 
 class _Topic:
@@ -192,10 +120,10 @@ class _Topic:
         """:return: of all messages [ns]"""
         return np.array(self.header if clock == _STAMP else self.received, np.int64)
 
-    def series(self, field: str, clock: str) -> Series:
-        """:return: the values of a field, in the messages that have it"""
+    def series(self, field: str, clock: str) -> tuple[np.ndarray, np.ndarray]:
+        """:return: stamps [ns] and values of a field, in the messages that have it"""
         at = np.array(self._at[field], np.int64)
-        return Series(self.stamps(clock)[at], np.array(self._values.get(field, ())))
+        return self.stamps(clock)[at], np.array(self._values.get(field, ()))
 
     def columns(self) -> dict[str, np.ndarray]:
         """:return: all fields by their full names; times in seconds from the first message"""
@@ -206,7 +134,7 @@ class _Topic:
         return found
 
 
-def _aligned_to(topics: Mapping[str, _Topic], columns: Columns, path: Path) -> Log:
+def _log_at_stamps(topics: Mapping[str, _Topic], columns: Columns, path: Path) -> Log:
     """All columns at the stamps of one topic."""
     time_field = [
         entry.column for entry in columns.time or () if entry.column not in (None, "time")
@@ -222,12 +150,12 @@ def _aligned_to(topics: Mapping[str, _Topic], columns: Columns, path: Path) -> L
         if field not in (_STAMP, _RECEIVED)
     }
     main = f"{leading}:{first}"
-    stamps = series[main].stamps if main in series else topics[leading].stamps(clock)
+    stamps = series[main][0] if main in series else topics[leading].stamps(clock)
     # Sort messages that arrived out of order, but keep the jump of a clock that was set back.
     if np.diff(stamps).min(initial=0) > -_MAX_OVERTAKING:
         stamps = np.sort(stamps)
     entries = {entry.column: entry for entry in columns.obs or ()}
-    table, done = _aligned(series, stamps, entries, columns.gap)
+    table, done = _align(series, stamps, entries, columns.gap)
     left = table.pop("")
     if not len(left):
         others = listed(sorted(set(topics) - {leading}))
@@ -240,6 +168,63 @@ def _aligned_to(topics: Mapping[str, _Topic], columns: Columns, path: Path) -> L
     which = "header stamps" if clock == _STAMP else "times of recording"
     note = f"At the {which} of '{leading}', {' and '.join(done)}."
     return Log([table], Columns(time=(_TIME,)), notes=(note,) if done else ())
+
+
+def _align(
+    series: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    stamps: np.ndarray,
+    observed: Mapping[str | None, Entry],
+    gap: float | None,
+) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+    """
+    All series at given stamps: observations interpolated linearly, actions and labels held.
+
+    Rows before the first value of a series are dropped, and so are those where an observation
+    would have to be interpolated across a gap, or beyond its last value.
+
+    :param series: stamps of the values [ns], and the values, by name
+    :param stamps: of the rows [ns]
+    :param observed: the observation channels among them; angles are interpolated the shorter way
+    :param gap: a longer time between two values is a gap [s]; default: five intervals
+    :return: columns by name, the stamps of their rows as ``""``; and phrases for the report
+    """
+    kept = np.ones(len(stamps), bool)
+    columns: dict[str, np.ndarray] = {}
+    done: dict[str, list[str]] = {"interpolated": [], "held": []}
+    for name, (times, values) in series.items():
+        order = np.argsort(times, kind="stable")
+        times, values = times[order], values[order]
+        if np.array_equal(times, stamps):
+            columns[name] = values
+            continue
+        before = np.searchsorted(times, stamps, side="right") - 1
+        kept &= before >= 0
+        if name not in observed or values.dtype.kind not in "fiub":
+            columns[name] = values[np.maximum(before, 0)]
+            done["held"].append(name)
+            continue
+        columns[name] = _interpolated(times, values, stamps, observed[name])
+        after = np.minimum(np.searchsorted(times, stamps, side="left"), len(times) - 1)
+        interval = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        longest = 1e9 * gap if gap else _GAP * interval
+        kept &= (stamps <= times[-1]) & (times[after] - times[np.maximum(before, 0)] <= longest)
+        done["interpolated"].append(name)
+    columns[""] = stamps
+    words = tuple(f"{listed(names)} {word}" for word, names in done.items() if names)
+    return {name: column[kept] for name, column in columns.items()}, words
+
+
+def _interpolated(
+    times: np.ndarray, values: np.ndarray, stamps: np.ndarray, entry: Entry
+) -> np.ndarray:
+    values = values.astype(float)
+    turn = 2.0 * np.pi / entry.factor if entry.angle and entry.factor else None
+    if turn:
+        values = np.unwrap(values, period=abs(turn))
+    # A double cannot represent nanoseconds since 1970 exactly.
+    begin = times[0]
+    at = np.interp((stamps - begin).astype(float), (times - begin).astype(float), values)
+    return (at + 0.5 * turn) % turn - 0.5 * turn if turn else at
 
 
 def _clock(topics: Mapping[str, _Topic], time_field: str, leading: str, path: Path) -> str:
@@ -280,7 +265,7 @@ def _open_bag(path: Path) -> Iterator[Any]:
 def _storage_files(path: Path) -> list[Path]:
     if not path.is_dir() or (path / "metadata.yaml").is_file():
         return [path]
-    return sorted(file for file in path.iterdir() if file.suffix in STORAGE)
+    return sorted(file for file in path.iterdir() if file.suffix in _STORAGE)
 
 
 def _messages(bag: Any, topic: str) -> Iterator[tuple[Any, int]]:
