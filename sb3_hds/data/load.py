@@ -123,9 +123,8 @@ def _paths(files: Any) -> list[str]:
         if path.startswith(PREFIX) or not glob.has_magic(path) or Path(path).exists():
             found.append(path)
             continue
-        matching = sorted(
-            p for p in glob.glob(path, recursive=True) if Path(p).is_file() or is_bag(Path(p))
-        )
+        matches = glob.glob(path, recursive=True)
+        matching = sorted(p for p in matches if Path(p).is_file() or is_bag(Path(p)))
         if not matching:
             raise TrajectoryError(f"No file matches '{path}' (in {Path.cwd()}).")
         found += matching
@@ -184,10 +183,10 @@ def epoch_unit(table: Table, entry: Entry) -> str:
     if entry.unit is not None or not stamps.size or stamps.dtype.kind not in "iuf":
         return ""
     first = float(stamps.ravel()[0])
-    units = [
-        unit for factor, unit in _EPOCH_UNITS.items() if _EARLIEST <= first / factor <= _LATEST
-    ]
-    return units[0] if units and units[0] != "s" else ""
+    for factor, unit in _EPOCH_UNITS.items():
+        if _EARLIEST <= first / factor <= _LATEST:
+            return "" if unit == "s" else unit
+    return ""
 
 
 def _check_same(first: _FirstFile, here: Columns, table: Table, path: str) -> None:

@@ -133,9 +133,8 @@ def _suggested_map(log: Log, columns: Sequence[_Column]) -> list[str]:
     sensed = [c for c in rest if c not in actions and c.varies]
     obs = [c for c in sensed if _has_word(c, _OBSERVED)] or sensed
     lines = [] if own.time else [_time_line(log, time)]
-    lines += (
-        _entry_lines("obs", obs, log.units) if obs else ["obs: []  # nothing changes: name them"]
-    )
+    nothing = ["obs: []  # nothing changes: name them"]
+    lines += _entry_lines("obs", obs, log.units) if obs else nothing
     lines += _entry_lines("actions", actions, log.units) if actions else ["actions: []"]
     if episodes and not own.episode:
         lines.append(f"episode: {_inline_yaml({'column': episodes[0].name})}")
@@ -143,13 +142,6 @@ def _suggested_map(log: Log, columns: Sequence[_Column]) -> list[str]:
     others = [c.name for c in columns if c.name not in used]
     lines += [f"# not used: {', '.join(others[:_SHOWN])}"] if others else []
     return lines
-
-
-def guessed_time(log: Log) -> Entry | None:
-    """:return: the likely time stamps of a log, with their unit"""
-    columns = _columns_in(log)
-    found = _guessed_time([c for c in columns if not np.isnan(c.lowest)])
-    return found and Entry(found.name, found.name, unit=_time_unit(log, found)[1] or None)
 
 
 def _guessed_time(columns: Sequence[_Column]) -> _Column | None:
@@ -191,11 +183,11 @@ def _entry_lines(key: str, columns: Sequence[_Column], units: Mapping[str, str])
     lines = [f"{key}:" + ("  # in the order of the twin: sb3-hds twins" if key == "obs" else "")]
     for column in columns[:_SHOWN]:
         unit = unit_of(units.get(column.name, ""))
-        comment = (
-            f"  # {units[column.name]}, converted to {unit.name}" if unit and unit.name else ""
-        )
         largest = max(abs(column.lowest), abs(column.highest))
-        if not comment and _has_word(column, _ANGLE) and largest > _MAX_RADIANS:
+        comment = ""
+        if unit and unit.name:
+            comment = f"  # {units[column.name]}, converted to {unit.name}"
+        elif _has_word(column, _ANGLE) and largest > _MAX_RADIANS:
             comment = "  # degrees? Then add unit: deg"
         lines.append(f"  - {_inline_yaml({'column': column.name})}{comment}")
     return lines
@@ -265,11 +257,12 @@ def channel_candidates(
     merged = (given or Columns()).completed_by(log.columns or Columns())
     guessed = []
     if merged.time is None and merged.dt is None:
-        entry = guessed_time(log)
-        if entry is not None:
+        found = _guessed_time(_columns_in(log))
+        if found is not None:
+            _, unit = _time_unit(log, found)
+            entry = Entry(found.name, found.name, unit=unit or None)
             merged = dataclasses.replace(merged, time=(entry,))
-            unit = f" in {entry.unit}" if entry.unit else ""
-            guessed.append(f"Time is taken from '{entry.column}'{unit}.")
+            guessed.append(f"Time is taken from '{found.name}'{f' in {unit}' if unit else ''}.")
     table = log.tables[0]
     taken = {entry.column for entry in (*(merged.obs or ()), *(merged.actions or ()))}
     every = tuple(

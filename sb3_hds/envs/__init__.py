@@ -1,7 +1,7 @@
 """
-Environments made of twins, and the way back: the twin that mirrors an environment.
+Environments made from twins, and the twins that mirror environments.
 
-Names are imported on first use, so that registering our ids costs neither jax nor torch.
+Names are imported on first use, so that registering our ids imports neither jax nor torch.
 """
 
 from typing import TYPE_CHECKING

@@ -16,7 +16,7 @@ _SECONDS, _FEWEST, _MOST = 0.1, 12, 100  # length of a window, and its limits in
 _WHITE_NOISE = 0.5  # mean squared step over variance: 2 for white noise, 0 for smooth motion
 _SMALL = 0.3  # of the standard deviation of a channel: larger deviations are motion
 _ONLY_NOISE = 3.0  # times the noise: a channel with a smaller standard deviation does not move
-NEEDED = 100  # steps: with fewer, hardly any effect is significant
+_NEEDED = 100  # steps: with fewer, hardly any effect is significant
 _THROUGHOUT = 0.95  # share of the time
 _MOSTLY = 0.8  # share of the time
 _WEAK = 5.0  # noise
@@ -234,8 +234,8 @@ def excitation(
     """
     places = all_samples(data)
     found: list[Finding] = []
-    if data.n_steps < NEEDED:
-        found.append(TooShort("all channels", places, data.n_steps, NEEDED))
+    if data.n_steps < _NEEDED:
+        found.append(TooShort("all channels", places, data.n_steps, _NEEDED))
     episodes = [data.episode(i) for i in range(len(data))]
     x, u = (
         np.concatenate(parts) for parts in zip(*((o[:-1], a) for o, a in episodes), strict=True)
