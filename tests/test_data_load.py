@@ -196,7 +196,7 @@ def test_a_gap_ends_the_episode_and_both_parts_are_one_recording(tmp_path):
     ({"obs": [{"colum": "q"}]}, "obs[0] has the unknown key 'colum'"),
     ({"obs": [{"column": "q", "constant": 1.0}]}, "obs[0] needs either 'column'"),
     ({"obs": [{"column": "q", "scale": "big"}]}, "scale must be a finite number, got 'big'"),
-    ({"obs": ["q", "q"]}, "two channels of obs are called 'q'"),
+    ({"obs": ["q", "q"]}, "obs: two channels are called 'q'"),
     ({"time": None}, "time: NAME"),
     ({"condition": "load"}, "condition must be {column: NAME} or {from: filename}"),
     ({"obs": None}, "columns does not name the obs."),

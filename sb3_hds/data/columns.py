@@ -4,7 +4,7 @@ import dataclasses
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -128,21 +128,17 @@ class Columns:
         :return: the map with these units, if known, for entries without a unit
         """
 
-        si = {name: unit_of(unit) for name, unit in units.items()}
-        known = {name: units[name] for name, unit in si.items() if unit and unit.name}
-        times = {name: units[name] for name, unit in si.items() if unit and unit.name == "s"}
-
-        def completed(entries: tuple[Entry, ...], units: Mapping[str, str]) -> tuple[Entry, ...]:
-            return tuple(
-                entry._replace(unit=units.get(entry.column or "")) if entry.unit is None else entry
-                for entry in entries
-            )
+        def completed(entry: Entry, time: bool = False) -> Entry:
+            declared = units.get(entry.column or "", "")
+            unit = unit_of(declared) if declared and entry.unit is None else None
+            fits = unit is not None and (unit.name == "s" if time else unit.name)
+            return entry._replace(unit=declared) if fits else entry
 
         return dataclasses.replace(
             self,
-            obs=self.obs and completed(self.obs, known),
-            actions=self.actions and completed(self.actions, known),
-            time=self.time and completed(self.time, times),
+            obs=self.obs and tuple(completed(entry) for entry in self.obs),
+            actions=self.actions and tuple(completed(entry) for entry in self.actions),
+            time=self.time and tuple(completed(entry, time=True) for entry in self.time),
         )
 
 
@@ -159,17 +155,13 @@ def columns_from(source: Any) -> Columns:
         source = _read_yml(Path(source).expanduser())
     if not isinstance(source, Mapping):
         raise TrajectoryError(f"{where} contains a {type(source).__name__}. {FORM}")
-    _check_keys(where, source, [field.name for field in dataclasses.fields(Columns)])
-    seconds = {key: source[key] for key in ("dt", "gap") if source.get(key) is not None}
+    _check_keys(where, source, list(_PARSERS))
     return Columns(
-        obs=_entries(where, "obs", source.get("obs")),
-        actions=_entries(where, "actions", source.get("actions")),
-        time=_time(where, source.get("time")),
-        condition=_condition(where, source.get("condition")),
-        episode=_episode(where, source.get("episode")),
-        records=None if source.get("records") is None else str(source["records"]),
-        skip=_skip(where, source.get("skip")),
-        **{key: check_dt(value) for key, value in seconds.items()},
+        **{
+            key: parse(f"{where}: {key}", source[key])
+            for key, parse in _PARSERS.items()
+            if source.get(key) is not None
+        }
     )
 
 
@@ -197,22 +189,19 @@ def _check_keys(where: str, given: Mapping[Any, Any], known: Sequence[str]) -> N
             )
 
 
-def _entries(where: str, key: str, given: Any) -> tuple[Entry, ...] | None:
-    if given is None:
-        return None
+def _entries(where: str, given: Any) -> tuple[Entry, ...]:
     if isinstance(given, str | Mapping) or not isinstance(given, Iterable):
-        raise TrajectoryError(f"{where}: {key} must be a list of columns, got {given!r}. {FORM}")
-    entries = tuple(
-        _entry(f"{where}: {key}[{i}]", item, f"{key}[{i}]") for i, item in enumerate(given)
-    )
+        raise TrajectoryError(f"{where} must be a list of columns, got {given!r}. {FORM}")
+    key = where.rpartition(": ")[-1]
+    entries = tuple(_entry(f"{where}[{i}]", item, f"{key}[{i}]") for i, item in enumerate(given))
     twice = [name for name, n in Counter(entry.name for entry in entries).items() if n > 1]
     if twice:
         raise TrajectoryError(
-            f"{where}: two channels of {key} are called '{twice[0]}'. Rename one of them: "
+            f"{where}: two channels are called '{twice[0]}'. Rename one of them: "
             "{column: NAME, name: OTHER}."
         )
     if key == "obs" and not entries:
-        raise TrajectoryError(f"{where}: obs must name at least one column. {FORM}")
+        raise TrajectoryError(f"{where} must name at least one column. {FORM}")
     return entries
 
 
@@ -266,51 +255,43 @@ def _unit(where: str, given: Mapping[str, Any]) -> Unit | None:
     return unit
 
 
-def _time(where: str, given: Any) -> tuple[Entry, ...] | None:
-    if given is None:
-        return None
+def _time(where: str, given: Any) -> tuple[Entry, ...]:
     several = isinstance(given, Sequence) and not isinstance(given, str)
     if several and not given:
-        raise TrajectoryError(f"{where}: time is an empty list. Name a column, or leave it out.")
-    entries = tuple(_entry(f"{where}: time", item) for item in (given if several else [given]))
+        raise TrajectoryError(f"{where} is an empty list. Name a column, or leave it out.")
+    entries = tuple(_entry(where, item) for item in (given if several else [given]))
     for entry in entries:
         if entry.unit and entry.si_unit not in ("s", ""):
             raise TrajectoryError(
-                f"{where}: time must be in one of {', '.join(TIMES)}, got unit: '{entry.unit}'."
+                f"{where} must be in one of {', '.join(TIMES)}, got unit: '{entry.unit}'."
             )
     return entries
 
 
-def _skip(where: str, given: Any) -> int | None:
-    if given is None or (isinstance(given, int) and not isinstance(given, bool) and given >= 0):
+def _skip(where: str, given: Any) -> int:
+    if isinstance(given, int) and not isinstance(given, bool) and given >= 0:
         return given
     raise TrajectoryError(
-        f"{where}: skip must be the number of lines before the names, or before the first row, "
+        f"{where} must be the number of lines before the names, or before the first row, "
         f"got {given!r}."
     )
 
 
-def _condition(where: str, given: Any) -> Label | None:
-    if given is None:
-        return None
+def _condition(where: str, given: Any) -> Label:
     if isinstance(given, Mapping):
-        _check_keys(f"{where}: condition", given, ("column", "from"))
+        _check_keys(where, given, ("column", "from"))
         if given == {"from": "filename"}:
             return Label(None)
         if set(given) == {"column"}:
-            return Label(_column_name(f"{where}: condition", given["column"]))
-    raise TrajectoryError(
-        f"{where}: condition must be {{column: NAME}} or {{from: filename}}, got {given!r}."
-    )
+            return Label(_column_name(where, given["column"]))
+    raise TrajectoryError(f"{where} must be {{column: NAME}} or {{from: filename}}, got {given!r}.")
 
 
-def _episode(where: str, given: Any) -> str | None:
-    if given is None:
-        return None
+def _episode(where: str, given: Any) -> str:
     if isinstance(given, Mapping):
-        _check_keys(f"{where}: episode", given, ("column",))
+        _check_keys(where, given, ("column",))
         given = given.get("column")
-    return _column_name(f"{where}: episode", given)
+    return _column_name(where, given)
 
 
 def _column_name(where: str, given: Any) -> str:
@@ -330,3 +311,16 @@ def _number(where: str, given: Any) -> float:
     if not math.isfinite(value):
         raise TrajectoryError(f"{where} must be a finite number, got {given!r}.")
     return value
+
+
+_PARSERS: dict[str, Callable[[str, Any], Any]] = {
+    "obs": _entries,
+    "actions": _entries,
+    "time": _time,
+    "condition": _condition,
+    "episode": _episode,
+    "records": lambda _, given: str(given),
+    "skip": _skip,
+    "dt": lambda _, given: check_dt(given),
+    "gap": lambda _, given: check_dt(given),
+}
