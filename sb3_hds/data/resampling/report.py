@@ -125,7 +125,7 @@ class Reading:
         for kind, kept in itertools.product(get_args(Kind), (True, False)):
             group = [r for r in self.recordings if (r.clock, not r.resampled) == (kind, kept)]
             if group:
-                found.append(f"{_names(group)}: {_clock(kind, group, kept)}")
+                found.append(f"{_subject(group)}: {_clock(kind, group, kept)}")
         rates = [1.0 / r.interval for r in self.recordings if r.clock != "irregular"]
         if rates and max(rates) > (1.0 + _DRIFT) * min(rates):
             found.append(
@@ -148,7 +148,7 @@ class Reading:
             errors = [max(values) for values in zip(*(r.error for r in uneven), strict=True)]
             pairs = ", ".join(f"{n} {e:.2g}" for n, e in zip(self.obs, errors, strict=True))
             found.append(
-                f"{_names_were(uneven)} resampled to dt = {self.dt:g} s: rows were "
+                f"{_subject_were(uneven)} resampled to dt = {self.dt:g} s: rows were "
                 f"{_ms(min(r.intervals[0] for r in uneven))} to "
                 f"{_ms(max(r.intervals[2] for r in uneven))} apart, samples are up to "
                 f"{_ms(max(r.moved for r in uneven))} from the closest row; interpolated back, "
@@ -157,13 +157,13 @@ class Reading:
         if filled:
             n = sum(rows for r in filled for _, rows in r.missing)
             found.append(
-                f"In {_names(filled)}, {counted(n, 'missing row was', 'missing rows were')} "
+                f"In {_subject(filled)}, {counted(n, 'missing row was', 'missing rows were')} "
                 "filled in by interpolation"
             )
         if repeated:
             n = sum(len(r.repeated) for r in repeated)
             found.append(
-                f"In {_names(repeated)}, {counted(n, 'row')} with the stamp of the row before "
+                f"In {_subject(repeated)}, {counted(n, 'row')} with the stamp of the row before "
                 f"{'was' if n == 1 else 'were'} left out"
             )
         if gaps:
@@ -171,7 +171,7 @@ class Reading:
             longest = max(length for r in gaps for _, length in r.gaps)
             left_out = f"; {counted(unused, 'row')} in shorter pieces left out" if unused else ""
             found.append(
-                f"{_names_were(gaps)} cut at {counted(n, 'gap')} of up to {longest:.3g} s{left_out}"
+                f"{_subject_were(gaps)} cut at {counted(n, 'gap')} of up to {longest:.3g} s{left_out}"
             )
         return ". ".join(found) + "." if found else "Nothing was changed."
 
@@ -202,15 +202,16 @@ class Reading:
     def __str__(self) -> str:
         shown = self.recordings[:_LISTED]
         width = min(max(9, *(len(r.source) for r in shown)), 34)
+        row = f"  {{:<{width}}} {{:>7}} {{:>21}} {{:>8}} {{:>4}}".format
         lines = [
             f"Read {counted(len(self.recordings), 'recording')} at dt = {self.dt:g} s",
-            _row(width, "recording", "rows", "interval [ms]", "repeated", "gaps"),
+            row("recording", "rows", "interval [ms]", "repeated", "gaps"),
         ]
         for r in shown:
             low, median, high = (f"{1e3 * value:.4g}" for value in r.intervals)
             interval = median if low == high else f"{low}..{median}..{high}"
             name = r.source if len(r.source) <= width else "..." + r.source[3 - width :]
-            lines.append(_row(width, name, r.rows, interval, len(r.repeated), len(r.gaps)))
+            lines.append(row(name, r.rows, interval, len(r.repeated), len(r.gaps)))
         if len(self.recordings) > _LISTED:
             lines.append(f"  and {len(self.recordings) - _LISTED} more")
         for text in (self.clocks(), self.summary(), *self.notes):
@@ -263,17 +264,12 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _row(width: int, name: str, *values: Any) -> str:
-    rows, interval, repeated, gaps = values
-    return f"  {name:<{width}} {rows:>7} {interval:>21} {repeated:>8} {gaps:>4}"
-
-
-def _names(recordings: list[Sampling]) -> str:
+def _subject(recordings: list[Sampling]) -> str:
     return recordings[0].source if len(recordings) == 1 else f"{len(recordings)} recordings"
 
 
-def _names_were(recordings: list[Sampling]) -> str:
-    return f"{_names(recordings)} {'was' if len(recordings) == 1 else 'were'}"
+def _subject_were(recordings: list[Sampling]) -> str:
+    return f"{_subject(recordings)} {'was' if len(recordings) == 1 else 'were'}"
 
 
 def _ms(seconds: float) -> str:
