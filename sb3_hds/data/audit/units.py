@@ -83,8 +83,9 @@ class OtherUnits(Finding):
         return ""
 
     remedy = (
-        "Declare its unit in columns, as {column: NAME, unit: deg}, or rpm or mm, or its scale: "
-        "0.0174533 for degrees, 0.104720 for revolutions per minute, 0.001 for millimetres."
+        "Declare the unit of that channel in columns, as {column: NAME, unit: deg}, or rpm or mm, "
+        "or its scale: 0.0174533 for degrees, 0.104720 for revolutions per minute, 0.001 for "
+        "millimetres."
     )
 
 

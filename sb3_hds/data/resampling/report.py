@@ -169,9 +169,9 @@ class Reading:
         if gaps:
             n, unused = sum(len(r.gaps) for r in gaps), sum(r.unused for r in gaps)
             longest = max(length for r in gaps for _, length in r.gaps)
-            left_out = f"; {counted(unused, 'row')} in shorter pieces left out" if unused else ""
+            short = f"; {counted(unused, 'row')} in shorter pieces left out" if unused else ""
             found.append(
-                f"{_subject_were(gaps)} cut at {counted(n, 'gap')} of up to {longest:.3g} s{left_out}"
+                f"{_subject_were(gaps)} cut at {counted(n, 'gap')} of up to {longest:.3g} s{short}"
             )
         return ". ".join(found) + "." if found else "Nothing was changed."
 
