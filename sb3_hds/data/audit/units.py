@@ -251,38 +251,35 @@ def mistaken_units(
         return []
     channel_of = position_channels(twin, windows)
     as_is = replay(twin, windows, np.ones(data.n_obs))
-    found: dict[int, tuple[float, MistakenUnits]] = {}
+    low, high = _ABOUT_RIGHT
+    found: dict[int, MistakenUnits] = {}
     for unit in units:
         scale = np.where([_has_unit(c, unit.of) for c in twin.channels], unit.factor, 1.0)
-        then = replay(twin, windows, scale)
+        converted = replay(twin, windows, scale)
         for joint, channel in channel_of.items():
             if twin.channels[channel].unit != unit.of:
                 continue
-            unexplained, times = then.unexplained_share()[joint], as_is.acceleration_ratio()[joint]
-            sure = (
-                as_is.unexplained_share()[joint] >= _MIN_UNEXPLAINED
-                and unexplained <= _MAX_UNEXPLAINED
-            )
-            low, high = _ABOUT_RIGHT
-            likely = times < _TOO_SMALL and low < then.acceleration_ratio()[joint] < high
-            if (sure or likely) and unexplained < found.get(joint, (np.inf,))[0]:
+            explained = 1.0 - float(converted.unexplained_share()[joint])
+            ratio = as_is.acceleration_ratio()[joint]
+            unexplained_as_is = as_is.unexplained_share()[joint]
+            sure = unexplained_as_is >= _MIN_UNEXPLAINED and 1.0 - explained <= _MAX_UNEXPLAINED
+            likely = ratio < _TOO_SMALL and low < converted.acceleration_ratio()[joint] < high
+            best = found[joint].explained if joint in found else -np.inf
+            if (sure or likely) and explained > best:
                 kind = MistakenUnits if sure else LikelyUnits
-                found[joint] = (
-                    float(unexplained),
-                    kind(
-                        channels[channel].name,
-                        all_samples(data),
-                        column=columns[channel],
-                        span=float(np.ptp(data.obs[..., channel])),
-                        unit=unit.of,
-                        other=unit.name,
-                        symbol=unit.symbol,
-                        factor=unit.factor,
-                        explained=float(1.0 - unexplained),
-                        times=float(1.0 / max(times, 1e-6)),
-                    ),
+                found[joint] = kind(
+                    channels[channel].name,
+                    all_samples(data),
+                    column=columns[channel],
+                    span=float(np.ptp(data.obs[..., channel])),
+                    unit=unit.of,
+                    other=unit.name,
+                    symbol=unit.symbol,
+                    factor=unit.factor,
+                    explained=explained,
+                    times=float(1.0 / max(ratio, 1e-6)),
                 )
-    return [finding for _, finding in found.values()]
+    return list(found.values())
 
 
 def _exceeds_span(data: Trajectories, twin: Twin, unit: _Unit) -> bool:
