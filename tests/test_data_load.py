@@ -153,7 +153,7 @@ def test_jittered_stamps_are_resampled_and_the_change_is_reported(tmp_path):
     [sampling] = data.report.recordings
     # The grid is a mean of 400 stamps that are off by up to a tenth of an interval.
     assert sampling.clock == "jittered" and 0.0 < sampling.moved <= 0.11 * DT
-    assert "measured when the stamps say" in data.report.clocks() and data.report.altered
+    assert "measured at their stamps" in data.report.clocks() and data.report.altered
     assert 0.0 < sampling.error[0] < 18.0 * bound
     assert max(map(len, str(data.report).splitlines())) <= 80
     assert json.loads(json.dumps(data.report.to_dict()))["recordings"][0]["rows"] == 400

@@ -152,7 +152,7 @@ class Reading:
                 f"{_ms(min(r.intervals[0] for r in uneven))} to "
                 f"{_ms(max(r.intervals[2] for r in uneven))} apart, samples are up to "
                 f"{_ms(max(r.moved for r in uneven))} from the closest row; interpolated back, "
-                f"rows differ by (rms) {pairs}"
+                f"the rms differences from the rows are {pairs}"
             )
         if filled:
             n = sum(rows for r in filled for _, rows in r.missing)
@@ -163,13 +163,13 @@ class Reading:
         if repeated:
             n = sum(len(r.repeated) for r in repeated)
             found.append(
-                f"In {_subject(repeated)}, {counted(n, 'row')} with the stamp of the row before "
-                f"{'was' if n == 1 else 'were'} left out"
+                f"In {_subject(repeated)}, {counted(n, 'row')} with the stamp of the previous row "
+                f"{'was' if n == 1 else 'were'} dropped"
             )
         if gaps:
             n, unused = sum(len(r.gaps) for r in gaps), sum(r.unused for r in gaps)
             longest = max(length for r in gaps for _, length in r.gaps)
-            short = f"; {counted(unused, 'row')} in shorter pieces left out" if unused else ""
+            short = f"; {counted(unused, 'row')} in shorter parts dropped" if unused else ""
             found.append(
                 f"{_subject_were(gaps)} cut at {counted(n, 'gap')} of up to {longest:.3g} s{short}"
             )
@@ -225,8 +225,8 @@ def _clock(kind: Kind, group: list[Sampling], kept: bool) -> str:
     low, high = f"{rates[0]:.5g}", f"{rates[-1]:.5g}"
     clock = f"clock of {low} Hz" if low == high else f"clock of {low} to {high} Hz"
     regular = f"regular {clock}" + ("" if kept else ", resampled to another interval")
-    fit = "their values fit these no worse"
-    follow = "rows were measured when the stamps say, as their values show"
+    consistent = "with which their values are consistent"
+    follow = "values show that rows were measured at their stamps"
     match kind:
         case "regular":
             return regular
@@ -238,15 +238,15 @@ def _clock(kind: Kind, group: list[Sampling], kept: bool) -> str:
                 sum(r.rows for r in group),
             )
             return (
-                f"{clock}, regular but for {n} of {counted(stamps, 'stamp')}, off by up to "
+                f"{clock}, regular except for {n} of {counted(stamps, 'stamp')}, off by up to "
                 f"{_ms(max(r.off for r in group))}; "
-                f"{f'rows stay at their ticks: {fit}' if kept else follow}"
+                f"{f'rows stay at their ticks, {consistent}' if kept else follow}"
             )
         case "jittered":
             return (
                 f"{clock}, regular with stamps that jitter by "
                 f"{_ms(max(r.jitter for r in group))} (rms); "
-                f"{f'rows are kept: {fit}' if kept else follow}"
+                f"{f'rows are kept at their ticks, {consistent}' if kept else follow}"
             )
         case "irregular":
             shortest, longest = (
