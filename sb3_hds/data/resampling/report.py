@@ -225,35 +225,25 @@ def _clock(kind: Kind, group: list[Sampling], kept: bool) -> str:
     low, high = f"{rates[0]:.5g}", f"{rates[-1]:.5g}"
     clock = f"clock of {low} Hz" if low == high else f"clock of {low} to {high} Hz"
     regular = f"regular {clock}" + ("" if kept else ", resampled to another interval")
-    consistent = "with which their values are consistent"
-    follow = "values show that rows were measured at their stamps"
+    stamps_hold = "values show that rows were measured at their stamps"
+    ticks_hold = "rows are kept at their ticks, with which their values are consistent"
+    holds = ticks_hold if kept else stamps_hold
+    off, jitter = _ms(max(r.off for r in group)), _ms(max(r.jitter for r in group))
     match kind:
         case "regular":
             return regular
         case "rounded":
             return f"{regular}, stamps rounded to {_ms(max(r.rounding for r in group))}"
         case "late":
-            n, stamps = (
-                sum(len(r.late) for r in group),
-                sum(r.rows for r in group),
-            )
-            return (
-                f"{clock}, regular except for {n} of {counted(stamps, 'stamp')}, off by up to "
-                f"{_ms(max(r.off for r in group))}; "
-                f"{f'rows stay at their ticks, {consistent}' if kept else follow}"
-            )
+            n_late = sum(len(r.late) for r in group)
+            stamps = counted(sum(r.rows for r in group), "stamp")
+            return f"{clock}, regular except for {n_late} of {stamps}, off by up to {off}; {holds}"
         case "jittered":
-            return (
-                f"{clock}, regular with stamps that jitter by "
-                f"{_ms(max(r.jitter for r in group))} (rms); "
-                f"{f'rows are kept at their ticks, {consistent}' if kept else follow}"
-            )
+            return f"{clock}, regular with stamps that jitter by {jitter} (rms); {holds}"
         case "irregular":
-            shortest, longest = (
-                min(r.intervals[0] for r in group),
-                max(r.intervals[2] for r in group),
-            )
-            return f"no regular clock, rows are {_ms(shortest)} to {_ms(longest)} apart"
+            shortest = _ms(min(r.intervals[0] for r in group))
+            longest = _ms(max(r.intervals[2] for r in group))
+            return f"no regular clock, rows are {shortest} to {longest} apart"
 
 
 def _finite(value: Any) -> Any:
