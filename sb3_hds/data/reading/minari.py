@@ -43,7 +43,10 @@ def read_minari(name: str) -> Log:
     for episode in dataset.iterate_episodes():
         obs = _flat("observations", episode.observations)
         actions = _flat("actions", episode.actions)
-        own = Columns(*(tuple(Entry(name, name) for name in part) for part in (obs, actions)))
+        own = Columns(
+            obs=tuple(Entry(name, name) for name in obs),
+            actions=tuple(Entry(name, name) for name in actions),
+        )
         # Row k has the action that follows it; the last row has none.
         tables.append(obs | {n: np.append(column, np.nan) for n, column in actions.items()})
     if not tables:
