@@ -153,7 +153,15 @@ def _twins_of_copies(env: VecEnv) -> list[Twin]:
     if isinstance(env, DummyVecEnv):
         return [_twin_of_one(copy) for copy in env.envs]
     layers = _transforms_of(env)
-    specs = _specs_of(env, {name for copy in layers for name, _ in copy})
+    transformed = {name for copy in layers for name, _ in copy}
+    # Only after that check: a spec contains the arguments of wrappers, and sending a lambda kills
+    # the process.
+    with _no_twin_errors(env):
+        specs = env.get_attr("spec")
+    for spec in specs:
+        for wrapper in spec.additional_wrappers if spec is not None else ():
+            if wrapper.name not in transformed:
+                _check_neutral(wrapper.name, wrapper.entry_point)
     _action_limits(env.action_space)
     own = env.get_attr("twin") if env.has_attr("twin") else []
     bare = own if own and all(isinstance(t, Twin) for t in own) else map(_twin_of_spec, specs)
@@ -183,24 +191,6 @@ def _transforms_of(env: VecEnv) -> list[list[tuple[str, StatefulTransform]]]:
             else:
                 _check_neutral(name)
     return copies
-
-
-def _specs_of(env: VecEnv, transformed: set[str]) -> list[EnvSpec | None]:
-    """
-    The specs of the copies in other processes. Call :func:`_transforms_of` first: a spec contains
-    the arguments of wrappers, and sending a lambda kills the process.
-
-    :param transformed: names of wrappers with a twin transform
-    :raises EnvironmentMismatchError: for another wrapper that is not neutral
-    :raises NoTwinError: if the copies have no spec
-    """
-    with _no_twin_errors(env):
-        specs = env.get_attr("spec")
-    for spec in specs:
-        for wrapper in spec.additional_wrappers if spec is not None else ():
-            if wrapper.name not in transformed:
-                _check_neutral(wrapper.name, wrapper.entry_point)
-    return specs
 
 
 @contextlib.contextmanager
