@@ -16,24 +16,14 @@ from sb3_hds.data.reading.text import read_text
 from sb3_hds.errors import TrajectoryError
 
 READERS: dict[str, Callable[[Path, Columns], Log]] = {
-    ".csv": read_text,
-    ".tsv": read_text,
-    ".txt": read_text,
-    ".dat": read_text,
-    ".log": read_text,
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".log"), read_text),
     ".parquet": read_parquet,
     ".npz": read_npz,
     ".npy": read_npy,
     ".mat": read_mat,
-    ".json": read_json,
-    ".jsonl": read_json,
-    ".ndjson": read_json,
-    ".h5": read_hdf5,
-    ".hdf5": read_hdf5,
-    ".hdf": read_hdf5,
-    ".bag": read_bag,
-    ".db3": read_bag,
-    ".mcap": read_bag,
+    **dict.fromkeys((".json", ".jsonl", ".ndjson"), read_json),
+    **dict.fromkeys((".h5", ".hdf5", ".hdf"), read_hdf5),
+    **dict.fromkeys((".bag", ".db3", ".mcap"), read_bag),
 }
 """The reader of each suffix. Add your own readers here."""
 
