@@ -6,7 +6,7 @@ from cases import each
 
 from sb3_hds import Trajectories
 from sb3_hds.data.columns import columns_from
-from sb3_hds.data.resampling.resample import at_one_interval
+from sb3_hds.data.resampling.resample import resample
 from sb3_hds.data.resampling.rows import Rows
 from sb3_hds.errors import TrajectoryError
 
@@ -25,8 +25,9 @@ def read(*stamps, values=None, **more):
         q = motion(t) if values is None else values[i]
         k = np.arange(len(t))
         episodes.append(Rows(f"log {i}", k, np.asarray(t, float), q[:, None], 1.0 * k[:, None], ""))
-    steps, report = at_one_interval(episodes, columns_from(COLUMNS | more))
-    return [x[:, 0] for x in steps.obs], [u[:, 0] for u in steps.actions], report
+    data = resample(episodes, columns_from(COLUMNS | more))
+    obs, actions = zip(*(data.episode(i) for i in range(len(data))), strict=True)
+    return [x[:, 0] for x in obs], [u[:, 0] for u in actions], data.report
 
 
 def regular(hz=100.0, n=3000):
@@ -192,7 +193,7 @@ def test_rows_that_were_held_up_and_catch_up_are_no_gap():
 def test_stamps_that_tell_no_interval_are_refused_with_the_way_out(stamps, says):
     with pytest.raises(TrajectoryError, match=says) as refusal:
         read(stamps, values=[motion(regular(n=len(stamps)))])
-    assert "leave 'time' out of columns and say the interval: dt: SECONDS" in str(refusal.value)
+    assert "remove 'time' from columns and give the interval: dt: SECONDS" in str(refusal.value)
 
 
 @pytest.mark.parametrize("n", [3, 4, 8, 20])
@@ -211,13 +212,13 @@ def test_a_wrapped_angle_is_refused_only_where_it_is_interpolated_at_its_seam():
     seam = int(np.flatnonzero(np.diff(angle) < -3.0)[0])
     there, elsewhere = (np.delete(np.arange(600), gone) for gone in (seam, seam + 40))
 
-    with pytest.raises(TrajectoryError, match="jumps by a whole turn"):
+    with pytest.raises(TrajectoryError, match="jumps by a full turn"):
         read(t[there], values=[angle[there]])
     assert len(read(t[elsewhere], values=[angle[elsewhere]])[0][0]) == 600
     for rows in (there, elsewhere):
         [obs], _, _ = read(t[rows], values=[angle[rows]], obs=[{"column": "q", "angle": True}])
         assert np.abs(obs - angle).max() < 1e-9
-    with pytest.raises(TrajectoryError, match=r"jumps by a whole turn after row .*angle: true"):
+    with pytest.raises(TrajectoryError, match=r"jumps by a full turn after row .*angle: true"):
         read(t, values=[angle], dt=0.004)
     [obs], _, _ = read(t, values=[angle], dt=0.004, obs=[{"column": "q", "angle": True}])
     np.testing.assert_allclose(np.unwrap(obs), 0.02 * np.arange(len(obs)), atol=1e-9)

@@ -405,7 +405,7 @@ def test_it_prints_in_80_columns_and_is_plain_json(data):
 
 def test_names_and_twins_must_fit_the_channels(data):
     for names in (["q", "v"], ["q", "q", "v"]):
-        with pytest.raises(TrajectoryError, match="a name of its own"):
+        with pytest.raises(TrajectoryError, match="a unique name"):
             audit(data, names)
     with pytest.raises(TrajectoryError, match="CartPole has 5 channels and 1 commands"):
         audit(data, twin=twins.make("CartPole"))

@@ -78,7 +78,7 @@ def test_patterns_give_files_in_alphabetical_order_and_lists_keep_theirs(tmp_pat
 
     assert found.conditions == ("a", "b", "run[1]") and found.origin.tolist() == [0, 1, 2]
     assert listed.conditions == ("run[1]", "a")
-    with pytest.raises(TrajectoryError, match="a recording is evidence only once"):
+    with pytest.raises(TrajectoryError, match="use each recording once"):
         Trajectories.load([tmp_path / "a.csv", str(tmp_path / "*.csv")], columns=COLUMNS)
 
 
@@ -153,7 +153,7 @@ def test_jittered_stamps_are_resampled_and_the_change_is_reported(tmp_path):
     [sampling] = data.report.recordings
     # The grid is a mean of 400 stamps that are off by up to a tenth of an interval.
     assert sampling.clock == "jittered" and 0.0 < sampling.moved <= 0.11 * DT
-    assert "measured when the stamps say" in data.report.clocks() and data.report.altered
+    assert "measured at their stamps" in data.report.clocks() and data.report.altered
     assert 0.0 < sampling.error[0] < 18.0 * bound
     assert max(map(len, str(data.report).splitlines())) <= 80
     assert json.loads(json.dumps(data.report.to_dict()))["recordings"][0]["rows"] == 400
@@ -193,13 +193,13 @@ def test_a_gap_ends_the_episode_and_both_parts_are_one_recording(tmp_path):
 @each(
     ({"tiem": "t"}, "Did you mean 'time'"),
     ({"obs": "q"}, "obs must be a list of columns, got 'q'."),
-    ({"obs": [{"colum": "q"}]}, "obs[0] has the key 'colum'"),
+    ({"obs": [{"colum": "q"}]}, "obs[0] has the unknown key 'colum'"),
     ({"obs": [{"column": "q", "constant": 1.0}]}, "obs[0] needs either 'column'"),
     ({"obs": [{"column": "q", "scale": "big"}]}, "scale must be a finite number, got 'big'"),
-    ({"obs": ["q", "q"]}, "two channels of obs are called 'q'"),
+    ({"obs": ["q", "q"]}, "obs: two channels are called 'q'"),
     ({"time": None}, "time: NAME"),
     ({"condition": "load"}, "condition must be {column: NAME} or {from: filename}"),
-    ({"obs": None}, "columns does not say which are the obs."),
+    ({"obs": None}, "columns does not name the obs."),
     ({"obs": ["Q"]}, "'log.csv' has no column 'Q'. It has: t, q, v, u."),
     # Its stamps are milliseconds, of which a thousand fit into this dt.
     ({"time": {"column": "t", "scale": 1e3}, "dt": 0.01}, "scale: 0.001"),
@@ -224,23 +224,23 @@ LINES = "0.0,1,2,3\n0.1,1,2,3\n"
     ("text.json", '"hello"', "has no column 'q', 't', 'u', 'v'. It has: 0."),
     ("log.mat", "nothing that MATLAB wrote" * 20, "is damaged or not a .mat file"),
     ("log.csv", "", "is empty: nothing was logged"),
-    ("log.csv", LINES, "its 4 columns have no names: write their numb"),
+    ("log.csv", LINES, "its 4 columns have no names: use their numb"),
     ("log.csv", "rig,3,hot\nMonday\nt,q,v,u\n" + LINES, "before the names: skip: 2."),
-    ("log.csv", "t,q,v,u\nlow,high,low,low\n" + LINES, "what follows must be numbers, got"),
+    ("log.csv", "t,q,v,u\nlow,high,low,low\n" + LINES, "followed by numbers, got"),
     ("log.csv", "t,q,v,u\n0,1,2,3\n3,4,5,6,7\n", "has 5 fields in line 3 and 4 before"),
     ("log.csv", "t,q,v,u\n0,00,1,5,0,0,0,0\n", "4 names in its first line and 8 fields"),
     ("log.csv", f"t,q,v,u\n{LINES}0.2,off?,6,0\n", "must hold numbers, got 'off?' in row 2"),
-    ("log.csv", "t,q,v,u\n2024-05-01 12:00:00.1,1,0,0\n", "to seconds before"),
+    ("log.csv", "t,q,v,u\n2024-05-01 12:00:00.1,1,0,0\n", "to seconds first"),
     ("log.csv", f"t,q,v,u\n{LINES}0.2,nan,6,0\n", "must be finite, got nan in row 2"),
     ("log.csv", f"t,q,v,u\n{LINES}0.05,0,6,0\n", "from 0.1 to 0.05 s at row 2"),
-    ("log.csv", b"\x89HDF\r\n\x1a\n" + bytes(99), "is an HDF5 file, in spite of its name"),
+    ("log.csv", b"\x89HDF\r\n\x1a\n" + bytes(99), "looks like an HDF5 file, in spite of its name"),
     ("log.mat", b"PAR1" + bytes(99), "rename it to 'log.parquet'"),
     ("log.db3", b"nothing", "'ros2 bag reindex' or 'rosbag reindex'"),
     ("log.csv", bytes(range(256)), "is damaged or not a .csv file"),
     ("nowhere.csv", None, "does not exist"),
     ("log.npz", None, "must have the same length, got q 50, t 50, u 50, v 49"),
     ("", None, "is a folder; name the files in it"),
-    ("[ab].csv", None, "b.csv' has not; it has: t, q, u"),
+    ("[ab].csv", None, "b.csv' does not; it has: t, q, u"),
     ("*.hdf", None, "No file matches"),
 )
 def test_a_file_that_cannot_be_read_says_why(name, content, says, tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from cases import each
 
 from sb3_hds import audit
-from sb3_hds.data.audit.velocity import lags_of
+from sb3_hds.data.audit.velocity import best_pairs, velocity_pairs
 
 pytestmark = [
     pytest.mark.measured,
@@ -86,6 +86,6 @@ def test_servos_report_their_speed_some_20_ms_late_whatever_they_do(name):
 
 
 def test_backward_differences_are_half_a_sample_late_and_no_finding():
-    lags = lags_of(load("dfki"), ["q1", "q2", "v1", "v2"])
+    lags = best_pairs(velocity_pairs(load("dfki"), ["q1", "q2", "v1", "v2"]))
     assert [(lag.velocity, lag.position) for lag in lags] == [(2, "q1"), (3, "q2")]
     np.testing.assert_allclose([lag.samples for lag in lags], 0.5, atol=0.02)

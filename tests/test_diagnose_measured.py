@@ -121,5 +121,5 @@ def test_a_servo_that_hardly_moves_supports_no_confident_name():
     assert not found.findings
     (poor,) = [caveat for caveat in found.caveats if "Excitation is poor" in caveat]
     assert "4 recordings under 1 condition" in poor and "Record more strokes" in poor
-    assert "vary what stayed the same: the load, the gain" in poor
+    assert "vary the load, the gain" in poor
     assert any("'kp' is 32 throughout" in caveat for caveat in found.caveats)

@@ -132,7 +132,7 @@ def test_impossible_settings_are_refused(settings, error, says):
 @each(
     (lambda env: env.step([np.nan]), r"finite actions \(torque \[N m\]\), got \[nan\]"),
     (lambda env: env.step([0.0, 0.0]), r"actions of shape \(1,\) .* got shape \(2,\)"),
-    (lambda env: env.reset(options={"stat": (0.0, 0.0)}), r"one option of reset\(\), 'state'"),
+    (lambda env: env.reset(options={"stat": (0.0, 0.0)}), r"only option of reset\(\) .* 'state'"),
     (lambda env: env.reset(options={"state": 3.0}), r"1 finite positions .*hinge \[rad\]"),
     (lambda env: env.reset(options={"state": (0.0, 9.0)}), "speed = 9 rad/s .from -8 to 8"),
 )

@@ -121,10 +121,10 @@ def test_a_unit_has_a_factor_to_a_name_in_the_si(unit, factor, name):
 
 
 @each(
-    ({"obs": [{"column": "q", "unit": "furlong"}]}, "'furlong' is not known. Known are rad"),
-    ({"obs": [{"column": "q", "unit": "counts"}]}, "mean nothing without a scale"),
-    ({"obs": [{"column": "q", "unit": "mm", "angle": True}]}, "an angle is in rad, deg or"),
-    ({"time": {"column": "t", "unit": "deg"}}, "time is in one of s, ms, us"),
+    ({"obs": [{"column": "q", "unit": "furlong"}]}, "unknown unit 'furlong'. Known are rad"),
+    ({"obs": [{"column": "q", "unit": "counts"}]}, "counts need a scale"),
+    ({"obs": [{"column": "q", "unit": "mm", "angle": True}]}, "an angle must be in rad, deg or"),
+    ({"time": {"column": "t", "unit": "deg"}}, "time must be in one of s, ms, us"),
 )
 def test_a_unit_that_cannot_be_converted_is_refused(change, says):
     with pytest.raises(TrajectoryError, match=says):
@@ -197,7 +197,7 @@ def test_episodes_are_found_wherever_json_nests_them(content, more, lengths, tmp
 
     assert data.lengths.tolist() == lengths and data.dt == 0.1
     assert data.obs[0, :, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
-    with pytest.raises(TrajectoryError, match="on the way to records"):
+    with pytest.raises(TrajectoryError, match="on the path records"):
         load(tmp_path / "log.json", COLUMNS | {"records": "data.x.y"})
 
 
@@ -349,7 +349,7 @@ def test_joints_keep_their_names_whatever_their_order(tmp_path):
     np.testing.assert_array_equal(read("/joints:position[elbow]").obs[0, :, 0], TABLE["q"])
     sparse = read("/joints:position[wrist]")
     assert sparse.lengths.tolist() == [N // 2 - 1] and sparse.dt == pytest.approx(0.02)
-    with pytest.raises(TrajectoryError, match=r"Choose them by name, as /joints:position\[elbow\]"):
+    with pytest.raises(TrajectoryError, match=r"Select them by name, as /joints:position\[elbow\]"):
         read("/joints:position[1]")
     for column in ("/joints:position[hand]", "/arm:position[elbow]"):
         with pytest.raises(TrajectoryError, match=f"has no column '{re.escape(column)}'"):
@@ -391,7 +391,7 @@ def test_topics_are_put_on_one_clock_observations_interpolated_and_actions_held(
     assert "/command:data held" in data.report.notes[0]
     with pytest.raises(TrajectoryError, match=r"/command has no header stamps.*/joints:received"):
         load(tmp_path / "log", columns | {"time": "/joints:header.stamp"})
-    with pytest.raises(TrajectoryError, match="several topics are put on one clock"):
+    with pytest.raises(TrajectoryError, match="several topics need a common clock"):
         load(tmp_path / "log", columns | {"time": "/joints:position[0]"})
 
 
@@ -421,7 +421,7 @@ def test_what_is_printed_of_a_log_is_a_map_that_reads_it(tmp_path, capsys):
     data = load(log, tmp_path / "map.yml")
 
     assert f"{N} rows, 4 columns" in shown and "time: {column: ms, unit: ms}" in shown
-    assert "degrees? Then write unit: deg" in shown and "# not used: run" in shown
+    assert "degrees? Then add unit: deg" in shown and "# not used: run" in shown
     assert data.report.obs == ("joint angle",) and data.report.actions == ("tau_cmd",)
     assert data.dt == 0.01
 

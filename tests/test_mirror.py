@@ -154,5 +154,5 @@ def test_a_twin_that_differs_is_found_out(difference):
 
 def test_a_state_that_cannot_be_observed_is_not_compared():
     blind = twins.make("CartPole", observe="q")
-    with pytest.warns(UserWarning, match="does not tell the state of CartPole"):
+    with pytest.warns(UserWarning, match="does not determine the state of CartPole"):
         assert math.isnan(verify_mirror(TwinEnv(blind), blind))

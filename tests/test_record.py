@@ -90,7 +90,7 @@ def test_a_file_that_is_cut_anywhere_loses_one_step_at_most(tmp_path):
         path.write_bytes(content[:size])
         n_steps = sum(end < size for end in ends) - 2  # without header and first observation
         if n_steps < 1:
-            with pytest.raises(TrajectoryError, match=r"interrupted before|holds no step yet"):
+            with pytest.raises(TrajectoryError, match=r"interrupted before|contains no step yet"):
                 Trajectories.load(path)
         else:
             assert Trajectories.load(path).obs[0, :, 0].tolist() == list(range(n_steps + 1))
@@ -125,9 +125,9 @@ def test_a_recording_is_never_overwritten_but_can_be_continued(tmp_path):
             file.write(b'{"time":0.2,"act')  # what a kill leaves behind
 
     assert Trajectories.load(robot.path).obs[:, 0, 0].tolist() == [0.0, 1.0]
-    with pytest.raises(TrajectoryError, match="exists; a recording is never overwritten"):
+    with pytest.raises(TrajectoryError, match="exists; recordings are never overwritten"):
         recorder(tmp_path / "run")
-    with pytest.raises(TrajectoryError, match="has another interval or other channels"):
+    with pytest.raises(TrajectoryError, match="has a different interval or different channels"):
         recorder(tmp_path / "run", append=True, actions=["torque"])
 
 
@@ -152,7 +152,7 @@ def test_wrong_use_is_refused_with_the_way_out(use, says, tmp_path):
 def test_what_is_refused_costs_nothing_that_was_recorded_whatever_the_actions_are(tmp_path):
     with begun(tmp_path / "a") as robot:
         robot.step([1.0], [1.0, 1.0])
-        with pytest.raises(TrajectoryError, match="what was before it is kept"):
+        with pytest.raises(TrajectoryError, match="This was not recorded"):
             robot.step([2.0], [np.nan, 2.0])
         with pytest.raises(TrajectoryError, match="must not decrease"):
             robot.step([2.0], [2.0, 2.0], time=0.0)

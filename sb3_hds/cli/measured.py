@@ -201,12 +201,12 @@ def _question_of_model(given: argparse.Namespace) -> "tuple[MechanismTwin, Traje
 
     :raises TrajectoryError: for signals of the twin that the log does not have by name
     """
-    from sb3_hds.data.overview import names_in
+    from sb3_hds.data.overview import channel_candidates
 
     own = settings("--set", given.set)
     make = partial(_twin_of_model, given.model, words=_words(given))
     files = given.data[0] if len(given.data) == 1 else given.data
-    named = names_in(files, given.columns)
+    named = channel_candidates(files, given.columns)
     if named is None:
         data = loaded(given, given.columns)
         return make({"dt": data.dt} | own), data

@@ -1,9 +1,9 @@
 """
-Measured data in and out: readers, recordings, and an audit before any physics.
+Measured data: readers of logs, recordings, and an audit before any physics is fitted.
 
-Importing it teaches ``Trajectories.load`` to read logs.
+Importing it registers the log readers with ``Trajectories.load``.
 
-Names are imported on first use: a loop on a robot needs few of them, and neither JAX nor PyTorch.
+Names are imported on first use, so that a control loop on a robot loads neither JAX nor PyTorch.
 """
 
 from typing import TYPE_CHECKING, Any

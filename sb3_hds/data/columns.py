@@ -4,7 +4,7 @@ import dataclasses
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,23 +15,23 @@ from sb3_hds.data.conversion import KNOWN, TIMES, Unit, unit_of
 from sb3_hds.errors import TrajectoryError, did_you_mean
 
 FORM = (
-    "columns names what a log holds: {'time': NAME, 'obs': [{'column': NAME, 'unit': 'deg'}, ...], "
-    "'actions': [{'column': NAME}, ...]}, or is the path of a yml file with that."
+    "columns maps what a log holds: {'time': NAME, 'obs': [{'column': NAME, 'unit': 'deg'}, ...], "
+    "'actions': [{'column': NAME}, ...]}, or is the path of a yml file with such a map."
 )
 
 
 class Entry(NamedTuple):
     """
-    One channel: ``factor * column + offset``, or ``offset`` alone where nothing was recorded.
+    One channel: ``factor * column + offset``, or ``offset`` alone if it was not recorded.
 
     :param name: of the channel; default: that of its column
-    :param column: in the log; None for a channel that is constant
-    :param scale: of the column, besides the factor of its unit
+    :param column: in the log; None for a constant channel
+    :param scale: applied to the column in addition to the factor of its unit
     :param offset: added after scaling, in the unit of the twin
-    :param angle: whether the result wraps to [-pi, pi) [rad]: it then turns the shorter way
-    :param unit: that the column, once scaled, is in, as ``"deg"``: it is converted to the SI unit.
-        Empty if ``scale`` leads to the unit of the twin; None if nothing is said, so that a file
-        which names its units may
+    :param angle: whether the result wraps to [-pi, pi) [rad], so that it is interpolated the
+        shorter way
+    :param unit: of the scaled column, such as ``"deg"``: it is converted to the SI unit. Empty if
+        ``scale`` converts to the unit of the twin; None if undeclared: the file's own unit applies
     """
 
     name: str
@@ -43,13 +43,13 @@ class Entry(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """From the column to the unit of the twin."""
+        """Factor from the column to the unit of the twin."""
         unit = unit_of(self.unit) if self.unit else None
         return self.scale * (unit.factor if unit else 1.0)
 
     @property
     def si_unit(self) -> str:
-        """Unit of the channel; empty where it is not known."""
+        """Unit of the channel; empty if unknown."""
         unit = unit_of(self.unit) if self.unit else None
         return unit.name if unit else ""
 
@@ -58,7 +58,7 @@ class Label(NamedTuple):
     """
     The source of a trajectory's label.
 
-    :param column: in the log; None: the name of the file, without folder and suffix
+    :param column: in the log; None: the file name without folder and suffix
     """
 
     column: str | None
@@ -71,14 +71,14 @@ class Columns:
 
     :param obs: observation channels, in the order of the twin; None: as declared in the file
     :param actions: action channels, in the order of the twin; None: as declared in the file
-    :param time: stamps, scaled to seconds, the sum of several columns where seconds and nanoseconds
-        stand apart; None where rows are exactly ``dt`` apart
-    :param condition: where the label is from; default: all trajectories have the same one
-    :param episode: the column that changes where a new episode begins
-    :param dt: sampling interval of the result [s]; default: the one in the log
+    :param time: stamps, scaled to seconds; the sum of several columns if seconds and nanoseconds
+        are separate; None if rows are exactly ``dt`` apart
+    :param condition: source of the label; default: all trajectories have the same label
+    :param episode: column whose value changes at the start of an episode
+    :param dt: sampling interval of the result [s]; default: that of the log
     :param gap: a longer time between two rows ends the episode [s]; default: five intervals
-    :param records: where the rows are in a file that nests them, as ``"data"`` or ``"run.rows"``
-    :param skip: number of lines of a text file before its names, or its first row
+    :param records: path to the rows in a nested file, such as ``"data"`` or ``"run.rows"``
+    :param skip: number of lines of a text file before the names, or before the first row
     """
 
     obs: tuple[Entry, ...] | None = None
@@ -99,55 +99,53 @@ class Columns:
         names = [*(entry.column for entry in entries), *labels, self.episode]
         return frozenset(name for name in names if name is not None)
 
+    def completed_by(self, other: "Columns") -> "Columns":
+        """:return: these columns, with missing fields taken from the others"""
+        names = [field.name for field in dataclasses.fields(self)]
+        missing = {name: getattr(other, name) for name in names if getattr(self, name) is None}
+        return dataclasses.replace(self, **missing)
+
     def over(self, own: "Columns | None") -> "Columns":
         """
         :param own: columns that the file itself declares
         :return: these columns, completed by those of the file
         :raises TrajectoryError: if neither declares observations or actions
         """
-        merged = self
-        if own is not None:
-            names = [field.name for field in dataclasses.fields(self)]
-            left = {name: getattr(own, name) for name in names if getattr(self, name) is None}
-            merged = dataclasses.replace(self, **left)
+        merged = self.completed_by(own or Columns())
         missing = [name for name in ("obs", "actions") if getattr(merged, name) is None]
         if missing:
-            raise TrajectoryError(f"columns does not say which are the {missing[0]}. {FORM}")
+            raise TrajectoryError(f"columns does not name the {missing[0]}. {FORM}")
         if merged.time is None and merged.dt is None:
             raise TrajectoryError(
-                "columns must name the column of time stamps, as time: NAME, or say how far rows "
-                "are apart, as dt: SECONDS."
+                "columns must name the column of time stamps, as time: NAME, or give the interval "
+                "between rows, as dt: SECONDS."
             )
         return merged
 
     def in_units(self, units: Mapping[str, str]) -> "Columns":
         """
-        :param units: of columns, as a file names them
-        :return: with these units where the map has none and they are known
+        :param units: of columns, as a file declares them
+        :return: the map with these units, if known, for entries without a unit
         """
 
-        si = {name: unit_of(unit) for name, unit in units.items()}
-        known = {name: units[name] for name, unit in si.items() if unit and unit.name}
-        times = {name: units[name] for name, unit in si.items() if unit and unit.name == "s"}
-
-        def completed(entries: tuple[Entry, ...], units: Mapping[str, str]) -> tuple[Entry, ...]:
-            return tuple(
-                entry._replace(unit=units.get(entry.column or "")) if entry.unit is None else entry
-                for entry in entries
-            )
+        def completed(entry: Entry, time: bool = False) -> Entry:
+            declared = units.get(entry.column or "", "")
+            unit = unit_of(declared) if declared and entry.unit is None else None
+            fits = unit is not None and (unit.name == "s" if time else unit.name)
+            return entry._replace(unit=declared) if fits else entry
 
         return dataclasses.replace(
             self,
-            obs=self.obs and completed(self.obs, known),
-            actions=self.actions and completed(self.actions, known),
-            time=self.time and completed(self.time, times),
+            obs=self.obs and tuple(completed(entry) for entry in self.obs),
+            actions=self.actions and tuple(completed(entry) for entry in self.actions),
+            time=self.time and tuple(completed(entry, time=True) for entry in self.time),
         )
 
 
 def columns_from(source: Any) -> Columns:
     """
     :param source: a dict as in the guide, the path of a yml file with one, or ``Columns``
-    :raises TrajectoryError: if it cannot be read, or for a key or a value that is not known
+    :raises TrajectoryError: if it cannot be read, or for an unknown key or an invalid value
     """
     if isinstance(source, Columns):
         return source
@@ -156,18 +154,14 @@ def columns_from(source: Any) -> Columns:
         where = f"'{source}'"
         source = _read_yml(Path(source).expanduser())
     if not isinstance(source, Mapping):
-        raise TrajectoryError(f"{where} holds a {type(source).__name__}. {FORM}")
-    _check_keys(where, source, [field.name for field in dataclasses.fields(Columns)])
-    seconds = {key: source[key] for key in ("dt", "gap") if source.get(key) is not None}
+        raise TrajectoryError(f"{where} contains a {type(source).__name__}. {FORM}")
+    _check_keys(where, source, list(_PARSERS))
     return Columns(
-        obs=_entries(where, "obs", source.get("obs")),
-        actions=_entries(where, "actions", source.get("actions")),
-        time=_time(where, source.get("time")),
-        condition=_condition(where, source.get("condition")),
-        episode=_episode(where, source.get("episode")),
-        records=None if source.get("records") is None else str(source["records"]),
-        skip=_skip(where, source.get("skip")),
-        **{key: check_dt(value) for key, value in seconds.items()},
+        **{
+            key: parse(f"{where}: {key}", source[key])
+            for key, parse in _PARSERS.items()
+            if source.get(key) is not None
+        }
     )
 
 
@@ -190,27 +184,24 @@ def _check_keys(where: str, given: Mapping[Any, Any], known: Sequence[str]) -> N
     for key in given:
         if key not in known:
             raise TrajectoryError(
-                f"{where} has the key '{key}', which is not known. "
-                f"Known are: {', '.join(known)}.{did_you_mean(str(key), known)}"
+                f"{where} has the unknown key '{key}'. "
+                f"Known keys: {', '.join(known)}.{did_you_mean(str(key), known)}"
             )
 
 
-def _entries(where: str, key: str, given: Any) -> tuple[Entry, ...] | None:
-    if given is None:
-        return None
+def _entries(where: str, given: Any) -> tuple[Entry, ...]:
     if isinstance(given, str | Mapping) or not isinstance(given, Iterable):
-        raise TrajectoryError(f"{where}: {key} must be a list of columns, got {given!r}. {FORM}")
-    entries = tuple(
-        _entry(f"{where}: {key}[{i}]", item, f"{key}[{i}]") for i, item in enumerate(given)
-    )
+        raise TrajectoryError(f"{where} must be a list of columns, got {given!r}. {FORM}")
+    key = where.rpartition(": ")[-1]
+    entries = tuple(_entry(f"{where}[{i}]", item, f"{key}[{i}]") for i, item in enumerate(given))
     twice = [name for name, n in Counter(entry.name for entry in entries).items() if n > 1]
     if twice:
         raise TrajectoryError(
-            f"{where}: two channels of {key} are called '{twice[0]}'. Give one another name: "
+            f"{where}: two channels are called '{twice[0]}'. Rename one of them: "
             "{column: NAME, name: OTHER}."
         )
     if key == "obs" and not entries:
-        raise TrajectoryError(f"{where}: obs must name at least one column. {FORM}")
+        raise TrajectoryError(f"{where} must name at least one column. {FORM}")
     return entries
 
 
@@ -247,74 +238,67 @@ def _unit(where: str, given: Mapping[str, Any]) -> Unit | None:
     unit = unit_of(str(given["unit"]))
     if unit is None:
         raise TrajectoryError(
-            f"{where}: the unit '{given['unit']}' is not known. Known are {KNOWN}, and what is "
-            "made of them, as 'deg/s' or 'N mm'. For another one, give the factor to the unit of "
-            "the twin: scale: NUMBER."
+            f"{where}: unknown unit '{given['unit']}'. Known are {KNOWN}, and their products and "
+            "quotients, as 'deg/s' or 'N mm'. For another unit, give the factor to the unit of the "
+            "twin: scale: NUMBER."
         )
     if not unit.name and "scale" not in given:
         raise TrajectoryError(
-            f"{where}: {given['unit']} mean nothing without a scale. Say what one of them is, in "
-            "the unit of the twin: scale: NUMBER."
+            f"{where}: {given['unit']} need a scale. Give the size of one, in the unit of the "
+            "twin: scale: NUMBER."
         )
     if given.get("angle") and unit.name not in ("rad", ""):
         raise TrajectoryError(
-            f"{where}: an angle is in rad, deg or turns, not in '{given['unit']}'. Leave out "
+            f"{where}: an angle must be in rad, deg or turns, got '{given['unit']}'. Remove "
             "angle: true, or correct the unit."
         )
     return unit
 
 
-def _time(where: str, given: Any) -> tuple[Entry, ...] | None:
-    if given is None:
-        return None
+def _time(where: str, given: Any) -> tuple[Entry, ...]:
     several = isinstance(given, Sequence) and not isinstance(given, str)
     if several and not given:
-        raise TrajectoryError(f"{where}: time is an empty list. Name a column, or leave it out.")
-    entries = tuple(_entry(f"{where}: time", item) for item in (given if several else [given]))
+        raise TrajectoryError(f"{where} is an empty list. Name a column, or leave it out.")
+    entries = tuple(_entry(where, item) for item in (given if several else [given]))
     for entry in entries:
         if entry.unit and entry.si_unit not in ("s", ""):
             raise TrajectoryError(
-                f"{where}: time is in one of {', '.join(TIMES)}, got unit: '{entry.unit}'."
+                f"{where} must be in one of {', '.join(TIMES)}, got unit: '{entry.unit}'."
             )
     return entries
 
 
-def _skip(where: str, given: Any) -> int | None:
-    if given is None or (isinstance(given, int) and not isinstance(given, bool) and given >= 0):
+def _skip(where: str, given: Any) -> int:
+    if isinstance(given, int) and not isinstance(given, bool) and given >= 0:
         return given
     raise TrajectoryError(
-        f"{where}: skip is the number of lines before the names, or the first row, got {given!r}."
+        f"{where} must be the number of lines before the names, or before the first row, "
+        f"got {given!r}."
     )
 
 
-def _condition(where: str, given: Any) -> Label | None:
-    if given is None:
-        return None
+def _condition(where: str, given: Any) -> Label:
     if isinstance(given, Mapping):
-        _check_keys(f"{where}: condition", given, ("column", "from"))
+        _check_keys(where, given, ("column", "from"))
         if given == {"from": "filename"}:
             return Label(None)
         if set(given) == {"column"}:
-            return Label(_column_name(f"{where}: condition", given["column"]))
-    raise TrajectoryError(
-        f"{where}: condition must be {{column: NAME}} or {{from: filename}}, got {given!r}."
-    )
+            return Label(_column_name(where, given["column"]))
+    raise TrajectoryError(f"{where} must be {{column: NAME}} or {{from: filename}}, got {given!r}.")
 
 
-def _episode(where: str, given: Any) -> str | None:
-    if given is None:
-        return None
+def _episode(where: str, given: Any) -> str:
     if isinstance(given, Mapping):
-        _check_keys(f"{where}: episode", given, ("column",))
+        _check_keys(where, given, ("column",))
         given = given.get("column")
-    return _column_name(f"{where}: episode", given)
+    return _column_name(where, given)
 
 
 def _column_name(where: str, given: Any) -> str:
     if isinstance(given, bool) or not isinstance(given, str | int | float):
         raise TrajectoryError(
             f"{where} must be the name of a column, got {given!r}. "
-            "Names that yml takes for something else (on, off, yes, no) need quotes."
+            "Names with another meaning in yml (on, off, yes, no) need quotes."
         )
     return str(given)
 
@@ -327,3 +311,16 @@ def _number(where: str, given: Any) -> float:
     if not math.isfinite(value):
         raise TrajectoryError(f"{where} must be a finite number, got {given!r}.")
     return value
+
+
+_PARSERS: dict[str, Callable[[str, Any], Any]] = {
+    "obs": _entries,
+    "actions": _entries,
+    "time": _time,
+    "condition": _condition,
+    "episode": _episode,
+    "records": lambda _, given: str(given),
+    "skip": _skip,
+    "dt": lambda _, given: check_dt(given),
+    "gap": lambda _, given: check_dt(given),
+}

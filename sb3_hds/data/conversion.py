@@ -17,40 +17,45 @@ _DERIVED: dict[str, dict[str, int]] = {
     "Pa": {"kg": 1, "m": -1, "s": -2},
 }
 
-# By name in a log: factor to SI, and powers of SI symbols.
-_PLAIN: dict[str, tuple[float, dict[str, int]]] = {
-    "rad": (1.0, {"rad": 1}),
+# Symbol in a log -> factor to SI, and powers of SI symbols.
+_UNITS: dict[str, tuple[float, dict[str, int]]] = {
+    **{symbol: (1.0, {symbol: 1}) for symbol in _ORDER if symbol != "kg"},
     "deg": (math.pi / 180.0, {"rad": 1}),
     "turn": (2.0 * math.pi, {"rad": 1}),
     "rpm": (math.pi / 30.0, {"rad": 1, "s": -1}),
-    "s": (1.0, {"s": 1}),
     "min": (60.0, {"s": 1}),
     "h": (3600.0, {"s": 1}),
     "Hz": (1.0, {"s": -1}),
-    "m": (1.0, {"m": 1}),
     "g": (1e-3, {"kg": 1}),
     "g0": (9.80665, {"m": 1, "s": -2}),
-    "N": (1.0, {"N": 1}),
     "kgf": (9.80665, {"N": 1}),
     "Nm": (1.0, {"N": 1, "m": 1}),
     "Nmm": (1e-3, {"N": 1, "m": 1}),
     "Ncm": (1e-2, {"N": 1, "m": 1}),
-    "A": (1.0, {"A": 1}),
-    "V": (1.0, {"V": 1}),
-    "W": (1.0, {"W": 1}),
-    "J": (1.0, {"J": 1}),
-    "Pa": (1.0, {"Pa": 1}),
     "bar": (1e5, {"Pa": 1}),
-    "ohm": (1.0, {"ohm": 1}),
-    "K": (1.0, {"K": 1}),
-    "degC": (1.0, {"degC": 1}),
     "%": (1e-2, {}),
     "1": (1.0, {}),
 }
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
-_PREFIXED = ("rad", "deg", "s", "m", "g", "N", "Nm", "A", "V", "W", "J", "Pa", "Hz", "ohm", "rpm")
+_WITH_PREFIX = (
+    "rad",
+    "deg",
+    "s",
+    "m",
+    "g",
+    "N",
+    "Nm",
+    "A",
+    "V",
+    "W",
+    "J",
+    "Pa",
+    "Hz",
+    "ohm",
+    "rpm",
+)
 
-_WORDS = {
+_SYNONYMS = {
     "radian": "rad",
     "degree": "deg",
     "°": "deg",
@@ -81,7 +86,7 @@ _WORDS = {
     "percent": "%",
     "-": "1",
 }
-"""Other names; a plural, and upper case, are understood too."""
+"""Other names; plurals and upper case are accepted too."""
 
 _COUNTS = ("count", "tick", "step", "pulse", "lsb", "raw", "bit")
 _SPELLINGS = {
@@ -98,7 +103,7 @@ _SPELLINGS = {
     "\N{SUPERSCRIPT MINUS}": "-",
     "^": "",
 }
-_FACTOR = re.compile(r"(1|%|g0|[^\W\d_]+|°[^\W\d_]*|-)(-?\d)?")
+_SYMBOL_AND_POWER = re.compile(r"(1|%|g0|[^\W\d_]+|°[^\W\d_]*|-)(-?\d)?")
 
 KNOWN = "rad deg turn rpm s ms us ns min m mm kg g N N m A V W J Pa Hz degC K % 1 counts"
 TIMES = ("s", "ms", "us", "ns", "min", "h")
@@ -107,8 +112,8 @@ TIMES = ("s", "ms", "us", "ns", "min", "h")
 class Unit(NamedTuple):
     """
     :param factor: from the unit of a log to the SI unit
-    :param name: of the SI unit, written as twins do: ``"rad/s"``, ``"N m"``, ``"kg m2"``, ``"1"``;
-        empty for counts, which mean nothing without a scale
+    :param name: of the SI unit, written as in twins: ``"rad/s"``, ``"N m"``, ``"kg m2"``, ``"1"``;
+        empty for counts, which have no unit without a scale
     """
 
     factor: float
@@ -117,21 +122,21 @@ class Unit(NamedTuple):
 
 def unit_of(text: str) -> Unit | None:
     """
-    :param text: as ``"deg"``, ``"rpm"``, ``"N mm"``, ``"[m/s^2]"``, ``"N·m"``, ``"counts"``
-    :return: None if it is unknown
+    :param text: such as ``"deg"``, ``"rpm"``, ``"N mm"``, ``"[m/s^2]"``, ``"N·m"``, ``"counts"``
+    :return: None for an unknown unit
     """
-    powers = _factors(text)
+    powers = _parse(text)
     if powers is None:
         return None
     factor, total = 1.0, dict[str, int]()
     for symbol, power in powers:
         if symbol in _COUNTS:
             return Unit(1.0, "")
-        size, parts = _sized(symbol)
+        size, parts = _size_of(symbol)
         factor *= size**power
         for part, own in parts.items():
             total[part] = total.get(part, 0) + own * power
-    return Unit(factor, _written(total))
+    return Unit(factor, _format_unit(total))
 
 
 def same_quantity(one: str, other: str) -> bool | None:
@@ -147,8 +152,8 @@ def same_quantity(one: str, other: str) -> bool | None:
         if unit is None or not unit.name:
             return None
         total: dict[str, int] = {}
-        for symbol, power in _factors(unit.name) or ():
-            _, parts = _sized(symbol)
+        for symbol, power in _parse(unit.name) or ():
+            _, parts = _size_of(symbol)
             for part, own in parts.items():
                 for base, times in _DERIVED.get(part, {part: 1}).items():
                     total[base] = total.get(base, 0) + own * times * power
@@ -156,8 +161,8 @@ def same_quantity(one: str, other: str) -> bool | None:
     return dimensions[0] == dimensions[1]
 
 
-def _factors(text: str) -> list[tuple[str, int]] | None:
-    """:return: symbols that are known, with their powers; None if it is anything else"""
+def _parse(text: str) -> list[tuple[str, int]] | None:
+    """:return: known symbols with their powers; None if the text is not a product of them"""
     written = text.strip().strip("[]<>{}").strip()
     if written.startswith("(") and written.endswith(")"):
         written = written[1:-1].strip()
@@ -170,7 +175,7 @@ def _factors(text: str) -> list[tuple[str, int]] | None:
         if i and len(factors) > 1:
             return None  # W/m2 K is ambiguous
         for factor in factors:
-            match = _FACTOR.fullmatch(factor)
+            match = _SYMBOL_AND_POWER.fullmatch(factor)
             symbol = match and _symbol(match[1])
             if match is None or symbol is None:
                 return None
@@ -179,25 +184,25 @@ def _factors(text: str) -> list[tuple[str, int]] | None:
 
 
 def _symbol(name: str) -> str | None:
-    """:return: the name in the table, with its prefix; None if there is none"""
-    # Upper case makes another unit of a short name: NM is not nm.
+    """:return: the symbol in the table, with its prefix; None if there is none"""
+    # Case matters in short names: NM is not nm.
     words = (name, name.lower(), name.lower().removesuffix("s")) if len(name) > 2 else (name,)
     for word in words:
-        if word in _PLAIN or word in _COUNTS:
+        if word in _UNITS or word in _COUNTS:
             return word
-        if word in _WORDS:
-            return _WORDS[word]
-    return name if name[:1] in _PREFIXES and name[1:] in _PREFIXED else None
+        if word in _SYNONYMS:
+            return _SYNONYMS[word]
+    return name if name[:1] in _PREFIXES and name[1:] in _WITH_PREFIX else None
 
 
-def _sized(symbol: str) -> tuple[float, Mapping[str, int]]:
-    if symbol in _PLAIN:
-        return _PLAIN[symbol]
-    size, parts = _PLAIN[symbol[1:]]
+def _size_of(symbol: str) -> tuple[float, Mapping[str, int]]:
+    if symbol in _UNITS:
+        return _UNITS[symbol]
+    size, parts = _UNITS[symbol[1:]]
     return _PREFIXES[symbol[0]] * size, parts
 
 
-def _written(powers: Mapping[str, int]) -> str:
+def _format_unit(powers: Mapping[str, int]) -> str:
     """``"N m s/rad"`` of ``{"N": 1, "m": 1, "s": 1, "rad": -1}``."""
     above, below = [], []
     for symbol in _ORDER:

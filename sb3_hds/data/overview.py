@@ -14,10 +14,10 @@ from sb3_hds.data.columns import Columns, Entry, columns_from
 from sb3_hds.data.conversion import unit_of
 from sb3_hds.data.load import Files, epoch_unit, first_log
 from sb3_hds.data.reading import Log, read_log
-from sb3_hds.data.reading.log import base_of
+from sb3_hds.data.reading.log import base_name
 
 _SHOWN = 200  # columns
-_MORE_THAN_A_TURN = 7.0  # [rad]
+_MAX_RADIANS = 7.0  # [rad]
 # Words of a name, without its digits.
 _TIME = "t time times timestamp stamp sec secs seconds clock ms us ns millis micros elapsed"
 _EPISODE = "episode ep run trial trajectory traj rollout"
@@ -37,11 +37,11 @@ _ANGLE = "q pos position positions angle theta phi qpos"
 class _Column(NamedTuple):
     """
     :param name: of the column
-    :param rows: in all episodes together; 0 for a value that holds for all rows
-    :param kind: of its values
-    :param lowest: not a number for texts
-    :param highest: not a number for texts
-    :param step: usual difference of two rows; not a number where rows decrease
+    :param rows: number of rows in all episodes; 0 for a value that applies to all rows
+    :param kind: dtype of its values
+    :param lowest: value; nan for texts
+    :param highest: value; nan for texts
+    :param step: median difference of two rows; nan if rows decrease
     :param example: first value
     """
 
@@ -55,34 +55,34 @@ class _Column(NamedTuple):
 
     @property
     def varies(self) -> bool:
-        """Whether it changes at all."""
+        """Whether it is not constant."""
         return self.highest > self.lowest and self.rows > 1
 
 
 def describe(path: Path, records: str | None = None, skip: int | None = None) -> str:
     """
-    List the columns of a file, and guess what they are.
+    List the columns of a file, and guess their meaning.
 
-    The text is a map of columns as a whole: what is listed are comments.
+    The text is a valid map of columns, with the list of columns as comments.
 
     :param path: of a log
-    :param records: where the rows are in a file that nests them
+    :param records: path to the rows in a nested file
     :param skip: number of lines before the names of a text file
     :raises TrajectoryError: if the file cannot be read
     """
     log = read_log(path, Columns(records=records, skip=skip))
-    columns = [_column(name, log) for name in _names(log)]
-    lines = [*_listing(path, log, columns), ""]
+    columns = _columns_in(log)
+    lines = [*_column_table(path, log, columns), ""]
     if log.columns is not None and log.columns.obs is not None:
-        return "\n".join([*lines, "# It says itself what its columns are, and needs no map.", ""])
-    lines += ["# A map to start from. Everything in it is a guess: check each line."]
+        return "\n".join([*lines, "# The file declares its columns and needs no map.", ""])
+    lines += ["# A map to start from. Every line is a guess: check it."]
     lines += [f"records: {records}"] if records else []
     lines += [f"skip: {skip}"] if skip else []
-    return "\n".join([*lines, *_map(log, columns), ""])
+    return "\n".join([*lines, *_suggested_map(log, columns), ""])
 
 
-def _names(log: Log) -> Iterable[str]:
-    return dict.fromkeys(name for table in log.tables for name in table)
+def _columns_in(log: Log) -> list[_Column]:
+    return [_column(name, log) for name in dict.fromkeys(n for table in log.tables for n in table)]
 
 
 def _column(name: str, log: Log) -> _Column:
@@ -101,7 +101,7 @@ def _column(name: str, log: Log) -> _Column:
     return _Column(name, rows, str(values.dtype), lowest, highest, step, example)
 
 
-def _listing(path: Path, log: Log, columns: Sequence[_Column]) -> list[str]:
+def _column_table(path: Path, log: Log, columns: Sequence[_Column]) -> list[str]:
     n = len(log.tables)
     counts = sorted({column.rows for column in columns})
     rows = f"{counts[-1]} rows" if counts else "nothing"
@@ -121,107 +121,101 @@ def _listing(path: Path, log: Log, columns: Sequence[_Column]) -> list[str]:
     return [line.rstrip() for line in lines]
 
 
-def _map(log: Log, columns: Sequence[_Column]) -> list[str]:
+def _suggested_map(log: Log, columns: Sequence[_Column]) -> list[str]:
     own = log.columns or Columns()
     signals = [c for c in columns if not np.isnan(c.lowest)]
     time = None if own.time else _guessed_time(signals)
-    episodes = [c for c in signals if c is not time and c.varies and _is(c, _EPISODE)]
+    episodes = [c for c in signals if c is not time and c.varies and _has_word(c, _EPISODE)]
     rest = [c for c in signals if c.rows > 1 and c is not time and c not in episodes]
-    rest = [c for c in rest if not _is(c, f"{_INDEX} {_TIME}")]
+    rest = [c for c in rest if not _has_word(c, f"{_INDEX} {_TIME}")]
     rest = [c for c in rest if time is None or c.rows in (time.rows, time.rows - len(log.tables))]
-    actions = [c for c in rest if _is(c, _ACTION)]
+    actions = [c for c in rest if _has_word(c, _ACTION)]
     sensed = [c for c in rest if c not in actions and c.varies]
-    obs = [c for c in sensed if _is(c, _OBSERVED)] or sensed
-    lines = [] if own.time else _time_lines(log, time)
-    lines += _entries("obs", obs, log.units) if obs else ["obs: []  # nothing changes: name them"]
-    lines += _entries("actions", actions, log.units) if actions else ["actions: []"]
+    obs = [c for c in sensed if _has_word(c, _OBSERVED)] or sensed
+    lines = [] if own.time else [_time_line(log, time)]
+    nothing = ["obs: []  # nothing changes: name them"]
+    lines += _entry_lines("obs", obs, log.units) if obs else nothing
+    lines += _entry_lines("actions", actions, log.units) if actions else ["actions: []"]
     if episodes and not own.episode:
-        lines.append(f"episode: {_flow({'column': episodes[0].name})}")
+        lines.append(f"episode: {_inline_yaml({'column': episodes[0].name})}")
     used = {c.name for c in (*obs, *actions, *episodes[:1])} | {time.name if time else ""}
     others = [c.name for c in columns if c.name not in used]
     lines += [f"# not used: {', '.join(others[:_SHOWN])}"] if others else []
     return lines
 
 
-def guessed_time(log: Log) -> Entry | None:
-    """:return: what looks like the time stamps of a log, with their unit"""
-    columns = [_column(name, log) for name in _names(log)]
-    found = _guessed_time([c for c in columns if not np.isnan(c.lowest)])
-    if found is None:
-        return None
-    said = unit_of(log.units.get(found.name, ""))
-    named = said is not None and said.name == "s"
-    unit = None if named else _time_unit(log.tables[0], found)
-    return Entry(found.name, found.name, unit=None if unit in (None, "s") else unit)
-
-
 def _guessed_time(columns: Sequence[_Column]) -> _Column | None:
-    """An increasing column with the name of a time, or else one that increases steadily."""
+    """An increasing column whose name suggests a time, or else one that increases steadily."""
     rising = [c for c in columns if c.step > 0.0]
-    called = [c for c in rising if _is(c, _TIME)]
-    others = [c for c in rising if c.varies and not _is(c, f"{_INDEX} {_OBSERVED} {_ACTION}")]
+    called = [c for c in rising if _has_word(c, _TIME)]
+    others = [c for c in rising if c.varies and not _has_word(c, f"{_INDEX} {_OBSERVED} {_ACTION}")]
     steady = [c for c in others if abs((c.highest - c.lowest) / (c.step * (c.rows - 1)) - 1) < 0.01]
     return next(iter([*called, *steady]), None)
 
 
-def _time_lines(log: Log, time: _Column | None) -> list[str]:
+def _time_line(log: Log, time: _Column | None) -> str:
     if time is None:
-        return ["dt: 0.01  # seconds between two rows: nothing here looks like time stamps"]
-    entry: dict[str, str] = {"column": time.name}
-    said = unit_of(log.units.get(time.name, ""))
-    step, unit = time.step, ""
-    if said is not None and said.name == "s":
-        step *= said.factor
-    else:
-        unit = _time_unit(log.tables[0], time)
-        step *= Entry("", "", unit=unit).factor
-        entry |= {"unit": unit} if unit != "s" else {}
-    return [f"time: {_flow(entry)}  # a row every {step:.4g} s, {1.0 / step:.4g} Hz"]
+        return "dt: 0.01  # seconds between two rows: no column looks like time stamps"
+    factor, unit = _time_unit(log, time)
+    entry = {"column": time.name} | ({"unit": unit} if unit else {})
+    step = time.step * factor
+    return f"time: {_inline_yaml(entry)}  # a row every {step:.4g} s, {1.0 / step:.4g} Hz"
 
 
-def _time_unit(table: Mapping[str, np.ndarray], time: _Column) -> str:
-    """From the size, the name or the steps of the stamps, in that order."""
-    named = [word for word in _words(time.name) if word in ("ms", "us", "ns", "millis", "micros")]
-    words = {"millis": "ms", "micros": "us"}
-    epoch = epoch_unit(table, Entry(time.name, time.name))
+def _time_unit(log: Log, time: _Column) -> tuple[float, str]:
+    """
+    The unit that the file declares, or else from the size, name or steps of the stamps.
+
+    :return: the unit in seconds; and its symbol, empty if the file declares it and for seconds
+    """
+    declared = unit_of(log.units.get(time.name, ""))
+    if declared is not None and declared.name == "s":
+        return declared.factor, ""
+    abbreviated = {"ms": "ms", "us": "us", "ns": "ns", "millis": "ms", "micros": "us"}
+    named = [abbreviated[word] for word in _words(time.name) if word in abbreviated]
     by_step = "ns" if time.step >= 1e5 else "us" if time.step >= 500.0 else "ms"
     by_step = by_step if time.step >= 1.0 else "s"
-    return epoch or next((words.get(word, word) for word in named), by_step)
+    unit = epoch_unit(log.tables[0], Entry(time.name, time.name)) or next(iter(named), by_step)
+    return Entry("", "", unit=unit).factor, "" if unit == "s" else unit
 
 
-def _entries(key: str, columns: Sequence[_Column], units: Mapping[str, str]) -> list[str]:
+def _entry_lines(key: str, columns: Sequence[_Column], units: Mapping[str, str]) -> list[str]:
     lines = [f"{key}:" + ("  # in the order of the twin: sb3-hds twins" if key == "obs" else "")]
     for column in columns[:_SHOWN]:
         unit = unit_of(units.get(column.name, ""))
-        said = f"  # {units[column.name]}, converted to {unit.name}" if unit and unit.name else ""
         largest = max(abs(column.lowest), abs(column.highest))
-        if not said and _is(column, _ANGLE) and largest > _MORE_THAN_A_TURN:
-            said = "  # degrees? Then write unit: deg"
-        lines.append(f"  - {_flow({'column': column.name})}{said}")
+        comment = ""
+        if unit and unit.name:
+            comment = f"  # {units[column.name]}, converted to {unit.name}"
+        elif _has_word(column, _ANGLE) and largest > _MAX_RADIANS:
+            comment = "  # degrees? Then add unit: deg"
+        lines.append(f"  - {_inline_yaml({'column': column.name})}{comment}")
     return lines
 
 
-def _is(column: _Column, words: str) -> bool:
-    """Whether the name has one of these words in it, at its end at first."""
+def _has_word(column: _Column, words: str) -> bool:
+    """Whether the last part of the name contains one of these words."""
     return bool(set(_words(column.name)) & set(words.split()))
 
 
 def _words(name: str) -> list[str]:
     """The words of the last part of a name: ``["pos", "meas"]`` of ``"arm/pos_meas1"``."""
-    last = re.split(r"[/:.]", base_of(name))[-1] or name
+    last = re.split(r"[/:.]", base_name(name))[-1] or name
     split = re.sub(r"([a-z])([A-Z])", r"\1 \2", last)
     return [word for word in re.split(r"[\W\d_]+", split.lower()) if word]
 
 
-def _flow(entry: Mapping[str, str]) -> str:
+def _inline_yaml(entry: Mapping[str, str]) -> str:
     text = yaml.safe_dump(dict(entry), default_flow_style=True, allow_unicode=True, width=10_000)
     return text.strip()
 
 
 @dataclasses.dataclass(frozen=True)
-class Named:
+class ChannelCandidates:
     """
-    :param observed: columns that may be observations, or anything
+    The columns of a log from which a twin's channels are chosen by name.
+
+    :param observed: columns that may be observations; or any channel, if the map names none
     :param commanded: columns that are known to be commands
     :param rest: the map without these two: time, episodes, label
     :param guessed: one sentence for each guess
@@ -235,8 +229,8 @@ class Named:
     def chosen(self, obs: Iterable[str], actions: Iterable[str]) -> Columns:
         """
         :param obs: names of entries, in the order of a twin's channels
-        :param actions: likewise, of its actuators
-        :return: what ``Trajectories.load`` takes
+        :param actions: names of entries, in the order of a twin's actuators
+        :return: a map of columns for ``Trajectories.load``
         """
         known = {entry.name: entry for entry in (*self.observed, *self.commanded)}
         commands = known | {entry.name: entry for entry in self.commanded}
@@ -247,28 +241,28 @@ class Named:
         )
 
 
-def names_in(files: Files, columns: str | os.PathLike[str] | dict | None = None) -> Named | None:
+def channel_candidates(
+    files: Files, columns: str | os.PathLike[str] | dict | None = None
+) -> ChannelCandidates | None:
     """
-    :param files: as for ``Trajectories.load``; the first of them is asked
-    :param columns: a map, whose ``obs`` and ``actions`` may be left out
-    :return: None for a file that ``Trajectories.save`` wrote, which has no names
+    :param files: as for ``Trajectories.load``; only the first one is read
+    :param columns: a map, whose ``obs`` and ``actions`` may be missing
+    :return: None for a file written by ``Trajectories.save``, which has no names
     :raises TrajectoryError: if it cannot be read
     """
-    said = Columns() if columns is None else columns_from(columns)
-    log = first_log(files, None if columns is None else said)
+    given = None if columns is None else columns_from(columns)
+    log = first_log(files, given)
     if log is None:
         return None
-    own = log.columns or Columns()
-    fields = [field.name for field in dataclasses.fields(Columns)]
-    unsaid = {name: getattr(own, name) for name in fields if getattr(said, name) is None}
-    merged = dataclasses.replace(said, **unsaid)
+    merged = (given or Columns()).completed_by(log.columns or Columns())
     guessed = []
     if merged.time is None and merged.dt is None:
-        entry = guessed_time(log)
-        if entry is not None:
+        found = _guessed_time(_columns_in(log))
+        if found is not None:
+            _, unit = _time_unit(log, found)
+            entry = Entry(found.name, found.name, unit=unit or None)
             merged = dataclasses.replace(merged, time=(entry,))
-            unit = f" in {entry.unit}" if entry.unit else ""
-            guessed.append(f"Time is taken from '{entry.column}'{unit}.")
+            guessed.append(f"Time is taken from '{found.name}'{f' in {unit}' if unit else ''}.")
     table = log.tables[0]
     taken = {entry.column for entry in (*(merged.obs or ()), *(merged.actions or ()))}
     every = tuple(
@@ -276,7 +270,7 @@ def names_in(files: Files, columns: str | os.PathLike[str] | dict | None = None)
         for name, values in table.items()
         if np.ndim(values) and values.dtype.kind in "iuf" and name not in taken
     )
-    return Named(
+    return ChannelCandidates(
         every if merged.obs is None else merged.obs,
         (merged.actions or ()) if merged.obs is not None or merged.actions else (),
         dataclasses.replace(merged, obs=None, actions=None),

@@ -14,28 +14,29 @@ from sb3_hds.errors import TrajectoryError
 
 _FORMAT, _VERSION, SUFFIX = "sb3_hds.Recording", 1, ".jsonl"
 _RESERVED = ("time", "condition")
-_KEPT = "This is not recorded; what was before it is kept."
+_NOT_RECORDED = "This was not recorded; earlier steps are unaffected."
 
 
 class Recorder:
     """
     Records a running system, for ``Trajectories.load(path)``.
 
-    Each call appends one line of JSON to the file and hands it to the operating system: a process
-    that is killed loses nothing that was recorded, at most the line that it was writing. Against a
-    power failure the disk is asked to write too, but only when an episode starts and at the end.
+    Each call appends one line of JSON to the file and passes it to the operating system: a process
+    that is killed loses at most the line that it was writing. Data are flushed to disk, to survive
+    a power failure, only when an episode starts and at the end.
 
-    **Action k acts from observation k to observation k + 1**: give :meth:`step` the command and
+    **Action k acts from observation k to observation k + 1**: pass :meth:`step` the command and
     what was measured *after* it.
 
-    :param path: ``.jsonl`` is appended where it is missing
+    :param path: ``.jsonl`` is appended if it is missing
     :param dt: intended sampling interval [s]; loading resamples to it
     :param obs: names of the observation channels
     :param actions: names of the action channels
-    :param condition: label of the episodes to come; may be changed at any time
-    :param clock: returns the time [s], as ``time.monotonic``, where the interval varies; default:
-        steps are taken to be exactly ``dt`` apart
-    :param append: continue an existing file of the same channels; otherwise it is refused
+    :param condition: label of the following episodes; may be changed at any time
+    :param clock: returns the time [s], such as ``time.monotonic``, if the interval varies; default:
+        steps are assumed to be exactly ``dt`` apart
+    :param append: continue an existing file with the same channels; otherwise an existing file is
+        an error
     :raises TrajectoryError: if the file cannot be written, exists, or has other channels
     """
 
@@ -60,19 +61,19 @@ class Recorder:
         header = {"format": _FORMAT, "version": _VERSION, "dt": self.dt}
         header |= {"obs": self._obs, "actions": self._actions}
         try:
-            continued = append and self._cut_to_whole_lines(header)
+            continued = append and self._truncate_partial_line(header)
             self._file = self.path.open("ab" if continued else "xb", buffering=0)
             if not continued:
                 self._write(header)
         except FileExistsError as error:
             raise TrajectoryError(
-                f"'{self.path}' exists; a recording is never overwritten. Choose another name, or "
+                f"'{self.path}' exists; recordings are never overwritten. Choose another name, or "
                 "continue it with append=True."
             ) from error
         except OSError as error:
             raise TrajectoryError(
                 f"'{self.path}' could not be written: {error.strerror}. "
-                "The folder must exist and be writable, with space left on the disk."
+                "The folder must exist and be writable, with free space on the disk."
             ) from error
 
     def start(self, obs: Any, time: float | None = None) -> None:
@@ -84,8 +85,12 @@ class Recorder:
         :raises TrajectoryError: for another shape, for numbers that are not finite, or after
             :meth:`close`
         """
-        now = self._stamp(0.0, time)
-        begun = {"time": now, "obs": _row("obs", obs, self._obs), "condition": str(self.condition)}
+        now = self._time_of(0.0, time)
+        begun = {
+            "time": now,
+            "obs": _numbers("obs", obs, self._obs),
+            "condition": str(self.condition),
+        }
         self._write(begun)
         self._time = now
         os.fsync(self._file.fileno())
@@ -96,22 +101,22 @@ class Recorder:
         :param obs: what was measured after it, shape ``(n_obs,)``
         :param time: when that was measured [s]; default: the clock, or ``dt`` after the last one
         :raises TrajectoryError: for another shape, for numbers that are not finite, for time that
-            decreases, before :meth:`start`, or after :meth:`close`; the step is not recorded then
+            decreases, before :meth:`start`, or after :meth:`close`; such a step is not recorded
         """
         if self._time is None:
-            raise TrajectoryError("No episode has begun: call start(obs) with the first one.")
-        now = self._stamp(self._time + self.dt, time)
+            raise TrajectoryError("No episode has begun: call start(obs) first.")
+        now = self._time_of(self._time + self.dt, time)
         if now < self._time:
             raise TrajectoryError(
                 f"time must not decrease within an episode, got {now:g} s after {self._time:g} s. "
-                f"If a new episode begins here, call start(obs). {_KEPT}"
+                f"If a new episode begins here, call start(obs). {_NOT_RECORDED}"
             )
-        taken = _row("action", action, self._actions)
-        self._write({"time": now, "action": taken, "obs": _row("obs", obs, self._obs)})
+        taken = _numbers("action", action, self._actions)
+        self._write({"time": now, "action": taken, "obs": _numbers("obs", obs, self._obs)})
         self._time = now
 
     def close(self) -> None:
-        """Leave the file on the disk. A second call does nothing."""
+        """Flush the file to disk and close it. A second call does nothing."""
         if not self._file.closed:
             os.fsync(self._file.fileno())
             self._file.close()
@@ -122,11 +127,11 @@ class Recorder:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _stamp(self, otherwise: float, given: float | None) -> float:
-        """The time that is given, or that of the clock."""
+    def _time_of(self, otherwise: float, given: float | None) -> float:
+        """The given time, or else that of the clock."""
         if given is None:
             given = otherwise if self._clock is None else self._clock()
-        return _row("time", given, ["time"])[0]
+        return _numbers("time", given, ["time"])[0]
 
     def _write(self, line: dict[str, Any]) -> None:
         if self._file.closed:
@@ -135,8 +140,8 @@ class Recorder:
         if self._file.write(text) < len(text):
             raise TrajectoryError(f"'{self.path}' could not be written: the disk is full.")
 
-    def _cut_to_whole_lines(self, header: dict[str, Any]) -> bool:
-        """Whether there is a file to continue; a line that was cut off is taken away."""
+    def _truncate_partial_line(self, header: dict[str, Any]) -> bool:
+        """Whether there is a file to continue; removes an incomplete last line."""
         if not self.path.exists():
             return False
         content = self.path.read_bytes()
@@ -147,15 +152,15 @@ class Recorder:
         earlier = _parse(content.partition(b"\n")[0], self.path, 1)
         if earlier != header:
             raise TrajectoryError(
-                f"'{self.path}' has another interval or other channels and cannot be continued: "
-                f"{earlier}, now {header}."
+                f"'{self.path}' has a different interval or different channels and cannot be "
+                f"continued: {earlier}, now {header}."
             )
         os.truncate(self.path, end)
         return True
 
 
 def is_recording(line: bytes) -> bool:
-    """:return: whether the first line of a file says that a :class:`Recorder` wrote it"""
+    """:return: whether this first line is the header of a :class:`Recorder` file"""
     try:
         header = json.loads(line)
     except (ValueError, RecursionError):
@@ -165,21 +170,21 @@ def is_recording(line: bytes) -> bool:
 
 def read_recording(path: Path) -> tuple[list[dict[str, np.ndarray]], Columns]:
     """
-    :param path: of a file that a :class:`Recorder` wrote, or was writing
-    :return: one table per episode with at least one step, and what their columns mean
-    :raises TrajectoryError: if it is of another kind or damaged; a cut last line is no damage
+    :param path: of a file that a :class:`Recorder` wrote or is writing
+    :return: one table per episode with at least one step, and the meaning of their columns
+    :raises TrajectoryError: if it is not a recording or damaged; an incomplete last line is ignored
     """
-    *lines, cut = path.read_bytes().split(b"\n")
+    *lines, incomplete = path.read_bytes().split(b"\n")
     header = _parse(lines[0], path, 1) if lines else {}
     if header.get("format") != _FORMAT:
         raise TrajectoryError(
-            f"'{path}' is no recording, or it was interrupted before its first line was written: "
-            f"it begins with {(lines or [cut])[0][:60]!r}."
+            f"'{path}' is not a recording, or was interrupted before its first line was written: "
+            f"it begins with {(lines or [incomplete])[0][:60]!r}."
         )
     _check_header(header, path)
     if header["version"] > _VERSION:
         raise TrajectoryError(
-            f"'{path}' is of version {header['version']}, this sb3_hds reads up to {_VERSION}. "
+            f"'{path}' has version {header['version']}; this sb3_hds reads up to {_VERSION}. "
             "Upgrade sb3_hds."
         )
     episodes: list[list[dict[str, Any]]] = []
@@ -192,7 +197,7 @@ def read_recording(path: Path) -> tuple[list[dict[str, np.ndarray]], Columns]:
         episodes[-1].append(row)
     tables = [_table(rows, header, path) for rows in episodes if len(rows) > 1]
     if not tables:
-        raise TrajectoryError(f"The recording '{path}' holds no step yet.")
+        raise TrajectoryError(f"The recording '{path}' contains no step yet.")
     return tables, Columns(
         obs=tuple(Entry(name, name) for name in header["obs"]),
         actions=tuple(Entry(name, name) for name in header["actions"]),
@@ -212,16 +217,14 @@ def _check_header(header: dict[str, Any], path: Path) -> None:
 
 
 def _table(rows: list[dict[str, Any]], header: dict[str, Any], path: Path) -> dict[str, np.ndarray]:
-    """Columns of one episode. Row k has the action that followed it; the last row has none."""
-    n_act = len(header["actions"])
+    """Columns of one episode. Row k has the action that follows it; the last row has none."""
+    n, n_act = len(rows), len(header["actions"])
     try:
-        obs = np.array([row["obs"] for row in rows], float).reshape(len(rows), len(header["obs"]))
-        actions = [row["action"] for row in rows[1:]]
-        actions = np.array(actions, float).reshape(len(rows) - 1, n_act)
-        columns = dict(zip(header["obs"], obs.T, strict=True))
-        columns |= dict(
-            zip(header["actions"], np.vstack([actions, np.full(n_act, np.nan)]).T, strict=True)
-        )
+        obs = np.array([row["obs"] for row in rows], float).reshape(n, len(header["obs"]))
+        actions = np.full((n, n_act), np.nan)
+        actions[:-1] = np.array([row["action"] for row in rows[1:]], float).reshape(n - 1, n_act)
+        names = [*header["obs"], *header["actions"]]
+        columns = dict(zip(names, np.hstack([obs, actions]).T, strict=True))
         times = np.array([row["time"] for row in rows], float)
         return columns | {"time": times, "condition": np.array(str(rows[0]["condition"]))}
     except (KeyError, ValueError, TypeError) as error:
@@ -261,12 +264,12 @@ def _names(obs: Sequence[str], actions: Sequence[str]) -> tuple[list[str], list[
     return list(obs), list(actions)
 
 
-def _row(argument: str, values: Any, names: list[str]) -> list[float]:
+def _numbers(argument: str, values: Any, names: list[str]) -> list[float]:
     try:
         row = np.asarray(values, float).ravel()
     except (TypeError, ValueError) as error:
         raise TrajectoryError(
-            f"{argument} must hold numbers ({', '.join(names)}), got {values!r}. {_KEPT}"
+            f"{argument} must hold numbers ({', '.join(names)}), got {values!r}. {_NOT_RECORDED}"
         ) from error
     if len(row) != len(names):
         raise TrajectoryError(
@@ -276,7 +279,7 @@ def _row(argument: str, values: Any, names: list[str]) -> list[float]:
     if not np.isfinite(row).all():
         raise TrajectoryError(
             f"{argument} must be finite ({', '.join(names)}), got {values!r}: the file could not "
-            f"be loaded. Where a measurement is missing, begin a new episode after it: start(obs). "
-            f"{_KEPT}"
+            f"be loaded. If a measurement is missing, begin a new episode after it: start(obs). "
+            f"{_NOT_RECORDED}"
         )
     return row.tolist()

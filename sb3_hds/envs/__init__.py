@@ -1,7 +1,7 @@
 """
-Environments made of twins, and the way back: the twin that mirrors an environment.
+Environments made from twins, and the twins that mirror environments.
 
-Names are imported on first use, so that registering our ids costs neither jax nor torch.
+Names are imported on first use, so that registering our ids imports neither jax nor torch.
 """
 
 from typing import TYPE_CHECKING
@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 from sb3_hds.lazy import lazily
 
 if TYPE_CHECKING:
-    from sb3_hds.envs.constant_reward import ConstantReward
-    from sb3_hds.envs.elastic_quadruped import ElasticQuadruped
     from sb3_hds.envs.ground_truth import true_twin
-    from sb3_hds.envs.inverted_pendulum_friction import InvertedPendulumFriction
     from sb3_hds.envs.mirror import check_mirrors, twin_of
-    from sb3_hds.envs.pendulum_real import PendulumReal
     from sb3_hds.envs.registration import register_environments
+    from sb3_hds.envs.tasks.constant_reward import ConstantReward
+    from sb3_hds.envs.tasks.elastic_quadruped import ElasticQuadruped
+    from sb3_hds.envs.tasks.inverted_pendulum_friction import InvertedPendulumFriction
+    from sb3_hds.envs.tasks.pendulum_real import PendulumReal
     from sb3_hds.envs.twin_env import TwinEnv
     from sb3_hds.envs.twin_vec_env import TwinVecEnv
     from sb3_hds.envs.verify import verify_mirror
@@ -37,12 +37,12 @@ __all__ = [
 lazily(
     __name__,
     {
-        "constant_reward": ("ConstantReward",),
-        "elastic_quadruped": ("ElasticQuadruped",),
+        "tasks.constant_reward": ("ConstantReward",),
+        "tasks.elastic_quadruped": ("ElasticQuadruped",),
         "ground_truth": ("true_twin",),
-        "inverted_pendulum_friction": ("InvertedPendulumFriction",),
+        "tasks.inverted_pendulum_friction": ("InvertedPendulumFriction",),
         "mirror": ("check_mirrors", "twin_of"),
-        "pendulum_real": ("PendulumReal",),
+        "tasks.pendulum_real": ("PendulumReal",),
         "registration": ("register_environments",),
         "twin_env": ("TwinEnv",),
         "twin_vec_env": ("TwinVecEnv",),

@@ -11,15 +11,15 @@ from sb3_hds.effects import (
     TorqueGain,
     ViscousFriction,
 )
-from sb3_hds.envs.inverted_pendulum_friction import InvertedPendulumFriction
-from sb3_hds.envs.pendulum_real import PendulumReal
+from sb3_hds.envs.tasks.inverted_pendulum_friction import InvertedPendulumFriction
+from sb3_hds.envs.tasks.pendulum_real import PendulumReal
 from sb3_hds.twins import registry
 
 
 def true_twin(env: Any) -> Twin:
     """
-    The true twin of an environment that stands in for hardware, hidden effects included: the upper
-    bound for any model. Sensor noise is not part of a twin.
+    The true twin of an environment that stands in for hardware, including its hidden effects: no
+    model can be better. Sensor noise is not part of a twin.
 
     :param env: ``sb3_hds/PendulumReal-v1`` or ``sb3_hds/InvertedPendulumFriction-v5``, wrapped or
         not
@@ -29,8 +29,9 @@ def true_twin(env: Any) -> Twin:
     bare = env.unwrapped
     if not isinstance(bare, PendulumReal | InvertedPendulumFriction):
         raise TypeError(
-            "The truth is known of sb3_hds/PendulumReal-v1 and sb3_hds/InvertedPendulumFriction-v5,"
-            f" not of {bare!r}. Build its twin yourself: twins.make(...).extend(...)."
+            "True twins are known for sb3_hds/PendulumReal-v1 and "
+            f"sb3_hds/InvertedPendulumFriction-v5, not for {bare!r}. Build its twin yourself: "
+            "twins.make(...).extend(...)."
         )
     twin = registry.from_env(env)
     hidden: list[tuple[float, float, Effect]]

@@ -1,9 +1,9 @@
 """
 The twin of an environment, whatever its vectorisation and wrappers.
 
-Neutral wrappers, which leave observations, actions and rewards alone, are skipped. Wrappers with a
-``twin_transform`` are put around the twin as well. All others are refused by name, because planning
-without them would be silently wrong.
+Neutral wrappers, which do not change observations, actions or rewards, are skipped. Wrappers with a
+``twin_transform`` are applied to the twin as well. Any other wrapper raises an error that names it,
+because planning without it would be silently wrong.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ from sb3_hds.envs.twin_vec_env import TwinVecEnv
 from sb3_hds.errors import EnvironmentMismatchError, NoTwinError
 from sb3_hds.twins import registry
 
-# Class name -> the package that it comes from. rl_zoo3 replaces Gymnasium's TimeLimit by its own.
+# Class name -> its package. rl_zoo3 replaces Gymnasium's TimeLimit by its own.
 _NEUTRAL = {
     "Autoreset": "gymnasium",
     "HumanRendering": "gymnasium",
@@ -46,7 +46,7 @@ _NEUTRAL = {
     "RenderCollection": "gymnasium",
     "TimeLimit": "gymnasium",
 }
-# VecNormalize is honoured by the learners themselves.
+# The learners apply VecNormalize themselves.
 _NEUTRAL_VEC = (VecCheckNan, VecMonitor, VecNormalize, VecVideoRecorder)
 
 # ``str(env)`` nests: <Monitor<TimeLimit<PendulumEnv<Pendulum-v1>>>>
@@ -60,13 +60,17 @@ def twin_of(env: gymnasium.Env | VecEnv) -> Twin:
 
     :param env: an environment or a vectorised one (in this process or in others), wrapped or not
     :return: its twin, with the parameters that the environment was made with
-    :raises EnvironmentMismatchError: for a wrapper not known to leave observations, actions and
-        rewards alone, for copies with different parameters, or for spaces that twins do not support
+    :raises EnvironmentMismatchError: for a wrapper that may change observations, actions or
+        rewards, for copies with different parameters, or for spaces that twins do not support
     :raises NoTwinError: if no twin is registered for it
     """
     if isinstance(env, VecEnv):
-        bare = _without_vec_wrappers(env)
-        twin = bare.twin if isinstance(bare, TwinVecEnv) else _agreed(_twins_of_copies(bare))
+        bare = env
+        while isinstance(bare, VecEnvWrapper):
+            if type(bare) not in _NEUTRAL_VEC:
+                raise _not_neutral_error(type(bare).__name__, "VecEnv wrapper")
+            bare = bare.venv
+        twin = bare.twin if isinstance(bare, TwinVecEnv) else _common_twin(_twins_of_copies(bare))
     elif isinstance(env, gymnasium.Env):
         twin = _twin_of_one(env)
     else:
@@ -79,11 +83,11 @@ def check_mirrors(env: gymnasium.Env | VecEnv, twin: Twin) -> None:
     """
     Check that a twin has the actions and the observations of an environment as wrapped.
 
-    Says nothing about what a step does: see :func:`~sb3_hds.envs.verify.verify_mirror`.
+    Steps are not compared: see :func:`~sb3_hds.envs.verify.verify_mirror`.
 
-    :param env: as the learner gets it
-    :param twin: for planning
-    :raises EnvironmentMismatchError: if actions are no bounded Box, or if sizes or limits differ
+    :param env: as the learner receives it
+    :param twin: used for planning
+    :raises EnvironmentMismatchError: if actions are not a bounded Box, or if sizes or limits differ
     """
     low, high = _action_limits(env.action_space)
     names = ", ".join(a.name for a in twin.actuators)
@@ -112,7 +116,7 @@ def check_mirrors(env: gymnasium.Env | VecEnv, twin: Twin) -> None:
 def _action_limits(space: spaces.Space) -> tuple[np.ndarray, np.ndarray]:
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise EnvironmentMismatchError(
-            "Planning follows derivatives with respect to the action, so actions must be a Box "
+            "Planning differentiates with respect to the action, so actions must be a Box "
             f"with one axis, got {space}. Use an environment with continuous actions."
         )
     if not space.is_bounded():
@@ -123,14 +127,6 @@ def _action_limits(space: spaces.Space) -> tuple[np.ndarray, np.ndarray]:
     return space.low.astype(np.float64), space.high.astype(np.float64)
 
 
-def _without_vec_wrappers(env: VecEnv) -> VecEnv:
-    while isinstance(env, VecEnvWrapper):
-        if type(env) not in _NEUTRAL_VEC:
-            raise _refused(type(env).__name__, "VecEnv wrapper")
-        env = env.venv
-    return env
-
-
 def _twin_of_one(env: gymnasium.Env) -> Twin:
     layer, transforms = env, []
     while isinstance(layer, gymnasium.Wrapper):
@@ -138,15 +134,15 @@ def _twin_of_one(env: gymnasium.Env) -> Twin:
         if isinstance(transform, StatefulTransform):
             transforms.append(transform)
         else:
-            _refuse_unless_neutral(type(layer).__name__, type(layer).__module__)
+            _check_neutral(type(layer).__name__, type(layer).__module__)
         layer = layer.env
     _action_limits(env.action_space)
     twin = layer.twin if isinstance(layer, TwinEnv) else registry.from_env(layer)
-    return _behind(twin, transforms)
+    return _transformed(twin, transforms)
 
 
-def _behind(twin: Twin, transforms: Iterable[StatefulTransform]) -> Twin:
-    """:return: the twin as seen through wrappers, the outermost first"""
+def _transformed(twin: Twin, transforms: Iterable[StatefulTransform]) -> Twin:
+    """:param transforms: of the wrappers, the outermost first"""
     for transform in reversed(list(transforms)):
         twin = TransformedTwin(twin, stateful=transform)
     return twin
@@ -156,78 +152,66 @@ def _twins_of_copies(env: VecEnv) -> list[Twin]:
     """The twin of each copy in this process (``DummyVecEnv``) or another (``SubprocVecEnv``)."""
     if isinstance(env, DummyVecEnv):
         return [_twin_of_one(copy) for copy in env.envs]
-    layers = _layers_of(env)
-    specs = _specs_of(env, {name for copy in layers for name, _ in copy})
-    _action_limits(env.action_space)
-    own = env.get_attr("twin") if env.has_attr("twin") else []
-    bare = own if own and all(isinstance(t, Twin) for t in own) else map(_twin_of_spec, specs)
-    return [
-        _behind(twin, (transform for _, transform in copy))
-        for twin, copy in zip(bare, layers, strict=True)
-    ]
-
-
-def _layers_of(env: VecEnv) -> list[list[tuple[str, StatefulTransform]]]:
-    """
-    The wrappers with a twin transform of each copy in another process, the outermost first.
-
-    :raises EnvironmentMismatchError: for a wrapper neither neutral nor among them
-    :raises NoTwinError: if the wrappers of the copies are unknown
-    """
-    with _telling(env):
-        named = [_wrappers_in(text) for text in env.env_method("__str__")]
-        if not env.has_attr("twin_transforms"):
-            layers_of_copies: list[list[tuple[str, StatefulTransform]]] = [[] for _ in named]
-        else:
-            layers_of_copies = env.get_attr("twin_transforms")
-    for names, layers in zip(named, layers_of_copies, strict=True):
-        left = iter([name for name, _ in layers] + [None])
-        following = next(left)
-        for name in names:
-            if name == following:
-                following = next(left)
-            else:
-                _refuse_unless_neutral(name)
-    return layers_of_copies
-
-
-def _specs_of(env: VecEnv, transformed: set[str]) -> list[EnvSpec | None]:
-    """
-    How the copies in other processes were made. Ask for :func:`_layers_of` before: a spec holds the
-    arguments of wrappers, and sending a lambda kills the process.
-
-    :param transformed: names of wrappers with a twin transform
-    :raises EnvironmentMismatchError: for another wrapper that is not neutral
-    :raises NoTwinError: if the copies have no spec
-    """
-    with _telling(env):
+    layers = _transforms_of(env)
+    transformed = {name for copy in layers for name, _ in copy}
+    # Only after that check: a spec contains the arguments of wrappers, and sending a lambda kills
+    # the process.
+    with _no_twin_errors(env):
         specs = env.get_attr("spec")
     for spec in specs:
         for wrapper in spec.additional_wrappers if spec is not None else ():
             if wrapper.name not in transformed:
-                _refuse_unless_neutral(wrapper.name, wrapper.entry_point)
-    return specs
+                _check_neutral(wrapper.name, wrapper.entry_point)
+    _action_limits(env.action_space)
+    own = env.get_attr("twin") if env.has_attr("twin") else []
+    bare = own if own and all(isinstance(t, Twin) for t in own) else map(_twin_of_spec, specs)
+    return [
+        _transformed(twin, (transform for _, transform in copy))
+        for twin, copy in zip(bare, layers, strict=True)
+    ]
+
+
+def _transforms_of(env: VecEnv) -> list[list[tuple[str, StatefulTransform]]]:
+    """
+    Names and transforms of the wrappers with a twin transform, for each copy in another process,
+    the outermost first.
+
+    :raises EnvironmentMismatchError: for a wrapper that is neither neutral nor has a twin transform
+    :raises NoTwinError: if the wrappers of the copies are unknown
+    """
+    with _no_twin_errors(env):
+        named = [_wrapper_names(text) for text in env.env_method("__str__")]
+        has_transforms = env.has_attr("twin_transforms")
+        copies = env.get_attr("twin_transforms") if has_transforms else [[] for _ in named]
+    for names, layers in zip(named, copies, strict=True):
+        expected = [name for name, _ in layers]
+        for name in names:
+            if expected[:1] == [name]:
+                del expected[0]
+            else:
+                _check_neutral(name)
+    return copies
 
 
 @contextlib.contextmanager
-def _telling(env: VecEnv) -> Iterator[None]:
+def _no_twin_errors(env: VecEnv) -> Iterator[None]:
     try:
         yield
     except (AttributeError, NotImplementedError, EOFError, ConnectionError) as error:
         raise NoTwinError(
-            f"{type(env).__name__} does not tell how its environments were made ({error!r}). "
+            f"{type(env).__name__} does not reveal how its environments were made ({error!r}). "
             "Pass twin=."
         ) from error
 
 
-def _wrappers_in(text: str) -> list[str]:
+def _wrapper_names(text: str) -> list[str]:
     """:return: class names of the wrappers in ``str(env)``, outermost first"""
     enclosing = _ENCLOSING.findall(text)
     return enclosing if _WITHOUT_ID.search(text) else enclosing[:-1]
 
 
 def _twin_of_spec(spec: EnvSpec | None) -> Twin:
-    """Make the bare environment here, to read the parameters of its copy elsewhere."""
+    """Make the bare environment in this process to read its parameters."""
     if spec is None:
         raise NoTwinError(
             "The environments in other processes were not made by gymnasium.make, so their "
@@ -245,43 +229,40 @@ def _twin_of_spec(spec: EnvSpec | None) -> Twin:
         env.close()
 
 
-def _agreed(copies: Sequence[Twin]) -> Twin:
+def _common_twin(copies: Sequence[Twin]) -> Twin:
     """
     :return: the twin of all copies
     :raises EnvironmentMismatchError: if they differ
     """
     first = copies[0]
     for i, other in enumerate(copies[1:], 1):
-        if other != first:
-            raise _differing(i, [f"{first!r} and {other!r}"])
-        differing = [
-            f"{name} is {value:g} and {other.values[name]:g} {first.parameters[name].unit}"
-            for name, value in first.values.items()
-            if other.values[name] != value
-        ]
-        if differing:
-            raise _differing(i, differing)
+        differences = [f"{first!r} and {other!r}"]
+        if other == first:
+            differences = [
+                f"{name} is {value:g} and {other.values[name]:g} {first.parameters[name].unit}"
+                for name, value in first.values.items()
+                if other.values[name] != value
+            ]
+        if differences:
+            raise EnvironmentMismatchError(
+                f"The copies 0 and {i} of the vectorised environment differ: "
+                f"{', '.join(differences)}. One twin cannot mirror both: make all copies with the "
+                "same arguments, or pass twin=."
+            )
     return first
 
 
-def _differing(index: int, differences: Iterable[str]) -> EnvironmentMismatchError:
-    return EnvironmentMismatchError(
-        f"The copies 0 and {index} of the vectorised environment differ: {', '.join(differences)}. "
-        "One twin cannot mirror both: make all copies with the same arguments, or pass twin=."
-    )
-
-
-def _refuse_unless_neutral(name: str, origin: str | None = None) -> None:
+def _check_neutral(name: str, origin: str | None = None) -> None:
     """
     :param origin: module or entry point of the wrapper; None where only its name is known
     :raises EnvironmentMismatchError: for a wrapper not known to be neutral
     """
     package = origin.split(".")[0].split(":")[0] if origin is not None else _NEUTRAL.get(name)
     if package is None or _NEUTRAL.get(name) != package:
-        raise _refused(name, "wrapper")
+        raise _not_neutral_error(name, "wrapper")
 
 
-def _refused(name: str, kind: str) -> EnvironmentMismatchError:
+def _not_neutral_error(name: str, kind: str) -> EnvironmentMismatchError:
     return EnvironmentMismatchError(
         f"The {kind} {name} may change observations, actions or rewards, so no registered twin "
         "mirrors the environment as wrapped. Remove it, or pass a twin= that simulates the wrapped "

@@ -2,7 +2,7 @@
 The compiled programs of the environments.
 
 Values of parameters are arguments, so all environments of equal twins share one compilation. States
-travel as numpy arrays: they pickle, they copy, and they belong to no device.
+are returned as numpy arrays, which can be pickled and copied and belong to no device.
 """
 
 import functools
@@ -17,12 +17,12 @@ from sb3_hds.core import Params, State, Twin
 
 class Transition(NamedTuple):
     """
-    The result of one step of a twin; with a leading axis for several copies.
+    The result of one step of a twin, with a leading axis for several copies.
 
     :param state: after the step
     :param obs: observation of that state
     :param reward: of this step
-    :param terminated: whether the task ends in that state
+    :param terminated: whether that state is terminal
     """
 
     state: State
@@ -33,12 +33,12 @@ class Transition(NamedTuple):
 
 class BatchTransition(NamedTuple):
     """
-    The result of one step of many copies; those that ended have restarted.
+    The result of one step of many copies; those whose episode ended have been reset.
 
     :param state: at the start of the next step, leading axis ``n_envs``
     :param obs: observation of that state, ``(n_envs, n_obs)``
     :param elapsed: steps since the start of each episode, ``(n_envs,)``
-    :param ended: the step itself, before any restart
+    :param ended: the step itself, before any reset
     :param truncated: whether the step limit was reached, ``(n_envs,)``
     """
 
@@ -51,47 +51,33 @@ class BatchTransition(NamedTuple):
 
 class Programs(NamedTuple):
     """
+    Compiled functions of a twin: for one copy, or for many, with a leading axis ``n_envs``.
+
     :param draw: ``(seed, params) -> state`` at the start of an episode
     :param observe: ``(state, params) -> obs``
     :param sketch: ``(state, params) -> points``
-    :param step: ``(state, action, params) -> Transition``
+    :param step: for one copy ``(state, action, params) -> Transition``; for many ``(states,
+        elapsed, actions, seeds, limit, params) -> BatchTransition``, where ``seeds`` are those of
+        the episodes that begin if a copy ends
     """
 
     draw: Callable[..., State]
     observe: Callable[..., Any]
     sketch: Callable[..., Any]
-    step: Callable[..., Transition]
-
-
-class BatchPrograms(NamedTuple):
-    """
-    :param draw: ``(seeds, params) -> states``
-    :param observe: ``(states, params) -> obs``
-    :param sketch: ``(states, params) -> points``
-    :param step: ``(states, elapsed, actions, seeds, limit, params) -> BatchTransition``, where
-        ``seeds`` are those of the episodes that begin if a copy ends
-    """
-
-    draw: Callable[..., State]
-    observe: Callable[..., Any]
-    sketch: Callable[..., Any]
-    step: Callable[..., BatchTransition]
+    step: Callable[..., Any]
 
 
 @functools.lru_cache(maxsize=64)
 def for_one(twin: Twin) -> Programs:
     """:return: the programs of a single copy"""
-    pure = _pure(twin)
-    return Programs(*(jax.jit(function) for function in pure))
+    return Programs(*map(jax.jit, _pure(twin)))
 
 
 @functools.lru_cache(maxsize=64)
-def for_many(twin: Twin) -> BatchPrograms:
+def for_many(twin: Twin) -> Programs:
     """:return: the programs of any number of copies that share their parameters"""
     pure = _pure(twin)
-    draw = jax.vmap(pure.draw, (0, None))
-    observe = jax.vmap(pure.observe, (0, None))
-    sketch = jax.vmap(pure.sketch, (0, None))
+    draw, observe, sketch = (jax.vmap(function, (0, None)) for function in pure[:3])
     transition = jax.vmap(pure.step, (0, 0, None))
 
     def step(
@@ -102,17 +88,19 @@ def for_many(twin: Twin) -> BatchPrograms:
         truncated = elapsed >= limit
         done = ended.terminated | truncated
 
-        def restart() -> tuple[State, Any]:
+        def reset() -> tuple[State, Any]:
+            def where_done(new: Any, old: Any) -> Any:
+                return jnp.where(done.reshape(done.shape + (1,) * (new.ndim - 1)), new, old)
+
             fresh = draw(seeds, params)
-            pick = functools.partial(_where, done)
             start = fresh, observe(fresh, params)
-            return jax.tree.map(pick, start, (ended.state, ended.obs))
+            return jax.tree.map(where_done, start, (ended.state, ended.obs))
 
         # Outside vmap, so drawing costs nothing in the many steps in which no copy ends.
-        state, obs = jax.lax.cond(jnp.any(done), restart, lambda: (ended.state, ended.obs))
+        state, obs = jax.lax.cond(jnp.any(done), reset, lambda: (ended.state, ended.obs))
         return BatchTransition(state, obs, jnp.where(done, 0, elapsed), ended, truncated)
 
-    return BatchPrograms(*(jax.jit(function) for function in (draw, observe, sketch, step)))
+    return Programs(*map(jax.jit, (draw, observe, sketch, step)))
 
 
 def _pure(twin: Twin) -> Programs:
@@ -127,7 +115,3 @@ def _pure(twin: Twin) -> Programs:
         )
 
     return Programs(draw, twin.observe, twin.sketch, step)
-
-
-def _where(done: Any, new: Any, old: Any) -> Any:
-    return jnp.where(done.reshape(done.shape + (1,) * (new.ndim - 1)), new, old)

@@ -11,11 +11,11 @@ from sb3_hds.envs import programs
 _PIXELS = 400
 _DPI = 100
 _N_POSES = 64
-# Beyond so many points a polyline is a curve, not rods between joints.
+# With more points, the polyline is a curve rather than rods between joints.
 _MAX_JOINTS = 12
 _MARGIN = 1.15
-# A system on a slider needs room to travel: so much more than its own extent is shown.
-_ROOM_TO_TRAVEL = 1.8
+# Size of the window of a system on a slider, which needs room to travel, relative to a fixed one.
+_TRAVEL_FACTOR = 1.8
 _LINE_COLOUR, _JOINT_COLOUR, _PAPER_COLOUR, _GRID_COLOUR = (
     "#27496d",
     "#d1495b",
@@ -38,7 +38,7 @@ class View(NamedTuple):
     half: float
 
     def following(self, points: np.ndarray) -> "View":
-        """:return: this window, moved just far enough to show ``points``, at the same scale"""
+        """:return: this window at the same scale, moved just far enough to show ``points``"""
         room = self.half / _MARGIN
         x, y = (
             centre + max(0.0, along.max() - centre - room) + min(0.0, along.min() - centre + room)
@@ -49,20 +49,23 @@ class View(NamedTuple):
 
 def view_of(twin: Twin) -> View:
     """
-    A window that holds the twin at its start states, with every hinge turned all the way.
+    A window that contains the twin at its start states, with every hinge at any angle.
 
-    :param twin: drawn with its current values
+    :param twin: drawn with its current parameter values
     :return: the window
     """
     seeds = np.arange(_N_POSES, dtype=np.uint32)
     start: State = jax.device_get(programs.for_many(twin).draw(seeds, twin.params))
-    poses = _turned(twin, np.array(start.q))
-    low, high = _outline(twin, start._replace(q=poses))
+    poses = _with_hinges_turned(twin, np.array(start.q))
+    low, high = _extremes(twin, start._replace(q=poses))
     extent = float((high - low).max())
-    shifted = _outline(twin, start._replace(q=_slid(twin, poses, 0.01 * extent)))
+    # Whether sliders move the drawing.
+    shifted = _extremes(
+        twin, start._replace(q=poses + 0.01 * extent * _coordinates_in(twin, "m", poses))
+    )
     roams = not np.allclose((low, high), shifted, rtol=0.0, atol=1e-3 * extent)
     x, y = (low + high) / 2.0
-    half = 0.5 * extent * _MARGIN * (_ROOM_TO_TRAVEL if roams else 1.0)
+    half = 0.5 * extent * _MARGIN * (_TRAVEL_FACTOR if roams else 1.0)
     return View(float(x), float(y), max(half, 1e-3))
 
 
@@ -70,7 +73,7 @@ class Canvas:
     """
     Draws frames with matplotlib's Agg backend; opens no window.
 
-    :param view: what is shown; moves along where the drawing leaves it
+    :param view: the window; follows a drawing that leaves it
     """
 
     def __init__(self, view: View) -> None:
@@ -108,26 +111,21 @@ class Canvas:
         return np.array(self._agg.buffer_rgba())[..., :3].copy()
 
 
-def _outline(twin: Twin, poses: State) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest coordinates [m] of all drawings."""
+def _extremes(twin: Twin, poses: State) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest coordinates of all drawings [m]."""
     sketches = programs.for_many(twin).sketch(poses, twin.params)
     points = np.asarray(sketches, np.float64).reshape(-1, 2)
     return points.min(0), points.max(0)
 
 
-def _turned(twin: Twin, q: np.ndarray) -> np.ndarray:
-    """Turn every hinge through the full circle, each at a different rate over the poses."""
+def _with_hinges_turned(twin: Twin, q: np.ndarray) -> np.ndarray:
+    """Turn every hinge through full circles over the poses, each at a different rate."""
     turn = 2.0 * np.pi * np.arange(len(q))[:, None] / len(q)
-    return np.where(_are(twin, "rad", q), turn * np.arange(1, q.shape[1] + 1), q)
+    return np.where(_coordinates_in(twin, "rad", q), turn * np.arange(1, q.shape[1] + 1), q)
 
 
-def _slid(twin: Twin, q: np.ndarray, shift: float) -> np.ndarray:
-    """Move every slider by ``shift`` [m]."""
-    return q + shift * _are(twin, "m", q)
-
-
-def _are(twin: Twin, unit: str, q: np.ndarray) -> np.ndarray:
-    """Which coordinates have this unit; none where a joint has several coordinates."""
+def _coordinates_in(twin: Twin, unit: str, q: np.ndarray) -> np.ndarray:
+    """Which coordinates have this unit; none if a joint has several coordinates."""
     if q.shape[1] != len(twin.joints):
         return np.zeros(q.shape[1], bool)
     return np.array([joint.unit == unit for joint in twin.joints])

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from sb3_hds.core import Actuator, Channel, State, Twin
 from sb3_hds.core.contract import check_methods
 from sb3_hds.envs import programs
-from sb3_hds.envs.validation import check_action, check_start, start_of
+from sb3_hds.envs.validation import check_action, check_start, start_state
 from sb3_hds.twins import registry
 
 _RENDER_MODES = ["rgb_array"]
@@ -23,8 +23,8 @@ class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """
     A twin as an environment: its ``initial``, ``step``, ``observe``, ``reward``, ``terminated``.
 
-    Has no time limit of its own; ``gymnasium.make`` of a registered id adds it. Steps are computed
-    on the host, where a single copy steps fastest. They are deterministic: all randomness is in
+    Has no time limit of its own; ``gymnasium.make`` of a registered id adds one. Steps are computed
+    on the CPU, where a single copy steps fastest. They are deterministic: all randomness is in
     ``reset``.
 
     :param twin: a twin, or the name or environment id under which one is registered
@@ -47,8 +47,8 @@ class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.twin = twin_from(twin, settings)
         self.render_mode = check_render_mode(render_mode)
         self.metadata = metadata_of(self.twin)
-        self.observation_space = observation_space(self.twin)
-        self.action_space = action_space(self.twin)
+        self.observation_space = box_of(self.twin.channels)
+        self.action_space = box_of(self.twin.actuators)
         self._state: State | None = None
         self._canvas: Any = None
 
@@ -72,17 +72,17 @@ class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Begin an episode.
 
         :param seed: restarts the sequence of start states; None continues it
-        :param options: ``{"state": (q, v)}`` begins there instead, in the units of the joints
+        :param options: ``{"state": (q, v)}`` sets the start state, in the units of the joints
         :return: observation of shape ``(n_obs,)``, empty info
-        :raises ValueError: for an unknown option, or a state of wrong size, not finite, or out of
-            the observation space
+        :raises ValueError: for an unknown option, or a state of the wrong size, not finite, or
+            outside the observation space
         """
         super().reset(seed=seed)
         run, params = programs.for_one(self.twin), self.twin.params
-        with _host():
+        with _on_cpu():
             drawn = run.draw(draw_seed(self.np_random), params)
-            state = jax.device_get(start_of(self.twin, drawn, options))
-            obs = _as_observation(run.observe(state, params))
+            state = jax.device_get(start_state(self.twin, drawn, options))
+            obs = np.array(run.observe(state, params), np.float32)
         check_start(self.twin, self.observation_space, obs, options)
         self._state = state
         return obs, {}
@@ -96,10 +96,10 @@ class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         :raises ValueError: for an action of the wrong shape or not finite
         """
         action = check_action(self.twin, action, self.action_space.shape)
-        with _host():
+        with _on_cpu():
             after = programs.for_one(self.twin).step(self.state, action, self.twin.params)
             self._state, obs, reward, terminated = jax.device_get(after)
-        return _as_observation(obs), float(reward), bool(terminated), False, {}
+        return np.array(obs, np.float32), float(reward), bool(terminated), False, {}
 
     def render(self) -> np.ndarray | None:
         """:return: an RGB image, uint8, shape ``(400, 400, 3)``; None without a render mode"""
@@ -111,7 +111,7 @@ class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             return None
         from sb3_hds.envs.rendering import Canvas, view_of
 
-        with _host():
+        with _on_cpu():
             if self._canvas is None:
                 self._canvas = Canvas(view_of(self.twin))
             points = programs.for_one(self.twin).sketch(self.state, self.twin.params)
@@ -127,7 +127,7 @@ class TwinEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 def twin_from(twin: Twin | str, settings: Mapping[str, Any]) -> Twin:
     """
     :return: the twin with ``settings``
-    :raises TypeError: for neither a twin nor a name
+    :raises TypeError: for anything but a twin or a name
     :raises TwinError: for a twin whose methods return the wrong type, shape or dtype
     """
     if isinstance(twin, Twin):
@@ -142,7 +142,7 @@ def twin_from(twin: Twin | str, settings: Mapping[str, Any]) -> Twin:
 
 
 def check_render_mode(mode: str | None) -> str | None:
-    """:raises ValueError: for a render mode that twins do not have"""
+    """:raises ValueError: for a render mode that twins do not support"""
     if mode is not None and mode not in _RENDER_MODES:
         raise ValueError(
             f"Twins render with render_mode='rgb_array' or None, got {mode!r}. "
@@ -156,14 +156,10 @@ def metadata_of(twin: Twin) -> dict[str, Any]:
     return {"render_modes": list(_RENDER_MODES), "render_fps": max(1, round(1.0 / twin.dt))}
 
 
-def observation_space(twin: Twin) -> spaces.Box:
-    """:return: the bounds of the twin's channels"""
-    return _box(twin.channels)
-
-
-def action_space(twin: Twin) -> spaces.Box:
-    """:return: the bounds of the twin's actuators"""
-    return _box(twin.actuators)
+def box_of(signals: Sequence[Actuator | Channel]) -> spaces.Box:
+    """:return: the space of a twin's observations or actions, with the bounds of its signals"""
+    low, high = np.array([(signal.low, signal.high) for signal in signals], np.float32).T
+    return spaces.Box(low, high)
 
 
 def draw_seed(generator: np.random.Generator) -> np.uint32:
@@ -171,23 +167,14 @@ def draw_seed(generator: np.random.Generator) -> np.uint32:
     return generator.integers(2**32, dtype=np.uint32)
 
 
-def _box(signals: Sequence[Actuator | Channel]) -> spaces.Box:
-    low, high = np.array([(signal.low, signal.high) for signal in signals], np.float32).T
-    return spaces.Box(low, high)
-
-
-def _as_observation(obs: Any) -> np.ndarray:
-    return np.array(obs, np.float32)
-
-
-def _host() -> contextlib.AbstractContextManager[None]:
+def _on_cpu() -> contextlib.AbstractContextManager[None]:
     """Compute on the CPU, even if JAX has an accelerator."""
-    return jax.default_device(_cpu())
+    return jax.default_device(_cpu_device())
 
 
 @functools.cache
-def _cpu() -> Any:
-    """:return: None where JAX was configured without a CPU; then the default device is used"""
+def _cpu_device() -> Any:
+    """:return: None if JAX was configured without a CPU, which selects the default device"""
     try:
         return jax.local_devices(backend="cpu")[0]
     except RuntimeError:

@@ -8,21 +8,13 @@ import gymnasium
 import jax
 import numpy as np
 from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 
 from sb3_hds.core import State, Twin
 from sb3_hds.envs import programs
-from sb3_hds.envs.twin_env import (
-    action_space,
-    check_render_mode,
-    draw_seed,
-    metadata_of,
-    observation_space,
-    twin_from,
-)
-from sb3_hds.envs.validation import check_action, check_start, start_of
+from sb3_hds.envs.twin_env import box_of, check_render_mode, draw_seed, metadata_of, twin_from
+from sb3_hds.envs.validation import check_action, check_start, start_state
 
 _NO_LIMIT = np.iinfo(np.int32).max
 
@@ -31,12 +23,12 @@ class TwinVecEnv(VecEnv):
     """
     Copies of a twin that step together in one compiled call.
 
-    Equivalent to a ``DummyVecEnv`` of ``TwinEnv`` under a ``TimeLimit``: the same seeds give the
-    same start states, and steps differ by rounding only. A copy that ends restarts
-    in the same call; its last observation is ``infos[i]["terminal_observation"]``.
+    Equivalent to a ``DummyVecEnv`` of ``TwinEnv`` with a ``TimeLimit``: the same seeds give the
+    same start states, and steps differ only by rounding. A copy whose episode ends is reset in the
+    same call; its last observation is ``infos[i]["terminal_observation"]``.
 
-    The copies share their parameters, and have no environments of their own: attributes are read
-    from, and written to, all of them at once.
+    The copies share their parameters and are not separate environments: attributes are read and
+    written for all of them at once.
 
     :param twin: a twin, or the name or environment id under which one is registered
     :param n_envs: number of copies
@@ -64,14 +56,14 @@ class TwinVecEnv(VecEnv):
         **settings: Any,
     ) -> None:
         self.twin = twin_from(twin, settings)
-        self.spec = _spec_of(self.twin)
-        self.max_episode_steps = _limit(self.twin, max_episode_steps)
+        self.spec = gymnasium.registry.get(self.twin.env_id) if self.twin.env_id else None
+        self.max_episode_steps = _step_limit(self.twin, max_episode_steps)
         if n_envs < 1:
             raise ValueError(
                 f"A vectorised environment needs at least one copy, got n_envs={n_envs}."
             )
         self.render_mode = check_render_mode(render_mode)
-        super().__init__(n_envs, observation_space(self.twin), action_space(self.twin))
+        super().__init__(n_envs, box_of(self.twin.channels), box_of(self.twin.actuators))
         self.metadata = metadata_of(self.twin)
         self._generators = [seeding.np_random(None)[0] for _ in range(n_envs)]
         self._next_seeds = np.zeros(n_envs, np.uint32)
@@ -84,7 +76,7 @@ class TwinVecEnv(VecEnv):
     @property
     def states(self) -> State:
         """
-        The current states, memory included; leading axis ``n_envs``.
+        The current states, memory included, with a leading axis ``n_envs``.
 
         :raises gymnasium.error.ResetNeeded: before the first reset
         """
@@ -99,7 +91,7 @@ class TwinVecEnv(VecEnv):
         Begin an episode in every copy.
 
         :return: observations, shape ``(n_envs, n_obs)``
-        :raises ValueError: for options that ``TwinEnv.reset`` refuses
+        :raises ValueError: for options that ``TwinEnv.reset`` rejects
         """
         seeds, options = self._seeds, self._options
         self._reset_seeds()
@@ -110,7 +102,7 @@ class TwinVecEnv(VecEnv):
                 self._draw_seeds([i])
         run, params = programs.for_many(self.twin), self.twin.params
         drawn = jax.device_get(run.draw(self._next_seeds, params))
-        states = _start_of_each(self.twin, drawn, options)
+        states = _start_states(self.twin, drawn, options)
         obs = np.array(run.observe(states, params), np.float32)
         for row, wanted in zip(obs, options, strict=True):
             check_start(self.twin, self.observation_space, row, wanted)
@@ -145,9 +137,8 @@ class TwinVecEnv(VecEnv):
         self._states, self._elapsed = after.state, after.elapsed
         only_truncated = after.truncated & ~after.ended.terminated
         dones = after.truncated | after.ended.terminated
-        infos: list[dict[str, Any]] = [
-            {"TimeLimit.truncated": cut} for cut in only_truncated.tolist()
-        ]
+        infos: list[dict[str, Any]]
+        infos = [{"TimeLimit.truncated": truncated} for truncated in only_truncated.tolist()]
         ended = np.flatnonzero(dones).tolist()
         for i in ended:
             infos[i]["terminal_observation"] = np.array(after.ended.obs[i], np.float32)
@@ -160,7 +151,7 @@ class TwinVecEnv(VecEnv):
         self._canvas = None
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """:return: an RGB image of each copy, as ``TwinEnv.render`` gives; None without a mode"""
+        """:return: an RGB image of each copy, as from ``TwinEnv.render``; None without a mode"""
         if self.render_mode is None:
             warnings.warn('There are no images without render_mode="rgb_array".')
             return [None] * self.num_envs
@@ -172,11 +163,11 @@ class TwinVecEnv(VecEnv):
         return [self._canvas.draw(points) for points in np.asarray(sketches)]
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """:return: the attribute of the whole, once for each copy asked for"""
+        """:return: the shared attribute, once for each requested copy"""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """:raises ValueError: for a part of the copies: they share their attributes"""
+        """:raises ValueError: for only some of the copies: they share their attributes"""
         if set(self._get_indices(indices)) != set(range(self.num_envs)):
             raise ValueError(
                 f"The copies of a TwinVecEnv share '{attr_name}'. Set it for all (indices=None), "
@@ -191,37 +182,37 @@ class TwinVecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """:raises AttributeError: always: the copies are no environments of their own"""
+        """:raises AttributeError: always: the copies are not separate environments"""
         raise AttributeError(
-            f"The copies of a TwinVecEnv are no separate environments, so '{method_name}' cannot "
+            f"The copies of a TwinVecEnv are not separate environments, so '{method_name}' cannot "
             "be called on them. Use DummyVecEnv of several TwinEnv."
         )
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """:return: False for each copy asked for: they cannot be wrapped one by one"""
+        """:return: False for each requested copy: they cannot be wrapped one by one"""
         return [False for _ in self._get_indices(indices)]
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_canvas": None}
 
     def _draw_seeds(self, indices: Sequence[int]) -> None:
-        """Choose the seeds of the episodes that begin next, as ``TwinEnv`` would at its reset."""
+        """Draw the seeds of the next episodes, as ``TwinEnv.reset`` would."""
         for i in indices:
             self._next_seeds[i] = draw_seed(self._generators[i])
 
 
-def _start_of_each(twin: Twin, drawn: State, options: Sequence[dict[str, Any]]) -> State:
-    """Put the copies with options where these want them."""
+def _start_states(twin: Twin, drawn: State, options: Sequence[dict[str, Any]]) -> State:
+    """The drawn start states, or those that the options of a copy set."""
     q, v = np.array(drawn.q), np.array(drawn.v)
     for i, wanted in enumerate(options):
-        one = start_of(twin, State(q[i], v[i], {}), wanted)
+        one = start_state(twin, State(q[i], v[i], {}), wanted)
         q[i], v[i] = one.q, one.v
     return drawn._replace(q=q, v=v)
 
 
-def _limit(twin: Twin, max_episode_steps: int | None) -> int:
+def _step_limit(twin: Twin, max_episode_steps: int | None) -> int:
     limit = twin.max_episode_steps if max_episode_steps is None else max_episode_steps
     if limit is None or limit == -1:
         return _NO_LIMIT
@@ -231,7 +222,3 @@ def _limit(twin: Twin, max_episode_steps: int | None) -> int:
             f"({twin.max_episode_steps}); got {max_episode_steps}."
         )
     return limit
-
-
-def _spec_of(twin: Twin) -> EnvSpec | None:
-    return gymnasium.registry.get(twin.env_id) if twin.env_id else None

@@ -11,7 +11,7 @@ from sb3_hds.core import State, Twin
 
 def check_action(twin: Twin, action: Any, shape: tuple[int, ...]) -> np.ndarray:
     """
-    :param shape: ``(n_act,)``, or ``(n_envs, n_act)`` where several copies act
+    :param shape: ``(n_act,)``, or ``(n_envs, n_act)`` for several copies
     :return: the action as float32
     :raises ValueError: for another shape, or numbers that are not finite
     """
@@ -26,29 +26,34 @@ def check_action(twin: Twin, action: Any, shape: tuple[int, ...]) -> np.ndarray:
     return action
 
 
-def start_of(twin: Twin, drawn: State, options: Mapping[str, Any] | None) -> State:
+def start_state(twin: Twin, drawn: State, options: Mapping[str, Any] | None) -> State:
     """
-    The state that ``options`` ask for.
+    The state that the episode starts from.
 
-    :param drawn: what the episode would begin with; gives the memory of attached effects
+    :param drawn: random start state; used without ``options``, and for the memory of effects
     :param options: None, empty, or ``{"state": (q, v)}``
     :raises ValueError: for an unknown option, or a state of the wrong size or not finite
     """
     unknown = set(options or ()) - {"state"}
     if unknown:
         raise ValueError(
-            f"{twin.name} knows one option of reset(), 'state'; got {sorted(map(str, unknown))}."
+            f"The only option of reset() of {twin.name} is 'state', got "
+            f"{sorted(map(str, unknown))}."
         )
     if not options:
         return drawn
     try:
         q, v = (np.array(part, drawn.q.dtype).reshape(-1) for part in options["state"])
+        fits = q.shape == drawn.q.shape and v.shape == drawn.v.shape
+        if not (fits and np.isfinite(q).all() and np.isfinite(v).all()):
+            raise ValueError
     except (TypeError, ValueError):
-        raise ValueError(_expected(twin, drawn, options["state"])) from None
-    if q.shape != drawn.q.shape or v.shape != drawn.v.shape:
-        raise ValueError(_expected(twin, drawn, options["state"]))
-    if not (np.isfinite(q).all() and np.isfinite(v).all()):
-        raise ValueError(_expected(twin, drawn, options["state"]))
+        joints = ", ".join(f"{joint.name} [{joint.unit}]" for joint in twin.joints)
+        raise ValueError(
+            f"reset(options={{'state': (q, v)}}) of {twin.name} takes {drawn.q.size} finite "
+            f"positions and {drawn.v.size} finite velocities ({joints}), got "
+            f"{options['state']!r}."
+        ) from None
     return drawn._replace(q=q, v=v)
 
 
@@ -66,11 +71,3 @@ def check_start(
             f"reset(options={{'state': ...}}) of {twin.name} leaves the observation space: "
             f"{', '.join(outside)}."
         )
-
-
-def _expected(twin: Twin, drawn: State, got: Any) -> str:
-    joints = ", ".join(f"{joint.name} [{joint.unit}]" for joint in twin.joints)
-    return (
-        f"reset(options={{'state': (q, v)}}) of {twin.name} takes {drawn.q.size} finite positions "
-        f"and {drawn.v.size} finite velocities ({joints}), got {got!r}."
-    )

@@ -14,8 +14,8 @@ from sb3_hds.core import Action, Obs, Params, Twin
 from sb3_hds.envs.mirror import check_mirrors
 from sb3_hds.errors import EnvironmentMismatchError
 
-# Random steps after which hidden parts of a state, if there are any, have come to differ from zero.
-_STEPS_TO_HIDE = 5
+# Random steps after which hidden parts of a state, if there are any, differ from zero.
+_STEPS_BEFORE = 5
 
 
 def verify_mirror(
@@ -25,25 +25,25 @@ def verify_mirror(
     Check a twin against its environment, one step at a time, with random actions.
 
     Each step starts from the state that the twin infers from the environment's observation, so
-    errors do not add up. The next observation and the reward are compared relative to
-    ``1 + |value|``; a step that ends the episode in one and not in the other is an error of 1.
+    errors do not accumulate. The next observation and the reward are compared relative to
+    ``1 + |value|``; a step that ends the episode in only one of them counts as an error of 1.
 
     :param env: the environment, wrapped or not; it is reset and stepped
-    :param twin: of the environment
-    :param steps: how many steps are compared
-    :param tolerance: largest error that passes. Observations are single precision, which a step may
-        magnify; hence the default.
+    :param twin: supposed to mirror the environment
+    :param steps: number of steps that are compared
+    :param tolerance: largest error that passes. The default allows for rounding: observations are
+        single precision, and a step may amplify their errors.
     :param seed: of the environment's resets and the actions
-    :return: the largest error, or nan if one observation does not determine the state; a warning
-        then says so
+    :return: the largest error, or nan, with a warning, if one observation does not determine the
+        state
     :raises EnvironmentMismatchError: if spaces differ, or an error exceeds the tolerance
     """
     check_mirrors(env, twin)
     with jax.enable_x64(True):
-        if not _tells_the_state(twin, seed):
+        if not _observation_determines_state(twin, seed):
             warnings.warn(
-                f"One observation does not tell the state of {twin.name}, so its steps cannot be "
-                "compared with the environment's. Compare them from known states."
+                f"One observation does not determine the state of {twin.name}, so its steps "
+                "cannot be compared with the environment's. Compare them from known states."
             )
             return math.nan
         errors = _errors(env, twin, steps, seed)
@@ -51,14 +51,14 @@ def verify_mirror(
     if not errors[worst] <= tolerance:
         raise EnvironmentMismatchError(
             f"{twin.name} disagrees with the environment: within {steps} steps the error in "
-            f"'{worst}' reaches {errors[worst]:.2g}, and {tolerance:.2g} passes. Compare its "
+            f"'{worst}' reaches {errors[worst]:.2g}; the tolerance is {tolerance:.2g}. Compare its "
             "parameters and its time step with the environment's."
         )
     return errors[worst]
 
 
 def _errors(env: gymnasium.Env, twin: Twin, steps: int, seed: int) -> dict[str, float]:
-    """Largest errors by name of channel, and of the reward and the end of the episode."""
+    """Largest error of each channel, of the reward and of the end of the episode, by name."""
     largest = dict.fromkeys([*(c.name for c in twin.channels), "reward", "terminated"], 0.0)
     generator = np.random.default_rng(seed)
     low, high = np.array([(a.low, a.high) for a in twin.actuators]).T
@@ -88,13 +88,13 @@ def _predict(twin: Twin, obs: Obs, action: Action, params: Params) -> Array:
     return jnp.concatenate([twin.observe(after, params), jnp.stack([reward, 1.0 * ended])])
 
 
-def _tells_the_state(twin: Twin, seed: int) -> bool:
-    """Whether a step from the inferred state leads where a step from the true one does."""
+def _observation_determines_state(twin: Twin, seed: int) -> bool:
+    """Whether a step from the inferred state gives the same observation as from the true one."""
     params, generator = twin.params, np.random.default_rng(seed)
     low, high = np.array([(a.low, a.high) for a in twin.actuators]).T
     step, observe = jax.jit(twin.step), jax.jit(twin.observe)
     state = twin.initial(jax.random.key(seed), params)
-    for _ in range(_STEPS_TO_HIDE):
+    for _ in range(_STEPS_BEFORE):
         state = step(state, generator.uniform(low, high), params)
     action = generator.uniform(low, high)
     inferred = twin.infer(observe(state, params), params)

@@ -8,13 +8,25 @@ import numpy as np
 from jaxtyping import Float64
 
 from sb3_hds.core.trajectories import Trajectories
-from sb3_hds.data.audit.finding import Finding, counted, percent, recordings
-from sb3_hds.data.audit.stretches import Stretch, all_samples, joined
+from sb3_hds.data.audit.finding import Finding
+from sb3_hds.data.audit.segments import Segment, all_samples, joined
+from sb3_hds.data.wording import counted, percent
 
 _SECONDS, _FEWEST, _MOST = 0.1, 12, 100  # length of a window, and its limits in rows
-_WHITE = 0.5  # mean squared step by variance: 2 for white noise, 0 for smooth motion
-_SMALL = 0.3  # of the standard deviation of a channel: what is larger is motion
-_ALL_NOISE = 3.0  # times the noise: a channel with a smaller standard deviation does not move
+_WHITE_NOISE = 0.5  # mean squared step over variance: 2 for white noise, 0 for smooth motion
+_SMALL = 0.3  # of the standard deviation of a channel: larger deviations are motion
+_ONLY_NOISE = 3.0  # times the noise: a channel with a smaller standard deviation does not move
+_NEEDED = 100  # steps: with fewer, hardly any effect is significant
+_THROUGHOUT = 0.95  # share of the time
+_MOSTLY = 0.8  # share of the time
+_WEAK = 5.0  # noise
+_DEPENDENT = 0.999  # share of the variance
+_CONSTANT = 0.01  # of its largest value: a command that varies less does not excite its drive
+_STROKE = 0.1  # of a channel's range, from one turning point to the next
+# Half of the strokes propose causes and half confirm them. The logarithm of the mean squared error
+# of a stroke has a standard deviation of about 0.5, so the mean over twenty has a standard error of
+# 0.11, and a reduction by a fifth (0.22) is just significant at 2.5 %.
+_STROKES = 40
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,11 +40,10 @@ class StandingStill(Finding):
     def sentence(self) -> str:
         return (
             f"The system stands still {percent(self.share)} of the time "
-            f"({recordings(self.places)}): this tells the noise of its sensors and nothing about "
-            "its motion."
+            f"({self.recordings}): such data contain the sensor noise, but no motion."
         )
 
-    remedy = "Record motion, with commands that use the range that matters to you."
+    remedy = "Record motion, with commands over the range of interest."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,9 +59,9 @@ class TooShort(Finding):
 
     @property
     def sentence(self) -> str:
-        return f"There are {self.n_steps} steps in all; a verdict needs {self.needed} at least."
+        return f"There are {self.n_steps} steps in all; a verdict needs at least {self.needed}."
 
-    remedy = "Record longer, or more often."
+    remedy = "Record longer, or at a higher rate."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,11 +73,10 @@ class WeakMotion(Finding):
     @property
     def sentence(self) -> str:
         return (
-            f"'{self.channel}' moves by only {self.ratio:.1f} times its noise "
-            f"({recordings(self.places)})."
+            f"'{self.channel}' moves by only {self.ratio:.1f} times its noise ({self.recordings})."
         )
 
-    remedy = "Move it further: what acts on it cannot be estimated from this."
+    remedy = "Move it further: effects on it cannot be estimated from such small motion."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,11 +89,10 @@ class WithinNoise(Finding):
     @property
     def sentence(self) -> str:
         return (
-            f"No channel moves by more than {self.ratio:.1f} times its noise "
-            f"({recordings(self.places)})."
+            f"No channel moves by more than {self.ratio:.1f} times its noise ({self.recordings})."
         )
 
-    remedy = "Record larger motion: nothing can be estimated from this."
+    remedy = "Record larger motion: nothing can be estimated from these data."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,19 +103,16 @@ class MostlyStill(Finding):
 
     @property
     def sentence(self) -> str:
-        return (
-            f"The system stands still {percent(self.share)} of the time "
-            f"({recordings(self.places)})."
-        )
+        return f"The system stands still {percent(self.share)} of the time ({self.recordings})."
 
-    remedy = "Only the rest tells anything about its motion: record more of it."
+    remedy = "Only the remaining time is informative: record more motion."
 
 
 @dataclasses.dataclass(frozen=True)
 class PoorExcitation(Finding):
     """
-    :param n_strokes: number of strokes in all recordings, of at least a tenth of the range of the
-        channel, which is the one with the most
+    :param n_strokes: number of strokes of the channel, which has the most, in all recordings; a
+        stroke covers at least a tenth of its range
     :param n_conditions: number of conditions
     """
 
@@ -116,15 +122,16 @@ class PoorExcitation(Finding):
     @property
     def sentence(self) -> str:
         return (
-            f"Excitation is poor: no channel goes to and fro more often than '{self.channel}', "
-            f"{counted(self.n_strokes, 'stroke')} in {counted(len(self.places), 'recording')} "
-            f"under {counted(self.n_conditions, 'condition')} ({recordings(self.places)})."
+            "Excitation is poor: no channel moves back and forth more often than "
+            f"'{self.channel}', {counted(self.n_strokes, 'stroke')} in "
+            f"{counted(len(self.places), 'recording')} under "
+            f"{counted(self.n_conditions, 'condition')} ({self.recordings})."
         )
 
     remedy = (
-        "What takes away less than a fifth of the error hardly stands out from chance in so few. "
-        "Record more strokes, at other speeds, and vary what stayed the same: the load, the gain, "
-        "the course of the commands."
+        "With so few strokes, an effect that removes less than a fifth of the error is hardly "
+        "significant. Record more strokes at other speeds, and vary the load, the gain and the "
+        "shape of the commands."
     )
 
 
@@ -142,96 +149,78 @@ class ConstantCommand(Finding):
     def sentence(self) -> str:
         span = f"between {self.low:.5g} and {self.high:.5g}"
         value = span if f"{self.low:.4g}" != f"{self.high:.4g}" else f"{self.high:.4g}"
-        return f"The command '{self.channel}' is {value} throughout ({recordings(self.places)})."
+        return f"The command '{self.channel}' is {value} throughout ({self.recordings})."
 
     remedy = (
-        "Gain, delay and lag of this actuator cannot be estimated from this. If it is meant to do "
-        "so (free swing), go on."
+        "Gain, delay and lag of this actuator cannot be estimated from it. If it is intended (free "
+        "swing), continue."
     )
 
 
 @dataclasses.dataclass(frozen=True)
 class DependentCommand(Finding):
-    """:param r2: share of its variance that follows from the observations"""
+    """:param r2: share of its variance that the observations explain"""
 
     r2: float
 
     @property
     def sentence(self) -> str:
         return (
-            f"The command '{self.channel}' follows from the observations of the same moment "
-            f"(R2 = {self.r2:.5f}), as under linear feedback ({recordings(self.places)})."
+            f"The command '{self.channel}' is a function of the simultaneous observations "
+            f"(R2 = {self.r2:.5f}), as under linear feedback ({self.recordings})."
         )
 
     remedy = (
-        "Feedback and dynamics cannot be told apart from this: add a signal to the command, or "
-        "change the set point."
+        "Feedback and dynamics cannot be distinguished in such data: add a signal to the command, "
+        "or change the set point."
     )
 
 
 class Stillness(NamedTuple):
     """
     :param share: of the time, in [0, 1]
-    :param noise: standard deviation of each channel while standing still, in its unit; nan where
-        the system never does
-    :param n_windows: number of windows that were looked at
+    :param noise: standard deviation of each channel at rest, in its unit; nan if the system never
+        rests
     """
 
     share: float
     noise: Float64[np.ndarray, " n_obs"]
-    n_windows: int
 
 
-def stillness_of(stretches: list[Stretch], resolution: Float64[np.ndarray, " n_obs"]) -> Stillness:
+def stillness_of(segments: list[Segment], resolution: Float64[np.ndarray, " n_obs"]) -> Stillness:
     """
     Detect rest in windows of 0.1 s: each channel either stays within two quantisation steps, or has
     a small standard deviation and the von Neumann ratio (mean squared step over variance) of white
     noise.
 
-    :param stretches: at least one
-    :param resolution: smallest step of each channel, 0 where it has none
+    :param segments: at least one
+    :param resolution: smallest step of each channel, 0 if it is not quantised
     """
-    windows = [_windows(stretch) for stretch in stretches]
-    if not any(len(part) for part in windows):
-        return Stillness(0.0, np.full(len(resolution), np.nan), 0)
-    # Deviations, steps, ranges: one array per window and channel, whatever its number of rows.
-    parts = [part for part in windows if len(part)]
+    parts = [part for part in map(_windows, segments) if len(part)]
+    if not parts:
+        return Stillness(0.0, np.full(len(resolution), np.nan))
+    # Standard deviation, rms step and range, for each window and channel.
     std = np.concatenate([part.std(axis=1, ddof=1) for part in parts])
     step = np.concatenate([np.sqrt(np.mean(np.diff(p, axis=1) ** 2, axis=1)) for p in parts])
     width = np.concatenate([np.ptp(part, axis=1) for part in parts])
-    overall = joined(stretches).std(axis=0)
-    jitters = step**2 >= _WHITE * std**2
-    floor = np.array([_median(s[j]) for s, j in zip(std.T, jitters.T, strict=True)])
-    small = (std <= _SMALL * overall) | (overall <= _ALL_NOISE * floor)
+    overall = joined(segments).std(axis=0)
+    jitters = step**2 >= _WHITE_NOISE * std**2
+    floor = np.array(
+        [np.median(s[j]) if j.any() else 0.0 for s, j in zip(std.T, jitters.T, strict=True)]
+    )
+    small = (std <= _SMALL * overall) | (overall <= _ONLY_NOISE * floor)
     still = ((width <= 2.01 * resolution) | (jitters & small)).all(axis=1)
     noise = (
         np.sqrt(np.mean(std[still] ** 2, axis=0)) if still.any() else np.full_like(floor, np.nan)
     )
-    return Stillness(float(still.mean()), noise, len(still))
+    return Stillness(float(still.mean()), noise)
 
 
-def _windows(stretch: Stretch) -> np.ndarray:
-    """Rows in windows without overlap, shape ``(windows, rows, n_obs)``; the rest is left out."""
-    length = int(np.clip(round(_SECONDS / stretch.dt), _FEWEST, _MOST))
-    n = len(stretch.obs) // length
-    return stretch.obs[: n * length].reshape(n, length, stretch.obs.shape[1])
-
-
-def _median(values: np.ndarray) -> float:
-    return float(np.median(values)) if len(values) else 0.0
-
-
-NEEDED = 100  # steps: with fewer, hardly any effect is significant
-_THROUGHOUT = 0.95  # share of the time
-_MOSTLY = 0.8  # share of the time
-_WEAK = 5.0  # noise
-_DEPENDENT = 0.999  # share of the variance
-_CONSTANT = 0.01  # of its largest value: a command that varies less does not excite its drive
-_STROKE = 0.1  # of a channel's range, from one turning point to the next
-# Half of the strokes propose and half confirm. The logarithm of the mean square error of a stroke
-# scatters by about a half: of twenty, the mean has a standard error of 0.11, and a fifth less error
-# (0.22) is just significant at 2.5 %.
-_STROKES = 40
+def _windows(segment: Segment) -> np.ndarray:
+    """Rows in windows without overlap, shape ``(windows, rows, n_obs)``; drops the remainder."""
+    length = int(np.clip(round(_SECONDS / segment.dt), _FEWEST, _MOST))
+    n = len(segment.obs) // length
+    return segment.obs[: n * length].reshape(n, length, segment.obs.shape[1])
 
 
 def excitation(
@@ -245,8 +234,8 @@ def excitation(
     """
     places = all_samples(data)
     found: list[Finding] = []
-    if data.n_steps < NEEDED:
-        found.append(TooShort("all channels", places, data.n_steps, NEEDED))
+    if data.n_steps < _NEEDED:
+        found.append(TooShort("all channels", places, data.n_steps, _NEEDED))
     episodes = [data.episode(i) for i in range(len(data))]
     x, u = (
         np.concatenate(parts) for parts in zip(*((o[:-1], a) for o, a in episodes), strict=True)
@@ -262,7 +251,7 @@ def excitation(
         return [*found, WithinNoise("all channels", places, float(ratios.max()))]
     weak = zip(obs, ratios.tolist(), strict=True)
     found += [WeakMotion(name, places, ratio) for name, ratio in weak if ratio < _WEAK]
-    strokes = [_strokes([o[:, j] for o, _ in episodes]) for j in range(data.n_obs)]
+    strokes = [_count_strokes([o[:, j] for o, _ in episodes]) for j in range(data.n_obs)]
     if max(strokes) < _STROKES:
         busiest = int(np.argmax(strokes))
         found.append(
@@ -277,18 +266,18 @@ def excitation(
     return found
 
 
-def _strokes(recordings: Sequence[np.ndarray]) -> int:
-    """Number of strokes (monotonic motions) of a channel, counted until there are enough."""
+def _count_strokes(recordings: Sequence[np.ndarray]) -> int:
+    """Number of strokes (monotonic motions) of a channel, up to the required number."""
     least = _STROKE * (max(x.max() for x in recordings) - min(x.min() for x in recordings))
     n = 0
     for x in recordings:
-        # The turning point that the last stroke began at, and the way it goes: 0 before the first.
+        # Range since the last turning point, and direction of the stroke: 0 before the first one.
         low = high = float(x[0])
-        way = 0
+        direction = 0
         for value in x.tolist():
             low, high = min(low, value), max(high, value)
-            if (way < 1 and value - low > least) or (way > -1 and high - value > least):
-                way = 1 if value - low > least and way < 1 else -1
+            if (direction < 1 and value - low > least) or (direction > -1 and high - value > least):
+                direction = 1 if value - low > least and direction < 1 else -1
                 low = high = value
                 n += 1
                 if n >= _STROKES:

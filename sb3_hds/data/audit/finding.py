@@ -2,19 +2,20 @@
 
 import abc
 import dataclasses
-from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
-_PLACES = 2  # that a sentence names
+from sb3_hds.data.wording import counted
+
+_SHOWN = 2  # places or recordings that a sentence names
 
 
 class Place(NamedTuple):
     """
-    Samples of one recording.
+    Consecutive samples of one recording.
 
     :param source: trajectory, or file
     :param first: first sample, or row of the file, from 0
-    :param last: last one
+    :param last: last sample, or row of the file
     :param trajectory: its number in the data
     :param time: of the first sample, since the beginning of the trajectory [s]
     :param before: time of the sample before the first one [s]
@@ -30,8 +31,9 @@ class Place(NamedTuple):
     after: float = 0.0
 
     def __str__(self) -> str:
-        samples = f"sample {self.first}" if self.first == self.last else f"samples {self.first}"
-        return f"{self.source}, {samples}" + ("" if self.first == self.last else f" to {self.last}")
+        if self.first == self.last:
+            return f"{self.source}, sample {self.first}"
+        return f"{self.source}, samples {self.first} to {self.last}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,15 +41,15 @@ class Finding(abc.ABC):
     """
     One defect of the data.
 
-    :param channel: name of the channel, or of what has the defect
-    :param places: where it was seen
+    :param channel: name of the channel, joint or command with the defect
+    :param places: where it was found
     """
 
     blocks: ClassVar[bool] = False
     """Whether data with this defect cannot support a verdict."""
 
     remedy: ClassVar[str]
-    """What to do about it."""
+    """How to correct or avoid it."""
 
     channel: str
     places: tuple[Place, ...]
@@ -56,6 +58,20 @@ class Finding(abc.ABC):
     @abc.abstractmethod
     def sentence(self) -> str:
         """The defect, in one sentence."""
+
+    @property
+    def where(self) -> str:
+        """The first places, and how many more there are."""
+        shown = "; ".join(map(str, self.places[:_SHOWN]))
+        more = len(self.places) - _SHOWN
+        return f"{shown}; and {counted(more, 'more place')}" if more > 0 else shown
+
+    @property
+    def recordings(self) -> str:
+        """The first recordings that have the defect throughout, and how many more there are."""
+        sources = list(dict.fromkeys(place.source for place in self.places))
+        more = f" and {len(sources) - _SHOWN} more" if len(sources) > _SHOWN else ""
+        return f"all samples of {', '.join(sources[:_SHOWN])}{more}"
 
     def __str__(self) -> str:
         return f"{self.sentence} {self.remedy}"
@@ -66,28 +82,3 @@ class Finding(abc.ABC):
         places = [place._asdict() for place in self.places]
         kind = {"kind": type(self).__name__, "blocks": self.blocks, "text": str(self)}
         return kind | fields | {"places": places}
-
-
-def percent(share: float) -> str:
-    """:return: a share in per cent, for people"""
-    return f"{100.0 * share:.2g} %" if share < 0.995 else "100 %"
-
-
-def counted(n: int, noun: str) -> str:
-    """:return: a number with its noun, for people"""
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
-
-
-def listed(places: Sequence[Place]) -> str:
-    """:return: the first places, and how many more there are"""
-    shown = "; ".join(map(str, places[:_PLACES]))
-    more = len(places) - _PLACES
-    return f"{shown}; and {counted(more, 'more place')}" if more > 0 else shown
-
-
-def recordings(places: Sequence[Place]) -> str:
-    """:return: the first affected recordings, and how many more there are"""
-    sources = list(dict.fromkeys(place.source for place in places))
-    names = ", ".join(sources[:_PLACES])
-    more = len(sources) - _PLACES
-    return f"all samples of {names}" + (f" and {more} more" if more > 0 else "")

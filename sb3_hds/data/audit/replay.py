@@ -1,4 +1,4 @@
-"""Short stretches of measured motion, and their simulation by a twin from the same start."""
+"""Short windows of measured motion, and their simulation by a twin from the same state."""
 
 from functools import partial
 from typing import NamedTuple
@@ -13,14 +13,16 @@ from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.core.twin import State, Twin
 from sb3_hds.data.resampling.values import unwrapped
 
-_SECONDS, _SHORTEST, _LONGEST = 0.3, 6, 60  # of a stretch, within these numbers of steps
-_MOST = 64  # stretches
-_LEAD = 2  # rows before and after the start of a stretch that its velocity is estimated from
-_WEIGHTS = np.array([-2.0, -1.0, 0.0, 1.0, 2.0]) / 10.0  # slope of a line through five rows
+_SECONDS, _FEWEST_STEPS, _MOST_STEPS = 0.3, 6, 60  # of a window, within these numbers of steps
+_MOST_WINDOWS = 64  # windows
+_LEAD = 2  # rows before and after the start of a window, for estimating its velocity
+_SLOPE_WEIGHTS = np.array([-2.0, -1.0, 0.0, 1.0, 2.0]) / 10.0  # slope of a line through five rows
 
 
-class Stretches(NamedTuple):
+class Windows(NamedTuple):
     """
+    Windows of equal length.
+
     :param obs: shape ``(n, lead + steps + 1, n_obs)``
     :param actions: from the start on, shape ``(n, steps, n_act)``
     """
@@ -31,10 +33,12 @@ class Stretches(NamedTuple):
 
 class Replay(NamedTuple):
     """
-    :param measured: positions, shape ``(n, steps + 1, dof)``
-    :param extrapolated: at the velocity of the start
+    Positions in windows, shape ``(n, steps + 1, dof)``, and simulated observations.
+
+    :param measured: positions
+    :param extrapolated: at constant velocity
     :param simulated: by the twin
-    :param obs: that the twin reports, shape ``(n, steps + 1, n_obs)``
+    :param obs: of the twin, shape ``(n, steps + 1, n_obs)``
     """
 
     measured: Float[np.ndarray, "n rows dof"]
@@ -42,74 +46,74 @@ class Replay(NamedTuple):
     simulated: Float[np.ndarray, "n rows dof"]
     obs: Float[np.ndarray, "n rows n_obs"]
 
-    def unexplained(self) -> Float[np.ndarray, " dof"]:
+    def unexplained_share(self) -> Float[np.ndarray, " dof"]:
         """:return: mean squared error relative to that of a constant velocity, for each joint"""
-        return self._by_acceleration(self.simulated - self.measured)
+        return self._median_ratio(self.simulated - self.measured)
 
-    def predicted(self) -> Float[np.ndarray, " dof"]:
+    def acceleration_ratio(self) -> Float[np.ndarray, " dof"]:
         """
         :return: displacement due to the simulated acceleration over that due to the measured one
         """
-        return np.sqrt(self._by_acceleration(self.simulated - self.extrapolated))
+        return np.sqrt(self._median_ratio(self.simulated - self.extrapolated))
 
-    def _by_acceleration(self, part: Float[np.ndarray, "n rows dof"]) -> np.ndarray:
-        """Median over the half of the stretches in which a joint accelerates most."""
-        # A simulation without the friction of a machine may blow up: its error is infinite then.
+    def _median_ratio(self, part: Float[np.ndarray, "n rows dof"]) -> np.ndarray:
+        """Median over the half of the windows in which a joint accelerates most."""
+        # A simulation without the friction of a machine may diverge: its error is infinite then.
         with np.errstate(over="ignore", invalid="ignore"):
-            size, whole = (np.sum(x**2, axis=1) for x in (part, self.measured - self.extrapolated))
-        fast = whole >= np.median(whole, axis=0)
-        ratio = size / np.maximum(whole, np.finfo(float).tiny)
+            size, total = (np.sum(x**2, axis=1) for x in (part, self.measured - self.extrapolated))
+        fast = total >= np.median(total, axis=0)
+        ratio = size / np.maximum(total, np.finfo(float).tiny)
         ratio = np.where(np.isfinite(ratio), ratio, np.inf)
         return np.array([np.median(r[chosen]) for r, chosen in zip(ratio.T, fast.T, strict=True)])
 
 
-def stretches_in(data: Trajectories) -> Stretches | None:
-    """:return: up to 64 of them, spread over the data; None if no trajectory is long enough"""
-    wanted = int(np.clip(round(_SECONDS / data.dt), _SHORTEST, _LONGEST))
+def windows_of(data: Trajectories) -> Windows | None:
+    """:return: up to 64 windows, spread over the data; None if no trajectory is long enough"""
+    wanted = int(np.clip(round(_SECONDS / data.dt), _FEWEST_STEPS, _MOST_STEPS))
     steps = min(wanted, int(data.lengths.max()) - _LEAD)
-    if steps < _SHORTEST:
+    if steps < _FEWEST_STEPS:
         return None
     begins = [
         (i, k)
         for i, n in enumerate(data.lengths.tolist())
         for k in range(0, n - _LEAD - steps + 1, steps)
     ]
-    chosen = np.unique(np.linspace(0, len(begins) - 1, _MOST).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(begins) - 1, _MOST_WINDOWS).round().astype(int))
     obs, actions = [], []
     for i, k in (begins[c] for c in chosen):
         obs.append(data.obs[i, k : k + _LEAD + steps + 1])
         actions.append(data.actions[i, k + _LEAD : k + _LEAD + steps])
-    return Stretches(np.array(obs), np.array(actions))
+    return Windows(np.array(obs), np.array(actions))
 
 
-def replayed(twin: Twin, stretches: Stretches, scale: Float[np.ndarray, " n_obs"]) -> Replay:
+def replay(twin: Twin, windows: Windows, scale: Float[np.ndarray, " n_obs"]) -> Replay:
     """
-    Simulate each stretch from its measured positions; velocities are slopes of these.
+    Simulate each window from measured positions, and velocities estimated from these.
 
     :param scale: factor of each channel to the unit of the twin
     """
-    obs = stretches.obs * scale
+    obs = windows.obs * scale
     with jax.enable_x64(True):
         q = np.array(_positions(twin, jnp.asarray(obs), twin.params))
         for row in q:
             row[...] = np.stack([unwrapped(column) for column in row.T], axis=1)
-        v = np.einsum("k,nkd->nd", _WEIGHTS, q[:, : 2 * _LEAD + 1]) / twin.dt
+        v = np.einsum("k,nkd->nd", _SLOPE_WEIGHTS, q[:, : 2 * _LEAD + 1]) / twin.dt
         start = jnp.asarray(obs[:, _LEAD]), jnp.asarray(q[:, _LEAD]), jnp.asarray(v)
-        simulated, seen = _simulated(twin, *start, jnp.asarray(stretches.actions), twin.params)
+        simulated, seen = _simulated(twin, *start, jnp.asarray(windows.actions), twin.params)
     measured = q[:, _LEAD:]
     time = twin.dt * np.arange(measured.shape[1])[None, :, None]
     extrapolated = measured[:, :1] + v[:, None] * time
     return Replay(measured, extrapolated, np.asarray(simulated), np.asarray(seen))
 
 
-def position_channels(twin: Twin, stretches: Stretches) -> dict[int, int]:
-    """:return: for each joint whose position is a channel as it is, that channel"""
-    some = stretches.obs[:1]
+def position_channels(twin: Twin, windows: Windows) -> dict[int, int]:
+    """:return: the channel that measures the position of a joint directly, for each such joint"""
+    first = windows.obs[:1]
     found = {}
     with jax.enable_x64(True):
-        q = np.asarray(_positions(twin, jnp.asarray(some), twin.params))
-        for channel in range(some.shape[-1]):
-            doubled = jnp.asarray(np.where(np.arange(some.shape[-1]) == channel, 2.0, 1.0) * some)
+        q = np.asarray(_positions(twin, jnp.asarray(first), twin.params))
+        for channel in range(first.shape[-1]):
+            doubled = jnp.asarray(np.where(np.arange(first.shape[-1]) == channel, 2.0, 1.0) * first)
             twice = np.asarray(_positions(twin, doubled, twin.params))
             follows = np.isclose(twice, 2.0 * q, rtol=1e-6).all((0, 1)) & (q != 0.0).any((0, 1))
             found |= {joint: channel for joint in np.flatnonzero(follows).tolist()}

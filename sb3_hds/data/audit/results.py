@@ -5,28 +5,30 @@ import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import accumulate
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from sb3_hds.core.trajectories import Trajectories
-from sb3_hds.data.audit.continuity import ReinitialisedState
-from sb3_hds.data.audit.finding import Finding, counted, percent
-from sb3_hds.data.audit.outliers import Outliers
+from sb3_hds.data.audit.finding import Finding
+from sb3_hds.data.audit.jumps import Outliers, ReinitialisedState
 from sb3_hds.data.audit.velocity import VelocityShift
+from sb3_hds.data.wording import counted, percent
 from sb3_hds.errors import TrajectoryError
 
 _WIDTH = 80
+_ON_GRID = 0.02  # samples
+_Kind = TypeVar("_Kind", bound=Finding)
 
 
 @dataclasses.dataclass(frozen=True)
 class ChannelSummary:
     """
     :param name: of the observation channel
-    :param unit: empty where it is not known
+    :param unit: empty if unknown
     :param lowest: measured value
     :param highest: measured value
-    :param noise: standard deviation while the system stands still; None where it never does
+    :param noise: standard deviation at rest; None if the system never rests
     :param resolution: smallest step of a quantised channel, otherwise 0
     """
 
@@ -43,8 +45,8 @@ class Audit:
     """
     The result of an audit. Prints itself.
 
-    :param findings: what was found, the most serious first
-    :param channels: of the observation
+    :param findings: defects, the most serious first
+    :param channels: summaries of the observation channels
     :param stands_still: share of the time during which nothing moves beyond noise
     :param conditions: labels of the data
     :param lengths: number of steps of each trajectory
@@ -73,12 +75,11 @@ class Audit:
     @property
     def velocity_shift(self) -> dict[str, float]:
         """Delay of each shifted velocity channel [s]; negative: early."""
-        shifts = [f for f in self.findings if isinstance(f, VelocityShift)]
-        return {shift.channel: shift.seconds for shift in shifts}
+        return {shift.channel: shift.seconds for shift in self._of_kind(VelocityShift)}
 
     @property
     def noise(self) -> dict[str, float | None]:
-        """Standard deviation of each channel at rest, in its unit; None where it never rests."""
+        """Standard deviation of each channel at rest, in its unit; None if it never rests."""
         return {channel.name: channel.noise for channel in self.channels}
 
     def corrected(self, data: Trajectories) -> Trajectories:
@@ -86,34 +87,35 @@ class Audit:
         Cut at resets of the state, cut out outliers, and undo shifts of velocities. Audit the
         result again: outliers may have hidden other defects.
 
-        :param data: those that were audited
+        :param data: the audited data
         :return: new trajectories; the same ones if there is nothing to correct
         :raises TrajectoryError: for other data, or if an episode is shorter than the shifts
         """
         if tuple(data.lengths.tolist()) != self.lengths or data.dt != self.dt:
             raise TrajectoryError("These are not the data of this audit: call audit(data) first.")
-        jumps = [f for f in self.findings if isinstance(f, ReinitialisedState)]
+        jumps, far = self._of_kind(ReinitialisedState), self._of_kind(Outliers)
         places = [(p.trajectory, p.before, p.time) for jump in jumps for p in jump.places]
-        far = [f for f in self.findings if isinstance(f, Outliers)]
         places += [(p.trajectory, p.before, p.after) for outlier in far for p in outlier.places]
         if places:
             data = cut(data, places)
         names = [channel.name for channel in self.channels]
-        shifts = [f for f in self.findings if isinstance(f, VelocityShift)]
-        lags = {names.index(shift.channel): shift.samples for shift in shifts}
+        lags = {names.index(s.channel): s.samples for s in self._of_kind(VelocityShift)}
         return shifted(data, lags) if lags else data
 
     @property
     def corrections(self) -> tuple[str, ...]:
-        """Sentences on what :meth:`corrected` does to the data."""
-        jumps = sum(len(f.places) for f in self.findings if isinstance(f, ReinitialisedState))
+        """Sentences on the corrections of :meth:`corrected`."""
+        jumps = sum(len(jump.places) for jump in self._of_kind(ReinitialisedState))
         cuts = (f"The data were cut at {counted(jumps, 'jump')} of the state.",) if jumps else ()
-        far = sum(len(f.places) for f in self.findings if isinstance(f, Outliers))
+        far = sum(len(outlier.places) for outlier in self._of_kind(Outliers))
         cuts += (f"Samples were cut out at {counted(far, 'place')} with outliers.",) if far else ()
         return cuts + tuple(
             f"'{channel}' was shifted by {-1e3 * seconds:+.3g} ms."
             for channel, seconds in self.velocity_shift.items()
         )
+
+    def _of_kind(self, kind: type[_Kind]) -> list[_Kind]:
+        return [finding for finding in self.findings if isinstance(finding, kind)]
 
     def to_dict(self) -> dict[str, Any]:
         """:return: plain data for JSON"""
@@ -134,18 +136,18 @@ class Audit:
         n, steps, labels = len(self.lengths), sum(self.lengths), len(set(self.conditions))
         verdict = "yes" if self.usable else f"NO. {self.reason}"
         head = (
-            f"Audit of {n} {'trajectory' if n == 1 else 'trajectories'}, "
-            f"{labels} {'condition' if labels == 1 else 'conditions'}: {steps} steps, "
-            f"{steps * self.dt:.4g} s at dt = {self.dt:g} s"
+            f"Audit of {counted(n, 'trajectory', 'trajectories')}, "
+            f"{counted(labels, 'condition')}: {steps} steps, {steps * self.dt:.4g} s at dt = "
+            f"{self.dt:g} s"
         )
         lines = [head, *_wrapped(f"usable: {verdict}", "", "  "), "", *_table(self.channels)]
-        lines += ["", f"It stands still {percent(self.stands_still)} of the time."]
-        lines += ["", "Findings:" if self.findings else "Nothing else was found."]
+        lines += ["", f"The system stands still {percent(self.stands_still)} of the time."]
+        lines += ["", "Findings:" if self.findings else "No defects were found."]
         for number, finding in enumerate(self.findings, start=1):
             lines += _wrapped(f"{number}. {finding.sentence}", "  ", "     ")
             lines += _wrapped(f"-> {finding.remedy}", "     ", "        ")
         if not self.stamps:
-            lines += ["", "Time stamps were not looked at: these data do not come with any."]
+            lines += ["", "Time stamps were not checked: these data have none."]
         return "\n".join(lines)
 
 
@@ -160,7 +162,7 @@ def _table(channels: Sequence[ChannelSummary]) -> list[str]:
         lines.append(
             f"  {shown:<{width}} {c.lowest:>10.4g} {c.highest:>10.4g} {noise:>10} {step:>10}"
         )
-    lines.append("  noise: standard deviation while standing still; step: of quantised values")
+    lines.append("  noise: standard deviation at rest; step: of quantised values")
     return lines
 
 
@@ -168,13 +170,10 @@ def _wrapped(text: str, first: str, rest: str) -> list[str]:
     return textwrap.wrap(text, _WIDTH, initial_indent=first, subsequent_indent=rest)
 
 
-_ON_GRID = 0.02  # samples
-
-
 def shifted(data: Trajectories, shifts: Mapping[int, float]) -> Trajectories:
     """
-    Shift channels in time, by linear interpolation; samples at the ends of an episode that then
-    lack a channel are left out.
+    Shift channels in time by linear interpolation; samples at the ends of an episode that then
+    lack a channel are dropped.
 
     :param data: at one interval
     :param shifts: delay of each observation channel, by index [samples]; negative: early
@@ -186,8 +185,7 @@ def shifted(data: Trajectories, shifts: Mapping[int, float]) -> Trajectories:
         shortest = int(data.lengths.argmin())
         raise TrajectoryError(
             f"Trajectory {shortest} has {data.lengths[shortest]} steps, too few for shifts that "
-            f"leave out {before + after} of them. Leave it out: data[data.lengths > "
-            f"{before + after}]."
+            f"drop {before + after} of them. Remove it: data[data.lengths > {before + after}]."
         )
     obs, actions = [], []
     for i, n in enumerate(data.lengths):
@@ -197,16 +195,16 @@ def shifted(data: Trajectories, shifts: Mapping[int, float]) -> Trajectories:
             moved[:, channel] = np.interp(rows + lag, rows, x[:, channel])
         obs.append(moved[before : len(x) - after])
         actions.append(u[before : n - after])
-    return _rebuilt(data, obs, actions, range(len(data)))
+    return _with_labels_of(data, obs, actions, range(len(data)))
 
 
 def cut(data: Trajectories, places: Sequence[tuple[int, float, float]]) -> Trajectories:
     """
-    Cut episodes at resets, and cut samples out; pieces without a step are dropped.
+    Cut episodes at resets, and cut samples out; parts without a step are dropped.
 
     :param data: at one interval
-    :param places: trajectory, and the times of the last sample before and the first one after [s],
-        since its beginning
+    :param places: trajectory, and the times of the last sample before and the first one after the
+        cut, since its beginning [s]
     """
     obs, actions, sources = [], [], []
     for i, n in enumerate(data.lengths):
@@ -215,16 +213,16 @@ def cut(data: Trajectories, places: Sequence[tuple[int, float, float]]) -> Traje
         ends = [math.floor(last / data.dt + _ON_GRID) + 1 for last, _ in here]
         begins = list(accumulate((math.ceil(first / data.dt - _ON_GRID) for _, first in here), max))
         for a, b in zip([0, *begins], [*ends, int(n) + 1], strict=True):
-            if b - a > 1:  # the action before the cut led nowhere that was measured
+            if b - a > 1:  # the result of the action before the cut was not measured
                 obs.append(x[a:b])
                 actions.append(u[a : b - 1])
                 sources.append(i)
     if not obs:
-        raise TrajectoryError("No piece between the cuts has a step. Look at the recording itself.")
-    return _rebuilt(data, obs, actions, sources)
+        raise TrajectoryError("No part between the cuts has a step. Inspect the recording.")
+    return _with_labels_of(data, obs, actions, sources)
 
 
-def _rebuilt(
+def _with_labels_of(
     data: Trajectories,
     obs: Sequence[np.ndarray],
     actions: Sequence[np.ndarray],

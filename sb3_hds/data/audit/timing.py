@@ -1,24 +1,22 @@
 """Defects of time stamps: uneven, jittered, repeated, missing."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
 from sb3_hds.core.trajectories import Trajectories
-from sb3_hds.data.audit.finding import Finding, Place, counted, listed, percent, recordings
-from sb3_hds.data.resampling.report import Reading
-
-
-def _are(n: int) -> str:
-    return "is" if n == 1 else "are"
+from sb3_hds.data.audit.finding import Finding, Place
+from sb3_hds.data.resampling.report import Reading, Sampling
+from sb3_hds.data.wording import counted, percent
 
 
 @dataclasses.dataclass(frozen=True)
 class UnevenSampling(Finding):
     """
-    :param shortest: interval between two rows [s]
-    :param median: [s]
-    :param longest: [s]
+    :param shortest: shortest interval between two rows [s]
+    :param median: median interval [s]
+    :param longest: longest interval [s]
     :param share: of the intervals that differ from the median by more than 10 %
     """
 
@@ -32,23 +30,23 @@ class UnevenSampling(Finding):
         return (
             f"Time stamps jitter: rows are {1e3 * self.shortest:.3g} to "
             f"{1e3 * self.longest:.3g} ms apart, the median is {1e3 * self.median:.3g} ms and "
-            f"{percent(self.share)} differ from it by more than 10 % ({recordings(self.places)})."
+            f"{percent(self.share)} differ from it by more than 10 % ({self.recordings})."
         )
 
     remedy = (
-        "The rows were resampled; compare the error of that (print data.report) with the noise. "
-        "Next time, let one clock trigger command and measurement."
+        "The rows were resampled; compare the interpolation error (print data.report) with the "
+        "noise. In future recordings, trigger command and measurement by one clock."
     )
 
 
 @dataclasses.dataclass(frozen=True)
 class JitteredStamps(Finding):
     """
-    Of a regular clock.
+    Stamps that deviate from the ticks of a regular clock.
 
-    :param n_rows: whose stamps are off, where these are few; otherwise 0
-    :param longest: farthest that a stamp is off [s]
-    :param rms: root mean square of how far stamps are off [s]
+    :param n_rows: number of rows whose stamps deviate, if these are few; otherwise 0
+    :param longest: largest deviation [s]
+    :param rms: root mean square of the deviations [s]
     """
 
     n_rows: int
@@ -60,55 +58,55 @@ class JitteredStamps(Finding):
         far = f"up to {1e3 * self.longest:.3g} ms"
         if self.n_rows:
             return (
-                f"{counted(self.n_rows, 'time stamp')} {_are(self.n_rows)} off by {far} in an "
-                f"otherwise regular clock ({listed(self.places)})."
+                f"{counted(self.n_rows, 'time stamp is', 'time stamps are')} off by {far} in an "
+                f"otherwise regular clock ({self.where})."
             )
         return (
             f"Time stamps jitter by {1e3 * self.rms:.3g} ms (rms), {far}, around the ticks of a "
-            f"regular clock ({recordings(self.places)})."
+            f"regular clock ({self.recordings})."
         )
 
     remedy = (
-        "The rows were kept at their ticks, which their values fit no worse. Next time, let the "
-        "sensor's own clock stamp them."
+        "The rows were assigned to the ticks, with which their values are consistent. In future "
+        "recordings, use time stamps of the sensor's own clock."
     )
 
 
 @dataclasses.dataclass(frozen=True)
 class MissingRows(Finding):
-    """:param n_rows: that are missing between rows of a regular clock"""
+    """:param n_rows: number of rows that are missing between rows of a regular clock"""
 
     n_rows: int
 
     @property
     def sentence(self) -> str:
         return (
-            f"{counted(self.n_rows, 'row')} of a regular clock {_are(self.n_rows)} missing, before "
-            f"{listed(self.places)}."
+            f"{counted(self.n_rows, 'row of a regular clock is', 'rows of a regular clock are')} "
+            f"missing, before {self.where}."
         )
 
-    remedy = "Interpolated. A longer gap ends the trajectory: gap: SECONDS in columns says when."
+    remedy = "They were interpolated. Longer gaps end the trajectory: set gap: SECONDS in columns."
 
 
 @dataclasses.dataclass(frozen=True)
 class RepeatedStamps(Finding):
-    """:param n_rows: rows that were left out"""
+    """:param n_rows: number of rows that were dropped"""
 
     n_rows: int
 
     @property
     def sentence(self) -> str:
         return (
-            f"{counted(self.n_rows, 'row')} with the time stamp of the row before "
-            f"{'was' if self.n_rows == 1 else 'were'} left out ({listed(self.places)})."
+            f"{counted(self.n_rows, 'row')} with the time stamp of the previous row "
+            f"{'was' if self.n_rows == 1 else 'were'} dropped ({self.where})."
         )
 
-    remedy = "Find out whether the logger writes twice or the clock is too coarse."
+    remedy = "Check whether the logger writes rows twice or its clock is too coarse."
 
 
 @dataclasses.dataclass(frozen=True)
 class Gaps(Finding):
-    """:param longest: [s]"""
+    """:param longest: longest gap [s]"""
 
     longest: float
 
@@ -116,64 +114,58 @@ class Gaps(Finding):
     def sentence(self) -> str:
         return (
             f"The recording has {counted(len(self.places), 'gap')} of up to {self.longest:.3g} s "
-            f"({listed(self.places)})."
+            f"({self.where})."
         )
 
-    remedy = "It was cut there. Look for what held up the logger."
+    remedy = "It was cut there. Find out what delayed the logger."
 
 
 def timing(data: Trajectories, report: Reading | None) -> list[Finding]:
     """
-    :param data: some of the recordings that were read, or all
-    :param report: of how they were read; None: nothing is known of time stamps
+    :param data: some or all of the recordings that were read
+    :param report: of how they were read; None: without time stamps
     """
     if report is None:
         return []
-    chosen = {o: i for i, o in reversed(list(enumerate(data.origin.tolist())))}
-    recordings = [(chosen[o], r) for o, r in enumerate(report.recordings) if o in chosen]
+    trajectory_of = {o: i for i, o in reversed(list(enumerate(data.origin.tolist())))}
+    read = [(trajectory_of[o], r) for o, r in enumerate(report.recordings) if o in trajectory_of]
     found: list[Finding] = []
-    uneven = [(i, r) for i, r in recordings if r.resampled and r.uneven]
+    uneven = [(i, r) for i, r in read if r.resampled and r.uneven]
     if uneven:
-        n = sum(r.rows - 1 for _, r in uneven)
         found.append(
             UnevenSampling(
                 "time",
-                tuple(Place(r.source, 0, r.rows - 1, i) for i, r in uneven),
+                _all_rows(uneven),
                 min(r.intervals[0] for _, r in uneven),
                 float(np.median([r.intervals[1] for _, r in uneven])),
                 max(r.intervals[2] for _, r in uneven),
-                sum(r.uneven for _, r in uneven) / n,
+                sum(r.uneven for _, r in uneven) / sum(r.rows - 1 for _, r in uneven),
             )
         )
-    late = [(i, r) for i, r in recordings if r.clock == "late" and not r.resampled]
-    if late:
-        found.append(
-            JitteredStamps(
-                "time",
-                tuple(Place(r.source, k, k, i) for i, r in late for k in r.late),
-                sum(len(r.late) for _, r in late),
-                max(r.off for _, r in late),
-                max(r.jitter for _, r in late),
+    for kind in ("late", "jittered"):
+        some = [(i, r) for i, r in read if r.clock == kind and not r.resampled]
+        if some:
+            late = tuple(Place(r.source, k, k, i) for i, r in some for k in r.late)
+            found.append(
+                JitteredStamps(
+                    "time",
+                    late if kind == "late" else _all_rows(some),
+                    len(late) if kind == "late" else 0,
+                    max(r.off for _, r in some),
+                    max(r.jitter for _, r in some),
+                )
             )
-        )
-    jittered = [(i, r) for i, r in recordings if r.clock == "jittered" and not r.resampled]
-    if jittered:
-        found.append(
-            JitteredStamps(
-                "time",
-                tuple(Place(r.source, 0, r.rows - 1, i) for i, r in jittered),
-                0,
-                max(r.off for _, r in jittered),
-                max(r.jitter for _, r in jittered),
-            )
-        )
-    holes = [(Place(r.source, k, k, i), n) for i, r in recordings for k, n in r.missing]
+    holes = [(Place(r.source, k, k, i), n) for i, r in read for k, n in r.missing]
     if holes:
         found.append(MissingRows("time", tuple(p for p, _ in holes), sum(n for _, n in holes)))
-    stamps = tuple(Place(r.source, k, k, i) for i, r in recordings for k in r.repeated)
+    stamps = tuple(Place(r.source, k, k, i) for i, r in read for k in r.repeated)
     if stamps:
         found.append(RepeatedStamps("time", stamps, len(stamps)))
-    gaps = [(Place(r.source, k, k, i), seconds) for i, r in recordings for k, seconds in r.gaps]
+    gaps = [(Place(r.source, k, k, i), seconds) for i, r in read for k, seconds in r.gaps]
     if gaps:
         found.append(Gaps("time", tuple(place for place, _ in gaps), max(s for _, s in gaps)))
     return found
+
+
+def _all_rows(read: Sequence[tuple[int, Sampling]]) -> tuple[Place, ...]:
+    return tuple(Place(r.source, 0, r.rows - 1, i) for i, r in read)

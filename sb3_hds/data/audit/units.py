@@ -10,24 +10,46 @@ import numpy as np
 from sb3_hds.core.signals import Channel
 from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.core.twin import Twin
-from sb3_hds.data.audit.finding import Finding, percent, recordings
-from sb3_hds.data.audit.replay import position_channels, replayed, stretches_in
-from sb3_hds.data.audit.stretches import all_samples
-from sb3_hds.data.audit.velocity import Match
+from sb3_hds.data.audit.finding import Finding
+from sb3_hds.data.audit.replay import position_channels, replay, windows_of
+from sb3_hds.data.audit.segments import all_samples
+from sb3_hds.data.audit.velocity import VelocityPair
+from sb3_hds.data.wording import percent
 
-# Factor: up to here `effects.SensorScale`, which is bounded to 0.1 to 10, gives it a name.
-_BEYOND = 10.0
-_RPM_NEAR = 0.05  # relative: a factor within those bounds that has a name of its own
-_LATEST = 4.0  # samples: a pair whose lag is longer may be a sine and its second derivative
-_ALIKE = 0.3  # largest difference of a block's slope from that of all data, for half of the blocks
+# Factors between 0.1 and 10 are explained by `effects.SensorScale`, except for that of rpm.
+_LARGE_FACTOR = 10.0
+_RPM_NEAR = 0.05  # relative
+_LONGEST_LAG = 4.0  # samples: a pair with a longer lag may be a sine and its second derivative
+_SAME_SLOPE = 0.3  # largest relative difference of the slope of half of the blocks from the total
 _FEWEST = 3  # blocks
-_SMOOTH = 0.2  # correlation of successive velocities: below, differences of positions are too small
+_SMOOTH = 0.2  # smallest correlation of successive velocities
 
 
-_FACTORS = {"degrees": 57.29578, "millimetres": 1000.0, "centimetres": 100.0}
-RPM = 30.0 / 3.1415926536
+RPM = 30.0 / np.pi
 """Revolutions per minute of one radian per second."""
-_NEAR = 0.15  # what a central difference and noise may change of the factor
+_FEWEST_WINDOWS = 6
+# Unexplained share of the acceleration: at least this in the declared unit, and at most this in the
+# other unit.
+_MIN_UNEXPLAINED, _MAX_UNEXPLAINED = 0.6, 0.3
+# For a suspicion, simulated over measured acceleration: at most this in the declared unit, and
+# within these bounds in the other unit.
+_TOO_SMALL, _ABOUT_RIGHT = 0.1, (0.4, 2.5)
+_NEAR = 0.15  # relative error of the factor due to the central difference and noise
+
+
+class _Unit(NamedTuple):
+    name: str
+    symbol: str
+    of: str  # unit of the twin
+    factor: float  # to the unit of the twin
+    span: float  # of the measurements, in the unit of the twin, above which this unit is tried
+
+
+_UNITS = (
+    _Unit("degrees", "deg", "rad", np.pi / 180.0, 2.0 * np.pi),
+    _Unit("millimetres", "mm", "m", 1e-3, 5.0),
+    _Unit("centimetres", "cm", "m", 1e-2, 5.0),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,41 +67,40 @@ class OtherUnits(Finding):
 
     @property
     def sentence(self) -> str:
-        fast = f"changes {self.factor:.3g} times as fast as '{self.channel}' says"
         return (
-            f"'{self.position}' {fast} ({recordings(self.places)}): one of them is in other units"
-            f"{self._likely}."
+            f"'{self.position}' changes {self.factor:.3g} times as fast as '{self.channel}' says "
+            f"({self.recordings}): one of them is in other units{self._likely}."
         )
 
     @property
     def _likely(self) -> str:
-        for unit, factor in _FACTORS.items():
-            for name, ratio in ((self.position, factor), (self.channel, 1.0 / factor)):
+        for unit in _UNITS:
+            for name, ratio in ((self.position, 1.0 / unit.factor), (self.channel, unit.factor)):
                 if abs(self.factor / ratio - 1.0) < _NEAR:
-                    return f", as if '{name}' were in {unit}"
+                    return f", as if '{name}' were in {unit.name}"
         if abs(self.factor * RPM - 1.0) < _NEAR:
             return f", as if '{self.channel}' were in revolutions per minute"
         return ""
 
     remedy = (
-        "Give that one its unit in columns, as {column: NAME, unit: deg}, or rpm or mm, or its "
-        "scale: 0.0174533 if it is in degrees, 0.104720 if it is in revolutions per minute, 0.001 "
-        "if it is in millimetres."
+        "Declare the unit of that channel in columns, as {column: NAME, unit: deg}, or rpm or mm, "
+        "or its scale: 0.0174533 for degrees, 0.104720 for revolutions per minute, 0.001 for "
+        "millimetres."
     )
 
 
 @dataclasses.dataclass(frozen=True)
 class MistakenUnits(Finding):
     """
-    A position that the twin can only follow in another unit.
+    A position whose motion the twin only explains in another unit.
 
     :param column: its name in the log
     :param span: of its measurements
     :param unit: unit of the twin's channel
-    :param other: unit that fits, in words
+    :param other: name of the unit that fits
     :param symbol: symbol of that unit
     :param factor: from that unit to the twin's
-    :param explained: share of the acceleration that the twin then explains
+    :param explained: share of the acceleration that the twin explains in that unit
     :param times: ratio of the measured to the simulated acceleration in the twin's unit
     """
 
@@ -97,7 +118,7 @@ class MistakenUnits(Finding):
     def sentence(self) -> str:
         return (
             f"'{self.channel}' spans {self.span:.3g} {self.unit}, and {self._why} "
-            f"({recordings(self.places)}). Write {{column: {self.column}, unit: {self.symbol}}}, "
+            f"({self.recordings}). Write {{column: {self.column}, unit: {self.symbol}}}, "
             f"or scale it by {self.factor:.6g}."
         )
 
@@ -108,19 +129,19 @@ class MistakenUnits(Finding):
             f"it is in {self.other}"
         )
 
-    remedy = "Whatever is named from such data makes up for the factor."
+    remedy = "Any effect that is identified from such data compensates for the factor."
 
 
 @dataclasses.dataclass(frozen=True)
 class LikelyUnits(MistakenUnits):
-    """The size of its acceleration fits another unit, but its course does not."""
+    """A position whose acceleration fits another unit in size, but not in shape."""
 
     blocks = False
 
     @property
     def _why(self) -> str:
         return (
-            f"it accelerates {self.times:.2g} times as much as the twin says, as if it were in "
+            f"it accelerates {self.times:.2g} times as much as the twin, as if it were in "
             f"{self.other}"
         )
 
@@ -136,115 +157,77 @@ class Swapped(Finding):
     def sentence(self) -> str:
         return (
             f"'{self.channel}' should be a position and is the derivative of "
-            f"'{self.derivative_of}', which should be its velocity ({recordings(self.places)})."
+            f"'{self.derivative_of}', which should be its velocity ({self.recordings})."
         )
 
     remedy = "They are swapped: name the columns of obs in the order of the twin's channels."
 
 
-def other_units(
-    data: Trajectories, channels: Sequence[Channel], matches: Sequence[Match]
-) -> list[OtherUnits]:
+def other_units(channels: Sequence[Channel], pairs: Sequence[VelocityPair]) -> list[OtherUnits]:
     """
     Velocities that equal the derivative of a position times a large factor, or the factor of
     revolutions per minute.
 
-    Channels that already form a pair of position and velocity are excluded: in an oscillation,
-    every channel is proportional to the derivative of some other. Known units restrict the pairs.
+    Channels that already form a pair of position and velocity are excluded, because in an
+    oscillation, every channel is proportional to the derivative of another one. Declared units
+    restrict the pairs.
 
-    :param data: at one interval
     :param channels: of the observation
-    :param matches: of the data
+    :param pairs: of the data
     """
-    own = [match for match in matches if match.agrees and _known(match, channels) is not False]
-    taken = {j for match in own for j in (match.velocity, *match.parts)}
-    far = [
-        match
-        for match in matches
-        if not taken & {match.velocity, *match.parts}
-        and _known(match, channels) is not False
-        and _far(match, data.dt)
-    ]
-    # Of each velocity, the position that it follows best comes last.
-    far.sort(key=lambda match: match.scores.highest)
-    found = {match.velocity: match for match in far}
+    possible = [pair for pair in pairs if _is_declared_pair(pair, channels) is not False]
+    taken = {j for pair in possible if pair.same_unit for j in pair.channels}
+    far = [p for p in possible if not taken & p.channels and _has_large_factor(p)]
+    # For each velocity, the position with the highest correlation comes last.
+    far.sort(key=lambda pair: pair.scores.peak)
     return [
-        OtherUnits(
-            channels[v].name, all_samples(data), match.position, 1.0 / match.scores.slope_there
-        )
-        for v, match in found.items()
+        OtherUnits(pair.name, pair.places, pair.position, 1.0 / pair.scores.peak_slope)
+        for pair in {pair.velocity: pair for pair in far}.values()
     ]
 
 
-def swapped(
-    data: Trajectories, channels: Sequence[Channel], matches: Sequence[Match]
-) -> list[Swapped]:
+def swapped(channels: Sequence[Channel], pairs: Sequence[VelocityPair]) -> list[Swapped]:
     """
     Pairs in which the channel with the unit of a position is the derivative of the other.
 
-    :param data: at one interval
-    :param channels: of the observation; nothing is found where they have no units
-    :param matches: of the data
+    :param channels: of the observation; those without units are ignored
+    :param pairs: of the data
     """
-    right = {j for m in matches if m.agrees and _known(m, channels) for j in (m.velocity, *m.parts)}
+    same = [pair for pair in pairs if pair.same_unit]
+    right = {j for pair in same if _is_declared_pair(pair, channels) for j in pair.channels}
     return [
-        Swapped(channels[m.velocity].name, all_samples(data), channels[m.parts[0]].name)
-        for m in matches
-        if m.agrees
-        and abs(m.scores.lag) <= _LATEST
-        and len(m.parts) == 1
-        and _is_rate(channels[m.parts[0]].unit, channels[m.velocity].unit)
-        and not right & {m.velocity, *m.parts}
+        Swapped(pair.name, pair.places, pair.position)
+        for pair in same
+        if abs(pair.scores.lag) <= _LONGEST_LAG
+        and len(pair.parts) == 1
+        and _is_rate(channels[pair.parts[0]].unit, channels[pair.velocity].unit)
+        and not right & pair.channels
     ]
 
 
-def _far(match: Match, dt: float) -> bool:
-    """Whether the factor is large, beyond doubt, and about the same everywhere."""
-    scores = match.scores
-    known = abs(scores.slope_there / RPM - 1.0) < _RPM_NEAR
-    usual = 1.0 / _BEYOND <= scores.slope_there <= _BEYOND and not known
-    if usual or abs(scores.lag) > _LATEST:
+def _has_large_factor(pair: VelocityPair) -> bool:
+    """Whether the factor is large and consistent over the data."""
+    scores = pair.scores
+    known = abs(scores.peak_slope / RPM - 1.0) < _RPM_NEAR
+    usual = 1.0 / _LARGE_FACTOR <= scores.peak_slope <= _LARGE_FACTOR and not known
+    if usual or abs(scores.lag) > _LONGEST_LAG:
         return False
-    v = np.concatenate([v - v.mean() for _, v in match.pairs])
-    slopes = match.slopes(dt)
-    alike = np.median(np.abs(slopes / scores.slope_there - 1.0)) < _ALIKE
-    return bool(len(slopes) >= _FEWEST and alike and v[1:] @ v[:-1] > _SMOOTH * (v @ v))
+    v = np.concatenate([v - v.mean() for _, v in pair.signals])
+    slopes = pair.slopes()
+    consistent = np.median(np.abs(slopes / scores.peak_slope - 1.0)) < _SAME_SLOPE
+    return bool(len(slopes) >= _FEWEST and consistent and v[1:] @ v[:-1] > _SMOOTH * (v @ v))
 
 
-def _known(match: Match, channels: Sequence[Channel]) -> bool | None:
-    """Whether the units are those of a position and its velocity; None: not all are known."""
-    units = [channels[j].unit for j in (match.velocity, *match.parts)]
+def _is_declared_pair(pair: VelocityPair, channels: Sequence[Channel]) -> bool | None:
+    """Whether the units are those of a position and its velocity; None if any is unknown."""
+    units = [channels[j].unit for j in (pair.velocity, *pair.parts)]
     if not all(units):
         return None
-    return _is_rate(units[0], "rad" if len(match.parts) > 1 else units[1])
+    return _is_rate(units[0], "rad" if len(pair.parts) > 1 else units[1])
 
 
 def _is_rate(velocity: str, position: str) -> bool:
     return bool(position) and velocity == f"{position}/s"
-
-
-_FEWEST_STRETCHES = 6  # stretches
-# Share of its acceleration that the twin leaves unexplained, as it is at least, and in the other
-# unit at most, to be sure.
-_NOTHING, _MOST = 0.6, 0.3
-# The twin's acceleration by the measured one, for a suspicion: as it is at most, in the other unit
-# within these bounds.
-_TOO_SMALL, _ABOUT_RIGHT = 0.1, (0.4, 2.5)
-
-
-class _Unit(NamedTuple):
-    name: str
-    symbol: str
-    of: str  # unit of the twin
-    factor: float
-    span: float  # of the measurements from which the other unit comes to mind
-
-
-_UNITS = (
-    _Unit("degrees", "deg", "rad", np.pi / 180.0, 2.0 * np.pi),
-    _Unit("millimetres", "mm", "m", 1e-3, 5.0),
-    _Unit("centimetres", "cm", "m", 1e-2, 5.0),
-)
 
 
 def mistaken_units(
@@ -254,63 +237,63 @@ def mistaken_units(
     Positions that span more than a turn, or 5 m, and whose acceleration the twin explains only in
     degrees, millimetres or centimetres.
 
-    The twin is simulated for 0.3 s from measured states. In the right unit it explains most of the
-    acceleration even if its parameters are off by a third, in a wrong one nothing. Linear systems
+    The twin is simulated for 0.3 s from measured states. In the right unit, it explains most of the
+    acceleration even if its parameters are off by a third; in a wrong unit, nothing. Linear systems
     without other forces fit any unit and give no finding.
 
     :param data: at the twin's interval
     :param channels: of the observation, named as in reports
     :param columns: names of the channels in the log
     """
-    units = [u for u in _UNITS if _spans(data, twin, u)]
-    stretches = stretches_in(data) if units and not _has_quaternions(twin) else None
-    if stretches is None or len(stretches.obs) < _FEWEST_STRETCHES:
+    units = [u for u in _UNITS if _exceeds_span(data, twin, u)]
+    windows = windows_of(data) if units and not _has_quaternions(twin) else None
+    if windows is None or len(windows.obs) < _FEWEST_WINDOWS:
         return []
-    channel_of = position_channels(twin, stretches)
-    as_is = replayed(twin, stretches, np.ones(data.n_obs))
-    found: dict[int, tuple[float, MistakenUnits]] = {}
+    channel_of = position_channels(twin, windows)
+    as_is = replay(twin, windows, np.ones(data.n_obs))
+    low, high = _ABOUT_RIGHT
+    found: dict[int, MistakenUnits] = {}
     for unit in units:
-        scale = np.where([_is_of(c, unit.of) for c in twin.channels], unit.factor, 1.0)
-        then = replayed(twin, stretches, scale)
+        scale = np.where([_has_unit(c, unit.of) for c in twin.channels], unit.factor, 1.0)
+        converted = replay(twin, windows, scale)
         for joint, channel in channel_of.items():
             if twin.channels[channel].unit != unit.of:
                 continue
-            left, times = then.unexplained()[joint], as_is.predicted()[joint]
-            sure = as_is.unexplained()[joint] >= _NOTHING and left <= _MOST
-            low, high = _ABOUT_RIGHT
-            likely = times < _TOO_SMALL and low < then.predicted()[joint] < high
-            if (sure or likely) and left < found.get(joint, (np.inf,))[0]:
+            explained = 1.0 - float(converted.unexplained_share()[joint])
+            ratio = as_is.acceleration_ratio()[joint]
+            unexplained_as_is = as_is.unexplained_share()[joint]
+            sure = unexplained_as_is >= _MIN_UNEXPLAINED and 1.0 - explained <= _MAX_UNEXPLAINED
+            likely = ratio < _TOO_SMALL and low < converted.acceleration_ratio()[joint] < high
+            best = found[joint].explained if joint in found else -np.inf
+            if (sure or likely) and explained > best:
                 kind = MistakenUnits if sure else LikelyUnits
-                found[joint] = (
-                    float(left),
-                    kind(
-                        channels[channel].name,
-                        all_samples(data),
-                        column=columns[channel],
-                        span=float(np.ptp(data.obs[..., channel])),
-                        unit=unit.of,
-                        other=unit.name,
-                        symbol=unit.symbol,
-                        factor=unit.factor,
-                        explained=float(1.0 - left),
-                        times=float(1.0 / max(times, 1e-6)),
-                    ),
+                found[joint] = kind(
+                    channels[channel].name,
+                    all_samples(data),
+                    column=columns[channel],
+                    span=float(np.ptp(data.obs[..., channel])),
+                    unit=unit.of,
+                    other=unit.name,
+                    symbol=unit.symbol,
+                    factor=unit.factor,
+                    explained=explained,
+                    times=float(1.0 / max(ratio, 1e-6)),
                 )
-    return [finding for _, finding in found.values()]
+    return list(found.values())
 
 
-def _spans(data: Trajectories, twin: Twin, unit: _Unit) -> bool:
-    """Whether some position of that unit spans so much that another one comes to mind."""
+def _exceeds_span(data: Trajectories, twin: Twin, unit: _Unit) -> bool:
+    """Whether a position in the twin's unit has too large a span for it."""
     own = [i for i, channel in enumerate(twin.channels) if channel.unit == unit.of]
     return any(np.ptp(data.obs[..., i], axis=1).max() > unit.span for i in own)
 
 
-def _is_of(channel: Channel, unit: str) -> bool:
+def _has_unit(channel: Channel, unit: str) -> bool:
     return channel.unit in (unit, f"{unit}/s")
 
 
 def _has_quaternions(twin: Twin) -> bool:
-    """Whether positions are longer than velocities, so that they have no unit of their own."""
+    """Whether there are more positions than velocities, so that some have no unit."""
     obs = jax.ShapeDtypeStruct((len(twin.channels),), float)
     state = jax.eval_shape(lambda obs: twin.infer(obs, twin.params), obs)
     return state.q.shape != state.v.shape

@@ -1,39 +1,43 @@
 """Time shifts of velocity channels relative to the derivatives of their positions."""
 
 import dataclasses
+import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
 from sb3_hds.core.trajectories import Trajectories
-from sb3_hds.data.audit.finding import Finding, recordings
-from sb3_hds.data.audit.stretches import all_samples
+from sb3_hds.core.twin import Twin
+from sb3_hds.data.audit.finding import Finding, Place
+from sb3_hds.data.audit.replay import replay, windows_of
+from sb3_hds.data.audit.segments import all_samples
 from sb3_hds.data.resampling.values import unwrapped
 
-_REACH = 0.05  # [s] longest shift that is looked for, but at least _FEWEST samples
+_REACH = 0.05  # longest shift that is tried [s], but at least _FEWEST samples
 _FEWEST, _MOST = 8, 100  # samples
-_SHORTEST = 24  # steps of an episode that is looked at
+_SHORTEST = 24  # steps of an episode; shorter ones are ignored
 _PER_REACH = 4  # steps of an episode for each sample of the longest shift
-_WIDTHS = (1, 3, 7, 15, 31)  # samples of the moving average; the first that makes a pair clear
-_CLEAR = 0.95  # correlation of a position's derivative with its velocity
-_SAME = 0.25  # largest difference of their ratio from 1
+_WIDTHS = (1, 3, 7, 15, 31)  # samples of the moving average; the first that identifies a pair
+_CLEAR = 0.95  # smallest correlation of a position's derivative with its velocity
+_SAME_SCALE = 0.25  # largest difference of their ratio from 1
 _CIRCLE = 0.1  # largest root mean square of cos^2 + sin^2 - 1
 _BLOCKS = 12
-_VISIBLE = 0.75  # samples: half of one is what a backward difference or semi-implicit Euler has
+_SHORTEST_SHIFT = 0.75  # samples; half a sample is due to backward differences or Euler steps
 _SIGMAS = 3.0
-_BETTER = 2.0  # by how much the shift must reduce the unexplained variance,
-# Mean square of a velocity less its backward difference, by that less a smoother one: where both
-# are noise, and where they are not. A smooth velocity half a sample late has 1/50.
-_SAME_NOISE, _SAME_NUMBER = 0.5, 2.5e-3
-# Correlation of successive fourth differences: -0.8 for noise of a position, -0.67 under random
+_VARIANCE_RATIO = 2.0  # smallest reduction of the unexplained variance by the shift, unless ...
+_LONG = 2.0  # ... the shift is longer than this [samples]
+# Largest ratio of mean squared deviations of a velocity from the backward difference and from a
+# smoother one, if the difference is noisy, and if not. A smooth velocity half a sample late has
+# 1/50.
+_SAME_NOISE, _SAME_SIGNAL = 0.5, 2.5e-3
+# Correlation of successive fourth differences: -0.8 for measurement noise, -0.67 under random
 # forces, and more for smooth motion.
-_ALTERNATES = -0.735
-_LONG = 2.0  # unless it is longer than this [samples]
+_NOISE_CORRELATION = -0.735
 
-Pairs = Sequence[tuple[np.ndarray, np.ndarray]]
+Signals = Sequence[tuple[np.ndarray, np.ndarray]]
 """Position and velocity of each episode, each of shape ``(rows,)``."""
 
 
@@ -57,7 +61,7 @@ class VelocityShift(Finding):
         return (
             f"'{self.channel}' {verb} the derivative of '{self.position}' by "
             f"{abs(self.samples):.2f} +- {self.stderr:.2f} samples, "
-            f"{1e3 * abs(self.seconds):.3g} ms ({recordings(self.places)})."
+            f"{1e3 * abs(self.seconds):.3g} ms ({self.recordings})."
         )
 
     remedy = (
@@ -66,128 +70,211 @@ class VelocityShift(Finding):
     )
 
 
-class Lag(NamedTuple):
-    """
-    :param velocity: channel
-    :param position: name of the position whose derivative it is
-    :param samples: delay of the velocity [samples]; negative: early
-    :param stderr: standard error of ``samples``, from blocks of the data
-    :param better: ratio of the unexplained variances without and with the shift
-    :param backward: whether it is the backward difference of the position
-    """
+@dataclasses.dataclass(frozen=True)
+class BackwardDifference(VelocityShift):
+    """A velocity that is the backward difference of its position, and so half a sample late."""
 
-    velocity: int
-    position: str
-    samples: float
-    stderr: float
-    better: float
-    backward: bool = False
+    @property
+    def sentence(self) -> str:
+        return (
+            f"'{self.channel}' is the backward difference of '{self.position}', which belongs half "
+            f"a sample, {1e3 * self.seconds:.3g} ms, earlier ({self.recordings})."
+        )
+
+    remedy = (
+        "Shift it: audit.corrected(data). This is not a sensor delay. Do not shift it if the twin "
+        "computes its velocity in the same way."
+    )
 
 
-class Match(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class VelocityPair:
     """
     A channel that is proportional to the derivative of another one.
 
     :param velocity: channel
+    :param name: of the velocity
     :param position: name of the position
     :param parts: channels of the position: one, or a cosine and a sine
-    :param pairs: position and velocity of each episode
-    :param scores: of the pairs
+    :param signals: position and velocity of each episode
+    :param dt: sampling interval [s]
+    :param scores: of the signals
     :param width: of the moving average [samples]
+    :param places: all samples of the data
     """
 
     velocity: int
+    name: str
     position: str
     parts: tuple[int, ...]
-    pairs: Pairs
-    scores: "_Scores"
+    signals: Signals
+    dt: float
+    scores: "_CrossCorrelation"
     width: int
+    places: tuple[Place, ...]
 
     @property
-    def agrees(self) -> bool:
+    def same_unit(self) -> bool:
         """Whether both are in the same unit."""
-        return abs(self.scores.slope_there - 1.0) < _SAME
+        return abs(self.scores.peak_slope - 1.0) < _SAME_SCALE
 
-    def slopes(self, dt: float) -> Float64[np.ndarray, " blocks"]:
-        """:return: of the velocity on the derivative, in blocks of the data, at the same lag"""
-        reach, there = len(self.scores.slope) // 2, int(self.scores.correlation.argmax())
-        blocks = _blocks(self.pairs, reach, self.width)
-        return np.array([_Scores.of([b], dt, reach, self.width).slope[there] for b in blocks])
+    @property
+    def channels(self) -> set[int]:
+        """All channels of the pair."""
+        return {self.velocity, *self.parts}
+
+    @property
+    def samples(self) -> float:
+        """Delay of the velocity [samples]; negative: early."""
+        return self.scores.lag
+
+    @functools.cached_property
+    def stderr(self) -> float:
+        """Standard error of ``samples``, from the scatter over blocks of the data."""
+        lags = np.array([s.lag for s in self._block_scores() if s.peak > 0.5 * _CLEAR])
+        if len(lags) < 3:
+            return 0.0 if len(lags) else np.inf
+        # Robust, because blocks with little motion are inaccurate.
+        sigma = 1.4826 * np.median(np.abs(lags - np.median(lags)))
+        return float(sigma / np.sqrt(len(lags)))
+
+    @functools.cached_property
+    def difference(self) -> "_Difference":
+        """How the velocity compares with the backward difference of the position."""
+        return _difference_of(self.signals, self.dt)
+
+    def slopes(self) -> Float64[np.ndarray, " blocks"]:
+        """:return: slope of the velocity on the derivative at this lag, in blocks of the data"""
+        there = self.scores.correlation.argmax()
+        return np.array([block.slope[there] for block in self._block_scores()])
+
+    def _block_scores(self) -> list["_CrossCorrelation"]:
+        """The cross-correlation in parts of the episodes, or in episodes if parts are too short."""
+        n_blocks = max(1, _BLOCKS // len(self.signals))
+        reach = len(self.scores.slope) // 2
+        blocks = [
+            block
+            for q, v in self.signals
+            for block in zip(np.array_split(q, n_blocks), np.array_split(v, n_blocks), strict=True)
+            if len(block[0]) > 4 * reach + self.width
+        ]
+        return [
+            _CrossCorrelation.of([b], self.dt, reach, self.width) for b in blocks or self.signals
+        ]
 
 
-def velocity_shifts(
-    data: Trajectories, names: Sequence[str], matches: Sequence[Match]
-) -> list[VelocityShift]:
+def velocity_shifts(pairs: Sequence[VelocityPair]) -> list[VelocityShift]:
     """
-    :param data: at one interval
-    :param names: of the observation channels
-    :param matches: of the data
     :return: the significant lags beyond that of a backward difference that are either long or
         explain half of the residual variance
     """
-    whole = all_samples(data)
     return [
         VelocityShift(
-            names[lag.velocity],
-            whole,
-            position=lag.position,
-            samples=lag.samples,
-            seconds=lag.samples * data.dt,
-            stderr=lag.stderr,
+            pair.name,
+            pair.places,
+            position=pair.position,
+            samples=pair.samples,
+            seconds=pair.samples * pair.dt,
+            stderr=pair.stderr,
         )
-        for lag in _lags(matches, data.dt)
-        if abs(lag.samples) >= max(_VISIBLE, _SIGMAS * lag.stderr)
-        and (lag.better >= _BETTER or abs(lag.samples) >= _LONG)
+        for pair in best_pairs(pairs)
+        if abs(pair.samples) >= max(_SHORTEST_SHIFT, _SIGMAS * pair.stderr)
+        and (pair.scores.variance_ratio >= _VARIANCE_RATIO or abs(pair.samples) >= _LONG)
     ]
 
 
-class Difference(NamedTuple):
+def backward_differences(
+    data: Trajectories, pairs: Sequence[VelocityPair], twin: Twin | None
+) -> list[BackwardDifference]:
     """
-    :param backward: whether a velocity is the backward difference of its position: it carries the
-        same noise, or is the same number
-    :param rough: whether it carries the noise of the position
+    :param data: at one interval
+    :param pairs: of the data
+    :param twin: if its own velocities are backward differences (semi-implicit Euler), they are not
+        reported; without a twin, only differences that carry the noise of the position are
+    """
+    found = {m.velocity: m for m in pairs if m.same_unit and m.difference.is_backward}
+    simulated = _backward_in_simulation(data, twin, found) if twin and found else None
+    return [
+        BackwardDifference(
+            pair.name,
+            pair.places,
+            position=pair.position,
+            samples=0.5,
+            seconds=0.5 * pair.dt,
+            stderr=0.0,
+        )
+        for v, pair in found.items()
+        if (pair.difference.is_noisy if simulated is None else v not in simulated)
+    ]
+
+
+def _backward_in_simulation(
+    data: Trajectories, twin: Twin, found: Mapping[int, VelocityPair]
+) -> set[int] | None:
+    """Velocity channels that are backward differences in a simulation; None if it is impossible."""
+    windows = windows_of(data)
+    if windows is None:
+        return None
+    obs = replay(twin, windows, np.ones(data.n_obs)).obs
+    obs = obs[np.isfinite(obs).all((1, 2))]
+    if not len(obs):
+        return None
+    own = set()
+    for v, pair in found.items():
+        first, *second = (obs[..., part] for part in pair.parts)
+        position = np.unwrap(np.arctan2(second[0], first), axis=1) if second else first
+        if _difference_of(list(zip(position, obs[..., v], strict=True)), data.dt).is_backward:
+            own.add(v)
+    return own
+
+
+class _Difference(NamedTuple):
+    """
+    :param is_backward: whether a velocity is the backward difference of its position: it has the
+        same noise, or the same values
+    :param is_noisy: whether it contains the noise of the position
     """
 
-    backward: bool
-    rough: bool
+    is_backward: bool
+    is_noisy: bool
 
 
-def difference_of(pairs: Pairs, dt: float) -> Difference:
+def _difference_of(signals: Signals, dt: float) -> _Difference:
     """
     Compare a velocity with the backward difference, and with a smoother one of equal delay.
 
-    :param pairs: position and velocity of each episode
+    :param signals: position and velocity of each episode
     """
     exact, smooth, bends = [], [], []
-    for q, v in pairs:
+    for q, v in signals:
         steps = np.diff(q) / dt
         exact.append(v[2:-1] - steps[1:-1])
         smooth.append(v[2:-1] - (steps[2:] + 2.0 * steps[1:-1] + steps[:-2]) / 4.0)
         bends.append(np.diff(q, 4))
     ours, others = (float(np.mean(np.concatenate(part) ** 2)) for part in (exact, smooth))
     products = sum(float(x[1:] @ x[:-1]) for x in bends)
-    rough = bool(products < _ALTERNATES * sum(float(x @ x) for x in bends))
-    share = _SAME_NOISE if rough else _SAME_NUMBER
-    return Difference(ours < share * others, rough)
+    is_noisy = bool(products < _NOISE_CORRELATION * sum(float(x @ x) for x in bends))
+    share = _SAME_NOISE if is_noisy else _SAME_SIGNAL
+    return _Difference(ours < share * others, is_noisy)
 
 
-def lags_of(data: Trajectories, names: Sequence[str]) -> list[Lag]:
-    """
-    Pairs of a position and its velocity in the same unit, and the lag between them.
+def best_pairs(pairs: Sequence[VelocityPair]) -> list[VelocityPair]:
+    """:return: for each velocity, the pair in the same unit with the highest correlation"""
+    best: dict[int, VelocityPair] = {}
+    for pair in pairs:
+        v = pair.velocity
+        if pair.same_unit and (v not in best or pair.scores.peak > best[v].scores.peak):
+            best[v] = pair
+    return list(best.values())
 
-    :param data: at one interval
-    :param names: of the observation channels
-    """
-    return _lags(matches_of(data, names), data.dt)
 
-
-def matches_of(data: Trajectories, names: Sequence[str]) -> list[Match]:
+def velocity_pairs(data: Trajectories, names: Sequence[str]) -> list[VelocityPair]:
     """
     Pairs of a position and its velocity, found by their correlation.
 
     The velocity is compared with the central difference of the position, which has no delay, both
     smoothed by the same symmetric window. A parabola through the correlations around the best shift
-    gives the fraction of a sample. The angle of a cosine and a sine is a position too.
+    interpolates between samples. The angle of a cosine and a sine is a position, too.
 
     :param data: at one interval
     :param names: of the observation channels
@@ -200,28 +287,16 @@ def matches_of(data: Trajectories, names: Sequence[str]) -> list[Match]:
     found = []
     for v in range(data.n_obs):
         for parts, positions in _positions(episodes, v):
-            pairs = [(q, x[:, v]) for q, x in zip(positions, episodes, strict=True)]
+            signals = [(q, x[:, v]) for q, x in zip(positions, episodes, strict=True)]
             for width in _WIDTHS:
                 if any(len(x) <= 4 * reach + width for x in episodes):
                     continue
-                scores = _Scores.of(pairs, data.dt, reach, width)
-                if scores.highest > _CLEAR:
-                    name = ", ".join(names[j] for j in parts)
-                    found.append(Match(v, name, parts, pairs, scores, width))
+                scores = _CrossCorrelation.of(signals, data.dt, reach, width)
+                if scores.peak > _CLEAR:
+                    position = ", ".join(names[j] for j in parts)
+                    about = (names[v], position, parts, signals, data.dt, scores, width)
+                    found.append(VelocityPair(v, *about, all_samples(data)))
                     break
-    return found
-
-
-def _lags(matches: Sequence[Match], dt: float) -> list[Lag]:
-    """The lag of each velocity to its best matching position."""
-    found = []
-    for v in dict.fromkeys(match.velocity for match in matches if match.agrees):
-        own = [match for match in matches if match.velocity == v and match.agrees]
-        best = max(own, key=lambda match: match.scores.highest)
-        scores = best.scores
-        stderr = _stderr(best.pairs, dt, len(scores.slope) // 2, best.width)
-        backward = difference_of(best.pairs, dt).backward
-        found.append(Lag(v, best.position, scores.lag, stderr, scores.better, backward))
     return found
 
 
@@ -240,30 +315,7 @@ def _positions(
     return found
 
 
-def _stderr(pairs: Pairs, dt: float, reach: int, width: int) -> float:
-    blocks = _blocks(pairs, reach, width)
-    scores = [_Scores.of([block], dt, reach, width) for block in blocks]
-    lags = np.array([s.lag for s in scores if s.highest > 0.5 * _CLEAR])
-    if len(lags) < 3:
-        return 0.0 if len(lags) else np.inf
-    # Robust, because a block in which hardly anything moves says little.
-    spread = 1.4826 * float(np.median(np.abs(lags - np.median(lags))))
-    return float(spread / np.sqrt(len(lags)))
-
-
-def _blocks(pairs: Pairs, reach: int, width: int) -> Pairs:
-    """Parts of the episodes, or these if parts are too short."""
-    n_blocks = max(1, _BLOCKS // len(pairs))
-    blocks = [
-        block
-        for q, v in pairs
-        for block in zip(np.array_split(q, n_blocks), np.array_split(v, n_blocks), strict=True)
-        if len(block[0]) > 4 * reach + width
-    ]
-    return blocks or pairs
-
-
-class _Scores(NamedTuple):
+class _CrossCorrelation(NamedTuple):
     """
     Cross-correlation of a velocity and a derivative, at shifts from -reach to reach samples.
 
@@ -275,10 +327,10 @@ class _Scores(NamedTuple):
     slope: Float64[np.ndarray, " shifts"]
 
     @classmethod
-    def of(cls, pairs: Pairs, dt: float, reach: int, width: int) -> "_Scores":
+    def of(cls, signals: Signals, dt: float, reach: int, width: int) -> "_CrossCorrelation":
         window = np.ones(width) / width
         moments = np.zeros((3, 2 * reach + 1))
-        for q, v in pairs:
+        for q, v in signals:
             rate = np.convolve((q[2:] - q[:-2]) / (2.0 * dt), window, "valid")
             speed = np.convolve(v[1:-1], window, "valid")[reach : len(rate) - reach]
             # At shift s, the velocity of sample k is compared with the derivative of k - s.
@@ -291,18 +343,18 @@ class _Scores(NamedTuple):
         return cls(vr / np.sqrt(np.maximum(vv * rr, tiny)), vr / np.maximum(rr, tiny))
 
     @property
-    def highest(self) -> float:
+    def peak(self) -> float:
         """The largest correlation."""
         return float(self.correlation.max())
 
     @property
-    def slope_there(self) -> float:
+    def peak_slope(self) -> float:
         """The slope where the correlation is largest."""
         return float(self.slope[self.correlation.argmax()])
 
     @property
-    def better(self) -> float:
-        """Unexplained variance without a shift by that with the best one."""
+    def variance_ratio(self) -> float:
+        """Unexplained variance without a shift over that with the best one."""
         unexplained = 1.0 - self.correlation**2
         return float(unexplained[len(unexplained) // 2] / max(unexplained.min(), 1e-12))
 

@@ -1,4 +1,4 @@
-"""NumPy's arrays, and archives of them, of any names."""
+"""NumPy arrays, and archives of arrays with any names."""
 
 import zipfile
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sb3_hds.data.columns import Columns
-from sb3_hds.data.reading.log import Log, base_of, foreign
+from sb3_hds.data.reading.log import Log, base_name, library_errors
 from sb3_hds.data.reading.tree import tables_of
 from sb3_hds.errors import TrajectoryError
 
@@ -17,19 +17,19 @@ def read_npz(path: Path, columns: Columns) -> Log:
     Arrays of one or two axes, or of three, of which the first one counts episodes.
 
     :param path: of the file
-    :param columns: for what is wanted
-    :raises TrajectoryError: for what ``Trajectories.save`` wrote, or if an array that is wanted
-        holds Python objects: they would have to be unpickled
+    :param columns: for the wanted names
+    :raises TrajectoryError: for a file of ``Trajectories.save``, or if a wanted array contains
+        Python objects, which would have to be unpickled
     """
-    with foreign(path):
+    with library_errors(path):
         if not zipfile.is_zipfile(path):
-            raise ValueError("it is no archive of arrays")
-        arrays, objects = _arrays(path, {base_of(name) for name in columns.wanted})
-    wanted = sorted(objects & {base_of(name) for name in columns.wanted})
+            raise ValueError("it is not an archive of arrays")
+        arrays, objects = _arrays(path, {base_name(name) for name in columns.wanted})
+    wanted = sorted(objects & {base_name(name) for name in columns.wanted})
     if wanted:
         raise TrajectoryError(
             f"'{path}' holds Python objects in {', '.join(wanted)}, as NumPy saves lists of "
-            "unequal arrays; they would have to be unpickled, and no file is. Save numbers: "
+            "unequal arrays. They would have to be unpickled, which is unsafe. Save numbers: "
             "Trajectories.from_arrays(obs, actions, dt=SECONDS).save(PATH)."
         )
     return Log(tables_of(arrays, columns, path.name))
@@ -40,15 +40,15 @@ def read_npy(path: Path, columns: Columns) -> Log:
     One array, whose columns are numbered from 0.
 
     :param path: of the file
-    :param columns: for what is wanted
+    :param columns: for the wanted names
     """
-    with foreign(path):
+    with library_errors(path):
         array = np.load(path, allow_pickle=False)
     return Log(tables_of(_fields(array), columns, path.name))
 
 
 def _arrays(path: Path, wanted: set[str]) -> tuple[dict[str, Any], set[str]]:
-    """:return: those that are wanted, or all; and the names of those that hold objects"""
+    """:return: the wanted arrays, or all; and the names of those that contain objects"""
     arrays, objects = {}, set()
     with np.load(path, allow_pickle=False) as archive:
         names = list(archive.files)

@@ -1,4 +1,4 @@
-"""Data sets of Minari."""
+"""Minari data sets."""
 
 import importlib
 from collections.abc import Mapping
@@ -7,20 +7,21 @@ from typing import Any
 import numpy as np
 
 from sb3_hds.data.columns import Columns, Entry
+from sb3_hds.data.reading.log import Log
 from sb3_hds.errors import TrajectoryError
 
 PREFIX = "minari:"
 
 
-def read_minari(name: str) -> tuple[list[dict[str, np.ndarray]], Columns]:
+def read_minari(name: str) -> Log:
     """
-    Episodes of a data set that is on this machine, as ``minari download`` leaves it there.
+    Episodes of a local data set, as installed by ``minari download``.
 
-    Minari's convention is ours: T actions and T + 1 observations. It knows no sampling interval, so
-    ``columns`` must give ``dt``. Channels are called ``observations[0]``, ``actions[0]``; those of
-    spaces with parts ``observations.arm[0]``.
+    Minari's convention is ours: T actions and T + 1 observations. It stores no sampling interval,
+    so ``columns`` must give ``dt``. Channels are called ``observations[0]``, ``actions[0]``, or
+    ``observations.arm[0]`` for nested spaces.
 
-    :param name: of the data set, as ``"D4RL/pen/human-v2"``
+    :param name: of the data set, such as ``"D4RL/pen/human-v2"``
     :return: one table per episode, and all channels
     :raises TrajectoryError: if Minari is not installed or has no such data set
     """
@@ -28,34 +29,33 @@ def read_minari(name: str) -> tuple[list[dict[str, np.ndarray]], Columns]:
         minari = importlib.import_module("minari")
     except ImportError as error:
         raise TrajectoryError(
-            "Data sets of Minari need the extra 'minari': pip install sb3-hds[minari]."
+            "Minari data sets need the extra 'minari': pip install sb3-hds[minari]."
         ) from error
     try:
         dataset = minari.load_dataset(name)
     except (OSError, ValueError) as error:  # it raises these for an unknown name
         local = ", ".join(minari.list_local_datasets()) or "none"
         raise TrajectoryError(
-            f"Minari has no data set '{name}' on this machine ({error}). There are: {local}. "
+            f"Minari has no data set '{name}' on this machine ({error}). Local data sets: {local}. "
             f"Download it first: minari download {name}."
         ) from error
     tables, own = [], Columns()
     for episode in dataset.iterate_episodes():
         obs = _flat("observations", episode.observations)
         actions = _flat("actions", episode.actions)
-        own = Columns(obs=_entries(obs), actions=_entries(actions))
-        # Row k has the action that followed it; the last row has none.
+        own = Columns(
+            obs=tuple(Entry(name, name) for name in obs),
+            actions=tuple(Entry(name, name) for name in actions),
+        )
+        # Row k has the action that follows it; the last row has none.
         tables.append(obs | {n: np.append(column, np.nan) for n, column in actions.items()})
     if not tables:
         raise TrajectoryError(f"Minari's data set '{name}' has no episodes.")
-    return tables, own
-
-
-def _entries(columns: Mapping[str, np.ndarray]) -> tuple[Entry, ...]:
-    return tuple(Entry(name, name) for name in columns)
+    return Log(tables, own)
 
 
 def _flat(name: str, values: Any) -> dict[str, np.ndarray]:
-    """Arrays of any depth of dicts and tuples, as columns of shape ``(rows,)``."""
+    """Nested dicts and tuples of arrays, as columns of shape ``(rows,)``."""
     if isinstance(values, tuple):
         values = {str(i): part for i, part in enumerate(values)}
     if isinstance(values, Mapping):

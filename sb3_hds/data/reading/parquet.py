@@ -1,4 +1,4 @@
-"""Parquet, with one number, or one list of numbers, in each row."""
+"""Parquet files with a number, a list of numbers or a struct in each row of a column."""
 
 from pathlib import Path
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from sb3_hds.data.columns import Columns
-from sb3_hds.data.reading.log import Log, base_of, columns_of, foreign
+from sb3_hds.data.reading.log import Log, base_name, library_errors, split_columns
 from sb3_hds.errors import TrajectoryError
 
 _EPISODE = "episode_index"  # of LeRobot
@@ -14,12 +14,12 @@ _EPISODE = "episode_index"  # of LeRobot
 
 def read_parquet(path: Path, columns: Columns) -> Log:
     """
-    Lists of one length are columns ``x[0]``, ``x[1]``, structs are columns ``x.a``.
+    Lists of equal length become columns ``x[0]``, ``x[1]``, structs become columns ``x.a``.
 
     A column ``episode_index``, as LeRobot writes it, separates episodes.
 
     :param path: of the file
-    :param columns: for what is wanted
+    :param columns: for the wanted names
     :raises TrajectoryError: if pyarrow is not installed
     """
     try:
@@ -29,21 +29,21 @@ def read_parquet(path: Path, columns: Columns) -> Log:
             f"'{path}': Parquet files are read by pyarrow, which is not installed. "
             "Install it: pip install sb3-hds[parquet]."
         ) from error
-    with foreign(path), ParquetFile(path) as file:
+    with library_errors(path), ParquetFile(path) as file:
         names = list(file.schema_arrow.names)
         tops = {name for name in names for w in columns.wanted if _is_of(w, name)}
         every = not all(any(_is_of(w, name) for name in names) for w in columns.wanted)
         chosen = names if every or not tops else [*tops, *{_EPISODE} & set(names)]
         table: dict[str, np.ndarray] = {}
         for name in chosen:
-            # One after another: the file's copy of a column goes before the next one comes.
+            # One at a time, so that the file's copy of a column is freed before the next is read.
             table |= _columns(name, file.read([name]).column(name))
     own = Columns(episode=_EPISODE) if _EPISODE in names else None
     return Log([table], own)
 
 
 def _is_of(wanted: str, name: str) -> bool:
-    return wanted == name or base_of(wanted) == name or wanted.startswith(f"{name}.")
+    return wanted == name or base_name(wanted) == name or wanted.startswith(f"{name}.")
 
 
 def _columns(name: str, column: Any) -> dict[str, np.ndarray]:
@@ -62,7 +62,7 @@ def _columns(name: str, column: Any) -> dict[str, np.ndarray]:
     if len(widths) != 1 or widths[0] is None:
         return {name: column.to_numpy()}
     chunks = [chunk.flatten().to_numpy(zero_copy_only=False) for chunk in column.chunks]
-    return columns_of(name, np.concatenate(chunks).reshape(-1, widths[0]), len(column))
+    return split_columns(name, np.concatenate(chunks).reshape(-1, widths[0]), len(column))
 
 
 def _part(column: Any, name: str) -> Any:

@@ -6,59 +6,191 @@ import re
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Int64
 
 from sb3_hds.data.columns import Columns, Entry
-from sb3_hds.data.reading.log import Log, foreign, listed
+from sb3_hds.data.reading.log import Log, library_errors
+from sb3_hds.data.wording import listed
 from sb3_hds.errors import TrajectoryError
 
 _GAP = 5.0  # intervals
-_LATE = 1_000_000_000  # [ns]: messages overtake each other by less than this
+_MAX_OVERTAKING = 1_000_000_000  # [ns]: by which messages may arrive out of order
+_STORAGE = (".db3", ".mcap")
+_REMEDY = "Repair an interrupted recording with 'ros2 bag reindex' or 'rosbag reindex'."
+_TIME = Entry("time", "time")
+_RECEIVED, _STAMP = "received", "header.stamp"
+_NAMES = ("name", "names", "joint_names")  # fields that name the entries of other fields
+_MAX_LISTED = 64  # entries of an array that are listed: longer arrays are images or scans
+_SAMPLE_MESSAGES = 50  # from which the names of columns are taken
+_TOKEN = re.compile(r"\[([^\]]*)\]|([^.\[\]]+)")
 
 
-class Series(NamedTuple):
+def is_bag(path: Path) -> bool:
+    """:return: whether a folder is one of rosbag2, with its metadata or without"""
+    return path.is_dir() and bool(_storage_files(path))
+
+
+def read_bag(path: Path, columns: Columns) -> Log:
     """
-    :param stamps: when each was measured [ns]
-    :param values: numbers, or texts
+    Columns are fields of topics, such as ``/joint_states:position[0]`` or
+    ``/joint_states:position[elbow]``.
+
+    Rows are the messages of one topic: that of ``time``, as ``/joint_states:header.stamp`` or
+    ``/joint_states:received``, or else that of the first observation. Observations of other topics
+    are interpolated linearly, actions and labels are held. All topics use one clock: their header
+    stamps if every topic that is used has them, otherwise the time of recording.
+
+    :param path: of a ``.bag``, ``.db3`` or ``.mcap`` file, or of a folder with the latter two
+    :param columns: for the wanted names and their kind
+    :raises TrajectoryError: if rosbags is not installed, a message is of an unknown type, or topics
+        have no clock in common
+    """
+    wanted = sorted(columns.wanted - {_TIME.name})
+    with _open_bag(path) as bag:
+        if not wanted:
+            topics = _read(bag, _all_columns(bag), path)
+            return Log([{k: v for t in topics.values() for k, v in t.columns().items()}])
+        in_bag = {connection.topic for connection in bag.connections}
+        known = {name.partition(":")[0] for name in wanted} <= in_bag
+        topics = _read(bag, wanted, path) if known else {}
+        if not known or any(topic.lacks_field for topic in topics.values()):
+            names = [*_all_columns(bag), "time"]
+            return Log([dict.fromkeys(names, np.zeros(0))], Columns(time=(_TIME,)))
+    return _log_at_stamps(topics, columns, path)
+
+
+class _Topic:
+    """
+    Some fields of all messages of a topic.
+
+    :param name: of the topic
+    :param fields: such as ``position[elbow]``
     """
 
-    stamps: Int64[np.ndarray, " n"]
-    values: np.ndarray
+    def __init__(self, name: str, fields: Iterable[str]) -> None:
+        self.name = name
+        self.received, self.header = array("q"), array("q")
+        self._paths = {field: _TOKEN.findall(field) for field in fields}
+        self._values: dict[str, Any] = {}
+        self._at: dict[str, array[int]] = {field: array("q") for field in self._paths}
+        # Arrays whose entries are selected by number -> the names of the entries.
+        self._numbered: dict[str, list[str] | None] = {
+            field[: token.start()]: None
+            for field in self._paths
+            for token in _TOKEN.finditer(field)
+            if (token[1] or "").isdigit()
+        }
+
+    def add(self, message: Any, received: int) -> None:
+        """
+        :param message: whose fields are stored, unless it lacks them
+        :param received: time of recording [ns]
+        """
+        number = len(self.received)
+        self.received.append(received)
+        stamp = _field_value(message, [("", "header"), ("", "stamp")])
+        self.header.append(stamp if isinstance(stamp, int) else 0)
+        for field, path in self._paths.items():
+            value = received if field == _RECEIVED else _field_value(message, path)
+            if value is None:
+                continue
+            if field not in self._values:
+                self._values[field] = [] if isinstance(value, str) else array("d")
+            self._values[field].append(value)
+            self._at[field].append(number)
+        for field, first in self._numbered.items():
+            names = _entry_names(message, [*_TOKEN.findall(field), ("0", "")])
+            if first is None:
+                self._numbered[field] = names
+            elif names != first:
+                raise TrajectoryError(
+                    f"The names in '{self.name}' change from message to message, so entries have "
+                    f"no fixed number. Select them by name, as {self.name}:{field}[{names[0]}]. "
+                    f"Names: {listed(dict.fromkeys([*first, *names]))}."
+                )
+
+    @property
+    def lacks_field(self) -> bool:
+        """Whether no message has one of the fields."""
+        return not all(at or field == _STAMP for field, at in self._at.items())
+
+    def stamps(self, clock: str) -> np.ndarray:
+        """:return: of all messages [ns]"""
+        return np.array(self.header if clock == _STAMP else self.received, np.int64)
+
+    def series(self, field: str, clock: str) -> tuple[np.ndarray, np.ndarray]:
+        """:return: stamps [ns] and values of a field, in the messages that have it"""
+        at = np.array(self._at[field], np.int64)
+        return self.stamps(clock)[at], np.array(self._values.get(field, ()))
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """:return: all fields by their full names; times in seconds from the first message"""
+        found = {f"{self.name}:{field}": np.array(v) for field, v in self._values.items()}
+        for field in {_STAMP, _RECEIVED} & self._values.keys():
+            stamps = self.stamps(field)
+            found[f"{self.name}:{field}"] = 1e-9 * (stamps - stamps[0])
+        return found
 
 
-def in_order(stamps: np.ndarray) -> np.ndarray:
-    """
-    :param stamps: of messages in the order in which they arrived [ns]
-    :return: sorted, if they only overtook each other; a clock that was set back stays as it is
-    """
-    back = np.diff(stamps, prepend=stamps[:1])
-    return np.sort(stamps) if back.min(initial=0) > -_LATE else stamps
+def _log_at_stamps(topics: Mapping[str, _Topic], columns: Columns, path: Path) -> Log:
+    """All columns at the stamps of one topic."""
+    time_field = [
+        entry.column for entry in columns.time or () if entry.column not in (None, "time")
+    ]
+    observed = [entry.column or "" for entry in columns.obs or () if entry.column]
+    every = [*time_field, *observed, *sorted(columns.wanted - {_TIME.name})]
+    leading, _, first = str(every[0]).partition(":")
+    clock = _clock(topics, first if time_field else "", leading, path)
+    series = {
+        f"{topic.name}:{field}": topic.series(field, clock)
+        for topic in topics.values()
+        for field in topic._paths
+        if field not in (_STAMP, _RECEIVED)
+    }
+    main = f"{leading}:{first}"
+    stamps = series[main][0] if main in series else topics[leading].stamps(clock)
+    # Sort messages that arrived out of order, but keep the jump of a clock that was set back.
+    if np.diff(stamps).min(initial=0) > -_MAX_OVERTAKING:
+        stamps = np.sort(stamps)
+    entries = {entry.column: entry for entry in columns.obs or ()}
+    table, done = _align(series, stamps, entries, columns.gap)
+    left = table.pop("")
+    if not len(left):
+        others = listed(sorted(set(topics) - {leading}))
+        raise TrajectoryError(
+            f"'{path}': no message of '{leading}' is between messages of {others} without a gap. "
+            "Record them at the same time, or set the longest gap: gap: SECONDS."
+        )
+    for name in (f"{leading}:{_STAMP}", f"{leading}:{_RECEIVED}", "time"):
+        table[name] = 1e-9 * (left - stamps[0])
+    which = "header stamps" if clock == _STAMP else "times of recording"
+    note = f"At the {which} of '{leading}', {' and '.join(done)}."
+    return Log([table], Columns(time=(_TIME,)), notes=(note,) if done else ())
 
 
-def aligned(
-    series: Mapping[str, Series],
+def _align(
+    series: Mapping[str, tuple[np.ndarray, np.ndarray]],
     stamps: np.ndarray,
     observed: Mapping[str | None, Entry],
     gap: float | None,
 ) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
     """
-    Everything at given stamps: observations interpolated linearly, actions and labels held.
+    All series at given stamps: observations interpolated linearly, actions and labels held.
 
-    Rows before the first value of a signal are left out, and so are those where an observation
+    Rows before the first value of a series are dropped, and so are those where an observation
     would have to be interpolated across a gap, or beyond its last value.
 
-    :param series: by name
+    :param series: stamps of the values [ns], and the values, by name
     :param stamps: of the rows [ns]
-    :param observed: the observation channels among them; an angle turns the shorter way
+    :param observed: the observation channels among them; angles are interpolated the shorter way
     :param gap: a longer time between two values is a gap [s]; default: five intervals
-    :return: columns by name, the stamps of their rows as ``""``; and what was done, in words
+    :return: columns by name, the stamps of their rows as ``""``; and phrases for the report
     """
     kept = np.ones(len(stamps), bool)
     columns: dict[str, np.ndarray] = {}
-    interpolated, held = list[str](), list[str]()
+    done: dict[str, list[str]] = {"interpolated": [], "held": []}
     for name, (times, values) in series.items():
         order = np.argsort(times, kind="stable")
         times, values = times[order], values[order]
@@ -69,17 +201,16 @@ def aligned(
         kept &= before >= 0
         if name not in observed or values.dtype.kind not in "fiub":
             columns[name] = values[np.maximum(before, 0)]
-            held.append(name)
+            done["held"].append(name)
             continue
         columns[name] = _interpolated(times, values, stamps, observed[name])
         after = np.minimum(np.searchsorted(times, stamps, side="left"), len(times) - 1)
-        usual = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
-        longest = 1e9 * gap if gap else _GAP * usual
+        interval = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        longest = 1e9 * gap if gap else _GAP * interval
         kept &= (stamps <= times[-1]) & (times[after] - times[np.maximum(before, 0)] <= longest)
-        interpolated.append(name)
+        done["interpolated"].append(name)
     columns[""] = stamps
-    done = ((interpolated, "interpolated"), (held, "held"))
-    words = tuple(f"{listed(names)} {word}" for names, word in done if names)
+    words = tuple(f"{listed(names)} {word}" for word, names in done.items() if names)
     return {name: column[kept] for name, column in columns.items()}, words
 
 
@@ -87,200 +218,33 @@ def _interpolated(
     times: np.ndarray, values: np.ndarray, stamps: np.ndarray, entry: Entry
 ) -> np.ndarray:
     values = values.astype(float)
-    if entry.angle and entry.factor:
-        values = np.unwrap(values * entry.factor) / entry.factor
-    # Nanoseconds since 1970 do not fit into a double.
+    turn = 2.0 * np.pi / entry.factor if entry.angle and entry.factor else None
+    if turn:
+        values = np.unwrap(values, period=abs(turn))
+    # A double cannot represent nanoseconds since 1970 exactly.
     begin = times[0]
     at = np.interp((stamps - begin).astype(float), (times - begin).astype(float), values)
-    if entry.angle and entry.factor:
-        turn = 2.0 * np.pi / entry.factor
-        at = (at + 0.5 * turn) % turn - 0.5 * turn
-    return at
+    return (at + 0.5 * turn) % turn - 0.5 * turn if turn else at
 
 
-STORAGE = (".db3", ".mcap")
-_REMEDY = "A recording that was cut off is mended by 'ros2 bag reindex' or 'rosbag reindex'."
-_TIME = Entry("time", "time")
-_RECEIVED, _STAMP = "received", "header.stamp"
-_NAMES = ("name", "names", "joint_names")  # fields that name the entries of those beside them
-_LONGEST = 64  # entries of an array that are listed: more are a picture or a scan
-_FIRST = 50  # messages from which the names of columns are taken
-_TOKEN = re.compile(r"\[([^\]]*)\]|([^.\[\]]+)")
-
-
-def is_bag(path: Path) -> bool:
-    """:return: whether a folder is one of rosbag2, with its metadata or without"""
-    return path.is_dir() and bool(_storage(path))
-
-
-def read_bag(path: Path, columns: Columns) -> Log:
-    """
-    Fields of topics, as ``/joint_states:position[0]`` or ``/joint_states:position[elbow]``.
-
-    Rows are the messages of one topic: that of ``time``, as ``/joint_states:header.stamp`` or
-    ``/joint_states:received``, or else that of the first observation. Observations of other topics
-    are interpolated linearly, actions and labels are held. All topics are on one clock: their
-    header stamps where every one that is used has some, otherwise the time of recording.
-
-    :param path: of a ``.bag``, ``.db3`` or ``.mcap`` file, or of a folder with the latter
-    :param columns: for what is wanted, and what it is
-    :raises TrajectoryError: if rosbags is not installed, a message is of an unknown type, or topics
-        have no clock in common
-    """
-    with _opened(path) as bag:
-        fields = _fields_of(sorted(columns.wanted - {_TIME.name}))
-        if fields and set(fields) <= {connection.topic for connection in bag.connections}:
-            topics = {t: _read(bag, t, names, path) for t, names in fields.items()}
-            lacking = [f"{t}:{n}" for t, topic in topics.items() for n in topic.lacking]
-        else:
-            topics, lacking = {}, ["all"]
-        if lacking or not fields:
-            found = _discovered(bag)
-            if fields:
-                return Log([dict.fromkeys([*found, "time"], np.zeros(0))], Columns(time=(_TIME,)))
-            topics = {t: _read(bag, t, n, path) for t, n in _fields_of(found).items()}
-            return Log([{k: v for t in topics.values() for k, v in t.columns().items()}])
-    return _rows(topics, columns, path)
-
-
-class _Topic:
-    """
-    Some fields of all messages of a topic.
-
-    :param name: of the topic
-    :param fields: as in ``position[elbow]``
-    """
-
-    def __init__(self, name: str, fields: Iterable[str]) -> None:
-        self.name = name
-        self.received, self.header = array("q"), array("q")
-        self._paths = {field: _TOKEN.findall(field) for field in fields}
-        self._values: dict[str, Any] = {}
-        self._at: dict[str, array[int]] = {field: array("q") for field in self._paths}
-        # Arrays whose entries are chosen by number, and the names of the entries.
-        self._numbered: dict[str, list[str] | None] = {}
-        for path in self._paths.values():
-            for i, (index, _) in enumerate(path):
-                if index.isdigit():
-                    self._numbered[_written(path[:i])] = None
-
-    def add(self, message: Any, received: int) -> None:
-        """
-        :param message: whose fields are kept; one that it lacks is left out
-        :param received: when it was recorded [ns]
-        """
-        number = len(self.received)
-        self.received.append(received)
-        stamp = _value(message, [("", "header"), ("", "stamp")])
-        self.header.append(stamp if isinstance(stamp, int) else 0)
-        for field, path in self._paths.items():
-            value = received if field == _RECEIVED else _value(message, path)
-            if value is None:
-                continue
-            if field not in self._values:
-                self._values[field] = [] if isinstance(value, str) else array("d")
-            self._values[field].append(value)
-            self._at[field].append(number)
-        for field, first in self._numbered.items():
-            names = _names_beside(message, [*_TOKEN.findall(field), ("0", "")])
-            if first is None:
-                self._numbered[field] = names
-            elif names != first:
-                raise TrajectoryError(
-                    f"The names in '{self.name}' change from message to message, so that entries "
-                    f"have no number. Choose them by name, as {self.name}:{field}[{names[0]}]. "
-                    f"There are: {listed(dict.fromkeys([*first, *names]))}."
-                )
-
-    @property
-    def lacking(self) -> list[str]:
-        """Fields that no message has."""
-        return [field for field, at in self._at.items() if not at and field != _STAMP]
-
-    def stamps(self, clock: str) -> np.ndarray:
-        """:return: of all messages [ns]"""
-        return np.array(self.header if clock == _STAMP else self.received, np.int64)
-
-    def series(self, field: str, clock: str) -> Series:
-        """:return: the messages that have the field"""
-        at = np.array(self._at[field], np.int64)
-        return Series(self.stamps(clock)[at], np.array(self._values.get(field, ())))
-
-    def columns(self) -> dict[str, np.ndarray]:
-        """:return: all fields, with their full names; times in seconds, from the first message"""
-        found = {}
-        for field, values in self._values.items():
-            column = np.array(values)
-            if field in (_STAMP, _RECEIVED):
-                stamps = self.stamps(field)
-                column = 1e-9 * (stamps - stamps[0])
-            found[f"{self.name}:{field}"] = column
-        return found
-
-
-def _written(path: Sequence[tuple[str, str]]) -> str:
-    """The reverse of the split into tokens."""
-    return "".join(f".{name}" if name else f"[{index}]" for index, name in path).lstrip(".")
-
-
-def _fields_of(names: Iterable[str]) -> dict[str, list[str]]:
-    """Fields by topic."""
-    found: dict[str, list[str]] = {}
-    for name in names:
-        topic, _, field = name.partition(":")
-        found.setdefault(topic, []).append(field)
-    return found
-
-
-def _rows(topics: Mapping[str, _Topic], columns: Columns, path: Path) -> Log:
-    """Everything at the stamps of one topic."""
-    said = [entry.column for entry in columns.time or () if entry.column not in (None, "time")]
-    observed = [entry.column or "" for entry in columns.obs or () if entry.column]
-    every = [*said, *observed, *sorted(columns.wanted - {_TIME.name})]
-    leading, _, first = str(every[0]).partition(":")
-    clock = _clock(topics, first if said else "", leading, path)
-    series = {
-        f"{topic.name}:{field}": topic.series(field, clock)
-        for topic in topics.values()
-        for field in topic._paths
-        if field not in (_STAMP, _RECEIVED)
-    }
-    main = f"{leading}:{first}"
-    stamps = in_order(series[main].stamps if main in series else topics[leading].stamps(clock))
-    entries = {entry.column: entry for entry in columns.obs or ()}
-    table, done = aligned(series, stamps, entries, columns.gap)
-    left = table.pop("")
-    if not len(left):
-        others = listed(sorted(set(topics) - {leading}))
-        raise TrajectoryError(
-            f"'{path}': no message of '{leading}' lies between those of {others}, without a gap. "
-            "Record them at once, or say how long a gap may be: gap: SECONDS."
-        )
-    for name in (f"{leading}:{_STAMP}", f"{leading}:{_RECEIVED}", "time"):
-        table[name] = 1e-9 * (left - stamps[0])
-    which = "header stamps" if clock == _STAMP else "times of recording"
-    note = f"At the {which} of '{leading}', {' and '.join(done)}."
-    return Log([table], Columns(time=(_TIME,)), notes=(note,) if done else ())
-
-
-def _clock(topics: Mapping[str, _Topic], said: str, leading: str, path: Path) -> str:
-    """The stamps that all topics share."""
+def _clock(topics: Mapping[str, _Topic], time_field: str, leading: str, path: Path) -> str:
+    """The clock that all topics use: header stamps or times of recording."""
     without = [t.name for t in topics.values() if not any(t.header)]
-    if said == _STAMP and without:
+    if time_field == _STAMP and without:
         raise TrajectoryError(
             f"'{path}': {listed(without)} has no header stamps. Use the time of recording: "
             f"time: '{leading}:{_RECEIVED}'."
         )
-    if said not in ("", _STAMP, _RECEIVED) and len(topics) > 1:
+    if time_field not in ("", _STAMP, _RECEIVED) and len(topics) > 1:
         raise TrajectoryError(
-            f"'{path}': several topics are put on one clock, which '{leading}:{said}' is not. Use "
-            f"time: '{leading}:{_STAMP}' or time: '{leading}:{_RECEIVED}'."
+            f"'{path}': several topics need a common clock, which '{leading}:{time_field}' is not. "
+            f"Use time: '{leading}:{_STAMP}' or time: '{leading}:{_RECEIVED}'."
         )
-    return said if said in (_STAMP, _RECEIVED) else _RECEIVED if without else _STAMP
+    return time_field if time_field in (_STAMP, _RECEIVED) else _RECEIVED if without else _STAMP
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open_bag(path: Path) -> Iterator[Any]:
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -289,16 +253,19 @@ def _opened(path: Path) -> Iterator[Any]:
             f"'{path}': bags are read by rosbags, which is not installed. Install it: "
             "pip install sb3-hds[ros]."
         ) from error
-    # Bags before ROS 2 Iron do not hold the definitions of their messages.
+    # Bags before ROS 2 Iron do not contain the definitions of their messages.
     known = get_typestore(Stores.ROS2_HUMBLE)
-    with foreign(path, _REMEDY), AnyReader(_storage(path), default_typestore=known) as bag:
+    with (
+        library_errors(path, _REMEDY),
+        AnyReader(_storage_files(path), default_typestore=known) as bag,
+    ):
         yield bag
 
 
-def _storage(path: Path) -> list[Path]:
+def _storage_files(path: Path) -> list[Path]:
     if not path.is_dir() or (path / "metadata.yaml").is_file():
         return [path]
-    return sorted(file for file in path.iterdir() if file.suffix in STORAGE)
+    return sorted(file for file in path.iterdir() if file.suffix in _STORAGE)
 
 
 def _messages(bag: Any, topic: str) -> Iterator[tuple[Any, int]]:
@@ -309,30 +276,36 @@ def _messages(bag: Any, topic: str) -> Iterator[tuple[Any, int]]:
         except KeyError as error:
             raise TrajectoryError(
                 f"Messages of '{topic}' are of the type {connection.msgtype}, which this bag does "
-                "not define. Record it with ROS 2 Iron or later, whose bags hold the definitions."
+                "not define. Record it with ROS 2 Iron or later, whose bags contain them."
             ) from error
 
 
-def _read(bag: Any, name: str, fields: Iterable[str], path: Path) -> _Topic:
-    topic = _Topic(name, fields)
-    for message, received in _messages(bag, name):
-        topic.add(message, received)
-    if not topic.received:
-        raise TrajectoryError(f"'{path}' has no message of '{name}'.")
-    return topic
+def _read(bag: Any, names: Iterable[str], path: Path) -> dict[str, _Topic]:
+    """The topics of these columns, with the fields that the columns name."""
+    fields: dict[str, list[str]] = {}
+    for name in names:
+        topic, _, field = name.partition(":")
+        fields.setdefault(topic, []).append(field)
+    topics = {name: _Topic(name, of_topic) for name, of_topic in fields.items()}
+    for name, topic in topics.items():
+        for message, received in _messages(bag, name):
+            topic.add(message, received)
+        if not topic.received:
+            raise TrajectoryError(f"'{path}' has no message of '{name}'.")
+    return topics
 
 
-def _value(message: Any, path: Sequence[tuple[str, str]]) -> Any:
+def _field_value(message: Any, path: Sequence[tuple[str, str]]) -> Any:
     """A number, a text, or a time [ns]; None if the message has no such field."""
     value = message
     for place, (index, name) in enumerate(path):
         if name:
             value = getattr(value, name, None)
         elif hasattr(value, "__len__"):
-            names = [] if index.isdigit() else _names_beside(message, path[: place + 1])
+            names = [] if index.isdigit() else _entry_names(message, path[: place + 1])
             at = int(index) if index.isdigit() else names.index(index) if index in names else -1
             value = value[at] if 0 <= at < len(value) else None
-        elif index != "0":  # a single number may be called the first one
+        elif index != "0":  # a scalar is its own first entry
             return None
         if value is None:
             return None
@@ -343,8 +316,8 @@ def _value(message: Any, path: Sequence[tuple[str, str]]) -> Any:
     return value if isinstance(value, str | bool | int | float | np.generic) else None
 
 
-def _names_beside(message: Any, path: Sequence[tuple[str, str]]) -> list[str]:
-    """Names of the entries of an array, from the closest part of the message that has some."""
+def _entry_names(message: Any, path: Sequence[tuple[str, str]]) -> list[str]:
+    """Names of the entries of an array, from the innermost part of the message with names."""
     owners = [message]
     for _, name in path[:-1]:
         owner = getattr(owners[-1], name, None) if name else None
@@ -359,30 +332,30 @@ def _names_beside(message: Any, path: Sequence[tuple[str, str]]) -> list[str]:
     return []
 
 
-def _discovered(bag: Any) -> list[str]:
+def _all_columns(bag: Any) -> list[str]:
     """Names of all columns, from the first messages of each topic."""
     found: dict[str, None] = {}
     for topic in dict.fromkeys(connection.topic for connection in bag.connections):
         with contextlib.suppress(TrajectoryError):
-            for message, _ in itertools.islice(_messages(bag, topic), _FIRST):
-                leaves = [_RECEIVED, *_leaves(message, message, "")]
+            for message, _ in itertools.islice(_messages(bag, topic), _SAMPLE_MESSAGES):
+                leaves = [_RECEIVED, *_fields_in(message, message, "")]
                 found |= dict.fromkeys(f"{topic}:{field}" for field in leaves)
     return list(found)
 
 
-def _leaves(message: Any, root: Any, prefix: str) -> Iterator[str]:
+def _fields_in(message: Any, root: Any, prefix: str) -> Iterator[str]:
     for field in getattr(message, "__dataclass_fields__", ()):
         value, name = getattr(message, field), f"{prefix}{field}"
         if field.startswith("__"):
             continue
         if hasattr(value, "nanosec") or isinstance(value, str | bool | int | float | np.generic):
             yield name
-        elif isinstance(value, np.ndarray) and len(value) <= _LONGEST:
-            names = _names_beside(root, _TOKEN.findall(f"{name}[0]"))
+        elif isinstance(value, np.ndarray) and len(value) <= _MAX_LISTED:
+            names = _entry_names(root, _TOKEN.findall(f"{name}[0]"))
             each = names if len(names) == len(value) else range(len(value))
             yield from (f"{name}[{index}]" for index in each)
-        elif isinstance(value, list) and len(value) <= _LONGEST:
+        elif isinstance(value, list) and len(value) <= _MAX_LISTED:
             for i, part in enumerate(value):
-                yield from _leaves(part, root, f"{name}[{i}].")
+                yield from _fields_in(part, root, f"{name}[{i}].")
         else:
-            yield from _leaves(value, root, f"{name}.")
+            yield from _fields_in(value, root, f"{name}.")

@@ -1,1 +1,1 @@
-"""From the rows of a log to samples at one constant interval, and a report of what was done."""
+"""Resampling of the rows of a log to a constant interval, with a report of the changes."""

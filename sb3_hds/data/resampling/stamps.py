@@ -1,26 +1,26 @@
-"""Checks of time stamps against the values of their rows: duplicates, coarse or true stamps."""
+"""Checks of time stamps, partly against the values: duplicates, resolution, true stamps."""
 
 import numpy as np
 from jaxtyping import Bool
 
 from sb3_hds.data.resampling.clock import Clock, shares_stamps
 from sb3_hds.data.resampling.rows import Rows
-from sb3_hds.data.resampling.values import unwrapped
+from sb3_hds.data.resampling.values import runs, unwrapped
 from sb3_hds.errors import TrajectoryError
 
-_NEIGHBOURS = 5  # rows before and after a repeated stamp that say whether there is a row too many
-_EQUAL = 1e-6  # of an interval: stamps that are closer than this are the same
-_TWICE, _ONCE = 0.9, 0.5  # share of equal rows under equal stamps, and under different ones
-_FEWEST_STAMPS = 30  # that tell an interval to 0.1 %, where several rows share each
-_FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # differences in which smooth motion vanishes
+_NEIGHBOURS = 5  # rows around a repeated stamp that decide whether a row is duplicated
+_EQUAL = 1e-6  # of an interval: closer stamps are equal
+_TWICE, _ONCE = 0.9, 0.5  # share of equal rows with equal stamps, and with different ones
+_FEWEST_STAMPS = 30  # for an interval to 0.1 %, if several rows share each
+_FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # fourth differences, small for smooth motion
 _SMOOTH = np.ones(5) / 5.0
 _SIGMAS = 4.0
 
 
-def check_resolved(rows: Rows) -> None:
+def check_resolution(rows: Rows) -> None:
     """
-    :param rows: of one episode, none written twice
-    :raises TrajectoryError: if stamps are so coarse that no interval follows from them
+    :param rows: of one episode, without duplicates
+    :raises TrajectoryError: if stamps are too coarse to determine an interval
     """
     different = np.unique(rows.times)
     coarse = len(different) == 1 or (shares_stamps(rows.times) and len(different) < _FEWEST_STAMPS)
@@ -34,39 +34,38 @@ def check_resolved(rows: Rows) -> None:
     if single > 1e-3 and stored_short and np.array_equal(rows.times, np.float32(rows.times)):
         why = (
             f"In single precision (float32), numbers around {largest:.4g} are {single:g} apart: "
-            "store stamps as float64, or subtract the first one before. "
+            "store stamps as float64, or subtract the first one before storing. "
         )
     raise TrajectoryError(
         f"The time stamps of '{rows.source}' are too coarse: {len(rows.times)} rows share "
-        f"{len(different)} of them, so how far rows are apart does not follow. {why}Or leave "
-        "'time' out of columns and say the interval: dt: SECONDS."
+        f"{len(different)} of them, which does not determine an interval. {why}Or remove 'time' "
+        "from columns and give the interval: dt: SECONDS."
     )
 
 
-def written_twice(rows: Rows, interval: float) -> Bool[np.ndarray, " rows"]:
+def duplicated(rows: Rows, interval: float) -> Bool[np.ndarray, " rows"]:
     """
-    Duplicated rows, which repeat the stamp of the row before.
+    Duplicated rows, which repeat the stamp of the previous row.
 
-    Where few stamps repeat, these are the rows after which the clock is one row behind. Where many
-    do, all of them are duplicates if their values repeat as well; otherwise none is, and the ticks
-    of the logger are coarser than the interval.
+    If few stamps repeat, a row is a duplicate if the stamps after it are one interval behind the
+    count of rows. If many do, all of them are duplicates if their values repeat as well; otherwise
+    none is, and stamps are coarser than the interval.
 
     :param rows: of one episode
-    :param interval: typical one [s]
+    :param interval: typical interval [s]
     """
     waits = np.diff(rows.times)
-    again = np.concatenate([[False], (waits == 0.0) | (waits <= _EQUAL * interval)])
-    if not again.any():
-        return again
+    repeats_stamp = np.concatenate([[False], (waits == 0.0) | (waits <= _EQUAL * interval)])
+    if not repeats_stamp.any():
+        return repeats_stamp
     if shares_stamps(rows.times):
         same = np.concatenate([[False], (rows.obs[1:] == rows.obs[:-1]).all(1)])
-        elsewhere = same[1:][~again[1:]]
-        copied = same[again].mean() > _TWICE and elsewhere.sum() < _ONCE * len(elsewhere)
-        return again if copied else np.zeros_like(again)
-    ahead = rows.times / interval - np.arange(len(again))
-    found = np.zeros_like(again)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], again, [0]])))
-    for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        elsewhere = same[1:][~repeats_stamp[1:]]
+        copied = same[repeats_stamp].mean() > _TWICE and elsewhere.sum() < _ONCE * len(elsewhere)
+        return repeats_stamp if copied else np.zeros_like(repeats_stamp)
+    ahead = rows.times / interval - np.arange(len(repeats_stamp))
+    found = np.zeros_like(repeats_stamp)
+    for first, end in runs(repeats_stamp):
         before, after = ahead[max(first - _NEIGHBOURS, 0) : first], ahead[end : end + _NEIGHBOURS]
         behind = np.median(before) - np.median(after) if len(after) else end - first
         found[end - int(np.clip(np.round(behind), 0, end - first)) : end] = True
@@ -77,18 +76,18 @@ def values_follow_stamps(rows: Rows, clock: Clock) -> bool:
     """
     Whether rows were measured at their stamps rather than at the ticks of their clock.
 
-    If row k was measured late by a time d, its value differs by v d from what it would be at its
-    tick, which spoils the smoothness of the motion. So fourth differences of the values are
+    If row k was measured a time d after its tick, its value differs by v d from the value at the
+    tick, so the values at the ticks are not smooth. Therefore, fourth differences of the values are
     regressed on those of v d: the slope is 1 if the stamps are right, and 0 if the ticks are. If
     noise hides the difference, it does not matter, and the answer is no.
 
-    :param rows: of which some stamps are off their ticks
-    :param clock: of these
+    :param rows: some of whose stamps deviate from their ticks
+    :param clock: of these rows
     """
     off = (rows.times - clock.times) / clock.dt
     usable = np.zeros(max(len(off) - 4, 0), bool)
     if len(off) > 4:
-        usable = clock.slots[4:] - clock.slots[:-4] == 4
+        usable = clock.ticks[4:] - clock.ticks[:-4] == 4
     products, squares, errors = 0.0, 0.0, []
     for column in rows.obs.T if usable.any() else []:
         x = unwrapped(column)

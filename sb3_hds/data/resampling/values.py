@@ -1,24 +1,23 @@
-"""What values alone tell: wrapped angles, and the smallest step of what is quantised."""
+"""Properties of values: wrapped angles, runs of flags, and the smallest step if quantised."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
-# Usual steps around a whole turn.
-_AROUND = 5.0
-_NEAR = 50  # smallest steps: beyond, quantisation cannot be distinguished from rounding
-_FEWEST = 10  # steps that tell
+_AROUND = 5.0  # typical steps: largest deviation of a wrap from a full turn
+_NEAR = 50  # smallest steps: for larger ones, quantisation cannot be distinguished from rounding
+_FEWEST = 10  # steps from which a smallest step is inferred
 
 
-def whole_turns(jumps: np.ndarray, usual: np.ndarray) -> np.ndarray:
+def angle_wraps(jumps: np.ndarray, typical: np.ndarray) -> np.ndarray:
     """
     :param jumps: from sample to sample [rad]
-    :param usual: typical size of a jump, one for all or one for each channel
-    :return: which of the jumps are whole turns of a wrapped angle
+    :param typical: size of a jump, one for all or one for each channel
+    :return: which of the jumps are wraps of an angle: one or more full turns
     """
     turns = np.round(np.abs(jumps) / (2.0 * np.pi))
-    return (turns > 0) & (np.abs(np.abs(jumps) - 2.0 * np.pi * turns) < _AROUND * usual)
+    return (turns > 0) & (np.abs(np.abs(jumps) - 2.0 * np.pi * turns) < _AROUND * typical)
 
 
 def unwrapped(x: np.ndarray) -> np.ndarray:
@@ -30,12 +29,21 @@ def unwrapped(x: np.ndarray) -> np.ndarray:
     return x
 
 
+def runs(flags: Bool[np.ndarray, " steps"]) -> Iterator[tuple[int, int]]:
+    """
+    :param flags: of rows, or of the steps between rows
+    :return: start (inclusive) and end (exclusive) of each run of set flags
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+
+
 def resolutions(rows: Sequence[np.ndarray]) -> Float64[np.ndarray, " n_obs"]:
     """
-    Works on interpolated values, too, as long as some of them stayed equal.
+    Works for interpolated values, too, if some of them are still equal.
 
-    :param rows: observations of each stretch, each of shape ``(rows, n_obs)``
-    :return: smallest step of each channel whose values are multiples of one, otherwise 0
+    :param rows: observations of each segment, each of shape ``(rows, n_obs)``
+    :return: smallest step of each quantised channel, otherwise 0
     """
     return np.array([_resolution([x[:, j] for x in rows]) for j in range(rows[0].shape[1])])
 
@@ -48,12 +56,12 @@ def _resolution(values: Sequence[np.ndarray]) -> float:
 
 
 def _common_step(steps: np.ndarray, span: float) -> float:
-    """What all steps are multiples of, or 0."""
-    # Differences of decimals are exact to some 1e-16 of the values; what is smaller is no step.
+    """The common divisor of all steps, or 0."""
+    # Differences of decimals are exact to about 1e-16 of the values; smaller steps are rounding.
     moving = steps[steps > 1e-9 * span]
     if len(moving) < _FEWEST:
         return 0.0
-    # The smallest step that was made may be a few of the smallest possible.
+    # The smallest observed step may be a multiple of the smallest possible one.
     for quantile in (0.01, 0.001, 0.0):
         smallest = float(np.quantile(moving, quantile, method="lower"))
         for step in (smallest, smallest / 2.0, smallest / 3.0):

@@ -18,7 +18,7 @@ from sb3_hds.core import (
 from sb3_hds.core.numerics.integrators import Integrator
 from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.data.audit.results import shifted
-from sb3_hds.data.audit.velocity import Lag, lags_of
+from sb3_hds.data.audit.velocity import VelocityPair, best_pairs, velocity_pairs
 from sb3_hds.sysid.checks.conventions import what_friction_leaves
 from sb3_hds.sysid.equation.motion import joint_motion, kinematics, lag_of, motion
 from sb3_hds.sysid.estimation.candidates import encoders
@@ -43,12 +43,13 @@ def in_step(twin: Twin, data: Trajectories) -> tuple[Trajectories, tuple[str, ..
     :return: the data, and what was changed, in words
     """
     names = [channel.name for channel in twin.channels]
-    measured = [lag for lag in lags_of(data, names) if _short(lag, data.dt)]
+    measured = [lag for lag in best_pairs(velocity_pairs(data, names)) if _short(lag, data.dt)]
     if not measured:
         return data, ()
-    own = {lag.velocity: lag.samples for lag in lags_of(_replayed(twin, data), names)}
+    simulated = best_pairs(velocity_pairs(_replayed(twin, data), names))
+    own = {lag.velocity: lag.samples for lag in simulated}
     late = {
-        lag: (0.5 if lag.backward else lag.samples) - own[lag.velocity]
+        lag: (0.5 if lag.difference.is_backward else lag.samples) - own[lag.velocity]
         for lag in measured
         if lag.velocity in own
     }
@@ -59,9 +60,9 @@ def in_step(twin: Twin, data: Trajectories) -> tuple[Trajectories, tuple[str, ..
     return shifted(data, {lag.velocity: samples for lag, samples in late.items()}), words
 
 
-def _in_words(lag: Lag, name: str, samples: float, dt: float) -> str:
+def _in_words(lag: VelocityPair, name: str, samples: float, dt: float) -> str:
     time = f"{1e3 * abs(samples) * dt:.2g} ms ({abs(samples):.2g} samples)"
-    if lag.backward:
+    if lag.difference.is_backward:
         return (
             f"{name} is the backward difference of {lag.position}, and so {time} late; it was "
             "moved back. No sensor delays it."
@@ -73,8 +74,8 @@ def _in_words(lag: Lag, name: str, samples: float, dt: float) -> str:
     )
 
 
-def _short(lag: Lag, dt: float) -> bool:
-    if lag.backward:
+def _short(lag: VelocityPair, dt: float) -> bool:
+    if lag.difference.is_backward:
         return True
     short = abs(lag.samples) <= _SAMPLES and abs(lag.samples) * dt <= _SECONDS
     return short and abs(lag.samples) > max(_VISIBLE, _SIGMAS * lag.stderr)

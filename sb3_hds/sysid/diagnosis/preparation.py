@@ -12,8 +12,8 @@ from jaxtyping import Float
 from sb3_hds.core import Effect, Trajectories, Twin, rk4
 from sb3_hds.core.twin import plant_of
 from sb3_hds.data import Audit, audit
-from sb3_hds.data.audit.differences import BackwardDifference
-from sb3_hds.data.audit.outliers import Glitches, Outliers
+from sb3_hds.data.audit.jumps import Glitches, Outliers
+from sb3_hds.data.audit.velocity import BackwardDifference
 from sb3_hds.sysid.checks.adequacy import noise_of
 from sb3_hds.sysid.checks.conventions import Convention, other_convention
 from sb3_hds.sysid.checks.timing import in_step, in_step_with_the_log

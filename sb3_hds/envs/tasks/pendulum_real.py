@@ -5,14 +5,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from sb3_hds.envs.quantities import checked
-
-# Its functions are not in its type stubs.
-_engine: Any = mujoco
+from sb3_hds.envs.tasks.engine import check_quantity, engine
 
 _MODEL = """
 <mujoco>
@@ -27,18 +23,18 @@ _MODEL = """
 """
 _MAX_TORQUE = 2.0  # [N m]
 _ENGINE_STEP = 0.0025  # [s]
-# A rod is thin: its moment of inertia about itself, as a share of that about its centre.
-_THIN = 1e-3
+# Moment of inertia about the rod's own axis, relative to that about its centre.
+_THIN_ROD = 1e-3
 _LONGEST_DELAY = 0.2  # [s]
 
 
 class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
     """
-    The pendulum of ``Pendulum-v1`` in continuous time, with friction, drag, and a drive and sensors
-    that are not ideal. It stands in for hardware: no twin takes part in its simulation.
+    The pendulum of ``Pendulum-v1`` in continuous time, with friction, drag, a non-ideal drive and
+    noisy sensors. It stands in for hardware: no twin takes part in its simulation.
 
-    The reward is that of ``Pendulum-v1``, from the true state and the command. Start states are
-    those of ``Pendulum-v1``, or ``reset(options={"state": (angle, speed)})``.
+    The reward is that of ``Pendulum-v1``, computed from the true state and the command. Start
+    states are those of ``Pendulum-v1``, or set by ``reset(options={"state": (angle, speed)})``.
 
     :param mass: of the rod [kg]
     :param length: of the rod [m]
@@ -77,21 +73,21 @@ class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}.")
         self.render_mode = render_mode
-        self.mass = checked("mass", mass, positive=True)
-        self.length = checked("length", length, positive=True)
-        self.gravity = checked("gravity", gravity)
-        self.damping = checked("damping", damping)
-        self.friction = checked("friction", friction)
-        self.drag = checked("drag", drag)
-        self.gain = checked("gain", gain)
-        self.delay = checked("delay", delay, most=_LONGEST_DELAY)
-        self.lag = checked("lag", lag)
-        self.noise = checked("noise", noise)
-        self.payload = checked("payload", payload)
-        self.dt = checked("dt", dt, positive=True)
+        self.mass = check_quantity("mass", mass, positive=True)
+        self.length = check_quantity("length", length, positive=True)
+        self.gravity = check_quantity("gravity", gravity)
+        self.damping = check_quantity("damping", damping)
+        self.friction = check_quantity("friction", friction)
+        self.drag = check_quantity("drag", drag)
+        self.gain = check_quantity("gain", gain)
+        self.delay = check_quantity("delay", delay, maximum=_LONGEST_DELAY)
+        self.lag = check_quantity("lag", lag)
+        self.noise = check_quantity("noise", noise)
+        self.payload = check_quantity("payload", payload)
+        self.dt = check_quantity("dt", dt, positive=True)
         self.frame_skip = max(1, round(self.dt / _ENGINE_STEP))
-        self.model = self._compiled()
-        self.data = _engine.MjData(self.model)
+        self.model = self._build_model()
+        self.data = engine.MjData(self.model)
         self.action_space = spaces.Box(-_MAX_TORQUE, _MAX_TORQUE, (1,), np.float32)
         self.observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
         self._commands: list[tuple[float, float]] = []
@@ -99,10 +95,10 @@ class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
         self._canvas: Any = None
 
     def set_payload(self, payload: float) -> None:
-        """Hang another point mass on the tip, between two steps. The state stays as it is."""
-        self.payload = checked("payload", payload)
-        before, self.model = self.data, self._compiled()
-        self.data = _engine.MjData(self.model)
+        """Change the point mass at the tip between two steps. The state does not change."""
+        self.payload = check_quantity("payload", payload)
+        before, self.model = self.data, self._build_model()
+        self.data = engine.MjData(self.model)
         self.data.time, self.data.qpos[:], self.data.qvel[:] = before.time, before.qpos, before.qvel
 
     def reset(
@@ -110,14 +106,14 @@ class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """
         :param seed: restarts the sequence of start states and of the noise
-        :param options: ``{"state": (angle, speed)}`` [rad, rad/s] begins there
+        :param options: ``{"state": (angle, speed)}`` sets the start state [rad, rad/s]
         :raises ValueError: for another option, or a state that is not two finite numbers
         """
         super().reset(seed=seed)
-        _engine.mj_resetData(self.model, self.data)
+        engine.mj_resetData(self.model, self.data)
         start = self.np_random.uniform([-np.pi, -1.0], [np.pi, 1.0])
         if options:
-            start = _state_in(options)
+            start = _start_state(options)
         self.data.qpos[0], self.data.qvel[0] = start
         self._commands, self._drive = [(-math.inf, 0.0)], 0.0
         return self._observation(), {}
@@ -138,8 +134,8 @@ class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
         self._commands.append((self.data.time, torque))
         for _ in range(self.frame_skip):
             drag = self.drag * self.data.qvel[0] * abs(self.data.qvel[0])
-            self.data.qfrc_applied[0] = self.gain * self._driven() - drag
-            _engine.mj_step(self.model, self.data)
+            self.data.qfrc_applied[0] = self.gain * self._drive_torque() - drag
+            engine.mj_step(self.model, self.data)
         return self._observation(), reward, False, False, {}
 
     def render(self) -> np.ndarray | None:
@@ -157,8 +153,8 @@ class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
     def close(self) -> None:
         self._canvas = None
 
-    def _compiled(self) -> Any:
-        """A rod and a point mass at its tip are one rigid body."""
+    def _build_model(self) -> Any:
+        """The rod and the point mass at its tip, as one rigid body."""
         mass = self.mass + self.payload
         centre = (0.5 * self.mass + self.payload) * self.length / mass
         about_hinge = (self.mass / 3.0 + self.payload) * self.length**2
@@ -171,15 +167,15 @@ class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
             centre=centre,
             mass=mass,
             inertia=inertia,
-            about_rod=_THIN * inertia,
+            about_rod=_THIN_ROD * inertia,
         )
-        return _engine.MjModel.from_xml_string(text)
+        return engine.MjModel.from_xml_string(text)
 
-    def _driven(self) -> float:
+    def _drive_torque(self) -> float:
         """Torque of the drive in the next engine step [N m]."""
         h = self.model.opt.timestep
-        asked_at = self.data.time + 0.5 * h - self.delay
-        command = next(torque for since, torque in reversed(self._commands) if since <= asked_at)
+        issued_at = self.data.time + 0.5 * h - self.delay
+        command = next(torque for since, torque in reversed(self._commands) if since <= issued_at)
         if self.lag <= 0.0:
             return command
         before = self._drive
@@ -194,7 +190,7 @@ class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
         return obs.astype(np.float32)
 
 
-def _state_in(options: Mapping[str, Any]) -> np.ndarray:
+def _start_state(options: Mapping[str, Any]) -> np.ndarray:
     try:
         (name, value), *others = options.items()
         start = np.array([np.ravel(part).astype(float) for part in value]).ravel()
@@ -202,7 +198,7 @@ def _state_in(options: Mapping[str, Any]) -> np.ndarray:
             raise ValueError
     except (TypeError, ValueError):
         raise ValueError(
-            "reset() knows one option, {'state': (angle, speed)} in rad and rad/s, "
+            "The only option of reset() is {'state': (angle, speed)} in rad and rad/s, "
             f"got {dict(options)!r}."
         ) from None
     return start

@@ -12,27 +12,27 @@ from sb3_hds.errors import ParameterError
 
 class ConstantReward(gymnasium.Env[np.ndarray, np.ndarray]):
     r"""
-    Each step pays the same, for ever; actions change nothing; the observation is a clock.
+    Every step pays the same reward, actions have no effect, and the observation is a clock.
 
-    With a time limit of ``period`` steps, and the discount :math:`\gamma`, the value of the first
+    With a time limit of ``period`` steps and the discount :math:`\gamma`, the value of the first
     state is
 
     .. math::
 
-        V = r \frac{1}{1 - \gamma} \quad \text{where the limit is a truncation,} \qquad
-        V = r \frac{1 - \gamma^n}{1 - \gamma} \quad \text{where it is a termination,}
+        V = r \frac{1}{1 - \gamma} \quad \text{if the limit is a truncation,} \qquad
+        V = r \frac{1 - \gamma^n}{1 - \gamma} \quad \text{if it is a termination,}
 
-    50 and 3.88 for ``reward=1``, ``period=4`` and :math:`\gamma = 0.98`: a learner that mistakes
-    one for the other is wrong by a factor of 13. The clock has gone round once when the limit cuts,
-    so that the last observation is one that the learner also starts from, and its value is learned.
+    that is 50 and 3.88 for ``reward=1``, ``period=4`` and :math:`\gamma = 0.98`: a learner that
+    confuses them is wrong by a factor of 13. The clock completes one period at the time limit, so
+    the last observation is also a start state, and its value is learned.
 
     Source: the example of A. Raffin's talk *Ingredients for learning locomotion directly on real
     hardware* (2024).
 
     :param reward: of each step
-    :param period: steps in which the clock goes round once; the registered limit is 4
+    :param period: of the clock [steps]; the registered time limit is 4
     :param render_mode: None
-    :raises ParameterError: for a period that is no positive whole number, or a reward that is not
+    :raises ParameterError: for a period that is not a positive integer, or a reward that is not
         finite
     """
 
@@ -42,7 +42,7 @@ class ConstantReward(gymnasium.Env[np.ndarray, np.ndarray]):
         self, reward: float = 1.0, period: int = 4, render_mode: str | None = None
     ) -> None:
         if isinstance(period, bool) or not isinstance(period, int) or period < 1:
-            raise ParameterError(f"period must be a positive whole number, got {period!r}.")
+            raise ParameterError(f"period must be a positive integer, got {period!r}.")
         if not math.isfinite(reward):
             raise ParameterError(f"reward must be finite, got {reward!r}.")
         if render_mode is not None:

@@ -3,33 +3,29 @@
 from types import SimpleNamespace
 from typing import Any
 
-import mujoco
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from gymnasium.utils import EzPickle
 
-from sb3_hds.envs.quantities import checked
-
-# Its functions are not in its type stubs.
-_engine: Any = mujoco
+from sb3_hds.envs.tasks.engine import check_quantity, engine
 
 _SLIDER, _HINGE = 0, 1
 
 
 class InvertedPendulumFriction(InvertedPendulumEnv):
     """
-    ``InvertedPendulum-v5`` with joints that resist more than its XML says. It stands in for
-    hardware: nothing of it is computed by a twin.
+    ``InvertedPendulum-v5`` with additional joint friction. It stands in for hardware: no twin takes
+    part in its simulation.
 
-    :param slider_damping: viscous friction of the rail, beyond the XML's [N s/m]
-    :param hinge_damping: viscous friction of the hinge, beyond the XML's [N m s/rad]
+    :param slider_damping: viscous friction of the rail, in addition to the XML's [N s/m]
+    :param hinge_damping: viscous friction of the hinge, in addition to the XML's [N m s/rad]
     :param slider_friction: dry friction of the rail [N]
     :param hinge_friction: dry friction of the hinge [N m]
-    :param swing_up: the pole starts hanging and is free to turn, nothing terminates, observations
-        are (position, cos, sin, speed, rate), and the reward is best upright in the middle: see the
-        twin of the same name
-    :param rail_ends: whether the cart is stopped at 1 m
+    :param swing_up: the pole starts hanging and turns freely, episodes do not terminate,
+        observations are (position, cos, sin, speed, rate), and the reward is largest upright in the
+        middle: see the twin of the same name
+    :param rail_ends: whether stops limit the cart to 1 m
     :param noise: standard deviation of each observation, in its own unit
     :param reset_noise_scale: as in ``InvertedPendulum-v5``
     :param settings: further arguments of ``InvertedPendulum-v5``
@@ -48,11 +44,11 @@ class InvertedPendulumFriction(InvertedPendulumEnv):
         reset_noise_scale: float = 0.01,
         **settings: Any,
     ) -> None:
-        self.slider_damping = checked("slider_damping", slider_damping)
-        self.hinge_damping = checked("hinge_damping", hinge_damping)
-        self.slider_friction = checked("slider_friction", slider_friction)
-        self.hinge_friction = checked("hinge_friction", hinge_friction)
-        self.noise = checked("noise", noise)
+        self.slider_damping = check_quantity("slider_damping", slider_damping)
+        self.hinge_damping = check_quantity("hinge_damping", hinge_damping)
+        self.slider_friction = check_quantity("slider_friction", slider_friction)
+        self.hinge_friction = check_quantity("hinge_friction", hinge_friction)
+        self.noise = check_quantity("noise", noise)
         self.swing_up, self.rail_ends = bool(swing_up), bool(rail_ends)
         super().__init__(reset_noise_scale=reset_noise_scale, **settings)
         EzPickle.__init__(
@@ -72,7 +68,7 @@ class InvertedPendulumFriction(InvertedPendulumEnv):
 
     @property
     def nominal(self) -> Any:
-        """The nominal model of the XML, in the form that twins read."""
+        """The model of the XML without the additional friction, as twins read it."""
         return SimpleNamespace(
             unwrapped=SimpleNamespace(
                 model=self._shipped,
@@ -83,7 +79,7 @@ class InvertedPendulumFriction(InvertedPendulumEnv):
         )
 
     def _initialize_simulation(self) -> tuple[Any, Any]:
-        self._shipped = _engine.MjModel.from_xml_path(self.fullpath)
+        self._shipped = engine.MjModel.from_xml_path(self.fullpath)
         model, data = super()._initialize_simulation()
         model.dof_damping[_SLIDER] += self.slider_damping
         model.dof_damping[_HINGE] += self.hinge_damping
@@ -102,7 +98,7 @@ class InvertedPendulumFriction(InvertedPendulumEnv):
         """
         if not self.swing_up:
             obs, _, _, truncated, info = super().step(action)
-            # By the true angle: noise tells nothing about whether the pole has fallen.
+            # By the true angle: noise does not make the pole fall.
             fallen = bool(abs(self.data.qpos[_HINGE]) > 0.2) or not np.isfinite(obs).all()
             return obs, float(not fallen), fallen, truncated, info | {"reward_survive": not fallen}
         self.do_simulation(action, self.frame_skip)

@@ -1,16 +1,12 @@
-"""A small quadruped with series-elastic joints, whose good gaits store energy in the springs."""
+"""A small quadruped with series-elastic joints; efficient gaits store energy in the springs."""
 
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from sb3_hds.envs.quantities import checked
-
-# Its functions are not in its type stubs.
-_engine: Any = mujoco
+from sb3_hds.envs.tasks.engine import check_quantity, engine
 
 #: legs in the order of the actuators: front left, front right, hind left, hind right
 LEGS = ("FL", "FR", "HL", "HR")
@@ -21,14 +17,14 @@ _DT = 0.02  # [s]
 _HIP = (0.13, 0.08)  # forwards and sideways from the middle of the trunk [m]
 _THIGH = _SHANK = 0.08  # [m]
 _FOOT = 0.015  # [m]
-_BENT = (0.6, -1.2)  # hip and knee where all joints are at zero [rad]
+_REST_POSE = (0.6, -1.2)  # hip and knee relative to the vertical if all joints are zero [rad]
 _MAX_TORQUE = 2.5  # of a motor [N m]
-_REACH = 0.6  # of a motor's target from where it rests [rad]
-_MAX_FORCE = 2.0  # that can be asked of a spring [N m]
-# Of the loop that holds a motor at its target [N m/rad], [N m s/rad].
-_STIFF, _DAMPED = 15.0, 0.35
-# A fall: less than so much of the trunk's axis points up, or the trunk is so low [m].
-_UPRIGHT, _LOWEST = 0.5, 0.05
+_MAX_ANGLE = 0.6  # of a motor's target [rad]
+_MAX_FORCE = 2.0  # commanded torque of a spring [N m]
+# Gains of the position loop of a motor [N m/rad], [N m s/rad].
+_DRIVE_KP, _DRIVE_KD = 15.0, 0.35
+# A fall: the vertical component of the trunk's axis, or the trunk's height [m], is below this.
+_MIN_UPRIGHT, _MIN_HEIGHT = 0.5, 0.05
 
 _LEG = """
 <body name="{leg}_thigh" pos="{x} {y} 0" euler="0 {hip} 0">
@@ -85,28 +81,28 @@ _MOTOR = (
 class ElasticQuadruped(gymnasium.Env[np.ndarray, np.ndarray]):
     """
     Walk forwards on four legs with a hip and a knee each. Every motor drives its joint through a
-    spring, as in the DLR's *bert*, whose size and weight this has about. Stepped by MuJoCo's
+    spring, as in the DLR's *bert*, which has about the same size and weight. Simulated by MuJoCo's
     engine; it has no twin.
 
-    An action is, for each motor, hips and knees of the legs front left, front right, hind left,
-    hind right, from -1 to 1:
+    The action has one element in [-1, 1] for each motor, hip and knee of the legs front left, front
+    right, hind left, hind right:
 
-    - ``control="torque"``: its torque, at most 2.5 N m
-    - ``"position"``: its angle, at most 0.6 rad from where it stands; the drive holds it there
-    - ``"force"``: the torque that its spring shall pass on, at most 2 N m; the drive moves the
-      motor to where the spring is stretched that much
+    - ``control="torque"``: motor torque, at most 2.5 N m
+    - ``"position"``: motor angle, at most 0.6 rad from the standing pose; the drive tracks it
+    - ``"force"``: torque of the spring, at most 2 N m; the drive moves the motor until the spring
+      is deflected accordingly
 
-    Observed are gravity, linear and angular velocity in the frame of the trunk (3 each), angles and
-    speeds of the joints, torques of the springs and speeds of the motors (8 each). All angles are
-    zero where it stands. The reward is the speed forwards [m/s] less 0.2 times that sideways, 0.1
-    times the rate of turning [rad/s], and 0.005 times the power of the motors [W]. An episode
-    terminates with a fall.
+    The observation consists of gravity, linear and angular velocity in the frame of the trunk (3
+    each), angles and speeds of the joints, torques of the springs and speeds of the motors (8
+    each). All angles are zero in the standing pose. The reward is the forward speed [m/s] minus 0.2
+    times the lateral speed, 0.1 times the yaw rate [rad/s] and 0.005 times the power of the motors
+    [W]. An episode terminates with a fall.
 
     Source: the robot, Seidel et al., *Using elastically actuated legged robots in rough terrain*,
     ICRA 2020; the task, Raffin et al., *Learning to exploit elastic actuators for quadruped
     locomotion*, 2022.
 
-    :param control: what an action is
+    :param control: ``"torque"``, ``"position"`` or ``"force"``: the meaning of an action
     :param stiffness: of the springs [N m/rad]
     :param damping: of the springs [N m s/rad]
     :param noise: standard deviation of each observation, in its own unit
@@ -130,12 +126,12 @@ class ElasticQuadruped(gymnasium.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}.")
         self.control, self.render_mode = control, render_mode
         self.commands_positions = control == "position"
-        self.stiffness = checked("stiffness", stiffness, positive=True)
-        self.damping = checked("damping", damping)
-        self.noise = checked("noise", noise)
+        self.stiffness = check_quantity("stiffness", stiffness, positive=True)
+        self.damping = check_quantity("damping", damping)
+        self.noise = check_quantity("noise", noise)
         self.dt, self.frame_skip = _DT, round(_DT / _ENGINE_STEP)
-        self.model = _engine.MjModel.from_xml_string(_written(self.stiffness, self.damping))
-        self.data = _engine.MjData(self.model)
+        self.model = engine.MjModel.from_xml_string(_mjcf(self.stiffness, self.damping))
+        self.data = engine.MjData(self.model)
         names = [f"{leg}_{part}" for leg in LEGS for part in ("hip", "knee")]
         joints = [self.model.joint(name) for name in names]
         motors = [self.model.joint(f"{name}_motor") for name in names]
@@ -148,23 +144,23 @@ class ElasticQuadruped(gymnasium.Env[np.ndarray, np.ndarray]):
         self._renderer: Any = None
 
     def state_vector(self) -> np.ndarray:
-        """:return: ``qpos`` and ``qvel`` in a row, as MuJoCo environments of Gymnasium have it"""
+        """:return: ``qpos`` and ``qvel``, concatenated as in Gymnasium's MuJoCo environments"""
         return np.concatenate([self.data.qpos, self.data.qvel])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """
-        Standing, joints and motors up to 0.05 rad from where they stand.
+        Start in the standing pose, with each joint and its motor up to 0.05 rad off.
 
         :param seed: restarts the sequence of start states and of the noise
         """
         super().reset(seed=seed)
-        _engine.mj_resetData(self.model, self.data)
+        engine.mj_resetData(self.model, self.data)
         joints = self.np_random.uniform(-0.05, 0.05, len(self._q))
         self.data.qpos[self._q] = self.data.qpos[self._motor_q] = joints
         self.data.qpos[2] = _height(joints)
-        _engine.mj_forward(self.model, self.data)
+        engine.mj_forward(self.model, self.data)
         return self._observation(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -180,10 +176,10 @@ class ElasticQuadruped(gymnasium.Env[np.ndarray, np.ndarray]):
         action, power = np.clip(action, -1.0, 1.0), 0.0
         before = self.data.qpos[:2].copy()
         for _ in range(self.frame_skip):
-            torque = np.clip(self._torque(action), -_MAX_TORQUE, _MAX_TORQUE)
+            torque = np.clip(self._drive_torque(action), -_MAX_TORQUE, _MAX_TORQUE)
             self.data.ctrl[:] = torque / _MAX_TORQUE
             power += float(np.abs(torque * self.data.qvel[self._motor_v]).sum()) / self.frame_skip
-            _engine.mj_step(self.model, self.data)
+            engine.mj_step(self.model, self.data)
         forwards, sideways = (self.data.qpos[:2] - before) / self.dt
         turning = abs(float(self.data.qvel[5]))
         reward = forwards - 0.2 * abs(sideways) - 0.1 * turning - 0.005 * power
@@ -195,8 +191,8 @@ class ElasticQuadruped(gymnasium.Env[np.ndarray, np.ndarray]):
         if self.render_mode is None:
             return None
         if self._renderer is None:
-            self._renderer = _engine.Renderer(self.model, 240, 320)
-        camera = _engine.MjvCamera()
+            self._renderer = engine.Renderer(self.model, 240, 320)
+        camera = engine.MjvCamera()
         camera.lookat[:] = self.data.qpos[0], self.data.qpos[1], 0.1
         camera.distance, camera.azimuth, camera.elevation = 0.9, 120.0, -15.0
         self._renderer.update_scene(self.data, camera)
@@ -207,23 +203,23 @@ class ElasticQuadruped(gymnasium.Env[np.ndarray, np.ndarray]):
             self._renderer.close()
             self._renderer = None
 
-    def _torque(self, action: np.ndarray) -> np.ndarray:
-        """What the drives do in the engine step that begins now [N m]."""
+    def _drive_torque(self, action: np.ndarray) -> np.ndarray:
+        """Torques of the drives in the next engine step [N m]."""
         if self.control == "torque":
             return _MAX_TORQUE * action
         motor, speed = self.data.qpos[self._motor_q], self.data.qvel[self._motor_v]
         if self.control == "position":
-            return _STIFF * (_REACH * action - motor) - _DAMPED * speed
-        # The joint is where the spring ends; the motor follows its motion, and holds the spring.
+            return _DRIVE_KP * (_MAX_ANGLE * action - motor) - _DRIVE_KD * speed
+        # The motor follows the joint and holds the deflection that gives the commanded torque.
         force = _MAX_FORCE * action
         away = self.data.qpos[self._q] + force / self.stiffness - motor
-        return force + _STIFF * away + _DAMPED * (self.data.qvel[self._v] - speed)
+        return force + _DRIVE_KP * away + _DRIVE_KD * (self.data.qvel[self._v] - speed)
 
     def _fallen(self) -> bool:
         state = self.state_vector()
         up = self.data.xmat[1].reshape(3, 3)[2, 2]
-        low = self.data.qpos[2] < _LOWEST
-        return bool(up < _UPRIGHT or low or not np.isfinite(state).all())
+        low = self.data.qpos[2] < _MIN_HEIGHT
+        return bool(up < _MIN_UPRIGHT or low or not np.isfinite(state).all())
 
     def _observation(self) -> np.ndarray:
         frame = self.data.xmat[1].reshape(3, 3)
@@ -245,18 +241,18 @@ class ElasticQuadruped(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 def _height(joints: np.ndarray) -> float:
-    """:return: of the trunk, so that the lowest foot just touches the floor [m]"""
-    hip, knee = _BENT[0] + joints[0::2], _BENT[1] + joints[1::2]
+    """Height of the trunk at which the lowest foot touches the floor [m]."""
+    hip, knee = _REST_POSE[0] + joints[0::2], _REST_POSE[1] + joints[1::2]
     lengths = _THIGH * np.cos(hip) + _SHANK * np.cos(hip + knee)
     return float(lengths.max()) + _FOOT
 
 
-def _written(stiffness: float, damping: float) -> str:
-    """:return: the model as MJCF"""
+def _mjcf(stiffness: float, damping: float) -> str:
+    """The model as MJCF."""
     legs, names = [], []
     for leg in LEGS:
         x, y = _HIP[0] * (1 if leg[0] == "F" else -1), _HIP[1] * (1 if leg[1] == "L" else -1)
-        bent = dict(zip(("hip", "knee"), _BENT, strict=True))
+        bent = dict(zip(("hip", "knee"), _REST_POSE, strict=True))
         sizes = {"thigh": _THIGH, "shank": _SHANK, "foot": _FOOT, "armature": 0.002}
         legs.append(_LEG.format(leg=leg, x=x, y=y, **bent, **sizes))
         names += [f"{leg}_hip", f"{leg}_knee"]
