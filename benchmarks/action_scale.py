@@ -16,13 +16,12 @@ for three episodes.
 """
 
 import argparse
-import json
 import math
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from runs import CACHE, RESULTS, fresh_process, resume, save
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, save
 
 SCALES = (0.4, 0.7, 1.0, "schedule")
 #: from 0.4 of the range to the whole over two thirds of the steps
@@ -106,25 +105,27 @@ def main() -> None:
     parser.add_argument("--wheelbase", type=float, default=_WHEELBASE, help="of the car [m]")
     parser.add_argument("--steering", action="store_true", help="shrink only its range")
     parser.add_argument("--sde", action="store_true", help="noise that lasts for 16 steps")
-    parser.add_argument("--worker", nargs=5, metavar=("SEED", "STEPS", "WHEELBASE", "AXES", "SDE"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        seed, steps, wheelbase, axes, sde = arguments.worker
-        given = int(seed), int(steps), float(wheelbase), json.loads(axes), json.loads(sde)
-        rows = [row for scale in SCALES for row in learn(str(scale), *given)]
-        print(json.dumps({"rows": rows}))
-        return
-    axes = [0] if arguments.steering else None
+    arguments = arguments_of(parser, worker)
     table = table_of(arguments.wheelbase, arguments.steering, arguments.sde)
     if not arguments.figure:
         wanted = [(seed, arguments.steps) for seed in range(arguments.seeds)]
-        given = arguments.wheelbase, json.dumps(axes), json.dumps(arguments.sde)
-        work = lambda *run: fresh_process(__file__, *run, *given, cache=CACHE)["rows"]  # noqa: E731
+        given = arguments.wheelbase, int(arguments.steering), int(arguments.sde)
+        work = lambda *run: fresh_process(__file__, *run, *given, cache=CACHE)  # noqa: E731
         resume(table, ["seed", "steps"], wanted, work, arguments.jobs)
     report(arguments.steps, table)
     for scale in SCALES[:-1]:
-        steps = steps_at_random(float(scale), arguments.wheelbase, axes)
+        steps = steps_at_random(float(scale), arguments.wheelbase, axes_of(arguments.steering))
         print(f"random actions, {scale} of the range: on the track for {steps:.1f} steps")
+
+
+def worker(seed: int, steps: int, wheelbase: float, steering: int, sde: int) -> list[dict]:
+    given = seed, steps, wheelbase, axes_of(bool(steering)), bool(sde)
+    return [row for scale in SCALES for row in learn(str(scale), *given)]
+
+
+def axes_of(steering: bool) -> list[int] | None:
+    """:return: actions whose range is scaled; None: all"""
+    return [0] if steering else None
 
 
 def steps_at_random(

@@ -11,11 +11,11 @@ for every run. Runs that are in the table are not done again.
 """
 
 import argparse
-import json
+from functools import partial
 
 import numpy as np
 import pandas as pd
-from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, seconds_since_start
 
 TAU = 2.0 * np.pi
 #: a travelling wave for each environment: arguments of ``CPGPrior``
@@ -51,12 +51,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=50_000)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=5, metavar=("ENV", "LEARNER", "PRIOR", "SEED", "STEPS"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        env_id, learner, prior, seed, steps = arguments.worker
-        print(json.dumps(worker(env_id, learner, prior, int(seed), int(steps))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         wanted = [
             (env_id, learner, prior, seed, arguments.steps)
@@ -65,13 +60,10 @@ def main() -> None:
             for learner in arguments.learners
             for prior in arguments.priors
         ]
+        work = partial(fresh_process, __file__, cache=CACHE / "programs")
         keys = ("env", "learner", "prior", "seed", "steps")
-        resume("cpg_prior", keys, wanted, _run, arguments.jobs)
+        resume("cpg_prior", keys, wanted, work, arguments.jobs)
     report()
-
-
-def _run(*run) -> list[dict]:
-    return [fresh_process(__file__, *run, cache=CACHE / "programs")]
 
 
 def worker(env_id: str, learner: str, prior: str, seed: int, steps: int) -> dict:

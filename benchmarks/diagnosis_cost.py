@@ -17,7 +17,6 @@ Finished rows are kept.
 
 import argparse
 import dataclasses
-import json
 import resource
 import shutil
 import time
@@ -27,7 +26,7 @@ import numpy as np
 import pandas as pd
 from hidden_cases import believed, nothing, recorded
 from independent_rigs import Planted
-from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, seconds_since_start
 
 RECORDINGS = (10, 30, 100, 300, 1000)
 BUDGETS = ("quick", "full")
@@ -47,12 +46,7 @@ def main() -> None:
     parser.add_argument("--recordings", nargs="*", type=int, default=list(RECORDINGS))
     parser.add_argument("--budgets", nargs="*", default=list(BUDGETS), choices=BUDGETS)
     parser.add_argument("--report-only", action="store_true")
-    parser.add_argument("--worker", nargs=3, metavar=("SYSTEM", "BUDGET", "RECORDINGS"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        system, budget, n = arguments.worker
-        print(json.dumps(worker(system, budget, int(n))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.report_only:
         wanted = [
             (system, budget, n)

@@ -25,12 +25,12 @@ for every run. Runs that are in the table are not done again.
 """
 
 import argparse
-import json
 import math
+from functools import partial
 
 import numpy as np
 import pandas as pd
-from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, seconds_since_start
 
 METHODS = (
     "rl, position",
@@ -68,24 +68,16 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=50_000)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=3, metavar=("METHOD", "SEED", "STEPS"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        method, seed, steps = arguments.worker
-        print(json.dumps(worker(method, int(seed), int(steps))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         wanted = [
             (method, seed, arguments.steps)
             for seed in range(arguments.seeds)
             for method in arguments.methods
         ]
-        resume("elastic_quadruped", ("method", "seed", "steps"), wanted, _run, arguments.jobs)
+        work = partial(fresh_process, __file__, cache=CACHE / "programs")
+        resume("elastic_quadruped", ("method", "seed", "steps"), wanted, work, arguments.jobs)
     report()
-
-
-def _run(*run) -> list[dict]:
-    return [fresh_process(__file__, *run, cache=CACHE / "programs")]
 
 
 def worker(method: str, seed: int, steps: int) -> dict:

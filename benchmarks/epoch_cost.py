@@ -9,12 +9,11 @@ resident size of the process. The regression does not grow with the number of ro
 """
 
 import argparse
-import json
 import resource
 import sys
 import time
 
-from runs import RESULTS, fresh_process, save, seconds_since_start
+from runs import RESULTS, arguments_of, fresh_process, save, seconds_since_start
 
 ROLLOUTS = (64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384)
 N_EPOCHS = 5
@@ -22,11 +21,7 @@ N_EPOCHS = 5
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
-    parser.add_argument("--worker", nargs=1, metavar="N_ROLLOUTS")
-    arguments = parser.parse_args()
-    if arguments.worker:
-        print(json.dumps(worker(int(arguments.worker[0]))))
-        return
+    arguments_of(parser, worker)
     rows = []
     for n_rollouts in ROLLOUTS:
         print(f"{n_rollouts} rollouts ...", file=sys.stderr, flush=True)

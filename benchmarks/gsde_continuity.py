@@ -15,12 +15,12 @@ Finished runs are kept.
 """
 
 import argparse
-import json
+from functools import partial
 
 import gymnasium
 import numpy as np
 import pandas as pd
-from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, seconds_since_start
 
 #: steps of a run, by environment; all their episodes have the same length
 LENGTHS = {"Pendulum-v1": 10_000, "HalfCheetah-v5": 50_000}
@@ -63,12 +63,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=3, metavar=("ENV", "NOISE", "SEED"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        env_id, noise, seed = arguments.worker
-        print(json.dumps({"rows": [worker(env_id, noise, int(seed))]}))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         wanted = [
             (env_id, noise, seed)
@@ -76,7 +71,7 @@ def main() -> None:
             for seed in range(arguments.seeds)
             for noise in NOISES
         ]
-        in_process = lambda *run: fresh_process(__file__, *run, cache=CACHE)["rows"]  # noqa: E731
+        in_process = partial(fresh_process, __file__, cache=CACHE)
         resume("gsde_continuity", KEYS, wanted, in_process, arguments.jobs)
     report()
 

@@ -25,12 +25,12 @@ weaknesses: the four that the authors of HDS name, with the remedy off and on, w
 """
 
 import argparse
-import json
+from functools import partial
 
 import numpy as np
 import pandas as pd
 from hardware import N_STARTS, data_sheet, length_of, make, pretrained, return_of
-from runs import CACHE, RESULTS, fresh_process, resume
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume
 from sim_to_real import planner
 
 CELL, EPISODES = "worn", 5
@@ -58,18 +58,17 @@ def main() -> None:
     parser.add_argument("--tables", nargs="*", default=list(TABLES), choices=TABLES)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=3, metavar=("TABLE", "VARIANT", "SEED"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        table, variant, seed = arguments.worker
-        print(json.dumps({"rows": [WORK[table](variant, int(seed))]}))
-        return
+    arguments = arguments_of(parser, worker)
     for table in arguments.tables:
         if not arguments.figure:
             wanted = [(v, seed) for seed in range(arguments.seeds) for v in VARIANTS[table]]
-            work = lambda v, seed, t=table: fresh_process(__file__, t, v, seed, cache=CACHE)["rows"]  # noqa: E731
+            work = partial(fresh_process, __file__, table, cache=CACHE)
             resume(f"hds_{table}", ("variant", "seed"), wanted, work, arguments.jobs)
         report(table)
+
+
+def worker(table: str, variant: str, seed: int) -> dict:
+    return WORK[table](variant, seed)
 
 
 def learned(changes: dict, seed: int) -> tuple:

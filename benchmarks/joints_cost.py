@@ -16,16 +16,16 @@ when it has been judged by simulation.
 """
 
 import argparse
-import json
 import os
 import resource
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from model_files import arm
-from runs import RESULTS, fresh_process, resume, seconds_since_start
+from runs import RESULTS, arguments_of, fresh_process, resume, seconds_since_start
 
 JOINTS = (1, 2, 3, 6, 12)
 BUDGETS = ("quick", "full")
@@ -44,23 +44,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=int, default=_SECONDS)
     parser.add_argument("--rate", type=int, default=_RATE, choices=(125, 250, 500, 1000))
     parser.add_argument("--report-only", action="store_true")
-    parser.add_argument("--worker", nargs=4, metavar=("JOINTS", "SECONDS", "RATE", "BUDGET"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        *numbers, budget = arguments.worker
-        print(json.dumps(worker(*map(int, numbers), budget)))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.report_only:
         given = arguments.seconds, arguments.rate
         wanted = [(n, *given, budget) for n in arguments.joints for budget in arguments.budgets]
-        resume(
-            "joints_cost", ("joints", "seconds", "rate [Hz]", "budget"), wanted, measured, jobs=1
-        )
+        keys = ("joints", "seconds", "rate [Hz]", "budget")
+        resume("joints_cost", keys, wanted, partial(fresh_process, __file__), jobs=1)
     print(pd.read_csv(RESULTS / "joints_cost.csv").to_string(index=False, float_format="%.3g"))
-
-
-def measured(joints: int, seconds: int, rate: int, budget: str) -> list[dict]:
-    return [fresh_process(__file__, joints, seconds, rate, budget)]
 
 
 def recorded(joints: int, seconds: int, rate: int) -> Any:

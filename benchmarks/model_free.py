@@ -26,9 +26,8 @@ those it would have had.
 
 import argparse
 import importlib
-import json
 import time
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,7 +35,7 @@ import numpy as np
 import yaml
 from episodes import returns_of
 from pendulum import held_out_states, rollouts
-from runs import CACHE, InterruptedRun, fresh_process, resume
+from runs import CACHE, InterruptedRun, arguments_of, fresh_process, resume
 
 PENDULUM = "Pendulum-v1"
 CAR, CART_POLE = "MountainCarContinuous-v0", "InvertedPendulum-v5"
@@ -141,12 +140,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=3, metavar=("ENV", "METHOD", "SEED"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        env, method, seed = arguments.worker
-        print(json.dumps({"rows": worker(env, method, int(seed))}))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         wanted = [
             (arguments.env, method, seed)
@@ -154,7 +148,7 @@ def main() -> None:
             for method in arguments.methods
             if arguments.env in ONLY_ON.get(method, LENGTHS)
         ]
-        in_process = lambda *run: fresh_process(__file__, *run, cache=CACHE)["rows"]  # noqa: E731
+        in_process = partial(fresh_process, __file__, cache=CACHE)
         resume("model_free", KEYS, wanted, in_process, arguments.jobs, through)
     from model_free_report import report
 

@@ -13,10 +13,11 @@ resets for every seed. Runs that are in the table are not done again.
 
 import argparse
 import json
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
-from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, seconds_since_start
 
 #: environment to the median return that 200,000 steps should reach
 TARGETS = {
@@ -38,20 +39,12 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200_000)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=3, metavar=("ENV", "SEED", "STEPS"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        env_id, seed, steps = arguments.worker
-        print(json.dumps(worker(env_id, int(seed), int(steps))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         wanted = [(e, s, arguments.steps) for s in range(arguments.seeds) for e in arguments.envs]
-        resume("open_loop", ("env", "seed", "steps"), wanted, _run, arguments.jobs)
+        work = partial(fresh_process, __file__, cache=CACHE / "programs")
+        resume("open_loop", ("env", "seed", "steps"), wanted, work, arguments.jobs)
     report()
-
-
-def _run(env_id: str, seed: int, steps: int) -> list[dict]:
-    return [fresh_process(__file__, env_id, seed, steps, cache=CACHE / "programs")]
 
 
 def worker(env_id: str, seed: int, steps: int) -> dict:

@@ -13,7 +13,7 @@ within each of them, as Agarwal et al. 2021 ask for. Runs that are in the table 
 """
 
 import argparse
-import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 from intervals import of_iqm
 from open_loop import N_EPISODES, TARGETS
-from runs import CACHE, RESULTS, fresh_process, resume, save, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, save, seconds_since_start
 
 _KEYS = ("env", "learner", "seed", "steps")
 _COLOURS = {"open loop": "#27496d", "ppo": "#d1495b"}
@@ -34,12 +34,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1_000_000)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=4, metavar=("ENV", "LEARNER", "SEED", "STEPS"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        env_id, learner, seed, steps = arguments.worker
-        print(json.dumps(worker(env_id, learner, int(seed), int(steps))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         wanted = [
             (env_id, learner, seed, steps)
@@ -47,12 +42,9 @@ def main() -> None:
             for learner, steps in (("random", 0), ("ppo", arguments.steps))
             for env_id in arguments.envs
         ]
-        resume("open_loop_ppo", _KEYS, wanted, _run, arguments.jobs)
+        work = partial(fresh_process, __file__, cache=CACHE / "programs")
+        resume("open_loop_ppo", _KEYS, wanted, work, arguments.jobs)
     report(arguments.steps)
-
-
-def _run(*run: Any) -> list[dict]:
-    return [fresh_process(__file__, *run, cache=CACHE / "programs")]
 
 
 def worker(env_id: str, learner: str, seed: int, steps: int) -> dict:

@@ -16,11 +16,10 @@ although worse than what they started from.
 """
 
 import argparse
-import json
 import sys
 import time
 
-from runs import RESULTS, fresh_process, save
+from runs import RESULTS, arguments_of, fresh_process, save
 
 METHODS = ("first_order", "gauss_newton", "bptt")
 GOALS = ("stop", "stop_at_origin")
@@ -33,12 +32,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--epochs", type=int, default=40)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=4, metavar=("METHOD", "GOAL", "SEED", "EPOCHS"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        method, goal, seed, epochs = arguments.worker
-        print(json.dumps(worker(method, goal, int(seed), int(epochs))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         rows = []
         for goal in GOALS:

@@ -12,12 +12,12 @@ load costs (the policy that never heard of it, against PODS on the true twin).
 """
 
 import argparse
-import json
+from functools import partial
 
 import numpy as np
 import pandas as pd
 from hardware import CELLS, N_STARTS, PENDULUM, length_of, make, pretrained
-from runs import CACHE, RESULTS, fresh_process, resume
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume
 
 BEFORE, AFTER, LOAD = "as described", "loaded", 0.25
 CELLS[BEFORE] = (PENDULUM, {"noise": 0.01})
@@ -32,13 +32,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--methods", nargs="*", default=list(METHODS))
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--worker", nargs=2, metavar=("METHOD", "SEED"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        print(json.dumps({"rows": worker(arguments.worker[0], int(arguments.worker[1]))}))
-        return
+    arguments = arguments_of(parser, worker)
     wanted = [(method, seed) for seed in range(arguments.seeds) for method in arguments.methods]
-    in_process = lambda *run: fresh_process(__file__, *run, cache=CACHE)["rows"]  # noqa: E731
+    in_process = partial(fresh_process, __file__, cache=CACHE)
     resume("payload_added", ("method", "seed"), wanted, in_process, arguments.jobs)
     report()
 

@@ -11,14 +11,13 @@ best return minus return.
 """
 
 import argparse
-import json
 import os
 import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from runs import RESULTS, fresh_process, save, seconds_since_start
+from runs import RESULTS, arguments_of, fresh_process, save, seconds_since_start
 
 PEERS = {"sb3_sac": 20_000, "sbx_sac": 20_000}
 TARGETS = (-150.0, -145.0, -140.0)
@@ -29,12 +28,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=2, metavar=("ALGORITHM", "SEED"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        name, seed = arguments.worker
-        print(json.dumps(worker(name, int(seed))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         run(arguments.seeds)
     report()

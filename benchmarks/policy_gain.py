@@ -13,12 +13,12 @@ table are not done again.
 """
 
 import argparse
-import json
+from functools import partial
 
 import numpy as np
 import pandas as pd
 from intervals import of_iqm
-from runs import CACHE, RESULTS, fresh_process, resume, save, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, save, seconds_since_start
 
 ROBOT = "sb3_hds/PendulumReal-v1"
 NOISE = 0.01
@@ -38,15 +38,10 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=2, metavar=("HIDDEN", "SEED"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        hidden, seed = arguments.worker
-        print(json.dumps({"rows": worker(hidden, int(seed))}))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         wanted = [(h, seed) for seed in range(arguments.seeds) for h in arguments.hidden]
-        work = lambda *run: fresh_process(__file__, *run, cache=CACHE / "programs")["rows"]  # noqa: E731
+        work = partial(fresh_process, __file__, cache=CACHE / "programs")
         resume("policy_gain", ("hidden", "seed"), wanted, work, arguments.jobs)
     report()
 

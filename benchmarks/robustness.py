@@ -11,10 +11,10 @@ perturbation. Runs that are in the table are not done again.
 """
 
 import argparse
-import json
+from functools import partial
 
 import numpy as np
-from runs import CACHE, RESULTS, fresh_process, resume
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume
 
 TAU = 2.0 * np.pi
 #: the constants that the paper's authors published, in rad and rad/s
@@ -49,19 +49,14 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200_000, help="that a learner has")
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--worker", nargs=3, metavar=("ENV", "POLICY", "EPISODES"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        env_id, policy, episodes = arguments.worker
-        print(json.dumps({"rows": worker(env_id, policy, int(episodes))}))
-        return
+    arguments = arguments_of(parser, worker)
     learned = [f"{name}, {arguments.steps:,} steps" for name in arguments.learners]
     wanted = [
         (env_id, policy, arguments.episodes)
         for policy in (*ENCODERS, *learned)
         for env_id in arguments.envs
     ]
-    work = lambda *run: fresh_process(__file__, *run, cache=CACHE)["rows"]  # noqa: E731
+    work = partial(fresh_process, __file__, cache=CACHE)
     resume("robustness", ["env", "policy", "episodes"], wanted, work, arguments.jobs)
     report()
 

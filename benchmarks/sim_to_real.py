@@ -16,12 +16,12 @@ the wrong twin and the ceiling of a seed drawn together with it).
 """
 
 import argparse
-import json
+from functools import partial
 
 import numpy as np
 import pandas as pd
 from hardware import CELLS, OTHER_TWIN, length_of, make, pretrained, return_of
-from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, seconds_since_start
 
 METHODS = ("ceiling", "wrong_twin", "randomised", "hds", "sac", "tqc", "droq")
 _DEEPEST = 1800.0  # below the best return, in the figure
@@ -37,12 +37,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="*", default=list(METHODS))
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=3, metavar=("CELL", "METHOD", "SEED"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        cell, method, seed = arguments.worker
-        print(json.dumps(worker(cell, method, int(seed))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         wanted = [
             (cell, method, seed)
@@ -50,21 +45,21 @@ def main() -> None:
             for cell in arguments.cells
             for method in arguments.methods
         ]
-        in_process = lambda *run: fresh_process(__file__, *run, cache=CACHE)["rows"]  # noqa: E731
+        in_process = partial(fresh_process, __file__, cache=CACHE)
         resume("sim_to_real", ("cell", "method", "seed"), wanted, in_process, arguments.jobs)
     report()
 
 
-def worker(cell: str, method: str, seed: int) -> dict:
+def worker(cell: str, method: str, seed: int) -> list[dict]:
     """Train once; evaluate after each number of real episodes."""
     if method in ("ceiling", "wrong_twin", "randomised"):
-        return {"rows": [evaluated(planner(method, cell, seed), cell, 0)]}
+        return [evaluated(planner(method, cell, seed), cell, 0)]
     model, rows = learner(method, cell, seed), []
     for episodes in STEPS:
         missing = episodes * length_of(cell) - model.num_timesteps
         model.learn(missing, reset_num_timesteps=False)
         rows.append(evaluated(model, cell, episodes))
-    return {"rows": rows}
+    return rows
 
 
 def planner(method: str, cell: str, seed: int):

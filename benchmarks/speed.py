@@ -20,14 +20,21 @@ twenty times, and depends on how many updates there are for each step in the env
 """
 
 import argparse
-import json
 import os
 import sys
 import time
 
 import numpy as np
 import pandas as pd
-from runs import CACHE, RESULTS, fresh_process, others_waiting, resume, seconds_since_start
+from runs import (
+    CACHE,
+    RESULTS,
+    arguments_of,
+    fresh_process,
+    others_waiting,
+    resume,
+    seconds_since_start,
+)
 
 ENV, BATCH, STARTS = "Pendulum-v1", 256, 100
 WIDE = {"pi": [256, 256], "qf": [1024, 1024]}
@@ -72,19 +79,14 @@ def main() -> None:
     parser.add_argument("--table", action="store_true")
     parser.add_argument("--on", default="cpu", choices=list(BLOCK_S))
     parser.add_argument("--jobs", type=int, default=1, help="one measures, the others compile")
-    parser.add_argument("--worker", nargs=3, metavar=("NAME", "RATIO", "PEER"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        name, ratio, peer = arguments.worker
-        print(json.dumps(worker(name, int(ratio), peer)))
-        return
+    arguments = arguments_of(parser, worker)
     on = arguments.on
     platforms = on if on == "cpu" else f"{on},cpu"
     os.environ |= {"JAX_PLATFORMS": platforms, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     name = "speed" if on == "cpu" else f"speed_{on}"
     if not arguments.table:
         wanted = [run for run in rows(on) if chosen(run, arguments.rows)]
-        in_process = lambda *run: fresh_process(__file__, *run, cache=cache_of(run))["rows"]  # noqa: E731
+        in_process = lambda *run: fresh_process(__file__, *run, cache=cache_of(run))  # noqa: E731
         resume(name, ("name", "ratio", "peer"), wanted, in_process, arguments.jobs)
     report(name)
 
@@ -113,9 +115,9 @@ def cache_of(run: tuple[str, int, str]):
 
 def worker(name: str, ratio: int, peer: str) -> dict:
     if peer.startswith("start-up"):
-        return {"rows": [{"start_up_s": start_up(name, peer.split()[-1])}]}
+        return {"start_up_s": start_up(name, peer.split()[-1])}
     if peer == "compiled":
-        return {"rows": [compiled(name, ratio)]}
+        return compiled(name, ratio)
     models = [ours(name, ratio)] + ([] if peer == "none" else [other(name, ratio, peer)])
     for model in models:
         model.learn(STARTS + 20)
@@ -128,7 +130,7 @@ def worker(name: str, ratio: int, peer: str) -> dict:
         low, faster, high = np.quantile(seconds[:, 1] / seconds[:, 0], (0.25, 0.5, 0.75))
         row |= {"peer_steps_per_s": steps / middle[1]}
         row |= {"speed_up": faster, "low": low, "high": high}
-    return {"rows": [row]}
+    return row
 
 
 def block_length(models: list) -> int:

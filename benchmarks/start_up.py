@@ -21,7 +21,6 @@ commands of `sb3-hds` are timed likewise.
 
 import argparse
 import hashlib
-import json
 import os
 import resource
 import subprocess
@@ -33,7 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from runs import RESULTS, fresh_process, save
+from runs import RESULTS, arguments_of, fresh_process, save
 
 HERE = Path(__file__).parent.parent
 COMMANDS = ("--help", "effects")
@@ -48,15 +47,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--only", nargs="*", default=["ours", "before", "sbx"])
     parser.add_argument("--table", action="store_true")
-    parser.add_argument("--worker", nargs=3, metavar=("WHO", "CHECKOUT", "CACHE"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        who, checkout, cache = arguments.worker
-        os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
-        os.environ["SB3_HDS_CACHE"] = cache
-        sys.path.insert(0, checkout)
-        print(json.dumps(sbx() if who == "sbx" else hds()))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.table:
         checkouts = {"ours": HERE, "sbx": HERE}
         if arguments.before:
@@ -67,6 +58,13 @@ def main() -> None:
                 rows += [row | {"round": number} for row in measured(who, checkouts[who])]
                 save(rows, "start_up")
     report()
+
+
+def worker(who: str, checkout: str, cache: str) -> dict[str, Any]:
+    os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
+    os.environ["SB3_HDS_CACHE"] = cache
+    sys.path.insert(0, checkout)
+    return sbx() if who == "sbx" else hds()
 
 
 def measured(who: str, checkout: Path) -> list[dict[str, Any]]:

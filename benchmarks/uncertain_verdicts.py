@@ -25,13 +25,14 @@ interrupted goes on with the policy that it was at.
 
 import argparse
 import json
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from hidden_cases import write
 from intervals import of_mean
-from runs import CACHE, RESULTS, fresh_process, resume, save, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, save, seconds_since_start
 
 EPISODES, EPOCHS = 20, 60
 # Of answers that are trained in, the likeliest, and of draws.
@@ -84,15 +85,10 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--report-only", action="store_true")
-    parser.add_argument("--worker", nargs=2, metavar=("SITUATION", "SEED"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        situation, seed = arguments.worker
-        print(json.dumps({"rows": worker(situation, int(seed))}))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.report_only:
         wanted = [(s, seed) for seed in range(arguments.seeds) for s in arguments.situations]
-        work = lambda *run: fresh_process(__file__, *run, cache=CACHE / "programs")["rows"]  # noqa: E731
+        work = partial(fresh_process, __file__, cache=CACHE / "programs")
         resume("uncertain_verdicts", ("situation", "seed"), wanted, work, arguments.jobs)
     report()
 
