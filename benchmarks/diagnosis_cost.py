@@ -24,7 +24,7 @@ from collections.abc import Iterable
 
 import numpy as np
 import pandas as pd
-from hidden_cases import believed, nothing, recorded
+from hidden_cases import nominal_twin, nothing, recorded
 from independent_rigs import Planted
 from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, seconds_since_start
 
@@ -34,10 +34,10 @@ BUDGETS = ("quick", "full")
 SYSTEMS = {"pendulum": 0.05, "double_pendulum": 0.05}
 NOISE = "1 %"
 #: seconds that ten recordings may take, compilation included
-PROMISED = {"quick": 15.0, "full": 60.0}
+TARGETS = {"quick": 15.0, "full": 60.0}
 # Two numbers always lie on a line.
 _FEWEST = 3
-_LINES = ("system", "budget", "programs")
+_LINES = ("system", "budget", "cache")
 
 
 def main() -> None:
@@ -64,13 +64,13 @@ def main() -> None:
 
 
 def cold_and_warm(system: str, budget: str, n: int) -> list[dict]:
-    """The same diagnosis by two processes, of which the second finds what the first compiled."""
+    """Run the same diagnosis in two processes; the second has the cache of the first."""
     folder = CACHE / "cost"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     return [
-        {"programs": programs} | fresh_process(__file__, system, budget, n, cache=folder)
-        for programs in ("compiled", "kept")
+        {"cache": cache} | fresh_process(__file__, system, budget, n, cache=folder)
+        for cache in ("empty", "warm")
     ]
 
 
@@ -78,7 +78,7 @@ def worker(system: str, budget: str, n: int) -> dict:
     planted = Planted("coulomb_friction", 0, {"tau_c": SYSTEMS[system]})
     case = dataclasses.replace(nothing(system, NOISE, recordings=n), planted=(planted,))
     data, _ = recorded(case, seed=n)
-    twin = believed(system)
+    twin = nominal_twin(system)
     simulated, busy = seconds_since_start(), time.process_time()
     from sb3_hds import diagnose
 
@@ -93,15 +93,15 @@ def worker(system: str, budget: str, n: int) -> dict:
 
 
 def straight_lines(table: pd.DataFrame) -> pd.DataFrame:
-    """:return: of each system, budget and state of the programs, what the cost is made of"""
+    """Fit a straight line for each system, budget and state of the compilation cache."""
     rows = []
     for label, own in table.groupby(list(_LINES), sort=False):
         own = own.sort_values("recordings")
         row = dict(zip(_LINES, label, strict=True)) | fitted(own["recordings"], own["seconds"])
         ten = own.loc[own["recordings"] == 10, "seconds"]
-        if row["programs"] == "compiled" and len(ten):
-            row["promise"] = PROMISED[row["budget"]]
-            row["kept"] = "yes" if ten.iloc[0] <= row["promise"] else "no"
+        if row["cache"] == "empty" and len(ten):
+            row["target_seconds"] = TARGETS[row["budget"]]
+            row["reached"] = "yes" if ten.iloc[0] <= row["target_seconds"] else "no"
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -133,10 +133,10 @@ def figure(table: pd.DataFrame) -> None:
     panels = drawing.subplots(1, len(systems), squeeze=False, sharey=True)[0]
     for panel, system in zip(panels, systems, strict=True):
         for budget, colour in zip(BUDGETS, ("#7fa6cc", "#27496d"), strict=True):
-            for programs, line in (("compiled", "o-"), ("kept", "o:")):
+            for cache, line in (("empty", "o-"), ("warm", "o:")):
                 own = (table["system"] == system) & (table["budget"] == budget)
-                rows = table[own & (table["programs"] == programs)].sort_values("recordings")
-                label = f"{budget}, programs {programs}"
+                rows = table[own & (table["cache"] == cache)].sort_values("recordings")
+                label = f"{budget}, {cache} cache"
                 panel.loglog(rows["recordings"], rows["seconds"], line, color=colour, label=label)
         panel.set_title(system.replace("_", " "))
         panel.set_xlabel("recordings of 200 steps")

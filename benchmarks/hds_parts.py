@@ -38,9 +38,9 @@ BETAS = (0.0, 0.05, 0.1, 0.3, 1.0, "auto")
 # Ends of the gap, as `sim_to_real.py` calls them.
 ENDS = {"wrong twin": "wrong_twin", "ceiling": "ceiling"}
 PARTS = {
-    "as it is": {},
-    "noise does not decay": {"exploration_decay": 1.0},
-    "best step always": {"temperature": 0.0},
+    "HDS, default settings": {},
+    "constant exploration noise": {"exploration_decay": 1.0},
+    "no annealed acceptance": {"temperature": 0.0},
     "no terminal value": {"terminal_value": False},
     "no calibration": {"calibrated": None},
     "nothing suspected": {"suspected": ()},

@@ -265,7 +265,7 @@ def slot_of(effect: str) -> str:
 
 
 def places_of(effect: str, system: str) -> Sequence[Any]:
-    twin = believed(system)
+    twin = nominal_twin(system)
     slots = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}
     return slots[slot_of(effect)]
 
@@ -345,7 +345,7 @@ def _late(delay: float) -> float:
 
 def _outside(case: Case, kind: str, rng: np.random.Generator) -> Planted:
     """Something that no catalogue holds, in units of what would show of its nearest relative."""
-    joints, limits = believed(case.system).joints, smallest(case)
+    joints, limits = nominal_twin(case.system).joints, smallest(case)
     index = int(rng.integers(len(joints)))
 
     def size(effect: str, name: str) -> float:
@@ -392,7 +392,7 @@ def _positions(system: str) -> np.ndarray:
 
 
 @functools.cache
-def believed(system: str, seen: str = "qv") -> Any:
+def nominal_twin(system: str, seen: str = "qv") -> Any:
     """
     :param seen: ``"q"`` if positions are observed only
     :return: the twin under diagnosis
@@ -411,7 +411,7 @@ def believed(system: str, seen: str = "qv") -> Any:
 def base_value(system: str) -> float:
     base = RIGS[system].base
     assert base is not None
-    return believed(system).values[base[0]]
+    return nominal_twin(system).values[base[0]]
 
 
 @functools.cache
@@ -486,7 +486,11 @@ def smallest(case: Case) -> dict[str, dict[str, float]]:
 
         data, _ = recorded(nothing(case.system, case.noise, case.disturbance), seed=99)
         found = diagnose(
-            believed(case.system), data, calibrate=case.nuisances, budget="quick", progress=False
+            nominal_twin(case.system),
+            data,
+            calibrate=case.nuisances,
+            budget="quick",
+            progress=False,
         )
         write(path, json.dumps(found.to_dict()["detectable"]))
     return json.loads(path.read_text())

@@ -48,9 +48,9 @@ from hidden_cases import (
     RIGS,
     SHARES,
     Case,
-    believed,
     draw,
     kind_of,
+    nominal_twin,
     spread,
 )
 from hidden_scores import loaded, report
@@ -226,7 +226,7 @@ def mismatch(system: str) -> float:
 
     from sb3_hds.core import rollout
 
-    twin, n = believed(system), round(1.0 / RIGS[system].dt)
+    twin, n = nominal_twin(system), round(1.0 / RIGS[system].dt)
     obs, actions = simulate(RIGS[system], [], n_recordings=8, n_steps=n, seed=2)
     with jax.enable_x64(True):
         start = jax.vmap(lambda o: twin.infer(o, twin.params))(jnp.array([o[0] for o in obs]))
@@ -262,7 +262,7 @@ def run(
         case, data, motion = several_cases.draw(system, number, noise=noise, most=most)
     else:
         case, data, motion = draw(system, number, kind=kind, noise=noise, most=most)
-    twin, started = believed(system, case.seen), time.time()
+    twin, started = nominal_twin(system, case.seen), time.time()
     inquiry = Inquiry(twin, data, effects.ALL, case.nuisances, number, budget, False)
     reason = inquiry.given.poor
     found = inquiry.refused(reason) if reason else inquiry.run()
@@ -330,7 +330,7 @@ def others_of_several(
     case: Case, inquiry: Any, data: Any, motion: np.ndarray, commands: np.ndarray, budget: str
 ) -> dict[str, str]:
     """What other rules say, and what that means in these data."""
-    found = several_rules.asked(inquiry, believed(case.system, case.seen), data, budget)
+    found = several_rules.asked(inquiry, nominal_twin(case.system, case.seen), data, budget)
     return {
         f"{RULE_OF_SEVERAL}{rule}": json.dumps(
             {
@@ -385,7 +385,7 @@ def _turns(planted: Planted, name: str, estimate: float, true: float) -> float:
 def true_value(planted: Planted, name: str, system: str) -> float | None:
     if name not in planted.values:
         return None
-    own = believed(system).values if planted.effect.startswith(PARAMETER) else {}
+    own = nominal_twin(system).values if planted.effect.startswith(PARAMETER) else {}
     return own.get(name, 0.0) + planted.values[name]
 
 

@@ -98,7 +98,11 @@ def scores(table: pd.DataFrame, budget: str) -> list[Score]:
         share("90 % intervals that cover", covered, least=0.85, most=0.95),
         middle("error of a parameter, median", errors),
         middle("error of a parameter, 90 % of them", errors, 0.9),
-        middle("gain over the oracle's, median", said["at_the_end"] / said["oracle"], least=0.9),
+        middle(
+            "gain relative to the true effect, median",
+            said["at_the_end"] / said["oracle"],
+            least=0.9,
+        ),
         middle("seconds, median", cases["seconds"]),
         middle("seconds, 90 % of them", cases["seconds"], 0.9, most=_SECONDS[budget]),
     ]
@@ -131,7 +135,7 @@ def by_difficulty(table: pd.DataFrame) -> pd.DataFrame:
     ):
         for factor in (2.0, 4.0, 8.0):
             some = effects[own & (effects["factor"] == factor)]
-            rows.append({"noise": label, "times": f"{factor:.0f}"} | _told(some))
+            rows.append({"noise": label, "size [detection limits]": f"{factor:.0f}"} | _told(some))
     return pd.DataFrame(rows)
 
 
@@ -152,7 +156,7 @@ def by_system(table: pd.DataFrame) -> pd.DataFrame:
             | _told(own[own["kind"] == "effect"])
             | {
                 "false alarms": told_share(nulls["spoke"]),
-                "refused outside": told_share(~outside["spoke"]),
+                "refused outside the catalogue": told_share(~outside["spoke"]),
                 "seconds": f"{own['seconds'].median():.0f}",
             }
         )
@@ -179,7 +183,7 @@ def by_outside(table: pd.DataFrame) -> pd.DataFrame:
         {
             "cause": name.replace("_", " "),
             "refused": told_share(~own["spoke"]),
-            "as unknown": told_share(own["verdict"] == "unknown"),
+            "called unknown": told_share(own["verdict"] == "unknown"),
         }
         for name, own in outside.groupby("truth")
     )
@@ -206,17 +210,19 @@ def _of_rule(rule: str, asked: pd.DataFrame, names: pd.Series, gains: pd.Series)
     return {
         "rule": rule,
         "false alarms": told_share(spoke[asked["kind"].isin(NULLS)]),
-        "named outside": told_share(spoke[asked["kind"] == "outside"]),
+        "named outside the catalogue": told_share(spoke[asked["kind"] == "outside"]),
         "right": told_share(good[effect]),
         "wrong": told_share((spoke & ~good)[effect]),
-        "gain over the oracle's": f"{np.nanmedian(ratio):.2f}" if ratio.notna().any() else "-",
+        "gain relative to the true effect": f"{np.nanmedian(ratio):.2f}"
+        if ratio.notna().any()
+        else "-",
     }
 
 
 def _told(rows: pd.DataFrame) -> dict[str, str]:
     return {
         "right": told_share(rows["right"]),
-        "to the letter": _share(rows["truth"] == rows["named"]),
+        "exact name": _share(rows["truth"] == rows["named"]),
         "within the set": _share(rows["within"][rows["spoke"]]),
         "wrong": _share(rows["spoke"] & ~rows["right"]),
         "none": _share(rows["verdict"] == "none"),

@@ -129,7 +129,11 @@ def beside_peers(runs: pd.DataFrame) -> pd.DataFrame:
                 their_mean, their_low, _ = intervals.of_mean(theirs)
                 difference, low, high = intervals.of_difference(mine, theirs)
                 row = {"env": env, "method": method, "peer": peer, "mark": at}
-                row |= {"return": mine.mean(), "of_peer": their_mean, "low_of_peer": their_low}
+                row |= {
+                    "return": mine.mean(),
+                    "return_of_peer": their_mean,
+                    "low_of_peer": their_low,
+                }
                 row |= {"difference": difference, "low": low, "high": high}
                 row |= {
                     "probability_of_improvement": intervals.probability_of_improvement(mine, theirs)
@@ -181,8 +185,8 @@ def fewer_steps(runs: pd.DataFrame) -> pd.DataFrame:
             goals |= {goal: median_first_mark(theirs, goal) for goal in GOALS.get(env, ())}
             for goal, theirs_needs in goals.items():
                 needs = median_first_mark(mine, goal)
-                row = {"env": env, "method": method, "than": other, "goal": goal, "steps": needs}
-                row |= {"steps_of_other": theirs_needs, "times": theirs_needs / needs}
+                row = {"env": env, "method": method, "peer": other, "target": goal, "steps": needs}
+                row |= {"steps_of_peer": theirs_needs, "ratio": theirs_needs / needs}
                 seeds = f"{mine['seed'].nunique()} and {theirs['seed'].nunique()}"
                 rows.append(row | {"seeds": seeds})
     return pd.DataFrame(rows)

@@ -39,7 +39,17 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from hidden_cases import N_STEPS, RIGS, believed, dealt, draw, plantable, recorded, sensed, spread
+from hidden_cases import (
+    N_STEPS,
+    RIGS,
+    dealt,
+    draw,
+    nominal_twin,
+    plantable,
+    recorded,
+    sensed,
+    spread,
+)
 from hidden_effects import key
 from independent_rigs import Loop, simulate
 from runs import RESULTS, save
@@ -141,7 +151,7 @@ def run(system: str, number: int, budget: str) -> list[dict[str, Any]]:
 
     began = time.time()
     case, data, motion = draw(system, number, kind="effect", noise=_NOISE, most=_RECORDINGS)
-    twin, rig = believed(system, case.seen), RIGS[system]
+    twin, rig = nominal_twin(system, case.seen), RIGS[system]
     family = family_of(case.planted[0].effect)
     if not family:  # what was dealt cannot be planted here, and something else was
         return []
@@ -253,7 +263,7 @@ def values_of(answer: Any) -> dict[str, float]:
 
 def limits_of(system: str, motion: np.ndarray) -> dict[str, Any]:
     """:param motion: positions and velocities that the recordings took"""
-    rig, twin = RIGS[system], believed(system)
+    rig, twin = RIGS[system], nominal_twin(system)
     joints, actuators = [j.name for j in twin.joints], [a.name for a in twin.actuators]
     q, v = motion[:, : rig.dof], motion[:, rig.dof :]
     middle, half = 0.5 * (q.max(0) + q.min(0)), 0.5 * np.ptp(q, 0)
@@ -350,7 +360,7 @@ def report() -> None:
     one = played.open & (played.needed <= 1.0)
     several = played.open & played.tellable & ~one
     classes = {
-        "settled, where one designed recording should do": one,
+        "settled, where one designed recording should suffice": one,
         "settled, where several should": several,
         "settled, where the tool says none can": played.open & ~played.tellable,
     }

@@ -28,7 +28,8 @@ HIDDEN = {
     "coulomb_friction": {"friction": 0.6},
     "torque_gain": {"gain": 0.6},
 }
-SIMULATIONS = ("believed", "extended", "true")
+#: twins in which policies are trained, by their names in `PolicyGain`
+SIMULATIONS = {"believed": "nominal twin", "extended": "diagnosed twin", "true": "true twin"}
 N_RECORDINGS, N_STEPS = 10, 200
 
 
@@ -59,14 +60,14 @@ def worker(hidden: str, seed: int) -> list[dict]:
     diagnosed = seconds_since_start()
     gain = measure_policy_gain(found, real, seeds=1, progress=False)
     keys = [key for f in found.findings for key in (f.key, *f.alternatives)]
-    told = {
+    diagnosis = {
         "verdict": found.verdict,
         "named": " ".join(f.key for f in found.findings),
         "within": any(key.startswith(f"{hidden}.") for key in keys),
         "diagnosed": diagnosed,
         "seconds": seconds_since_start(),
     }
-    return [{"twin": s, "return": gain.of(s).mean} | told for s in SIMULATIONS]
+    return [{"twin": s, "return": gain.of(s).mean} | diagnosis for s in SIMULATIONS]
 
 
 def recorded(real, seed: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -83,7 +84,7 @@ def recorded(real, seed: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 
 def report() -> None:
-    """Print, keep and draw what the seeds say."""
+    """Print, save and plot the intervals over seeds."""
     table = pd.read_csv(RESULTS / "policy_gain.csv")
     rows = [summary(hidden, own) for hidden, own in table.groupby("hidden", sort=False)]
     print(save(rows, "policy_gain_intervals").to_string(index=False))
@@ -93,21 +94,21 @@ def report() -> None:
 def summary(hidden: str, own: pd.DataFrame) -> dict:
     """:return: interquartile means over seeds with 95 % intervals, and the gain, paired by seed"""
     by = own.pivot(index="seed", columns="twin", values="return")
-    believed, extended, true = (by[s].to_numpy() for s in SIMULATIONS)
-    told = own[own.twin == "extended"]
-    first = told.named.astype(str).str.startswith(f"{hidden}.").sum()
-    gap = of_iqm([true - believed])[0]
+    nominal, extended, true = (by[s].to_numpy() for s in SIMULATIONS)
+    diagnosed = own[own.twin == "extended"]
+    first = diagnosed.named.astype(str).str.startswith(f"{hidden}.").sum()
+    gap = of_iqm([true - nominal])[0]
     return {
         "hidden": hidden,
-        "named first": f"{first} of {len(told)}",
-        "within the set": f"{int(told.within.sum())} of {len(told)}",
-        **{s: _told(by[s].to_numpy()) for s in SIMULATIONS},
-        "gain": _told(extended - believed),
-        "share of the gap": f"{of_iqm([extended - believed])[0] / gap:.2f}" if gap > 0 else "-",
+        "named first": f"{first} of {len(diagnosed)}",
+        "within the set": f"{int(diagnosed.within.sum())} of {len(diagnosed)}",
+        **{title: _with_interval(by[s].to_numpy()) for s, title in SIMULATIONS.items()},
+        "gain": _with_interval(extended - nominal),
+        "share of the gap": f"{of_iqm([extended - nominal])[0] / gap:.2f}" if gap > 0 else "-",
     }
 
 
-def _told(values: np.ndarray) -> str:
+def _with_interval(values: np.ndarray) -> str:
     middle, low, high = of_iqm([values])
     return f"{middle:.1f} [{low:.1f}, {high:.1f}]"
 
@@ -119,10 +120,11 @@ def draw(table: pd.DataFrame) -> None:
     shown = list(dict.fromkeys(table.hidden))
     figure = Figure(figsize=(2.6 * len(shown) + 0.6, 3.0), layout="constrained")
     panels = figure.subplots(1, len(shown), squeeze=False)[0]
+    names = [title.removesuffix(" twin") for title in SIMULATIONS.values()]
     for axes, hidden in zip(panels, shown, strict=True):
         by = table[table.hidden == hidden].pivot(index="seed", columns="twin", values="return")
         for _, returns in by[list(SIMULATIONS)].iterrows():
-            axes.plot(SIMULATIONS, returns, "o-", color="#27496d", alpha=0.5, lw=1)
+            axes.plot(names, returns, "o-", color="#27496d", alpha=0.5, lw=1)
         axes.set_title(hidden.replace("_", " "), fontsize=10)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("return on the real system")

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from hidden_cases import RIGS, Case, believed, places_of, slot_of, spread
+from hidden_cases import RIGS, Case, nominal_twin, places_of, slot_of, spread
 from independent_rigs import EVERYWHERE
 
 # Share of the samples that have to agree where something is said of all.
@@ -189,7 +189,7 @@ def _together(effect: str, joint: int, case: Case, named: Sequence[str]) -> list
 
 def _named_at(effect: str, joint: int, system: str) -> str:
     """:return: the effect with its place at or before a joint; empty if there is none"""
-    twin = believed(system)
+    twin = nominal_twin(system)
     if effect.startswith("parameter."):
         return effect if effect.partition(".")[2] in twin.parameters else ""
     if slot_of(effect) == "channel" or joint >= len(places_of(effect, system)):

@@ -26,9 +26,9 @@ from hidden_cases import (
     RIGS,
     Case,
     base_value,
-    believed,
     dealt,
     kind_of,
+    nominal_twin,
     nothing,
     places_of,
     recorded,
@@ -303,8 +303,8 @@ def _parameter(case: Case, joint: int, side: float, rng: np.random.Generator) ->
     if rig.base is not None:
         name, index, most = rig.base[0], 0, _OFF * base_value(case.system)
     else:
-        name, index = f"{believed(case.system).joints[joint].name}{ARMATURE}", joint
-        own = believed(case.system).values[name]
+        name, index = f"{nominal_twin(case.system).joints[joint].name}{ARMATURE}", joint
+        own = nominal_twin(case.system).values[name]
         most = _OFF * (own if side < 0.0 else max(own, usual.inertia[joint]))
     limit = usual.limits.get(f"parameter.{name}", {}).get(name, np.nan)
     return Planted(f"parameter.{name}", index, {name: side * _between(limit, most, rng)})
@@ -433,7 +433,7 @@ def _measured(system: str, noise: str, seen: str, loop: str) -> dict[str, Any]:
 
     case = dataclasses.replace(nothing(system, noise), kind=SEVERAL, seen=seen, loop=loop)
     data, moved = _driven(case, 99)
-    twin = believed(system, seen)
+    twin = nominal_twin(system, seen)
     found = screen(twin, motion(twin, data), effects.ALL, ())
     if found is None:
         raise RuntimeError(f"{system}: there is no equation of motion, so no size just shows.")

@@ -273,7 +273,7 @@ def report(name: str) -> None:
             print(f"\n{table.to_string(index=False, float_format='%.3g')}")
 
 
-def wanted(ratio: int, peer: str) -> float:
+def target(ratio: int, peer: str) -> float:
     """:return: how many times as fast as the peer ours shall be"""
     if peer == "sb3":
         return 3.0
@@ -284,8 +284,8 @@ def beside_targets(measured: pd.DataFrame) -> pd.DataFrame:
     """:return: a row for each pair, with the speed-up that it shall have"""
     pairs = measured[measured["peer"].isin(("sbx", "sb3"))]
     pairs = pairs[["name", "ratio", "peer", "speed_up", "low", "high"]].copy()
-    pairs["wanted"] = [wanted(*pair) for pair in pairs[["ratio", "peer"]].itertuples(index=False)]
-    pairs["reached"] = np.where(pairs["speed_up"] >= pairs["wanted"], "yes", "no")
+    pairs["target"] = [target(*pair) for pair in pairs[["ratio", "peer"]].itertuples(index=False)]
+    pairs["reached"] = np.where(pairs["speed_up"] >= pairs["target"], "yes", "no")
     return pairs
 
 

@@ -192,11 +192,11 @@ def summary(least: pd.DataFrame) -> list[dict[str, Any]]:
     starts = {"before": "before", "ours": "now", "sbx": "SBX SAC"}
     return [
         {
-            "": name,
+            "version": name,
             "start": state,
             "own imports and construction [s]": row["own_s"],
             "first plan or update after construction [s]": row["first_plan_s"],
-            "in all [s]": row["total_s"],
+            "total [s]": row["total_s"],
             "processor [s]": row["total_cpu_s"],
             "programs compiled": row["compiled"],
             "epoch [ms]": row["epoch_ms"],

@@ -20,7 +20,7 @@ import pandas as pd
 import pytest
 import same_cause
 from cases import each
-from hidden_cases import NULLS, believed, nothing
+from hidden_cases import NULLS, nominal_twin, nothing
 from hidden_scores import prepared, scores
 from independent_rigs import SYSTEMS, Planted, _moment, modelled, simulate
 
@@ -46,7 +46,7 @@ def test_a_changed_inertia_and_the_planted_load_are_those_of_the_twin(system):
     mujoco.mj_forward(model, data)
     engine = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, engine)
-    twin, name = believed(system), rig.base[0]
+    twin, name = nominal_twin(system), rig.base[0]
     twin = twin.with_parameters(**{name: twin.values[name] + change})
     with jax.enable_x64(True):
         q, v = jnp.asarray(data.qpos), jnp.asarray(data.qvel)

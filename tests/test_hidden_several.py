@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import several_rules
 from cases import each
-from hidden_cases import RIGS, believed, kind_of, nothing
+from hidden_cases import RIGS, kind_of, nominal_twin, nothing
 from independent_rigs import EVERYWHERE, Loop, Planted, modelled
 from several_cases import SEVERAL, share_of_friction, visible
 from several_scores import judged
@@ -43,7 +43,7 @@ def test_a_rotor_of_the_engine_is_that_of_the_twin():
     mujoco.mj_forward(model, data)
     engine = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, engine)
-    twin = believed("leg")
+    twin = nominal_twin("leg")
     twin = twin.with_parameters(**{name: twin.values[name] + 0.02})
     with jax.enable_x64(True):
         matrix = twin.mass_matrix(jnp.asarray(data.qpos), twin.params)

@@ -1,12 +1,13 @@
 """
-Fills in what the code knows better than a page.
+Generates parts of pages from the package and from ``benchmarks/results``.
 
-A line ``<!-- generated: NAME -->`` of a page is replaced by Markdown that is made from the package
-as it is now, each time that the page is read.
+A line ``<!-- generated: NAME -->`` of a page is replaced by Markdown, each time that the page is
+read.
 """
 
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import benchmark_results
@@ -15,10 +16,11 @@ import import_picture
 import reference
 import summaries
 
-# Between which planning in the data sheet's twin and in the true one lie, of the worn pendulum.
+# Table, and its variants at both ends of the gap: planning in the data sheet's twin and in the true
+# one, of the worn pendulum.
 WORN = ("hds_parts", "wrong twin", "ceiling")
 
-# What is shown beside an algorithm on its page.
+# Methods with which the page of an algorithm compares it.
 LEARNED = {
     "hds": ("sac", "sb3_sac", "sbx_sac"),
     "gsde_sac": ("sb3_gsde_sac", "sac", "sb3_sac", "sbx_sac"),
@@ -38,7 +40,11 @@ PARTS: dict[str, Callable[[], str]] = {
     "effects": catalogue.effects_as_markdown,
     "nameless": catalogue.nameless_as_markdown,
     "environments": catalogue.environments_as_markdown,
-    "benchmarks": benchmark_results.as_markdown,
+    "benchmarks": lambda: benchmark_results.as_markdown(pages_by_result()),
+    "pendulum": summaries.whole("pendulum"),
+    "epoch_cost": summaries.whole("epoch_cost", "time and memory of an epoch against rollouts"),
+    "import_time": summaries.whole("import_time"),
+    "qp_solvers": summaries.whole("qp_solvers"),
     "sim_to_real_gap": summaries.whole(
         "sim_to_real_gap", "share of the gap that is closed, by cell"
     ),
@@ -165,7 +171,9 @@ PARTS: dict[str, Callable[[], str]] = {
     ),
 }
 
+_DOCS = Path(__file__).parent.parent
 _LINE = re.compile(r"^<!-- generated: (\w+) -->$", re.MULTILINE)
+_RESULT = re.compile(r"benchmarks/results/([\w.-]+)\.(?:csv|png)")
 
 
 def fill_in(text: str) -> str:
@@ -175,6 +183,18 @@ def fill_in(text: str) -> str:
     :raises KeyError: for a part that does not exist
     """
     return _LINE.sub(lambda line: PARTS[line[1]](), text)
+
+
+def pages_by_result() -> dict[str, list[str]]:
+    """:return: for each table or picture, the pages that show it, relative to a folder of docs"""
+    pages: dict[str, list[str]] = {}
+    for page in sorted([*_DOCS.glob("*.md"), *_DOCS.glob("[!_]*/[!_]*.md")]):
+        text = page.read_text()
+        parts = [PARTS[name] for name in _LINE.findall(text)]
+        shown = [text, *(part() for part in parts if part.__module__ == summaries.__name__)]
+        for name in dict.fromkeys(_RESULT.findall("\n".join(shown))):
+            pages.setdefault(name, []).append(f"../{page.relative_to(_DOCS).as_posix()}")
+    return pages
 
 
 def setup(app: Any) -> dict[str, bool]:
