@@ -2,17 +2,17 @@
 The range of actions against learning speed and final return: a car on an oval.
 
     python benchmarks/action_scale.py [--seeds 5] [--steps 6000] [--figure]
-    python benchmarks/action_scale.py --steering        # and all of the speed's range
+    python benchmarks/action_scale.py --steering        # with the full range of speed
     python benchmarks/action_scale.py --wheelbase 0.4   # a car that turns more sharply
-    python benchmarks/action_scale.py --steering --wheelbase 0.25 --sde   # noise that persists
+    python benchmarks/action_scale.py --steering --wheelbase 0.25 --sde   # persistent noise
 
-Raffin reports it for the steering range of a racing car (*Learning to race in an hour*, 2022).
-Here, ``ActionScale`` shrinks the range of steering, and unless ``--steering`` is given that of the
-target speed, of a car that understeers, around straight ahead at 7 m/s. Each way of asking has a
-table of its own. Noise is drawn at every step, or with ``--sde`` for 16 steps at a time (gSDE, as
-the racing car had it). An episode ends after 20 s or off the track; its return is the distance
-covered [m]. The learner is CrossQ with the same settings for all; the policy's mean is evaluated
-for three episodes.
+Tests what Raffin reports for the steering range of a racing car (*Learning to race in an hour*,
+2022). ``ActionScale`` shrinks the range of steering of an understeering car, and that of its target
+speed unless ``--steering`` is given, around driving straight ahead at 7 m/s. Each combination of
+options has a table of its own. Noise is drawn at every step, or with ``--sde`` lasts for 16 steps
+(gSDE, as on the racing car). An episode ends after 20 s or off the track; its return is the
+distance covered [m]. The learner is CrossQ with the same settings for all; its mean policy is
+evaluated over three episodes.
 """
 
 import argparse

@@ -1,11 +1,11 @@
 """
-HDS with default arguments on the other control tasks: return in the environment, and wall time.
+HDS with default arguments on six control tasks: return in the environment, and wall time.
 
     python benchmarks/control_tasks.py [--seeds 3]
 
-Each run is a fresh process with an empty compilation cache; the time counts from the start of its
-interpreter to the end of ``HDS(env_id).learn()``. The policy is then evaluated on 100 episodes of
-the environment as ``gymnasium.make`` makes it, the same resets for every seed.
+Each run is a fresh process with an empty compilation cache; its time counts from the start of the
+interpreter to the end of ``HDS(env_id).learn()``. The policy is then evaluated over 100 episodes of
+the environment as ``gymnasium.make`` makes it, with the same resets for every seed.
 """
 
 import argparse

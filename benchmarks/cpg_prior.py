@@ -2,12 +2,12 @@
 SAC and gSDE-SAC with and without a rhythm under the policy: Swimmer-v5 and HalfCheetah-v5.
 
     python benchmarks/cpg_prior.py                 # 50,000 steps, three seeds
-    python benchmarks/cpg_prior.py --figure        # draw the figure again from the table
+    python benchmarks/cpg_prior.py --figure        # redraw the figure from the table
 
-The rhythm is a plain one, not the result of a search: joints one after another on a wave, at a
-frequency within the range of the search. ``residual`` and ``offset`` are the modes of ``CPGPrior``.
-Each run is a process of its own; what acts at the end is evaluated on 20 episodes, the same resets
-for every run. Runs that are in the table are not done again.
+The rhythm is not optimised: the joints follow a travelling wave, one after another, at a frequency
+within the range of the search. ``residual`` and ``offset`` are modes of ``CPGPrior``. Each run is a
+process of its own; its final policy is evaluated over 20 episodes, with the same resets for every
+run. Finished runs are kept.
 """
 
 import argparse

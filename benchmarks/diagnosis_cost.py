@@ -1,18 +1,17 @@
 """
-The cost of a diagnosis against the number of recordings.
+The time and memory of a diagnosis against the number of recordings.
 
     python benchmarks/diagnosis_cost.py
     python benchmarks/diagnosis_cost.py --systems pendulum --recordings 10 30 --budgets quick
     python benchmarks/diagnosis_cost.py --report-only
 
-A pendulum and a double pendulum on MuJoCo's engine with dry friction that `diagnose` is not told
-of, against the whole catalogue; recordings of 200 steps. Each row is a fresh process: first with
-nothing compiled beforehand, then with the programs that the first one kept. Starting Python and
-making the data do not count. Processor seconds are those of all cores, and hardly depend on what
-else the machine does. Memory is the peak resident size of the process. A straight line is fitted to
-the seconds, relative errors of all rows counting the same: its ends, how far rows are from it, and
-the exponent between the two largest numbers of recordings, which is 1 where the cost is linear.
-Finished rows are kept.
+The data are recordings of 200 steps of a pendulum and a double pendulum on MuJoCo's engine with dry
+friction, diagnosed with the full catalogue. Each row is a fresh process: first with an empty
+compilation cache, then with the cache of the first one. Starting Python and making the data do not
+count. Processor seconds are the sum over all cores and hardly depend on other load. Memory is the
+peak resident size of the process. A straight line is fitted to the seconds by relative errors; the
+table of lines has its coefficients, its largest deviation, and the exponent between the two largest
+numbers of recordings, which is 1 where the cost is linear. Finished rows are kept.
 """
 
 import argparse

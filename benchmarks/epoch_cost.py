@@ -1,11 +1,11 @@
 """
-The cost of a planning epoch against the number of rollouts, and a profile of a cold start.
+The cost of a planning epoch against the number of rollouts, and the parts of a cold start.
 
     python benchmarks/epoch_cost.py
 
-Pendulum-v1, default arguments but for ``n_rollouts``; one fresh process per row. Memory is the peak
-resident size of the process. The regression does not grow with the number of rollouts (96 steps of
-512 samples), the planning does: both are timed.
+Pendulum-v1 with default arguments except ``n_rollouts``; one fresh process per row. Memory is the
+peak resident size of the process. Planning grows with the number of rollouts, the regression does
+not (96 steps of 512 samples): both are timed.
 """
 
 import argparse

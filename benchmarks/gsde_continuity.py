@@ -1,16 +1,16 @@
 """
-The price of smooth exploration: return against continuity, for white noise and gSDE.
+The price of smooth exploration: return against continuity cost, for white noise and gSDE.
 
     python benchmarks/gsde_continuity.py                 # two environments, three seeds
-    python benchmarks/gsde_continuity.py --figure        # draw the figure again from the table
+    python benchmarks/gsde_continuity.py --figure        # redraw the figure from the table
 
 After figure 2 of Raffin, Kober and Stulp, *Smooth Exploration for Robotic Reinforcement Learning*,
-CoRL 2021. The learner is GSDESAC throughout, updated after each episode as often as it has steps,
-so that only the noise differs: drawn anew at every step without regard to the state, or from
-features of the state by a matrix that stays for 2, 8, 64 steps or a whole episode. The continuity
-cost is theirs, 100 times the mean square of the change between successive actions as a share of
-their range: 0 for a constant action, 100 for one that jumps from end to end. It is taken while
-learning (from the first update on, what motors feel), and of the mean policy that is evaluated.
+CoRL 2021. The learner is always GSDESAC, with as many updates after each episode as it had steps,
+so that only the noise differs: drawn at every step independently of the state, or computed from
+features of the state by a matrix that lasts for 2, 8, 64 steps or a whole episode. The continuity
+cost is that of the paper, 100 times the mean square of the change between successive actions as a
+share of their range: 0 for a constant action, 100 for one that jumps from end to end. It is
+measured during learning, from the first update on, and for the mean policy that is evaluated.
 Finished runs are kept.
 """
 

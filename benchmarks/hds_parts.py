@@ -3,23 +3,23 @@ Ablations of HDS: one part changed at a time, on a stand-in for worn hardware.
 
     python benchmarks/hds_parts.py                        # beta, parts and weaknesses, five seeds
     python benchmarks/hds_parts.py --tables parts --seeds 2 --jobs 1
-    python benchmarks/hds_parts.py --figure                # draw the figures again from the tables
+    python benchmarks/hds_parts.py --figure               # redraw the figures from the tables
 
-The cell "worn" of `hardware.py` is heavier and longer than its data sheet says, has dry friction,
-and stirs the air, for which the twin has no parameter and HDS suspects no effect. Runs with the
-same seed start from the same policy where the change does not touch the pretraining. Returns are
-means over the same 50 start states; finished runs are kept.
+The cell "worn" of `hardware.py` is heavier and longer than its data sheet says and has dry friction
+and air drag; the twin has no parameter for drag, and HDS suspects no such effect. Runs with the
+same seed start from the same policy unless the change affects the pretraining. Returns are means
+over the same 50 start states. Finished runs are kept.
 
-beta: the share of plans made in the model with the learned force, which is all that is learned
-here, as in the HDS project: no parameter is estimated and no effect suspected. Beside the return,
-what the HDS project asked about numerical stability: samples that were dropped because they were
-not finite, the norm of the policy's gradient, and that of the derivative of the return of 100 steps
-by the first action, at the median and at its worst over 256 start states, in the model that was
-learned.
+beta: the share of plans made in the model with the learned force. As in the HDS project, only that
+force is learned: no parameter is estimated and no effect suspected. Besides the return, the table
+has measures of the numerical stability that the HDS project asked about: the number of non-finite
+samples that were dropped, the norm of the policy's gradient, and the median and the maximum, over
+256 start states, of the derivative of the return of 100 steps by the first action, in the learned
+model.
 
-parts: each remedy and each way to use the data switched off. "wrong twin" and "ceiling", what was
-planned in the data sheet's twin and in the true one, are the ends of the gap; the share of it that
-is closed is printed beside the returns, for beta too.
+parts: each remedy and each use of the data switched off. "wrong twin" and "ceiling", planned in the
+data sheet's twin and in the true one, are the ends of the gap; the share of it that a variant
+closes is printed beside its return, also for beta.
 
 weaknesses: the four that the authors of HDS name, with the remedy off and on, without data.
 """

@@ -1,8 +1,9 @@
 """
 The cases of `hidden_effects.py`: planted effects, their places and sizes, and the recordings.
 
-Everything about a case follows from its system and its number. Kinds of cases, effects, sizes,
-noises and numbers of recordings are dealt like cards: each comes up in its share, not by chance.
+A case is determined by its system and its number. Kinds of cases, effects, sizes, noises and
+numbers of recordings are drawn without replacement from shuffled decks, so that each occurs in its
+exact share.
 """
 
 import dataclasses

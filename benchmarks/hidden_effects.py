@@ -3,25 +3,26 @@ Detection and false-alarm rates of `diagnose` on data with and without hidden ef
 
     python benchmarks/hidden_effects.py --cases 1000 --jobs 2
     python benchmarks/hidden_effects.py --cases 100 --systems pendulum furuta --kinds null
-    python benchmarks/hidden_effects.py --report-only         # tables and figure of what has run
+    python benchmarks/hidden_effects.py --report-only         # tables and figure of finished cases
 
-Data come from `independent_rigs.py`; sensors round to their ticks or get white noise. The twin
-under diagnosis knows the rig but not what was planted, and follows the engine, where nothing is
-planted, to a tenth of the smallest noise: that is measured first, and nothing runs where it fails.
-Sizes are 2, 4 and 8 times what null data of the same rig, noise, disturbance and nuisances would
-have shown (`Diagnosis.detectable`); a few effects without a slope at zero have sizes of their own
-(`hidden_cases.py`). Names count as right only where and when they mean the same (`same_cause.py`).
+Data come from `independent_rigs.py`; sensors round to their ticks or have white noise. The twin
+under diagnosis describes the rig without the planted effects. Without any, it follows the engine to
+a tenth of the smallest noise: this is measured first, and nothing runs if it fails. Sizes are 2, 4
+and 8 times the detection limit (`Diagnosis.detectable`) of null data with the same rig, noise,
+disturbance and nuisance parameters; a few effects whose derivative vanishes at zero have sizes of
+their own (`hidden_cases.py`). An equivalent name counts as right only under its declared condition
+(`same_cause.py`).
 
-A case of a kind is the same however many are run. Each is kept as soon as it is finished; several
-runs at once may add to one table. Other rules, and the planted effects fitted from their truth, are
-tried on every fourth case of a kind. Beside the cases, one in fifty more asks about Pendulum-v1's
-Euler twin, which differs from the engine by half a step and by no friction, and one in a hundred
-about each of a six-joint arm and a three-joint leg whose twins come from their MJCFs, driven by
-torques and, as many, in closed loop by servos.
+A case of a kind does not depend on the number of cases. Each is saved as soon as it is finished;
+several runs at once may add to one table. On every fourth case of a kind, other rules and the
+planted effects fitted from their true values are evaluated as well. In addition, one case in fifty
+has the Euler twin of Pendulum-v1, which differs from the engine by half a step and by no friction,
+and one in a hundred each has a six-joint arm and a three-joint leg whose twins come from their
+MJCFs, driven by torques, and as many by servos in closed loop.
 
-Half of the cases with effects have two to nine at once (`several_cases.py`), and of these the arm
-and the leg have more than of all others. They are judged cause by cause (`several_scores.py`),
-beside others on the same data (`several_rules.py`).
+Half of the cases with effects have two to nine at once (`several_cases.py`); of the arm and the
+leg, most do. They are scored cause by cause (`several_scores.py`), and compared with other methods
+on the same data (`several_rules.py`).
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""The scores of `hidden_effects.py`: rates beside the targets, tables, a picture."""
+"""The scores of `hidden_effects.py`: rates and their targets, tables, a figure."""
 
 import json
 from collections.abc import Callable, Sequence

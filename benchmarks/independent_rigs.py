@@ -1,10 +1,10 @@
 """
-Rigs on MuJoCo's C engine, with effects planted that are computed here, not by the product.
+Rigs on MuJoCo's C engine, with planted effects that this file computes by itself.
 
-Each rig is one XML file, stepped every millisecond. Forces of effects go through MuJoCo's own
-damping, dry friction and springs where it has them, and otherwise through `qfrc_applied`, which is
-recomputed before each step; commands and measurements are changed on their way in and out. What
-parameters mean is what the catalogue says they mean; how they are computed is not.
+Each rig is one XML file, stepped every millisecond. Forces of effects use MuJoCo's own damping, dry
+friction and springs where it has them, and otherwise `qfrc_applied`, which is recomputed before
+each step; effects of actuators and sensors change commands and measurements. Parameters have the
+meaning that the catalogue gives them; the computation is separate.
 """
 
 import functools

@@ -1,18 +1,17 @@
 """
-The cost of a diagnosis against the number of joints.
+The time and memory of a diagnosis against the number of joints.
 
     python benchmarks/joints_cost.py
     python benchmarks/joints_cost.py --joints 1 6 --budgets quick
     python benchmarks/joints_cost.py --joints 6 --budgets quick --seconds 3600 --rate 1000
     python benchmarks/joints_cost.py --report-only
 
-Arms of 1 to 12 hinges on MuJoCo's engine, 30 s at 125 Hz (or as asked) of smooth random torques,
-positions and velocities with noise. Every joint has viscous and dry friction that the model file
-lacks. Each row is a fresh process with nothing compiled beforehand; starting Python and making the
-data do not count. Processor seconds are those of all cores, and hardly depend on what else the
-machine does.
-Proposals are done when the whole set of causes is known by the equation of motion; the verdict,
-when it has been judged by simulation.
+The data are of arms of 1 to 12 hinges on MuJoCo's engine: smooth random torques for 30 s at 125 Hz,
+or as given, with noise on positions and velocities. Every joint has viscous and dry friction that
+the model file lacks. Each row is a fresh process with an empty compilation cache; starting Python
+and making the data do not count. Processor seconds are the sum over all cores and hardly depend on
+other load. Proposals are complete when the set of causes is known from the equation of motion; the
+verdict, when simulation has confirmed or rejected it.
 """
 
 import argparse

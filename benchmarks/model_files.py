@@ -1,14 +1,15 @@
 """
-The cost of a twin from a model file, against the number of its joints and of its rows.
+The cost of a twin from a model file, against the number of joints and of rows.
 
     python benchmarks/model_files.py
     python benchmarks/model_files.py --joints 1 7 30 --rows 64
     python benchmarks/model_files.py --report-only
 
-Arms of 1 to 30 hinges, MuJoCo's implicitfast of 2 ms, in double precision. One row is a state with
-a command: a step, or a step with its derivatives by state and command. Each number of joints is a
-fresh process that compiles from nothing on one core; the fastest of five calls counts, in processor
-time of that process. Beside it, what the C engine takes for a step.
+The models are arms of 1 to 30 hinges with MuJoCo's implicitfast integrator at 2 ms, in double
+precision. A row is a state with a command; its cost is that of a step, or of a step with its
+derivatives by state and command. Each number of joints is a fresh process with an empty compilation
+cache on one core; the fastest of five calls counts, in processor time. A step of the C engine is
+measured for comparison.
 """
 
 import argparse

@@ -1,27 +1,26 @@
 """
-The model-free family beside SB3, SB3-contrib and SBX: return against steps and against wall time.
+Model-free algorithms compared with SB3, SB3-Contrib and SBX: return against steps and wall time.
 
     python benchmarks/model_free.py                                   # Pendulum-v1, five seeds
     python benchmarks/model_free.py --env MountainCarContinuous-v0 --seeds 2 --methods td7 bro
-    python benchmarks/model_free.py --figure                          # tables and figures again
+    python benchmarks/model_free.py --figure                          # rebuild tables and figures
 
-Ours run with their file in `hyperparams/`, the others with what RL Zoo has for SAC, TQC and CrossQ
-on that environment (those of -v4 for -v5; SBX's DroQ: that of SAC with its documented arguments;
-SB3's gSDE: that of SAC with what ours has on Pendulum-v1).
-`sac` is our GSDESAC without gSDE, `bro_fast` BRO with two updates per step; the critics of
-`crossq_jax_512` have the default width of the constructor, a quarter of the paper's, those of
-`crossq_jax_narrow` an eighth of it, those of `simba_narrow` (with four times
-the learning rate) and `bro_fast_narrow` a quarter, those of `tqc_jax_narrow` two layers of 256 for
-three of 512, which two cores can bear. HDS, which knows a simulation of Pendulum-v1,
-stands beside them with the few steps of its own file. Each run is a fresh process; training stops
-for each evaluation, whose time does not count. `seconds` of the runs are those of their days: the
-tables have what `model_free_pace.py` makes of them. On Pendulum-v1, policies start from the 500
-states whose best return is known (SB3_HDS_DATA); elsewhere, ten episodes with the same seeds.
-Learners that only stop at the end of an episode may have made more steps than the mark at which
-they are compared. Finished runs are kept: an interrupted benchmark goes on where it stopped. Of the
-long runs, which are not those of Pendulum-v1, model and replay buffer are kept at every mark; one
-that is interrupted goes on from its last mark, with a new episode and random numbers other than
-those it would have had.
+Ours run with their file in `hyperparams/`, the others with RL Zoo's hyperparameters of SAC, TQC and
+CrossQ for that environment (those of -v4 for -v5; SBX's DroQ: those of SAC with its documented
+arguments; SB3's gSDE: those of SAC with our gSDE arguments for Pendulum-v1). `sac` is our GSDESAC
+without gSDE, `bro_fast` BRO with two updates per step. The critics of `crossq_jax_512` have the
+default width of the constructor, a quarter of the paper's, those of `crossq_jax_narrow` an eighth
+of it, those of `simba_narrow` (with four times the learning rate) and `bro_fast_narrow` a quarter;
+those of `tqc_jax_narrow` have two layers of 256 instead of three of 512, which two cores can
+compute. HDS, which knows a simulation of Pendulum-v1, is run with the few steps of its own file.
+
+Each run is a fresh process; training stops for each evaluation, whose time does not count.
+`seconds` of the runs depend on the day; the tables use the times of `model_free_pace.py`. On
+Pendulum-v1, policies start from the 500 states whose best return is known (SB3_HDS_DATA);
+elsewhere, from ten resets with the same seeds. Learners that only stop at the end of an episode may
+have made more steps than the mark at which they are compared. Finished runs are kept, so an
+interrupted benchmark resumes. Long runs, on all tasks but Pendulum-v1, save model and replay buffer
+at every mark, from which an interrupted run resumes with a new episode and other random numbers.
 """
 
 import argparse

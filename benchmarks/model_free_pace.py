@@ -1,15 +1,15 @@
 """
-Time per step of the learners of ``model_free.py``, interleaved in one process.
+Time per step of the learners of ``model_free.py``, alternating in one process.
 
     taskset -c 0 python benchmarks/model_free_pace.py                       # Pendulum-v1
     taskset -c 0 python benchmarks/model_free_pace.py --env HalfCheetah-v5 --methods sac td7
 
-Runs of ``model_free.py`` are days apart, and a machine that others share is twice as fast on one
-day as on another: the same run took 37 s and 94 s. Its wall times are made of steps, which are
-counted, and of what is measured here: the seconds until the first block of steps with updates is
-through, programs compiled anew, and then the median time of a step in further blocks, one learner
-after the other, so that a slow moment meets all. Evaluation is not in it. What is measured again
-takes the place of what was; learners that stand beside each other shall come from one run.
+Runs of ``model_free.py`` are days apart, and a shared machine is twice as fast on one day as on
+another: the same run took 37 s and 94 s. The wall times of its tables are therefore computed from
+the number of steps and the times measured here: the seconds of the first block of steps with
+updates, with an empty compilation cache, and the median time of a step in further blocks. Learners
+alternate, so that a slow moment affects all. Evaluation does not count. New measurements replace
+old ones; learners that are compared with each other should come from one run.
 """
 
 import argparse

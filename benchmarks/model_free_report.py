@@ -1,8 +1,8 @@
 """
-The tables and figures of ``model_free.py``: each method beside its peers and its paper.
+The tables and figures of ``model_free.py``: each method compared with its peers and its paper.
 
-Intervals are those of means over seeds (see ``intervals.py``): of five seeds they are rough, of two
-little more than the spread.
+Intervals are those of means over seeds (see ``intervals.py``): rough for five seeds, and for two
+little more than the range.
 """
 
 from collections.abc import Sequence

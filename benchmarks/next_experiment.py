@@ -1,28 +1,30 @@
 """
-Whether one more recording settles what was ambiguous: designed, or a chirp, a random smooth signal
-or a pseudo-random binary sequence of the same length, within the same limits.
+Does one more recording settle an ambiguous verdict? The designed one compared with three others.
 
     python benchmarks/next_experiment.py --systems pendulum linear_axis --cases 40
     python benchmarks/next_experiment.py --report-only
 
-Cases have one planted cause, drawn as `hidden_effects.py` draws them, but so that data leave more
-open: twice as large as would just show, with sensors' errors of 5 % and six recordings at most.
-Only causes that have near relatives are taken, and the diagnosis is asked about these: friction and
-drag; what is late; gain, scale and, as always, the twin's own parameters. Where it ends ambiguous,
-one recording is made on the engine for each kind of command, from rest, and the answers are weighed
-by it (`Diagnosis.decided_by`). Limits are what the case's own recordings took, and a quarter more,
-and the rig's typical command; the three other signals are made as large as the limits allow under
-every answer.
+The others are a chirp, a smooth random signal and a pseudo-random binary sequence (PRBS) of the
+same length, within the same limits.
 
-`open`: the planted cause, or a name that means the same in these recordings (`same_cause.py`), is
-among the answers. `needed`: designed recordings that tell it from every other answer with a chance
-of 90 %, by the tool's own account; `tellable`: a hundred at most. `settled`: after one recording it
-has 95 % of the weight; `wrong`: other names have. `broken`: the largest share of a limit that the
-real rig took.
+Cases have one planted cause, drawn as in `hidden_effects.py`, but with data that leave more open:
+at twice the detection limit, with sensor errors of 5 % and six recordings at most. Only causes with
+similar alternatives are planted, and only these are candidates: friction and drag; delays and lags;
+gain, scale and, as always, the twin's own parameters. If the verdict is ambiguous, the engine makes
+one recording from rest for each kind of command, and the explanations are weighted by it
+(`Diagnosis.decided_by`). Limits are those of the case's own recordings plus a quarter, and the
+rig's typical command; the three other signals are as large as the limits allow under every
+explanation.
 
-`inside`: of every case that is diagnosed, ambiguous or not, another recording of the rig is held
-out: the share of its instants within the central 90 % of what the draws of `Diagnosis.belief`
-predict from its start on, with the errors that the best answer leaves added.
+`open`: the planted cause, or an equivalent name (`same_cause.py`), is among the explanations.
+`needed`: number of designed recordings that separate it from every other explanation with a
+probability of 90 %, by the tool's estimate; `tellable`: a hundred at most. `settled`: after one
+recording it has 95 % of the weight; `wrong`: another name has. `broken`: the largest share of a
+limit that the real rig reached.
+
+`inside`: for every diagnosed case, ambiguous or not, another recording of the rig is held out; the
+share of its samples within the central 90 % of what the draws of `Diagnosis.belief` predict from
+its start, with the residual errors of the best explanation added.
 """
 
 import argparse

@@ -1,14 +1,14 @@
 """
-Open-loop gaits from scratch: return and wall time in five environments of MuJoCo.
+Open-loop gaits from scratch: return and wall time in five MuJoCo environments.
 
     python benchmarks/open_loop.py                      # 200,000 steps, five seeds
     python benchmarks/open_loop.py --steps 1000000
-    python benchmarks/open_loop.py --figure             # draw the figure again from the table
+    python benchmarks/open_loop.py --figure             # redraw the figure from the table
 
 Each run is a process of its own with the hyperparameters of ``hyperparams/openloop.yml``, which are
-for 200,000 steps, and longer rollouts where there are more steps for them; the time counts from the
-start of its interpreter. What acts at the end of the search is evaluated on 20 episodes, the same
-resets for every seed. Runs that are in the table are not done again.
+for 200,000 steps, and longer rollouts for more steps; its time counts from the start of the
+interpreter. The final gait is evaluated over 20 episodes, with the same resets for every seed.
+Finished runs are kept.
 """
 
 import argparse

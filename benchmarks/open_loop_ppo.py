@@ -1,15 +1,16 @@
 """
-Open-loop gaits beside PPO, both after a million steps: the picture of the open-loop paper.
+Open-loop gaits compared with PPO after a million steps: the figure of the open-loop paper.
 
     python benchmarks/open_loop.py --steps 1000000     # the gaits
     python benchmarks/open_loop_ppo.py                 # PPO and random actions, five seeds
-    python benchmarks/open_loop_ppo.py --figure        # draw the figure again from the tables
+    python benchmarks/open_loop_ppo.py --figure        # redraw the figure from the tables
 
 PPO is SBX's, with RL Zoo's hyperparameters for these environments and its normalisation of
-observations and rewards. What acts at the end is evaluated on the same 20 resets as the gaits. In
-the picture, 0 is what random actions earn in an environment and 1 the mean of PPO's seeds; over
-environments there are interquartile means with 95 % intervals of a bootstrap that draws seeds
-within each of them, as Agarwal et al. 2021 ask for. Runs that are in the table are not done again.
+observations and rewards. Its final policy is evaluated on the same 20 resets as the gaits. In the
+figure, a score of 0 is the return of random actions in an environment and 1 the mean of PPO's
+seeds; over all environments there are interquartile means with 95 % bootstrap intervals that
+resample seeds within each environment, as recommended by Agarwal et al. 2021. Finished runs are
+kept.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""What simpler rules would have said of the same data: the peers of `hidden_effects.py`."""
+"""The verdicts of simpler rules on the same data: the peers of `hidden_effects.py`."""
 
 from typing import NamedTuple
 

@@ -1,17 +1,16 @@
 """
-The paper's comparison on its 2D pendulum payload: second order, backpropagation through time, first
-order.
+The PODS paper's comparison on its 2D pendulum payload: second order, BPTT, first order.
 
     python benchmarks/payload.py [--seeds 5] [--epochs 40]
 
-All three have the same networks, start states, number of rollouts, discount and number of Adam
-steps per epoch, and the paper's settings otherwise: whole episodes of 100 steps, no terminal value,
-one improvement of each plan, regression with a squared error. Backpropagation takes each Adam step
-along the gradient of the mean objective through the twin and the policy, from the same start
-states.
+All three methods have the same networks, start states, number of rollouts, discount and number of
+Adam steps per epoch, and otherwise the settings of the paper: whole episodes of 100 steps, no
+terminal value, one improvement of each plan, regression with a squared error. Backpropagation
+through time (BPTT) takes each Adam step along the gradient of the mean objective through the twin
+and the policy, from the same start states.
 
 The objective is minus the cost whose inverse is the paper's reward (see the twin). Return and
-objective are measured on 500 start states that no epoch has seen. ``worsened`` counts plans kept
+objective are measured on 500 start states that no epoch has used. ``worsened`` counts plans kept
 although worse than what they started from.
 """
 

@@ -2,13 +2,15 @@
 A payload added during training: the number of episodes until a learner has recovered.
 
     python benchmarks/payload_added.py [--seeds 5] [--jobs 2]
+    python benchmarks/payload_added.py --figure        # rebuild table and figure from the runs
 
-`sb3_hds/PendulumReal-v1` as its data sheet says, plus sensor noise. After some real episodes a
-point mass of 0.25 kg is fastened to its tip (the rod weighs 1 kg) and nobody is told. HDS and SAC
-(SBX, RL Zoo's settings for Pendulum-v1) learn for ten episodes before; as SAC has learned little by
-then, it also gets fifty. Returns are means over the same 50 start states of the loaded system; a
-learner has recovered from the first evaluation on after which all are within a tenth of what the
-load costs (the policy that never heard of it, against PODS on the true twin).
+The system is `sb3_hds/PendulumReal-v1` as its data sheet says, with sensor noise. After some real
+episodes, a point mass of 0.25 kg is added to its tip (the rod weighs 1 kg) without the learner's
+knowledge. HDS and SAC (SBX, RL Zoo's settings for Pendulum-v1) learn for ten episodes before that;
+because SAC has learned little by then, it is also run with fifty. Returns are means over the same
+50 start states of the loaded system. A learner has recovered at the first evaluation after which
+all are within a tenth of the cost of the load (the policy without adaptation compared with PODS in
+the true twin).
 """
 
 import argparse

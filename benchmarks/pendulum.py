@@ -1,13 +1,13 @@
 """
-Pendulum-v1 from a cold start: HDS beside SB3's SAC and SBX's SAC, each in fresh processes.
+Pendulum-v1 from a cold start: HDS, SB3's SAC and SBX's SAC, each in fresh processes.
 
     python benchmarks/pendulum.py            # five seeds of HDS, one of each SAC
-    python benchmarks/pendulum.py --figure   # draw the figure again from the tables
+    python benchmarks/pendulum.py --figure   # redraw the figure from the tables
 
-Every policy is a sequence of snapshots, taken while it trains and evaluated afterwards on 500 start
-states whose best reachable return is known (SB3_HDS_DATA). Those rows are drawn afresh and exclude
-rows 0, 16, 32, ..., on which the defaults were tuned. Regret is the mean over the same states of
-best return minus return.
+Snapshots of every policy are taken during training and evaluated afterwards on 500 start states
+whose best reachable return is known (SB3_HDS_DATA). These states are drawn afresh and exclude rows
+0, 16, 32, ..., on which the defaults were tuned. Regret is the mean over these states of the best
+return minus the return.
 """
 
 import argparse

@@ -1,15 +1,14 @@
 """
-The policy gain of a diagnosis: policies from the nominal, the extended and the true twin.
+The policy gain of a diagnosis: policies from the nominal, the diagnosed and the true twin.
 
     python benchmarks/policy_gain.py                # three hidden causes, five seeds
-    python benchmarks/policy_gain.py --figure       # draw the figure again from the table
+    python benchmarks/policy_gain.py --figure       # redraw the figure from the table
 
-The real system is `sb3_hds/PendulumReal-v1` with something planted that the twin does not have, and
-sensors with noise. Each seed records ten trajectories of torques that wander, diagnoses them, and
-trains HDS in each twin without a real step, with the defaults of `measure_policy_gain`: all three
-policies act from the same 20 start states. Trainings share their seed, so what differs between
-seeds is what the data said. Each run is a process of its own; runs that are in the
-table are not done again.
+The real system is `sb3_hds/PendulumReal-v1` with a planted effect that the twin lacks, and noisy
+sensors. Each seed makes ten recordings under random torques, diagnoses them, and trains HDS in each
+twin without a real step, with the defaults of `measure_policy_gain`: all three policies act from
+the same 20 start states. All trainings share one seed, so only the data differ between seeds. Each
+run is a process of its own. Finished runs are kept.
 """
 
 import argparse

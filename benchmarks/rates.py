@@ -1,4 +1,4 @@
-"""Rates with their intervals beside targets: what the tables of hidden effects are made of."""
+"""Rates with their intervals and targets, for the tables of `hidden_effects.py`."""
 
 import json
 from collections.abc import Sequence

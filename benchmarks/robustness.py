@@ -2,12 +2,12 @@
 Returns under sensor noise, sensor failure and pushes: open-loop gaits and learned policies.
 
     python benchmarks/robustness.py                                 # published gaits
-    python benchmarks/robustness.py --learners sac --steps 200000   # and what is learned there
+    python benchmarks/robustness.py --learners sac --steps 200000   # and a learner
 
-The gaits are those that the authors of the open-loop paper published. Twice: with encoders of their
-own, as on a robot, and with the loop that tracks joints looking at the observation. Learners are
-ids of this package, or SBX's ``sac`` and ``ppo``. Each policy runs the same starts under each
-perturbation. Runs that are in the table are not done again.
+The gaits are those that the authors of the open-loop paper published, in two variants: with
+encoders of their own, as on a robot, and with joint controllers that use the observation. Learners
+are ids of this package, or SBX's ``sac`` and ``ppo``. Each policy runs from the same starts under
+each perturbation. Finished runs are kept.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Fresh processes, and runs and tables that survive an interruption."""
+"""Fresh processes, and tables of runs that survive an interruption."""
 
 import argparse
 import fcntl

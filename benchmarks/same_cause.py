@@ -1,10 +1,9 @@
 """
-When two names mean the same cause: what the catalogue declares, where it acts, and whether the
-condition that it declares holds in the recordings at hand.
+Which names are equivalent: what the catalogue declares, checked at this place in these recordings.
 
-Effects declare what they cannot be told from, *and when*: a constant force is a Coulomb friction
-only while the joint moves in one direction. Elsewhere the one is a wrong name for the other. Both
-have to be at one place; an actuator is at the joint that it drives.
+Effects declare from which other effects they cannot be distinguished, *and when*: a constant force
+is equivalent to Coulomb friction only while the joint moves in one direction. Otherwise the name is
+wrong. Both must be at one place; an actuator is at the joint that it drives.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,13 +1,13 @@
 """
-Run the test files of Stable-Baselines3 and SB3-Contrib on our classes, in the place of theirs.
+The test files of Stable-Baselines3 and SB3-Contrib, run on our classes in place of theirs.
 
     pip download --no-binary :all: --no-deps stable-baselines3==2.9.2 sb3-contrib==2.9.2
     tar xzf stable_baselines3-2.9.2.tar.gz && tar xzf sb3_contrib-2.9.2.tar.gz
     python benchmarks/sb3_tests.py stable_baselines3-2.9.2 sb3_contrib-2.9.2
 
-Nothing in those files is changed: this file is also a plugin of pytest, which binds the name that
-they import (``SAC``) to our class before they are read, and picks the cases that use it. Classes
-that are in the table already are not run again.
+The files are unchanged: this script is also a pytest plugin, which binds the name that they import
+(``SAC``) to our class before they are read, and selects the cases that use it. Classes that are
+already in the table are not run again.
 """
 
 import argparse

@@ -1,11 +1,11 @@
 """
-Cases of `hidden_effects.py` with two to nine causes at once, as real machines have them.
+Cases of `hidden_effects.py` with two to nine causes at once, as on real machines.
 
-Friction at the joints comes first, in half of the cases the scale is wrong besides (an inertia, or
-the gain of a motor), and then whatever else a machine has. Sizes lie between twice what would just
-show and *dominant*: friction that carries nine tenths of the torque. Commands are torques as they
-come, or those of a position or velocity loop; recordings are many, or a single long one; some are
-of positions only. All that is dealt, as everything about other cases is.
+Most cases have friction at the joints; in half of them the scale is wrong as well (an inertia, or
+the gain of a motor); further causes are drawn from the rest of the catalogue. Sizes lie between
+twice the detection limit and *dominant*: friction that takes nine tenths of the torque. Commands
+are open-loop torques, or those of a position or velocity loop; there are many recordings or a
+single long one; some have positions only. All of these are drawn from decks, as in other cases.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""What came out of the cases with several causes at once: rates beside the targets, tables."""
+"""The scores of cases with several causes at once: rates and their targets, tables."""
 
 import json
 from collections.abc import Mapping, Sequence

@@ -3,16 +3,16 @@ The gap between simulation and reality, and how much of it each method closes pe
 
     python benchmarks/sim_to_real.py                       # all cells and methods, five seeds
     python benchmarks/sim_to_real.py --cells heavy --seeds 2 --jobs 1
-    python benchmarks/sim_to_real.py --figure              # draw the figure again from the table
+    python benchmarks/sim_to_real.py --figure              # redraw the figure from the table
 
 Each cell is a stand-in for hardware that its data sheet describes wrongly. Wrong twin, HDS and
-domain randomisation know the data sheet; the ceiling is PODS on the true twin. Every policy is
-evaluated on the same 50 start states of the real system. Finished runs are kept in the table: an
-interrupted benchmark goes on where it stopped. Only cells whose gap (ceiling minus wrong twin) is
-above three standard errors count; a twin that is wrong in nothing but its steps is a case of its
-own, beside the medians. Medians over cells come with 90 % intervals of a bootstrap that
-draws seeds within each cell, as Agarwal et al. 2021 ask for (rliable's stratified bootstrap, with
-the wrong twin and the ceiling of a seed drawn together with it).
+domain randomisation know the data sheet; the ceiling is PODS in the true twin. Every policy is
+evaluated on the same 50 start states of the real system. Finished runs are kept, so an interrupted
+benchmark resumes. Only cells whose gap (ceiling minus wrong twin) exceeds three standard errors
+count; a twin that is wrong only in its steps is reported apart from the medians. Medians over cells
+have 90 % bootstrap intervals that resample seeds within each cell, as recommended by Agarwal et al.
+2021 (rliable's stratified bootstrap, in which a seed's wrong twin and ceiling are drawn together
+with it).
 """
 
 import argparse

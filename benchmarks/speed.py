@@ -1,22 +1,23 @@
 """
-Steps and updates per second of the model-free family, beside SBX, SB3 and SB3-contrib.
+Steps and updates per second of the model-free algorithms, compared with SBX, SB3 and SB3-Contrib.
 
     python benchmarks/speed.py                     # all rows; resumable
     python benchmarks/speed.py --rows "droq, 20" "droq, 1, start-up"
     python benchmarks/speed.py --table
     python benchmarks/speed.py --on cuda --jobs 4  # rows of a GPU, in a table of their own
 
-Pendulum-v1, equal networks, batches and replay ratios. The two that are compared learn by turns in
-one process, in short blocks, so that a slow moment of the machine meets both; the ratio is the
-median over pairs of neighbouring blocks, with its first and third quartile. The start-up is that of
-a fresh process each, from the interpreter to the first update, with no compiled program kept.
+Pendulum-v1 with equal networks, batches and replay ratios. Two learners alternate in one process,
+in short blocks, so that a slow moment of the machine affects both; the speed-up is the median ratio
+over pairs of neighbouring blocks, with its quartiles. The start-up is that of a fresh process, from
+the interpreter to the first update, with an empty compilation cache.
 
-Beside them, `learn_compiled`: environment and updates in one program, several seeds side by side.
-What no code around them can save: `products` are the matrix products of SAC's update with these
-networks and this batch, and nothing else, compiled and timed by turns with the whole.
+Two more kinds of rows have no peer: `learn_compiled`, with environment and updates in one program
+and several seeds side by side; and `products`, the matrix products of SAC's update with these
+networks and this batch alone, compiled and timed in alternation with the complete update, which no
+code around them can save.
 
-A second table says what SBX gains over SB3, both measured beside ours; it is said to be up to
-twenty times, and depends on how many updates there are for each step in the environment.
+A second table has the gain of SBX over SB3, computed from both comparisons. It is reported to be up
+to twenty times, and depends on the number of updates per step.
 """
 
 import argparse

@@ -1,22 +1,23 @@
 """
-How soon a policy is there, beside the state before and beside SBX's SAC.
+The time until a first policy, compared with an earlier version and with SBX's SAC.
 
     git worktree add /tmp/before COMMIT
     python benchmarks/start_up.py --before /tmp/before --rounds 3
     python benchmarks/start_up.py --table
 
-Pendulum-v1, default arguments, seed 0. Cold: a fresh process, and no compiled program kept. Warm: a
-fresh process with what the cold one has kept. They take turns, so that a slow moment of the machine
-meets all of them; the table shows the smallest of the rounds, in seconds of wall time and of the
-processor, which other work on the machine disturbs less. Columns, each beyond the one before:
+Pendulum-v1, default arguments, seed 0. Cold: a fresh process with an empty compilation cache. Warm:
+a fresh process with the cache of the cold one. The programs alternate, so that a slow moment of the
+machine affects all; the table has the smallest of the rounds, in seconds of wall time and of
+processor time, which depends less on other load. Columns, each counted from the end of the one
+before:
 
-- `base`: `import jax, stable_baselines3`, with what the interpreter takes
+- `base`: the interpreter and `import jax, stable_baselines3`
 - `imports`, `construct`: ours, or SBX's
-- `first_plan`: to the end of the first planning epoch; of SBX, the first update
-- `epoch_ms`: the least of an epoch's
+- `first_plan`: to the end of the first planning epoch; for SBX, of the first update
+- `epoch_ms`: the shortest epoch
 
-`weights` is a digest of what was learned in the first epochs: equal where numbers are the same. The
-commands of `sb3-hds` are timed likewise.
+`weights` is a hash of the networks after the first epochs: equal where the numbers are the same.
+The commands of `sb3-hds` are timed in the same way.
 """
 
 import argparse

@@ -1,26 +1,27 @@
 """
-What a belief is worth: policies from it, from single answers and from guessed boxes, where data
-leave open what is wrong.
+The value of a belief to a policy, compared with single explanations and domain randomisation.
 
     python benchmarks/uncertain_verdicts.py --seeds 5
     python benchmarks/uncertain_verdicts.py --report-only
 
-Four situations, two machines. Of the pendulum, which MuJoCo's engine simulates
-(`sb3_hds/PendulumReal-v1`): a weak drive that is as well a heavier rod, and drag of which gentle
-motion tells no more than that something brakes. Of the cart-pole, a twin with an effect that the
-one under diagnosis lacks: commands that come late by 20 ms +- 20 ms, which a data sheet says and no
-recording, and drag on the pole where only drives and dry friction were suspected, so that something
-stays without a name. Each seed makes its own recordings, or its own delay, and diagnoses them.
+There are four situations on two machines, in which the data leave open what is wrong. The pendulum
+is simulated by MuJoCo's engine (`sb3_hds/PendulumReal-v1`): a weak drive that could as well be a
+heavier rod, and drag that gentle motion cannot distinguish from other friction. The cart-pole is a
+twin with an effect that the twin under diagnosis lacks: commands that are late by 20 ms +- 20 ms,
+known from a data sheet and from no recording, and drag on the pole where only drives and dry
+friction were suspected, so that a residual remains without a name. Each seed makes its own
+recordings, or draws its own delay, and diagnoses them.
 
-HDS is trained without a real step in each of these: the nominal twin; each answer that the
-diagnosis leaves open; boxes of 20 % and 50 % around the nominal twin's parameters and the drive's
-gain, uniform; the belief; the truth. All policies act from the same 20 start states. `real`: mean
-return on the machine; `decile`: its lowest decile over start states; `worst`: the lowest mean
-return over machines that are each of the answers and the real one. The first name is the likeliest
-answer, the worst member that of the answers whose policy has the lowest `worst`.
+HDS is trained without a real step in the nominal twin; in the twin of each explanation that the
+diagnosis leaves open; in uniform boxes of 20 % and 50 % around the parameters of the nominal twin
+and the gain of the drive; in the belief; and in the true twin. All policies act from the same 20
+start states. `real`: mean return on the machine; `decile`: its lowest decile over start states;
+`worst`: the lowest mean return over the real machine and those that the explanations describe. The
+first name is the most likely explanation, the worst member the one whose policy has the lowest
+`worst`.
 
-Each run is a process of its own. Runs that are in the table are not done again, and one that was
-interrupted goes on with the policy that it was at.
+Each run is a process of its own. Finished runs are kept, and an interrupted one resumes at its
+current policy.
 """
 
 import argparse
