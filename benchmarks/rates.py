@@ -78,7 +78,7 @@ def sizes_of(rows: pd.DataFrame) -> tuple[list[bool], list[float]]:
     return covered, errors
 
 
-def told_share(hits: Any) -> str:
+def share_with_interval(hits: Any) -> str:
     hits = np.asarray(hits, bool)
     if not len(hits):
         return "-"

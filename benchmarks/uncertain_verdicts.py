@@ -265,7 +265,7 @@ def report() -> None:
         told = own.groupby("seed").verdict.first().value_counts()
         for policy in POLICIES:
             row = {"situation": name, "policy": policy}
-            row |= {m: _told(chosen[m][policy]) for m in MEASURED}
+            row |= {m: _with_interval(chosen[m][policy]) for m in MEASURED}
             rows.append(row | {"seeds": len(by["real"]), "verdicts": _counted(told)})
         print(f"{name}: {gaps(chosen)}")
     print(save(rows, "uncertain_verdicts_intervals").to_string(index=False))
@@ -300,7 +300,7 @@ def gaps(chosen: dict[str, Any]) -> str:
     return f"{told}; the belief beside {beside}"
 
 
-def _told(values: Any) -> str:
+def _with_interval(values: Any) -> str:
     middle, low, high = of_mean(list(values))
     return f"{middle:.1f}" if np.isnan(low) else f"{middle:.1f} [{low:.1f}, {high:.1f}]"
 

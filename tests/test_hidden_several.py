@@ -14,7 +14,7 @@ from cases import each
 from hidden_cases import RIGS, kind_of, nominal_twin, nothing
 from independent_rigs import EVERYWHERE, Loop, Planted, modelled
 from several_cases import SEVERAL, share_of_friction, visible
-from several_scores import judged
+from several_scores import score_case
 
 from sb3_hds import effects
 from sb3_hds.sysid.checks.timing import in_step_with_the_log
@@ -103,7 +103,7 @@ def test_a_late_bus_delays_every_motor_and_friction_has_its_share():
     (dict(sets=[]), [False, False], [], False, False),
 )
 def test_sets_are_judged_cause_by_cause_and_name_by_name(said, named, right, flawless, with_sets):
-    found = judged(
+    found = score_case(
         [VISCOUS, DRY], said.get("visible", [True, True]), said.get("same", {}), said["sets"]
     )
 
