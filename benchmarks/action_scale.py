@@ -24,9 +24,9 @@ from gymnasium import spaces
 from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, save
 
 SCALES = (0.4, 0.7, 1.0, "schedule")
-#: from 0.4 of the range to the whole over two thirds of the steps
+#: from 0.4 of the range to the full range over two thirds of the steps
 SCHEDULE_SHARE = 2.0 / 3.0
-#: that are asked for [m]
+#: distances for which the number of steps is reported [m]
 DISTANCES = (100, 140, 160, 180, 200, 220)
 _EVERY = 500  # steps, from one evaluation to the next
 
@@ -146,7 +146,7 @@ def steps_at_random(
 
 
 def table_of(wheelbase: float, steering: bool, sde: bool) -> str:
-    """:return: its name"""
+    """:return: name of the table"""
     parts = ["action_scale"]
     parts += ["steering"] * steering
     parts += [f"wheelbase_{wheelbase:g}"] * (wheelbase != _WHEELBASE)

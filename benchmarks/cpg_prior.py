@@ -35,7 +35,7 @@ RHYTHMS = {
         "kd": 0.05,
     },
 }
-#: how far an action of 1 goes: commands, rad
+#: effect of an action of 1: on commands, on targets [rad]
 RANGES = {"residual": 0.5, "offset": 0.5}
 PRIORS = ("none", "residual", "offset", "parameters")
 LEARNERS = ("sac", "gsde_sac")
@@ -67,7 +67,7 @@ def main() -> None:
 
 
 def worker(env_id: str, learner: str, prior: str, seed: int, steps: int) -> dict:
-    """Learn once, then evaluate what was learned."""
+    """Learn once, then evaluate the policy."""
     from sb3_hds.experiments import returns_of
 
     model = algorithm(learner)("MlpPolicy", make(env_id, prior), seed=seed, **settings(learner))

@@ -29,10 +29,10 @@ from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, seconds_si
 
 RECORDINGS = (10, 30, 100, 300, 1000)
 BUDGETS = ("quick", "full")
-#: and how strong the dry friction at the first joint is [N m]
+#: systems, and the dry friction at their first joint [N m]
 SYSTEMS = {"pendulum": 0.05, "double_pendulum": 0.05}
 NOISE = "1 %"
-#: seconds that ten recordings may take, compilation included
+#: target for the seconds of ten recordings, compilation included
 TARGETS = {"quick": 15.0, "full": 60.0}
 # Two numbers always lie on a line.
 _FEWEST = 3

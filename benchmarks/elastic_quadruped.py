@@ -81,7 +81,7 @@ def main() -> None:
 
 
 def worker(method: str, seed: int, steps: int) -> dict:
-    """Learn once, then evaluate what was learned."""
+    """Learn once, then evaluate the policy."""
     from sb3_hds.experiments import returns_of
 
     model, env = learned(method, seed, steps)
@@ -128,7 +128,7 @@ def over(gait: dict, mode: str, **settings):
 
 
 def plain(seed: int, gait: str | None = "trot"):
-    """:return: the plain trot, from which a search can go on"""
+    """:return: the plain trot, from which a search can start"""
     from sb3_hds import OpenLoop
 
     model = OpenLoop("MlpPolicy", make("position"), seed=seed, gait=gait, **SEARCH)

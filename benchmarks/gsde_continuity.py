@@ -24,7 +24,7 @@ from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, seconds_si
 
 #: steps of a run, by environment; all their episodes have the same length
 LENGTHS = {"Pendulum-v1": 10_000, "HalfCheetah-v5": 50_000}
-#: of gSDE's noise: how many steps it stays; None: unstructured noise
+#: number of steps between new noise matrices of gSDE; None: unstructured noise
 NOISES = {"unstructured": None, "gSDE 2": 2, "gSDE 8": 8, "gSDE 64": 64, "gSDE episode": -1}
 SETTINGS = {
     "Pendulum-v1": {"learning_starts": 500, "learning_rate": 1e-3},

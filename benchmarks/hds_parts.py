@@ -72,7 +72,7 @@ def worker(table: str, variant: str, seed: int) -> dict:
 
 
 def learned(changes: dict, seed: int) -> tuple:
-    """:return: HDS after some real episodes, with what happened in each of its epochs"""
+    """:return: HDS after some real episodes, with the log of each of its epochs"""
     first = {name: value for name, value in changes.items() if name in PRETRAINED_WITH}
     model, reports = pretrained(CELL, seed, **first), []
     for name, value in changes.items():
@@ -98,7 +98,7 @@ def beta(variant: str, seed: int) -> dict:
 
 
 def derivative_norms(model, n_steps: int = 100, n_starts: int = 256) -> np.ndarray:
-    """Of the return of random torques by the first of them, in the model that is planned in."""
+    """Norms of the derivative of the return of random torques by the first one, in the model."""
     import jax
     import jax.numpy as jnp
 
@@ -127,7 +127,7 @@ def parts(variant: str, seed: int) -> dict:
 
 
 def in_twin(cell: str, **changes):
-    """Return on the real system of what was planned in the data sheet's twin."""
+    """Return on the real system of a policy planned in the data sheet's twin."""
 
     def work(seed: int) -> float:
         return return_of(pretrained(cell, seed, **changes), cell)
@@ -155,7 +155,7 @@ def balanced(**changes):
 
 
 def open_loop(closed: bool):
-    """The policy's own commands, either seen through in the twin beforehand, or as it goes."""
+    """The policy's commands, either computed in the twin beforehand (open loop) or in feedback."""
 
     def work(seed: int) -> float:
         model, env = pretrained("heavy, long", seed), make("heavy, long")
@@ -224,7 +224,7 @@ def report(table: str) -> None:
 
 
 def in_order(table: str) -> pd.DataFrame:
-    """:return: rows of the table, whenever they were measured, as variants are listed here"""
+    """:return: rows of the table in the order of the variants here"""
     rows = pd.read_csv(RESULTS / f"hds_{table}.csv", dtype={"variant": str})
     place = {variant: i for i, variant in enumerate(VARIANTS[table])}
     rows = rows[rows["variant"].isin(place)]

@@ -62,16 +62,16 @@ from same_cause import equals
 from several_scores import RULE as RULE_OF_SEVERAL
 from several_scores import SEVERAL
 
-# Cases of one system that one process works through, so that it compiles once.
+# Number of cases of one system that one process runs, so that it compiles once.
 BLOCK = 40
-# Of so many cases, one more is Euler's.
+# One additional case of the Euler twin for so many others.
 _EULER = 50
 # And one is of each rig whose twin comes from a model file, torques and servos apart: a diagnosis
 # of six joints takes minutes.
 _OF_FILES = 100
 # But of several causes, so many times as many: few joints are no measure of many.
 _MORE_OF_SEVERAL = 10
-# Share of the sensors' noise by which twin and engine may differ after a second.
+# Largest difference of twin and engine after a second, as a share of the sensor noise.
 _LEAST_MISMATCH = 0.1
 # Compiled programs take memory maps, of which Linux gives a process 65,530.
 _MAPS, _MOST_MAPS = Path("/proc/self/maps"), 20_000
@@ -124,7 +124,7 @@ def go(table: str, wanted: dict[str, list[int]], budget: str, jobs: int) -> int:
     done = {(row["system"], row["case"]) for row in read(table)}
     left = {s: [n for n in cases if (s, n) not in done] for s, cases in wanted.items()}
     longest = max(map(len, left.values()), default=0)
-    # Systems take turns, so that what has been run is at any time like the whole.
+    # Systems alternate, so that the finished cases are representative at any time.
     blocks = [
         (system, cases[first : first + BLOCK])
         for first in range(0, longest, BLOCK)
@@ -189,7 +189,7 @@ def read(table: str) -> list[dict[str, Any]]:
 
 
 def keep(table: str, row: dict[str, Any]) -> None:
-    """Add a row; a kill leaves the old table or the new one, and other runs may add theirs."""
+    """Add a row atomically; other runs may add theirs at the same time."""
     RESULTS.mkdir(exist_ok=True)
     path = RESULTS / f"{table}.csv"
     CACHE.mkdir(exist_ok=True)
@@ -204,7 +204,7 @@ def keep(table: str, row: dict[str, Any]) -> None:
 
 
 def check_mismatch(systems: Sequence[str]) -> None:
-    """Print how far twin and engine are apart without any effect; leave if that is too far."""
+    """Print the difference of twin and engine without planted effects; exit if it is too large."""
     worst = _LEAST_MISMATCH * min(NOISES.values())
     found = {system: mismatch(system) for system in systems if system in {**SYSTEMS, **FROM_FILES}}
     for system, apart in found.items():
@@ -221,7 +221,7 @@ def check_mismatch(systems: Sequence[str]) -> None:
 
 
 def mismatch(system: str) -> float:
-    """Largest difference after a second, in units of each channel's spread, without effects."""
+    """Largest difference without effects after a second, in standard deviations of each channel."""
     import jax
     import jax.numpy as jnp
 
@@ -276,7 +276,7 @@ def run(
     said = {}
     if case.kind == SEVERAL:
         said = of_several(case, inquiry.screened, found)
-    # A log in other conventions is told before anything is simulated.
+    # Other conventions are recognised before anything is simulated.
     wanted = rules and case.asked and not reason and inquiry.given.convention is None
     if wanted:
         said |= (
@@ -313,7 +313,7 @@ def run(
 
 
 def of_several(case: Case, screened: Any, found: Any) -> dict[str, Any]:
-    """How the data came about, which causes show in them, and every set that was named."""
+    """How the data were made, which causes are detectable in them, and every set that was named."""
     visible = (
         several_cases.visible(screened, case.truths) if screened else [True] * len(case.truths)
     )
@@ -330,7 +330,7 @@ def of_several(case: Case, screened: Any, found: Any) -> dict[str, Any]:
 def others_of_several(
     case: Case, inquiry: Any, data: Any, motion: np.ndarray, commands: np.ndarray, budget: str
 ) -> dict[str, str]:
-    """What other rules say, and what that means in these data."""
+    """The answers of other methods, with the equivalent names in these data."""
     found = several_rules.asked(inquiry, nominal_twin(case.system, case.seen), data, budget)
     return {
         f"{RULE_OF_SEVERAL}{rule}": json.dumps(
@@ -345,13 +345,13 @@ def others_of_several(
 
 
 def _turned(convention: str) -> str:
-    """A wrong direction is told as a convention; what is planted then is a sign."""
+    """A reversed direction is reported as a convention; the planted effect is a sign."""
     kind, _, place = convention.partition(".")
     return f"sign_flip.{place}" if kind in ("direction", "command") else ""
 
 
 def others(inquiry: Any, case: Case) -> dict[str, Any]:
-    """What an oracle and other rules say of the same data."""
+    """The answers of an oracle and of other rules on the same data."""
     found: dict[str, Any] = {"oracle": oracle(inquiry, case) if case.truths else np.nan}
     for rule, (name, gain) in asked(inquiry).items():
         found |= {f"rule: {rule}": name, f"gain: {rule}": gain}
@@ -359,7 +359,7 @@ def others(inquiry: Any, case: Case) -> dict[str, Any]:
 
 
 def estimates(case: Case, found: Any) -> dict[str, tuple[float, float, float, float]]:
-    """:return: of each parameter of a cause that was found: estimate, interval, truth"""
+    """:return: for each parameter of a found cause: estimate, ends of its interval, true value"""
     said = {}
     for finding in found.findings:
         for planted, truth in zip(case.planted, case.truths, strict=False):
@@ -376,7 +376,7 @@ def estimates(case: Case, found: Any) -> dict[str, tuple[float, float, float, fl
 
 
 def _turns(planted: Planted, name: str, estimate: float, true: float) -> float:
-    """A phase is as good a period later."""
+    """Shift a phase by whole periods towards its true value."""
     if (planted.effect, name) != ("cogging", "phase"):
         return 0.0
     period = planted.values["period"]
@@ -391,7 +391,7 @@ def true_value(planted: Planted, name: str, system: str) -> float | None:
 
 
 def reached(found: Any) -> float:
-    """By which share what was found lowers held-out errors at the end of a window."""
+    """Share by which the found causes lower held-out errors at the end of a window."""
     if not found.gain:
         return np.nan
     last = found.gain[max(found.gain)]
@@ -399,7 +399,7 @@ def reached(found: Any) -> float:
 
 
 def oracle(inquiry: Any, case: Case) -> float:
-    """By which share the planted effects, fitted from their truth, lower held-out errors."""
+    """Share by which the planted effects, fitted from their true values, lower held-out errors."""
     search, h = inquiry.search, inquiry.hypotheses
     start = search.base(h.null, h.nuisances)
     theta, free = start.point.theta.copy(), [*start.free]

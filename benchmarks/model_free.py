@@ -51,8 +51,8 @@ LENGTHS = {
 class Ours(NamedTuple):
     """
     :param file: id in the zoo, whose hyperparameters are used
-    :param changes: to them
-    :param peers: methods that are the same elsewhere; without an equal, what it improves on
+    :param changes: changed hyperparameters
+    :param peers: the same method in other libraries; if there is none, the one that it improves on
     """
 
     file: str
@@ -63,7 +63,7 @@ class Ours(NamedTuple):
 class Peer(NamedTuple):
     """
     :param file: of RL Zoo, whose hyperparameters are used
-    :param changes: to them
+    :param changes: changed hyperparameters
     """
 
     library: str
@@ -155,7 +155,7 @@ def main() -> None:
 
 
 def through(run: tuple[Any, ...], rows: list[dict[str, Any]]) -> bool:
-    """:return: whether a run has come to its last mark, or was stopped before"""
+    """:return: whether a run reached its last mark, or was deliberately stopped before"""
     env, method, _ = run
     return max(row["mark"] for row in rows) >= marks(env, method)[-1]
 
@@ -190,7 +190,7 @@ def marks(env: str, method: str) -> range:
 
 
 def learner(env: str, method: str, seed: int) -> Any:
-    """:return: a model that has not learned yet"""
+    """:return: an untrained model"""
     return class_of(env, method)("MlpPolicy", env, seed=seed, **made_of(env, method)[1])
 
 
@@ -268,7 +268,7 @@ def _zoo_file(name: str) -> Path:
 
 
 def evaluation(env: str):
-    """:return: model to returns, from the same start states for all"""
+    """:return: function from a model to its returns, from the same start states for all"""
     if env == PENDULUM:
         angles, speeds, _ = held_out_states()
         return lambda model: rollouts(model, angles, speeds)

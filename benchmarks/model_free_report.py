@@ -17,7 +17,7 @@ from runs import RESULTS
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: return that every method shall reach; Gymnasium's own of the two small tasks
+#: target return of every method; that of Gymnasium for the two small tasks
 TARGETS = {PENDULUM: -150.0, CAR: 90.0, CART_POLE: 950.0}
 #: mean and standard deviation over seeds, and their number, after some of the steps after which
 #: ours are evaluated, on the tasks of -v4 for ours of -v5: from `results/baseline` and
@@ -73,7 +73,7 @@ def report() -> None:
 
 
 def in_order(runs: pd.DataFrame) -> pd.DataFrame:
-    """:return: the same rows, by environment and method, in whatever order they were run"""
+    """:return: the same rows, sorted by environment and method"""
     for column, order in (("method", [*OURS, *PEERS]), ("env", list(LENGTHS))):
         runs = runs.sort_values(column, key=lambda names: names.map(order.index), kind="stable")
     return runs.reset_index(drop=True)
@@ -82,7 +82,7 @@ def in_order(runs: pd.DataFrame) -> pd.DataFrame:
 def wall_seconds(runs: pd.DataFrame, paces: pd.DataFrame) -> pd.Series:
     """
     :param paces: of the methods, from ``model_free_pace.py``
-    :return: of each row, seconds that training takes up to there, all on one day; nan: no pace
+    :return: for each row, seconds of training up to its mark; nan where the pace was not measured
     """
     rows = runs[["env", "method", "steps"]].merge(paces, "left", ["env", "method"])
     begun = (rows["steps"] / rows["first_steps"]).clip(upper=1.0) * rows["first_s"]
@@ -193,21 +193,21 @@ def fewer_steps(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def median_first_mark(some: pd.DataFrame, goal: float) -> float:
-    """:return: median over seeds of the first mark at which each is no less; nan: never so far"""
+    """:return: median over seeds of the first mark at which each reaches the goal; nan: never"""
     reached = (run.loc[run["return"] >= goal, "mark"] for _, run in some.groupby("seed"))
     median = np.median([min(marks, default=np.inf) for marks in reached])
     return float(median) if np.isfinite(median) else np.nan
 
 
 def first_mark(some: pd.DataFrame, goal: float) -> float:
-    """:return: the first mark at which the mean over seeds is no less; nan: none"""
+    """:return: the first mark at which the mean over seeds reaches the goal; nan: none"""
     means = some.groupby("mark")["return"].mean()
     reached = means.index[means >= goal]
     return float(reached[0]) if len(reached) else np.nan
 
 
 def common_mark(some: pd.DataFrame, *methods: str) -> int | None:
-    """:return: the last mark that all their runs have; None: there is none"""
+    """:return: the last mark that all runs of these methods have; None: there is none"""
     if not set(methods) <= set(some["method"]):
         return None
     runs = some[some["method"].isin(methods)].groupby(["method", "seed"])

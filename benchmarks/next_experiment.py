@@ -60,7 +60,7 @@ from scipy.special import ndtr
 
 _TABLE = RESULTS / "next_experiment.csv"
 SIGNALS = ("designed", "chirp", "random smooth", "PRBS")
-# What makes data leave more open.
+# Settings with which data leave more open.
 _NOISE, _RECORDINGS = "5 %", 6
 _FACTOR, _FACTORS = 2.0, (2.0, 4.0, 8.0)
 _FAMILIES = (
@@ -74,21 +74,21 @@ _FAMILIES = (
 )
 # Recordings that are held out, what numbers them apart, and the tails beyond the band.
 _HELD_OUT, _SEED, _TAIL = 2, 1_000_000, 0.05
-# Recordings beyond which the tool says that commands do not tell.
+# Number of recordings beyond which the tool says that no command decides.
 _MOST_RECORDINGS = 100
-# What a machine may do beyond what its recordings show.
+# Limits of a machine relative to what its recordings reach.
 _ROOM = 1.25
 # Share of a limit that other signals take at most, as the designed one does, and how finely their
 # size is sought.
 _MOST, _HALVINGS = 0.9, 7
-# Weight from which a question is settled.
+# Weight at which a question counts as settled.
 _SURE = 0.95
-# Sampling intervals that a level of a binary sequence lasts.
+# Sampling intervals per level of a binary sequence.
 _LEVEL = 5
 
 
 class Played(Loop):
-    """Commands that are given: no loop at all."""
+    """Given commands, without a loop."""
 
     def set_points(self, rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
         return np.stack([self.amplitude, self.amplitude])
@@ -105,7 +105,7 @@ def main() -> None:
     parser.add_argument("--report-only", action="store_true")
     arguments = parser.parse_args()
     if not arguments.report_only:
-        # Systems take turns, so that the table is at any time like the whole.
+        # Systems alternate, so that the finished cases are representative at any time.
         turns = itertools.product(range(arguments.cases), list[str](arguments.systems))
         for number, system in turns:
             deal = functools.partial(dealt, number, system, "effect")
@@ -124,7 +124,7 @@ def main() -> None:
 
 
 def family_of(effect: str) -> tuple[str, ...]:
-    """:return: names of effects that act much like this one; none: it has no relatives"""
+    """:return: names of effects that act similarly; empty if there are none"""
     name = effect.partition(".")[0]
     return next((family for family in _FAMILIES if name in family), ())
 
@@ -213,13 +213,13 @@ def run(system: str, number: int, budget: str) -> list[dict[str, Any]]:
 
 
 def recordings_for(designed: Any, same: set[str]) -> float:
-    """:return: designed recordings that tell the planted cause from names that mean another"""
+    """:return: number of designed recordings that separate the planted cause from wrong names"""
     own = [p.needed for p in designed.pairs if p.true in same and p.other not in same]
     return max(own, default=math.inf)
 
 
 def inside_band(found: Any, case: Any) -> float:
-    """:return: share of instants of held-out motion in the 90 % band; nan: there is no belief"""
+    """:return: share of samples of held-out motion in the 90 % band; nan: there is no belief"""
     if found.opened is None:
         return math.nan
     data, motion = recorded(dataclasses.replace(case, recordings=_HELD_OUT), _SEED + case.number)
@@ -252,7 +252,7 @@ def _simulated(base: Any) -> Any:
 
 
 def told(found: Any) -> str:
-    """:return: the first cause and what cannot be told from it"""
+    """:return: the first cause and its alternatives"""
     if not found.findings:
         return ""
     return ";".join((key(found.findings[0]), *found.findings[0].alternatives))
@@ -264,7 +264,7 @@ def values_of(answer: Any) -> dict[str, float]:
 
 
 def limits_of(system: str, motion: np.ndarray) -> dict[str, Any]:
-    """:param motion: positions and velocities that the recordings took"""
+    """:param motion: positions and velocities of the recordings"""
     rig, twin = RIGS[system], nominal_twin(system)
     joints, actuators = [j.name for j in twin.joints], [a.name for a in twin.actuators]
     q, v = motion[:, : rig.dof], motion[:, rig.dof :]
@@ -289,7 +289,7 @@ def largest_share(limits: dict[str, Any], true: np.ndarray, rig: Any) -> float:
 def as_large_as_allowed(
     signal: str, excitation: Any, numbers: Any, rig: Any, rng: np.random.Generator
 ) -> np.ndarray:
-    """:return: commands of this kind, as large as the limits allow under every answer"""
+    """:return: commands of this kind, as large as the limits allow under every explanation"""
     import jax
 
     shape = unit_signal(signal, len(rig.torque), rig.dt, rng) * np.array(rig.torque)
@@ -342,7 +342,7 @@ def played(
 
 
 def report() -> None:
-    """Print and keep how often each signal settled the question, of the same cases."""
+    """Print and save how often each signal settled the question, on the same cases."""
     table: Any = pd.read_csv(_TABLE)
     one_each = table.groupby(["system", "case"]).head(1)
     print(f"{len(one_each)} cases: {one_each.verdict.value_counts().to_dict()}")

@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def worker(env_id: str, seed: int, steps: int) -> dict:
-    """Search once, then evaluate what was found."""
+    """Search once, then evaluate the gait."""
     import gymnasium
 
     from sb3_hds import OpenLoop
@@ -79,7 +79,7 @@ def _rounded(value: float | list[float]) -> float | list[float]:
 
 
 def hyperparameters(env_id: str) -> dict:
-    """:return: of the zoo's file, without what the zoo itself consumes"""
+    """:return: those of the zoo's file, without the keys of the zoo itself"""
     import yaml
 
     path = Path(__file__).parent.parent / "hyperparams" / "openloop.yml"

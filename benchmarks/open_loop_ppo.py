@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def worker(env_id: str, learner: str, seed: int, steps: int) -> dict:
-    """Learn once, then evaluate what was learned."""
+    """Learn once, then evaluate the policy."""
     import gymnasium
 
     from sb3_hds.experiments import returns_of
@@ -71,7 +71,7 @@ class RandomActions:
 
 
 class Normalised:
-    """PPO that has learned, with the statistics of the observations that it learned from."""
+    """A trained PPO with the normalisation statistics of its observations."""
 
     def __init__(self, env_id: str, seed: int, steps: int) -> None:
         from sbx import PPO
@@ -89,7 +89,7 @@ class Normalised:
 
 
 def hyperparameters(env_id: str) -> dict[str, Any]:
-    """:return: RL Zoo's, under the version of the environment that it knows"""
+    """:return: hyperparameters of RL Zoo for the version of the environment that it has"""
     import flax.linen as nn
     import rl_zoo3
     import yaml
@@ -108,7 +108,7 @@ def hyperparameters(env_id: str) -> dict[str, Any]:
 
 
 def report(steps: int) -> None:
-    """Print and keep scores, and draw them."""
+    """Print, save and plot the scores."""
     peers = pd.read_csv(RESULTS / "open_loop_ppo.csv")
     gaits = pd.read_csv(RESULTS / "open_loop.csv")
     gaits = gaits[gaits.steps == steps].assign(learner="open loop")

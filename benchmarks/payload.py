@@ -106,7 +106,7 @@ def worker(method: str, goal: str, seed: int, epochs: int) -> dict:
 
 
 def model_epoch(model):
-    """One epoch of PODS as the model does it."""
+    """One epoch of PODS."""
     from stable_baselines3.common.utils import configure_logger
 
     model.set_logger(configure_logger(0))

@@ -36,7 +36,7 @@ def main() -> None:
 
 def run(n_seeds: int) -> None:
     jobs = [("hds", seed) for seed in range(n_seeds)] + [(peer, 0) for peer in PEERS]
-    held_out_states()  # says so now where the data are missing
+    held_out_states()  # raises before any run if the data are missing
     curves, finals = [], []
     for name, seed in jobs:
         print(f"{name}, seed {seed} ...", file=sys.stderr, flush=True)
@@ -139,7 +139,7 @@ def watched(model, total_timesteps: int, copy):
 
 
 def held_out_states():
-    """:return: angles [rad], speeds [rad/s], best returns of 500 states that no tuning has seen"""
+    """:return: angles [rad], speeds [rad/s] and best returns of 500 states not used in tuning"""
     folder = os.environ.get("SB3_HDS_DATA")
     if folder is None:
         raise SystemExit(

@@ -37,7 +37,7 @@ GAITS = {
         "kd": 0.05,
     },
 }
-#: how the joints of a gait are known
+#: source of the joint states that a gait tracks
 ENCODERS = {"gait": "own", "gait, joints observed": "observation"}
 _SEED = 0
 

@@ -63,7 +63,7 @@ def worker(cell: str, method: str, seed: int) -> list[dict]:
 
 
 def planner(method: str, cell: str, seed: int):
-    """HDS that never sees data is PODS with the same planning settings as HDS beside it."""
+    """HDS without data is PODS with the planning settings of HDS."""
     from sb3_hds import HDS, envs
 
     if method == "ceiling":
@@ -139,7 +139,7 @@ def by_cell(table: pd.DataFrame, shown: pd.DataFrame) -> pd.DataFrame:
 
 
 def ahead(group: pd.DataFrame) -> float:
-    """Of every learner and number of steps, the least difference, over the seeds that both have."""
+    """The least lead of HDS over all learners and numbers of steps, over common seeds."""
     returns = group.pivot_table("return", ["seed", "episodes"], "method")
     others = [name for name in ("sac", "tqc", "droq") if name in returns]
     if "hds" not in returns or not others:
@@ -149,7 +149,7 @@ def ahead(group: pd.DataFrame) -> float:
 
 
 def seed_by_seed(table: pd.DataFrame) -> pd.DataFrame:
-    """How often HDS is behind a learner with the same seed after as many real steps, if ever."""
+    """How often HDS is behind a learner with the same seed after the same number of real steps."""
     returns = table.pivot_table("return", ["cell", "seed", "episodes"], "method")
     rows = []
     for method in ("sac", "tqc", "droq"):
@@ -225,7 +225,7 @@ def closed(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def learned_in(shown: pd.DataFrame) -> list[str]:
-    """:return: cells in which somebody has learned, in their order"""
+    """:return: cells in which a learner was run, in order"""
     return list(dict.fromkeys(shown[shown["episodes"] > 0]["cell"]))
 
 
@@ -252,7 +252,7 @@ def figure(shown: pd.DataFrame) -> None:
         for method, colour in styles.items():
             rows = group[group["method"] == method]
             panel.plot(rows["episodes"], rows["return"], "o-", color=colour, label=method)
-        # Where a learner first spins, the rest would be a line.
+        # The returns of a learner that first spins would compress the rest to a line.
         worst, best = group["return"].min(), group["return"].max()
         deepest = max(worst, best - _DEEPEST)
         panel.set_ylim(deepest - 0.05 * (best - deepest), best + 0.1 * (best - deepest))

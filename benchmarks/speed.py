@@ -39,7 +39,7 @@ from runs import (
 
 ENV, BATCH, STARTS = "Pendulum-v1", 256, 100
 WIDE = {"pi": [256, 256], "qf": [1024, 1024]}
-#: ours, its peer, and what both are made with
+#: our class, its peer, and the arguments of both
 PAIRS = {
     "sac": ("GSDESAC", {"use_sde": False}, "SAC", {}),
     "gsde_sac": ("GSDESAC", {"policy_kwargs": {"log_std_init": -3.0}}, "SAC", {"use_sde": True}),
@@ -69,7 +69,7 @@ IN_SB3 = ("sac", "gsde_sac", "tqc", "crossq")
 ALONE = {"td7": ("TD7", {"use_checkpoints": False}), "bro": ("BRO", {})}
 RATIOS = (1, 20)
 N_BLOCKS = 9
-#: of a block of the slower of two, about [s]
+#: approximate duration of a block of the slower of two learners [s]
 BLOCK_S = {"cpu": 3.0, "cuda": 0.5}
 SEEDS = (1, 2, 4, 8)
 
@@ -110,7 +110,7 @@ def chosen(run: tuple[str, int, str], words: list[str] | None) -> bool:
 
 
 def cache_of(run: tuple[str, int, str]):
-    """A start-up compiles everything."""
+    """Start-ups are measured with an empty compilation cache."""
     return None if "start-up" in run[2] else CACHE
 
 
@@ -135,18 +135,18 @@ def worker(name: str, ratio: int, peer: str) -> dict:
 
 
 def block_length(models: list) -> int:
-    """:return: steps that take the slower of them about ``BLOCK_S``"""
+    """:return: number of steps for which the slower learner needs about ``BLOCK_S``"""
     slowest = max(turn(models, 10, backwards=False)) / 10
     return int(np.clip(BLOCK_S[device()] / slowest, 5, 500))
 
 
 def device() -> str:
-    """:return: on which all of them compute"""
+    """:return: name of the device that all learners use"""
     return os.environ["JAX_PLATFORMS"].partition(",")[0]
 
 
 def turn(models: list, steps: int, backwards: bool) -> list[float]:
-    """:return: seconds that each of them takes, one after the other"""
+    """:return: seconds of each learner, run one after the other"""
     seconds = [0.0] * len(models)
     order = range(len(models))
     for i in reversed(order) if backwards else order:
@@ -238,7 +238,7 @@ def start_up(name: str, who: str) -> float:
 
 
 def compiled(name: str, n_seeds: int) -> dict:
-    """Steps of all seeds together in a second, compiled before."""
+    """Steps per second of all seeds together, compilation excluded."""
     from sb3_hds.algos import learn_compiled
 
     model, steps = ours(name, 1), 2_000
@@ -275,14 +275,14 @@ def report(name: str) -> None:
 
 
 def target(ratio: int, peer: str) -> float:
-    """:return: how many times as fast as the peer ours shall be"""
+    """:return: target of the speed-up"""
     if peer == "sb3":
         return 3.0
     return 1.3 if ratio == 20 else 1.0
 
 
 def beside_targets(measured: pd.DataFrame) -> pd.DataFrame:
-    """:return: a row for each pair, with the speed-up that it shall have"""
+    """:return: a row for each pair, with the target of its speed-up"""
     pairs = measured[measured["peer"].isin(("sbx", "sb3"))]
     pairs = pairs[["name", "ratio", "peer", "speed_up", "low", "high"]].copy()
     pairs["target"] = [target(*pair) for pair in pairs[["ratio", "peer"]].itertuples(index=False)]
@@ -291,7 +291,7 @@ def beside_targets(measured: pd.DataFrame) -> pd.DataFrame:
 
 
 def sbx_beside_sb3(measured: pd.DataFrame) -> pd.DataFrame:
-    """:return: how many times as fast SBX is, from the speed-ups of ours beside both"""
+    """:return: speed-up of SBX over SB3, the quotient of our speed-ups over both"""
     wide = measured.pivot_table("speed_up", ["name", "ratio"], "peer").reindex(
         columns=["sbx", "sb3"]
     )
@@ -300,7 +300,7 @@ def sbx_beside_sb3(measured: pd.DataFrame) -> pd.DataFrame:
 
 
 def products(measured: pd.DataFrame) -> pd.DataFrame:
-    """:return: what share of the time of a whole step its matrix products alone would take"""
+    """:return: share of the matrix products in the time of a complete step"""
     rows = measured[measured["peer"] == "products"]
     return rows[["name", "ratio", "speed_up", "low", "high"]].rename(
         columns={"speed_up": "share_of_products"}
@@ -317,7 +317,7 @@ def start_ups(measured: pd.DataFrame) -> pd.DataFrame:
 
 
 def alone(measured: pd.DataFrame) -> pd.DataFrame:
-    """:return: what has no peer; of the compiled path, ``ratio`` is the number of seeds"""
+    """:return: rows without a peer; for the compiled path, ``ratio`` is the number of seeds"""
     rows = measured[measured["peer"].isin(("none", "compiled"))]
     return rows[["name", "ratio", "peer", "steps_per_s", "updates_per_s"]]
 

@@ -100,7 +100,7 @@ class Marks:
 
     def __init__(self) -> None:
         self.found: dict[str, Any] = {}
-        # Including what the interpreter took to come here.
+        # Includes the start of the interpreter.
         self._wall = float(os.environ["BENCHMARK_START"]), 0.0
 
     def mark(self, name: str) -> None:
@@ -160,7 +160,7 @@ def sbx() -> dict[str, Any]:
 
 
 def counter(jax: Any) -> Callable[[], int]:
-    """:return: says how many programs were compiled, and not taken from where they are kept"""
+    """:return: function that returns how many programs were compiled, cached ones not counted"""
     counts = {"backend_compile_duration": 0, "cache_hits": 0}
 
     def count(event: str, *_: Any, **__: Any) -> None:
@@ -189,7 +189,7 @@ def report() -> None:
 
 
 def summary(least: pd.DataFrame) -> list[dict[str, Any]]:
-    """:return: what the docs show of starts, one row each"""
+    """:return: one row for each start, for the docs"""
     starts = {"before": "before", "ours": "now", "sbx": "SBX SAC"}
     return [
         {

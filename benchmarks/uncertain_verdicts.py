@@ -47,9 +47,9 @@ _DELAY = 0.02  # [s], of the cart-pole, give or take as much
 class Situation(NamedTuple):
     """
     :param env: id of the task
-    :param hidden: what the machine has: settings of the engine's pendulum, or effects
-    :param suspects: names of effects that the diagnosis asks about
-    :param torque: of the recordings, as a share of what the drive gives
+    :param hidden: what is hidden in the machine: settings of the engine's pendulum, or effects
+    :param suspects: names of the candidate effects of the diagnosis
+    :param torque: of the recordings, as a share of the drive's limit
     :param gentle: whether recordings begin at rest, hanging
     """
 
@@ -134,7 +134,7 @@ def worker(name: str, seed: int) -> list[dict[str, Any]]:
 
 
 def asked(situation: Situation, nominal: Any, true: Any, seed: int) -> dict[str, Any]:
-    """:return: what the recordings leave open, as plain data"""
+    """:return: the explanations that the recordings leave open, as plain data"""
     from sb3_hds.sysid.belief.belief import belief_of
 
     verdict, answers = left_open(situation, nominal, true, seed)
@@ -148,7 +148,7 @@ def asked(situation: Situation, nominal: Any, true: Any, seed: int) -> dict[str,
 
 
 def truth(situation: Situation, nominal: Any, seed: int) -> Any:
-    """:return: the twin of the machine as it is"""
+    """:return: the true twin of the machine"""
     import gymnasium
 
     from sb3_hds import effects
@@ -163,7 +163,7 @@ def truth(situation: Situation, nominal: Any, seed: int) -> Any:
 
 
 def left_open(situation: Situation, nominal: Any, true: Any, seed: int) -> tuple[str, Any]:
-    """:return: the verdict on recordings of the machine, and the answers that they leave open"""
+    """:return: the verdict on recordings of the machine, and the remaining explanations"""
     from sb3_hds import Trajectories, diagnose, effects
     from sb3_hds.sysid.belief.answers import Answer, Answers
 
@@ -214,7 +214,7 @@ def machine_of(situation: Situation, true: Any, noise: float = 0.0) -> Any:
 
 
 def boxed(nominal: Any, share: float, seed: int) -> Any:
-    """:return: every parameter that is not zero, and the drive's gain, uniform in a box"""
+    """:return: draws of all nonzero parameters and of the drive's gain, uniform in a box"""
     from sb3_hds.core.belief import BeliefTwin
     from sb3_hds.effects import TorqueGain
 
@@ -256,7 +256,7 @@ def returns_in(model: Any, twin: Any) -> np.ndarray:
 
 
 def report() -> None:
-    """Print and keep means over seeds with 95 % intervals, and shares of gaps."""
+    """Print and save means over seeds with 95 % intervals, and shares of gaps."""
     table: Any = pd.read_csv(RESULTS / "uncertain_verdicts.csv")
     rows = []
     for name, own in table.groupby("situation", sort=False):
@@ -275,7 +275,7 @@ MEASURED = ("real", "decile", "worst")
 
 
 def named(frame: Any, worst: Any) -> Any:
-    """:return: with the first name and the worst member in the place of numbered answers"""
+    """:return: the frame with first name and worst member instead of numbered explanations"""
     answers = [column for column in frame if str(column).startswith("answer ")]
     lowest = worst[answers].idxmin(axis=1)
     frame = frame.copy()
