@@ -55,7 +55,7 @@ NULLS = tuple(kind for kind in SHARES if kind.startswith("null"))
 #: Pendulum-v1's twin, which takes semi-implicit Euler steps, compared with the engine
 EULERS = "Euler's twin"
 RIGS: dict[str, System] = {**SYSTEMS, "pendulum_v1": EULER, **FROM_FILES}
-#: index, among four cases of a kind, of the one to which other rules are applied
+#: other rules are applied to one in so many cases of a kind
 ASKED = 4
 PARAMETER = "parameter"
 # Effects that can be planted at joints.
