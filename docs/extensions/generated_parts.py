@@ -94,10 +94,11 @@ PARTS: dict[str, Callable[[], str]] = {
     ),
     **{
         f"hidden_effects_{part}": summaries.complete(f"hidden_effects_{part}")
-        for part in (
-            *("targets", "kinds", "difficulty", "causes", "systems", "outside", "rules"),
-            *("several", "several_conditions", "several_rules"),
-        )
+        for part in ("targets", "kinds", "difficulty", "causes", "systems", "outside", "rules")
+    },
+    **{
+        f"hidden_effects_{part}": summaries.complete(f"hidden_effects_quick_{part}")
+        for part in ("several", "several_conditions", "several_rules")
     },
     "hidden_effects_picture": summaries.picture(
         "hidden_effects", "rates with intervals beside their targets, right names against size"
