@@ -1,4 +1,4 @@
-"""What the benchmarks run, compute from their tables, and keep between runs."""
+"""What benchmarks run, compute from their tables, and save between runs."""
 
 from importlib.util import find_spec
 from inspect import signature

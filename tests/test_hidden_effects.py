@@ -195,7 +195,7 @@ def told(rows):
 
 
 @hidden
-def test_nothing_is_named_where_nothing_was_hidden_or_what_the_catalogue_does_not_hold(table):
+def test_nothing_is_named_for_nulls_and_for_effects_outside_the_catalogue(table):
     nulls, outside = table[table["kind"].isin(NULLS)], table[table["kind"] == "outside"]
     alarms = nulls[nulls["spoke"]]
     assert len(alarms) <= allowed([0.025] * len(nulls)), told(alarms)
@@ -219,6 +219,6 @@ def test_what_shows_is_found(table):
 
 
 @hidden
-def test_standing_still_says_nothing(table):
+def test_recordings_at_standstill_are_not_identifiable(table):
     still = table[table["kind"] == "still"]
     assert len(still) and (still["verdict"] == "not_identifiable").all(), told(still)
