@@ -14,8 +14,8 @@ _RUN = {
     *("algorithm", "budget", "cache", "case", "cell", "env", "goal", "hidden", "joints", "kind"),
     *("learner", "method", "noise", "prior", "recordings", "seed", "system", "tasks", "twin"),
 }
-# Columns with the time of a run, in units of so many seconds.
-_TIMES = {"seconds": 1.0, "run_seconds": 1.0, "verdict [s]": 1.0, "cluster [s]": 1.0}
+# Columns with the time of a run, the first that a table has, in units of so many seconds.
+_TIMES = {"verdict [s]": 1.0, "cluster [s]": 1.0, "run_seconds": 1.0, "seconds": 1.0}
 _TIMES |= {"minutes": 60.0}
 
 
@@ -84,6 +84,7 @@ def _seconds_of_runs(path: Path) -> float:
         return 0.0
     runs: dict[tuple[str, ...], float] = {}
     run_by = _RUN if "mark" in columns else _RUN | {"steps"}
+    run_by = run_by | ({"rate [Hz]", "seconds"} - {time})
     keys = [i for i, column in enumerate(columns) if column in run_by]
     for row in rows:
         run = tuple(row[i] for i in keys)
