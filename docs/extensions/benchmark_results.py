@@ -83,7 +83,8 @@ def _seconds_of_runs(path: Path) -> float:
     if time is None:
         return 0.0
     runs: dict[tuple[str, ...], float] = {}
-    run_by = _RUN if "mark" in columns else _RUN | {"steps"}
+    # With marks or minutes, the steps are those of a row.
+    run_by = _RUN if "mark" in columns or time == "minutes" else _RUN | {"steps"}
     run_by = run_by | ({"rate [Hz]", "seconds"} - {time})
     keys = [i for i, column in enumerate(columns) if column in run_by]
     for row in rows:
