@@ -147,16 +147,16 @@ def kinds(system: str) -> tuple[str, ...]:
     """:return: kinds of a hundred cases in order; the first n have nearly the right shares"""
     if RIGS[system] is EULER:
         return (EULERS,) * 100
-    shares, dealt = dict(SHARES), list[str]()
+    shares, order = dict(SHARES), list[str]()
     shares["effect"] += shares.pop("several")
     if RIGS[system].base is None:
         shares["null"] += shares.pop("null, wrong base")
     for n in range(1, 101):
-        behind = {kind: share * n / 100 - dealt.count(kind) for kind, share in shares.items()}
-        dealt.append(max(behind, key=lambda kind: behind[kind]))
-    for place in [i for i, kind in enumerate(dealt) if kind == "effect"][1::2]:
-        dealt[place] = "several"
-    return tuple(dealt)
+        behind = {kind: share * n / 100 - order.count(kind) for kind, share in shares.items()}
+        order.append(max(behind, key=lambda kind: behind[kind]))
+    for place in [i for i, kind in enumerate(order) if kind == "effect"][1::2]:
+        order[place] = "several"
+    return tuple(order)
 
 
 def kind_of(system: str, number: int) -> tuple[str, int]:
@@ -165,9 +165,9 @@ def kind_of(system: str, number: int) -> tuple[str, int]:
         many, as they have every second card of their packs
     """
     hundreds, place = divmod(number, 100)
-    dealt = kinds(system)
-    kind = dealt[place]
-    turn = hundreds * dealt.count(kind) + dealt[:place].count(kind)
+    order = kinds(system)
+    kind = order[place]
+    turn = hundreds * order.count(kind) + order[:place].count(kind)
     return kind, 2 * turn if kind == "effect" else turn
 
 
@@ -183,7 +183,7 @@ def draw(
     turn = number
     if not kind:
         kind, turn = kind_of(system, number)
-    deal = functools.partial(dealt, turn, system, kind)
+    deal = functools.partial(from_deck, turn, system, kind)
     factors = {"effect": (2.0, 4.0, 8.0), "pair": (2.0, 4.0, 8.0), "outside": (4.0, 8.0)}
     noise = noise or deal("noise", ("tick", "tick", "1 %", "1 %", "5 %"))
     wrong, disturbance = deal("condition", _CONDITIONS) if kind == "effect" else (False, 0.0)
@@ -214,7 +214,7 @@ def draw(
     raise RuntimeError(f"{system}, case {number}: nothing could be planted in {_TRIES} tries.")
 
 
-def dealt(turn: int, system: str, kind: str, what: str, cards: Sequence[_Card]) -> _Card:
+def from_deck(turn: int, system: str, kind: str, what: str, cards: Sequence[_Card]) -> _Card:
     """Draw without replacement from a deck that is reshuffled when it is used up."""
     pack, place = divmod(turn, len(cards))
     label = zlib.crc32(f"{system}, {kind}, {what}".encode())

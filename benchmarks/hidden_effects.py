@@ -56,7 +56,7 @@ from hidden_cases import (
 )
 from hidden_scores import loaded, report
 from independent_rigs import FROM_FILES, SYSTEMS, Planted, simulate
-from other_rules import asked
+from other_rules import answers_of
 from runs import CACHE, RESULTS
 from same_cause import equals
 from several_scores import RULE as RULE_OF_SEVERAL
@@ -251,7 +251,7 @@ def run(
 ) -> dict[str, Any]:
     """
     :param kind: instead of the one whose turn it is
-    :param noise: instead of the one that is dealt
+    :param noise: instead of the drawn one
     :param most: recordings
     :param rules: whether other rules are asked, and an oracle, where it is the case's turn
     :return: what was planted and what was said
@@ -353,7 +353,7 @@ def _turned(convention: str) -> str:
 def others(inquiry: Any, case: Case) -> dict[str, Any]:
     """The answers of an oracle and of other rules on the same data."""
     found: dict[str, Any] = {"oracle": oracle(inquiry, case) if case.truths else np.nan}
-    for rule, (name, gain) in asked(inquiry).items():
+    for rule, (name, gain) in answers_of(inquiry).items():
         found |= {f"rule: {rule}": name, f"gain: {rule}": gain}
     return found
 

@@ -44,8 +44,8 @@ import pandas as pd
 from hidden_cases import (
     N_STEPS,
     RIGS,
-    dealt,
     draw,
+    from_deck,
     nominal_twin,
     plantable,
     recorded,
@@ -108,7 +108,7 @@ def main() -> None:
         # Systems alternate, so that the finished cases are representative at any time.
         turns = itertools.product(range(arguments.cases), list[str](arguments.systems))
         for number, system in turns:
-            deal = functools.partial(dealt, number, system, "effect")
+            deal = functools.partial(from_deck, number, system, "effect")
             large = deal("factor", _FACTORS) != _FACTOR
             lonely = not family_of(deal("effect", plantable(RIGS[system])))
             if large or lonely or (system, number) in done():
@@ -155,7 +155,7 @@ def run(system: str, number: int, budget: str) -> list[dict[str, Any]]:
     case, data, motion = draw(system, number, kind="effect", noise=_NOISE, most=_RECORDINGS)
     twin, rig = nominal_twin(system, case.seen), RIGS[system]
     family = family_of(case.planted[0].effect)
-    if not family:  # what was dealt cannot be planted here, and something else was
+    if not family:  # the drawn effect cannot be planted here, and another one was
         return []
     asked: dict[str, Any] = {
         "effects": [effect for effect in ALL if effect.name in family],
@@ -165,7 +165,7 @@ def run(system: str, number: int, budget: str) -> list[dict[str, Any]]:
         "progress": False,
     }
     found = diagnose(twin, data, **asked)
-    common = {"system": system, "case": number, "truth": case.truths[0], "set": told(found)}
+    common = {"system": system, "case": number, "truth": case.truths[0], "set": first_set(found)}
     common |= {"verdict": found.verdict, "inside": inside_band(found, case)}
     common["seconds"] = time.time() - began
     if found.verdict != "ambiguous":
@@ -251,7 +251,7 @@ def _simulated(base: Any) -> Any:
     return jax.jit(jax.vmap(one, (None, 0, 0)))
 
 
-def told(found: Any) -> str:
+def first_set(found: Any) -> str:
     """:return: the first cause and its alternatives"""
     if not found.findings:
         return ""

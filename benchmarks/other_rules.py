@@ -24,7 +24,7 @@ class Answer(NamedTuple):
     gain: float = 0.0
 
 
-def asked(inquiry) -> dict[str, Answer]:
+def answers_of(inquiry) -> dict[str, Answer]:
     """
     :param inquiry: a `sb3_hds.sysid.diagnosis.pipeline.Inquiry` that has run
     :return: the answer of each rule

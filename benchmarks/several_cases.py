@@ -26,7 +26,7 @@ from hidden_cases import (
     RIGS,
     Case,
     base_value,
-    dealt,
+    from_deck,
     kind_of,
     nominal_twin,
     nothing,
@@ -121,7 +121,7 @@ def draw(
     """
     kind, turn = kind_of(system, number)
     turn = turn if kind == SEVERAL else number
-    deal = functools.partial(dealt, turn, system, SEVERAL)
+    deal = functools.partial(from_deck, turn, system, SEVERAL)
     driven = "servos" not in system
     recordings = min(deal("recordings", _RECORDINGS), most)
     long = deal("long", LONG)

@@ -104,7 +104,7 @@ def worker(name: str, seed: int) -> list[dict[str, Any]]:
     true = truth(situation, nominal, seed)
     kept = json.loads(path.read_text()) if path.exists() else None
     if kept is None:
-        kept = asked(situation, nominal, true, seed) | {"rows": []}
+        kept = diagnosed(situation, nominal, true, seed) | {"rows": []}
         write(path, json.dumps(kept))
     back = lambda spec: twins.from_spec(spec, effects.ALL)  # noqa: E731
     members = [back(spec) for spec in kept["members"]]
@@ -133,7 +133,7 @@ def worker(name: str, seed: int) -> list[dict[str, Any]]:
     return kept["rows"]
 
 
-def asked(situation: Situation, nominal: Any, true: Any, seed: int) -> dict[str, Any]:
+def diagnosed(situation: Situation, nominal: Any, true: Any, seed: int) -> dict[str, Any]:
     """:return: the explanations that the recordings leave open, as plain data"""
     from sb3_hds.sysid.belief.belief import belief_of
 

@@ -1,4 +1,4 @@
-"""Several causes hidden at once: how they are dealt, driven and judged, and what others say."""
+"""Several hidden causes: how cases are drawn, driven and scored, and the answers of others."""
 
 import dataclasses
 
